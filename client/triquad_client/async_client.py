@@ -89,6 +89,9 @@ class AsyncClient(AsyncMapQueries):
             )
         )
 
+    async def restart_source(self, source: str = "default") -> None:
+        await self._driver.in_order(lambda: self._scans.restart(source))
+
     async def flush(self, timeout_s: float = 30.0, pending: int = 0) -> FlushReport:
         return await self._run(self._scans.flush(timeout_s, pending))
 

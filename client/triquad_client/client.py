@@ -117,6 +117,13 @@ class Client(MapQueries):
         points = depth_points(depth, intrinsics, stride)
         self.publish_scan(points, world_from_camera, stamp_s, source)
 
+    def restart_source(self, source: str = "default") -> None:
+        """Let the time of a source begin again, as that of a simulation that was started again.
+
+        Its next scan may have any stamp. :meth:`flush` counts only those from then on.
+        """
+        self._scans.restart(source)
+
     def flush(self, timeout_s: float = 30.0, pending: int = 0) -> FlushReport:
         """Wait until what this client published is dealt with and queries see it.
 

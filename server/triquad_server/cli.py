@@ -127,10 +127,7 @@ def _run(options: argparse.Namespace) -> int:
 
 def _implied(options: argparse.Namespace) -> list[str]:
     """The settings that flags stand for."""
-    implied = ["ros2.enabled=true"] if options.ros2 else []
-    if options.metrics_port is not None:
-        implied.append(f"metrics.port={options.metrics_port}")
-    return implied
+    return [] if options.metrics_port is None else [f"metrics.port={options.metrics_port}"]
 
 
 def _log_options() -> argparse.ArgumentParser:
@@ -187,12 +184,6 @@ def _parser(log_options: argparse.ArgumentParser) -> argparse.ArgumentParser:
         metavar="EPOCH",
         help="take the map back to an older checkpoint of the store, such as the one that is kept "
         "before a reset (triquad-inspect STORE --log lists them); what it was stays on disk",
-    )
-    add(
-        "--ros2",
-        action="store_true",
-        help="take in clouds and poses of ROS 2 nodes (rmw_zenoh, zenoh-bridge-ros2dds), and "
-        "publish the map to them: docs/guides/ros2.md",
     )
     add("--device", choices=("auto", "cpu", "cuda"), default="auto", help="default: auto")
     _add_settings(parser.add_argument_group("settings (docs/settings.md)"))

@@ -144,7 +144,7 @@ class Service:
         self._serve_queries()
         self._serve_changes(health.server)
         self._serve_sources(health.server)
-        feed, tiles = self._serve_mesh(health.server)
+        tiles = self._serve_mesh(health.server)
         downloads = self._serve_downloads(health.server)
         self.metrics = Metrics(
             health, self._session, tiles=tiles, downloads=downloads, queues=self._operations.queues
@@ -172,8 +172,6 @@ class Service:
         )
         self._parts.callback(self._mapper.rest)
         self._open_intake()
-        if self._settings.ros2.enabled:
-            self._open_ros2(feed)
         self._parts.callback(Heartbeat(self._session, health).close)
         alive = keys.alive_key(health.map_name, health.server)
         self._parts.callback(self._session.liveliness().declare_token(alive).undeclare)
@@ -204,21 +202,6 @@ class Service:
             arrived=self._mapper.wake,
         )
         self._parts.callback(intake.close)
-
-    def _open_ros2(self, tiles: TileFeed) -> None:
-        # Only where it is wanted, since the types of ROS take a while to import.
-        from triquad_server.ros2.connection import Ros2Connection, ServedParts
-
-        parts = ServedParts(
-            scans=self._scans,
-            scan_arrived=self._mapper.wake,
-            max_points=self._settings.scan.max_points,
-            epochs=self._mapper.epochs,
-            tiles=tiles,
-            team=self._served.teams.meshing,
-        )
-        connection = Ros2Connection(self._session, self._settings.ros2, parts)
-        self._parts.callback(connection.close)
 
     def _serve_queries(self) -> None:
         limits = self._settings.service
@@ -256,8 +239,8 @@ class Service:
         queries = SourceQueries(self._mapper.trails, server)
         self._serve("sources", {keys.SOURCES: answering(SourcesRequest, queries.sources)})
 
-    def _serve_mesh(self, server: str) -> tuple[TileFeed, TileCache]:
-        """Queries of mesh tiles, and following them; the feed of what changes, and all tiles."""
+    def _serve_mesh(self, server: str) -> TileCache:
+        """Queries of mesh tiles, and following them; all tiles."""
         cache = TileCache(self._settings.mesh, self._served.teams.meshing)
         feed = TileFeed(
             cache,
@@ -279,7 +262,7 @@ class Service:
         )
         self._serve("tile_updates", {keys.TILE_UPDATES: feed.add})
         self._operations.queues["mesh_followers"] = lambda: feed.queue
-        return feed, cache
+        return cache
 
     def _serve_status(self) -> None:
         """How the server is doing, and whether scans are in the map."""

@@ -14,9 +14,9 @@ import triquad_client
 import zenoh
 from support.role_files import free_tls_endpoint, opened, showing
 from support.role_matrix import ATTEMPTS, OTHERS, OWN, WILD, achieved, expected
+from support.ros_bridge import MAST, bridging, stand
 from support.ros_messages import RosMessages
 from support.ros_robot import RmwZenoh, Robot
-from support.ros_server import MAST, stand, until
 from support.servers import SMALL_TOML, WAIT_S, server_process, sphere
 from triquad_client.errors import ConnectError, NoReplyError, UnknownMapError
 from triquad_format.wire import keys
@@ -72,6 +72,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> KeyFolder:
     for role in Role:
         folder.add(Holder(role.value, role, MEMBERS[role.value]), DAYS)
     folder.add(Holder("nodes", Role.ROBOT, ros2_domain=0), DAYS)
+    folder.add(Holder("bridge", Role.ROBOT, PATHS, ros2_domain=0), DAYS)
     file = folder.add(Holder("removed", Role.ROBOT, MEMBERS["removed"]), DAYS)
     copied = file.read_bytes()
     folder.remove("removed")
@@ -91,7 +92,6 @@ def served(folder: KeyFolder, server: Path) -> Iterator[Network]:
     for name, value in own.items():
         router.insert_json5(name.replace("__", "/"), json.dumps(value))
     arguments = ["--config", server, "--settings", settings, "--connect", endpoints["router"]]
-    arguments.append("--ros2")
     with (
         zenoh.open(router),
         server_process(arguments, endpoints["server"]),
@@ -249,15 +249,14 @@ def test_nodes_of_ros_take_part_in_their_domain_alone(folder: KeyFolder) -> None
 def test_a_robot_with_ros_is_mapped(network: Network, path: str) -> None:
     messages = RosMessages()
     with (
+        bridging(network.endpoints["server"], "--config", network.file("bridge")) as bridged,
         opened(network.file("nodes"), network.endpoints[path]) as session,
-        connected(network, path, "viewer") as viewer,
     ):
-        taken = viewer.status().scans_taken
         robot = Robot(session, RmwZenoh(session, messages), messages)
         robot.tf(0, ("base_link", "lidar", MAST), static=True)
         stand(robot, 0, 1)
         robot.cloud(0.1, sphere(), topic=f"/{path}")
-        until(viewer, lambda status: status.scans_taken == taken + 1)
+        bridged.wait_for(lambda: bridged.taken == 1)
 
 
 def test_tools_come_with_credentials(network: Network, capsys: pytest.CaptureFixture[str]) -> None:

@@ -69,7 +69,7 @@ def image(tmp_path_factory: pytest.TempPathFactory) -> Image:
     (packages,) = installed.glob("lib/python*/site-packages")
     (packages / "libraries.pth").write_text("\n".join(installed_packages()))
     assert torch.endswith("torch")
-    assert ours.endswith('".[server]"')
+    assert ours.endswith('".[server,ros]"')
     pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
     alone = ["--no-deps", "--no-index", "--no-build-isolation"]
     subprocess.run([*pip, "wheel", *alone, "-w", image.folder, sources], check=True)

@@ -1,42 +1,63 @@
-"""Robots with ROS 2 and a server, over Zenoh: clouds and poses in, a map to ask."""
+"""Robots with ROS 2, the bridge and a server, over Zenoh: clouds and poses in, a map to ask."""
 
 import logging
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
+import triquad_client
 from support import servers
+from support.ros_bridge import AT, MAST, Bridged, bridging, stand
 from support.ros_messages import CLOUD
 from support.ros_robot import T0, robot, shifted
-from support.ros_server import AT, MAST, accounted, serving, stand, until
-from triquad_client import Client, ServerStatus, Status
-from triquad_server.ros2.intake import silence
+from triquad_client import Client, Status
 from triquad_server.settings import SourceSettings
+from triquad_tools.ros2.intake import first_scan
 
 WAYS = ["rmw", "bridge"]
 
 
+@pytest.fixture(scope="module")
+def endpoint() -> Iterator[str]:
+    """A server with a source that sees 2 m far, which other tests do not use."""
+    sources = {"lidar.near": SourceSettings(range_max_m=2.0)}
+    settings = servers.SMALL.model_copy(update={"sources": sources})
+    with servers.running_service(settings) as endpoint:
+        yield endpoint
+
+
 def finds_sphere(client: Client, centre: tuple[float, float, float]) -> bool:
     """Whether the map has the sphere that the lidar sees around it."""
-    until(client, lambda status: status.settled)
+    client.settle(servers.WAIT_S)
     answer = client.query_sdf(np.array(centre) + servers.sphere(500))
     is_surface = answer.status == Status.SURFACE
     return bool(is_surface.mean() > 0.95 and np.abs(answer.sdf).mean() < 0.1)
 
 
+def finds_its_sphere(bridged: Bridged) -> bool:
+    """Whether the map has the sphere around the lidar on its mast."""
+    bridged.settle()
+    return finds_sphere(bridged.client, (AT[0], AT[1], AT[2] + 0.5))
+
+
 @pytest.mark.parametrize(("way", "mode"), [("rmw", "peer"), ("bridge", "client")])
-def test_clouds_and_transforms_become_a_map(way: str, mode: str) -> None:
-    with serving() as (endpoint, client), robot(endpoint, way, mode) as r2:
+def test_clouds_and_transforms_become_a_map(endpoint: str, way: str, mode: str) -> None:
+    with bridging(endpoint) as bridged, robot(endpoint, way, mode) as r2:
         r2.tf(0, ("base_link", "lidar", MAST), static=True)
         stand(r2, 0, 1)
         for number in range(4):
             r2.cloud(0.2 * number + 0.1, servers.sphere())
-        status = until(client, lambda status: accounted(status) == 4)
-        assert status.scans_taken == 4, status
-        assert finds_sphere(client, (AT[0], AT[1], AT[2] + 0.5))
+        bridged.wait_for(lambda: bridged.accounted == 4)
+        assert (bridged.taken, bridged.bridge.published) == (4, 4), bridged.bridge.dropped
+        assert finds_its_sphere(bridged)
 
 
-def test_clouds_wait_for_their_transforms_and_stay_in_order() -> None:
-    with serving(waiting_s=30.0) as (endpoint, client), robot(endpoint) as r2:
+def test_clouds_wait_for_their_transforms_and_stay_in_order(endpoint: str) -> None:
+    with bridging(endpoint, "--wait-s", 30) as bridged, robot(endpoint) as r2:
         for number in range(4):
             r2.cloud(0.2 * number + 0.1, servers.sphere())
         r2.tf(0, ("base_link", "lidar", MAST), static=True)
@@ -45,34 +66,32 @@ def test_clouds_wait_for_their_transforms_and_stay_in_order() -> None:
         # Last, and on the same topic: only there messages keep their order for sure.
         for second in (0, 1):
             r2.tf(second, ("map", "odom", shifted()))
-        status = until(client, lambda status: accounted(status) == 4)
-        assert (status.scans_taken, status.scans_lost) == (4, {}), status
+        bridged.wait_for(lambda: bridged.accounted == 4)
+        assert (bridged.taken, bridged.lost) == (4, 0), bridged.bridge.dropped
 
 
-def test_what_cannot_be_placed_is_counted_by_its_reason(caplog: pytest.LogCaptureFixture) -> None:
-    with serving(waiting_s=0.2) as (endpoint, client), robot(endpoint) as r2:
+def test_what_cannot_be_placed_is_counted_by_its_reason(
+    endpoint: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    with bridging(endpoint, "--wait-s", 0.2) as bridged, robot(endpoint) as r2:
         r2.cloud(0, servers.sphere())
-        until(client, lambda status: status.scans_dropped.get("no_transform") == 1)
+        bridged.wait_for(lambda: bridged.bridge.dropped == {"no_transform": 1})
         stand(r2, 10, 10.1, 20)
         r2.tf(0, ("base_link", "lidar", MAST), static=True)
         for second in (5, 15, 25):
             r2.cloud(second, servers.sphere())
-        status = until(client, lambda status: accounted(status) == 4)
-    assert status.scans_dropped == {
-        "no_transform": 1,
-        "pose_early": 1,
-        "pose_gap": 1,
-        "pose_late": 1,
-    }
-    assert status.scans_lost == {}
-    assert "/points: 1 lost, no_transform: " in caplog.text
-    assert "set ros2.clock" in caplog.text
+        bridged.wait_for(lambda: bridged.accounted == 4)
+        reasons = ("no_transform", "pose_early", "pose_gap", "pose_late")
+        assert bridged.bridge.dropped == dict.fromkeys(reasons, 1)
+        assert bridged.lost == 0
+    assert "/points: 1 dropped, no_transform: " in caplog.text
+    assert "use --clock arrival" in caplog.text
 
 
 def test_clouds_that_are_no_scans_are_refused_with_the_reason(
-    caplog: pytest.LogCaptureFixture,
+    endpoint: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with serving() as (endpoint, client), robot(endpoint) as r2:
+    with bridging(endpoint) as bridged, robot(endpoint) as r2:
         r2.tf(0, ("base_link", "lidar", MAST), static=True)
         stand(r2, 0, 1)
         flat = r2.messages.cloud(servers.sphere(10), T0)
@@ -81,62 +100,57 @@ def test_clouds_that_are_no_scans_are_refused_with_the_reason(
         r2.cloud(0.1, servers.sphere(), topic="/registered", frame="map")
         r2.cloud(0.1, np.full((10, 3), np.nan), topic="/empty")
         r2.wire.publish("/points", CLOUD, b"\0\1\0\0 no cloud")
-        status = until(client, lambda status: accounted(status) == 4)
+        bridged.wait_for(lambda: bridged.accounted == 4)
         r2.cloud(0.2, servers.sphere())
-        until(client, lambda status: status.scans_taken == 1)
-    assert status.scans_dropped == {
-        "no_xyz": 1,
-        "registered": 1,
-        "empty": 1,
-        "decode": 1,
-    }
+        bridged.wait_for(lambda: bridged.taken == 1)
+        reasons = ("no_xyz", "registered", "empty", "decode")
+        assert bridged.bridge.dropped == dict.fromkeys(reasons, 1)
     assert "the cloud has no field z" in caplog.text
 
 
 def test_only_chosen_topics_are_mapped_and_others_are_named(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    endpoint: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(silence, "AFTER_S", 1.0)
+    monkeypatch.setattr(first_scan, "AFTER_S", 1.0)
     caplog.set_level(logging.INFO)
-    with serving(clouds=["/front/points"]) as (endpoint, client), robot(endpoint) as r2:
+    with bridging(endpoint, "--clouds", "/front/points") as bridged, robot(endpoint) as r2:
         r2.tf(0, ("base_link", "lidar", MAST), static=True)
         stand(r2, 0, 1)
         r2.cloud(0.1, servers.sphere(), topic="/rear/points")
-        until(client, lambda _: "wanted are /front/points" in caplog.text)
+        bridged.wait_for(lambda: "wanted are /front/points" in caplog.text)
         assert "/rear/points (sensor_msgs/msg/PointCloud2)" in caplog.text
         r2.cloud(0.2, servers.sphere(), topic="/front/points")
-        status = until(client, lambda status: accounted(status) == 1)
-        assert status.scans_taken == 1
-        assert client.flush().taken == 0  # nothing of the client's own
+        bridged.wait_for(lambda: bridged.accounted == 1)
+        assert bridged.taken == 1
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_sensors_are_sources_of_their_own(way: str) -> None:
-    box = {"lidar.front": SourceSettings(range_max_m=2.0), "rear": SourceSettings()}
-    with serving(sources=box) as (endpoint, client), robot(endpoint, way) as r2:
+def test_sensors_are_sources_of_their_own(endpoint: str, way: str) -> None:
+    rear, near = f"rear.{way}", "lidar.near"
+    with bridging(endpoint) as bridged, robot(endpoint, way) as r2:
         r2.tf(0, ("base_link", "front", shifted(x=5)), static=True)
         r2.tf(0, ("base_link", "rear", shifted(x=-5)), static=True)
         stand(r2, 0, 1)
         for number in range(3):
-            r2.cloud(0.1 * number, servers.sphere(), topic="/lidar/front", frame="front")
-            r2.cloud(0.1 * number, servers.sphere(), topic="/rear", frame="rear")
-        status = until(client, lambda status: accounted(status) == 6)
-        assert status.scans_taken == 6, status
-        assert finds_sphere(client, (AT[0] - 5, AT[1], AT[2]))
+            r2.cloud(0.1 * number, servers.sphere(), topic="/lidar/near", frame="front")
+            r2.cloud(0.1 * number, servers.sphere(), topic=f"/rear/{way}", frame="rear")
+        bridged.wait_for(lambda: bridged.accounted == 6)
+        assert bridged.taken == 6, bridged.bridge.dropped
+        assert finds_sphere(bridged.client, (AT[0] - 5, AT[1], AT[2]))
         # Of the front one, all lies beyond the range that its own section sets.
-        assert not finds_sphere(client, (AT[0] + 5, AT[1], AT[2]))
-        seen = client.sources().sources
-        assert seen["rear"].trail.tolist() == [[AT[0] - 5, AT[1], AT[2]]]
-        assert seen["lidar.front"].trail.tolist() == [[AT[0] + 5, AT[1], AT[2]]]
-        assert len(seen["lidar.front"].newest.points) == 0 < len(seen["rear"].newest.points)
+        assert not finds_sphere(bridged.client, (AT[0] + 5, AT[1], AT[2]))
+        seen = bridged.client.sources().sources
+        assert seen[rear].trail[-1].tolist() == [AT[0] - 5, AT[1], AT[2]]
+        assert seen[near].trail[-1].tolist() == [AT[0] + 5, AT[1], AT[2]]
+        assert len(seen[near].newest.points) == 0 < len(seen[rear].newest.points)
 
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("kind", ["odometry", "pose"])
-def test_poses_come_from_a_topic(kind: str, way: str) -> None:
+def test_poses_come_from_a_topic(endpoint: str, kind: str, way: str) -> None:
     topic = {"odometry": "/odom", "pose": "/pose"}[kind]
-    frames = {"map_frame": {"odometry": "/odom", "pose": "/map"}[kind], "body_frame": "/body"}
-    with serving(poses=topic, **frames) as (endpoint, client), robot(endpoint, way) as r2:
+    frames = ("--map-frame", {"odometry": "/odom", "pose": "/map"}[kind], "--body-frame", "/body")
+    with bridging(endpoint, "--poses", topic, *frames) as bridged, robot(endpoint, way) as r2:
         r2.tf(0, ("body", "lidar", MAST), static=True)
         for second in (0, 1):
             # What transforms say of the body does not count then.
@@ -146,53 +160,55 @@ def test_poses_come_from_a_topic(kind: str, way: str) -> None:
             else:
                 r2.pose(second, shifted(*AT))
         r2.cloud(0.5, servers.sphere())
-        until(client, lambda status: status.scans_taken == 1)
-        assert finds_sphere(client, (AT[0], AT[1], AT[2] + 0.5))
+        bridged.wait_for(lambda: bridged.taken == 1)
+        assert finds_its_sphere(bridged)
 
 
 @pytest.mark.parametrize(
     ("way", "options"), [("rmw", {}), ("bridge", {}), ("bridge", {"old": True})]
 )
-def test_a_server_that_starts_late_learns_the_static_transforms(
-    way: str, options: dict[str, bool]
+def test_a_bridge_that_starts_late_learns_the_static_transforms(
+    endpoint: str, way: str, options: dict[str, bool]
 ) -> None:
+    """At a router of the nodes' own, which the server has nothing to do with."""
     router = servers.free_endpoint()
     with servers.raw_session("router", listen=router), robot(router, way, **options) as r2:
         r2.tf(0, ("base_link", "lidar", MAST), static=True)
-        with serving(connect=(router,)) as (_, client):
+        with bridging(endpoint, router=router) as bridged:
             stand(r2, 0, 1)
             r2.cloud(0.5, servers.sphere())
-            status = until(client, lambda status: accounted(status) == 1)
-            assert status.scans_taken == 1, status
+            bridged.wait_for(lambda: bridged.accounted == 1)
+            assert bridged.taken == 1, bridged.bridge.dropped
 
 
-def test_depth_images_are_mapped_with_the_camera_beside_them() -> None:
+def test_depth_images_are_mapped_with_the_camera_beside_them(endpoint: str) -> None:
     matrix = np.array([[100.0, 0, 80], [0, 100, 60], [0, 0, 1]])
     forward = shifted(*AT)
     forward[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]  # the optical axis is the map's x
     wall = np.full((120, 160), 3000, np.uint16)
-    with serving(depth=["/camera/depth"]) as (endpoint, client), robot(endpoint) as r2:
+    with bridging(endpoint, "--depth", "/camera/depth") as bridged, robot(endpoint) as r2:
         for second in (0, 1):
             r2.tf(second, ("map", "optical", forward))
         r2.depth(0.1, wall)
-        until(client, lambda status: status.scans_dropped == {"no_camera_info": 1})
+        bridged.wait_for(lambda: bridged.bridge.dropped == {"no_camera_info": 1})
         # The camera publishes what it sees as a cloud too, which nobody chose.
         r2.cloud(0.1, np.zeros((10, 3)), topic="/camera/points", frame="map")
         r2.camera(0.2, wall.shape, matrix)
         times = (0.2 + number / 1000 for number in range(800))
 
-        def is_mapped(status: ServerStatus) -> bool:
-            if status.scans_taken == 0:  # the camera may be heard of later than an image
+        def is_mapped() -> bool:
+            if bridged.taken == 0:  # the camera may be heard of later than an image
                 r2.depth(next(times), wall)
-            return status.scans_taken > 0 and status.settled
+            return bridged.taken > 0
 
-        until(client, is_mapped)
+        bridged.wait_for(is_mapped)
+        bridged.settle()
         at_wall = np.array([[AT[0] + 3, AT[1] + y, AT[2] + z] for y in (-1, 0, 1) for z in (-1, 1)])
-        assert (client.query_sdf(at_wall).status == Status.SURFACE).all()
-        assert client.status().scans_dropped.keys() == {"no_camera_info"}
+        assert (bridged.client.query_sdf(at_wall).status == Status.SURFACE).all()
+        assert bridged.bridge.dropped.keys() == {"no_camera_info"}
 
 
-def test_other_domains_and_namespaces_are_not_heard() -> None:
+def test_other_domains_and_namespaces_are_not_heard(endpoint: str) -> None:
     ours: list[tuple[str, dict[str, object]]] = [
         ("rmw", {"domain": 7, "namespace": "/robot1"}),
         ("bridge", {"namespace": "robot1"}),
@@ -202,83 +218,109 @@ def test_other_domains_and_namespaces_are_not_heard() -> None:
         ("rmw", {"domain": 7}),
         ("bridge", {}),
     ]
-    with serving(domain=7, namespace="/robot1") as (endpoint, client):
+    with bridging(endpoint, "--domain", 7, "--namespace", "/robot1") as bridged:
         for way, options in [*others, *ours]:
             with robot(endpoint, way, **options) as r2:
                 r2.tf(0, ("base_link", "lidar", MAST), static=True)
                 stand(r2, 0, 1)
                 r2.cloud(0.5, servers.sphere())
-        status = until(client, lambda status: accounted(status) == 2)
-        assert (status.scans_taken, status.scans_dropped) == (2, {}), status
+        bridged.wait_for(lambda: bridged.accounted == 2)
+        assert (bridged.taken, bridged.bridge.dropped) == (2, {})
 
 
-def test_clouds_that_wait_are_bounded_and_all_accounted_for() -> None:
-    with serving(waiting_clouds=3, waiting_s=60.0) as (endpoint, client), robot(endpoint) as r2:
-        for number in range(10):
-            r2.cloud(0.1 * number, servers.sphere(), topic=f"/lidar{number % 2}")
-        until(client, lambda status: status.scans_dropped == {"no_transform": 7})
+def test_clouds_that_wait_are_bounded_and_all_accounted_for(endpoint: str) -> None:
+    with bridging(endpoint, "--wait-s", 60) as bridged, robot(endpoint) as r2:
+        for number in range(39):
+            r2.cloud(0.02 * number, servers.sphere(50), topic=f"/lidar{number % 2}")
+            bridged.wait_for(
+                lambda number=number: (
+                    number < 32 or bridged.bridge.dropped == {"no_transform": number - 31}
+                )
+            )
         r2.tf(0, ("base_link", "lidar", MAST), static=True)
         stand(r2, 0, 1)
-        status = until(client, lambda status: accounted(status) == 10)
-        assert (status.scans_taken, status.scans_lost) == (3, {}), status
+        bridged.wait_for(lambda: bridged.bridge.published == 32)
+        assert bridged.bridge.dropped == {"no_transform": 7}
 
 
-def test_clouds_that_the_network_lost_are_counted() -> None:
-    with serving() as (endpoint, client), robot(endpoint) as r2:
+def test_clouds_that_the_network_lost_are_counted(endpoint: str) -> None:
+    with bridging(endpoint) as bridged, robot(endpoint) as r2:
         r2.tf(0, ("base_link", "lidar", MAST), static=True)
         stand(r2, 0, 1)
         r2.cloud(0.1, servers.sphere())
         r2.wire.skip("/points", 2)
         r2.cloud(0.4, servers.sphere())
-        status = until(client, lambda status: status.scans_taken == 2)
-        assert status.scans_dropped == {"not_received": 2}
+        bridged.wait_for(lambda: bridged.taken == 2)
+        assert bridged.bridge.dropped == {"not_received": 2}
 
 
-def test_a_better_frame_that_turns_up_late_is_named(caplog: pytest.LogCaptureFixture) -> None:
-    with serving() as (endpoint, client), robot(endpoint) as r2:
+def test_a_better_frame_that_turns_up_late_is_named(
+    endpoint: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    with bridging(endpoint) as bridged, robot(endpoint) as r2:
         r2.tf(0, ("base_link", "lidar", MAST), static=True)
         for second in (0, 1):
             r2.tf(second, ("odom", "base_link", shifted(*AT)))
         r2.cloud(0.5, servers.sphere())
-        until(client, lambda status: status.scans_taken == 1)
+        bridged.wait_for(lambda: bridged.taken == 1)
         r2.tf(0, ("map", "odom", shifted(x=99)), static=True)
         for taken in range(2, 30):  # the transform may come after the first clouds
             r2.cloud(0.5 + 0.01 * taken, servers.sphere())
-            until(client, lambda status, taken=taken: status.scans_taken == taken)
-            if "set ros2.map_frame" in caplog.text:
+            bridged.wait_for(lambda taken=taken: bridged.taken == taken)
+            if "--map-frame" in caplog.text:
                 break
-        assert finds_sphere(client, (AT[0], AT[1], AT[2] + 0.5))
-    assert 'set ros2.map_frame = "map"' in caplog.text
+        assert finds_its_sphere(bridged)
+    assert "use --map-frame map" in caplog.text
 
 
-def test_tokens_with_impossible_names_stop_nothing() -> None:
-    with serving() as (endpoint, client), robot(endpoint, "bridge") as r2:
+def test_tokens_with_impossible_names_stop_nothing(endpoint: str) -> None:
+    with bridging(endpoint) as bridged, robot(endpoint, "bridge") as r2:
         cloud = "sensor_msgs§msg§PointCloud2"
         dds = "sensor_msgs::msg::dds_::PointCloud2_"
-        for token in (
-            f"@/x/@ros2_lv/MP/§§/{cloud}/q",
-            f"@/x/@ros2_lv/MP/a§§b/{cloud}/q",
-            f"@ros2_lv/0/x/0/1/MP/%/%/n/%%/{dds}/RIHS01_0/q",
-            f"@ros2_lv/0/x/0/1/MP/%/%/n/%a/{dds}/%/q",
-            "@ros2_lv/0/x/0/1/MP/%/%/n/%a/no_type/RIHS01_0/q",
-        ):
+        tokens = [
             r2.session.liveliness().declare_token(token)
+            for token in (
+                f"@/x/@ros2_lv/MP/§§/{cloud}/q",
+                f"@/x/@ros2_lv/MP/a§§b/{cloud}/q",
+                f"@ros2_lv/0/x/0/1/MP/%/%/n/%%/{dds}/RIHS01_0/q",
+                f"@ros2_lv/0/x/0/1/MP/%/%/n/%a/{dds}/%/q",
+                "@ros2_lv/0/x/0/1/MP/%/%/n/%a/no_type/RIHS01_0/q",
+            )
+        ]
         r2.tf(0, ("base_link", "lidar", MAST), static=True)
         stand(r2, 0, 1)
         r2.cloud(0.5, servers.sphere())
-        until(client, lambda status: status.scans_taken == 1)
+        bridged.wait_for(lambda: bridged.taken == 1)
+        assert tokens
 
 
-def test_a_server_started_with_the_flag_says_what_it_maps() -> None:
-    with (
-        servers.server_process(["--ros2", "--settings", "/dev/null"]) as server,
-        robot(server.endpoint) as r2,
-    ):
-        r2.tf(0, ("base_link", "lidar", MAST), static=True)
-        stand(r2, 0, 1)
-        r2.cloud(0.5, servers.sphere())
-        server.wait_for("ros2: mapping in the frame 'map'")
-        assert "ros2: listening in domain 0" in server.log
-        assert "ros2: found /points (sensor_msgs/msg/PointCloud2)" in server.log
-        server.process.terminate()
-        assert server.wait() == 0
+def test_one_command_serves_a_map_and_bridges(tmp_path: Path) -> None:
+    """It says what it maps, is stopped by SIGTERM, and what it mapped is in the store."""
+    servers.compiled()
+    endpoint = servers.free_endpoint()
+    (tmp_path / "ros2.toml").write_text('clouds = ["/points"]\nwait_s = 30.0\n')
+    (tmp_path / "server.toml").write_text(servers.SMALL_TOML)
+    command = [sys.executable, "-m", "triquad_tools.commands.ros2"]
+    command += ["--settings", str(tmp_path / "ros2.toml"), "--serve", "--listen", endpoint]
+    command += ["--store", str(tmp_path / "maps"), "--settings", str(tmp_path / "server.toml")]
+    command += ["--device", "cpu", "--map", "yard"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        both = servers.ServerProcess(process, endpoint)
+        try:
+            both.wait_for("ros2: listening in domain 0")
+            with robot(endpoint, mode="peer") as r2:
+                r2.tf(0, ("base_link", "lidar", MAST), static=True)
+                stand(r2, 0, 1)
+                r2.cloud(0.5, servers.sphere())
+                both.wait_for("ros2: mapping in the frame 'map'")
+            with triquad_client.connect(endpoint, "yard") as client:
+                while client.status().scans_taken == 0:
+                    assert process.poll() is None
+            process.send_signal(signal.SIGTERM)
+            assert both.wait() == 0
+        finally:
+            if process.poll() is None:
+                process.kill()
+    assert "ros2: found /points (sensor_msgs/msg/PointCloud2)" in both.log
+    assert "ros2: 1 scans published, dropped: none" in both.log
+    assert list((tmp_path / "maps" / "yard").iterdir())

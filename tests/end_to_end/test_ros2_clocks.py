@@ -1,68 +1,84 @@
 """Time that goes back or leaps, and clocks that differ: no sensor falls silent for it."""
 
 import itertools
+from collections.abc import Iterator
 
 import pytest
 from support import servers
+from support.ros_bridge import MAST, bridging, stand
 from support.ros_robot import robot
-from support.ros_server import MAST, accounted, serving, stand, until
-from triquad_client import ServerStatus
+
+
+@pytest.fixture(scope="module")
+def endpoint() -> Iterator[str]:
+    with servers.running_service() as endpoint:
+        yield endpoint
 
 
 @pytest.mark.parametrize("transforms_first", [True, False])
-def test_a_simulation_may_begin_anew(
-    transforms_first: bool, caplog: pytest.LogCaptureFixture
+def test_a_simulation_may_begin_again(
+    endpoint: str, transforms_first: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with serving() as (endpoint, client), robot(endpoint) as r2:
+    with bridging(endpoint) as bridged, robot(endpoint) as r2:
         r2.tf(0, ("base_link", "lidar", MAST), static=True)
         stand(r2, 100, 101)
         r2.cloud(100.5, servers.sphere())
-        until(client, lambda status: status.scans_taken == 1)
+        bridged.wait_for(lambda: bridged.taken == 1)
         if transforms_first:
             stand(r2, 0)
         r2.cloud(0.5, servers.sphere())
         stand(r2, 0, 1)
-        status = until(client, lambda status: accounted(status) == 2)
-        assert status.scans_taken == 2, status
+        bridged.wait_for(lambda: bridged.accounted == 2)
+        assert bridged.taken == 2, bridged.bridge.dropped
     assert "time went back" in caplog.text
 
 
-def test_a_bag_may_begin_anew_while_a_cloud_still_waits() -> None:
-    with serving(waiting_s=60.0) as (endpoint, client), robot(endpoint) as r2:
+def test_a_bag_may_begin_again_while_a_cloud_still_waits(endpoint: str) -> None:
+    with bridging(endpoint, "--wait-s", 60) as bridged, robot(endpoint) as r2:
         r2.tf(0, ("base_link", "lidar", MAST), static=True)
         stand(r2, 100, 101)
         r2.cloud(100.5, servers.sphere())
-        until(client, lambda status: status.scans_taken == 1)
+        bridged.wait_for(lambda: bridged.taken == 1)
         r2.cloud(101.5, servers.sphere())  # whose transforms never come
         stand(r2, 0, 1)
         for number in range(5):
             r2.cloud(0.1 * number, servers.sphere())
-        status = until(client, lambda status: accounted(status) == 7)
-        assert (status.scans_taken, status.scans_dropped) == (6, {"began_anew": 1}), status
+        bridged.wait_for(lambda: bridged.accounted == 7)
+        assert (bridged.taken, bridged.bridge.dropped) == (6, {"restarted": 1})
 
 
 @pytest.mark.parametrize("ahead_s", [3, 3600])
-def test_a_stamp_far_ahead_costs_one_cloud(ahead_s: int) -> None:
-    with serving(waiting_s=60.0) as (endpoint, client), robot(endpoint) as r2:
+def test_a_stamp_far_ahead_costs_one_cloud(endpoint: str, ahead_s: int) -> None:
+    with bridging(endpoint, "--wait-s", 60) as bridged, robot(endpoint) as r2:
         r2.tf(0, ("base_link", "lidar", MAST), static=True)
         r2.cloud(0.1, servers.sphere())
         r2.cloud(0.2 + ahead_s, servers.sphere())
         for number in range(3, 9):
             r2.cloud(0.1 * number, servers.sphere())
         stand(r2, 0, 1)  # so that all of them waited
-        status = until(client, lambda status: accounted(status) == 8)
-        assert (status.scans_taken, status.scans_dropped) == (7, {"began_anew": 1}), status
+        bridged.wait_for(lambda: bridged.accounted == 8)
+        assert (bridged.taken, bridged.bridge.dropped) == (7, {"restarted": 1})
 
 
-def test_clocks_that_differ_do_not_matter_by_arrival() -> None:
-    with serving(clock="arrival") as (endpoint, client), robot(endpoint) as r2:
+def test_a_stamp_a_little_before_the_last_costs_that_cloud(endpoint: str) -> None:
+    with bridging(endpoint) as bridged, robot(endpoint) as r2:
+        r2.tf(0, ("base_link", "lidar", MAST), static=True)
+        stand(r2, 0, 1)
+        for second in (0.1, 0.5, 0.3, 0.7):
+            r2.cloud(second, servers.sphere())
+        bridged.wait_for(lambda: bridged.accounted == 4)
+        assert (bridged.taken, bridged.bridge.dropped) == (3, {"time_backwards": 1})
+
+
+def test_clocks_that_differ_do_not_matter_by_arrival(endpoint: str) -> None:
+    with bridging(endpoint, "--clock", "arrival") as bridged, robot(endpoint) as r2:
         r2.tf(0, ("base_link", "lidar", MAST), static=True)
         stand(r2, 5)
         r2.cloud(-1e9, servers.sphere())
         later = itertools.count(6)
 
-        def is_taken(status: ServerStatus) -> bool:
+        def is_taken() -> bool:
             stand(r2, next(later))
-            return status.scans_taken == 1
+            return bridged.taken == 1
 
-        until(client, is_taken)
+        bridged.wait_for(is_taken)

@@ -6,85 +6,79 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-import triquad_client
 from support import servers
+from support.ros_bridge import bridging
 from support.ros_listener import GRID, MARKER, Listener, ShownMarkers, listening
 from support.ros_robot import robot, shifted
 from triquad_client import Client, Status
-from triquad_server.ros2.topics import End, read_token
-from triquad_server.settings import MeshSettings, Ros2Settings
+from triquad_server.settings import MeshSettings
+from triquad_tools.ros2.topics import End, read_token
 
 HEIGHT_M = 0.7
 SOME_POINTS = 300  # of a tile that holds more than a corner of the surface
 WAYS = ["rmw", "humble", "bridge"]
 
 
+@pytest.fixture(scope="module")
+def server() -> Iterator[str]:
+    settings = servers.SMALL.model_copy(update={"mesh": MeshSettings(tile_cells=16)})
+    with servers.running_service(settings) as endpoint:
+        yield endpoint
+
+
 @contextmanager
-def serving(**changes: object) -> Iterator[tuple[str, Client]]:
-    """A server with a map of a sphere around the origin, and a client of it."""
-    ros2 = Ros2Settings(
-        **{
-            "enabled": True,
-            "map_frame": "world",
-            "grid_side_m": 12.0,
-            "grid_height_m": HEIGHT_M,
-            "mesh_bytes_per_s": 10**9,
-            "mesh_level": 0,
-            **changes,
-        }
-    )
-    settings = servers.SMALL.model_copy(update={"ros2": ros2, "mesh": MeshSettings(tile_cells=16)})
-    with (
-        servers.running_service(settings) as endpoint,
-        triquad_client.connect(endpoint) as client,
-    ):
-        servers.learn(client)
-        client.settle(servers.WAIT_S)
-        yield endpoint, client
+def shown(server: str) -> Iterator[Client]:
+    """A bridge that shows a map of a sphere around the origin, and a client of the map."""
+    shape = ("--map-frame", "world", "--grid-side-m", 12, "--grid-height-m", HEIGHT_M)
+    mesh = ("--mesh-bytes-per-s", 10**9, "--mesh-level", 0)
+    with bridging(server, *shape, *mesh) as bridged:
+        servers.learn(bridged.client)
+        bridged.client.settle(servers.WAIT_S)
+        yield bridged.client
 
 
 def shown_once_complete(listener: Listener, client: Client) -> ShownMarkers:
     """What is shown, once it is the mesh that the client follows."""
-    shown = ShownMarkers()
+    markers = ShownMarkers()
     with client.watch_mesh() as watch:
         watch.catch_up(servers.WAIT_S)
-    while not shown.shows(watch):
-        shown.take(listener.message())
-    return shown
+    while not markers.shows(watch):
+        markers.take(listener.message())
+    return markers
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_markers_show_the_mesh_and_what_changes(way: str) -> None:
-    with serving() as (endpoint, client), listening(endpoint, "/triquad/mesh", MARKER, way) as rviz:
-        shown = shown_once_complete(rviz, client)
-        assert len(shown.triangles) > 8, "a marker each tile"
+def test_markers_show_the_mesh_and_what_changes(server: str, way: str) -> None:
+    with shown(server) as client, listening(server, "/triquad/mesh", MARKER, way) as rviz:
+        markers = shown_once_complete(rviz, client)
+        assert len(markers.triangles) > 8, "a marker each tile"
         client.reset(((0.5, -9, -9), (9, 9, 9)))
         client.settle(servers.WAIT_S)
         with client.watch_mesh() as watch:
             watch.catch_up(servers.WAIT_S)
         changed = 0
-        while not shown.shows(watch):
-            shown.take(rviz.message())
+        while not markers.shows(watch):
+            markers.take(rviz.message())
             changed += 1
-        assert changed < len(shown.triangles) + 10, "what did not change is not sent again"
+        assert changed < len(markers.triangles) + 10, "what did not change is not sent again"
 
 
 @pytest.mark.parametrize("token", [True, False])
-def test_whoever_listens_late_gets_the_whole_mesh(token: bool) -> None:
-    with serving() as (endpoint, client):
+def test_whoever_listens_late_gets_the_whole_mesh(server: str, token: bool) -> None:
+    with shown(server) as client:
         for _ in range(2):
-            with listening(endpoint, "/triquad/mesh", MARKER, token=token) as rviz:
+            with listening(server, "/triquad/mesh", MARKER, token=token) as rviz:
                 shown_once_complete(rviz, client)
         with (
-            listening(endpoint, "/triquad/mesh", MARKER) as first,
-            listening(endpoint, "/triquad/mesh", MARKER) as second,
+            listening(server, "/triquad/mesh", MARKER) as first,
+            listening(server, "/triquad/mesh", MARKER) as second,
         ):
             shown_once_complete(first, client)
             shown_once_complete(second, client)
 
 
-def test_markers_are_coloured_by_height_in_the_frame_of_the_map() -> None:
-    with serving() as (endpoint, _), listening(endpoint, "/triquad/mesh", MARKER) as rviz:
+def test_markers_are_coloured_by_height_in_the_frame_of_the_map(server: str) -> None:
+    with shown(server), listening(server, "/triquad/mesh", MARKER) as rviz:
         while len((marker := rviz.message()).points) < SOME_POINTS:
             assert marker.points or marker.action == marker.DELETEALL
         assert (marker.header.frame_id, marker.ns) == ("world", "triquad")
@@ -100,8 +94,8 @@ def test_markers_are_coloured_by_height_in_the_frame_of_the_map() -> None:
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_grids_say_what_the_map_says(way: str) -> None:
-    with serving() as (endpoint, client), listening(endpoint, "/triquad/grid", GRID, way) as nav2:
+def test_grids_say_what_the_map_says(server: str, way: str) -> None:
+    with shown(server) as client, listening(server, "/triquad/grid", GRID, way) as nav2:
         grid = nav2.message()
         assert (grid.info.width, grid.info.height) == (120, 120)
         assert grid.info.resolution == pytest.approx(0.1)
@@ -123,11 +117,11 @@ def test_grids_say_what_the_map_says(way: str) -> None:
         assert is_unknown.sum() > 1000
 
 
-def test_grids_go_with_the_robot() -> None:
+def test_grids_go_with_the_robot(server: str) -> None:
     with (
-        serving(grid_period_s=0.1) as (endpoint, _),
-        robot(endpoint) as r2,
-        listening(endpoint, "/triquad/grid", GRID) as nav2,
+        shown(server),
+        robot(server) as r2,
+        listening(server, "/triquad/grid", GRID) as nav2,
     ):
         assert nav2.message().info.origin.position.x == pytest.approx(-6.0)
         r2.tf(0, ("world", "lidar", shifted(x=30.04)))
@@ -136,8 +130,8 @@ def test_grids_go_with_the_robot() -> None:
             assert origin == pytest.approx(-6.0)
 
 
-def test_messages_carry_what_rmw_zenoh_attaches() -> None:
-    with serving() as (endpoint, _), listening(endpoint, "/triquad/mesh", MARKER) as rviz:
+def test_messages_carry_what_rmw_zenoh_attaches(server: str) -> None:
+    with shown(server), listening(server, "/triquad/mesh", MARKER) as rviz:
         numbers, identities = [], set()
         for _ in range(3):
             attachment = rviz.sample().attachment.to_bytes()
@@ -151,8 +145,8 @@ def test_messages_carry_what_rmw_zenoh_attaches() -> None:
         assert len(identities) == 1
 
 
-def test_nodes_and_bridges_find_the_topics_and_their_types() -> None:
-    with serving() as (endpoint, _), servers.raw_session(connect=endpoint) as session:
+def test_nodes_and_bridges_find_the_topics_and_their_types(server: str) -> None:
+    with shown(server), servers.raw_session(connect=server) as session:
         tokens = [
             str(reply.ok.key_expr)
             for key in ("@ros2_lv/**", "@/*/@ros2_lv/**")
@@ -166,12 +160,3 @@ def test_nodes_and_bridges_find_the_topics_and_their_types() -> None:
         assert names == 2 * [("/triquad/grid", GRID)] + 2 * [("/triquad/mesh", MARKER)]
         grid = next(token for token in tokens if "%triquad%grid" in token)
         assert grid.rpartition("/")[2] == ":1:,1:,:,:,,"
-
-
-def test_topics_without_a_name_are_not_published() -> None:
-    with (
-        serving(mesh_topic="", grid_topic="") as (endpoint, _),
-        servers.raw_session(connect=endpoint) as session,
-    ):
-        tokens = session.liveliness().get("@ros2_lv/*/*/*/*/MP/**", timeout=servers.WAIT_S)
-        assert [str(reply.ok.key_expr) for reply in tokens] == []

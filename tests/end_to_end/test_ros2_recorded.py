@@ -6,13 +6,10 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import pytest
-import triquad_client
 from support import servers
+from support.ros_bridge import Bridged, bridging
 from support.ros_robot import SECOND, T0, robot
-from support.ros_server import accounted, until
-from triquad_client import Client
 from triquad_server.settings import (
-    Ros2Settings,
     ScanSettings,
     ServiceSettings,
     Settings,
@@ -31,7 +28,6 @@ SETTINGS = Settings(
     scan=ScanSettings(range_min_m=RANGES_M[0], range_max_m=RANGES_M[1]),
     training=TrainingSettings(samples_per_ray=12.0, samples_per_voxel=50.0),
     service=ServiceSettings(scan_queue=64),
-    ros2=Ros2Settings(enabled=True),
 )
 
 
@@ -40,27 +36,21 @@ Publish = Callable[[int], None]
 
 
 def mapped(
-    folder: KittiFolder, way: Callable[[Client, str], AbstractContextManager[Publish]]
+    folder: KittiFolder, endpoint: str, way: Callable[[Bridged], AbstractContextManager[Publish]]
 ) -> float:
     """The median |SDF| at scans that were withheld, of a map of the others, in metres."""
     withheld = [i for i in range(SCANS) if is_withheld(i, WITHHELD_EVERY)]
     taken = [i for i in range(SCANS) if i not in withheld]
-    with (
-        servers.running_service(SETTINGS) as endpoint,
-        triquad_client.connect(endpoint) as client,
-        way(client, endpoint) as publish,
-    ):
+    with bridging(endpoint) as bridged, way(bridged) as publish:
         started = time.monotonic()
         for number, index in enumerate(taken):
             time.sleep(max(0.0, started + number * PERIOD_S - time.monotonic()))
             publish(index)
-        status = until(
-            client, lambda status: accounted(status) + sum(status.scans_lost.values()) >= len(taken)
-        )
-        assert (status.scans_taken, status.scans_lost) == (len(taken), {}), status
-        client.settle(600.0)
+        bridged.wait_for(lambda: bridged.accounted + bridged.lost >= len(taken))
+        assert (bridged.taken, bridged.lost) == (len(taken), 0), bridged.bridge.dropped
+        bridged.client.settle(600.0)
         clouds = (world_points(scan, *RANGES_M) for scan in folder.read(withheld))
-        return score_withheld(ask_withheld(client.query_sdf, clouds)).sdf_median_m
+        return score_withheld(ask_withheld(bridged.client.query_sdf, clouds)).sdf_median_m
 
 
 def test_the_map_is_as_good_as_that_of_the_client() -> None:
@@ -69,12 +59,14 @@ def test_the_map_is_as_good_as_that_of_the_client() -> None:
     folder = read_kitti_folder(SEOSAN)
 
     @contextmanager
-    def by_client(client: Client, _: str) -> Iterator[Publish]:
-        yield lambda index: client.publish_scan(folder.read_points(index), folder.poses[index])
+    def by_client(bridged: Bridged) -> Iterator[Publish]:
+        yield lambda index: bridged.client.publish_scan(
+            folder.read_points(index), folder.poses[index]
+        )
 
     @contextmanager
-    def by_ros(_: Client, endpoint: str) -> Iterator[Publish]:
-        with robot(endpoint) as r2:
+    def by_ros(bridged: Bridged) -> Iterator[Publish]:
+        with robot(bridged.endpoint) as r2:
 
             def publish(index: int) -> None:
                 second = (int(folder.stamps_ns[index]) - T0) / SECOND
@@ -83,5 +75,7 @@ def test_the_map_is_as_good_as_that_of_the_client() -> None:
 
             yield publish
 
-    client_m, ros_m = mapped(folder, by_client), mapped(folder, by_ros)
+    with servers.running_service(SETTINGS) as endpoint:
+        client_m = mapped(folder, endpoint, by_client)
+        ros_m = mapped(folder, endpoint, by_ros)
     assert ros_m == pytest.approx(client_m, abs=0.002)

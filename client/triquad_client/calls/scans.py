@@ -5,7 +5,7 @@ import secrets
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -45,6 +45,7 @@ class FlushReport:
 class _Source:
     """How far a source has come."""
 
+    session: int = field(default_factory=lambda: secrets.randbits(62))
     next_sequence: int = 0
     stamp_ns: int = 0
 
@@ -54,7 +55,6 @@ class ScanPublisher:
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
-        self._session = secrets.randbits(62)
         self._sending = threading.Lock()
         self._lock = threading.Lock()  # of the dictionary, never held for long
         self._sources: dict[str, _Source] = {}
@@ -96,13 +96,18 @@ class ScanPublisher:
                 world_from_sensor=pose,
                 stamp_ns=stamp_ns,
                 source=source,
-                session=self._session,
+                session=state.session,
                 sequence=state.next_sequence,
                 no_return=directions,
             )
             self._connection.put(key, scan)
             state.next_sequence += 1
             state.stamp_ns = stamp_ns
+
+    def restart(self, source: str) -> None:
+        """Let the next scan of a source have any stamp; as ``Client.restart_source``."""
+        with self._sending, self._lock:
+            self._sources.pop(source, None)
 
     def flush(self, timeout_s: float, pending: int) -> Call[FlushReport]:
         """Wait for the server; arguments as in ``Client.flush``."""
@@ -160,13 +165,13 @@ class ScanPublisher:
     def _requests(self, timeout_s: float, pending: int) -> Iterator[FlushRequest]:
         """One request per source; the scans that may be pending are shared out among them."""
         with self._lock:
-            last = {name: state.next_sequence - 1 for name, state in self._sources.items()}
-        for source, sequence in last.items():
-            target = sequence - pending // len(last)
+            states = dict(self._sources)
+        for source, state in states.items():
+            target = state.next_sequence - 1 - pending // len(states)
             if target >= 0:
                 yield FlushRequest(
                     source=source,
-                    session=self._session,
+                    session=state.session,
                     sequence=target,
                     timeout_s=timeout_s,
                 )

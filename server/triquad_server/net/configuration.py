@@ -44,7 +44,6 @@ class NetworkDefaults:
 
     grants: tuple[Grant, ...]  # who may do what
     max_message_bytes: int
-    gossip: bool = False  # whether programs that are connected hear of each other
 
 
 @dataclass(frozen=True)
@@ -136,7 +135,6 @@ def _safe(defaults: NetworkDefaults) -> dict[str, Any]:
     return {
         **QUIET,
         **_LINKS,
-        "scouting/gossip/enabled": defaults.gossip,
         "transport/link/rx/max_message_size": defaults.max_message_bytes,
         "access_control": access_control(defaults.grants),
     }

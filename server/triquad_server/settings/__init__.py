@@ -7,7 +7,6 @@ from triquad_server.settings.change import ChangeSettings
 from triquad_server.settings.memory import MemorySettings
 from triquad_server.settings.mesh import MeshSettings
 from triquad_server.settings.metrics import MetricsSettings
-from triquad_server.settings.ros2 import Ros2Settings
 from triquad_server.settings.scan import ScanSettings
 from triquad_server.settings.service import ServiceSettings
 from triquad_server.settings.settings import Settings, UnfitSettingsError
@@ -21,7 +20,6 @@ __all__ = [
     "MemorySettings",
     "MeshSettings",
     "MetricsSettings",
-    "Ros2Settings",
     "ScanSettings",
     "ServiceSettings",
     "Settings",

@@ -10,7 +10,6 @@ from triquad_server.settings.leaf_lengths import DEFAULT_LEAF_M, at_leaf, follow
 from triquad_server.settings.memory import MemorySettings
 from triquad_server.settings.mesh import MeshSettings
 from triquad_server.settings.metrics import MetricsSettings
-from triquad_server.settings.ros2 import Ros2Settings
 from triquad_server.settings.scan import ScanSettings
 from triquad_server.settings.section import RECORD
 from triquad_server.settings.service import ServiceSettings
@@ -49,7 +48,6 @@ class Settings(BaseModel):
     service: ServiceSettings = ServiceSettings()
     memory: MemorySettings = MemorySettings()
     metrics: MetricsSettings = MetricsSettings()
-    ros2: Ros2Settings = Ros2Settings()
     sources: dict[str, SourceSettings] = {}
 
     @model_validator(mode="after")

@@ -10,7 +10,7 @@ from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
 from triquad_server.errors import ServerError
 from triquad_server.net.configuration import Configuration, NetworkOptions
 from triquad_server.network_defaults import network_defaults
-from triquad_server.settings import Ros2Settings, Settings
+from triquad_server.settings import Settings
 
 SAFE = {
     "mode": "router",
@@ -21,7 +21,7 @@ SAFE = {
     "transport/unicast/max_sessions": 500,
     "transport/unicast/accept_pending": 1000,
     "transport/unicast/accept_timeout": 5000,
-    "transport/link/rx/max_message_size": 24_008_192,
+    "transport/link/rx/max_message_size": 32_004_096,  # 64 bytes for each point of a scan
     "access_control/enabled": True,
     "access_control/default_permission": "deny",
 }
@@ -92,13 +92,6 @@ def test_access_control_of_a_file_is_taken_as_it_is(tmp_path):
 def test_a_client_listens_nowhere(tmp_path):
     config = of_file(tmp_path, "{}", mode="client", connect=("tcp/router:7447",))
     assert (config.listen, config.connect) == ((), ("tcp/router:7447",))
-
-
-def test_nodes_of_ros_find_each_other_and_their_clouds_get_in():
-    settings = Settings(ros2=Ros2Settings(enabled=True))
-    found = values(network.configuration(NetworkOptions(), network_defaults("lab", settings)))
-    assert found["scouting/gossip/enabled"] is True
-    assert found["transport/link/rx/max_message_size"] > 500_000 * 64
 
 
 def test_a_file_that_is_none_is_an_error(tmp_path):

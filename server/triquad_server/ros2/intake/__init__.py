@@ -1,1 +1,0 @@
-"""Clouds, depth images and poses, from messages of ROS 2 to scans."""

@@ -1,0 +1,296 @@
+"""``triquad-ros2``: maps what a robot with ROS 2 publishes, and publishes the map to it."""
+
+import argparse
+import logging
+import os
+import re
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing
+from functools import partial
+from pathlib import Path
+
+from triquad_client import Client, ConnectError, UnknownMapError, connect
+
+from triquad_tools.console.arguments import add_version, count
+from triquad_tools.console.command import OK, ToolError, run
+from triquad_tools.console.interrupts import sigterm_interrupts
+from triquad_tools.console.log import start_log
+from triquad_tools.console.server_arguments import DEFAULT_MAP, add_server
+from triquad_tools.ros2.bridge import Bridge
+from triquad_tools.ros2.options import (
+    MAX_GRID_CELLS,
+    BridgeOptions,
+    MeshOptions,
+    ScanOptions,
+    SliceShape,
+)
+from triquad_tools.ros2.server_process import ServerProcess
+from triquad_tools.ros2.session import open_session
+from triquad_tools.ros2.topic_choice import TF_POSES, TopicChoice
+from triquad_tools.sensors.ros.header import frame_name
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+_COMMAND = "triquad-ros2"
+_RETRY_S = 0.5  # while the server starts
+_LAST_DOMAIN = 232
+_TOPIC = re.compile(r"(/?[A-Za-z_][A-Za-z0-9_]*)+")
+_MAX_NAME = 255
+
+_log = logging.getLogger("triquad_ros2")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the tool: 0 stopped, 1 the server failed, 2 wrong usage; with --serve, as the server."""
+    start_log("ros2")
+    return run(_COMMAND, partial(_run, sys.argv[1:] if argv is None else argv))
+
+
+def parsed(argv: Sequence[str]) -> argparse.Namespace:
+    """The options of a command line, over those of the file of settings that it names.
+
+    Raises:
+        ToolError: the file is no TOML, or a name in it is not that of an option.
+    """
+    parser = _parser()
+    options = parser.parse_args(argv)
+    if options.settings is None:
+        return options
+    return parser.parse_args([*_of_file(options.settings, options), *argv])
+
+
+def _run(argv: Sequence[str]) -> int:
+    options = parsed(argv)
+    asked = bridge_options(options)
+    server: ServerProcess | None = None
+    try:
+        with sigterm_interrupts(), ExitStack() as stack:
+            if options.serve is not None:
+                server = stack.enter_context(ServerProcess(options.serve, asked.topics))
+            _bridge(options, asked, server)
+    except KeyboardInterrupt:
+        _log.info("stopped")
+    return OK if server is None else server.exit_code or OK
+
+
+def _bridge(
+    options: argparse.Namespace, asked: BridgeOptions, server: ServerProcess | None
+) -> None:
+    """Bridge until the server ends, or else for ever."""
+    with ExitStack() as stack:
+        client = _connected(options, server)
+        if client is None:
+            return
+        stack.enter_context(client)
+        router = options.router
+        if router is None and server is not None and options.config is None:
+            router = server.endpoint
+        session = stack.enter_context(closing(open_session(router, options.config)))
+        bridge = stack.enter_context(Bridge(session, client, asked))
+        stack.callback(_log_counts, bridge)
+        if server is None:
+            threading.Event().wait()
+        else:
+            server.wait()
+
+
+def _connected(options: argparse.Namespace, server: ServerProcess | None) -> Client | None:
+    """A client of the map server, once it serves; None where it ended before."""
+    if server is None:
+        return connect(options.connect, options.map or DEFAULT_MAP, config=options.config)
+    endpoint, why = options.connect, ""
+    if endpoint is None and options.config is None:
+        endpoint = server.endpoint
+    while server.exit_code is None:
+        try:
+            return connect(endpoint, options.map or server.map_name, config=options.config)
+        except (ConnectError, UnknownMapError) as error:
+            if str(error) != why:
+                _log.info("waiting for the server: %s", why := str(error))
+            server.wait(_RETRY_S)
+    return None
+
+
+def _log_counts(bridge: Bridge) -> None:
+    dropped = ", ".join(f"{reason}: {n}" for reason, n in bridge.dropped.items())
+    _log.info("%d scans published, dropped: %s", bridge.published, dropped or "none")
+
+
+def bridge_options(options: argparse.Namespace) -> BridgeOptions:
+    """What the arguments ask of the bridge.
+
+    Raises:
+        ToolError: the grid would have too many cells.
+    """
+    grid = SliceShape(options.grid_height_m, options.grid_side_m, options.grid_cell_m)
+    if grid.cells**2 > MAX_GRID_CELLS:
+        raise ToolError(
+            f"a grid of {grid.side_m:g} m has {grid.cells} cells of {grid.cell_m:g} m along each "
+            f"side: use at most {int(MAX_GRID_CELLS**0.5)}"
+        )
+    return BridgeOptions(
+        TopicChoice.named(
+            options.domain,
+            options.namespace or "",
+            clouds=options.clouds,
+            depth=options.depth,
+            poses=options.poses,
+        ),
+        ScanOptions(
+            depth_stride=options.depth_stride,
+            body_frame=options.body_frame,
+            map_frame=options.map_frame,
+            by_arrival=options.clock == "arrival",
+            wait_s=options.wait_s,
+        ),
+        MeshOptions(options.mesh_level, options.mesh_bytes_per_s),
+        grid,
+    )
+
+
+def _of_file(path: Path, known: argparse.Namespace) -> Iterator[str]:
+    """The settings of a file, as arguments."""
+    try:
+        settings = tomllib.loads(path.read_text())
+    except ValueError as error:
+        raise ToolError(f"{path}: {error}") from error
+    for name, value in settings.items():
+        if name not in vars(known) or name in ("settings", "serve"):
+            raise ToolError(f"{path}: {name} is no setting: see triquad-ros2 --help")
+        option = f"--{name.replace('_', '-')}"
+        if isinstance(value, list):
+            yield option
+            yield from map(str, value)
+        else:
+            yield f"{option}={value}"
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=_COMMAND,
+        description="Map the clouds and depth images of a robot with ROS 2 (rmw_zenoh or "
+        "zenoh-bridge-ros2dds), and publish the map's mesh and an occupancy grid to it: "
+        "docs/guides/ros2.md.",
+        epilog="Exit status: 0 stopped by Ctrl-C or SIGTERM, 1 there is no such server, 2 wrong "
+        "usage; with --serve, that of triquad-server where it is not 0.",
+    )
+    add = parser.add_argument
+    add(
+        "--serve",
+        nargs=argparse.REMAINDER,
+        metavar="...",
+        help="run a map server, too, which is the router of the nodes; what follows are arguments "
+        "of triquad-server, such as --store maps --preset indoor",
+    )
+    add("--settings", type=Path, metavar="FILE", help="TOML: options by their names, as map_frame")
+    add(
+        "--router",
+        metavar="ENDPOINT",
+        help="of the nodes (default: that of --config or --serve, or tcp/127.0.0.1:7447)",
+    )
+    add_server(parser)
+    _add_topics(parser.add_argument_group("what is taken in"))
+    _add_outputs(parser.add_argument_group("what is published, while somebody subscribes"))
+    add_version(parser)
+    return parser
+
+
+def _add_topics(group: argparse._ArgumentGroup) -> None:
+    add = group.add_argument
+    add(
+        "--domain",
+        type=partial(_whole, 0, _LAST_DOMAIN),
+        default=os.environ.get("ROS_DOMAIN_ID") or "0",
+        metavar="ID",
+        help="of nodes of rmw_zenoh (default: ROS_DOMAIN_ID of the environment, or 0)",
+    )
+    add("--namespace", type=_topic, metavar="NAME", help="before all topics")
+    for name, what in (
+        ("clouds", "PointCloud2 (default: all, or none with --depth)"),
+        ("depth", "depth images; camera_info next to each gives the camera"),
+    ):
+        add(f"--{name}", type=_topic, nargs="+", default=[], metavar="TOPIC", help=what)
+    add("--depth-stride", type=count, default=2, metavar="N", help="every Nth pixel (default: 2)")
+    add(
+        "--poses",
+        type=_topic,
+        default=TF_POSES,
+        metavar="TOPIC",
+        help="Odometry or PoseStamped (default: /tf)",
+    )
+    add("--body-frame", type=frame_name, default="base_link", metavar="NAME", help="of PoseStamped")
+    add(
+        "--map-frame",
+        type=frame_name,
+        default="",
+        metavar="NAME",
+        help="(default: map, odom or world, the first that there is)",
+    )
+    add(
+        "--clock",
+        choices=("header", "arrival"),
+        default="header",
+        help="which tells the time of messages (default: header)",
+    )
+    add(
+        "--wait-s",
+        type=partial(_within, 0, 60),
+        default=2.0,
+        metavar="S",
+        help="for which a cloud waits for its transforms (default: 2)",
+    )
+
+
+def _add_outputs(group: argparse._ArgumentGroup) -> None:
+    add = group.add_argument
+    add("--mesh-level", type=int, choices=(0, 1, 2), default=1, help="of detail (default: 1)")
+    add(
+        "--mesh-bytes-per-s",
+        type=partial(_whole, 1000, 2**40),
+        default=5_000_000,
+        metavar="N",
+        help="of markers, at most (default: 5000000)",
+    )
+    for name, low, high, default in (
+        ("height", -1e5, 1e5, 0.5),
+        ("side", 0.1, 10_000, 40.0),
+        ("cell", 0.01, 10, 0.1),
+    ):
+        add(
+            f"--grid-{name}-m",
+            type=partial(_within, low, high),
+            default=default,
+            metavar="M",
+            help=f"{name} of the occupancy grid (default: {default:g})",
+        )
+
+
+def _topic(text: str) -> str:
+    if len(text) > _MAX_NAME or not _TOPIC.fullmatch(text):
+        raise argparse.ArgumentTypeError(f"{text!r:.300} is not the name of a topic")
+    return text
+
+
+def _whole(low: int, high: int, text: str) -> int:
+    if not text.isascii() or not text.isdigit() or not low <= int(text) <= high:
+        raise argparse.ArgumentTypeError(f"{text!r:.40} is out of range: use {low} to {high}")
+    return int(text)
+
+
+def _within(low: float, high: float, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r:.40} is not a number") from None
+    if not low <= value <= high:
+        raise argparse.ArgumentTypeError(f"{text} is out of range: use {low:g} to {high:g}")
+    return value
+
+
+if __name__ == "__main__":
+    sys.exit(main())

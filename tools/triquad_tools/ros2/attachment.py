@@ -1,0 +1,34 @@
+"""What rmw_zenoh attaches to messages, and how many never arrived, as their numbers tell."""
+
+import struct
+from collections import OrderedDict
+
+ATTACHMENT = struct.Struct("<qqB16s")
+"""The attachment: number, time, length of the identity, identity of the publisher."""
+
+_MAX_PUBLISHERS = 256
+_MAX_MISSED = 2**20  # a larger step is of a publisher that was started again, or of wrong bytes
+
+
+class SequenceGaps:
+    """The last number of each publisher; those heard of longest ago are forgotten."""
+
+    def __init__(self) -> None:
+        self._last: OrderedDict[bytes, int] = OrderedDict()
+
+    def missed(self, attachment: bytes) -> int:
+        """How many messages of its publisher are missing before one with this attachment.
+
+        What is attached in another form, as by old releases, tells nothing, and neither does a
+        number below 0 or one that is too far ahead.
+        """
+        if len(attachment) != ATTACHMENT.size:
+            return 0
+        number: int
+        number, _, _, publisher = ATTACHMENT.unpack(attachment)
+        last = self._last.pop(publisher, number - 1)
+        self._last[publisher] = number
+        if len(self._last) > _MAX_PUBLISHERS:
+            self._last.popitem(last=False)
+        missed = number - last - 1
+        return missed if 0 <= missed <= _MAX_MISSED and last >= 0 else 0

@@ -1,0 +1,66 @@
+"""The bridge between ROS 2 and a map server."""
+
+import logging
+from contextlib import ExitStack, closing
+from functools import partial
+
+import zenoh
+from triquad_client import Client
+
+from triquad_tools.ros2.intake.intake import Intake
+from triquad_tools.ros2.node import Node
+from triquad_tools.ros2.options import BridgeOptions
+from triquad_tools.ros2.output.grid_publisher import GridPublisher
+from triquad_tools.ros2.output.mesh_publisher import MeshPublisher
+from triquad_tools.ros2.output.topic_publisher import TopicPublisher
+from triquad_tools.ros2.topics import Delivery, Topic
+from triquad_tools.sensors.ros.type_store import MARKER, OCCUPANCY_GRID
+
+_log = logging.getLogger("triquad_ros2")
+
+_MESH_DELIVERY = Delivery(depth=100)
+_GRID_DELIVERY = Delivery(latched=True, depth=1)  # as Nav2 expects of a map
+
+
+class Bridge:
+    """Takes part in ROS 2 for a map server, until it is closed; session and client stay open."""
+
+    def __init__(self, session: zenoh.Session, client: Client, options: BridgeOptions) -> None:
+        """Begin: ``session`` reaches the nodes of ROS, ``client`` the server."""
+        topics = options.topics
+        below = f" below {topics.prefix}" if topics.prefix else ""
+        _log.info("listening in domain %d%s", topics.domain, below)
+        with ExitStack() as parts:
+            node = parts.enter_context(closing(Node(session, topics.domain)))
+            intake = Intake(session, client, options, node)
+            self._intake = parts.enter_context(closing(intake))
+            topic = partial(TopicPublisher, session, node, domain=topics.domain)
+            markers = topic(Topic(topics.mesh, MARKER), delivery=_MESH_DELIVERY)
+            parts.enter_context(closing(markers))
+            mesh = MeshPublisher(markers, client, options.mesh, lambda: intake.place)
+            parts.enter_context(closing(mesh))
+            slices = topic(Topic(topics.grid, OCCUPANCY_GRID), delivery=_GRID_DELIVERY)
+            parts.enter_context(closing(slices))
+            grid = GridPublisher(slices, client, options.grid, lambda: intake.place)
+            parts.enter_context(closing(grid))
+            self._parts = parts.pop_all()
+
+    def __enter__(self) -> "Bridge":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def published(self) -> int:
+        """Scans that were published to the server."""
+        return self._intake.scans.count
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """Messages of which no scan could be published, by reason."""
+        return self._intake.drops.counts()
+
+    def close(self) -> None:
+        """Take in and publish no more."""
+        self._parts.close()

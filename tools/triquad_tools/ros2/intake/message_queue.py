@@ -1,0 +1,94 @@
+"""Messages that arrived and wait for the thread that reads them: the newest, within limits."""
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import zenoh
+
+from triquad_tools.ros2.topic_choice import Role
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """A message as it arrived."""
+
+    role: Role
+    topic_name: str
+    payload: zenoh.ZBytes
+    arrived_ns: int  # nanoseconds since 1970, by this machine's clock
+    attachment: bytes = b""
+
+
+@dataclass(frozen=True)
+class WaitLimit:
+    """How much may wait."""
+
+    messages: int
+    bytes: int
+
+
+class _Waiting:
+    """Messages in the order in which they came; the oldest are dropped where there are too many."""
+
+    def __init__(self, limit: WaitLimit) -> None:
+        self._limit = limit
+        self._bytes = 0
+        self.messages: deque[Arrival] = deque()
+
+    def put(self, arrival: Arrival) -> list[Arrival]:
+        """Add a message; returns those that are dropped for it."""
+        self.messages.append(arrival)
+        self._bytes += len(arrival.payload)
+        dropped = []
+        while len(self.messages) > self._limit.messages or self._bytes > self._limit.bytes:
+            dropped.append(self.take())
+        return dropped
+
+    def take(self) -> Arrival:
+        """The oldest message."""
+        arrival = self.messages.popleft()
+        self._bytes -= len(arrival.payload)
+        return arrival
+
+
+class MessageQueue:
+    """What says something about scans is read before the scans."""
+
+    def __init__(
+        self, scans: WaitLimit, others: WaitLimit, dropped: Callable[[Arrival], None]
+    ) -> None:
+        """``dropped`` is called with each message that nobody will read."""
+        self._changed = threading.Condition()
+        self._scans = _Waiting(scans)
+        self._others = _Waiting(others)
+        self._dropped = dropped
+        self._closed = False
+
+    def put(self, arrival: Arrival) -> None:
+        """Add a message; never waits."""
+        waiting = self._scans if arrival.role.brings_scans else self._others
+        with self._changed:
+            dropped = waiting.put(arrival)
+            self._changed.notify()
+        for each in dropped:
+            self._dropped(each)
+
+    def take(self, timeout_s: float) -> Arrival | None:
+        """The message to read next; None where none comes in time, or the queue is closed."""
+        with self._changed:
+            self._changed.wait_for(self._has_any, timeout_s)
+            for waiting in (self._others, self._scans):
+                if waiting.messages and not self._closed:
+                    return waiting.take()
+            return None
+
+    def close(self) -> None:
+        """Give out no more messages."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+
+    def _has_any(self) -> bool:
+        return bool(self._closed or self._others.messages or self._scans.messages)

@@ -1,0 +1,73 @@
+"""What is known of how the robot moves, from transforms or from a topic of poses."""
+
+from triquad_client.errors import InvalidScanError
+
+from triquad_tools.sensors.errors import NoScanError
+from triquad_tools.sensors.motion.frame_tree import STATIC, FrameTree, Transform
+
+RESTART_NS = 10 * 10**9
+"""Transforms that go back by more are of a simulation or a bag that was started again."""
+
+_POSES_KEPT = 2000  # of each frame; 20 s at 100 Hz
+_MAX_FRAMES = 1000
+_MAX_NAME = 256
+
+
+class Motion:
+    """Keeps the transforms that count, within limits: their names come from the network."""
+
+    def __init__(self, *, from_topic: bool) -> None:
+        """``from_topic``: a topic of poses tells how the robot's body moves, no other may."""
+        self.frames = FrameTree(_POSES_KEPT)
+        self.body_parent: str | None = None  # in which frame that topic has the body
+        self._from_topic = from_topic
+        self._body: str | None = None
+        self._newest_ns: dict[str, int] = {}  # stamp by child, of those that move
+
+    def add(self, transforms: list[Transform], *, is_body: bool) -> None:
+        """Take in transforms, or the pose of the body.
+
+        Raises:
+            NoScanError: one of them is of no use; the others were taken in.
+        """
+        if is_body:
+            self._body, self.body_parent = transforms[0].child, transforms[0].parent
+        refusal = None
+        for transform in transforms:
+            if self._from_topic and not is_body and transform.child == self._body:
+                continue
+            try:
+                self._check(transform)
+                self._restart(transform)
+                self.frames.add(transform)
+            except (InvalidScanError, NoScanError) as error:
+                refusal = NoScanError("bad_transform", f"{transform.child[:_MAX_NAME]}: {error}")
+        if refusal is not None:
+            raise refusal
+
+    def forget_after(self, stamp_ns: int) -> None:
+        """Forget poses from before time went back to a stamp."""
+        for child, newest_ns in list(self._newest_ns.items()):
+            if newest_ns > stamp_ns + RESTART_NS:
+                self._forget(child)
+
+    def _restart(self, transform: Transform) -> None:
+        """Forget the poses of a frame whose time goes back."""
+        if transform.stamp_ns is STATIC:
+            self._newest_ns.pop(transform.child, None)
+            return
+        newest_ns = self._newest_ns.get(transform.child, transform.stamp_ns)
+        if transform.stamp_ns < newest_ns - RESTART_NS:
+            self._forget(transform.child)
+            newest_ns = transform.stamp_ns
+        self._newest_ns[transform.child] = max(newest_ns, transform.stamp_ns)
+
+    def _forget(self, child: str) -> None:
+        self.frames.forget(child)
+        self._newest_ns.pop(child, None)
+
+    def _check(self, transform: Transform) -> None:
+        if max(len(transform.parent), len(transform.child)) > _MAX_NAME or not transform.child:
+            raise NoScanError("bad_transform", "its name is empty or too long")
+        if len(self.frames) >= _MAX_FRAMES and not self.frames.knows(transform.child):
+            raise NoScanError("bad_transform", f"more than {_MAX_FRAMES} frames")

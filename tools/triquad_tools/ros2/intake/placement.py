@@ -1,0 +1,162 @@
+"""Sweeps that wait until it is known where they were taken."""
+
+import logging
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from triquad_tools.ros2.intake.message_queue import WaitLimit
+from triquad_tools.ros2.intake.motion import Motion
+from triquad_tools.sensors.errors import NoScanError, NoTransformError
+from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES
+from triquad_tools.sensors.motion.placing import place
+from triquad_tools.sensors.sweep import PosedScan, Sweep
+
+_log = logging.getLogger("triquad_ros2")
+
+_CHOICE_S = 1.0
+"""For how long after a sweep could first be placed a better frame to map in may turn up."""
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A sweep with what became of it: a scan, or why there is none."""
+
+    topic_name: str
+    sweep: Sweep
+    outcome: PosedScan | NoScanError
+    map_frame: str
+
+
+@dataclass
+class _Waiting:
+    topic_name: str
+    sweep: Sweep
+    needs_ns: tuple[int, int]  # first and last time at which the sensor's pose is needed
+    give_up_s: float  # monotonic
+    is_over: bool = False  # time went back before its stamp, so its transforms come no more
+
+
+class Placement:
+    """Places sweeps in the map frame, those of each topic in the order in which they came."""
+
+    def __init__(
+        self, motion: Motion, *, map_frame: str, limit: WaitLimit, timeout_s: float
+    ) -> None:
+        """``motion`` is added to by others in the meantime, on the same thread.
+
+        Without a ``map_frame`` it is chosen, once, as the transforms come. Sweeps wait within the
+        ``limit``, for ``timeout_s`` each.
+        """
+        self.map_frame = map_frame
+        self._motion = motion
+        self._limit = limit
+        self._timeout_s = timeout_s
+        self._waiting: dict[str, deque[_Waiting]] = {}
+        self._warned = bool(map_frame)  # that there is a better frame; not where it was chosen
+        self._choose_s: float | None = None  # when the map frame is chosen at the latest
+
+    def add(self, topic_name: str, sweep: Sweep, now_s: float) -> None:
+        """Have a sweep placed; where too many wait, those that wait for longest give up."""
+        offsets = np.zeros(1) if sweep.offsets_s is None else sweep.offsets_s
+        first, last = offsets.min(initial=0), offsets.max(initial=0)
+        needs = (sweep.stamp_ns + round(first * 1e9), sweep.stamp_ns + round(last * 1e9))
+        entry = _Waiting(topic_name, sweep, needs, now_s + self._timeout_s)
+        self._waiting.setdefault(topic_name, deque()).append(entry)
+        self._keep_within_limit(now_s)
+
+    def give_up_after(self, topic_name: str, stamp_ns: int) -> None:
+        """Let sweeps of a topic wait no longer that lie after a time to which it went back."""
+        for entry in self._waiting.get(topic_name, ()):
+            entry.is_over = entry.is_over or entry.sweep.stamp_ns > stamp_ns
+
+    def settle(self, now_s: float) -> Iterator[Placed]:
+        """Those that wait no longer, with what became of them."""
+        for topic_name, entries in list(self._waiting.items()):
+            while entries and (placed := self._try(entries[0], now_s)) is not None:
+                entries.popleft()
+                yield placed
+            if not entries:
+                del self._waiting[topic_name]
+
+    def _keep_within_limit(self, now_s: float) -> None:
+        """Give up the oldest sweeps, so that no more are left than may wait."""
+        entries = [entry for entries in self._waiting.values() for entry in entries]
+        messages = len(entries)
+        taken_bytes = sum(entry.sweep.memory_bytes for entry in entries)
+        for entry in sorted(entries, key=lambda entry: entry.give_up_s):
+            if messages <= self._limit.messages and taken_bytes <= self._limit.bytes:
+                return
+            entry.give_up_s = min(entry.give_up_s, now_s)
+            messages -= 1
+            taken_bytes -= entry.sweep.memory_bytes
+
+    def _try(self, entry: _Waiting, now_s: float) -> Placed | None:
+        """What becomes of a sweep; None where it waits on."""
+        try:
+            outcome: PosedScan | NoScanError = self._scan(entry, now_s)
+        except NoTransformError as error:
+            if error.late and entry.is_over:
+                text = "time went back before its transforms came, or its stamp was wrong"
+                outcome = NoScanError("restarted", text)
+            elif error.late and now_s < entry.give_up_s:
+                return None
+            else:
+                outcome = error
+        except NoScanError as error:
+            outcome = error
+        except Exception as error:  # whatever numbers came must not stop the others
+            outcome = NoScanError("internal", repr(error))
+        return Placed(entry.topic_name, entry.sweep, outcome, self.map_frame)
+
+    def _scan(self, entry: _Waiting, now_s: float) -> PosedScan:
+        frame = entry.sweep.frame
+        target = self.map_frame or self._best_frame(frame, now_s)
+        if frame in (target, *ROOT_NAMES):
+            raise NoScanError(
+                "registered",
+                f"the cloud is in the frame {frame!r}, so where the sensor was is not known: "
+                "choose the topic of the sensor itself with --clouds",
+            )
+        # Asked first, since it is quick, and most that wait will wait on.
+        frames = self._motion.frames
+        frames.poses(target, frame, np.array(entry.needs_ns, np.int64))
+        scan = place(entry.sweep, frames, target)
+        if not self.map_frame:
+            _log.info("mapping in the frame %r", target)
+            self.map_frame = target
+        self._warn_of_better_frame()
+        return scan
+
+    def _warn_of_better_frame(self) -> None:
+        """Say so, once, where a frame to map in turned up too late."""
+        better = self._motion.frames.fixed_frame(self.map_frame)
+        if better != self.map_frame and not self._warned:
+            self._warned = True
+            _log.warning(
+                "%r turned up above %r, in which the map is made: to map in it, use "
+                "--map-frame %s with an empty map",
+                better,
+                self.map_frame,
+                better,
+            )
+
+    def _best_frame(self, frame: str, now_s: float) -> str:
+        """The frame to map in, as far as is known by now."""
+        if self._motion.body_parent is not None:
+            return self._motion.body_parent
+        found = self._motion.frames.fixed_frame(frame)
+        if found not in ROOT_NAMES:
+            above = "no transform names it" if found == frame else f"it is in {found!r}"
+            raise NoTransformError(
+                "no_transform",
+                f"{frame!r} is in none of the frames {', '.join(ROOT_NAMES)}: {above}",
+                late=True,
+            )
+        if self._choose_s is None:
+            self._choose_s = now_s + min(_CHOICE_S, self._timeout_s / 2)
+        if found != ROOT_NAMES[0] and now_s < self._choose_s:
+            raise NoTransformError("no_transform", f"no frame above {found!r} yet", late=True)
+        return found

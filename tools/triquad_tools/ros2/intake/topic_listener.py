@@ -1,0 +1,149 @@
+"""Subscribing to topics: those that are known from the start, and those that are found."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import zenoh
+import zenoh.ext
+
+from triquad_tools.ros2.intake.message_queue import Arrival
+from triquad_tools.ros2.node import Node
+from triquad_tools.ros2.token_watch import TokenWatch
+from triquad_tools.ros2.topic_choice import Feed, Role, TopicChoice
+from triquad_tools.ros2.topics import (
+    ANY_HASH,
+    Announcement,
+    Delivery,
+    End,
+    Topic,
+    bridge_key,
+    old_bridge_cache,
+    rmw_topic_name,
+)
+
+_log = logging.getLogger("triquad_ros2")
+
+MAX_TOPICS = 64
+"""Topics that are subscribed to at most, of those that are found."""
+
+_MAX_FOUND = 1000  # that are remembered, whether they are wanted or not
+_RING = 256  # emptied at once by a thread that does nothing else
+_HISTORY = 100  # messages of static transforms, of each who publishes some
+_ASK_S = 2.0
+_SUBSCRIPTION = Delivery(reliable=False)  # which suits every publisher
+
+
+class TopicListener:
+    """Passes on what arrives on all wanted topics, on a thread for each feed."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        choice: TopicChoice,
+        node: Node,
+        arrived: Callable[[Arrival], None],
+    ) -> None:
+        """``arrived`` is called with each message, and must not wait."""
+        self._session = session
+        self._choice = choice
+        self._node = node
+        self._arrived = arrived
+        self._lock = threading.Lock()
+        self._closed = False
+        self._feeds: dict[str, Any] = {}  # subscriber by key
+        self._threads: list[threading.Thread] = []
+        self._found: set[Announcement] = set()
+        for feed in choice.feeds():
+            self._open(feed)
+        self._watch = TokenWatch(session, choice.domain, End.PUBLISHER, self._find)
+
+    @property
+    def found(self) -> list[Topic]:
+        """The topics that somebody publishes, wanted or not."""
+        with self._lock:
+            return list({each.topic for each in self._found})
+
+    def close(self) -> None:
+        """Pass on nothing more."""
+        with self._lock:
+            self._closed = True
+        self._watch.close()
+        for subscriber in self._feeds.values():
+            subscriber.undeclare()
+        for thread in self._threads:
+            thread.join()
+
+    def _open(self, feed: Feed) -> None:
+        """Subscribe to a feed, unless that is done already."""
+        with self._lock:
+            if feed.key in self._feeds or self._closed:
+                return
+            ring = zenoh.handlers.RingChannel(_RING)
+            subscriber: Any
+            if feed.role is Role.TF_STATIC:
+                # Published once: who publishes it keeps it for those that come later.
+                subscriber = zenoh.ext.declare_advanced_subscriber(
+                    self._session,
+                    feed.key,
+                    ring,
+                    history=zenoh.ext.HistoryConfig(
+                        detect_late_publishers=True, max_samples=_HISTORY
+                    ),
+                )
+            else:
+                subscriber = self._session.declare_subscriber(feed.key, ring)
+            self._feeds[feed.key] = subscriber
+            thread = threading.Thread(
+                target=self._pass_on, args=(feed, subscriber), name=f"ros2-{feed.key}"
+            )
+            self._threads.append(thread)
+            thread.start()
+
+    def _pass_on(self, feed: Feed, subscriber: Any) -> None:
+        for sample in subscriber:
+            name = feed.topic_name or rmw_topic_name(str(sample.key_expr))
+            attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+            self._arrived(
+                Arrival(feed.role, name, sample.payload, time.time_ns(), attachment=attachment)
+            )
+
+    def _find(self, announcement: Announcement) -> None:
+        """Somebody publishes on a topic."""
+        topic = announcement.topic
+        role = self._choice.wants(topic)
+        if role is Role.TF_STATIC and announcement.type_hash == ANY_HASH:
+            self._ask_old_bridges(topic.name)
+        with self._lock:
+            if announcement in self._found or len(self._found) >= _MAX_FOUND:
+                return
+            self._found.add(announcement)
+        if role is None:
+            return
+        if len(self._feeds) >= MAX_TOPICS:
+            _log.warning("%s is left out: more than %d topics", topic.name, MAX_TOPICS)
+            return
+        _log.info("found %s (%s)", topic.name, topic.type_name)
+        if announcement.type_hash == ANY_HASH:
+            self._open(Feed(role, bridge_key(topic.name), topic.name))
+        else:
+            # Drivers that publish only while somebody subscribes learn it from this.
+            what = Announcement(End.SUBSCRIPTION, topic, announcement.type_hash)
+            self._node.announce(what, _SUBSCRIPTION)
+
+    def _ask_old_bridges(self, topic_name: str) -> None:
+        """Take in what bridges up to 1.5 published before anybody subscribed."""
+        replies = self._session.get(
+            old_bridge_cache(topic_name),
+            zenoh.handlers.FifoChannel(_RING),
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            accept_replies=zenoh.ReplyKeyExpr.ANY,
+            timeout=_ASK_S,
+        )
+        for reply in replies:
+            if reply.ok is not None:
+                payload = reply.ok.payload
+                self._arrived(Arrival(Role.TF_STATIC, topic_name, payload, time.time_ns()))

@@ -1,0 +1,135 @@
+"""A topic that the bridge publishes, for nodes of rmw_zenoh and for zenoh-bridge-ros2dds."""
+
+import hashlib
+import itertools
+import threading
+import time
+from dataclasses import dataclass
+
+import zenoh
+
+from triquad_tools.ros2.attachment import ATTACHMENT
+from triquad_tools.ros2.node import Node
+from triquad_tools.ros2.token_watch import TokenWatch
+from triquad_tools.ros2.topics import (
+    NO_HASH,
+    Announcement,
+    Delivery,
+    End,
+    Topic,
+    bridge_key,
+    rmw_key,
+    type_hash,
+)
+
+
+@dataclass(frozen=True)
+class _Key:
+    """One key under which the topic is published."""
+
+    publisher: zenoh.Publisher
+    listener: "zenoh.MatchingListener[None]"
+    identity: bytes | None  # that messages of rmw_zenoh carry
+
+    @property
+    def is_followed(self) -> bool:
+        return bool(self.publisher.matching_status.matching)  # type: ignore[attr-defined]
+
+
+class TopicPublisher:
+    """Publishes to all subscribers, and notices new ones: they have nothing of the past yet.
+
+    Nodes and bridges are told apart by their tokens; of others the first is noticed.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        node: Node,
+        topic: Topic,
+        domain: int,
+        delivery: Delivery,
+    ) -> None:
+        self._session = session
+        self._node = node
+        self._topic = topic
+        self._domain = domain
+        self._delivery = delivery
+        self._hash = type_hash(topic.type_name)
+        self._lock = threading.Lock()
+        self._numbers = itertools.count(1)
+        self._keys: dict[str, _Key] = {}
+        self._came = threading.Event()  # a subscriber did
+        self._open_rmw(self._hash)
+        self._open_bridge()
+        self._watch = TokenWatch(session, domain, End.SUBSCRIPTION, self._appeared)
+
+    def close(self) -> None:
+        """Publish no more."""
+        self._watch.close()
+        for key in self._keys.values():
+            key.listener.undeclare()
+            key.publisher.undeclare()
+
+    @property
+    def is_followed(self) -> bool:
+        """Whether there is any subscriber."""
+        return any(key.is_followed for key in self._all_keys())
+
+    def has_newcomers(self) -> bool:
+        """Whether any subscriber came since this was asked last."""
+        if not self._came.is_set():
+            return False
+        self._came.clear()
+        return True
+
+    def put(self, payload: bytes) -> None:
+        """Publish a message, CDR."""
+        number, now_ns = next(self._numbers), time.time_ns()
+        for key in self._all_keys():
+            if key.is_followed:
+                attachment = key.identity and ATTACHMENT.pack(number, now_ns, 16, key.identity)
+                key.publisher.put(payload, attachment=attachment)
+
+    def _all_keys(self) -> list[_Key]:
+        with self._lock:
+            return list(self._keys.values())
+
+    def _appeared(self, who: Announcement) -> None:
+        """Somebody subscribes to some topic."""
+        if who.topic != self._topic:
+            return
+        if who.type_hash == NO_HASH:
+            self._open_rmw(NO_HASH)
+        self._came.set()
+
+    def _matched(self, status: zenoh.MatchingStatus) -> None:
+        if status.matching:
+            self._came.set()
+
+    def _open_rmw(self, type_hash: str) -> None:
+        key = rmw_key(self._domain, self._topic, type_hash)
+        if self._open(key, hashlib.blake2b(key.encode(), digest_size=16).digest()):
+            what = Announcement(End.PUBLISHER, self._topic, type_hash)
+            self._node.announce(what, self._delivery)
+
+    def _open_bridge(self) -> None:
+        if self._open(bridge_key(self._topic.name), None):
+            what = Announcement(End.PUBLISHER, self._topic, self._hash)
+            self._node.announce_to_bridges(what, self._delivery)
+
+    def _open(self, key: str, identity: bytes | None) -> bool:
+        """Publish under a key from now on; False where it is done already."""
+        with self._lock:
+            if key in self._keys:
+                return False
+            # Large messages that may be dropped are lost without need. Last of all, since a
+            # publisher that waits for a slow subscriber holds up others of its priority.
+            publisher = self._session.declare_publisher(
+                key,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                priority=zenoh.Priority.BACKGROUND,
+            )
+            listener = publisher.declare_matching_listener(self._matched)
+            self._keys[key] = _Key(publisher, listener, identity)
+            return True

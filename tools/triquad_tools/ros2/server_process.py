@@ -1,0 +1,94 @@
+"""A ``triquad-server`` that runs for the bridge, and is the router of the ROS nodes."""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from triquad_format.wire.access_control import (
+    access_control,
+    take_part_in_ros2,
+    without_credentials,
+)
+from triquad_format.wire.endpoints import DEFAULT_ENDPOINT, Locator, full_endpoint
+
+from triquad_tools.console.server_arguments import DEFAULT_MAP
+from triquad_tools.ros2.topic_choice import TopicChoice
+from triquad_tools.ros2.topics import bridge_key
+
+_ANYWHERE = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]", "": "127.0.0.1"}
+
+
+class ServerProcess:
+    """A running server; leaving the ``with`` statement stops it, and waits for its checkpoint."""
+
+    def __init__(self, arguments: Sequence[str], topics: TopicChoice) -> None:
+        """Start a server with the arguments of its command line.
+
+        Unless they name a Zenoh configuration, nodes find each other by it, and those beyond this
+        machine may take part in the domain of the ``topics``.
+        """
+        given = _parsed(arguments)
+        self.map_name: str = given.map
+        self.endpoint = _reached(
+            full_endpoint(given.listen[0] if given.listen else DEFAULT_ENDPOINT)
+        )
+        self._folder = TemporaryDirectory(prefix="triquad-ros2-")
+        command = [sys.executable, "-m", "triquad_server.cli", *arguments]
+        if given.config is None:
+            file = Path(self._folder.name) / "zenoh.json5"
+            file.write_text(_network(given.map, topics))
+            command += ["--config", str(file)]
+        # A service manager may watch this process; it is the server that tells how it is.
+        environment = {key: value for key, value in os.environ.items() if key != "WATCHDOG_PID"}
+        self._process = subprocess.Popen(command, env=environment)
+
+    def __enter__(self) -> "ServerProcess":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.terminate()
+        while self.exit_code is None:  # however often Ctrl-C is pressed: a checkpoint is written
+            with suppress(KeyboardInterrupt):
+                self._process.wait()
+        self._folder.cleanup()
+
+    @property
+    def exit_code(self) -> int | None:
+        """The status with which it has ended; None: it runs."""
+        return self._process.poll()
+
+    def wait(self, timeout_s: float | None = None) -> None:
+        """Return once it has ended, or after some time."""
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(timeout_s)
+
+
+def _parsed(arguments: Sequence[str]) -> argparse.Namespace:
+    """What the bridge has to know of the server's arguments."""
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--map", default=DEFAULT_MAP)
+    parser.add_argument("-l", "--listen", action="append")
+    parser.add_argument("-c", "--config")
+    return parser.parse_known_args(arguments)[0]
+
+
+def _reached(endpoint: str) -> str:
+    """Where a program of this machine reaches what listens at an endpoint."""
+    protocol, host, port = Locator.of(endpoint)
+    return f"{protocol}/{_ANYWHERE[host]}:{port}" if host in _ANYWHERE and port else endpoint
+
+
+def _network(map_name: str, topics: TopicChoice) -> str:
+    published = [bridge_key(topics.mesh), bridge_key(topics.grid)]
+    rules = take_part_in_ros2(map_name, topics.domain, published)
+    configuration = {
+        "scouting": {"gossip": {"enabled": True}},  # by which nodes find each other
+        "access_control": access_control(without_credentials(map_name, ros2=rules)),
+    }
+    return json.dumps(configuration)
