@@ -1,7 +1,6 @@
 """Watching liveliness tokens: who publishes on topics, and who subscribes to them."""
 
 import logging
-import threading
 from collections.abc import Callable
 
 import zenoh
@@ -9,8 +8,6 @@ import zenoh
 from triquad_tools.ros2.topics import Announcement, End, bridge_tokens, read_token, rmw_tokens
 
 _log = logging.getLogger("triquad_ros2")
-
-_WAITING = 256
 
 
 class TokenWatch:
@@ -27,36 +24,22 @@ class TokenWatch:
         self._appeared = appeared
         self._own_chunk = f"/{session.zid()}/"
         self._subscribers = [
-            session.liveliness().declare_subscriber(
-                key, zenoh.handlers.FifoChannel(_WAITING), history=True
-            )
+            session.liveliness().declare_subscriber(key, self._receive, history=True)
             for key in (rmw_tokens(domain, end), bridge_tokens(end))
         ]
-        self._threads = [
-            threading.Thread(target=self._run, args=(each,), name="ros2-tokens")
-            for each in self._subscribers
-        ]
-        for thread in self._threads:
-            thread.start()
 
     def close(self) -> None:
         """End the watch."""
         for subscriber in self._subscribers:
             subscriber.undeclare()
-        for thread in self._threads:
-            thread.join()
 
-    def _run(self, subscriber: "zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]") -> None:
-        for sample in subscriber:
-            token = str(sample.key_expr)
-            if sample.kind != zenoh.SampleKind.PUT or self._own_chunk in token:
-                continue
-            announcement = read_token(token)
-            if announcement is not None:
-                self._tell(announcement)
-
-    def _tell(self, announcement: Announcement) -> None:
+    def _receive(self, sample: zenoh.Sample) -> None:
+        token = str(sample.key_expr)
+        if sample.kind != zenoh.SampleKind.PUT or self._own_chunk in token:
+            return
+        announcement = read_token(token)
         try:
-            self._appeared(announcement)
+            if announcement is not None:
+                self._appeared(announcement)
         except zenoh.ZError as error:  # names that cannot stand in a key
-            _log.debug("%s cannot be used: %s", announcement, error)
+            _log.debug("%s cannot be used: %s", token, error)

@@ -68,9 +68,8 @@ class MessageQueue:
 
     def put(self, arrival: Arrival) -> None:
         """Add a message; never waits."""
-        waiting = self._scans if arrival.role.brings_scans else self._others
         with self._changed:
-            dropped = waiting.put(arrival)
+            dropped = (self._scans if arrival.role.brings_scans else self._others).put(arrival)
             self._changed.notify()
         for each in dropped:
             self._dropped(each)
@@ -78,11 +77,8 @@ class MessageQueue:
     def take(self, timeout_s: float) -> Arrival | None:
         """The message to read next; None where none comes in time, or the queue is closed."""
         with self._changed:
-            self._changed.wait_for(self._has_any, timeout_s)
-            for waiting in (self._others, self._scans):
-                if waiting.messages and not self._closed:
-                    return waiting.take()
-            return None
+            self._changed.wait_for(lambda: self._closed or self._first is not None, timeout_s)
+            return None if self._closed or self._first is None else self._first.take()
 
     def close(self) -> None:
         """Give out no more messages."""
@@ -90,5 +86,7 @@ class MessageQueue:
             self._closed = True
             self._changed.notify()
 
-    def _has_any(self) -> bool:
-        return bool(self._closed or self._others.messages or self._scans.messages)
+    @property
+    def _first(self) -> _Waiting | None:
+        """Where the next message waits."""
+        return next((each for each in (self._others, self._scans) if each.messages), None)

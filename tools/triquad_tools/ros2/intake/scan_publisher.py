@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-import numpy as np
 from triquad_client import Client
 from triquad_format.records.arrays import Doubles
 
@@ -74,7 +73,7 @@ class ScanPublisher:
         scan, stamp_ns = placed.outcome, placed.sweep.stamp_ns
         if isinstance(scan, NoScanError):
             raise scan
-        if not np.isfinite(scan.points).all(axis=1).any():
+        if len(scan.points) == 0:
             raise NoScanError("empty", "no point of it is finite")
         source = self._sources[placed.topic_name]
         if stamp_ns < source.sent_ns - RESTART_NS:

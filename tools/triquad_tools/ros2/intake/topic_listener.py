@@ -4,6 +4,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import zenoh
@@ -30,14 +31,14 @@ MAX_TOPICS = 64
 """Topics that are subscribed to at most, of those that are found."""
 
 _MAX_FOUND = 1000  # that are remembered, whether they are wanted or not
-_RING = 256  # emptied at once by a thread that does nothing else
-_HISTORY = 100  # messages of static transforms, of each who publishes some
 _ASK_S = 2.0
 _SUBSCRIPTION = Delivery(reliable=False)  # which suits every publisher
+# Static transforms are published once: who publishes them keeps them for those that come later.
+_HISTORY = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=100)
 
 
 class TopicListener:
-    """Passes on what arrives on all wanted topics, on a thread for each feed."""
+    """Passes on what arrives on all wanted topics."""
 
     def __init__(
         self,
@@ -46,15 +47,14 @@ class TopicListener:
         node: Node,
         arrived: Callable[[Arrival], None],
     ) -> None:
-        """``arrived`` is called with each message, and must not wait."""
+        """``arrived`` is called with each message, from several threads, and must not wait."""
         self._session = session
         self._choice = choice
         self._node = node
         self._arrived = arrived
         self._lock = threading.Lock()
         self._closed = False
-        self._feeds: dict[str, Any] = {}  # subscriber by key
-        self._threads: list[threading.Thread] = []
+        self._subscribers: dict[str, Any] = {}  # by key
         self._found: set[Announcement] = set()
         for feed in choice.feeds():
             self._open(feed)
@@ -68,47 +68,30 @@ class TopicListener:
 
     def close(self) -> None:
         """Pass on nothing more."""
+        self._watch.close()
         with self._lock:
             self._closed = True
-        self._watch.close()
-        for subscriber in self._feeds.values():
+        for subscriber in self._subscribers.values():
             subscriber.undeclare()
-        for thread in self._threads:
-            thread.join()
 
     def _open(self, feed: Feed) -> None:
         """Subscribe to a feed, unless that is done already."""
         with self._lock:
-            if feed.key in self._feeds or self._closed:
+            if feed.key in self._subscribers or self._closed:
                 return
-            ring = zenoh.handlers.RingChannel(_RING)
-            subscriber: Any
-            if feed.role is Role.TF_STATIC:
-                # Published once: who publishes it keeps it for those that come later.
-                subscriber = zenoh.ext.declare_advanced_subscriber(
-                    self._session,
-                    feed.key,
-                    ring,
-                    history=zenoh.ext.HistoryConfig(
-                        detect_late_publishers=True, max_samples=_HISTORY
-                    ),
+            receive = partial(self._receive, feed)
+            self._subscribers[feed.key] = (
+                zenoh.ext.declare_advanced_subscriber(
+                    self._session, feed.key, receive, history=_HISTORY
                 )
-            else:
-                subscriber = self._session.declare_subscriber(feed.key, ring)
-            self._feeds[feed.key] = subscriber
-            thread = threading.Thread(
-                target=self._pass_on, args=(feed, subscriber), name=f"ros2-{feed.key}"
+                if feed.role is Role.TF_STATIC
+                else self._session.declare_subscriber(feed.key, receive)
             )
-            self._threads.append(thread)
-            thread.start()
 
-    def _pass_on(self, feed: Feed, subscriber: Any) -> None:
-        for sample in subscriber:
-            name = feed.topic_name or rmw_topic_name(str(sample.key_expr))
-            attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
-            self._arrived(
-                Arrival(feed.role, name, sample.payload, time.time_ns(), attachment=attachment)
-            )
+    def _receive(self, feed: Feed, sample: zenoh.Sample) -> None:
+        name = feed.topic_name or rmw_topic_name(str(sample.key_expr))
+        attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+        self._arrived(Arrival(feed.role, name, sample.payload, time.time_ns(), attachment))
 
     def _find(self, announcement: Announcement) -> None:
         """Somebody publishes on a topic."""
@@ -122,7 +105,7 @@ class TopicListener:
             self._found.add(announcement)
         if role is None:
             return
-        if len(self._feeds) >= MAX_TOPICS:
+        if len(self._subscribers) >= MAX_TOPICS:
             _log.warning("%s is left out: more than %d topics", topic.name, MAX_TOPICS)
             return
         _log.info("found %s (%s)", topic.name, topic.type_name)
@@ -135,9 +118,9 @@ class TopicListener:
 
     def _ask_old_bridges(self, topic_name: str) -> None:
         """Take in what bridges up to 1.5 published before anybody subscribed."""
+        feed = Feed(Role.TF_STATIC, old_bridge_cache(topic_name), topic_name)
         replies = self._session.get(
-            old_bridge_cache(topic_name),
-            zenoh.handlers.FifoChannel(_RING),
+            feed.key,
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             accept_replies=zenoh.ReplyKeyExpr.ANY,
@@ -145,5 +128,4 @@ class TopicListener:
         )
         for reply in replies:
             if reply.ok is not None:
-                payload = reply.ok.payload
-                self._arrived(Arrival(Role.TF_STATIC, topic_name, payload, time.time_ns()))
+                self._receive(feed, reply.ok)

@@ -13,12 +13,13 @@ from triquad_format.errors import TriquadError
 from triquad_tools.ros2.intake.scan_publisher import Place
 from triquad_tools.ros2.options import SliceShape
 from triquad_tools.ros2.output.topic_publisher import TopicPublisher
-from triquad_tools.sensors.ros.type_store import OCCUPANCY_GRID, encode_cdr, type_store
+from triquad_tools.sensors.ros.cdr import CdrWriter
 
 _log = logging.getLogger("triquad_ros2")
 
 _TICK_S = 0.2
 _PERIOD_S = 1.0  # between two slices
+_RETRY_S = 5.0  # after an error
 _MAX_SHARE = 4  # the server works on slices for at most one part in four of the time
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
@@ -60,12 +61,14 @@ class GridPublisher:
                 continue
             try:
                 self._publish(place)
+                pause_s = max(_PERIOD_S, _MAX_SHARE * (time.monotonic() - started))
             except TriquadError as error:
                 _log.warning("the slice cannot be made now: %s", error)
+                pause_s = _RETRY_S
             except Exception:
                 _log.exception("the slice could not be published")
-            now = time.monotonic()
-            self._due_s = max(started + _PERIOD_S, now + (_MAX_SHARE - 1) * (now - started))
+                pause_s = _RETRY_S
+            self._due_s = started + pause_s
 
     def _publish(self, place: Place) -> None:
         """Publish a slice where the map or the place changed since the last."""
@@ -92,22 +95,10 @@ def occupancy(found: Grid) -> NDArray[np.int8]:
 
 def grid_message(found: Grid, place: Place) -> bytes:
     """A slice as a message, CDR."""
-    types = type_store().types
-
-    def new(name: str, *values: object) -> object:
-        return types[name](*values)  # type: ignore[arg-type]
-
-    time_ = new("builtin_interfaces/msg/Time", *divmod(place.stamp_ns, 10**9))
-    origin = new(
-        "geometry_msgs/msg/Pose",
-        new("geometry_msgs/msg/Point", *map(float, found.shape.corner)),
-        new("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0),
-    )
+    seconds, nanoseconds = divmod(place.stamp_ns, 10**9)
     width, height, _ = found.shape.counts
-    message = new(
-        OCCUPANCY_GRID,
-        new("std_msgs/msg/Header", time_, place.map_frame),
-        new("nav_msgs/msg/MapMetaData", time_, found.shape.cell_m, width, height, origin),
-        occupancy(found).reshape(-1),
-    )
-    return encode_cdr(message, OCCUPANCY_GRID)
+    writer = CdrWriter().numbers("<u4", seconds, nanoseconds).text(place.map_frame)
+    writer.numbers("<u4", seconds, nanoseconds).numbers("<f4", found.shape.cell_m)
+    writer.numbers("<u4", width, height)
+    writer.numbers("<f8", *found.shape.corner, 0, 0, 0, 1)  # position and rotation of the origin
+    return writer.sequence(occupancy(found).reshape(-1)).payload()

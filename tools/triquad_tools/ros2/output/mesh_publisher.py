@@ -17,8 +17,9 @@ from triquad_tools.ros2.output.topic_publisher import TopicPublisher
 _log = logging.getLogger("triquad_ros2")
 
 _TICK_S = 0.2
+_ASK_S = 1.0  # for how long the server may wait for changes
 _SEND_S = 1.0  # for how long markers are sent before the server is asked for changes again
-_RETRY_S = 2.0  # after an error
+_RETRY_S = 5.0  # after an error
 
 TileIndex = tuple[int, int, int]
 
@@ -71,7 +72,7 @@ class MeshPublisher:
             if self._publisher.has_newcomers():
                 pending.update(dict.fromkeys(watch.tiles))
             try:
-                update = watch.next(0.0 if pending else _TICK_S)
+                update = watch.next(0.0 if pending else _ASK_S)
             except TriquadError as error:
                 _log.warning("the mesh cannot be followed now: %s", error)
                 self._stopping.wait(_RETRY_S)
