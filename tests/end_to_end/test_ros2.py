@@ -239,7 +239,8 @@ def test_clouds_that_wait_are_bounded_and_all_accounted_for(endpoint: str) -> No
             )
         r2.tf(0, ("base_link", "lidar", MAST), static=True)
         stand(r2, 0, 1)
-        bridged.wait_for(lambda: bridged.bridge.published == 32)
+        bridged.wait_for(lambda: bridged.accounted == 39)
+        assert (bridged.taken, bridged.lost) == (32, 0)
         assert bridged.bridge.dropped == {"no_transform": 7}
 
 

@@ -48,7 +48,8 @@ class Bridged:
         """Return once something holds."""
         deadline = time.monotonic() + servers.WAIT_S
         while not holds():
-            assert time.monotonic() < deadline, (self.client.status(), self.bridge.dropped)
+            state = (self.bridge.published, self.bridge.dropped, self.client.status())
+            assert time.monotonic() < deadline, state
             time.sleep(0.02)
 
     def settle(self) -> None:

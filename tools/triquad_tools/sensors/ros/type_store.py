@@ -37,8 +37,3 @@ def decode_cdr(payload: bytes, type_name: str) -> Any:
     # Whatever the decoder raises: bytes of another type lead it anywhere.
     except (SerdeError, ValueError, IndexError, MemoryError, TypeError) as error:
         raise NoScanError("decode", f"no {type_name}: {error}") from error
-
-
-def encode_cdr(message: Any, type_name: str) -> bytes:
-    """The bytes of a message, as ROS 2 sends them."""
-    return bytes(type_store().serialize_cdr(message, type_name))
