@@ -6,6 +6,7 @@ import os
 import re
 import sys
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing
 from functools import partial
@@ -14,7 +15,7 @@ from pathlib import Path
 from triquad_client import Client, ConnectError, UnknownMapError, connect
 
 from triquad_tools.console.arguments import add_version, count
-from triquad_tools.console.command import OK, ToolError, run
+from triquad_tools.console.command import FAILED, OK, ToolError, run
 from triquad_tools.console.interrupts import sigterm_interrupts
 from triquad_tools.console.log import start_log
 from triquad_tools.console.server_arguments import DEFAULT_MAP, add_server
@@ -38,9 +39,8 @@ else:
 
 _COMMAND = "triquad-ros2"
 _RETRY_S = 0.5  # while the server starts
-_LAST_DOMAIN = 232
+_TELL_S = 30.0  # after which the log says why it cannot be reached, and again
 _TOPIC = re.compile(r"(/?[A-Za-z_][A-Za-z0-9_]*)+")
-_MAX_NAME = 255
 
 _log = logging.getLogger("triquad_ros2")
 
@@ -68,6 +68,7 @@ def _run(argv: Sequence[str]) -> int:
     options = parsed(argv)
     asked = bridge_options(options)
     server: ServerProcess | None = None
+    by_signal = FAILED
     try:
         with sigterm_interrupts(), ExitStack() as stack:
             if options.serve is not None:
@@ -75,7 +76,9 @@ def _run(argv: Sequence[str]) -> int:
             _bridge(options, asked, server)
     except KeyboardInterrupt:
         _log.info("stopped")
-    return OK if server is None else server.exit_code or OK
+        by_signal = OK  # a server that was just starting ends so, too
+    code = OK if server is None else server.exit_code or OK
+    return by_signal if code < OK else code
 
 
 def _bridge(
@@ -103,15 +106,16 @@ def _connected(options: argparse.Namespace, server: ServerProcess | None) -> Cli
     """A client of the map server, once it serves; None where it ended before."""
     if server is None:
         return connect(options.connect, options.map or DEFAULT_MAP, config=options.config)
-    endpoint, why = options.connect, ""
+    endpoint, tell_s = options.connect, time.monotonic() + _TELL_S
     if endpoint is None and options.config is None:
         endpoint = server.endpoint
     while server.exit_code is None:
         try:
             return connect(endpoint, options.map or server.map_name, config=options.config)
         except (ConnectError, UnknownMapError) as error:
-            if str(error) != why:
-                _log.info("waiting for the server: %s", why := str(error))
+            if time.monotonic() > tell_s:
+                tell_s = time.monotonic() + _TELL_S
+                _log.warning("waiting for the server: %s", error)
             server.wait(_RETRY_S)
     return None
 
@@ -204,7 +208,7 @@ def _add_topics(group: argparse._ArgumentGroup) -> None:
     add = group.add_argument
     add(
         "--domain",
-        type=partial(_whole, 0, _LAST_DOMAIN),
+        type=partial(_whole, 0, 232),
         default=os.environ.get("ROS_DOMAIN_ID") or "0",
         metavar="ID",
         help="of nodes of rmw_zenoh (default: ROS_DOMAIN_ID of the environment, or 0)",
@@ -271,7 +275,7 @@ def _add_outputs(group: argparse._ArgumentGroup) -> None:
 
 
 def _topic(text: str) -> str:
-    if len(text) > _MAX_NAME or not _TOPIC.fullmatch(text):
+    if len(text) > 255 or not _TOPIC.fullmatch(text):
         raise argparse.ArgumentTypeError(f"{text!r:.300} is not the name of a topic")
     return text
 
