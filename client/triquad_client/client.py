@@ -108,8 +108,8 @@ class Client(MapQueries):
                 forward) in the map frame, as in :meth:`publish_scan`.
             stamp_s: as in :meth:`publish_scan`.
             source: name of the camera.
-            stride: take every so many-th row and column, where an image has more pixels than a
-                scan may have points.
+            stride: every how many rows and columns one is taken, where an image has more pixels
+                than a scan may have points.
 
         Raises:
             InvalidScanError: the image cannot be used; nothing was sent.

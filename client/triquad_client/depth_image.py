@@ -57,7 +57,7 @@ def depth_points(depth: ArrayLike, intrinsics: Intrinsics, stride: int = 1) -> F
         depth: [rows, columns] along the optical axis: metres as floating numbers, or millimetres
             as integers without sign (``16UC1``). A pixel that is 0 or not finite shows nothing.
         intrinsics: of the camera.
-        stride: take every so many-th row and column.
+        stride: every how many rows and columns one is taken.
 
     Returns:
         Metres, in the camera's optical frame: x to the right, y down, z forward.

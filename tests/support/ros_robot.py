@@ -26,7 +26,7 @@ from support.servers import raw_session
 Array = NDArray[Any]
 
 SECOND = 10**9
-_HEARD_S = 2.0  # in which whoever wants to listen does
+_HEARD_S = 2.0  # for subscribers to be there
 T0 = 1_700_000_000 * SECOND
 
 
@@ -77,7 +77,7 @@ class RmwZenoh:
         self._publishers[key].put(payload, attachment=attachment)
 
     def skip(self, topic: str, count: int) -> None:
-        """As if so many messages were lost on the way."""
+        """As if ``count`` messages were lost on the way."""
         self._sent[self._namespace + topic] += count
 
 

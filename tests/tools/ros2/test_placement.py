@@ -16,11 +16,11 @@ def sweep(points: int, stamp_ns: int) -> Sweep:
 def given_up(limit: WaitLimit, *points: int) -> list[int]:
     """The numbers of the sweeps that do not wait on, of some that came one after another."""
     placement = Placement(Motion(from_topic=False), map_frame="map", limit=limit, timeout_s=60.0)
-    gone = []
+    dropped = []
     for number, count in enumerate(points):
         placement.add(f"/lidar{number % 2}", sweep(count, number), now_s=float(number))
-        gone += [placed.sweep.stamp_ns for placed in placement.settle(float(number))]
-    return gone
+        dropped += [placed.sweep.stamp_ns for placed in placement.settle(float(number))]
+    return dropped
 
 
 def test_the_oldest_gives_up_where_too_many_wait() -> None:

@@ -88,7 +88,7 @@ def _network(map_name: str, topics: TopicChoice) -> str:
     published = [bridge_key(topics.mesh), bridge_key(topics.grid)]
     rules = take_part_in_ros2(map_name, topics.domain, published)
     configuration = {
-        "scouting": {"gossip": {"enabled": True}},  # by which nodes find each other
+        "scouting": {"gossip": {"enabled": True}},  # nodes find each other through it
         "access_control": access_control(without_credentials(map_name, ros2=rules)),
     }
     return json.dumps(configuration)

@@ -1,4 +1,4 @@
-"""The Zenoh session by which the bridge reaches the nodes of ROS."""
+"""The Zenoh session that reaches the nodes of ROS."""
 
 import json
 from pathlib import Path

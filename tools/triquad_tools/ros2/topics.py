@@ -1,4 +1,4 @@
-"""Topics of ROS 2 in Zenoh: their keys, and the liveliness tokens of who publishes and listens.
+"""Topics of ROS 2 in Zenoh: their keys, and the liveliness tokens of publishers and subscribers.
 
 There are two ways to write them: that of rmw_zenoh (its docs/design.md), and that of
 zenoh-bridge-ros2dds (its liveliness_mgt.rs).
@@ -31,7 +31,7 @@ class Topic:
 
 @dataclass(frozen=True)
 class Announcement:
-    """What a token says: that somebody publishes on a topic, or listens to it."""
+    """What a token says: that somebody publishes on a topic, or subscribes to it."""
 
     end: End
     topic: Topic
@@ -96,7 +96,7 @@ class Delivery:
     """How messages are delivered, as tokens have it: quality of service."""
 
     reliable: bool = True
-    latched: bool = False  # who comes late gets the last ones too: TRANSIENT_LOCAL
+    latched: bool = False  # later subscribers get the last ones too: TRANSIENT_LOCAL
     depth: int = 10
 
     @property

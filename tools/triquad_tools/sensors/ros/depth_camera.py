@@ -20,7 +20,7 @@ def is_depth(encoding: str) -> bool:
 
 
 def camera_topic(image_topic: str) -> str:
-    """Where the ``CameraInfo`` of an image is published: beside it, by the habit of ROS."""
+    """Where the ``CameraInfo`` of an image is published: next to it, by the habit of ROS."""
     return image_topic.rpartition("/")[0] + "/camera_info"
 
 
