@@ -1,8 +1,10 @@
 """A ``triquad-server`` that runs for the bridge, and is the router of the ROS nodes."""
 
 import argparse
+import ctypes
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -21,6 +23,7 @@ from triquad_tools.console.server_arguments import DEFAULT_MAP
 from triquad_tools.ros2.topic_choice import TopicChoice
 from triquad_tools.ros2.topics import bridge_key
 
+_PR_SET_PDEATHSIG = 1  # of prctl(2)
 _ANYWHERE = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]", "": "127.0.0.1"}
 
 
@@ -46,7 +49,7 @@ class ServerProcess:
             command += ["--config", str(file)]
         # A service manager may watch this process; it is the server that tells how it is.
         environment = {key: value for key, value in os.environ.items() if key != "WATCHDOG_PID"}
-        self._process = subprocess.Popen(command, env=environment)
+        self._process = subprocess.Popen(command, env=environment, preexec_fn=_end_with_parent)
 
     def __enter__(self) -> "ServerProcess":
         return self
@@ -67,6 +70,11 @@ class ServerProcess:
         """Return once it has ended, or after some time."""
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(timeout_s)
+
+
+def _end_with_parent() -> None:
+    """Let the system stop the server where the bridge is killed: it would hold the port."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def _parsed(arguments: Sequence[str]) -> argparse.Namespace:
