@@ -16,12 +16,12 @@ from contextlib import contextmanager
 import numpy as np
 import zenoh
 from triquad_format.wire import codec, keys
+from triquad_format.wire.limits import MAX_SEARCHES
 from triquad_format.wire.messages import Scan
 from triquad_format.wire.origin import RequestOrigin
 from triquad_format.wire.query_messages import DistanceRequest, SegmentsRequest
 from triquad_format.wire.zenoh_config import QUIET, put
 
-MOST_POINTS = 250_000  # of one request, as servers are set by default
 FLOOD_HZ = 650.0
 _GREEDY_AT_ONCE = 300
 _GREEDY_EVERY_S = 5.0
@@ -64,7 +64,7 @@ def frozen_neighbours(endpoint: str, map_name: str) -> Iterator[None]:
 
 
 def be_greedy(session: zenoh.Session, map_name: str) -> None:
-    """Ask for 250,000 distances 300 times every few seconds, as somebody else each time."""
+    """Ask for 20,000 distances 300 times every few seconds, as somebody else each time."""
     request = codec.encode(_distances())
     _say_begun()
     while True:
@@ -91,7 +91,7 @@ def leave_unread(session: zenoh.Session, map_name: str) -> None:
 def leave_segments(session: zenoh.Session, map_name: str) -> None:
     """Ask for long segments, 64 times; then sleep until the parent ends this process."""
     rng = np.random.default_rng(0)
-    starts = rng.uniform((-8, -8, -1), (8, 8, 2), (12_000, 3)).astype(np.float32)
+    starts = rng.uniform((-8, -8, -1), (8, 8, 2), (2_000, 3)).astype(np.float32)
     ends = starts + rng.normal(0, 3, starts.shape).astype(np.float32)
     request = SegmentsRequest(np.zeros(3), starts, ends, 0.3, 5.0, 0)
     payload = codec.encode(request)
@@ -127,7 +127,7 @@ KINDS = {
 
 
 def _distances() -> DistanceRequest:
-    points = np.random.default_rng(0).uniform((-30, -8, -1), (30, 8, 4), (MOST_POINTS, 3))
+    points = np.random.default_rng(0).uniform((-30, -8, -1), (30, 8, 4), (MAX_SEARCHES, 3))
     return DistanceRequest(np.zeros(3), points.astype(np.float32), 5.0, False, True, 0)
 
 

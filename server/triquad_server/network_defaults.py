@@ -1,9 +1,9 @@
 """What a server lets in where no configuration says otherwise: no more than the protocol needs."""
 
 from triquad_format.wire.access_control import without_credentials
+from triquad_format.wire.limits import MAX_QUERY_POINTS, payload_limit
 
 from triquad_server.net.configuration import NetworkDefaults
-from triquad_server.net.payload_limit import payload_limit
 from triquad_server.settings import Settings
 
 _SENSOR_POINT_BYTES = 64
@@ -22,5 +22,5 @@ def _max_message_bytes(settings: Settings) -> int:
     It is twice what is answered: what is somewhat too large is refused with the reason, and only
     what is far beyond goes without an answer.
     """
-    largest = 2 * payload_limit(max(settings.service.max_query_points, settings.scan.max_points))
+    largest = 2 * payload_limit(max(MAX_QUERY_POINTS, settings.scan.max_points))
     return max(largest, payload_limit(0) + settings.scan.max_points * _SENSOR_POINT_BYTES)

@@ -1,17 +1,20 @@
 """The map server: its parts, wired to a Zenoh session."""
 
 import secrets
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 
 import zenoh
 from triquad_format.wire import keys
+from triquad_format.wire.codec import Message
+from triquad_format.wire.limits import MAX_KNOWN_TILES, MAX_QUERY_POINTS, payload_limit
 from triquad_format.wire.messages import (
     CheckpointInfo,
     CheckpointRequest,
     MapChunkRequest,
     MapInfoRequest,
+    MeshRequest,
     ResetRequest,
     SdfRequest,
     StatusRequest,
@@ -29,7 +32,7 @@ from triquad_format.wire.query_messages import (
     SpheresRequest,
 )
 from triquad_format.wire.source_messages import SourcesRequest
-from triquad_map.questions.answers import QuestionLimits
+from triquad_map.questions.answers import Answers, QuestionLimits
 
 from triquad_server.health import Health, Heartbeat
 from triquad_server.intake.flush import FlushHandler
@@ -42,12 +45,10 @@ from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_feed import TileFeed
 from triquad_server.mesh.tile_queries import TileQueries
 from triquad_server.monitoring.metrics import Metrics
-from triquad_server.net.request_handlers import Handler, answering
-from triquad_server.process.threads import NICENESS, Teams
+from triquad_server.process.threads import Teams
 from triquad_server.queries.change_queries import ChangeQueries
-from triquad_server.queries.questions import Questions
-from triquad_server.queries.served_operations import ServedOperations
 from triquad_server.queries.source_queries import SourceQueries
+from triquad_server.serving.operations import Lane, Operations, answering
 from triquad_server.settings import Settings
 from triquad_server.store.checkpoint_thread import CheckpointThread
 from triquad_server.store.download import MapDownloads
@@ -55,7 +56,18 @@ from triquad_server.store.resets import Resets
 from triquad_server.store.scrub import Scrubber
 from triquad_server.store.store import Store
 
-_TILE_WORKERS = 2  # each makes tiles of its own; a client asks for several at the same time
+_QUESTIONS: dict[str, type[Message]] = {
+    keys.SDF: SdfRequest,
+    keys.DISTANCE: DistanceRequest,
+    keys.SPHERES: SpheresRequest,
+    keys.SEGMENTS: SegmentsRequest,
+    keys.RAYS: RaysRequest,
+    keys.GROUND: GroundRequest,
+    keys.GRID: GridRequest,
+    keys.ALIGN: AlignRequest,
+}
+_QUESTION_BYTES = payload_limit(MAX_QUERY_POINTS)
+_TILE_UPDATES_BYTES = 20 * MAX_KNOWN_TILES + 16_384  # 20 bytes of each known tile
 
 
 @dataclass(frozen=True)
@@ -88,8 +100,10 @@ class Service:
         self._session = session
         self._served = served
         self._settings = settings
-        self._operations = ServedOperations(session, served.name, settings.service)
         self._scans = ScanQueue(settings.service.scan_queue, settings.service.scan_queue_bytes)
+        self._operations = Operations(
+            session, served.name, settings.service, give_way=self._scans.give_way
+        )
         self._warnings = ScanWarnings(self._scans, settings)
         self._parts = ExitStack()  # closed in reverse order of opening
         try:
@@ -162,20 +176,18 @@ class Service:
             self._served.store,
             protect_h=self._settings.store.protect_h,
         )
-        # Closed before the last checkpoint is written: it shows every reset that was answered.
-        self._serve(
-            "admin",
-            {
-                keys.CHECKPOINT: answering(CheckpointRequest, checkpoints.answer),
-                keys.RESET: answering(ResetRequest, resets.answer),
-            },
+        self._operations.serve(
+            keys.CHECKPOINT, answering(CheckpointRequest, checkpoints.answer), Lane.SLOW
         )
+        self._operations.serve(keys.RESET, answering(ResetRequest, resets.answer), Lane.SLOW)
+        # Closed before the last checkpoint is written: it shows every reset that was answered.
+        self._parts.callback(self._operations.close)
         self._parts.callback(self._mapper.rest)
         self._open_intake()
         self._parts.callback(Heartbeat(self._session, health).close)
         alive = keys.alive_key(health.map_name, health.server)
         self._parts.callback(self._session.liveliness().declare_token(alive).undeclare)
-        self._parts.callback(self._operations.stop)  # of all groups, before any is waited for
+        self._parts.callback(self._operations.stop)  # before anything is waited for
 
     def _open_mapper(self, failed: Callable[[], None], maps: bool) -> MapperThread:
         mapper = MapperThread(
@@ -204,40 +216,17 @@ class Service:
         self._parts.callback(intake.close)
 
     def _serve_queries(self) -> None:
-        limits = self._settings.service
-        questions = Questions(
-            self._mapper.epochs.view,
-            QuestionLimits(limits.max_query_points, limits.max_search_points),
-            give_way=self._mapper.epochs.gate.wait_for_mapping,
-        )
-        self._serve("field", {keys.SDF: questions.of(SdfRequest)}, limits.query_workers)
-        self._serve(
-            "distances",
-            {
-                keys.DISTANCE: questions.of(DistanceRequest),
-                keys.SPHERES: questions.of(SpheresRequest),
-            },
-            limits.query_workers,
-        )
-        self._serve(
-            "places",
-            {
-                keys.SEGMENTS: questions.of(SegmentsRequest),
-                keys.RAYS: questions.of(RaysRequest),
-                keys.GROUND: questions.of(GroundRequest),
-                keys.GRID: questions.of(GridRequest),
-            },
-            limits.query_workers,
-        )
-        self._serve("poses", {keys.ALIGN: questions.of(AlignRequest)})
+        answers = Answers(self._mapper.epochs.view, QuestionLimits())
+        for name, kind in _QUESTIONS.items():
+            self._operations.serve(name, answering(kind, answers.answer), max_bytes=_QUESTION_BYTES)
 
     def _serve_changes(self, server: str) -> None:
         queries = ChangeQueries(self._mapper.epochs, self._mapper.surface, server)
-        self._serve("changes", {keys.CHANGES: answering(ChangesRequest, queries.changes)})
+        self._operations.serve(keys.CHANGES, answering(ChangesRequest, queries.changes))
 
     def _serve_sources(self, server: str) -> None:
         queries = SourceQueries(self._mapper.trails, server)
-        self._serve("sources", {keys.SOURCES: answering(SourcesRequest, queries.sources)})
+        self._operations.serve(keys.SOURCES, answering(SourcesRequest, queries.sources))
 
     def _serve_mesh(self, server: str) -> TileCache:
         """Queries of mesh tiles, and following them; all tiles."""
@@ -251,16 +240,11 @@ class Service:
         )
         self._parts.callback(feed.close)
         tiles = TileQueries(self._mapper.epochs, cache)
-        self._serve(
-            "tiles",
-            {
-                keys.TILE_LIST: answering(TileListRequest, tiles.tiles),
-                keys.MESH: tiles.answer_mesh,
-            },
-            _TILE_WORKERS,
-            NICENESS,
+        self._operations.serve(keys.TILE_LIST, answering(TileListRequest, tiles.tiles))
+        self._operations.serve(keys.MESH, answering(MeshRequest, tiles.mesh))
+        self._operations.serve(
+            keys.TILE_UPDATES, feed.add, Lane.ADMINISTRATION, max_bytes=_TILE_UPDATES_BYTES
         )
-        self._serve("tile_updates", {keys.TILE_UPDATES: feed.add})
         self._operations.queues["mesh_followers"] = lambda: feed.queue
         return cache
 
@@ -275,28 +259,15 @@ class Service:
         )
         self._parts.callback(flush.close)
         self._operations.queues["flushes"] = lambda: flush.queue
-        self._serve(
-            "status",
-            {
-                keys.STATUS: answering(StatusRequest, lambda _: self.metrics.health.status()),
-                keys.METRICS: answering(MetricsRequest, lambda _: self.metrics.now()),
-                keys.FLUSH: flush.add,
-            },
-        )
+        for name, handler in {
+            keys.STATUS: answering(StatusRequest, lambda _: self.metrics.health.status()),
+            keys.METRICS: answering(MetricsRequest, lambda _: self.metrics.now()),
+            keys.FLUSH: flush.add,
+        }.items():
+            self._operations.serve(name, handler, Lane.ADMINISTRATION)
 
     def _serve_downloads(self, server: str) -> MapDownloads:
         downloads = MapDownloads(self._mapper, server)
-        self._serve(
-            "downloads",
-            {
-                keys.MAP_INFO: answering(MapInfoRequest, downloads.info),
-                keys.MAP_CHUNK: answering(MapChunkRequest, downloads.chunk),
-            },
-        )
+        self._operations.serve(keys.MAP_INFO, answering(MapInfoRequest, downloads.info), Lane.SLOW)
+        self._operations.serve(keys.MAP_CHUNK, answering(MapChunkRequest, downloads.chunk))
         return downloads
-
-    def _serve(
-        self, queue: str, handlers: Mapping[str, Handler], workers: int = 1, niceness: int = 0
-    ) -> None:
-        """Answer a group of operations from now on, as :meth:`ServedOperations.serve`."""
-        self._parts.callback(self._operations.serve(queue, handlers, workers, niceness).close)

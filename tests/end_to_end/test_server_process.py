@@ -304,15 +304,17 @@ def test_a_zenoh_configuration_file_is_used(tmp_path, settings):
 
 
 A_THREAD_ENDS = """
-import zenoh
-from triquad_server.net.askers import Askers
+from triquad_server.intake.scan import ScanIntake
 
-def watch(askers):
-    for event in askers._listener:
-        if event.kind == zenoh.SampleKind.DELETE:
-            raise RuntimeError("a defect")
+keep, kept = ScanIntake._keep, []
 
-Askers._watch = watch
+def keep_two(intake, sample):
+    if len(kept) == 2:
+        raise RuntimeError("a defect")
+    kept.append(sample)
+    keep(intake, sample)
+
+ScanIntake._keep = keep_two
 """
 
 
@@ -322,6 +324,8 @@ def test_a_thread_that_ends_by_a_defect_stops_the_server_after_a_last_checkpoint
     (tmp_path / "sitecustomize.py").write_text(A_THREAD_ENDS)
     with servers.server_process(arguments, environment={"PYTHONPATH": str(tmp_path)}) as server:
         before = learn(server.endpoint)
+        with triquad_client.connect(server.endpoint) as client:
+            client.publish_scan(servers.sphere(), POSE)
         assert server.wait() == 1
     assert "RuntimeError: a defect" in server.log
     assert "stopping, by an internal error" in server.log

@@ -5,14 +5,20 @@ epoch; ``None`` is the newest. What cannot be asked raises :class:`InvalidInputE
 :mod:`triquad_map.questions.answers` is the other side.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from triquad_format.errors import InvalidInputError
 from triquad_format.records.arrays import Doubles
 from triquad_format.wire import keys
-from triquad_format.wire.limits import MAX_RANGE_M
+from triquad_format.wire.limits import (
+    MAX_QUERY_POINTS,
+    MAX_RANGE_M,
+    MAX_SEARCHES,
+    RAY_M_PER_SEARCH,
+    SEGMENT_M_PER_SEARCH,
+)
 from triquad_format.wire.messages import SdfReply, SdfRequest
 from triquad_format.wire.query_messages import (
     AlignReply,
@@ -50,11 +56,9 @@ from triquad_client.calls.parts import in_parts, joined, offsets_from, origin_of
 from triquad_client.checks import Bounds, PoseLike
 from triquad_client.net.call import NEWEST, Ask, Call, ask, offload, retried
 
-# Items of one request: it takes the server some tens of milliseconds, and others wait as long.
-_PART_SDF_POINTS = 100_000
-_PART_POINTS = 20_000  # around which something is searched for
-_PART_WAYS = 2_000  # segments, rays or columns down to the ground
-_PART_CELLS = 20_000  # unless a layer has more
+_MOST_WAYS = 2_000
+"""Segments, rays or columns down to the ground of one request, which takes a server some tens of
+milliseconds."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +83,7 @@ class SdfResult:
 def sdf(points: ArrayLike, gradient: bool, at_epoch: int | None) -> Call[SdfResult]:
     """The trained field at ``points`` [N, 3]."""
     gradient = checks.flag("gradient", gradient)
-    if isinstance(points, np.ndarray) and points.size > 3 * _PART_SDF_POINTS:
+    if isinstance(points, np.ndarray) and points.size > 3 * MAX_QUERY_POINTS:
         checked = yield from offload(lambda _: checks.query_points(points))
     else:
         checked = checks.query_points(points)
@@ -87,7 +91,7 @@ def sdf(points: ArrayLike, gradient: bool, at_epoch: int | None) -> Call[SdfResu
     def request(part: slice, epoch: int) -> Ask[SdfReply]:
         return _ask_sdf(checked[part], gradient, epoch)
 
-    parts = yield from in_parts(request, len(checked), most=_PART_SDF_POINTS, at_epoch=at_epoch)
+    parts = yield from in_parts(request, len(checked), most=MAX_QUERY_POINTS, at_epoch=at_epoch)
     asked_for = {"gradient": gradient}
     if len(parts) == 1:
         return SdfResult(**joined(parts, asked_for=asked_for))
@@ -134,7 +138,7 @@ def distance(
         )
         return Ask(keys.DISTANCE, message, DistanceReply)
 
-    parts = yield from in_parts(request, len(checked), most=_PART_POINTS, at_epoch=at_epoch)
+    parts = yield from in_parts(request, len(checked), most=MAX_SEARCHES, at_epoch=at_epoch)
     asked_for = {
         "surface_point": surface_point,
         "unknown_distance_m": unknown_distance,
@@ -149,8 +153,8 @@ def distance(
 
 def _origins(points: Doubles, counts: list[int]) -> Doubles:
     """The origin [N, 3] from which each of ``points`` [N, 3] was sent, in parts of ``counts``."""
-    starts = range(0, max(1, len(points)), _PART_POINTS)
-    origins = [origin_of(points[start : start + _PART_POINTS]) for start in starts]
+    starts = range(0, max(1, len(points)), MAX_SEARCHES)
+    origins = [origin_of(points[start : start + MAX_SEARCHES]) for start in starts]
     return np.repeat(origins, counts, axis=0)
 
 
@@ -166,7 +170,7 @@ def spheres(centres: ArrayLike, radii_m: ArrayLike, at_epoch: int | None) -> Cal
         )
         return Ask(keys.SPHERES, message, SpheresReply)
 
-    parts = yield from in_parts(request, len(checked), most=_PART_POINTS, at_epoch=at_epoch)
+    parts = yield from in_parts(request, len(checked), most=MAX_SEARCHES, at_epoch=at_epoch)
     return Spheres(**joined(parts))
 
 
@@ -192,8 +196,15 @@ def segments(
         )
         return Ask(keys.SEGMENTS, message, SegmentsReply)
 
-    parts = yield from in_parts(request, len(first), most=_PART_WAYS, at_epoch=at_epoch)
+    longest_m = float(np.linalg.norm(last - first, axis=1).max(initial=0.0))
+    most = _ways_at_once(longest_m / SEGMENT_M_PER_SEARCH)
+    parts = yield from in_parts(request, len(first), most=most, at_epoch=at_epoch)
     return Segments(**joined(parts, flags=["blocked", "meets_unknown"]))
+
+
+def _ways_at_once(searches: float) -> int:
+    """How many ways that take as many ``searches`` each one request may ask about."""
+    return max(1, min(_MOST_WAYS, int(MAX_SEARCHES / max(1.0, searches))))
 
 
 def polyline(points: ArrayLike, options: SegmentOptions, at_epoch: int | None) -> Call[Polyline]:
@@ -226,7 +237,8 @@ def rays(
         )
         return Ask(keys.RAYS, message, RaysReply)
 
-    parts = yield from in_parts(request, len(ways), most=_PART_WAYS, at_epoch=at_epoch)
+    most = _ways_at_once(reach_m / RAY_M_PER_SEARCH)
+    parts = yield from in_parts(request, len(ways), most=most, at_epoch=at_epoch)
     return RayRanges(**joined(parts))
 
 
@@ -242,7 +254,8 @@ def ground(points: ArrayLike, max_drop_m: float, at_epoch: int | None) -> Call[G
         )
         return Ask(keys.GROUND, message, GroundReply)
 
-    parts = yield from in_parts(request, len(checked), most=_PART_WAYS, at_epoch=at_epoch)
+    most = _ways_at_once(drop_m / RAY_M_PER_SEARCH)
+    parts = yield from in_parts(request, len(checked), most=most, at_epoch=at_epoch)
     fields = joined(parts)
     return Ground(height_m=checked[:, 2] - fields.pop("drop_m"), **fields)
 
@@ -251,17 +264,44 @@ def grid(bounds: Bounds, cell_m: float, max_distance_m: float, at_epoch: int | N
     """The map at the cells that fill ``bounds``; a flat box is one layer of them."""
     shape = checks.grid_shape(bounds, cell_m)
     reach_m = checks.within("max_distance_m", max_distance_m)
-    columns, *layer = shape.counts
+    blocks = _blocks(shape.counts)
 
     def request(part: slice, epoch: int) -> Ask[GridReply]:
-        corner = shape.corner + (part.start * shape.cell_m, 0.0, 0.0)
-        counts = np.array([min(part.stop, columns) - part.start, *layer], np.int32)
+        (block,) = blocks[part]
+        corner = shape.corner + np.array(block.first) * shape.cell_m
+        counts = np.array(block.counts, np.int32)
         message = GridRequest(corner, shape.cell_m, counts, max_distance_m=reach_m, epoch=epoch)
         return Ask(keys.GRID, message, GridReply)
 
-    at_once = max(1, _PART_CELLS // (layer[0] * layer[1]))
-    parts = yield from in_parts(request, columns, most=at_once, at_epoch=at_epoch)
-    return Grid(shape, **joined(parts))
+    replies = yield from in_parts(request, len(blocks), most=1, at_epoch=at_epoch)
+    flat = [
+        replace(reply, distance_m=reply.distance_m.ravel(), status=reply.status.ravel())
+        for reply in replies
+    ]
+    fields = joined(flat)
+    for name in ("distance_m", "status"):
+        fields[name] = fields[name].reshape(shape.counts)
+    return Grid(shape, **fields)
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Cells of a grid that lie one after the other, z running fastest."""
+
+    first: tuple[int, int, int]
+    counts: tuple[int, int, int]
+
+
+def _blocks(counts: tuple[int, int, int]) -> list[_Block]:
+    """A grid in blocks that one request may ask about: layers of one x each, or parts of one."""
+    columns, rows, height = counts
+    rows_each = min(rows, max(1, MAX_SEARCHES // height))
+    columns_each = max(1, MAX_SEARCHES // (rows * height))
+    return [
+        _Block((x, y, 0), (min(columns_each, columns - x), min(rows_each, rows - y), height))
+        for x in range(0, columns, columns_each)
+        for y in range(0, rows, rows_each)
+    ]
 
 
 def align(

@@ -15,6 +15,20 @@ MAX_RANGE_M = 1_000.0
 MAX_ITERATIONS = 200
 """Steps of an alignment."""
 
+MAX_QUERY_POINTS = 100_000
+"""Points of one request for the field, which takes a server some tens of milliseconds of one core;
+clients ask about more in several requests."""
+
+MAX_SEARCHES = 20_000
+"""Points of one request around which something is searched for, for as long. Cells of a grid and
+points of a scan count as one each."""
+
+RAY_M_PER_SEARCH = 10.0
+"""Metres of a ray, or below a point on the way down to the ground, that count as one search."""
+
+SEGMENT_M_PER_SEARCH = 1.0
+"""Metres of a segment that count as one search: it is walked in shorter steps than a ray."""
+
 LEVELS = 3
 """Levels of detail of meshes: cells of level ``l`` are ``2**l`` times as large as those of 0."""
 
@@ -24,8 +38,8 @@ MAX_SAMPLE_POINTS = 10_000
 TILE_INDEX_LIMIT = 1_000_000
 """Tile indices lie in ``[-TILE_INDEX_LIMIT, TILE_INDEX_LIMIT]``."""
 
-MAX_TILES_ASKED = 64
-"""Mesh tiles of one request."""
+MAX_TILES_ASKED = 8
+"""Mesh tiles of one request, each of which takes a server some tens of milliseconds of one core."""
 
 MAX_KNOWN_TILES = 100_000
 """Mesh tiles that a client may name as known when it asks what changed."""
@@ -41,3 +55,11 @@ MAX_FILL_M = 5.0
 
 MAX_CHUNK_BYTES = 64 * 2**20
 """Of a map file, in one reply."""
+
+_POINT_BYTES = 12
+_OTHER_BYTES = 4096  # the largest message takes less without its points
+
+
+def payload_limit(points: int) -> int:
+    """Most bytes of a message of ``points`` points: what is larger is not decoded."""
+    return points * _POINT_BYTES + _OTHER_BYTES

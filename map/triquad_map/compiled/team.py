@@ -46,10 +46,11 @@ class Team:
     def __init__(self, name: str, niceness: int = 0) -> None:
         """Threads start with the first work; ``niceness`` is as of :func:`lower_priority`."""
         self._pool = ThreadPoolExecutor(
-            THREADS, thread_name_prefix=name, initializer=lower_priority, initargs=(niceness,)
+            max(1, THREADS - 1),  # the caller is the other one
+            thread_name_prefix=name,
+            initializer=lower_priority,
+            initargs=(niceness,),
         )
-        self._counting = threading.Lock()
-        self._callers = 0  # that have work split
 
     def close(self) -> None:
         """End the threads once their work is done."""
@@ -62,21 +63,13 @@ class Team:
     def split(self, count: int, work: Callable[[int, int], None], least: int = _MIN_SHARE) -> None:
         """Run ``work(first, last)`` over ``range(count)``, in parallel where it is worth it.
 
-        ``least`` is how many a thread is given at least. A core is left to each other caller: with
-        parts for all cores, callers would only wait for each other's.
+        ``least`` is how many a thread is given at least.
         """
-        with self._counting:
-            cores = max(1, THREADS - self._callers)
-            self._callers += 1
-        try:
-            parts = min(cores, max(1, count // least))
-            if parts == 1:
-                work(0, count)
-            else:
-                self._run(lambda part: work(*share(count, part, parts)), parts)
-        finally:
-            with self._counting:
-                self._callers -= 1
+        parts = min(THREADS, max(1, count // least))
+        if parts == 1:
+            work(0, count)
+        else:
+            self._run(lambda part: work(*share(count, part, parts)), parts)
 
     @contextlib.contextmanager
     def beside(self) -> Iterator[Callable[[Callable[[], None]], None]]:

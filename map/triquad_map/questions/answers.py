@@ -17,8 +17,12 @@ from triquad_format.wire.limits import (
     MAX_DISTANCE_M,
     MAX_ITERATIONS,
     MAX_POSITION_M,
+    MAX_QUERY_POINTS,
     MAX_RANGE_M,
+    MAX_SEARCHES,
     MIN_LENGTH_M,
+    RAY_M_PER_SEARCH,
+    SEGMENT_M_PER_SEARCH,
 )
 from triquad_format.wire.messages import SdfReply, SdfRequest
 from triquad_format.wire.query_messages import (
@@ -43,24 +47,19 @@ from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.questions.grid import GridShape, grid
 from triquad_map.questions.ground import ground
 from triquad_map.questions.rays import RayOptions, rays
-from triquad_map.questions.segments import SegmentOptions, segments, steps_at_most
+from triquad_map.questions.segments import SegmentOptions, segments
 from triquad_map.questions.spheres import spheres
 from triquad_map.view import MapView
 
 _DECIMALS = 5  # of positions, metres
-_STEPS_EACH = 50
-"""Places along a segment that count as much as a point that is asked for."""
-
-_RANGE_EACH_M = 10.0
-"""Range of a ray, or drop of a column, that counts as much."""
 
 
 @dataclass(frozen=True)
 class QuestionLimits:
     """How much one question may ask."""
 
-    points: int  # at which the field is evaluated
-    searches: int  # points around which something is searched for, which takes ten times as long
+    points: int = MAX_QUERY_POINTS  # at which the field is evaluated
+    searches: int = MAX_SEARCHES  # points around which something is searched for
 
 
 Views = Callable[[int], AbstractContextManager[MapView]]
@@ -154,9 +153,9 @@ class Answers:
                 "bad_request",
                 f"segment {worst} is {lengths[worst]:g} m long: use at most {MAX_RANGE_M:g} m",
             )
+        total_m = float(lengths.sum())
+        self._check_count(total_m / SEGMENT_M_PER_SEARCH, f"segments of {total_m:.0f} m in all")
         with self._view(request.epoch) as view:
-            steps = steps_at_most(view, starts, ends)
-            self._check_count(steps / _STEPS_EACH, f"segments of {steps} steps")
             answer = segments(view, starts, ends, options=options)
         return SegmentsReply(
             epoch=answer.epoch,
@@ -183,7 +182,7 @@ class Answers:
             )
         reach_m = _within("max_range_m", request.max_range_m, MAX_RANGE_M)
         self._check_count(
-            len(starts) * reach_m / _RANGE_EACH_M, f"{len(starts)} rays of {reach_m:g} m"
+            len(starts) * reach_m / RAY_M_PER_SEARCH, f"{len(starts)} rays of {reach_m:g} m"
         )
         options = RayOptions(reach_m, request.through_unknown)
         with self._view(request.epoch) as view:
@@ -195,7 +194,7 @@ class Answers:
         points = self._searched("point", request.origin, request.points)
         drop_m = _within("max_drop_m", request.max_drop_m, MAX_DISTANCE_M)
         self._check_count(
-            len(points) * drop_m / _RANGE_EACH_M, f"{len(points)} points with {drop_m:g} m below"
+            len(points) * drop_m / RAY_M_PER_SEARCH, f"{len(points)} points with {drop_m:g} m below"
         )
         with self._view(request.epoch) as view:
             answer = ground(view, points, drop_m)

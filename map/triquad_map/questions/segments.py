@@ -68,12 +68,6 @@ class _March:
     clearance_at: Doubles
 
 
-def steps_at_most(view: MapView, starts: Doubles, ends: Doubles) -> int:
-    """How many places may have to be checked between ``starts`` and ``ends`` [N, 3]."""
-    lengths = np.linalg.norm(ends - starts, axis=1)
-    return int(np.ceil(lengths / (STEP_VOXELS * view.voxel_m)).sum()) + 2 * len(starts)
-
-
 def segments(view: MapView, starts: Doubles, ends: Doubles, options: SegmentOptions) -> Segments:
     """What a ball meets that moves from ``starts`` to ``ends`` [N, 3], metres, map frame."""
     lengths = np.linalg.norm(ends - starts, axis=1)

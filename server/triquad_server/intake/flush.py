@@ -13,8 +13,8 @@ from triquad_format.wire.metrics_messages import QueueMetrics
 
 from triquad_server.fair_queue import first_to_go
 from triquad_server.intake.source_ledger import MAX_SEQUENCE, SourceLedger
-from triquad_server.net.request import Request
 from triquad_server.process.threads import submit
+from triquad_server.serving.request import Request
 
 ARRIVAL_GRACE_S = 2.0
 """A scan that has not arrived so long after the flush request, which travels the same way behind

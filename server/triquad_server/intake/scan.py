@@ -8,13 +8,13 @@ from contextlib import suppress
 import zenoh
 from triquad_format.errors import FormatError, ProtocolVersionError, WireError
 from triquad_format.wire import codec, keys
+from triquad_format.wire.limits import payload_limit
 from triquad_format.wire.messages import Scan
 
 from triquad_server.errors import ScanRefusedError
 from triquad_server.fair_queue import FairQueue, Owner
 from triquad_server.intake.rays import check_count
 from triquad_server.intake.scan_queue import ScanQueue
-from triquad_server.net.payload_limit import payload_limit
 
 _log = logging.getLogger(__name__)
 
@@ -42,7 +42,9 @@ class ScanIntake:
         self._queue = queue
         self._arrived = arrived
         # Scans as they came, by key: to decode them, too, takes time that a source may take up.
-        self._inbox: FairQueue[zenoh.Sample] = FairQueue(_INBOX, queue.limit_bytes)
+        self._inbox: FairQueue[zenoh.Sample] = FairQueue(
+            _INBOX, queue.limit_bytes, _INBOX, newest_go=False
+        )
         # A ring, since a full channel of another kind would stall the network's threads.
         self._subscriber = session.declare_subscriber(
             keys.all_scans_key(map_name), zenoh.handlers.RingChannel(_INBOX)
@@ -73,8 +75,8 @@ class ScanIntake:
 
     def _keep(self, sample: zenoh.Sample) -> None:
         self._queue.received_bytes += len(sample.payload)
+        # What is removed for it is a gap in the sequence, and counted as that.
         self._inbox.put(Owner(str(sample.key_expr)), sample, len(sample.payload))
-        self._inbox.excess(newest=False)  # which is a gap in the sequence, and counted as that
 
     def _receive_safely(self, sample: zenoh.Sample) -> None:
         """As :meth:`_receive`; an internal error must not stop the intake of other scans."""

@@ -15,6 +15,13 @@ MAX_SOURCES_WAITING = 64
 _BEHIND = 0.25
 """A source falls behind of whose scans more than this share of its limit wait."""
 
+_PRESSED = 0.5
+"""Requests give way to scans once more than this share of the limit of a source wait."""
+
+_GIVE_WAY_S = 0.05
+"""Requests wait for so long at most, before each of them: they are late then, but scans that do
+not fit in the queue are lost."""
+
 _SCAN_BYTES = 2_000  # that a scan takes beside its points
 
 
@@ -32,10 +39,11 @@ class ScanQueue:
         self.ledger = SourceLedger()
         self.dropped = Counter()  # scans that are not in the map, by reason
         self.received_bytes = 0  # of all messages of scans that arrived
-        self._lock = threading.Lock()
-        self._scans: FairQueue[Scan] = FairQueue(limit * MAX_SOURCES_WAITING, limit_bytes)
+        self._taken = threading.Condition()
+        self._scans: FairQueue[Scan] = FairQueue(
+            limit * MAX_SOURCES_WAITING, limit_bytes, limit, newest_go=False
+        )
         self._in_hand = False
-        self._holds = False  # more scans of a source than the limit
 
     def __len__(self) -> int:
         return len(self._scans) + self._in_hand
@@ -47,16 +55,12 @@ class ScanQueue:
 
     def put(self, scan: Scan) -> None:
         """Add a scan, unless its sequence or stamp refuses it."""
-        with self._lock:
+        with self._taken:
             reason = self.ledger.arrive(scan)
             if reason is not None:
                 self.dropped.add(reason)
                 return
-            owner = Owner(scan.source)
-            self._scans.put(owner, scan, _bytes_of(scan))
-            if self._scans.count(owner) > self.limit and not self._holds:
-                self.ledger.push_out(self._scans.drop_oldest(owner))
-            for pushed_out in self._scans.excess(newest=False):
+            for pushed_out in self._scans.put(Owner(scan.source), scan, _bytes_of(scan)):
                 self.ledger.push_out(pushed_out)
 
     def hold(self) -> None:
@@ -64,11 +68,11 @@ class ScanQueue:
 
         That is for a server which takes none in yet.
         """
-        self._holds = True
+        self._scans.limit_each = self._scans.limit
 
     def refuse(self, scan: Scan, reason: str, text: str) -> None:
         """Account for a scan that arrived but is not let in."""
-        with self._lock:
+        with self._taken:
             backwards = self.ledger.arrive(scan)
             if backwards is None:
                 self.ledger.turn_away(scan, text)
@@ -80,22 +84,25 @@ class ScanQueue:
         Of a source that falls behind it may be, nevertheless. It counts as waiting until another
         is asked for.
         """
-        with self._lock:
-            self._holds = self._holds and len(self._scans) > self.limit
+        with self._taken:
+            if len(self._scans) <= self.limit:
+                self._scans.limit_each = self.limit
             scan = self._scans.take(
                 lambda scan: scan.source not in passed_over or self._falls_behind(scan.source)
             )
             self._in_hand = scan is not None
+            self._taken.notify_all()
             return scan
 
-    def pressure(self) -> float:
-        """How near a source is to losing scans: 0 while half as many wait as may, 1: it does."""
-        with self._lock:
-            share = self._scans.most() / self.limit
-        return min(1.0, max(0.0, 2.0 * share - 1.0))
+    def give_way(self) -> None:
+        """Return once no source is about to lose scans, or after a moment."""
+        with self._taken:
+            self._taken.wait_for(
+                lambda: self._scans.most() <= _PRESSED * self._scans.limit_each, _GIVE_WAY_S
+            )
 
     def _falls_behind(self, source: str) -> bool:
-        return self._scans.count(Owner(source)) > _BEHIND * self.limit
+        return self._scans.count(source) > _BEHIND * self.limit
 
 
 def _bytes_of(scan: Scan) -> int:

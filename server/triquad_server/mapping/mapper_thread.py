@@ -114,7 +114,6 @@ class MapperThread:
         self._fit = map_fit(mapper.regions)
         older_bytes = (memory or MemorySettings()).epochs_bytes
         self.epochs = EpochHistory(first, settings, older_bytes=older_bytes)
-        self.epochs.gate.hold_back_by(scans.pressure)
         self.surface = SurfaceHistory(first, settings.changes_kept)
         self.trails = SourceTrails(first.field_settings.leaf_m)
         self.progress = Progress()
@@ -236,12 +235,11 @@ class MapperThread:
         if not self._mapper.settled:
             self.time.begin(Activity.GIVING_WAY)
             # However many ask, training waits a third of its time at most.
-            self.epochs.gate.give_way(min(_GIVE_WAY_S, self._step_s / 2))
+            self.epochs.give_way(min(_GIVE_WAY_S, self._step_s / 2))
             self.time.begin(Activity.TRAINING)
             started = time.monotonic()
             trained = self._mapper.samples_trained
-            with self.epochs.gate.turn():
-                self._mapper.train()
+            self._mapper.train()
             self._samples_trained += self._mapper.samples_trained - trained
             self._step_s = time.monotonic() - started
             self._unpublished = True

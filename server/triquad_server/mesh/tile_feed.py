@@ -39,11 +39,6 @@ _GIVE_WAY_S = 0.1
 _MAX_REFRESH_SHARE = 4
 """Refreshing the cache takes at most one part in so many of the thread's time."""
 
-_PLANNER_S = 1.0  # who asked so short a time ago will ask again
-_BESIDE_PLANNER_SHARE = 8
-"""While a planner asks, each of refreshing and making tiles that only changed takes at most one
-part in so many of the time: a query that meets it takes a third longer."""
-
 _REFRESH_GRACE_S = 10.0
 """So long after its deadline, a request may wait for the epoch that was the newest when it came to
 be refreshed from; that takes a fraction of this."""
@@ -75,7 +70,6 @@ class TileFeed:
         self._pending: list[Follower] = []
         self._stopping = False
         self._next_refresh_s = 0.0
-        self._next_remake_s = 0.0
         self._senders = TileSenders()
         self._thread = threading.Thread(target=self._run, name="meshing")
         self._thread.start()
@@ -167,13 +161,13 @@ class TileFeed:
         if newest.number <= self._cache.made_from or started < self._next_refresh_s:
             return
         try:
-            with self._epochs.gate.turn():
-                self._cache.refresh(newest)
+            self._cache.refresh(newest)
         except Exception:
             _log.exception("an internal error, while changes of the surface were searched for")
         now = time.monotonic()
-        share = _BESIDE_PLANNER_SHARE if self._planner_asks() else _MAX_REFRESH_SHARE
-        self._next_refresh_s = now + max(self._settings.update_period_s, share * (now - started))
+        self._next_refresh_s = now + max(
+            self._settings.update_period_s, _MAX_REFRESH_SHARE * (now - started)
+        )
 
     def _serve_safely(self, follower: Follower) -> bool:
         """As :meth:`_serve`; an internal error ends this request only."""
@@ -202,13 +196,8 @@ class TileFeed:
         if delta.ready or (delta.removed and not delta.to_make):
             self._send(follower, self._filled(follower, delta))
             return True
-        if delta.missing:
-            self._make(asks.level, delta.missing)
-            return True
-        if delta.outdated:
-            if time.monotonic() < self._next_remake_s:
-                return self._answer_if_late(follower, knows_all=False)
-            self._remake(asks.level, delta.outdated)
+        if delta.to_make:
+            self._make(asks.level, delta.missing or delta.outdated)
             return True
         if follower.restart and self._is_current_for(follower):
             self._send(follower, TileReply(complete=True, revision=delta.revision))
@@ -235,22 +224,10 @@ class TileFeed:
         ends_s = time.monotonic() + _SLICE_S
         left = dict.fromkeys(indices)
         while left and time.monotonic() < ends_s and not self._stopping:
-            self._epochs.gate.give_way(_GIVE_WAY_S)
-            with self._epochs.gate.turn():
-                made = self._cache.make_some(level, left)
+            self._epochs.give_way(_GIVE_WAY_S)
+            made = self._cache.make_some(level, left)
             for index in made:
                 del left[index]
-
-    def _remake(self, level: int, indices: list[TileIndex]) -> None:
-        """Make tiles anew for a moment; while a planner asks, leave it alone for longer then."""
-        started = time.monotonic()
-        self._make(level, indices)
-        ended = time.monotonic()
-        if self._planner_asks():
-            self._next_remake_s = ended + _BESIDE_PLANNER_SHARE * (ended - started)
-
-    def _planner_asks(self) -> bool:
-        return self._epochs.gate.asked_within(_PLANNER_S)
 
     def _filled(self, follower: Follower, delta: TileDelta) -> TileReply:
         """As many of the tiles as a reply may have, at least one."""
@@ -281,7 +258,7 @@ class TileFeed:
         data = self._cache.data(level, tile)
         if data is not None:
             return data
-        self._epochs.gate.give_way(_GIVE_WAY_S)
+        self._epochs.give_way(_GIVE_WAY_S)
         if self._cache.make(level, tile.index).revision != tile.revision:
             return None
         return self._cache.data(level, tile)

@@ -1,7 +1,5 @@
 """Answers to queries of mesh tiles, and of which there are."""
 
-from collections.abc import Callable
-
 import numpy as np
 from triquad_format.errors import RefusedError
 from triquad_format.records.arrays import Ints
@@ -17,7 +15,6 @@ from triquad_server.mesh.answered_tiles import AnsweredTile, AskedTile
 from triquad_server.mesh.holes import check_fill
 from triquad_server.mesh.mesher import TileLattice, check_box, check_level, mesh_tile
 from triquad_server.mesh.tile_cache import TileCache
-from triquad_server.net.request import Request
 
 MAX_TILES = 1_000_000
 """Tiles of one list."""
@@ -55,12 +52,8 @@ class TileQueries:
             changed=np.minimum(changed, epoch.number),
         )
 
-    def answer_mesh(self, request: Request) -> None:
-        """Answer a :class:`MeshRequest`; after the first few tiles, others have their turn."""
-        request.answer(self.mesh(request.read(MeshRequest), request.turn))
-
-    def mesh(self, request: MeshRequest, turn: Callable[[], object]) -> MeshReply:
-        """The meshes of some tiles; ``turn`` returns when it is that of the next.
+    def mesh(self, request: MeshRequest) -> MeshReply:
+        """The meshes of some tiles.
 
         Raises:
             RefusedError: a field is out of range, or the epoch is gone.
@@ -73,7 +66,6 @@ class TileQueries:
         view, lattice = epoch.asked_with(), self._cache.lattice(request.level)
         tiles = []
         for x, y, z in request.tiles.tolist():
-            turn()
             asked = AskedTile(request.level, (x, y, z), request.fill_m)
             tiles.append(self._tile(view, asked, lattice))
         filled = [tile.filled for tile in tiles if tile.filled is not None]

@@ -11,9 +11,9 @@ from triquad_server.array_memory import bytes_by_part
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.health import Health
 from triquad_server.mesh.tile_cache import TileCache
-from triquad_server.net.operation_counts import BOUNDS_S
 from triquad_server.process.memory import resident_bytes
-from triquad_server.queries.served_operations import ReadQueue
+from triquad_server.serving.operation_counts import BOUNDS_S
+from triquad_server.serving.operations import ReadQueue
 from triquad_server.store.download import MapDownloads
 
 _MAX_SESSIONS = 1024  # that are listed

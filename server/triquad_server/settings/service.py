@@ -20,25 +20,15 @@ class ServiceSettings(BaseModel):
     is pushed out."""
 
     request_queue: Annotated[int, Field(ge=1, le=10_000)] = 64
-    """Requests that wait, per group of operations; of more, the newest of the client that has most
-    of them is refused."""
+    """Requests of each client that wait, and an eighth of those of all; of more, the newest of the
+    client that has most of them is refused."""
 
-    request_queue_bytes: Annotated[int, Field(ge=0, le=2**40)] = 16_000_000
-    """Bytes of the requests that wait, per group of operations, likewise."""
+    request_queue_bytes: Annotated[int, Field(ge=0, le=2**40)] = 64_000_000
+    """Bytes of the requests of all clients that wait, likewise."""
 
     request_timeout_max_s: Annotated[float, Field(ge=0.1, le=1e6)] = 60.0
     """A request is given up after this time, or after the shorter one for which its client
     waits."""
-
-    query_workers: Annotated[int, Field(ge=1, le=64)] = 2
-    """Threads that answer queries of the field, as many for distances and spheres, and as many for
-    segments, rays, ground and grids."""
-
-    max_query_points: Annotated[int, Field(ge=1, le=20_000_000)] = 1_000_000
-    """Points of one request for the field."""
-
-    max_search_points: Annotated[int, Field(ge=1, le=20_000_000)] = 250_000
-    """Points of one request that searches around points."""
 
     publish_period_s: Annotated[float, Field(ge=0.01, le=3600)] = 0.5
     """Time between epochs while the map changes."""
@@ -48,10 +38,8 @@ class ServiceSettings(BaseModel):
     the newest alone."""
 
     epochs_pinned: Annotated[int, Field(ge=0, le=1000)] = 8
-    """Older epochs that stay because they were asked for by number, of all clients together."""
-
-    client_pins: Annotated[int, Field(ge=1, le=1000)] = 3
-    """Epochs that one client may pin; of more, the one that it asked for longest ago goes."""
+    """Older epochs that stay because they were asked for by number; of more, the one that was asked
+    for longest ago is removed."""
 
     pin_s: Annotated[float, Field(ge=0, le=1e6)] = 30.0
     """Time for which an epoch stays after it was last asked for by number."""

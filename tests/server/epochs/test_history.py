@@ -1,14 +1,16 @@
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.servers import WAIT_S
 from triquad_format.errors import RefusedError
 from triquad_format.records.field_settings import FieldSettings
 from triquad_map.composition.field_view import in_one
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.history import EpochHistory
-from triquad_server.net.asking_client import asking_client
 from triquad_server.settings import ServiceSettings
 
 
@@ -24,10 +26,8 @@ def epoch(number):
     return Epoch("lab", number, FieldSettings(), (), in_one)
 
 
-def history(kept, pinned=0, pin_s=30.0, clock=None, client_pins=3):
-    settings = ServiceSettings(
-        epochs_kept=kept, epochs_pinned=pinned, pin_s=pin_s, client_pins=client_pins
-    )
+def history(kept, pinned=0, pin_s=30.0, clock=None):
+    settings = ServiceSettings(epochs_kept=kept, epochs_pinned=pinned, pin_s=pin_s)
     return EpochHistory(epoch(1), settings, clock or Clock())
 
 
@@ -94,56 +94,13 @@ def test_what_is_pinned_goes_also_where_no_newer_epoch_comes():
     assert is_gone(epochs, 1)
 
 
-def of_client(epochs, client, number):
-    """Whether a client that has a name is refused an epoch."""
-    token = asking_client.set(client)
-    try:
-        return is_gone(epochs, number)
-    finally:
-        asking_client.reset(token)
-
-
-def test_a_client_that_pins_too_many_loses_the_one_it_asked_for_longest_ago():
-    clock = Clock()
-    epochs = history(kept=1, pinned=8, clock=clock, client_pins=2)
+def test_of_too_many_pins_the_one_that_was_asked_for_longest_ago_goes():
+    epochs = history(kept=1, pinned=2)
     for number in range(1, 4):
-        epochs.add(epoch(number))
-        assert not of_client(epochs, "robot", number)
-        clock.now += 1
-    epochs.add(epoch(4))
-    assert [is_gone(epochs, number) for number in (1, 2, 3, 4)] == [True, False, False, False]
-
-
-@pytest.mark.parametrize("stranger", ["", "stranger"])
-def test_who_pins_every_epoch_takes_no_other_clients_pin(stranger):
-    clock = Clock()
-    epochs = history(kept=2, pinned=4, clock=clock, client_pins=2)
-    assert not of_client(epochs, "robot", 1)
-    for number in range(2, 40):
-        epochs.add(epoch(number))
-        assert not of_client(epochs, stranger, number)
-        clock.now += 5.0
-        assert not of_client(epochs, "robot", 1)
-    epochs.add(epoch(40))
-    assert not of_client(epochs, "late", 39), "there is room for one who comes later"
-    for number in range(41, 50):
-        epochs.add(epoch(number))
-        assert not of_client(epochs, stranger, number)
-        assert not of_client(epochs, "late", 39)
-        assert len(epochs.kept().epochs) <= 2 + 4
-
-
-def test_few_clients_with_many_pins_leave_one_to_whoever_comes_later():
-    epochs = history(kept=1, pinned=4, client_pins=3)
-    for number in range(1, 7):
-        epochs.add(epoch(number))
-        of_client(epochs, f"stranger-{number % 2}", number)
-    assert not of_client(epochs, "late", 6)
-    for number in range(7, 20):
-        epochs.add(epoch(number))
-        for client in range(2):
-            of_client(epochs, f"stranger-{client}", number)
-        assert not of_client(epochs, "late", 6)
+        epochs.get(number)
+        epochs.add(epoch(number + 1))
+        assert not is_gone(epochs, 1), "it is asked for again and again"
+    assert [kept.number for kept in epochs.kept().epochs] == [1, 3, 4]
 
 
 @pytest.mark.parametrize("by_view", [False, True])
@@ -173,19 +130,40 @@ def large(number, size):
     return made
 
 
-def test_older_epochs_have_a_share_of_the_memory_and_pinned_ones_half_of_it():
-    settings = ServiceSettings(epochs_kept=4, epochs_pinned=8, client_pins=8)
+def test_older_epochs_stay_while_they_fit_in_their_memory_and_first_those_asked_for():
+    settings = ServiceSettings(epochs_kept=4, epochs_pinned=8)
     epochs = EpochHistory(large(1, 100), settings, Clock(), older_bytes=400)
     for number in range(2, 10):
         epochs.add(large(number, 100))
     assert [one.number for one in epochs.kept().epochs] == [6, 7, 8, 9]
-    for number in range(10, 15):
-        of_client(epochs, "robot", number - 1)
+    for number in (7, 6):
+        epochs.get(number)
+    for number in range(10, 14):
         epochs.add(large(number, 100))
-    assert [one.number for one in epochs.kept().epochs] == [9, 10, 12, 13, 14]
-    epochs.add(large(15, 10_000))
-    epochs.add(large(16, 100))
-    assert [one.number for one in epochs.kept().epochs] == [9, 10, 13, 14, 16]
+    assert [one.number for one in epochs.kept().epochs] == [6, 7, 11, 12, 13]
+    epochs.add(large(14, 10_000))
+    epochs.add(large(15, 100))
+    assert [one.number for one in epochs.kept().epochs] == [6, 7, 12, 13, 15]
+
+
+def test_training_waits_while_an_epoch_is_asked_but_not_for_ever():
+    epochs, asked, answered = history(kept=1), threading.Event(), threading.Event()
+
+    def ask():
+        with epochs.view(0):
+            asked.set()
+            answered.wait(WAIT_S)
+
+    with ThreadPoolExecutor(1) as threads:
+        threads.submit(ask)
+        assert asked.wait(WAIT_S)
+        epochs.give_way(0.0)  # returns, however long it is asked
+        giving = threading.Thread(target=epochs.give_way, args=(WAIT_S,))
+        giving.start()
+        assert giving.is_alive()
+        answered.set()
+        giving.join(WAIT_S)
+        assert not giving.is_alive()
 
 
 def test_the_newest_never_goes():

@@ -222,16 +222,26 @@ def test_a_source_is_passed_over_until_it_falls_behind():
     assert queue.take().sequence == 2
 
 
-def test_pressure_rises_from_half_of_what_may_wait_to_where_scans_are_lost():
+def test_requests_give_way_while_a_source_is_about_to_lose_scans(monkeypatch):
+    monkeypatch.setattr(scan_queue, "_GIVE_WAY_S", servers.WAIT_S)
     queue = ScanQueue(limit=8)
-    pressures = []
-    for sequence in range(9):
-        pressures.append(queue.pressure())
-        queue.put(servers.scan(sequence, source="a"))
-    assert pressures[:5] == [0.0] * 5
-    assert pressures[5:] == sorted(set(pressures[5:]))
-    queue.put(servers.scan(0, source="b"))
-    assert pressures[-1] == queue.pressure() == 1.0
+    for sequence in range(4):
+        queue.put(servers.scan(sequence))
+    queue.give_way()  # returns at once
+    queue.put(servers.scan(4))
+    waiting = threading.Thread(target=queue.give_way)
+    waiting.start()
+    waiting.join(0.1)
+    assert waiting.is_alive()
+    queue.take()
+    waiting.join(servers.WAIT_S)
+    assert not waiting.is_alive()
+
+
+def test_requests_give_way_to_scans_for_a_moment_only():
+    queue = ScanQueue(limit=1)
+    queue.put(servers.scan(0))
+    queue.give_way()
 
 
 def test_scans_that_wait_are_bounded_in_bytes_over_all_sources():

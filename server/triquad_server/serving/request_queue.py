@@ -1,0 +1,133 @@
+"""The queue of requests: client sessions take turns at a few workers."""
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
+
+from triquad_format.wire.metrics_messages import QueueMetrics
+
+from triquad_server.fair_queue import FairQueue, Owner
+
+MOST_SENDING = 32
+"""Replies on their way to clients, which may not read them, each in a thread. Zenoh gives up a
+client that has taken nothing for five seconds."""
+
+_SENDING_EACH = 2
+"""Replies on their way to one client: no more of its requests are worked at until it takes one."""
+
+_SESSIONS_WAITING = 8
+"""Client sessions of which as many requests may wait as may of each; more share that."""
+
+_REPLY_BYTES = 32_000_000
+"""Of all replies on their way; a large one beyond is refused."""
+
+_SMALL_REPLY_BYTES = 262_144
+"""A reply of no more, such as a planner's, never is."""
+
+
+class Owned(Protocol):
+    """What waits in the queue."""
+
+    owner: Owner
+
+
+RequestT = TypeVar("RequestT", bound=Owned)
+
+
+@dataclass(frozen=True)
+class QueueLimits:
+    """Bounds of what waits."""
+
+    requests_each: int  # of one client session
+    nbytes: int  # of the payloads of all
+
+
+class RequestQueue(Generic[RequestT]):
+    """A bounded queue of requests, of which one is worked at by each worker; safe for any thread.
+
+    A session has at most half of the workers, so that one is left for the next. A request is
+    worked at until its reply is made: while that is on its way, another may begin.
+    """
+
+    def __init__(
+        self, begin: Callable[[RequestT], None], *, workers: int, limits: QueueLimits
+    ) -> None:
+        """``begin`` has a thread work at a request, and returns at once."""
+        self._begin = begin
+        self._workers = workers
+        self._most_each = max(1, workers // 2)
+        self._lock = threading.Lock()
+        self._waiting: FairQueue[RequestT] = FairQueue(
+            limits.requests_each * _SESSIONS_WAITING,
+            limits.nbytes,
+            limits.requests_each,
+            newest_go=True,
+        )
+        self._working: set[RequestT] = set()
+        self._sending: dict[RequestT, int] = {}  # with the bytes of the reply
+
+    @property
+    def metrics(self) -> QueueMetrics:
+        """What waits for a worker."""
+        with self._lock:
+            return QueueMetrics(len(self._waiting), self._waiting.limit)
+
+    def put(self, request: RequestT, nbytes: int) -> list[RequestT]:
+        """Have a request wait for a worker; returns those that are too many now."""
+        with self._lock:
+            excess = self._waiting.put(request.owner, request, nbytes)
+            self._fill()
+            return excess
+
+    def send(self, request: RequestT, nbytes: int) -> bool:
+        """Free the worker of a request whose reply is made and about to be sent.
+
+        Returns whether it may be: a large one may not while others take the memory. Of requests
+        that are not worked at any more, every reply may.
+        """
+        with self._lock:
+            if request not in self._working:
+                return True
+            on_their_way = sum(self._sending.values())
+            if (
+                nbytes > _SMALL_REPLY_BYTES
+                and on_their_way
+                and on_their_way + nbytes > _REPLY_BYTES
+            ):
+                return False
+            self._working.discard(request)
+            self._sending[request] = nbytes
+            self._fill()
+            return True
+
+    def finish(self, request: RequestT) -> None:
+        """End a request: its reply is sent, or another thread will answer it later."""
+        with self._lock:
+            self._working.discard(request)
+            self._sending.pop(request, None)
+            self._fill()
+
+    def clear(self) -> list[RequestT]:
+        """Remove all requests that wait."""
+        with self._lock:
+            return self._waiting.clear()
+
+    def _fill(self) -> None:
+        """Have requests worked at while there are workers and replies can be sent."""
+        while len(self._working) < self._workers and len(self._sending) < MOST_SENDING:
+            request = self._waiting.take(self._may_begin)
+            if request is None:
+                return
+            self._working.add(request)
+            self._begin(request)
+
+    def _may_begin(self, request: RequestT) -> bool:
+        owner = request.owner
+        working = sum(one.owner.group == owner.group for one in self._working)
+        sending = [one.owner for one in self._sending if one.owner.group == owner.group]
+        return (
+            working < self._most_each
+            and len(sending) < MOST_SENDING // 2
+            and sending.count(owner) < _SENDING_EACH
+        )

@@ -1,0 +1,35 @@
+"""What is refused while other clients do not read their refusals."""
+
+import threading
+
+from support.servers import WAIT_S
+from triquad_server.serving import refusals as module
+from triquad_server.serving.refusals import Refusals
+
+
+class Request:
+    """Is refused once its client reads."""
+
+    def __init__(self, size, reads):
+        self.size = size
+        self.refused_by = None
+        self._reads = reads
+
+    def refuse(self, code, text):
+        self._reads.wait(WAIT_S)
+        self.refused_by = threading.current_thread()
+
+
+def test_large_requests_that_are_refused_do_not_pile_up_behind_who_reads_nothing():
+    reads, at_once = threading.Event(), threading.Event()
+    at_once.set()
+    refusals = Refusals()
+    stuck = [Request(100, reads) for _ in range(module._THREADS)]
+    large = [Request(module._MOST_BYTES // 2 + 1, at_once) for _ in range(10)]
+    for request in (*stuck, *large):
+        refusals.add(request, "too_large", "")
+    assert sum(request.refused_by is None for request in large) == 1
+    assert large[-1].refused_by is threading.current_thread()
+    reads.set()
+    refusals.close()
+    assert all(request.refused_by for request in (*stuck, *large))
