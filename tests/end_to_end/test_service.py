@@ -263,7 +263,7 @@ def test_requests_beyond_the_queue_are_told_to_come_back(monkeypatch):
         return answer(queries, request)
 
     monkeypatch.setattr(Answers, "answer", answer_later)
-    limits = ServiceSettings(request_queue=1, query_workers=1)
+    limits = ServiceSettings(request_queue=1)
     settings = servers.SMALL.model_copy(update={"service": limits})
     key = keys.operation_key(servers.MAP, keys.SDF)
     payload = codec.encode(SdfRequest(np.zeros(3), np.zeros((1, 3), np.float32), True, 0))

@@ -56,9 +56,8 @@ from triquad_client.calls.parts import in_parts, joined, offsets_from, origin_of
 from triquad_client.checks import Bounds, PoseLike
 from triquad_client.net.call import NEWEST, Ask, Call, ask, offload, retried
 
-_MOST_WAYS = 2_000
-"""Segments, rays or columns down to the ground of one request, which takes a server some tens of
-milliseconds."""
+_MOST_WAYS = 1_000
+"""Segments, rays or columns down to the ground of one request, however short they are."""
 
 
 @dataclass(frozen=True)

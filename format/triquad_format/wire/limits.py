@@ -16,17 +16,18 @@ MAX_ITERATIONS = 200
 """Steps of an alignment."""
 
 MAX_QUERY_POINTS = 100_000
-"""Points of one request for the field, which takes a server some tens of milliseconds of one core;
-clients ask about more in several requests."""
+"""Points of one request for the field, which takes a server a tenth of a second of one core at
+most; clients ask about more in several requests."""
 
 MAX_SEARCHES = 20_000
 """Points of one request around which something is searched for, for as long. Cells of a grid and
 points of a scan count as one each."""
 
-RAY_M_PER_SEARCH = 10.0
-"""Metres of a ray, or below a point on the way down to the ground, that count as one search."""
+RAY_M_PER_SEARCH = 2.0
+"""Metres of a ray, or below a point on the way down to the ground, that count as one search: 2,000
+m of rays take about as long as 1,000 distances."""
 
-SEGMENT_M_PER_SEARCH = 1.0
+SEGMENT_M_PER_SEARCH = 0.25
 """Metres of a segment that count as one search: it is walked in shorter steps than a ray."""
 
 LEVELS = 3

@@ -18,4 +18,4 @@ class MemorySettings(BaseModel):
 
     epochs_bytes: Annotated[int, Field(ge=0, le=2**50)] = 300_000_000
     """Of older epochs that can be asked for by number, beyond what they share with newer ones;
-    those that are pinned have at most half of it."""
+    those that were asked for last stay first."""
