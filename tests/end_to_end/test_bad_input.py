@@ -219,10 +219,10 @@ def test_repeated_and_overtaken_scans_are_counted(peer, client, scan):
         (keys.SDF, SdfRequest(ORIGIN, ONE_POINT, False, -1), "epoch_gone"),
         (
             keys.SDF,
-            SdfRequest(ORIGIN, np.zeros((1_900_000, 3), np.float32), False, 0),
+            SdfRequest(ORIGIN, np.zeros((900_000, 3), np.float32), False, 0),
             "too_large",
         ),
-        *((operation, bytes(12_010_000), "too_large") for operation in OPERATIONS),
+        *((operation, bytes(6_010_000), "too_large") for operation in OPERATIONS),
         (keys.SEGMENTS, segments(2_000, 900.0), "too_large"),
         (keys.SEGMENTS, segments(1, 1_001.0), "bad_request"),
         (keys.RAYS, rays(100_000, 1_000.0), "too_large"),

@@ -3,7 +3,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.servers import WAIT_S
 from triquad_format.errors import RefusedError
@@ -27,8 +27,8 @@ def epoch(number):
 
 
 def history(kept, pinned=0, pin_s=30.0, clock=None):
-    settings = ServiceSettings(epochs_kept=kept, epochs_pinned=pinned, pin_s=pin_s)
-    return EpochHistory(epoch(1), settings, clock or Clock())
+    kept_for = ServiceSettings(epochs_kept=kept, epochs_pinned=pinned, pin_s=pin_s)
+    return EpochHistory(epoch(1), kept_for, clock or Clock())
 
 
 def is_gone(epochs, number):
@@ -131,8 +131,8 @@ def large(number, size):
 
 
 def test_older_epochs_stay_while_they_fit_in_their_memory_and_first_those_asked_for():
-    settings = ServiceSettings(epochs_kept=4, epochs_pinned=8)
-    epochs = EpochHistory(large(1, 100), settings, Clock(), older_bytes=400)
+    kept_for = ServiceSettings(epochs_kept=4, epochs_pinned=8)
+    epochs = EpochHistory(large(1, 100), kept_for, Clock(), older_bytes=400)
     for number in range(2, 10):
         epochs.add(large(number, 100))
     assert [one.number for one in epochs.kept().epochs] == [6, 7, 8, 9]
@@ -193,6 +193,7 @@ DEEDS = st.one_of(
 )
 
 
+@settings(deadline=None)
 @given(st.integers(1, 4), st.integers(0, 4), st.lists(DEEDS, max_size=60))
 def test_whatever_is_asked_when_an_epoch_goes_only_where_it_may(kept, pinned, deeds):
     pin_s = 10.0
@@ -224,6 +225,7 @@ def test_whatever_is_asked_when_an_epoch_goes_only_where_it_may(kept, pinned, de
         assert epochs.newest.number == newest
 
 
+@settings(deadline=None)
 @given(st.integers(1, 4), st.integers(0, 4), st.integers(5, 30), st.data())
 def test_no_more_stay_than_may(kept, pinned, count, data):
     epochs = history(kept, pinned)
