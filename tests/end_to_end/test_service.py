@@ -17,6 +17,7 @@ from triquad_format.wire.messages import (
     MeshRequest,
     SdfRequest,
     ServerStatus,
+    StatusRequest,
 )
 from triquad_format.wire.tile_codec import decode_tile
 from triquad_map.questions.answers import Answers
@@ -277,5 +278,8 @@ def test_requests_beyond_the_queue_are_told_to_come_back(monkeypatch):
         for _ in range(5):
             (reply,) = session.get(key, payload=payload, timeout=servers.WAIT_S)
             assert codec.decode(ErrorReply, reply.err.payload.to_bytes()).code == "busy"
+        status = keys.operation_key(servers.MAP, keys.STATUS)
+        (reply,) = session.get(status, payload=codec.encode(StatusRequest()))
+        assert reply.ok is not None, "how the server is doing is told however many questions wait"
         go_on.set()
         assert [reply.ok is not None for replies in answered for reply in replies] == [True, True]

@@ -95,7 +95,7 @@ class EpochHistory:
         """
         with self._lock:
             epoch = self._get(number)
-            if number:  # whoever pins may exceed a limit
+            if number:  # one more pin may exceed a limit
                 self._tidy()
             return epoch
 
@@ -122,7 +122,7 @@ class EpochHistory:
                     self._lock.notify_all()
 
     def give_way(self, limit_s: float) -> None:
-        """Return once no epoch is asked, or after ``limit_s``: whoever trains never starves."""
+        """Return once no epoch is asked, or after ``limit_s``: training never starves."""
         with self._lock:
             self._lock.wait_for(lambda: not self._viewed, limit_s)
 

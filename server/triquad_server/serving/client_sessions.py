@@ -62,7 +62,7 @@ class ClientSessions:
         return Source(self._owner(origin), now + wait_s + _GRACE_S)
 
     def have_left(self, owner: Owner) -> bool:
-        """Whether the link to the client that a request is of is gone.
+        """Whether the link to the client that a request is of is closed.
 
         A request may arrive before its link is known: a link that never was counts for nothing.
         """

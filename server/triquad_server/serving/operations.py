@@ -31,7 +31,7 @@ _WORKERS = max(2, THREADS)  # for questions: one per core
 _ADMINISTRATION_WORKERS = 2
 _PLAIN_BYTES = 16_384  # of a request that holds neither points nor tiles
 _SLOW = "slow"
-"""The group of all requests that may take seconds: one of them is worked at, whoever asks."""
+"""The group of all requests that may take seconds: one of all clients is worked at."""
 
 _STOPPING = "the server is stopping"
 
