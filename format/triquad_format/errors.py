@@ -65,10 +65,6 @@ class DamagedMapFileError(MapFileError):
     """A map file whose bytes are incomplete or fail a check."""
 
 
-class NoIndexError(MapFileError):
-    """A map file that can only be read as a whole: another tool rewrote it."""
-
-
 class UnsupportedMapFileError(MapFileError):
     """A valid map file that needs a newer reader; the text names what is missing."""
 

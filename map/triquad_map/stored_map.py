@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from triquad_format.mapfile.container import RandomAccess
 from triquad_format.mapfile.index import FileBytes, MapIndex, OpenFile, files_in, named
 from triquad_format.mapfile.manifest import Entry, Manifest
-from triquad_format.mapfile.mcap.reader import RandomAccess
 from triquad_format.mapfile.parts.part import (
     EVIDENCE,
     FIELD_TOPICS,
@@ -57,7 +57,6 @@ class StoredMap:
         """The map in a file; other files that it needs lie in the same folder.
 
         Raises:
-            NoIndexError: only :func:`triquad_format.mapfile.reader.read_map` can read the file.
             MapFileError: it is not a map file, is damaged, or needs a newer reader.
             OSError: it cannot be read.
         """

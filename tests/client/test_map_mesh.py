@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 from support.exact_maps import SEEN_M, exact_map, flat, table
-from support.map_records import with_margins
+from support.map_records import with_support
 from triquad_client import ClosedError, InvalidInputError, Mesh, OfflineMap, open_map
 from triquad_client.offline import map_mesh
 from triquad_format.mapfile.writer import write_map
@@ -76,7 +76,7 @@ def test_far_regions_are_meshed_as_near_ones() -> None:
 
 
 def test_surface_is_where_the_mesh_has_faces() -> None:
-    with OfflineMap(with_margins(exact_map(flat(0.1)))) as offline:
+    with OfflineMap(with_support(exact_map(flat(0.1)))) as offline:
         middles = centroids(offline.mesh())
         assert offline.has_surface(middles).all()
         x, y = np.random.default_rng(0).uniform(-SEEN_M - 1, SEEN_M + 1, (2, 2_000))

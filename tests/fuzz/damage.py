@@ -1,24 +1,9 @@
 """Damage of map files. It must be found: the file reads back as it was, or is refused."""
 
 import numpy as np
-from fuzz.choices import (
-    NUMBERS,
-    Draw,
-    Mutation,
-    bomb_bytes,
-    chance,
-    flipped,
-    number,
-    place,
-    shuffle,
-)
-from fuzz.mcap_edit import RawRecord, checksummed, chunk, chunk_records, packed, records_of
+from fuzz.choices import Draw, Mutation, bomb_bytes, flipped, number, place, shuffle
 from hypothesis import strategies as st
-from support.mapfile_edit import RawPart, metadata_of, parts_of, rebuild
-from triquad_format.mapfile.mcap.records import CHUNK, MAGIC
-
-CHUNK_HEAD = ((16, 8), (24, 4), (28, 4), (32, 8), (36, 8), (40, 8))
-"""Offset and size of the numbers in the head of a chunk."""
+from support.mapfile_edit import parts_of, rewritten, with_fitting_crcs
 
 
 def flip_bits(draw: Draw, data: bytes) -> bytes:
@@ -36,87 +21,43 @@ def cut(draw: Draw, data: bytes) -> bytes:
     return cuts[place(draw, cuts)]
 
 
-def change_heads(draw: Draw, data: bytes) -> bytes:
-    """A number in the head of a record or in the index is another; MCAP's checksums fit."""
-    records = records_of(data)
-    if chance(draw, 30):
-        return checksummed(records, lambda summary: _with_number(draw, summary, 8))
-    at = place(draw, records)
-    opcode, content = records[at]
-    if opcode == CHUNK and chance(draw, 80):
-        content = _patched(content, *draw(st.sampled_from(CHUNK_HEAD)), number(draw))
-    elif content and chance(draw, 50):
-        content = flipped(draw, content, 2)
-    else:
-        content = _with_number(draw, content, 4)
-    records[at] = RawRecord(opcode, content)
-    return checksummed(records)
+def change_numbers(draw: Draw, data: bytes) -> bytes:
+    """A number at any place is another, most of them at the end; MCAP's checksums fit."""
+    near_end = st.integers(max(0, len(data) - 2000), len(data) - 8)
+    at = draw(near_end | st.integers(0, len(data) - 8))
+    size = draw(st.sampled_from([1, 2, 4, 8]))
+    new = number(draw).to_bytes(8, "little")[:size]
+    return with_fitting_crcs(data[:at] + new + data[at + size :])
 
 
-def change_lengths(draw: Draw, data: bytes) -> bytes:
-    """The length of a record is another, in the file or within a chunk."""
-    records = records_of(data)
-    if chance(draw, 50):
-        starts = np.cumsum([len(MAGIC), *(len(packed(record)) for record in records)]).tolist()
-        return _patched(data, starts[place(draw, starts)] + 1, 8, number(draw))
-    at = draw(st.sampled_from([i for i, record in enumerate(records) if record.opcode == CHUNK]))
-    inner = chunk_records(records[at])
-    length = draw(st.sampled_from(NUMBERS) | st.integers(-40, 40).map(len(inner).__add__))
-    near = st.integers(-3, 3).map(len(inner).__add__)
-    declared = draw(st.none() | near | st.sampled_from(NUMBERS))
-    changed = _patched(inner, 1, 8, max(0, length))
-    records[at] = chunk(changed, compressed=chance(draw, 50), declared=declared)
-    return checksummed(records)
-
-
-def shuffle_records(draw: Draw, data: bytes) -> bytes:
-    """Records are missing, doubled, swapped or in each other's place; MCAP's checksums fit."""
-    records = records_of(data)
-    for _ in range(draw(st.integers(1, 2))):
-        shuffle(draw, records)
-    return checksummed(records)
+def flip_bits_within_crcs(draw: Draw, data: bytes) -> bytes:
+    """Some bits are flipped anywhere; the checksums of data and summary fit."""
+    return with_fitting_crcs(flipped(draw, data, 8))
 
 
 def change_parts(draw: Draw, data: bytes) -> bytes:
-    """Parts are others, missing, doubled or swapped; MCAP's checksums fit, digests do not."""
-    *parts, manifest = parts_of(data)
-    at = place(draw, parts)
-    if parts[at].payload and chance(draw, 70):
-        parts[at] = parts[at]._replace(payload=flipped(draw, parts[at].payload, 3))
+    """Parts are others, doubled or swapped; MCAP's checksums fit, digests do not."""
+    payloads = [part.payload for part in parts_of(data)[:-1]]
+    at = place(draw, payloads)
+    if payloads[at] and draw(st.booleans()):
+        payloads[at] = flipped(draw, payloads[at], 3)
     else:
-        shuffle(draw, parts)
-    return rebuild([*parts, manifest], metadata_of(data))
+        others = list(payloads)
+        shuffle(draw, others)
+        payloads = (others + payloads[-1:])[: len(payloads)]
+    return rewritten(data, payloads=dict(enumerate(payloads)), fitting=False)
 
 
 def add_bombs(draw: Draw, data: bytes) -> bytes:
-    """Parts or a chunk that the manifest does not list, and that take far more than their file."""
-    size = bomb_bytes(draw)
-    if chance(draw, 50):
-        extra = chunk(
-            bytes(size), compressed=True, declared=draw(st.none() | st.sampled_from(NUMBERS))
-        )
-        return checksummed([*records_of(data), extra])
-    *parts, manifest = parts_of(data)
-    parts += [RawPart("/triquad/x", b"")] * (size // 1024)
-    return rebuild([*parts, manifest], metadata_of(data))
-
-
-def _with_number(draw: Draw, data: bytes, size: int) -> bytes:
-    """Another number at any place."""
-    if len(data) < size:
-        return data + b"\0"
-    return _patched(data, draw(st.integers(0, len(data) - size)), size, number(draw))
-
-
-def _patched(data: bytes, at: int, size: int, number: int) -> bytes:
-    return data[:at] + number.to_bytes(8, "little")[:size] + data[at + size :]
+    """A part takes far more than its file, and is not the one that is listed."""
+    at = place(draw, parts_of(data)[:-1])
+    return rewritten(data, payloads={at: bytes(bomb_bytes(draw))}, fitting=False)
 
 
 DAMAGE: tuple[Mutation, ...] = (
     flip_bits,
     cut,
-    change_heads,
-    change_lengths,
-    shuffle_records,
+    change_numbers,
+    flip_bits_within_crcs,
     change_parts,
 )

@@ -11,8 +11,7 @@ import msgpack
 import numpy as np
 from fuzz.choices import NUMBERS, Draw, Mutation, bomb_bytes, chance, flipped, place, shuffle
 from hypothesis import strategies as st
-from mcap.writer import CompressionType
-from support.mapfile_edit import parts_of, with_part
+from support.mapfile_edit import parts_of, rewritten
 
 VALUES: tuple[Any, ...] = (
     *NUMBERS, -1, -(2**31), -(2**63), 0.5, -1.0, 1e300, math.nan, math.inf, True, None, "", "x",
@@ -33,14 +32,13 @@ def forge_values(draw: Draw, data: bytes) -> bytes:
 def forge_manifest(draw: Draw, data: bytes) -> bytes:
     """The manifest tells something else."""
     change = _other_values if chance(draw, 67) else _other_bytes
-    manifest = parts_of(data)[-1]
-    return with_part(data, -1, change(draw, manifest.payload))
+    return rewritten(data, manifest_payload=lambda payload: change(draw, payload))
 
 
 def forge_bombs(draw: Draw, data: bytes) -> bytes:
     """A part takes far more memory than its file; digests fit."""
     parts = parts_of(data)
-    at = place(draw, parts) - len(parts)
+    at = place(draw, parts)
     size = bomb_bytes(draw)
     how = draw(st.sampled_from(["zeros", "nested", "column"]))
     if how == "zeros":
@@ -50,7 +48,9 @@ def forge_bombs(draw: Draw, data: bytes) -> bytes:
         payload = _nested(item, size)
     else:
         payload = _with_column(draw, parts[at].payload, size)
-    return with_part(data, at, payload)
+    if at == len(parts) - 1:
+        return rewritten(data, manifest_payload=lambda _: payload)
+    return rewritten(data, payloads={at: payload})
 
 
 def _nested(item: bytes, size: int) -> bytes:
@@ -64,8 +64,7 @@ def _nested(item: bytes, size: int) -> bytes:
 def _forged(draw: Draw, data: bytes, change: Mutation) -> bytes:
     parts = parts_of(data)
     at = place(draw, parts[:-1])
-    compression = CompressionType.ZSTD if chance(draw, 20) else CompressionType.NONE
-    return with_part(data, at, change(draw, parts[at].payload), compression=compression)
+    return rewritten(data, payloads={at: change(draw, parts[at].payload)})
 
 
 def _other_bytes(draw: Draw, payload: bytes) -> bytes:

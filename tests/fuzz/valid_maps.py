@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from support import golden
 from support.map_records import (
     random_record,
     with_integers,
-    with_levels,
-    with_margins,
-    with_outcomes,
     with_progress,
     with_rays,
+    with_support,
 )
 from support.mapfile_edit import write_pair
 from triquad_format.mapfile.reader import read_map
@@ -25,7 +24,6 @@ from triquad_format.records.region import MapRecord
 from triquad_map.stored_map import StoredMap
 from triquad_server.mesh.preview import previews_of
 
-GOLDEN = Path(__file__).parents[1] / "golden"
 TINY = FieldSettings(
     depth=6, feature_levels=1, feature_size=2, frequencies=1, hidden=2, logit_scale_m=0.5
 )
@@ -64,24 +62,16 @@ class ValidMap:
 
 def valid_maps(folder: Path) -> list[ValidMap]:
     """Maps of every kind, each written into a folder of its own."""
-    plain = random_record(settings=TINY, points=3, training=False)
+    plain = with_support(random_record(settings=TINY, points=3, training=False))
+    trained = with_rays(with_support(random_record(settings=TINY, points=3)), rays=12)
     complete = {
         "plain": plain,
-        "training": random_record(settings=TINY, points=3),
+        "training": with_progress(trained, MapProgress(60, 116_000_000, 0.25)),
         "integers": with_integers(plain),
-        "levels": with_levels(plain),
-        "outcomes": with_outcomes(plain),
-        "margins": with_margins(plain),
-        "rays": with_rays(random_record(settings=TINY, points=3), rays=12),
-        "progress": with_progress(
-            random_record(settings=TINY, points=3), MapProgress(60, 116_000_000, 0.25)
-        ),
     }
     maps = [_written(folder / kind, record) for kind, record in complete.items()]
     maps.append(_written_pair(folder / "delta", plain))
-    maps.append(_copied(folder / "golden", "map_v1_next.triquad", "map_v1.triquad"))
-    maps.append(_copied(folder / "golden-levels", "map_v1_levels.triquad"))
-    maps.append(_copied(folder / "golden-outcomes", "map_v1_outcomes.triquad"))
+    maps.append(_copied(folder / "golden", golden.NEXT, golden.TRAINED))
     return maps
 
 
@@ -102,7 +92,7 @@ def _written_pair(folder: Path, base: MapRecord) -> ValidMap:
 def _copied(folder: Path, *names: str) -> ValidMap:
     folder.mkdir()
     for name in names:
-        shutil.copy(GOLDEN / name, folder)
+        shutil.copy(golden.FOLDER / name, folder)
     return _found(folder / names[0])
 
 

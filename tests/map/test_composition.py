@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 import pytest
-from support.map_records import random_record, with_levels
+from support.map_records import evidence_of, random_record, with_support
 from triquad_format.records import morton
 from triquad_format.records.field_settings import RegionIndex
-from triquad_format.records.region import BLOCK_BYTES, Evidence, MapRecord
+from triquad_format.records.region import BLOCK_BYTES, MapRecord
 from triquad_map.composition.region import no_surfels
 from triquad_map.reference.evaluator import MapEvaluator
 
@@ -56,7 +56,7 @@ def widely_seen(record: MapRecord) -> MapRecord:
     codes = np.arange(side**3)
     masks = np.full((len(codes), BLOCK_BYTES), 255, np.uint8)
     masks[::7] = np.random.default_rng(0).integers(0, 256, masks[::7].shape)
-    evidence = Evidence(codes, np.zeros_like(masks), masks)
+    evidence = evidence_of(codes, np.zeros_like(masks), masks)
     regions = tuple(dataclasses.replace(region, evidence=evidence) for region in record.regions)
     return dataclasses.replace(record, regions=regions)
 
@@ -85,7 +85,7 @@ def test_the_nearest_unknown_space_may_lie_in_another_region(spread_m: float) ->
 def test_the_nearest_surface_is_that_of_the_region_where_it_is_nearest(
     indices: tuple[RegionIndex, ...],
 ) -> None:
-    record = with_levels(random_record(4, indices=indices, points=60, training=False))
+    record = with_support(random_record(4, indices=indices, points=60, training=False))
     leaf_m = record.settings.leaf_m
     points = np.random.default_rng(5).uniform(-20, 30, (200, 3))
     found = MapEvaluator(record).nearest_surface(points, 9.0)
@@ -103,7 +103,7 @@ def test_the_nearest_surface_is_that_of_the_region_where_it_is_nearest(
 
 
 def test_confidence_fades_with_the_age_since_anything_was_seen_anywhere() -> None:
-    record = with_levels(random_record(4, indices=TWO, points=60, training=False))
+    record = with_support(random_record(4, indices=TWO, points=60, training=False))
     old, new = record.regions
     seen_s = [
         np.where(region.evidence.surface.any(axis=1), when, 0)

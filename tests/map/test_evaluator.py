@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 import pytest
-from support.map_records import SMALL, random_record
+from support.map_records import SMALL, evidence_of, random_record
 from triquad_format.errors import FormatError
 from triquad_format.records import morton
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import AXES, Evidence, MapRecord, VertexTable
+from triquad_format.records.region import AXES, MapRecord, VertexTable
 from triquad_format.records.status import Status
 from triquad_map.asked import NotAskedError
 from triquad_map.reference import evaluator
@@ -237,7 +237,7 @@ def with_evidence(surface_voxels, free_voxels):
             row = np.searchsorted(codes, morton.encode(np.array([x, y, z]) // 8))
             masks[kind, row, x % 8 * 8 + y % 8] |= 1 << z % 8
     record = random_record(9)
-    evidence = Evidence(codes, masks[0], masks[1])
+    evidence = evidence_of(codes, masks[0], masks[1])
     region = dataclasses.replace(record.regions[0], evidence=evidence)
     return dataclasses.replace(record, regions=(region,))
 
@@ -273,13 +273,11 @@ def test_ghost_cells_are_unknown():
 def test_status_is_of_the_owner():
     """In an overlap the nearer region's evidence counts, and only that."""
     record = random_record(10, indices=PAIR)
-    blank = dataclasses.replace(
-        record.regions[1].evidence, surface=record.regions[1].evidence.free * 0
-    )
-    blank = dataclasses.replace(blank, free=blank.surface)
+    seen = record.regions[1].evidence
+    blank = evidence_of(seen.codes, seen.free * 0, seen.free * 0)
     full = dataclasses.replace(
         record.regions[0],
-        evidence=Evidence(
+        evidence=evidence_of(
             np.arange(512), np.full((512, 64), 255, np.uint8), np.full((512, 64), 255, np.uint8)
         ),
     )

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.exact_maps import exact_map, flat, table
-from support.map_records import SMALL, random_record, with_levels
+from support.map_records import SMALL, random_record, with_support
 from triquad_format.records.region import MapRecord
 from triquad_format.records.status import Status
 from triquad_map.compiled.evidence.live_evidence import LiveEvidence
@@ -246,7 +246,7 @@ def test_the_blended_field_of_several_regions_is_the_same(seed, indices):
 @given(st.integers(0, 10**6), st.sampled_from([((0, 0, 0),), TWO, APART]))
 @settings(max_examples=10, deadline=None)
 def test_maps_of_several_regions_answer_alike(seed, indices):
-    record = with_levels(random_record(seed, indices=indices, points=80, training=False))
+    record = with_support(random_record(seed, indices=indices, points=80, training=False))
     points = around(record, 300, seed)
     have, want = (distances(v, points, DistanceOptions(6.0)) for v in both(record))
     np.testing.assert_array_equal(have.status, want.status)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.map_records import SMALL, assert_same, random_record, with_outcomes
+from support.map_records import SMALL, assert_same, random_record, with_support
 from support.mapfile_edit import (
     edited,
     file_bytes,
@@ -28,7 +28,7 @@ from triquad_map.compiled.evidence.outcomes import outcome_codes
 CUBES = dataclasses.replace(SMALL, depth=9)
 """Two cubes to a side."""
 
-RECORD = with_outcomes(
+RECORD = with_support(
     random_record(21, settings=CUBES, indices=((0, 0, 0), (1, 0, 0)), points=500)
 )
 
@@ -175,7 +175,7 @@ def test_cubes_without_them_read_as_zero():
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 999))
 def test_masked_voxels_take_their_levels_with_them(seed):
-    evidence = with_outcomes(record_of(blocks(seed, 8)), seed).regions[0].evidence
+    evidence = with_support(record_of(blocks(seed, 8)), seed).regions[0].evidence
     rng = np.random.default_rng(seed)
     mask = rng.integers(0, 256, evidence.surface.shape).astype(np.uint8)
     mask[rng.random(len(mask)) < 0.5] = 0
@@ -201,7 +201,7 @@ def test_a_crop_keeps_the_levels_of_what_it_keeps():
 
 def test_what_a_region_owns_keeps_its_levels():
     whole = random_record(4, points=4000)
-    region = with_outcomes(whole).regions[0]
+    region = with_support(whole).regions[0]
     owned = owned_evidence(whole.settings, region)
     assert 0 < len(owned.levels) < len(region.evidence.levels)
     assert_part_of(owned, region.evidence)

@@ -5,9 +5,10 @@ from pathlib import Path
 
 from support.map_records import random_record
 from triquad_format.mapfile.checkpoint_folder import checkpoint_name
-from triquad_format.mapfile.manifest import FileRef
+from triquad_format.mapfile.manifest import Entry
 from triquad_format.mapfile.metadata import MapFacts
 from triquad_format.mapfile.parts.pack import pack_record
+from triquad_format.mapfile.parts.part import PartKey
 from triquad_format.mapfile.writer import write_parts
 from triquad_format.records.region import MapRecord
 
@@ -25,14 +26,15 @@ def map_at(epoch: int) -> MapRecord:
 
 def write_checkpoints(folder: Path, epochs: tuple[int, ...]) -> list[Path]:
     """A complete checkpoint, then deltas, an hour apart; their files."""
-    known, paths = {}, []
+    known: dict[PartKey, Entry] = {}
+    paths = []
     for hours, epoch in enumerate(epochs):
         record = map_at(epoch)
         stamp_ns = START_NS + hours * HOUR_NS
         path = folder / checkpoint_name(epoch, complete=not known)
-        facts = MapFacts(record.name, epoch, record.settings)
+        facts = MapFacts.of(record)
         parts = pack_record(record, "<f2", {})
         written = write_parts(path, facts, parts, stamp_ns=stamp_ns, known=known)
-        known = written.manifest.elsewhere(FileRef(path.name, written.manifest_sha256))
+        known = written.manifest.elsewhere(path.name)
         paths.append(path)
     return paths

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
+from support.map_records import evidence_of
 from triquad_format.records import morton
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
 from triquad_format.records.region import (
@@ -88,7 +89,7 @@ def _evidence(height: Height) -> Evidence:
     free = np.concatenate([surface + [0, 0, up] for up in range(1, _SEEN_ABOVE + 1)])
     blocks = np.concatenate([surface, free]) // BLOCK_VOXELS
     codes = np.unique(morton.encode(blocks))
-    return Evidence(codes, _masks(codes, surface), _masks(codes, free))
+    return evidence_of(codes, _masks(codes, surface), _masks(codes, free))
 
 
 def _masks(codes: NDArray[np.int64], voxels: NDArray[np.int64]) -> NDArray[np.uint8]:

@@ -1,9 +1,8 @@
 """Map files damaged at a chosen place."""
 
-import io
 from dataclasses import dataclass
 
-from mcap.reader import make_reader
+from support.mapfile_edit import manifest_of, metadata_of
 
 
 @dataclass(frozen=True)
@@ -14,21 +13,25 @@ class Chunk:
     start: int
     end: int
 
-
-def chunks(data):
-    """The chunks of a file, one to a part, in their order."""
-    summary = make_reader(io.BytesIO(data)).get_summary()
-    return [
-        Chunk(
-            summary.channels[next(iter(index.message_index_offsets))].topic,
-            index.chunk_start_offset,
-            index.chunk_start_offset + index.chunk_length,
-        )
-        for index in summary.chunk_indexes
-    ]
+    @property
+    def middle(self) -> int:
+        """A place within its data."""
+        return (self.start + self.end) // 2
 
 
-def flipped(data, *places):
+def chunks(data: bytes) -> list[Chunk]:
+    """The chunks of a file, one to a part, in their order; that of the manifest is the last."""
+    own = [(e.key.topic, e.offset, e.offset + e.stored) for e in manifest_of(data).own]
+    start, size = map(int, metadata_of(data)["manifest"].split())
+    return [Chunk(*place) for place in (*own, ("/triquad/manifest", start, start + size))]
+
+
+def first_chunk(data: bytes, topic: str) -> Chunk:
+    """Where the first part of a topic lies."""
+    return next(chunk for chunk in chunks(data) if chunk.topic == topic)
+
+
+def flipped(data: bytes, *places: int) -> bytes:
     """The bytes with one bit changed at each of these places."""
     corrupt = bytearray(data)
     for place in places:
@@ -36,6 +39,6 @@ def flipped(data, *places):
     return bytes(corrupt)
 
 
-def zeroed(data, first, last):
+def zeroed(data: bytes, first: int, last: int) -> bytes:
     """The bytes with zeros from ``first`` to before ``last``."""
     return data[:first] + bytes(len(data[first:last])) + data[last:]

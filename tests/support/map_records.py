@@ -12,6 +12,7 @@ from triquad_format.records.region import (
     AXES,
     BLOCK_BYTES,
     MARGIN_BITS,
+    MAX_LEVEL,
     OUTCOME_BITS,
     Evidence,
     MapRecord,
@@ -105,14 +106,30 @@ def _mlp(rng: np.random.RandomState, settings: FieldSettings) -> Mlp:
 def _evidence(rng: np.random.RandomState, leaves: NDArray[np.int64]) -> Evidence:
     codes, surface = _surface(leaves)
     free = rng.randint(0, 256, surface.shape, np.int64).astype(np.uint8)
-    return Evidence(codes, surface, free)
+    return evidence_of(codes, surface, free)
+
+
+def evidence_of(
+    codes: NDArray[np.int64], surface: NDArray[np.uint8], free: NDArray[np.uint8]
+) -> Evidence:
+    """Evidence of which no more is known than where rays ended and passed."""
+    voxels = int(np.unpackbits(surface).sum())
+    return Evidence(
+        codes,
+        surface,
+        free,
+        levels=np.zeros(voxels, np.uint8),
+        seen_s=np.zeros(len(codes), np.int64),
+        outcomes=np.zeros((voxels, len(OUTCOME_BITS)), np.uint8),
+        margins=np.zeros((voxels, len(MARGIN_BITS)), np.uint8),
+    )
 
 
 def surface_evidence(points: NDArray[np.float64], settings: FieldSettings) -> Evidence:
     """Evidence of surface at points [N, 3], metres from a region's centre."""
     leaves = np.floor(points / settings.leaf_m).astype(np.int64) + (1 << (settings.depth - 1))
     codes, surface = _surface(leaves)
-    return Evidence(codes, surface, np.zeros_like(surface))
+    return evidence_of(codes, surface, np.zeros_like(surface))
 
 
 def _surface(leaves: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
@@ -161,8 +178,8 @@ def _integers(rng: np.random.RandomState, table: VertexTable, limit: int) -> Ver
     return dataclasses.replace(table, features=features, scale=2.0 ** -rng.randint(1, 9))
 
 
-def with_levels(record: MapRecord, seed: int = 0) -> MapRecord:
-    """The record with levels of its surface voxels, and times of its blocks, some not known."""
+def with_support(record: MapRecord, seed: int = 0) -> MapRecord:
+    """The record with levels, times, outcomes and margins of its surface, some not known."""
     rng = np.random.RandomState(seed)
     regions = tuple(
         dataclasses.replace(region, evidence=_supported(rng, region.evidence))
@@ -173,10 +190,21 @@ def with_levels(record: MapRecord, seed: int = 0) -> MapRecord:
 
 def _supported(rng: np.random.RandomState, evidence: Evidence) -> Evidence:
     counts = np.unpackbits(evidence.surface, axis=1).sum(axis=1)
-    levels = rng.randint(0, 8, int(counts.sum()), np.int64).astype(np.uint8)
+    voxels = int(counts.sum())
+    levels = rng.randint(0, MAX_LEVEL + 1, voxels, np.int64).astype(np.uint8)
     seen_s = 1_700_000_000 + rng.randint(0, 400, len(counts), np.int64)
     seen_s *= (counts > 0) & (rng.randint(0, 4, len(counts), np.int64) > 0)
-    return dataclasses.replace(evidence, levels=levels, seen_s=seen_s)
+    codes = [rng.randint(0, 1 << bits, voxels, np.int64) for bits in OUTCOME_BITS]
+    outcomes = np.stack(codes, axis=1) * rng.randint(0, 2, (voxels, 1), np.int64)
+    shape = (voxels, len(MARGIN_BITS))
+    margins = rng.randint(1, 4, shape, np.int64) * (rng.randint(0, 3, shape, np.int64) == 0)
+    return dataclasses.replace(
+        evidence,
+        levels=levels,
+        seen_s=seen_s,
+        outcomes=outcomes.astype(np.uint8),
+        margins=margins.astype(np.uint8),
+    )
 
 
 def with_rays(record: MapRecord, rays: int = 200, seed: int = 0) -> MapRecord:
@@ -208,35 +236,6 @@ def with_progress(record: MapRecord, progress: MapProgress) -> MapRecord:
         training = dataclasses.replace(region.training, places_repaired=3, places_given_up=1)
         regions.append(dataclasses.replace(region, training=training))
     return dataclasses.replace(record, regions=tuple(regions), progress=progress)
-
-
-def with_outcomes(record: MapRecord, seed: int = 0) -> MapRecord:
-    """The record with outcomes of rays at its surface voxels besides, half of them a wall's."""
-    rng = np.random.RandomState(seed)
-    regions = tuple(
-        dataclasses.replace(region, evidence=_missed(rng, region.evidence))
-        for region in with_levels(record, seed).regions
-    )
-    return dataclasses.replace(record, regions=regions)
-
-
-def with_margins(record: MapRecord, seed: int = 0) -> MapRecord:
-    """The record with margins of its surface voxels besides, on a third of all sides."""
-    rng = np.random.RandomState(seed)
-    regions = []
-    for region in with_outcomes(record, seed).regions:
-        shape = (int(np.unpackbits(region.evidence.surface).sum()), len(MARGIN_BITS))
-        margins = rng.randint(1, 4, shape, np.int64) * (rng.randint(0, 3, shape, np.int64) == 0)
-        evidence = dataclasses.replace(region.evidence, margins=margins.astype(np.uint8))
-        regions.append(dataclasses.replace(region, evidence=evidence))
-    return dataclasses.replace(record, regions=tuple(regions))
-
-
-def _missed(rng: np.random.RandomState, evidence: Evidence) -> Evidence:
-    voxels = int(np.unpackbits(evidence.surface).sum())
-    columns = [rng.randint(0, 1 << bits, voxels, np.int64) for bits in OUTCOME_BITS]
-    outcomes = np.stack(columns, axis=1) * rng.randint(0, 2, (voxels, 1), np.int64)
-    return dataclasses.replace(evidence, outcomes=outcomes.astype(np.uint8))
 
 
 def assert_same(have: object, want: object, where: str = "record") -> None:

@@ -3,51 +3,51 @@
 import dataclasses
 import hashlib
 import io
-from typing import NamedTuple
+import struct
+import zlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import msgpack
 import numpy as np
 import pytest
+import zstandard
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from numpy.typing import NDArray
 from triquad_format.errors import DamagedMapFileError, MapFileError
-from triquad_format.mapfile.index import check_range
-from triquad_format.mapfile.manifest import FileRef, pack_manifest, unpack_manifest
+from triquad_format.mapfile.index import MapIndex, MemoryBytes
+from triquad_format.mapfile.manifest import Manifest, pack_manifest
 from triquad_format.mapfile.metadata import MapFacts
 from triquad_format.mapfile.parts.pack import pack_record
 from triquad_format.mapfile.parts.part import MANIFEST
 from triquad_format.mapfile.reader import read_map
-from triquad_format.mapfile.writer import write_map, write_parts
+from triquad_format.mapfile.writer import WrittenMap, write_map, write_parts
+from triquad_format.records.region import MapRecord
 from triquad_format.wire.codec import pack_array, unpack_array
 from triquad_map.stored_map import StoredMap
 from triquad_server.mesh.preview import previews_of
 
-
-class MemoryBytes:
-    """A map file's bytes in memory, read at random."""
-
-    def __init__(self, data, name="map file"):
-        self.name = name
-        self.size = len(data)
-        self._data = memoryview(data)
-
-    def read(self, offset, length):
-        """As :meth:`RandomAccess.read`."""
-        check_range(offset, length, self.size)
-        return bytes(self._data[offset : offset + length])
-
-    def close(self):
-        """Do nothing: there is no file."""
+Edit = Callable[[dict[str, Any]], object]
+"""Changes the msgpack map of a part."""
 
 
 class RawPart(NamedTuple):
-    """A message of a map file."""
+    """A message of a map file, unpacked."""
 
     topic: str
     payload: bytes
 
 
-def file_bytes(record, *, preview=False, distances=None, stamp_ns=None, **options):
+def file_bytes(
+    record: MapRecord,
+    *,
+    preview: bool = False,
+    distances: Any = None,
+    stamp_ns: int | None = None,
+    **options: Any,
+) -> bytes:
     """A complete map file."""
     stream = io.BytesIO()
     if preview:
@@ -56,159 +56,169 @@ def file_bytes(record, *, preview=False, distances=None, stamp_ns=None, **option
     return stream.getvalue()
 
 
-def read_bytes(data):
+def read_bytes(data: bytes) -> MapRecord:
     return read_map(io.BytesIO(data))
 
 
-def stored(data):
+def stored(data: bytes) -> StoredMap:
     """The map of a file's bytes, by random access."""
     return StoredMap(MemoryBytes(data))
 
 
-def stored_record(data):
+def stored_record(data: bytes) -> MapRecord:
     """The record in a file's bytes, part by part."""
     with stored(data) as map_file:
         return map_file.record()
 
 
-def assert_refused(data):
-    """Both ways of reading refuse the file as damaged, with a text."""
+def assert_refused(data: bytes, text: str | None = None) -> None:
+    """Both ways of reading refuse the file as damaged, in words that match ``text``."""
     for read, error in ((read_bytes, DamagedMapFileError), (stored_record, MapFileError)):
-        with pytest.raises(error) as refusal:
+        with pytest.raises(error, match=text) as refusal:
             read(data)
         assert str(refusal.value)
 
 
-def parts_of(data):
-    """The messages of a file by the stock reader, which also checks the CRCs it knows."""
+def parts_of(data: bytes) -> list[RawPart]:
+    """The messages of a file by the stock reader, which also checks the CRCs of chunks."""
     reader = make_reader(io.BytesIO(data), validate_crcs=True)
     return [
-        RawPart(channel.topic, message.data)
-        for _, channel, message in reader.iter_messages(log_time_order=False)
+        RawPart(
+            c.topic, zstandard.decompress(m.data) if c.message_encoding != "protobuf" else m.data
+        )
+        for _, c, m in reader.iter_messages(log_time_order=False)
     ]
 
 
-def metadata_of(data):
-    return {m.name: m.metadata for m in make_reader(io.BytesIO(data)).iter_metadata()}
+def metadata_of(data: bytes) -> dict[str, str]:
+    (record,) = make_reader(io.BytesIO(data)).iter_metadata()
+    return record.metadata
 
 
-def manifest_of(data):
-    return unpack_manifest(parts_of(data)[-1].payload, len(data))
+def manifest_of(data: bytes) -> Manifest:
+    return MapIndex(MemoryBytes(data)).manifest
 
 
-def rebuild(parts, metadata, *, encoding="msgpack", chunk_size=1, **options):
-    """An MCAP file with right CRCs around whatever parts are given, each in its own chunk."""
+def rewritten(
+    data: bytes,
+    *,
+    payloads: Mapping[int, bytes] = {},  # noqa: B006
+    manifest: Callable[[Manifest], Manifest] = lambda manifest: manifest,
+    manifest_payload: Callable[[bytes], bytes] = bytes,
+    metadata: Mapping[str, str | None] = {},  # noqa: B006
+    fitting: bool = True,
+) -> bytes:
+    """A valid file with changes; all checksums, places and lengths around them fit.
+
+    Args:
+        data: the file.
+        payloads: other payloads of its own parts, by their number.
+        manifest: changes the manifest.
+        manifest_payload: changes the payload of the manifest.
+        metadata: other values in the metadata; ``None`` takes one out.
+        fitting: whether sizes and digests of other payloads are listed, or those of the file.
+    """
     stream = io.BytesIO()
-    writer = Writer(stream, enable_data_crcs=True, chunk_size=chunk_size, **options)
+    writer = Writer(stream, chunk_size=0, enable_data_crcs=True)
     writer.start()
-    for name, entries in metadata.items():
-        writer.add_metadata(name, entries)
-    channels = {}
-    for part in parts:
-        if part.topic not in channels:
-            channels[part.topic] = writer.register_channel(part.topic, encoding, 0)
-        writer.add_message(channels[part.topic], 0, part.payload, 0)
+    channels: dict[str, int] = {}
+
+    def put(topic: str, payload: bytes) -> tuple[int, int]:
+        if topic not in channels:
+            channels[topic] = writer.register_channel(topic, "", 0)
+        if topic.startswith("/triquad/"):
+            payload = zstandard.compress(payload)
+        start = stream.tell()
+        writer.add_message(channels[topic], 0, payload, 0)
+        return start, stream.tell() - start
+
+    whole = manifest_of(data)
+    entries = [entry for entry in whole.entries if entry.file is not None]
+    for number, (entry, part) in enumerate(zip(whole.own, parts_of(data)[:-1], strict=True)):
+        payload = payloads.get(number, part.payload)
+        offset, size = put(part.topic, payload)
+        entry = dataclasses.replace(entry, offset=offset, stored=size)
+        if fitting:
+            digest = hashlib.sha256(payload).digest()
+            entry = dataclasses.replace(entry, size=len(payload), sha256=digest)
+        entries.append(entry)
+    whole = manifest(dataclasses.replace(whole, entries=tuple(entries)))
+    place = "{} {}".format(*put(MANIFEST, manifest_payload(pack_manifest(whole).payload)))
+    told = {**metadata_of(data), "manifest": place, **metadata}
+    writer.add_metadata("triquad", {k: v for k, v in told.items() if v is not None})
     writer.finish()
     return stream.getvalue()
 
 
-def without_index(data):
-    """The map with all parts in one chunk, as other tools write it: it can only be read whole."""
-    return rebuild(parts_of(data), metadata_of(data), chunk_size=1 << 30)
+def with_fitting_crcs(data: bytes) -> bytes:
+    """The bytes, with the checksums of data and summary as they must be, if there is a footer."""
+    out = bytearray(data)
+    if len(out) < 50:
+        return data
+    (start,) = struct.unpack_from("<Q", out, len(out) - 28)
+    if 13 <= start <= len(out) - 37:
+        out[start - 4 : start] = struct.pack("<I", zlib.crc32(out[: start - 13]))
+        out[-12:-8] = struct.pack("<I", zlib.crc32(out[start:-12]))
+    return bytes(out)
 
 
-def listed(parts, manifest):
-    """Parts and a manifest with their sizes and digests; keys are those of ``manifest``."""
-    own = tuple(
-        dataclasses.replace(
-            entry, size=len(part.payload), sha256=hashlib.sha256(part.payload).digest()
-        )
-        for entry, part in zip(manifest.own, parts, strict=True)
-    )
-    others = tuple(entry for entry in manifest.entries if entry.file is not None)
-    packed = pack_manifest(dataclasses.replace(manifest, entries=own + others))
-    return [*parts, RawPart(MANIFEST, packed.payload)]
-
-
-def with_part(data, at, payload, **options):
-    """The file with another payload in one of its parts; digests fit."""
-    parts = parts_of(data)
-    parts[at] = parts[at]._replace(payload=payload)
-    is_manifest = at in (-1, len(parts) - 1)
-    whole = parts if is_manifest else listed(parts[:-1], manifest_of(data))
-    return rebuild(whole, metadata_of(data), **options)
-
-
-def edited(data, topic, edit, number=0):
+def edited(data: bytes, topic: str, edit: Edit, number: int = 0) -> bytes:
     """The file with the body of the ``number``-th part of a topic edited; digests fit."""
+
+    def change(payload: bytes) -> bytes:
+        body = msgpack.unpackb(payload)
+        edit(body)
+        packed: bytes = msgpack.packb(body)
+        return packed
+
+    if topic == MANIFEST:
+        return rewritten(data, manifest_payload=change)
     parts = parts_of(data)
     at = [i for i, part in enumerate(parts) if part.topic == topic][number]
-    body = msgpack.unpackb(parts[at].payload)
-    edit(body)
-    return with_part(data, at, msgpack.packb(body))
+    return rewritten(data, payloads={at: change(parts[at].payload)})
 
 
-def with_manifest(data, edit):
-    """The file with another manifest, which ``edit`` makes of its own."""
-    parts = parts_of(data)
-    parts[-1] = RawPart(MANIFEST, pack_manifest(edit(manifest_of(data))).payload)
-    return rebuild(parts, metadata_of(data))
-
-
-def with_metadata(data, changes):
-    """The file with other values in its metadata; ``None`` takes one out."""
-    metadata = metadata_of(data)
-    metadata["triquad"].update(changes)
-    metadata["triquad"] = {k: v for k, v in metadata["triquad"].items() if v is not None}
-    return rebuild(parts_of(data), metadata)
-
-
-def set_field(key, value):
+def set_field(key: str, value: object) -> Edit:
     return lambda body: body.__setitem__(key, value)
 
 
-def set_array(key, array):
+def set_array(key: str, array: NDArray[Any]) -> Edit:
     return set_field(key, pack_array(array))
 
 
-def shorten(key, axis):
+def shorten(key: str, axis: int) -> Edit:
     """Cut the last row off one column of a part."""
 
-    def edit(body):
+    def edit(body: dict[str, Any]) -> None:
         planes = unpack_array(key, body[key])
         body[key] = pack_array(np.ascontiguousarray(np.delete(planes, -1, axis)))
 
     return edit
 
 
-def all_of(*edits):
+def all_of(*edits: Edit) -> Edit:
     return lambda body: [edit(body) for edit in edits]
 
 
-def in_level(number, edit):
+def in_level(number: int, edit: Edit) -> Edit:
     """Edit the rows of one level of a part."""
     return lambda body: edit(body["levels"][number])
 
 
 def write_pair(
-    folder,
-    base,
-    record,
+    folder: Path,
+    base: MapRecord,
+    record: MapRecord,
     *,
-    names=("base.triquad", "next.triquad"),
-    stamps=(None, None),
-    preview_schema=None,
-):
+    names: tuple[str, str] = ("base.triquad", "next.triquad"),
+    stamps: tuple[int | None, int | None] = (None, None),
+) -> tuple[WrittenMap, WrittenMap]:
     """A complete file of ``base``, and one of what ``record`` changes of it."""
-    options = {"preview_schema": preview_schema}
-    first = write_record(folder / names[0], base, stamp_ns=stamps[0], **options)
-    known = first.manifest.elsewhere(FileRef(names[0], first.manifest_sha256))
-    later = write_record(folder / names[1], record, stamp_ns=stamps[1], known=known, **options)
-    return first, later
+    first = write_record(folder / names[0], base, stamp_ns=stamps[0])
+    known = first.manifest.elsewhere(names[0])
+    return first, write_record(folder / names[1], record, stamp_ns=stamps[1], known=known)
 
 
-def write_record(path, record, **options):
+def write_record(path: Path, record: MapRecord, **options: Any) -> WrittenMap:
     """A file of all parts of a record; options are those of ``write_parts``."""
-    facts = MapFacts.of(record)
-    parts = pack_record(record, "<f2", {})
-    return write_parts(path, facts, parts, **options)
+    return write_parts(path, MapFacts.of(record), pack_record(record, "<f2", {}), **options)

@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from support.file_damage import chunks, flipped
+from support.file_damage import first_chunk, flipped
 from support.map_records import SMALL, assert_same, random_record
 from support.mapfile_edit import file_bytes
 from triquad_format.mapfile.parts.part import VERTICES
@@ -24,8 +24,7 @@ def test_recovery_tells_what_it_saved_and_lost(tmp_path, capsys):
     assert main(["--recover", str(broken), str(out)]) == 0
     assert "saved all" in capsys.readouterr().out
     assert_same(read_map(out), RECORD)
-    chunk = next(chunk for chunk in chunks(DATA) if chunk.topic == VERTICES)
-    broken.write_bytes(flipped(DATA, chunk.end - 20))
+    broken.write_bytes(flipped(DATA, first_chunk(DATA, VERTICES).middle))
     assert main(["--recover", "--force", str(broken), str(out)]) == 1
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("lost: training state of region 0 0 0")

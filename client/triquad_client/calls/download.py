@@ -5,8 +5,9 @@ import shutil
 from pathlib import Path
 
 from triquad_format.errors import FormatError
+from triquad_format.mapfile.durable_file import replacing
 from triquad_format.mapfile.index import check_range
-from triquad_format.mapfile.writer import MapFileInfo, replacing, write_map
+from triquad_format.mapfile.writer import MapFileInfo, write_map
 from triquad_format.records.crop import crop_record
 from triquad_format.wire import keys
 from triquad_format.wire.messages import MapChunk, MapChunkRequest, MapInfo, MapInfoRequest

@@ -91,7 +91,6 @@ def open_manifest(file: CheckpointFile) -> Manifest:
     """The manifest of a checkpoint, found by the file's index.
 
     Raises:
-        NoIndexError: another tool rewrote the file without one.
         MapFileError: the file is damaged, or needs a newer reader.
         OSError: it cannot be read.
     """

@@ -1,7 +1,6 @@
-"""A map file opened by its index: its manifest at once, each part when it is asked for."""
+"""A map file opened by its end: its manifest at once, each part when it is asked for."""
 
 import contextlib
-import hashlib
 import io
 import os
 import stat
@@ -12,26 +11,25 @@ from triquad_format.errors import (
     DamagedMapFileError,
     FormatError,
     MapFileError,
-    NoIndexError,
     TooLargeMapFileError,
 )
-from triquad_format.mapfile.manifest import Entry, FileRef, unpack_manifest
-from triquad_format.mapfile.mcap.reader import McapIndex, RandomAccess
+from triquad_format.mapfile.container import RandomAccess, decompress, read_end, read_message
+from triquad_format.mapfile.manifest import Entry, unpack_manifest
 from triquad_format.mapfile.metadata import (
-    METADATA_NAME,
     check_agreement,
     check_map_part,
-    readable_metadata,
+    check_readable,
+    manifest_place,
 )
-from triquad_format.mapfile.parts.part import MANIFEST, MAP, PartKey
+from triquad_format.mapfile.parts.part import MAP, PREFIX, PartKey
 
 DAMAGED_SUFFIX = ".damaged"
 """Added to the names of files that are set aside."""
 
 _REMEDY = "triquad-pack --recover saves what is intact; an older checkpoint may be intact"
 
-OpenFile = Callable[[FileRef], RandomAccess]
-"""Opens another file of the same folder."""
+OpenFile = Callable[[str], RandomAccess]
+"""Opens another file of the same folder by its name."""
 
 
 @contextlib.contextmanager
@@ -94,6 +92,23 @@ class FileBytes:
         self._stream.close()
 
 
+class MemoryBytes:
+    """The bytes of a file that are in memory."""
+
+    def __init__(self, data: bytes, name: str = "map file") -> None:
+        self.name = name
+        self.size = len(data)
+        self.data = data
+
+    def read(self, offset: int, length: int) -> bytes:
+        """As :meth:`RandomAccess.read`."""
+        check_range(offset, length, self.size)
+        return self.data[offset : offset + length]
+
+    def close(self) -> None:
+        """Do nothing: there is no file."""
+
+
 def check_range(offset: int, length: int, size: int) -> None:
     """Raise :class:`DamagedMapFileError` unless the file's ``size`` bytes hold that range."""
     if offset < 0 or length < 0 or offset + length > size:
@@ -108,7 +123,7 @@ def files_in(folder: Path) -> OpenFile:
     One that was set aside as damaged is opened, too: its parts are checked one by one.
     """
 
-    return lambda file: FileBytes(file_in(folder, file.name))
+    return lambda name: FileBytes(file_in(folder, name))
 
 
 def file_in(folder: Path, name: str) -> Path:
@@ -117,12 +132,28 @@ def file_in(folder: Path, name: str) -> Path:
     return aside if aside.exists() and not (folder / name).exists() else folder / name
 
 
+def _payload(source: RandomAccess, entry: Entry) -> bytes:
+    """The payload of a part in the file that holds it.
+
+    Raises:
+        DamagedMapFileError: it is not there, or not the part that is listed.
+    """
+    try:
+        data = read_message(source, entry.offset, entry.stored)
+        if entry.key.topic.startswith(PREFIX):
+            data = decompress(data, entry.size)
+        entry.check(data)
+    except DamagedMapFileError as error:
+        raise DamagedMapFileError(f"{entry.key.topic:.80}: {error}") from error
+    return data
+
+
 class OtherFiles:
     """The other files that hold parts of a map; each is opened when it is needed."""
 
     def __init__(self, open_file: OpenFile | None) -> None:
         self._open_file = open_file
-        self._indices: dict[FileRef, MapIndex] = {}
+        self._open: dict[str, RandomAccess] = {}
 
     def payload(self, entry: Entry) -> bytes:
         """The payload of a part that another file holds.
@@ -132,45 +163,30 @@ class OtherFiles:
             OSError: the system refuses to read it.
         """
         assert entry.file is not None
-        if entry.file not in self._indices:
-            self._indices[entry.file] = self._open(entry.file)
-        index = self._indices[entry.file]
+        if self._open_file is None:
+            raise MapFileError(f"parts lie in {entry.file}, which cannot be reached from here")
         try:
-            return index.payload(index.find(entry))
-        except MapFileError as error:
-            raise DamagedMapFileError(f"{entry.file.name}, which holds parts: {error}") from error
+            if entry.file not in self._open:
+                self._open[entry.file] = self._open_file(entry.file)
+            return _payload(self._open[entry.file], entry)
+        except FileNotFoundError as error:
+            raise DamagedMapFileError(
+                f"{entry.file}, which holds parts, is missing; copy it into the folder of this file"
+            ) from error
+        except FormatError as error:
+            raise DamagedMapFileError(f"{entry.file}, which holds parts: {error}") from error
 
     def close(self) -> None:
         """Close those that were opened."""
-        for index in self._indices.values():
-            index.close()
-
-    def _open(self, file: FileRef) -> "MapIndex":
-        if self._open_file is None:
-            raise MapFileError(f"parts lie in {file.name}, which cannot be reached from here")
-        try:
-            source = self._open_file(file)
-            try:
-                index = MapIndex(source)
-                if index.manifest_sha256 != file.manifest_sha256:
-                    raise DamagedMapFileError("it is not the file that the map was made with")
-                return index
-            except BaseException:
-                source.close()
-                raise
-        except FileNotFoundError as error:
-            raise DamagedMapFileError(
-                f"{file.name}, which holds parts, is missing; put it beside this file"
-            ) from error
-        except FormatError as error:
-            raise DamagedMapFileError(f"{file.name}, which holds parts: {error}") from error
+        for source in self._open.values():
+            source.close()
 
 
 class MapIndex:
     """The manifest of a map file, and its parts by random access.
 
-    What is read is checked: the summary and the manifest by their checksums, each part by its
-    digest. What is not read is not.
+    What is read is checked: the summary by its checksum, the manifest by that of its chunk, each
+    part by its digest. What is not read is not.
     """
 
     def __init__(self, source: RandomAccess, open_file: OpenFile | None = None) -> None:
@@ -185,23 +201,16 @@ class MapIndex:
         """
         self._source = source
         self._others = OtherFiles(open_file)
-        self._mcap = McapIndex(source)
-        self.metadata = readable_metadata(self._mcap.metadata(METADATA_NAME))
-        last = self._mcap.chunks - 1
-        message = self._mcap.message(last) if last >= 0 else None
-        if message is None or message.channel.topic != MANIFEST:
-            raise NoIndexError("its last chunk is not its manifest: triquad-pack rewrites it")
-        self.manifest = unpack_manifest(message.data, source.size)
-        self.manifest_sha256 = hashlib.sha256(message.data).digest()
-        own = self.manifest.own
-        if len(own) != last:
-            raise DamagedMapFileError(f"{last} parts, but its manifest lists {len(own)}")
-        needs_others = bool(self.manifest.files)
-        check_agreement(self.metadata, self.manifest.facts, needs_other_files=needs_others)
-        self._numbers = {entry.key: number for number, entry in enumerate(own)}
-        self._own = {entry.key: entry for entry in own}
-        if (stated := self._own.get(PartKey(MAP))) is not None:
-            check_map_part(self.payload(stated), self.manifest.facts)
+        self.end = read_end(source)
+        check_readable(self.end.metadata)
+        try:
+            packed = decompress(read_message(source, *manifest_place(self.end.metadata)))
+            self.manifest = unpack_manifest(packed, source.size)
+        except DamagedMapFileError as error:
+            raise DamagedMapFileError(f"{error} (or another program rewrote it)") from error
+        check_agreement(self.end.metadata, self.manifest.facts)
+        stated = next(entry for entry in self.manifest.own if entry.key == PartKey(MAP))
+        check_map_part(self.payload(stated), self.manifest.facts)
 
     def close(self) -> None:
         """Close this file and the others that were opened."""
@@ -215,20 +224,4 @@ class MapIndex:
             MapFileError: the part is damaged, or the file that holds it is missing or another.
             OSError: a file cannot be read.
         """
-        if entry.file is not None:
-            return self._others.payload(entry)
-        number = self._numbers[entry.key]
-        message = self._mcap.message(number)
-        entry.check(number, message.channel.topic, message.data)
-        return message.data
-
-    def find(self, entry: Entry) -> Entry:
-        """The part of this file that another file's ``entry`` is about.
-
-        Raises:
-            DamagedMapFileError: the file does not hold it.
-        """
-        own = self._own.get(entry.key)
-        if own is None or own.sha256 != entry.sha256:
-            raise DamagedMapFileError(f"it does not hold {entry.key}")
-        return own
+        return _payload(self._source, entry) if entry.file is None else self._others.payload(entry)

@@ -16,6 +16,7 @@ from triquad_format.mapfile.parts.pack import pack_part
 from triquad_format.mapfile.parts.part import (
     MANIFEST,
     MAP,
+    MAX_PART_BYTES,
     REGION,
     REGION_TOPICS,
     TRAINING,
@@ -40,15 +41,13 @@ _COLUMNS = {
     "epoch": ("<i8", ()),
     "stamp_ns": ("<i8", ()),
     "file": ("<u2", ()),
+    "offset": ("<i8", ()),
+    "stored": ("<i8", ()),
 }
 
-
-@dataclass(frozen=True)
-class FileRef:
-    """Another map file of the same folder that holds parts."""
-
-    name: str
-    manifest_sha256: bytes  # of the payload of its manifest: what tells it from any other file
+_FREE_TOTAL_BYTES = 32 * 2**20
+_MAX_TOTAL_RATIO = 32
+"""The parts of a file, decompressed, have at most this multiple of its size, and that more."""
 
 
 @dataclass(frozen=True)
@@ -60,15 +59,14 @@ class Entry:
     sha256: bytes  # of its payload
     epoch: int  # in which it last changed
     stamp_ns: int  # time of that epoch, nanoseconds since 1970; 0 if not known
-    file: FileRef | None = None  # None: the file that holds the manifest
+    file: str | None = None  # name of the file of the same folder that holds it; None: this one
+    offset: int = 0  # where its chunk record begins in that file, bytes
+    stored: int = 0  # bytes of that record, and of the message index after it
 
-    def check(self, number: int, topic: str, data: bytes) -> None:
-        """Raise :class:`DamagedMapFileError` unless part ``number`` of its file is this one."""
-        fits = topic == self.key.topic and len(data) == self.size
-        if not fits or hashlib.sha256(data).digest() != self.sha256:
-            raise DamagedMapFileError(
-                f"part {number}, {topic:.80}, is not the one that the manifest lists there",
-            )
+    def check(self, data: bytes) -> None:
+        """Raise :class:`DamagedMapFileError` unless ``data`` is the payload of this part."""
+        if len(data) != self.size or hashlib.sha256(data).digest() != self.sha256:
+            raise DamagedMapFileError(f"what lies at byte {self.offset} is not the part listed")
 
 
 @dataclass(frozen=True)
@@ -80,8 +78,8 @@ class Manifest:
     entries: tuple[Entry, ...]  # those of this file in the order of the file
 
     @property
-    def files(self) -> tuple[FileRef, ...]:
-        """The other files that are needed."""
+    def files(self) -> tuple[str, ...]:
+        """Names of the other files that are needed."""
         return tuple(dict.fromkeys(e.file for e in self.entries if e.file is not None))
 
     @property
@@ -89,8 +87,8 @@ class Manifest:
         """The parts in the manifest's own file, in their order."""
         return tuple(entry for entry in self.entries if entry.file is None)
 
-    def elsewhere(self, own: FileRef) -> dict[PartKey, Entry]:
-        """The parts as another file lists them; ``own`` is the manifest's own file."""
+    def elsewhere(self, own: str) -> dict[PartKey, Entry]:
+        """The parts as another file lists them; ``own`` names the manifest's own file."""
         return {e.key: dataclasses.replace(e, file=e.file or own) for e in self.entries}
 
 
@@ -108,7 +106,7 @@ def pack_manifest(manifest: Manifest) -> Part:
             f"{MAX_ENTRIES} in {MAX_FILES}"
         )
     topics = sorted({entry.key.topic for entry in entries})
-    numbers: dict[FileRef | None, int] = {None: 0, **{f: i + 1 for i, f in enumerate(files)}}
+    numbers: dict[str | None, int] = {None: 0, **{f: i + 1 for i, f in enumerate(files)}}
     columns: dict[str, Any] = {
         "topic": [topics.index(entry.key.topic) for entry in entries],
         "region": [entry.key.region for entry in entries],
@@ -119,11 +117,13 @@ def pack_manifest(manifest: Manifest) -> Part:
         "epoch": [entry.epoch for entry in entries],
         "stamp_ns": [entry.stamp_ns for entry in entries],
         "file": [numbers[entry.file] for entry in entries],
+        "offset": [entry.offset for entry in entries],
+        "stored": [entry.stored for entry in entries],
     }
     body: dict[str, object] = {
         **pack_facts(manifest.facts),
         "created_ns": manifest.stamp_ns,
-        "files": [{"name": file.name, "manifest": file.manifest_sha256} for file in files],
+        "files": list(files),
         "topics": topics,
         "parts": {
             name: pack_array(np.array(columns[name], dtype).reshape(-1, *row))
@@ -145,7 +145,7 @@ def unpack_manifest(payload: bytes, file_bytes: int) -> Manifest:
     """
     body = unpack_body(MANIFEST, payload, max_items=MAX_FILES)
     facts = unpack_facts(body)
-    files: list[FileRef | None] = [None, *_files(body.value("files", list))]
+    files = [None, *_files(body.texts("files"))]
     topics = body.texts("topics")
     packed = PartBody(MANIFEST, body.mapping("parts"))
     columns = {
@@ -161,23 +161,18 @@ def unpack_manifest(payload: bytes, file_bytes: int) -> Manifest:
     if len({entry.key for entry in entries}) != count:
         raise DamagedMapFileError(f"{MANIFEST}: it lists a part twice")
     _check_keys([entry.key for entry in entries])
+    _check_sizes(entries, file_bytes)
     return Manifest(facts, body.count("created_ns"), entries)
 
 
-def _files(listed: list[Any]) -> list[FileRef]:
-    files = []
-    for item in listed:
-        file = PartBody(MANIFEST, item)
-        name, digest = file.value("name", str), file.value("manifest", bytes)
+def _files(names: list[str]) -> list[str]:
+    for name in names:
         # A name, not a path: a manifest must not lead a reader to other folders.
         if name in ("", ".", "..") or len(name) > _MAX_FILE_NAME or set(name) & set("/\\\0"):
             raise DamagedMapFileError(f"{MANIFEST}: {name!r:.80} is not the name of a file")
-        if len(digest) != DIGEST_BYTES:
-            raise DamagedMapFileError(f"{MANIFEST}: the digest of {name!r:.80} is not a digest")
-        files.append(FileRef(name, digest))
-    if len({file.name for file in files}) != len(files):
+    if len(set(names)) != len(names):
         raise DamagedMapFileError(f"{MANIFEST}: it names a file twice")
-    return files
+    return names
 
 
 def _check_columns(columns: Mapping[str, NDArray[Any]], topics: int, files: int) -> None:
@@ -185,15 +180,13 @@ def _check_columns(columns: Mapping[str, NDArray[Any]], topics: int, files: int)
     for name, limit in limits.items():
         if (columns[name] >= limit).any():
             raise DamagedMapFileError(f"{MANIFEST}: a number in {name!r} is out of range")
-    for name in ("cell", "bytes", "epoch", "stamp_ns"):
+    for name in ("cell", "bytes", "epoch", "stamp_ns", "offset", "stored"):
         if (columns[name] < 0).any():
             raise DamagedMapFileError(f"{MANIFEST}: a number in {name!r} is negative")
 
 
 def _check_keys(keys: list[PartKey]) -> None:
     """Refuse parts of a region whose head is not listed, and cells of what has none."""
-    if PartKey(MAP) not in keys:
-        raise DamagedMapFileError(f"{MANIFEST}: it does not list the part {MAP}")
     for key in keys:
         if key.topic in (MAP, REGION, TRAINING) and (key.plane or key.cell):
             raise DamagedMapFileError(f"{MANIFEST}: {key.topic} has plane or cell: {key}")
@@ -203,13 +196,32 @@ def _check_keys(keys: list[PartKey]) -> None:
             raise DamagedMapFileError(f"the part {REGION} of {key.region} is missing")
 
 
+def _check_sizes(entries: tuple[Entry, ...], file_bytes: int) -> None:
+    """Refuse a file that unpacks to too much, or does not hold its first part itself."""
+    own = [entry for entry in entries if entry.file is None]
+    if PartKey(MAP) not in {entry.key for entry in own}:
+        raise DamagedMapFileError(f"{MANIFEST}: it does not list the part {MAP}")
+    for entry in entries:
+        if entry.size > MAX_PART_BYTES:
+            raise DamagedMapFileError(
+                f"{MANIFEST}: a part {entry.key.topic:.80} exceeds {MAX_PART_BYTES} bytes"
+            )
+    if (total := sum(entry.size for entry in own)) > total_limit(file_bytes):
+        raise DamagedMapFileError(f"{MANIFEST}: parts of {total} bytes in a file of {file_bytes}")
+
+
+def total_limit(file_bytes: int) -> int:
+    """Bytes to which all parts of a file of ``file_bytes`` may decompress together."""
+    return _FREE_TOTAL_BYTES + _MAX_TOTAL_RATIO * file_bytes
+
+
 def _entries(
-    columns: Mapping[str, NDArray[Any]], topics: list[str], files: list[FileRef | None]
+    columns: Mapping[str, NDArray[Any]], topics: list[str], files: list[str | None]
 ) -> Iterable[Entry]:
     digests = [digest.tobytes() for digest in columns["sha256"]]
     others = [columns[name].tolist() for name in _COLUMNS if name != "sha256"]
     for digest, row in zip(digests, zip(*others, strict=True), strict=True):
-        topic, region, plane, cell, size, epoch, stamp_ns, file = row
+        topic, region, plane, cell, size, epoch, stamp_ns, file, offset, stored = row
         yield Entry(
             PartKey(topics[topic], tuple(region), plane=plane, cell=cell),
             size=size,
@@ -217,4 +229,6 @@ def _entries(
             epoch=epoch,
             stamp_ns=stamp_ns,
             file=files[file],
+            offset=offset,
+            stored=stored,
         )

@@ -5,6 +5,7 @@ manifest, too.
 """
 
 import dataclasses
+import re
 import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,7 +16,6 @@ from triquad_format import __version__
 from triquad_format.errors import (
     DamagedMapFileError,
     FormatError,
-    MapFileError,
     UnsupportedMapFileError,
 )
 from triquad_format.mapfile.parts.body import PartBody, unpack_body
@@ -25,18 +25,18 @@ from triquad_format.records.map_progress import MapProgress
 from triquad_format.records.region import MapRecord
 from triquad_format.wire.keys import check_name
 
-METADATA_NAME = "triquad"
 FORMAT_VERSION = 1
 MIN_READER_VERSION = 1
-
-BASE_FILES = "base-files"
-"""The required feature of a file whose parts lie in other files, too."""
 
 FRAME_ID = "map"
 UNITS = "m"
 
+PRODUCER = f"triquad {__version__}"
+
+_NUMBER = re.compile("[0-9]{1,18}")  # int() alone would also take '+1', and digits of other scripts
+
 MAX_MAP_BYTES = 4 * 2**30
-"""Limit on the size of a map file, and on its chunks' decompressed size together."""
+"""Limit on the size of a map file, and on its parts' decompressed size together."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class MapFacts:
     name: str
     epoch: int
     settings: FieldSettings
-    progress: MapProgress = MapProgress()
+    progress: MapProgress
 
     @classmethod
     def of(cls, record: MapRecord) -> "MapFacts":
@@ -58,24 +58,25 @@ def pack_facts(facts: MapFacts) -> dict[str, object]:
     """The facts as a msgpack map."""
     defaults = dataclasses.asdict(FieldSettings())
     settings = dataclasses.asdict(facts.settings)
-    body: dict[str, object] = {
+    return {
+        "min_reader_version": MIN_READER_VERSION,
         "name": facts.name,
         "epoch": facts.epoch,
         "frame_id": FRAME_ID,
         "units": UNITS,
         "settings": {name: type(defaults[name])(value) for name, value in settings.items()},
+        "progress": dataclasses.asdict(facts.progress),
     }
-    if facts.progress != MapProgress():
-        body["progress"] = dataclasses.asdict(facts.progress)
-    return body
 
 
 def unpack_facts(body: PartBody) -> MapFacts:
     """The facts in a part.
 
     Raises:
-        FormatError: one is missing or out of range.
+        UnsupportedMapFileError: the part needs a newer reader.
+        FormatError: a fact is missing or out of range.
     """
+    _check_version(body.count("min_reader_version"), "unknown")
     for key, wanted in (("frame_id", FRAME_ID), ("units", UNITS)):
         if body.value(key, str) != wanted:
             raise UnsupportedMapFileError(f"{key} = {body.value(key, str)!r:.80}, not {wanted!r}")
@@ -92,9 +93,6 @@ def check_map_part(payload: bytes, facts: MapFacts) -> None:
 
 
 def _unpack_progress(body: PartBody) -> MapProgress:
-    """The progress of a map; older files do not tell it."""
-    if not body.has("progress"):
-        return MapProgress()
     told = PartBody(body.topic, body.mapping("progress"))
     progress = MapProgress(
         scans_taken=told.count("scans_taken"),
@@ -122,18 +120,18 @@ def _unpack_settings(body: Mapping[str, object]) -> FieldSettings:
 
 
 def pack_metadata(
-    facts: MapFacts, *, stamp_ns: int | None, needs_other_files: bool
+    facts: MapFacts, *, stamp_ns: int | None, offset: int, stored: int
 ) -> dict[str, str]:
-    """The metadata of a file, parts of which may lie in other files.
+    """The metadata of a file, whose manifest lies in the ``stored`` bytes from ``offset`` on.
 
     ``stamp_ns`` is the time of its epoch, nanoseconds since 1970; ``None``: not known.
     """
     entries = {
         "format_version": str(FORMAT_VERSION),
         "min_reader_version": str(MIN_READER_VERSION),
-        "required_features": BASE_FILES if needs_other_files else "",
-        "producer": f"triquad {__version__}",
+        "producer": PRODUCER,
         **_facts_in_metadata(facts),
+        "manifest": f"{offset} {stored}",
     }
     if stamp_ns is not None:
         entries["created"] = utc_time(stamp_ns)
@@ -149,25 +147,6 @@ def _facts_in_metadata(facts: MapFacts) -> dict[str, str]:
     return {"map": facts.name, "epoch": str(facts.epoch), "frame_id": FRAME_ID, "units": UNITS}
 
 
-def readable_metadata(found: list[dict[str, str]]) -> dict[str, str]:
-    """The metadata of a file that this reader can read.
-
-    Args:
-        found: the entries of all metadata records ``triquad``; there must be one.
-
-    Raises:
-        MapFileError: there is none: it is no map file.
-        UnsupportedMapFileError: it needs a newer reader; the text names what is missing.
-        DamagedMapFileError: there are several, or it does not tell which reader it needs.
-    """
-    if not found:
-        raise MapFileError("this is an MCAP file, but not a map: it has no metadata 'triquad'")
-    if len(found) > 1:
-        raise DamagedMapFileError("the metadata 'triquad' is there more than once")
-    check_readable(found[0])
-    return found[0]
-
-
 def check_readable(metadata: dict[str, str]) -> None:
     """Refuse a file that this reader does not understand.
 
@@ -176,37 +155,35 @@ def check_readable(metadata: dict[str, str]) -> None:
         DamagedMapFileError: the metadata does not tell.
     """
     needed = metadata.get("min_reader_version", "")
-    # int() alone would also take '+1', ' 1' and digits of other scripts, of any length.
-    if not (needed.isascii() and needed.isdigit() and len(needed) < 10):
+    if not _NUMBER.fullmatch(needed):
         raise DamagedMapFileError(f"min_reader_version = {needed!r:.40} is not a number")
-    if int(needed) > FORMAT_VERSION:
+    _check_version(int(needed), metadata.get("producer", "unknown"))
+
+
+def _check_version(needed: int, producer: str) -> None:
+    if needed > FORMAT_VERSION:
         raise UnsupportedMapFileError(
             f"it needs a reader of map file version {needed}; this one reads {FORMAT_VERSION}: "
-            f"install a newer triquad (written by {metadata.get('producer', 'unknown')!r:.80})",
-        )
-    if "required_features" not in metadata:
-        raise DamagedMapFileError("the metadata 'triquad' does not name its required_features")
-    missing = _required(metadata) - {BASE_FILES}
-    if missing:
-        unknown = ", ".join(sorted(missing))
-        raise UnsupportedMapFileError(
-            f"it requires {unknown:.200}, which this reader does not know: install a newer triquad"
+            f"install a newer triquad (written by {producer!r:.80})",
         )
 
 
-def _required(metadata: dict[str, str]) -> set[str]:
-    return {name.strip() for name in metadata["required_features"].split(",")} - {""}
+def manifest_place(metadata: dict[str, str]) -> tuple[int, int]:
+    """Where the manifest lies: offset and bytes.
 
-
-def check_agreement(metadata: dict[str, str], facts: MapFacts, *, needs_other_files: bool) -> None:
-    """Raise :class:`DamagedMapFileError` unless metadata and manifest tell the same.
-
-    ``facts`` and ``needs_other_files`` are the manifest's: whether it lists parts of other files.
+    Raises:
+        DamagedMapFileError: the metadata does not tell.
     """
+    offset, _, stored = metadata.get("manifest", "").partition(" ")
+    if not (_NUMBER.fullmatch(offset) and _NUMBER.fullmatch(stored)):
+        raise DamagedMapFileError(f"manifest = {metadata.get('manifest')!r:.40} is not a place")
+    return int(offset), int(stored)
+
+
+def check_agreement(metadata: dict[str, str], facts: MapFacts) -> None:
+    """Raise :class:`DamagedMapFileError` unless metadata and the manifest's facts are the same."""
     for key, value in _facts_in_metadata(facts).items():
         if metadata.get(key) != value:
             raise DamagedMapFileError(
                 f"its metadata says {key} = {metadata.get(key)!r:.80}, its parts say {value!r}",
             )
-    if needs_other_files and BASE_FILES not in _required(metadata):
-        raise DamagedMapFileError(f"parts lie in other files, but {BASE_FILES} is not required")

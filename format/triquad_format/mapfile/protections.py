@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from triquad_format.errors import MapFileError
+from triquad_format.mapfile.durable_file import replacing
 from triquad_format.mapfile.index import open_regular
-from triquad_format.mapfile.writer import replacing
 
 PROTECTIONS_NAME = "protected.json"
 

@@ -1,35 +1,28 @@
 """Writing map files: the same record gives the same bytes, and a path gets all of them or none."""
 
 import contextlib
+import dataclasses
 import hashlib
-import os
-import secrets
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import BinaryIO
+from typing import BinaryIO, cast
 
-from mcap.records import Channel, Schema
+from mcap.writer import Writer
 
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.manifest import Entry, Manifest, pack_manifest
-from triquad_format.mapfile.mcap.records import total_limit
-from triquad_format.mapfile.mcap.writer import McapWriter
-from triquad_format.mapfile.metadata import (
-    MAX_MAP_BYTES,
-    METADATA_NAME,
-    MapFacts,
-    pack_facts,
-    pack_metadata,
-)
+from triquad_format.mapfile.container import METADATA_NAME, compress
+from triquad_format.mapfile.durable_file import replacing
+from triquad_format.mapfile.manifest import Entry, Manifest, pack_manifest, total_limit
+from triquad_format.mapfile.metadata import MAX_MAP_BYTES, MapFacts, pack_facts, pack_metadata
 from triquad_format.mapfile.parts.pack import pack_part, pack_record, seams
 from triquad_format.mapfile.parts.part import (
-    ENCODINGS,
     EVIDENCE,
     MANIFEST,
     MAP,
     MAX_PART_BYTES,
+    MESSAGE_ENCODING,
     MOMENTS,
     PREVIEW,
     PREVIEW_ENCODING,
@@ -57,19 +50,7 @@ _LEVELS = {
     MOMENTS: 1,
     SAMPLES: 1,
     RAYS: 1,
-    PREVIEW: 19,
     MANIFEST: 3,
-}
-_PREVIEW_SCHEMA_ID = 1
-_CHANNELS = {
-    topic: Channel(
-        id=number,
-        topic=topic,
-        message_encoding=encoding,
-        metadata={},
-        schema_id=_PREVIEW_SCHEMA_ID if topic == PREVIEW else 0,
-    )
-    for number, (topic, encoding) in enumerate(ENCODINGS.items(), start=1)
 }
 
 
@@ -96,7 +77,6 @@ class WrittenMap:
 
     info: MapFileInfo
     manifest: Manifest
-    manifest_sha256: bytes  # of the manifest's payload
 
 
 def write_map(
@@ -159,59 +139,29 @@ def write_parts(
         FormatError: a limit of the format is exceeded, or there are previews without their schema.
         OSError: the file cannot be written.
     """
-    # Where parts of other files are known, some of them are nearly always needed.
-    needs_others = any(entry.file is not None for entry in known.values())
-    metadata = pack_metadata(facts, stamp_ns=stamp_ns, needs_other_files=needs_others)
     opened = (
         replacing(Path(file)) if isinstance(file, (str, Path)) else contextlib.nullcontext(file)
     )
     with opened as stream:
-        mcap = _mcap_writer(stream, metadata["producer"], preview_schema)
-        mcap.add_metadata(METADATA_NAME, metadata)
-        return _PartsWriter(mcap, facts, stamp_ns=stamp_ns, known=known).write(parts)
+        writer = _PartsWriter(stream, facts, stamp_ns or 0, known, preview_schema)
+        return writer.write(parts, stamp_ns)
 
 
-@contextlib.contextmanager
-def replacing(path: Path) -> Iterator[BinaryIO]:
-    """A stream whose bytes replace the file at ``path``, durably, where nothing is raised.
+class _Counted:
+    """Counts and digests what is written to a stream, which need not be able to seek."""
 
-    Raises:
-        OSError: the file cannot be written; it is named, and the one that was there stays.
-    """
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
-    try:
-        with temporary.open("xb") as stream:
-            yield stream
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(temporary, path)
-    except BaseException as error:
-        temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.errno and error.filename is None:
-            raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
-        raise
-    _sync_folder(path.parent)
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream = stream
+        self.digest = hashlib.sha256()
+        self.size = 0
 
+    def write(self, data: bytes) -> int:
+        self.digest.update(data)
+        self.size += len(data)
+        return self._stream.write(data)
 
-def _sync_folder(folder: Path) -> None:
-    """Make renames in a folder durable, where the system lets folders be synced."""
-    if os.name != "posix":
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _mcap_writer(file: BinaryIO, producer: str, preview_schema: bytes | None) -> McapWriter:
-    """A writer for a file's messages: previews are described where their schema is given."""
-    unused = {RAYS} if preview_schema is not None else {RAYS, PREVIEW}
-    channels = [channel for topic, channel in _CHANNELS.items() if topic not in unused]
-    schemas = []
-    if preview_schema is not None:
-        schemas = [Schema(_PREVIEW_SCHEMA_ID, preview_schema, PREVIEW_ENCODING, PREVIEW_SCHEMA)]
-    return McapWriter(file, producer, schemas=schemas, channels=channels)
+    def tell(self) -> int:
+        return self.size
 
 
 class _PartsWriter:
@@ -219,69 +169,64 @@ class _PartsWriter:
 
     def __init__(
         self,
-        mcap: McapWriter,
+        stream: BinaryIO,
         facts: MapFacts,
-        *,
-        stamp_ns: int | None,
+        stamp_ns: int,
         known: Mapping[PartKey, Entry],
+        preview_schema: bytes | None,
     ) -> None:
-        self._mcap = mcap
+        self._stream = _Counted(stream)
+        # A chunk ends after each message. The library compresses chunks, which matters to previews
+        # alone: parts are compressed before, each as suits it.
+        self._mcap = Writer(cast(BinaryIO, self._stream), chunk_size=0, enable_data_crcs=True)
         self._facts = facts
-        self._stamp_ns = stamp_ns or 0
+        self._stamp_ns = stamp_ns
         self._known = known
-        self._entries: list[Entry] = []
+        self._preview_schema = preview_schema
+        self._channels: dict[str, int] = {}
         self._total = 0
 
-    def write(self, parts: Iterable[Part | Entry]) -> WrittenMap:
-        whole = pack_part(PartKey(MAP), pack_facts(self._facts))
-        self._put(whole, self._stamp_ns)
-        self._entries.append(self._changed(whole))
+    def write(self, parts: Iterable[Part | Entry], stamp_ns: int | None) -> WrittenMap:
+        """Write the file; the metadata tells the time ``stamp_ns``, if it is given."""
+        self._mcap.start(library="triquad")
+        entries = [self._stored(pack_part(PartKey(MAP), pack_facts(self._facts)))]
         for part in parts:
-            if isinstance(part, Entry):
-                self._entries.append(part)
-            else:
-                self._add(part)
-        manifest = Manifest(self._facts, self._stamp_ns, tuple(self._entries))
-        packed = pack_manifest(manifest)
-        self._put(packed, self._stamp_ns)
-        self._mcap.finish()
-        _check_total(self._mcap.size)
-        if self._total > total_limit(self._mcap.size):
+            entries.append(part if isinstance(part, Entry) else self._stored(part))
+        manifest = Manifest(self._facts, self._stamp_ns, tuple(entries))
+        offset, stored = self._put(pack_manifest(manifest), self._stamp_ns)
+        metadata = pack_metadata(self._facts, stamp_ns=stamp_ns, offset=offset, stored=stored)
+        self._mcap.add_metadata(METADATA_NAME, metadata)
+        self._mcap.finish()  # type: ignore[no-untyped-call]
+        size = self._stream.size
+        _check_total(size)
+        if self._total > total_limit(size):
             raise FormatError(
-                f"the map's parts shrink from {self._total} to {self._mcap.size} bytes: "
-                "readers take that for an attack"
+                f"the map's parts shrink from {self._total} to {size} bytes: readers take that "
+                "for an attack"
             )
-        info = MapFileInfo(self._mcap.size, self._mcap.sha256, self._facts.epoch)
-        return WrittenMap(info, manifest, hashlib.sha256(packed.payload).digest())
+        info = MapFileInfo(size, self._stream.digest.hexdigest(), self._facts.epoch)
+        return WrittenMap(info, manifest)
 
-    def _add(self, part: Part) -> None:
-        """List a part; store it unless another file has it."""
-        entry = self._changed(part)
-        known = self._known.get(part.key)
-        if known is not None and known.sha256 == entry.sha256:
-            entry = known
-        if entry.file is None:
-            self._put(part, entry.stamp_ns)
-        self._entries.append(entry)
-
-    def _changed(self, part: Part) -> Entry:
-        """The entry of a part that this epoch changed."""
-        return Entry(
+    def _stored(self, part: Part) -> Entry:
+        """The entry of a part, which is written unless another file has it."""
+        entry = Entry(
             part.key,
             size=len(part.payload),
             sha256=hashlib.sha256(part.payload).digest(),
             epoch=self._facts.epoch,
             stamp_ns=self._stamp_ns,
         )
+        known = self._known.get(part.key)
+        if known is not None and known.sha256 == entry.sha256:
+            entry = known
+        if entry.file is not None:
+            return entry
+        offset, stored = self._put(part, entry.stamp_ns)
+        return dataclasses.replace(entry, offset=offset, stored=stored)
 
-    def _put(self, part: Part, stamp_ns: int) -> None:
+    def _put(self, part: Part, stamp_ns: int) -> tuple[int, int]:
+        """Write a part; where its chunk begins, and bytes up to the next."""
         topic = part.key.topic
-        if topic == RAYS and topic not in self._mcap.topics:
-            self._mcap.add_channel(_CHANNELS[topic])
-        if topic not in self._mcap.topics:
-            raise FormatError(
-                f"the file has no channel for {part.key}; for previews give preview_schema as well"
-            )
         if len(part.payload) > MAX_PART_BYTES:
             raise FormatError(
                 f"the part {topic} has {len(part.payload)} bytes; "
@@ -289,9 +234,26 @@ class _PartsWriter:
             )
         self._total += len(part.payload)
         _check_total(self._total)
-        self._mcap.add_message(
-            topic, part.payload, time_ns=stamp_ns, level=_LEVELS[topic], seams=seams(part)
-        )
+        data = part.payload
+        if topic != PREVIEW:
+            data = compress(data, seams(part), _LEVELS[topic])
+        start = self._stream.size
+        self._mcap.add_message(self._channel(topic), stamp_ns, data, stamp_ns)
+        return start, self._stream.size - start
+
+    def _channel(self, topic: str) -> int:
+        """The number of a topic's channel, which is described before its first message."""
+        if topic not in self._channels:
+            schema, encoding = 0, MESSAGE_ENCODING
+            if topic == PREVIEW:
+                if self._preview_schema is None:
+                    raise FormatError(f"there are parts {topic}: give preview_schema as well")
+                schema = self._mcap.register_schema(
+                    PREVIEW_SCHEMA, PREVIEW_ENCODING, self._preview_schema
+                )
+                encoding = PREVIEW_ENCODING
+            self._channels[topic] = self._mcap.register_channel(topic, encoding, schema)
+        return self._channels[topic]
 
 
 def _check_total(size: int) -> None:

@@ -105,26 +105,22 @@ def _check_evidence(settings: FieldSettings, evidence: Evidence) -> None:
     masks.check("evidence surface", evidence.surface)
     masks.check("evidence free", evidence.free)
     counts = surface_counts(evidence.surface)
-    if evidence.levels is not None:
-        ArraySpec("|u1", (int(counts.sum()),)).check("evidence levels", evidence.levels)
-        if evidence.levels.max(initial=0) > MAX_LEVEL:
-            raise FormatError(f"evidence levels: one exceeds {MAX_LEVEL}")
+    ArraySpec("|u1", (int(counts.sum()),)).check("evidence levels", evidence.levels)
+    if evidence.levels.max(initial=0) > MAX_LEVEL:
+        raise FormatError(f"evidence levels: one exceeds {MAX_LEVEL}")
     for name, codes, bits in (
         ("outcomes", evidence.outcomes, OUTCOME_BITS),
         ("margins", evidence.margins, MARGIN_BITS),
     ):
-        if codes is None:
-            continue
         ArraySpec("|u1", (int(counts.sum()), len(bits))).check(f"evidence {name}", codes)
         if (codes >> np.array(bits, np.uint8)).any():
             raise FormatError(f"evidence {name}: a code exceeds {bits} bits")
-    if evidence.seen_s is not None:
-        ArraySpec("<i8", counts.shape).check("evidence seen_s", evidence.seen_s)
-        low, high = evidence.seen_s.min(initial=0), evidence.seen_s.max(initial=0)
-        if low < 0 or high > MAX_SEEN_S:
-            raise FormatError(f"evidence seen_s: a time lies outside of 0 to {MAX_SEEN_S} s")
-        if evidence.seen_s[counts == 0].any():
-            raise FormatError("evidence seen_s: a block without surface has a time")
+    ArraySpec("<i8", counts.shape).check("evidence seen_s", evidence.seen_s)
+    low, high = evidence.seen_s.min(initial=0), evidence.seen_s.max(initial=0)
+    if low < 0 or high > MAX_SEEN_S:
+        raise FormatError(f"evidence seen_s: a time lies outside of 0 to {MAX_SEEN_S} s")
+    if evidence.seen_s[counts == 0].any():
+        raise FormatError("evidence seen_s: a block without surface has a time")
 
 
 def _check_training(settings: FieldSettings, region: Region, training: TrainingState) -> None:

@@ -77,29 +77,29 @@ class Evidence:
     codes: Longs  # [B] 3-D Morton codes of blocks, strictly increasing
     surface: Bytes  # [B, BLOCK_BYTES] a ray ended in the voxel
     free: Bytes  # [B, BLOCK_BYTES] a ray passed through the voxel
-    levels: Bytes | None = None
-    """[S] How well each surface voxel is supported, from 0 to ``MAX_LEVEL``; ``None``: not known.
+    levels: Bytes
+    """[S] How well each surface voxel is supported, from 0 to ``MAX_LEVEL``.
 
-    In the order of :func:`seen_voxels`. What a level
-    stands for is up to those who set and read it; a higher one is better supported.
+    In the order of :func:`seen_voxels`. What a level stands for is up to those who set and read
+    it; a higher one is better supported.
     """
-    seen_s: Longs | None = None
+    seen_s: Longs
     """[B] When a ray last ended in the block: whole seconds since 1970, by the stamps of scans.
 
-    0 where none did or it is not known; ``None``: nowhere known.
+    0 where none did, or it is not known.
     """
-    outcomes: Bytes | None = None
+    outcomes: Bytes
     """[S, 3] Codes of how often rays hit, passed and missed each surface voxel.
 
-    In the order of :func:`seen_voxels`. ``docs/map-file.md`` says what the codes stand for;
-    ``None``: not known.
+    In the order of :func:`seen_voxels`. ``docs/map-file.md`` says what the codes stand for; they
+    are 0 where nothing is known.
     """
-    margins: Bytes | None = None
+    margins: Bytes
     """[S, 6] On each side of each surface voxel, how many quarters of it lie beyond all ends.
 
     In the order of :func:`seen_voxels`; the sides towards lesser x, y, z, then towards greater
     ones. 0 as well where the surface goes on beyond that side, or too few scans hit the voxel to
-    tell; ``None``: not known.
+    tell.
     """
 
 
@@ -159,6 +159,13 @@ class MapRecord:
         return any(len(region.evidence.codes) for region in self.regions)
 
 
+def no_evidence() -> Evidence:
+    """Evidence of a region of which rays have shown nothing."""
+    masks, none = np.zeros((0, BLOCK_BYTES), np.uint8), np.zeros(0, np.int64)
+    outcomes, margins = (np.zeros((0, len(bits)), np.uint8) for bits in (OUTCOME_BITS, MARGIN_BITS))
+    return Evidence(none, masks, masks, np.zeros(0, np.uint8), none, outcomes, margins)
+
+
 def seen_voxels(evidence: Evidence, masks: Bytes) -> Longs:
     """Voxels [N, 3] of a region whose bit is set in ``masks`` [B, BLOCK_BYTES] of its evidence."""
     bits = np.unpackbits(masks, axis=1, bitorder="little")
@@ -191,19 +198,12 @@ def masked(evidence: Evidence, mask: Bytes) -> Evidence:
         np.unpackbits(bits, bitorder="little").astype(bool) for bits in (evidence.surface, surface)
     )
     kept = after[before]
-    levels, outcomes, margins = (
-        None if column is None else column[kept]
-        for column in (evidence.levels, evidence.outcomes, evidence.margins)
-    )
-    seen_s = evidence.seen_s
-    if seen_s is not None:
-        seen_s = np.where(surface.any(axis=1), seen_s, 0)[rows]
     return Evidence(
         evidence.codes[rows],
         surface[rows],
         free[rows],
-        levels=levels,
-        seen_s=seen_s,
-        outcomes=outcomes,
-        margins=margins,
+        levels=evidence.levels[kept],
+        seen_s=np.where(surface.any(axis=1), evidence.seen_s, 0)[rows],
+        outcomes=evidence.outcomes[kept],
+        margins=evidence.margins[kept],
     )

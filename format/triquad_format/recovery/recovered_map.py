@@ -5,8 +5,7 @@ themselves.
 """
 
 import dataclasses
-import itertools
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,10 +38,6 @@ STATUS_REACH_LEAVES = 2
 """How far beyond lost vertices a status may change: voxels that have an effect there are dropped
 whole, and had an effect half a leaf beyond."""
 
-_AROUND = tuple(itertools.product((-2, -1, 0, 1, 2), repeat=3))
-"""From a region to those whose losses may reach into it: lost vertices have an effect beyond the
-border of their own region, but never beyond the cubes of those around."""
-
 
 @dataclass(frozen=True)
 class Loss:
@@ -56,11 +51,6 @@ class Loss:
     key: PartKey
     minimum: Doubles  # [3] metres, map frame
     maximum: Doubles  # [3]
-
-    def meets(self, centre: Doubles, side_m: float) -> bool:
-        """Whether the box meets a cube of side ``side_m`` around ``centre`` [3] m, map frame."""
-        low, high = centre - side_m / 2, centre + side_m / 2
-        return bool(((self.minimum <= high) & (self.maximum >= low)).all())
 
 
 @dataclass(frozen=True)
@@ -101,21 +91,6 @@ def recover(path: Path, *, max_bytes: int = MAX_MAP_BYTES) -> RecoveredMap:
         return recovered
 
 
-class _LossesNear:
-    """Losses by where they are: of a large map, each region is compared with few of them."""
-
-    def __init__(self, losses: Iterable[Loss]) -> None:
-        self._losses: dict[RegionIndex, list[Loss]] = {}
-        for loss in losses:
-            self._losses.setdefault(loss.key.region, []).append(loss)
-
-    def of(self, index: RegionIndex) -> Iterator[Loss]:
-        """Those that may reach into a region: its own, and of the regions around."""
-        x, y, z = index
-        for dx, dy, dz in _AROUND:
-            yield from self._losses.get((x + dx, y + dy, z + dz), ())
-
-
 def _recovered(found: IntactParts) -> RecoveredMap:
     settings = found.facts.settings
     regions: list[Region] = []
@@ -136,12 +111,10 @@ def _recovered(found: IntactParts) -> RecoveredMap:
     losses = tuple(
         loss_of(key, settings) for key in sorted(lost, key=lambda key: (key.region, key))
     )
-    near = _LossesNear(losses)
-    regions = [_masked_where_lost(settings, region, near.of(region.index)) for region in regions]
+    regions = _masked_where_lost(settings, regions, losses)
     facts = found.facts
-    record = MapRecord(facts.name, facts.epoch, settings, tuple(regions), facts.progress)
     return RecoveredMap(
-        record,
+        MapRecord(facts.name, facts.epoch, settings, tuple(regions), facts.progress),
         losses,
         parts_intact=len(found.payloads),
         parts_listed=found.parts_listed,
@@ -193,16 +166,24 @@ def _missing_squares(
     return needed - payloads.keys()
 
 
-def _masked_where_lost(settings: FieldSettings, region: Region, losses: Iterable[Loss]) -> Region:
-    """The region without evidence where vertices are lost, be they its own or a neighbour's."""
-    evidence = region.evidence
-    centre = settings.region_centre(region.index)
-    for loss in losses:
-        if loss.key.topic == VERTICES and loss.meets(centre, settings.region_side_m):
-            corners = effect_box(loss.key, settings)
+def _masked_where_lost(
+    settings: FieldSettings, regions: list[Region], losses: Sequence[Loss]
+) -> list[Region]:
+    """The regions without evidence where vertices are lost, their own or a neighbour's."""
+    vertices = [loss for loss in losses if loss.key.topic == VERTICES]
+    low = np.array([loss.minimum for loss in vertices]).reshape(-1, 3)
+    high = np.array([loss.maximum for loss in vertices]).reshape(-1, 3)
+    masked_regions = []
+    for region in regions:
+        evidence, centre = region.evidence, settings.region_centre(region.index)
+        reach_m = settings.region_side_m / 2
+        near = ((low <= centre + reach_m) & (high >= centre - reach_m)).all(axis=1)
+        for number in np.flatnonzero(near).tolist():
+            corners = effect_box(vertices[number].key, settings)
             box = LeafBox(*settings.leaf_coordinates(corners - centre))
             evidence = masked(evidence, ~status_voxels(evidence, box))
-    return dataclasses.replace(region, evidence=evidence)
+        masked_regions.append(dataclasses.replace(region, evidence=evidence))
+    return masked_regions
 
 
 def loss_of(key: PartKey, settings: FieldSettings) -> Loss:

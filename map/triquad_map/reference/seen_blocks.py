@@ -41,12 +41,10 @@ class SeenBlocks:
         """Add the evidence of some cells."""
         self._surface.add(evidence.codes, evidence.surface)
         self._free.add(evidence.codes, evidence.free)
-        if evidence.margins is not None:
-            voxels = seen_voxels(evidence, evidence.surface) % BLOCK_VOXELS
-            blocks = evidence.codes.repeat(surface_counts(evidence.surface))
-            self._margins.add(_voxel_codes(blocks, voxels), evidence.margins)
-        if evidence.seen_s is not None:
-            self.newest_s = max(self.newest_s, int(evidence.seen_s.max(initial=0)))
+        voxels = seen_voxels(evidence, evidence.surface) % BLOCK_VOXELS
+        blocks = evidence.codes.repeat(surface_counts(evidence.surface))
+        self._margins.add(_voxel_codes(blocks, voxels), evidence.margins)
+        self.newest_s = max(self.newest_s, int(evidence.seen_s.max(initial=0)))
 
     def status(self, voxels: Doubles, reach: float) -> Bytes:
         """Status values [N]; see :class:`triquad_map.composition.region.SeenSpace`."""

@@ -171,7 +171,5 @@ def fitted_surfels(record: Evidence, seen: SeenBlocks, field: SampleField) -> Su
     """The surfels of all voxels in which rays ended; ``seen`` holds what ``record`` does."""
     voxels = seen_voxels(record, record.surface)
     surfels = fit_surfels(voxels, field, seen.ended_in)
-    levels = np.zeros(len(voxels), np.uint8) if record.levels is None else record.levels
-    seen_s = np.zeros(len(record.codes), np.int64) if record.seen_s is None else record.seen_s
-    seen_s = np.repeat(seen_s, surface_counts(record.surface))
-    return SurfelCloud(voxels, surfels, support_confidence(levels, surfels.kinds), seen_s)
+    seen_s = np.repeat(record.seen_s, surface_counts(record.surface))
+    return SurfelCloud(voxels, surfels, support_confidence(record.levels, surfels.kinds), seen_s)

@@ -187,7 +187,7 @@ class KeptCheckpoints:
             names = {file.path.name}
             # One that does not open needs nothing any more.
             with contextlib.suppress(MapFileError):
-                names |= {other.name for other in open_manifest(file).files}
+                names |= set(open_manifest(file).files)
             self._needed[file.path] = frozenset(names)
         return self._needed[file.path]
 

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
-from triquad_format.mapfile.manifest import Entry, FileRef, Manifest
+from triquad_format.mapfile.manifest import Entry, Manifest
 from triquad_format.mapfile.metadata import MapFacts
 from triquad_format.mapfile.parts.part import MAP, PartKey
 from triquad_format.records.field_settings import RegionIndex
@@ -24,13 +24,11 @@ class KnownParts:
     facts: MapFacts
     stamp_ns: int
     entries: Mapping[PartKey, Entry]
-    stored: Mapping[FileRef, int]  # bytes of the parts in each of its files, needed or not
+    stored: Mapping[str, int]  # bytes of the parts in each of its files, by name, needed or not
 
     @classmethod
-    def after(
-        cls, manifest: Manifest, file: FileRef, stored_before: Mapping[FileRef, int]
-    ) -> "KnownParts":
-        """What is known once ``file`` with this manifest is on the disk.
+    def after(cls, manifest: Manifest, file: str, stored_before: Mapping[str, int]) -> "KnownParts":
+        """What is known once the file of the name ``file`` with this manifest is on the disk.
 
         ``stored_before`` gives the bytes of the parts in each of the other files.
         """
@@ -43,7 +41,7 @@ class KnownParts:
     @property
     def files(self) -> frozenset[str]:
         """Names of all its files."""
-        return frozenset(file.name for file in self.stored)
+        return frozenset(self.stored)
 
     @property
     def worth_folding(self) -> bool:

@@ -7,10 +7,9 @@ from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
-from triquad_format.errors import FormatError, NoIndexError
+from triquad_format.errors import FormatError
 from triquad_format.mapfile.checkpoint_folder import CheckpointFile, checkpoint_files
 from triquad_format.mapfile.index import FileBytes, MapIndex, named
-from triquad_format.mapfile.reader import read_map_file
 from triquad_map.compiled.priority import lower_priority
 
 from triquad_server.process.threads import NICENESS
@@ -85,11 +84,7 @@ class Scrubber:
         """
         with closing(FileBytes(path)) as file, named(str(path)):
             file.drop_cached()
-            try:
-                index = MapIndex(file)
-            except NoIndexError:
-                read_map_file(path)  # another tool rewrote it
-                return
+            index = MapIndex(file)
             for entry in index.manifest.own:
                 index.payload(entry)
                 if self._stopping.wait(entry.size / _BYTES_PER_S):

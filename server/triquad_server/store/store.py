@@ -20,7 +20,7 @@ from triquad_format.mapfile.checkpoint_folder import (
     open_manifest,
 )
 from triquad_format.mapfile.index import OtherFiles, files_in
-from triquad_format.mapfile.manifest import Entry, FileRef
+from triquad_format.mapfile.manifest import Entry
 from triquad_format.mapfile.metadata import MapFacts
 from triquad_format.mapfile.parts.pack import pack_region
 from triquad_format.mapfile.parts.part import MAP, Part
@@ -246,22 +246,20 @@ class Store:
         except MemoryError as error:
             raise StoreError(f"{failure}: out of memory") from error
 
-    def _set_newest(self, path: Path, written: WrittenMap, stored: Mapping[FileRef, int]) -> None:
+    def _set_newest(self, path: Path, written: WrittenMap, stored: Mapping[str, int]) -> None:
         """Record what was written; delete the oldest."""
-        file = FileRef(path.name, written.manifest_sha256)
-        self._known = KnownParts.after(written.manifest, file, stored)
+        self._known = KnownParts.after(written.manifest, path.name, stored)
         self._files.add(path, self._known.files)
         self._files.delete_old(self._known.facts.epoch)
 
     def _known_of(self, checkpoint: ValidCheckpoint) -> KnownParts:
         manifest = checkpoint.file.manifest
-        own = FileRef(checkpoint.path.name, checkpoint.file.manifest_sha256)
         stored = {other: self._stored_bytes(other) for other in manifest.files}
-        return KnownParts.after(manifest, own, stored)
+        return KnownParts.after(manifest, checkpoint.path.name, stored)
 
-    def _stored_bytes(self, file: FileRef) -> int:
+    def _stored_bytes(self, name: str) -> int:
         """Bytes of the parts in a file, needed or not."""
-        checkpoint = checkpoint_file(self.folder / file.name)
+        checkpoint = checkpoint_file(self.folder / name)
         return 0 if checkpoint is None else own_bytes(open_manifest(checkpoint))
 
 

@@ -159,7 +159,7 @@ def _show(options: argparse.Namespace) -> int:
         file = read_whole(path)
         summary = summarise(file)
         if options.verify:
-            summary = dataclasses.replace(summary, checks=verify(path, file))
+            summary = dataclasses.replace(summary, checks=verify(file))
     if options.plot:
         from triquad_tools.plots.map_plan import draw_map  # slow to import
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from triquad_format.mapfile.writer import replacing
+from triquad_format.mapfile.durable_file import replacing
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.cells import cells_of_boxes
 from triquad_format.records.region import MapRecord

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 from triquad_client import Mesh, OfflineMap
-from triquad_format.mapfile.writer import replacing
+from triquad_format.mapfile.durable_file import replacing
 from triquad_format.records.region import MapRecord
 
 from triquad_tools.console.command import ToolError

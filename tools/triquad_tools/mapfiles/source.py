@@ -7,7 +7,6 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from triquad_format.errors import NoIndexError
 from triquad_format.mapfile.checkpoint_folder import checkpoint_at, checkpoint_files, map_folder
 from triquad_format.mapfile.index import FileBytes, MapIndex, file_in, named
 from triquad_format.mapfile.parts.part import TRAINING_TOPICS
@@ -124,8 +123,7 @@ def read_whole(path: Path) -> MapFile:
 def read_source(path: Path, box: Box | None, training: bool) -> SourceMap:
     """The map in a file, cropped to a box, with training state if that is kept.
 
-    Of a file with an index only the parts that the box needs are read, unless it has training
-    state and that is kept.
+    Only the parts that the box needs are read, unless there is training state and that is kept.
 
     Raises:
         NothingLeftError: no region lies in the box.
@@ -152,19 +150,13 @@ def cropped(source: SourceMap, box: Box | None, training: bool) -> SourceMap:
 
 def _box(path: Path, box: Box, training: bool) -> SourceMap | None:
     """What answers in a box; ``None`` where the file has to be read whole."""
-    try:
-        with StoredMap.open(path) as stored:
-            topics = {entry.key.topic for entry in stored.manifest.entries}
-            if training and topics & set(TRAINING_TOPICS):
-                return None
-            return SourceMap(stored.box(box[0], box[1]), stored.manifest.stamp_ns or None)
-    except NoIndexError:
-        return None
+    with StoredMap.open(path) as stored:
+        topics = {entry.key.topic for entry in stored.manifest.entries}
+        if training and topics & set(TRAINING_TOPICS):
+            return None
+        return SourceMap(stored.box(box[0], box[1]), stored.manifest.stamp_ns or None)
 
 
 def _needed_files(path: Path) -> list[str]:
     with closing(FileBytes(path)) as source, named(str(path)):
-        try:
-            return [file.name for file in MapIndex(source).manifest.files]
-        except NoIndexError:
-            return []
+        return list(MapIndex(source).manifest.files)

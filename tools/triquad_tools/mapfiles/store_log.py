@@ -5,7 +5,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from triquad_format.errors import FormatError, MapFileError, NoIndexError
+from triquad_format.errors import FormatError, MapFileError
 from triquad_format.mapfile.checkpoint_folder import (
     CheckpointFile,
     checkpoint_files,
@@ -13,7 +13,7 @@ from triquad_format.mapfile.checkpoint_folder import (
     set_aside,
 )
 from triquad_format.mapfile.index import FileBytes, MapIndex
-from triquad_format.mapfile.manifest import FileRef, Manifest
+from triquad_format.mapfile.manifest import Manifest
 from triquad_format.mapfile.metadata import utc_time
 from triquad_format.mapfile.parts.part import REGION_TOPICS
 from triquad_format.mapfile.protections import read_protections
@@ -42,7 +42,7 @@ class LoggedCheckpoint:
     epoch: int
     complete: bool  # whether it needs no other file
     bytes: int
-    parts: LoggedParts | None  # None: it has no index, or does not open
+    parts: LoggedParts | None  # None: it does not open
     problem: str | None  # why it does not open
     protected: str | None = None  # why retention keeps it for a while, whatever its limits
 
@@ -112,7 +112,7 @@ def _row(checkpoint: LoggedCheckpoint) -> tuple[str, ...]:
         "complete" if checkpoint.complete else "delta",
         f"{checkpoint.bytes:,}",
         *told,
-        "no" if checkpoint.problem else "yes" if parts else "no index",
+        "no" if checkpoint.problem else "yes",
     )
 
 
@@ -121,8 +121,6 @@ def _logged(file: CheckpointFile, indices: "_Indices") -> LoggedCheckpoint:
     try:
         size = file.path.stat().st_size
         parts = indices.parts(file.path.name)
-    except NoIndexError:
-        pass  # another tool rewrote it: only reading all of it shows whether it is intact
     except (FormatError, OSError) as error:
         problem = str(error)
     return LoggedCheckpoint(
@@ -149,22 +147,21 @@ class _Indices:
             stored=len(manifest.own),
             total=len(manifest.entries),
             changed_regions=tuple(sorted({k.region for k in new if k.topic in REGION_TOPICS})),
-            other_files=tuple(file.name for file in manifest.files),
+            other_files=manifest.files,
         )
 
-    def _check_base(self, manifest: Manifest, file: FileRef) -> None:
-        """Raise unless another file is the one that was meant, and lists the parts."""
+    def _check_base(self, manifest: Manifest, file: str) -> None:
+        """Raise unless the file of this name lists the parts that it is to hold."""
         try:
-            index = self._index(file.name)
+            index = self._index(file)
         except FileNotFoundError as error:
-            raise MapFileError(f"it needs {file.name}, which is missing") from error
+            raise MapFileError(f"it needs {file}, which is missing") from error
         except (FormatError, OSError) as error:
-            raise MapFileError(f"it needs {file.name}: {error}") from error
+            raise MapFileError(f"it needs {file}: {error}") from error
         listed = {entry.key: entry.sha256 for entry in index.manifest.own}
         wanted = [entry for entry in manifest.entries if entry.file == file]
-        same = index.manifest_sha256 == file.manifest_sha256
-        if not same or any(listed.get(entry.key) != entry.sha256 for entry in wanted):
-            raise MapFileError(f"it needs {file.name}, but not the file that now has this name")
+        if any(listed.get(entry.key) != entry.sha256 for entry in wanted):
+            raise MapFileError(f"it needs {file}, but not the file that now has this name")
 
     def _index(self, name: str) -> MapIndex:
         if name not in self._read:

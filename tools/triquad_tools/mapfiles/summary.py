@@ -42,7 +42,7 @@ class RegionSummary:
     evidence_blocks: int
     evidence_box_m: tuple[tuple[float, ...], ...] | None  # two corners, to whole blocks
     surface_m3: float  # voxels in which rays ended
-    surface_levels: tuple[int, ...] | None  # number of such voxels by level; None: not known
+    surface_levels: tuple[int, ...]  # number of such voxels by level
     free_m3: float  # voxels through which rays only passed
     rays: int | None  # for replay; None: no training state
     samples: int | None  # likewise
@@ -65,7 +65,7 @@ class MapSummary:
     bytes_per_parameter: float | None
     surface_m3: float
     free_m3: float
-    progress: MapProgress | None  # None: the file does not tell
+    progress: MapProgress
     training: bool
     fit: MapFit | None  # to the rays that are held out; None: it holds none
     regions: tuple[RegionSummary, ...]
@@ -79,7 +79,7 @@ def summarise(file: MapFile) -> MapSummary:
     regions = tuple(_summarise_region(record, region) for region in record.regions)
     parts = _summarise_parts(file)
     parameters = sum(region.parameters for region in regions)
-    other_files = tuple(ref.name for ref in file.manifest.files)
+    other_files = file.manifest.files
     training_bytes = sum(parts[t].stored_bytes for t in TRAINING_TOPICS if t in parts)
     whole = parameters > 0 and not other_files
     return MapSummary(
@@ -94,7 +94,7 @@ def summarise(file: MapFile) -> MapSummary:
         bytes_per_parameter=(file.size - training_bytes) / parameters if whole else None,
         surface_m3=sum(region.surface_m3 for region in regions),
         free_m3=sum(region.free_m3 for region in regions),
-        progress=record.progress if record.progress != MapProgress() else None,
+        progress=record.progress,
         training=any(region.training is not None for region in record.regions),
         fit=recorded_fit(record),
         regions=regions,
@@ -129,10 +129,9 @@ def _facts(summary: MapSummary) -> Iterator[Row]:
     each = f", {share:.2f} bytes each" if share else ""
     yield Row("parameters", f"{summary.parameters:,}{each}")
     yield Row("evidence", _evidence(summary))
-    if summary.progress is not None:
-        done = summary.progress
-        made = f"{done.scans_taken:,} scans, {done.samples_trained:,} training samples"
-        yield Row("made of", made)
+    done = summary.progress
+    made = f"{done.scans_taken:,} scans, {done.samples_trained:,} training samples"
+    yield Row("made of", made)
     yield Row("training state", "yes" if summary.training else "no")
     yield from _fit_facts(summary)
     settings = vars(summary.settings).items()
@@ -164,8 +163,7 @@ def _region_facts(region: RegionSummary) -> Iterator[Row]:
         low, high = map(list, region.evidence_box_m)
         yield Row("evidence", f"{region.evidence_blocks:,} blocks in {low} to {high} m")
         yield Row("", _evidence(region))
-    if region.surface_levels is not None:
-        voxels = max(sum(region.surface_levels), 1)
+    if voxels := sum(region.surface_levels):
         shares = ", ".join(f"{i}: {n / voxels:.0%}" for i, n in enumerate(region.surface_levels))
         yield Row("", f"surface by level of support: {shares}")
     if region.samples is not None:
@@ -183,9 +181,7 @@ def _summarise_region(record: MapRecord, region: Region) -> RegionSummary:
     evidence = owned_evidence(record.settings, region)
     box = evidence_box(record.settings, region)
     voxel_m3 = record.settings.leaf_m**3
-    levels = None
-    if evidence.levels is not None:
-        levels = np.bincount(evidence.levels, minlength=MAX_LEVEL + 1)
+    levels = np.bincount(evidence.levels, minlength=MAX_LEVEL + 1)
     return RegionSummary(
         index=region.index,
         centre_m=_rounded(record.settings.region_centre(region.index)),
@@ -199,7 +195,7 @@ def _summarise_region(record: MapRecord, region: Region) -> RegionSummary:
         evidence_blocks=len(region.evidence.codes),
         evidence_box_m=None if box is None else tuple(map(_rounded, box)),
         surface_m3=_bits(evidence.surface) * voxel_m3,
-        surface_levels=None if levels is None else tuple(levels.tolist()),
+        surface_levels=tuple(levels.tolist()),
         free_m3=_bits(evidence.free & ~evidence.surface) * voxel_m3,
         rays=None if training is None else len(training.rays),
         samples=None if training is None else len(training.sample_points),
@@ -220,10 +216,10 @@ def _summarise_parts(file: MapFile) -> dict[str, TopicSummary]:
     """The parts by topic, those in other files included."""
     sizes: dict[str, list[int]] = {}
     stored: dict[str, list[int]] = {}
-    for part in file.parts:
-        stored.setdefault(part.topic, []).append(part.stored_size)
     for entry in file.manifest.entries:
         sizes.setdefault(entry.key.topic, []).append(entry.size)
+        if entry.file is None:
+            stored.setdefault(entry.key.topic, []).append(entry.stored)
     return {
         topic: TopicSummary(len(own), sum(own), len(here := stored.get(topic, [])), sum(here))
         for topic, own in sizes.items()

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from triquad_format.mapfile.writer import replacing
+from triquad_format.mapfile.durable_file import replacing
 from triquad_format.records.region import MapRecord
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings, StoreSettings

@@ -13,7 +13,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
-from triquad_format.mapfile.writer import replacing
+from triquad_format.mapfile.durable_file import replacing
 from triquad_format.records.arrays import Bytes, Doubles
 
 from triquad_tools.plots.camera import Camera, ParallelCamera

@@ -1,5 +1,6 @@
 """The msgpack map of a part, read with every field checked."""
 
+import re
 import reprlib
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -25,17 +26,31 @@ _MAX_REGION_INDEX = 2**31 - 1
 _MAX_ITEMS = 64
 _OBJECTS_PER_ITEM = 8  # of a manifest's longest list
 _MAX_STRING_BYTES = 4096
+_TOPIC = re.compile(rb"[\x80-\x8f]\xa5topic[\xa0-\xbf](/triquad/[a-z]+)")
+"""How a part begins: a short msgpack map, whose first key is ``topic``."""
 
 
 def unpack_body(topic: str, payload: bytes, max_items: int = _MAX_ITEMS) -> "PartBody":
     """The body of a part, whose lists have at most ``max_items`` items.
 
     Raises:
-        DamagedMapFileError: it is not a msgpack map, or exceeds a limit.
+        DamagedMapFileError: it is not a msgpack map, exceeds a limit, or is of another topic.
     """
+    part = PartBody(topic, _unpacked(topic, payload, max_items))
+    part.expect("topic", topic)
+    return part
+
+
+def part_topic(payload: bytes) -> str | None:
+    """The topic that a part names first; ``None``: it is no part."""
+    match = _TOPIC.match(payload)
+    return None if match is None else match[1].decode()
+
+
+def _unpacked(topic: str, payload: bytes, max_items: int) -> object:
     try:
         check_structure(payload, max(MAX_OBJECTS, _OBJECTS_PER_ITEM * max_items))
-        body = msgpack.unpackb(
+        return msgpack.unpackb(
             payload,
             max_str_len=_MAX_STRING_BYTES,
             max_array_len=max_items,
@@ -44,7 +59,6 @@ def unpack_body(topic: str, payload: bytes, max_items: int = _MAX_ITEMS) -> "Par
         )
     except (WireError, ValueError, msgpack.exceptions.UnpackException) as error:
         raise DamagedMapFileError(f"{topic}: not a msgpack map: {error}") from error
-    return PartBody(topic, body)
 
 
 class PartBody:
@@ -82,10 +96,6 @@ class PartBody:
         if not 0 <= value < 2**63:
             raise DamagedMapFileError(f"{self.topic}: {key} = {value} is not a count")
         return value
-
-    def optional_count(self, key: str) -> int:
-        """A number as of :meth:`count`; 0 where it is left out."""
-        return self.count(key) if self.has(key) else 0
 
     def texts(self, key: str) -> list[str]:
         """A list of strings."""

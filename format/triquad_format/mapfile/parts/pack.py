@@ -55,15 +55,12 @@ from triquad_format.wire.codec import binary_offsets, pack_array
 SAMPLES_PER_PART = 1 << 17
 RAYS_PER_PART = 1 << 21
 
-_COUNTS = ("places_repaired", "places_given_up")
-"""Of training state; left out where they are 0."""
-
 _MIN_SEAM_BYTES = 512  # a block of its own costs some bytes
 
 
 def pack_part(key: PartKey, body: Mapping[str, object]) -> Part:
     """A part of this body: numbers, strings, lists, maps and packed arrays."""
-    return Part(key, typing.cast(bytes, msgpack.packb(body)))
+    return Part(key, typing.cast(bytes, msgpack.packb({"topic": key.topic, **body})))
 
 
 def pack_record(
@@ -193,16 +190,13 @@ def _pack_evidence(region: Region) -> Iterator[Part]:
             "free": pack_array(evidence.free[rows]),
         }
         voxels = slice(first_voxel[rows.start], first_voxel[rows.stop])
-        if evidence.levels is not None:
-            fields["levels"] = pack_array(split_bits(evidence.levels[voxels], LEVEL_BITS))
-        if evidence.seen_s is not None:
-            fields |= _seen_fields(evidence.seen_s[rows][surface.any(axis=1)])
-        for name, column, widths in (
-            ("outcomes", evidence.outcomes, OUTCOME_BITS),
-            ("margins", evidence.margins, MARGIN_BITS),
-        ):
-            if column is not None:
-                fields[name] = pack_array(split_codes(column[voxels], widths))
+        outcomes, margins = evidence.outcomes[voxels], evidence.margins[voxels]
+        fields |= {
+            "levels": pack_array(split_bits(evidence.levels[voxels], LEVEL_BITS)),
+            **_seen_fields(evidence.seen_s[rows][surface.any(axis=1)]),
+            "outcomes": pack_array(split_codes(outcomes, OUTCOME_BITS)),
+            "margins": pack_array(split_codes(margins, MARGIN_BITS)),
+        }
         yield _region_part(PartKey(EVIDENCE, region.index, cell=cell), fields)
 
 
@@ -223,11 +217,11 @@ def _pack_training(
         "mlp_steps": training.mlp_steps,
         "training_budget": training.budget_samples,
         "samples": len(training.sample_points),
+        "rays": len(training.rays),
+        "origins": pack_array(training.rays.origins),
+        "places_repaired": training.places_repaired,
+        "places_given_up": training.places_given_up,
     }
-    counts = {name: getattr(training, name) for name in _COUNTS}
-    fields |= {name: count for name, count in counts.items() if count}
-    if len(training.rays):
-        fields |= {"rays": len(training.rays), "origins": pack_array(training.rays.origins)}
     yield _region_part(PartKey(TRAINING, region.index), fields)
     moments = (training.table_means, training.table_variances, training.table_steps)
     columns = moment_columns(settings)

@@ -32,21 +32,12 @@ PREVIEW = "/preview/mesh"
 FIELD_TOPICS = (REGION, VERTICES, EVIDENCE)
 TRAINING_TOPICS = (TRAINING, MOMENTS, SAMPLES, RAYS)
 REGION_TOPICS = (*FIELD_TOPICS, *TRAINING_TOPICS)
-TOPICS = (MAP, *REGION_TOPICS, MANIFEST)
-
-MESSAGE_ENCODING = "msgpack"
+MESSAGE_ENCODING = "msgpack-zstd"
 PREVIEW_ENCODING = "protobuf"
 PREVIEW_SCHEMA = "foxglove.SceneUpdate"
 
-ENCODINGS = {
-    **dict.fromkeys((MAP, *FIELD_TOPICS, TRAINING, MOMENTS, SAMPLES), MESSAGE_ENCODING),
-    PREVIEW: PREVIEW_ENCODING,
-    MANIFEST: MESSAGE_ENCODING,
-    RAYS: MESSAGE_ENCODING,
-}
-"""How the messages of each topic are encoded; topics in the order of their channels' numbers."""
-
 MAX_PART_BYTES = 32 * 2**20 - 65_536
+"""Bytes of the largest payload."""
 
 NO_REGION: RegionIndex = (0, 0, 0)
 

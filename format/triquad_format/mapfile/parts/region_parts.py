@@ -3,8 +3,9 @@
 Sizes are checked before anything is decoded, which takes more memory than a part has bytes.
 """
 
+import dataclasses
 from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,13 +49,12 @@ from triquad_format.records.region import (
     Region,
     TrainingState,
     VertexTable,
+    no_evidence,
     surface_counts,
 )
 from triquad_format.records.replay_rays import STEPS, ReplayRays, no_rays
 
 _MAX_SEEN_BYTES = (MAX_SEEN_S.bit_length() + 7) // 8
-
-_Number = TypeVar("_Number", bound=np.number)
 
 _Columns = tuple[NDArray[Any], ...]
 """Columns of equal length: some rows of a table."""
@@ -184,13 +184,13 @@ class RegionParts:
             sample_labels=labels,
             budget_samples=head.count("training_budget"),
             rays=self._rays(head),
-            places_repaired=head.optional_count("places_repaired"),
-            places_given_up=head.optional_count("places_given_up"),
+            places_repaired=head.count("places_repaired"),
+            places_given_up=head.count("places_given_up"),
         )
 
     def _rays(self, head: PartBody) -> ReplayRays:
-        """The rays, of which older files have none."""
-        count = head.optional_count("rays")
+        """The rays of all cubes, in the order of their leaves."""
+        count = head.count("rays")
         keys = [key for key in self._rows if key.topic == RAYS]
         keys.sort(key=lambda key: (key.cell, key.plane))
         none = no_rays()
@@ -198,8 +198,7 @@ class RegionParts:
         ends, origin_of, slopes = _joined(RAYS, [self._rows[key][0] for key in keys], empty)
         if len(ends) != count:
             raise DamagedMapFileError(f"{RAYS}: {len(ends)} rays, not {count}")
-        origins = head.array("origins", "<f4", (None, 3)) if count else none.origins
-        return ReplayRays(ends, origin_of, slopes, origins=origins)
+        return ReplayRays(ends, origin_of, slopes, origins=head.array("origins", "<f4", (None, 3)))
 
 
 def _read_codes(body: PartBody, key: PartKey, shift: int, most: int | None = None) -> Longs:
@@ -232,32 +231,25 @@ def _read_rays(body: PartBody, key: PartKey) -> _Columns:
 
 
 def _read_evidence(body: PartBody, key: PartKey) -> Evidence:
-    """The evidence of a cube; its optional fields are ``None`` where the part has none."""
+    """The evidence of a cube."""
     codes = _read_codes(body, key, cube_shift())
     surface, free = (
         body.array(name, "|u1", (len(codes), BLOCK_BYTES)) for name in ("surface", "free")
     )
     count = int(surface_counts(surface).sum())
-    levels = None
-    if body.has("levels"):
-        levels = join_bits(_planes(body, "levels", LEVEL_BITS, count), count)
     return Evidence(
         codes,
         surface,
         free,
-        levels=levels,
-        seen_s=_read_seen(body, surface) if body.has("seen_s") else None,
+        levels=join_bits(_planes(body, "levels", LEVEL_BITS, count), count),
+        seen_s=_read_seen(body, surface),
         outcomes=_read_codes_of_voxels(body, "outcomes", OUTCOME_BITS, count),
         margins=_read_codes_of_voxels(body, "margins", MARGIN_BITS, count),
     )
 
 
-def _read_codes_of_voxels(
-    body: PartBody, key: str, widths: Sequence[int], count: int
-) -> Bytes | None:
-    """Codes [count, C] of surface voxels, of so many bits each; ``None``: the part has none."""
-    if not body.has(key):
-        return None
+def _read_codes_of_voxels(body: PartBody, key: str, widths: Sequence[int], count: int) -> Bytes:
+    """Codes [count, C] of surface voxels, one column for each of ``widths``, which are bits."""
     return join_codes(_planes(body, key, sum(widths), count), widths, count)
 
 
@@ -299,37 +291,10 @@ def _joined(topic: str, portions: Sequence[_Columns], empty: _Columns) -> _Colum
 
 
 def _joined_evidence(portions: Sequence[Evidence]) -> Evidence:
-    """The evidence of a region from that of its cubes, in their order.
-
-    Where some of them tell no levels, times, outcomes or margins and others do, the former's are 0.
-    """
+    """The evidence of a region from that of its cubes, in their order."""
     if len(portions) == 1:
         return portions[0]
-    codes, masks = np.zeros(0, np.int64), np.zeros((0, BLOCK_BYTES), np.uint8)
-    blocks = [(len(portion.codes),) for portion in portions]
-    voxels = [(int(surface_counts(portion.surface).sum()),) for portion in portions]
-    outcomes = [(*shape, len(OUTCOME_BITS)) for shape in voxels]
-    margins = [(*shape, len(MARGIN_BITS)) for shape in voxels]
-    return Evidence(
-        np.concatenate([codes, *(portion.codes for portion in portions)]),
-        np.concatenate([masks, *(portion.surface for portion in portions)]),
-        np.concatenate([masks, *(portion.free for portion in portions)]),
-        levels=_joined_column([portion.levels for portion in portions], voxels),
-        seen_s=_joined_column([portion.seen_s for portion in portions], blocks),
-        outcomes=_joined_column([portion.outcomes for portion in portions], outcomes),
-        margins=_joined_column([portion.margins for portion in portions], margins),
-    )
-
-
-def _joined_column(
-    columns: Sequence[NDArray[_Number] | None], shapes: Sequence[tuple[int, ...]]
-) -> NDArray[_Number] | None:
-    """Columns of these shapes in one, with zeros for those that are not known."""
-    known = next((column for column in columns if column is not None), None)
-    if known is None:
-        return None
-    filled = [
-        np.zeros(shape, known.dtype) if column is None else column
-        for column, shape in zip(columns, shapes, strict=True)
-    ]
-    return np.concatenate(filled)
+    whole = [no_evidence(), *portions]
+    names = [field.name for field in dataclasses.fields(Evidence)]
+    columns = {name: np.concatenate([getattr(one, name) for one in whole]) for name in names}
+    return Evidence(**columns)

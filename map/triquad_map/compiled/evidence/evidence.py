@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from triquad_format.records import morton
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Longs
-from triquad_format.records.region import MARGIN_BITS, surface_counts
+from triquad_format.records.region import OUTCOME_BITS, surface_counts
 from triquad_format.records.region import Evidence as EvidenceRecord
 from triquad_format.records.status import Status
 
@@ -155,8 +155,11 @@ class FrozenEvidence:
     def record(self, outcomes: Bytes | None = None) -> EvidenceRecord:
         """The evidence as the map file holds it; empty blocks are left out.
 
-        ``outcomes`` [S, 3] are those of the voxels in ``surface``, in their order.
+        ``outcomes`` [S, 3] are those of the voxels in ``surface``, in their order; without them
+        nothing is known of any.
         """
+        if outcomes is None:
+            outcomes = np.zeros((len(self.levels), len(OUTCOME_BITS)), np.uint8)
         surface, free = self.seen.surface, self.seen.free
         used = np.flatnonzero((surface | free).any(axis=1))
         codes = morton.encode(self.cells[used])
@@ -174,7 +177,7 @@ class FrozenEvidence:
             free[used],
             levels=self.levels[voxels],
             seen_s=seen_s[used],
-            outcomes=None if outcomes is None else outcomes[voxels],
+            outcomes=outcomes[voxels],
             margins=self.margins[voxels],
         )
 
@@ -182,14 +185,6 @@ class FrozenEvidence:
     def from_record(cls, side: int, record: EvidenceRecord) -> "FrozenEvidence":
         """The evidence of a record, of a region of ``side`` voxels."""
         index = VoxelIndex.of_cells(morton.decode(record.codes, 3)).freeze()
-        levels, seen_s = record.levels, record.seen_s
-        if levels is None:
-            levels = np.zeros(int(surface_counts(record.surface).sum()), np.uint8)
-        if seen_s is None:
-            seen_s = np.zeros(len(record.codes), np.int64)
-        margins = record.margins
-        if margins is None:
-            margins = np.zeros((len(levels), len(MARGIN_BITS)), np.uint8)
         masks = (np.ascontiguousarray(mask) for mask in (record.surface, record.free))
         seen = SeenVoxels(side, index, *masks)
-        return cls(seen, levels, scans=None, beyond=margins, seen_s=seen_s)
+        return cls(seen, record.levels, scans=None, beyond=record.margins, seen_s=record.seen_s)

@@ -197,12 +197,11 @@ class Observations:
         seen_s: Longs,
         *,
         margins: Bytes,
-        outcomes: Bytes | None,
+        outcomes: Bytes,
     ) -> "Observations":
         """Observations of the blocks ``surface`` [blocks, BLOCK_BYTES] that give these levels.
 
-        And these ``margins`` [S, 6]. ``outcomes`` are the codes [S, 3] of what became of rays;
-        ``None``: not known.
+        And these ``margins`` [S, 6]. ``outcomes`` are the codes [S, 3] of what became of rays.
         """
         used = used_blocks(surface)
         places = slice(1, 1 + len(used))
@@ -224,8 +223,6 @@ class Observations:
         voxels["sectors"] = known
         eighths = np.where(margins > 0, 2 * margins + 1, 0)
         voxels["lowest"], voxels["highest"] = eighths[:, :3], EIGHTHS - 1 - eighths[:, 3:]
-        if outcomes is None:
-            outcomes = np.zeros((len(levels), len(_RECORD)), np.uint8)
         for name, counts in zip(_RECORD, outcome_counts(outcomes).T, strict=True):
             voxels[name] = counts
         # The margins that a file tells count, however few scans its hits stand for.

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from triquad_format.errors import FormatError, NoIndexError
+from triquad_format.errors import FormatError
 from triquad_format.mapfile.checkpoint_folder import (
     CheckpointFile,
     checkpoint_files,
@@ -116,13 +116,10 @@ class History:
             self.release(moment)
 
     def _read(self, file: CheckpointFile) -> None:
-        time = ""
         try:
             stamp_ns = open_manifest(file).stamp_ns
-            time = utc_time(stamp_ns) if stamp_ns else ""
-        except NoIndexError:
-            pass  # another tool rewrote it: it may be intact all the same
         except (FormatError, OSError) as error:
             self._damaged[file] = f"{file.path.name} is left out: {error}"
             return
+        time = utc_time(stamp_ns) if stamp_ns else ""
         self._moments[file] = Moment(file.epoch, time, file.path)

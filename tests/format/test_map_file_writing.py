@@ -1,19 +1,25 @@
+"""What a writer refuses, and that a path gets all of a file or nothing of it."""
+
 import dataclasses
 import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from support.map_records import SMALL, assert_same, random_record, with_integers
+from support.map_records import SMALL, assert_same, evidence_of, random_record, with_integers
 from support.mapfile_edit import write_pair, write_record
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records import morton
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import MAX_INTEGER, MAX_SEEN_S
+from triquad_format.records.map_progress import MapProgress
+from triquad_format.records.region import MAX_INTEGER, MAX_SEEN_S, MapRecord
 
 
-def with_table(record, **changes):
+def with_table(record: MapRecord, **changes: Any) -> MapRecord:
     """The record with changes to the first table of its first region."""
     region = record.regions[0]
     table = dataclasses.replace(region.tables[0], **changes)
@@ -21,7 +27,11 @@ def with_table(record, **changes):
     return dataclasses.replace(record, regions=(region, *record.regions[1:]))
 
 
-INVALID = {
+INVALID: dict[str, Callable[[MapRecord], MapRecord]] = {
+    "scans below none": lambda r: dataclasses.replace(r, progress=MapProgress(-1)),
+    "a loss that is none": lambda r: dataclasses.replace(
+        r, progress=MapProgress(loss=float("inf"))
+    ),
     "epoch": lambda r: dataclasses.replace(r, epoch=-1),
     "name": lambda r: dataclasses.replace(r, name="a/b"),
     "a region twice": lambda r: dataclasses.replace(r, regions=r.regions * 2),
@@ -41,7 +51,7 @@ INVALID = {
 
 
 @pytest.mark.parametrize("case", INVALID)
-def test_invalid_records_are_not_written(tmp_path, case):
+def test_invalid_records_are_not_written(tmp_path: Path, case: str) -> None:
     path = tmp_path / "map.triquad"
     with pytest.raises(FormatError):
         write_map(INVALID[case](random_record(15)), path)
@@ -79,7 +89,7 @@ INVALID_EVIDENCE = {
 }
 
 
-def with_evidence(record, **changes):
+def with_evidence(record: MapRecord, **changes: Any) -> MapRecord:
     """The record with changes to the evidence of its only region."""
     region = record.regions[0]
     region = dataclasses.replace(region, evidence=dataclasses.replace(region.evidence, **changes))
@@ -87,23 +97,25 @@ def with_evidence(record, **changes):
 
 
 @pytest.mark.parametrize("case", INVALID_EVIDENCE)
-def test_invalid_evidence_is_not_written(tmp_path, case):
+def test_invalid_evidence_is_not_written(tmp_path: Path, case: str) -> None:
     field, array, message = INVALID_EVIDENCE[case]
     with pytest.raises(FormatError, match=message):
         write_map(with_evidence(random_record(15), **{field: array}), tmp_path / "map.triquad")
     assert not list(tmp_path.iterdir())
 
 
-def test_blocks_without_surface_have_no_time(tmp_path):
+def test_blocks_without_surface_have_no_time(tmp_path: Path) -> None:
     record = random_record(15)
-    surface = record.regions[0].evidence.surface.copy()
+    evidence = record.regions[0].evidence
+    surface = evidence.surface.copy()
     surface[5] = 0
-    record = with_evidence(record, surface=surface, seen_s=np.ones(38, np.int64))
+    fewer = evidence_of(evidence.codes, surface, evidence.free)
+    record = with_evidence(record, **vars(fewer) | {"seen_s": np.ones(38, np.int64)})
     with pytest.raises(FormatError, match="seen_s: a block without surface has a time"):
         write_map(record, tmp_path / "map.triquad")
 
 
-def test_features_beyond_half_precision(tmp_path):
+def test_features_beyond_half_precision(tmp_path: Path) -> None:
     record = random_record(16, feature_dtype="<f4")
     record.regions[0].tables[1].features[0, 0] = 1e6
     with pytest.raises(FormatError, match="1e\\+06|1000000"):
@@ -114,7 +126,7 @@ def test_features_beyond_half_precision(tmp_path):
         write_map(record, tmp_path / "map.triquad", feature_dtype="<f8")
 
 
-def test_total_limit_holds_while_writing(monkeypatch, tmp_path):
+def test_total_limit_holds_while_writing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     path = tmp_path / "map.triquad"
     write_map(random_record(17), path)
     size = path.stat().st_size
@@ -126,14 +138,14 @@ def test_total_limit_holds_while_writing(monkeypatch, tmp_path):
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_part_limit(monkeypatch, tmp_path):
+def test_part_limit(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("triquad_format.mapfile.writer.MAX_PART_BYTES", 200)
     with pytest.raises(FormatError, match="at most 200"):
         write_map(random_record(17), tmp_path / "map.triquad")
 
 
 @pytest.mark.parametrize("limit", ["MAX_ENTRIES", "MAX_FILES"])
-def test_manifest_limits(monkeypatch, tmp_path, limit):
+def test_manifest_limits(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, limit: str) -> None:
     monkeypatch.setattr(f"triquad_format.mapfile.manifest.{limit}", 0)
     with pytest.raises(FormatError, match="at most"):
         write_pair(tmp_path, random_record(17), random_record(17, epoch=8))
@@ -141,12 +153,14 @@ def test_manifest_limits(monkeypatch, tmp_path, limit):
 
 
 @pytest.mark.parametrize("step", ["write", "fsync", "replace"])
-def test_interrupted_write_leaves_the_old_file(monkeypatch, tmp_path, step):
+def test_interrupted_write_leaves_the_old_file(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, step: str
+) -> None:
     path = tmp_path / "map.triquad"
     write_map(random_record(18), path)
     before = path.read_bytes()
 
-    def fail(*_):
+    def fail(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
     if step == "write":
@@ -162,8 +176,10 @@ def test_interrupted_write_leaves_the_old_file(monkeypatch, tmp_path, step):
     assert_same(read_map(path), random_record(19))
 
 
-def test_file_is_synced_before_and_folder_after_the_rename(monkeypatch, tmp_path):
-    calls = []
+def test_file_is_synced_before_and_folder_after_the_rename(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    calls: list[str] = []
     real_sync, real_replace = os.fsync, os.replace
     monkeypatch.setattr(os, "fsync", lambda fd: (calls.append("fsync"), real_sync(fd))[1])
     monkeypatch.setattr(
@@ -173,7 +189,7 @@ def test_file_is_synced_before_and_folder_after_the_rename(monkeypatch, tmp_path
     assert calls == ["fsync", "replace", "fsync"]
 
 
-def test_an_unchanged_part_keeps_its_epoch_and_time(tmp_path):
+def test_an_unchanged_part_keeps_its_epoch_and_time(tmp_path: Path) -> None:
     """Also in a complete file, which stores it anew."""
     base = random_record(21, indices=((0, 0, 0), (1, 0, 0)), epoch=3)
     one, other = base.regions
@@ -198,13 +214,21 @@ def test_an_unchanged_part_keeps_its_epoch_and_time(tmp_path):
         assert (entry.epoch, entry.stamp_ns) == ((5, 2 * 10**9) if is_new else (3, 10**9))
 
 
-def test_what_shrinks_more_than_readers_believe_is_stored_as_it_is(tmp_path):
+def test_what_shrinks_to_a_thousandth_is_read(tmp_path: Path) -> None:
     wide = FieldSettings(depth=8, feature_levels=1, feature_size=64)
     record = random_record(0, settings=wide, training=False, feature_dtype="<f4")
     cells = np.stack(np.meshgrid(np.arange(256), np.arange(256)), axis=-1).reshape(-1, 2)
     codes = np.sort(morton.encode(cells))
-    zeros = np.zeros((len(codes), 64), np.float32)
-    record = with_table(record, codes=codes, features=zeros)
+    record = with_table(record, codes=codes, features=np.zeros((len(codes), 64), np.float32))
     path = tmp_path / "map.triquad"
     write_map(record, path, feature_dtype="<f4")
     assert_same(read_map(path), record)
+
+
+def test_a_map_that_readers_would_take_for_an_attack_is_not_written(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("triquad_format.mapfile.writer.total_limit", lambda _: 1000)
+    with pytest.raises(FormatError, match="attack"):
+        write_map(random_record(1), tmp_path / "map.triquad")
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,355 @@
+"""Damaged map files: each is read as it was, as another valid map, or refused by name.
+
+What is recovered of each is a valid map, or nothing.
+
+``TRIQUAD_FUZZ`` is the number of mutants of each kind. Given, others are drawn each time, and none
+may take longer than 5 s; otherwise they are always the same. Linux only: memory is limited.
+"""
+
+import io
+import os
+import resource
+import subprocess
+import sys
+import tracemalloc
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fuzz.choices import Mutation
+from fuzz.damage import DAMAGE, add_bombs, change_parts
+from fuzz.forgery import FORGERY, forge_bombs
+from fuzz.valid_maps import READERS, Reader, Results, ValidMap, valid_maps
+from hypothesis import HealthCheck, Phase, event, given, settings
+from hypothesis import strategies as st
+from mcap.writer import Writer
+from support.file_damage import chunks, flipped, zeroed
+from support.map_records import assert_same, random_record
+from support.mapfile_edit import (
+    assert_refused,
+    file_bytes,
+    parts_of,
+    read_bytes,
+    rewritten,
+    stored,
+    stored_record,
+)
+from triquad_format.errors import (
+    DamagedMapFileError,
+    FormatError,
+    MapFileError,
+    TooLargeMapFileError,
+    UnsupportedMapFileError,
+)
+from triquad_format.mapfile import reader
+from triquad_format.mapfile import writer as writer_module
+from triquad_format.mapfile.manifest import Entry
+from triquad_format.mapfile.metadata import MapFacts
+from triquad_format.mapfile.parts.pack import pack_part, pack_record
+from triquad_format.mapfile.parts.part import PartKey
+from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.writer import write_parts
+from triquad_format.records.record_check import check_record
+from triquad_format.records.region import MapRecord
+from triquad_format.recovery.recovered_map import recover
+
+CAMPAIGN = os.environ.get("TRIQUAD_FUZZ")
+COUNT = int(CAMPAIGN or 40)
+LIMIT_BYTES = 64 * 2**20
+"""Memory that a reader may take beside the size of the file."""
+
+mutants = settings(
+    max_examples=COUNT,
+    derandomize=CAMPAIGN is None,
+    deadline=5000 if CAMPAIGN else None,
+    suppress_health_check=list(HealthCheck),
+    report_multiple_bugs=False,
+)
+bombs = settings(mutants, max_examples=max(COUNT // 20, 10))
+
+
+@pytest.fixture(scope="module")
+def maps(tmp_path_factory: pytest.TempPathFactory) -> list[ValidMap]:
+    return valid_maps(tmp_path_factory.mktemp("maps"))
+
+
+@pytest.mark.parametrize("mutation", DAMAGE)
+@mutants
+@given(data=st.data())
+def test_damage_is_found(maps: list[ValidMap], mutation: Mutation, data: st.DataObject) -> None:
+    check_mutant(maps, mutation, data)
+
+
+@pytest.mark.parametrize("mutation", FORGERY)
+@mutants
+@given(data=st.data())
+def test_forged_maps_are_valid(
+    maps: list[ValidMap], mutation: Mutation, data: st.DataObject
+) -> None:
+    check_mutant(maps, mutation, data, forged=True)
+
+
+@pytest.mark.parametrize("mutation", [add_bombs, forge_bombs])
+@bombs
+@given(data=st.data())
+def test_bombs_take_little_memory(
+    maps: list[ValidMap], mutation: Mutation, data: st.DataObject
+) -> None:
+    check_mutant(maps, mutation, data, forged=mutation is forge_bombs)
+
+
+def test_a_reader_that_checks_no_digests_is_found(
+    maps: list[ValidMap], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The tests above must be able to fail."""
+    monkeypatch.setattr(Entry, "check", lambda *_: None)
+
+    @settings(mutants, max_examples=500, derandomize=True, phases=[Phase.generate])
+    @given(data=st.data())
+    def damage_is_found(data: st.DataObject) -> None:
+        check_mutant(maps, change_parts, data)
+
+    with pytest.raises(AssertionError, match="read as another map"):
+        damage_is_found()
+
+
+def check_mutant(
+    maps: list[ValidMap], mutation: Mutation, data: st.DataObject, *, forged: bool = False
+) -> None:
+    """Change one file of a map, and check what each way of reading the map makes of it."""
+    valid = data.draw(st.sampled_from(maps))
+    name = data.draw(st.sampled_from(sorted(valid.files)))
+    mutant = mutation(data.draw, valid.files[name])
+    # A map knows the digests of the other files that it needs: no forgery of them passes.
+    forged = forged and name == valid.path.name
+    (valid.path.parent / name).write_bytes(mutant)
+    try:
+        for read, wanted in zip(READERS, valid.results, strict=True):
+            with little_memory(len(mutant)), np.errstate(all="ignore"):
+                have = outcome(read, valid.path)
+            if isinstance(have, FormatError):
+                check_error(have)
+            elif not is_same(have, wanted):
+                assert forged, f"{read}: it is read as another map"
+                check_results(have)
+        with little_memory(len(mutant)), suppress(FormatError):
+            check_record(recover(valid.path).record)
+    finally:
+        (valid.path.parent / name).write_bytes(valid.files[name])
+
+
+def outcome(read: Reader, path: Path) -> Results | FormatError:
+    try:
+        return read(path)
+    except FormatError as error:
+        return error
+
+
+def check_error(error: FormatError) -> None:
+    event(type(error).__name__)
+    assert not isinstance(error.__cause__, MemoryError), "it takes too much memory"
+    assert str(error).strip(), f"{type(error).__name__} without a text"
+
+
+def is_same(results: Results, wanted: Results) -> bool:
+    try:
+        assert_same(results, wanted)
+    except AssertionError:
+        return False
+    return True
+
+
+def check_results(results: Results) -> None:
+    event("another valid map")
+    for record in results:
+        if isinstance(record, MapRecord):
+            check_record(record)
+
+
+@contextmanager
+def little_memory(file_bytes: int) -> Iterator[None]:
+    """Limit the address space, so that no allocation passes unseen, and measure Python's."""
+    limit = LIMIT_BYTES + file_bytes
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    tracemalloc.start()
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + limit, before[1]))
+    try:
+        yield
+        assert tracemalloc.get_traced_memory()[1] <= limit, "it takes too much memory"
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+        tracemalloc.stop()
+
+
+# Damage at chosen places
+
+RECORD = random_record(6, indices=((0, 0, 0), (1, 0, 0)))
+DATA = file_bytes(RECORD, preview=True)
+
+
+def test_files_that_are_cut_anywhere() -> None:
+    offsets = {*range(200), *range(0, len(DATA), 997), *range(len(DATA) - 600, len(DATA))}
+    for offset in offsets:
+        for read in (read_bytes, stored):
+            with pytest.raises(MapFileError):
+                read(DATA[:offset])
+
+
+def test_every_byte_at_both_ends_is_checked() -> None:
+    for place in (*range(300), *range(len(DATA) - 300, len(DATA))):
+        with pytest.raises(MapFileError):
+            read_bytes(flipped(DATA, place))
+
+
+@pytest.mark.parametrize("number", range(len(chunks(DATA))))
+def test_a_damaged_part_is_refused_when_it_is_read(number: int) -> None:
+    chunk = chunks(DATA)[number]
+    for mutant in (flipped(DATA, chunk.middle), zeroed(DATA, chunk.start, chunk.end)):
+        with pytest.raises(DamagedMapFileError):
+            read_bytes(mutant)
+        if chunk.topic == "/preview/mesh":
+            assert_same(stored_record(mutant), RECORD)  # nothing there is read
+            continue
+        with pytest.raises(MapFileError):
+            stored_record(mutant)
+
+
+def test_equal_parts_of_two_maps_are_not_mixed_up() -> None:
+    changed = random_record(7)
+    for table in changed.regions[0].tables:
+        table.features[:] *= -1
+    other = dict(enumerate(part.payload for part in parts_of(file_bytes(changed))[:-1]))
+    del other[0]
+    mixed = rewritten(file_bytes(random_record(7)), payloads=other, fitting=False)
+    assert_refused(mixed, "not the part listed")
+
+
+def test_messages_name_file_fault_and_remedy(tmp_path: Path) -> None:
+    path = tmp_path / "broken.triquad"
+    path.write_bytes(DATA[:-100])
+    with pytest.raises(DamagedMapFileError, match=r"broken.triquad .*incomplete.*older"):
+        read_map(path)
+    path.write_bytes(b"")
+    with pytest.raises(DamagedMapFileError, match="incomplete: 0 bytes"):
+        read_map(path)
+    for other in (b"PK\x03\x04 a zip file", b"\x89PNG\r\n\x1a\n" * 10):
+        path.write_bytes(other)
+        with pytest.raises(MapFileError, match="not a map file"):
+            read_map(path)
+    with pytest.raises(FileNotFoundError):
+        read_map(tmp_path / "none.triquad")
+
+
+@pytest.mark.parametrize("names", [[], ["other"], ["triquad", "triquad"]])
+def test_other_mcap_files(names: list[str]) -> None:
+    stream = io.BytesIO()
+    writer = Writer(stream, enable_data_crcs=True)
+    writer.start()
+    for name in names:
+        writer.add_metadata(name, {})
+    writer.finish()
+    message = "more than once" if len(names) > 1 else "not a map"
+    for read in (read_bytes, stored):
+        with pytest.raises(MapFileError, match=message):
+            read(stream.getvalue())
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "text"),
+    [
+        ({"min_reader_version": "2"}, UnsupportedMapFileError, "version 2.*triquad 0.1.0"),
+        ({"min_reader_version": None}, DamagedMapFileError, "min_reader_version"),
+        ({"min_reader_version": "one"}, DamagedMapFileError, "min_reader_version"),
+        ({"min_reader_version": "9" * 5000}, DamagedMapFileError, "min_reader_version"),
+        ({"epoch": "8"}, DamagedMapFileError, "epoch"),
+        ({"frame_id": "odom"}, DamagedMapFileError, "frame_id"),
+        ({"map": "other"}, DamagedMapFileError, "map"),
+        ({"units": "ft"}, DamagedMapFileError, "units"),
+        ({"manifest": None}, DamagedMapFileError, "manifest"),
+        ({"manifest": "8"}, DamagedMapFileError, "manifest"),
+        ({"manifest": "-8 100"}, DamagedMapFileError, "manifest"),
+        ({"manifest": "8 100"}, DamagedMapFileError, "chunk at byte 8"),
+        ({"manifest": f"8 {2**40}"}, DamagedMapFileError, "too long"),
+    ],
+)
+def test_metadata_is_checked(
+    changes: dict[str, str | None], error: type[MapFileError], text: str
+) -> None:
+    mutant = rewritten(file_bytes(random_record(9, epoch=7)), metadata=changes)
+    for read in (read_bytes, stored):
+        with pytest.raises(error, match=text):
+            read(mutant)
+
+
+def test_later_minor_versions_are_read() -> None:
+    changes = {"format_version": "4", "colour": "green"}
+    later = rewritten(file_bytes(random_record(9)), metadata=changes)
+    assert_same(read_bytes(later), random_record(9))
+    assert_same(stored_record(later), random_record(9))
+
+
+def test_unknown_parts_are_skipped_but_checked(monkeypatch: pytest.MonkeyPatch) -> None:
+    part = pack_part(PartKey("/triquad/colours"), {"anything": 1})
+    parts = [part, *pack_record(RECORD, "<f2", {})]
+    monkeypatch.setitem(writer_module._LEVELS, part.key.topic, 3)
+    stream = io.BytesIO()
+    write_parts(stream, MapFacts.of(RECORD), parts)
+    data = stream.getvalue()
+    assert_same(read_bytes(data), RECORD)
+    assert_same(stored_record(data), RECORD)
+    other = rewritten(data, payloads={1: b"anything else"}, fitting=False)
+    with pytest.raises(DamagedMapFileError, match="colours"):
+        read_bytes(other)
+
+
+def test_total_is_limited() -> None:
+    data = file_bytes(random_record(14, points=300))
+    for limit in (len(data) + 100, len(data) - 1):
+        with pytest.raises(TooLargeMapFileError, match="limit"):
+            read_map(io.BytesIO(data), max_bytes=limit)
+    assert read_map(io.BytesIO(data), max_bytes=10 * len(data)).regions
+
+
+def test_memory_error_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def out_of_memory(*_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(reader, "assemble", out_of_memory)
+    with pytest.raises(TooLargeMapFileError, match="memory"):
+        read_bytes(DATA)
+
+
+READ_WITH_LITTLE_MEMORY = """
+import os
+import resource
+import sys
+from pathlib import Path
+
+from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.writer import write_parts
+
+for room in range(0, 6 * 2**20, 2**16):
+    if os.fork() == 0:
+        taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (taken + room, resource.RLIM_INFINITY))
+        try:
+            read_map(sys.argv[1])
+            outcome = b"read"
+        except BaseException as error:
+            outcome = type(error).__name__.encode()
+        os.write(1, outcome + b"\\n")
+        os._exit(0)
+    os.wait()
+"""
+
+
+def test_too_little_memory_is_no_damage(tmp_path: Path) -> None:
+    path = tmp_path / "map.triquad"
+    path.write_bytes(file_bytes(random_record(3, points=20000)))
+    command = [sys.executable, "-c", READ_WITH_LITTLE_MEMORY, str(path)]
+    told = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert set(told.split()) == {"read", "TooLargeMapFileError"}, Counter(told.split())

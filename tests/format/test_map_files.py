@@ -1,0 +1,261 @@
+"""Map files of every kind: what is written is read back, and other programs can open it."""
+
+import dataclasses
+import hashlib
+import io
+from collections import Counter
+from pathlib import Path
+
+import msgpack
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from support import golden
+from support.map_records import (
+    SMALL,
+    assert_same,
+    random_record,
+    with_integers,
+    with_progress,
+    with_rays,
+    with_support,
+)
+from support.mapfile_edit import (
+    edited,
+    file_bytes,
+    manifest_of,
+    metadata_of,
+    parts_of,
+    read_bytes,
+    stored_record,
+)
+from triquad_format.errors import FormatError
+from triquad_format.mapfile.metadata import MapFacts
+from triquad_format.mapfile.parts.pack import pack_record
+from triquad_format.mapfile.reader import read_map, read_map_file
+from triquad_format.mapfile.writer import MapFileInfo, write_map, write_parts
+from triquad_format.records import morton
+from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.map_progress import MapProgress
+from triquad_format.records.region import AXES, MAX_INTEGER, MapRecord
+from triquad_server.mesh.preview import previews_of
+
+
+def assert_read_back(record: MapRecord, data: bytes | None = None) -> None:
+    """Both ways of reading give the record."""
+    data = file_bytes(record) if data is None else data
+    assert_same(read_bytes(data), record)
+    assert_same(stored_record(data), record)
+
+
+@pytest.mark.parametrize("training", [True, False])
+@pytest.mark.parametrize("dtype", ["<f2", "<f4"])
+def test_round_trip(tmp_path: Path, training: bool, dtype: str) -> None:
+    record = with_support(
+        random_record(1, indices=((0, 0, 0), (3, -1, 2)), training=training, feature_dtype=dtype)
+    )
+    path = tmp_path / "map.triquad"
+    info = write_map(record, path, feature_dtype=dtype)
+    assert_same(read_map(path), record)
+    assert_same(read_map(str(path)), record)
+    with path.open("rb") as stream:
+        assert_same(read_map(stream), record)
+    data = path.read_bytes()
+    assert info == MapFileInfo(len(data), hashlib.sha256(data).hexdigest(), record.epoch)
+
+
+@pytest.mark.parametrize(("limit", "planes"), [(1, 1), (127, 1), (128, 2), (MAX_INTEGER, 2)])
+def test_integer_features(limit: int, planes: int) -> None:
+    record = with_integers(random_record(2), limit)
+    data = file_bytes(record)
+    assert_read_back(record, data)
+    bodies = [msgpack.unpackb(p.payload) for p in parts_of(data) if p.topic == "/triquad/vertices"]
+    levels = [level for body in bodies for level in body["levels"]]
+    assert {level["integers"]["shape"][0] for level in levels} == {planes}
+    assert not any("features" in level for level in levels)
+
+
+def test_rays_of_a_cube_that_fill_several_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("triquad_format.mapfile.parts.pack.RAYS_PER_PART", 80)
+    record = with_rays(random_record(2))
+    data = file_bytes(record)
+    assert sum(part.topic == "/triquad/rays" for part in parts_of(data)) > 1
+    assert_read_back(record, data)
+
+
+def test_empty_map() -> None:
+    assert_read_back(MapRecord("default", 0, SMALL, ()))
+
+
+@pytest.mark.parametrize("preview", [True, False])
+def test_regions_that_saw_nothing(preview: bool) -> None:
+    record = random_record(0, points=0)
+    for seen in (record, with_integers(record)):
+        assert_read_back(seen, file_bytes(seen, preview=preview))
+
+
+@pytest.mark.parametrize("integers", [True, False])
+def test_regions_are_split_into_squares_and_cubes(integers: bool) -> None:
+    record = random_record(2, settings=FieldSettings(), points=350)
+    record = with_integers(record) if integers else record
+    (region,) = record.regions
+    places = {
+        (table.plane, *cell)
+        for table in region.tables
+        for cell in (morton.decode(table.codes, 2) << (12 - table.level) >> 8).tolist()
+    }
+    cubes = np.unique(morton.decode(region.evidence.codes, 3) >> 5, axis=0)
+    data = file_bytes(record)
+    found = Counter(part.topic for part in parts_of(data))
+    assert found["/triquad/vertices"] == found["/triquad/moments"] == len(places) > len(AXES)
+    assert found["/triquad/evidence"] == len(cubes) > 1
+    assert_same(read_bytes(data), record)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    points=st.integers(0, 30),
+    encoding=st.sampled_from(["both", "features", "fourier"]),
+    depth=st.integers(6, 15),
+    levels=st.integers(1, 4),
+    size=st.integers(1, 9),
+    training=st.booleans(),
+    limit=st.none() | st.integers(1, MAX_INTEGER),
+    epoch=st.integers(0, 2**63 - 1),
+    progress=st.tuples(st.integers(0, 2**62 - 1), st.integers(0, 2**62 - 1), st.floats(0, 9)),
+)
+def test_round_trip_of_any_record(
+    seed: int,
+    points: int,
+    encoding: str,
+    depth: int,
+    levels: int,
+    size: int,
+    training: bool,
+    limit: int | None,
+    epoch: int,
+    progress: tuple[int, int, float],
+) -> None:
+    chosen = dataclasses.replace(
+        SMALL, encoding=encoding, depth=depth, feature_levels=levels, feature_size=size
+    )
+    record = random_record(seed, settings=chosen, points=points, training=training, epoch=epoch)
+    record = with_support(record if limit is None else with_integers(record, limit, seed))
+    if training:
+        record = with_progress(with_rays(record, points), MapProgress(*progress))
+    assert_read_back(record)
+
+
+def test_features_are_rounded_to_the_file_dtype() -> None:
+    record = random_record(3, feature_dtype="<f4")
+    table = read_bytes(file_bytes(record)).regions[0].tables[0]
+    want = record.regions[0].tables[0].features.astype(np.float16)
+    assert table.features.dtype == np.float16
+    np.testing.assert_array_equal(table.features, want)
+
+
+def test_same_record_same_bytes() -> None:
+    assert file_bytes(random_record(4), preview=True) == file_bytes(random_record(4), preview=True)
+    assert "created" not in metadata_of(file_bytes(random_record(4)))
+
+
+def test_stamp() -> None:
+    stamp_ns = 1_700_000_000_123_456_789
+    stamped = file_bytes(random_record(4), stamp_ns=stamp_ns)
+    assert metadata_of(stamped)["created"] == "2023-11-14T22:13:20Z"
+    manifest = manifest_of(stamped)
+    assert manifest.stamp_ns == stamp_ns
+    assert {(entry.epoch, entry.stamp_ns) for entry in manifest.entries} == {(7, stamp_ns)}
+    messages = make_reader(io.BytesIO(stamped)).iter_messages()
+    assert {message.log_time for _, _, message in messages} == {stamp_ns}
+    assert manifest_of(file_bytes(random_record(4))).stamp_ns == 0
+    for bad in (-1, 2**63):
+        with pytest.raises(FormatError, match="stamp_ns"):
+            file_bytes(random_record(4), stamp_ns=bad)
+
+
+def test_what_is_known_of_a_file_and_its_parts() -> None:
+    data = file_bytes(random_record(5))
+    file = read_map_file(io.BytesIO(data))
+    assert file.size == len(data)
+    assert file.metadata["frame_id"] == "map"
+    assert file.manifest == manifest_of(data)
+    own = file.manifest.own
+    assert [entry.key.topic for entry in own] == [part.topic for part in parts_of(data)[:-1]]
+    assert 0 < sum(entry.stored for entry in own) < len(data)
+
+
+# The golden files
+
+
+def test_golden_files_read_back() -> None:
+    assert sum(path.stat().st_size for path in golden.FOLDER.iterdir()) <= 100_000
+    for name, record in golden.golden_records().items():
+        assert_same(read_map(golden.FOLDER / name), record)
+
+
+@pytest.fixture
+def written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A folder with what the writer writes now, under the name that it had then."""
+    monkeypatch.setattr("triquad_format.mapfile.metadata.PRODUCER", golden.PRODUCER)
+    golden.write_golden(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", [golden.TRAINED, golden.NEXT, golden.PLAIN])
+def test_golden_files_are_what_the_writer_writes(written: Path, name: str) -> None:
+    now, then = (written / name).read_bytes(), (golden.FOLDER / name).read_bytes()
+    if zstandard.ZSTD_VERSION == golden.ZSTD:
+        assert now == then
+    assert parts_of(now)[:-1] == parts_of(then)[:-1]
+    assert metadata_of(now).keys() == metadata_of(then).keys()
+
+
+def test_a_delta_holds_only_what_changed() -> None:
+    base, following = (
+        parts_of((golden.FOLDER / name).read_bytes()) for name in (golden.TRAINED, golden.NEXT)
+    )
+    changed = {part.topic for part in following}
+    assert changed == {"/triquad/map", "/triquad/region", "/triquad/vertices", "/triquad/manifest"}
+    assert not {part.payload for part in base} & {part.payload for part in following}
+
+
+# Other programs
+
+
+def test_stock_reader_sees_an_ordinary_file() -> None:
+    data = file_bytes(random_record(6), preview=True)
+    reader = make_reader(io.BytesIO(data), validate_crcs=True)
+    assert reader.get_header().profile == ""
+    assert reader.get_header().library == "triquad"
+    summary = reader.get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    assert summary.statistics.message_count == len(parts_of(data)) == len(summary.chunk_indexes)
+    encodings = {c.topic: c.message_encoding for c in summary.channels.values()}
+    assert encodings.pop("/preview/mesh") == "protobuf"
+    assert set(encodings.values()) == {"msgpack-zstd"}
+    assert parts_of(data)[-1].topic == "/triquad/manifest"
+
+
+def test_a_file_without_previews_has_no_protobuf_in_it() -> None:
+    summary = make_reader(io.BytesIO(file_bytes(random_record(6)))).get_summary()
+    assert summary is not None
+    assert not summary.schemas
+    assert {channel.message_encoding for channel in summary.channels.values()} == {"msgpack-zstd"}
+
+
+def test_previews_are_written_with_their_schema_only() -> None:
+    record = random_record(6)
+    parts = pack_record(record, "<f2", previews_of(record).parts)
+    with pytest.raises(FormatError, match="give preview_schema"):
+        write_parts(io.BytesIO(), MapFacts.of(record), parts)
+
+
+def test_unknown_fields_are_skipped() -> None:
+    data = edited(file_bytes(random_record(7)), "/triquad/region", lambda b: b.update(more=[1]))
+    assert_read_back(random_record(7), data)
