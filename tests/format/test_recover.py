@@ -194,7 +194,7 @@ def test_a_file_cut_within_its_index_loses_nothing(recovered: Recover) -> None:
 
 
 def test_blocks_of_zeros(recovered: Recover) -> None:
-    for first in range(0, len(DATA), len(DATA) // 24):
+    for first in range(0, len(DATA), len(DATA) // 12):
         assert_answers(recovered(zeroed(DATA, first, first + 4096)))
 
 
@@ -214,7 +214,7 @@ def test_without_its_manifest(recovered: Recover) -> None:
 
 def test_lost_vertices_are_missed_without_a_manifest(recovered: Recover) -> None:
     *parts, manifest = chunks(DATA)
-    for chunk in [chunk for chunk in parts if chunk.topic == VERTICES]:
+    for chunk in [chunk for chunk in parts if chunk.topic == VERTICES][::4]:
         corrupt = zeroed(DATA[: manifest.start], chunk.start, chunk.end)
         recovery = recovered(corrupt)
         assert [loss.key.topic for loss in recovery.losses].count(VERTICES) == 1
@@ -239,7 +239,7 @@ def test_bytes_inserted_and_removed(recovered: Recover) -> None:
 
 def test_flipped_bytes_anywhere(recovered: Recover) -> None:
     rng = np.random.default_rng(3)
-    for _ in range(40):
+    for _ in range(15):
         recovery = recovered(flipped(DATA, *rng.integers(0, len(DATA), 3).tolist()))
         assert_answers(recovery)
 

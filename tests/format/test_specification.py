@@ -1,19 +1,17 @@
 """docs/map-file.md is complete: a reader written from it alone answers as the project's does."""
 
 import dataclasses
-import io
 import shutil
-import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support import map_records, spec_reader
+from support import golden, map_records, spec_reader
 from support.file_damage import flipped
 from support.map_records import SMALL
-from support.spec_parts import Map, RefusedError, Settings, is_held_out
-from triquad_format.errors import FormatError
+from support.mapfile_edit import rewritten
+from support.spec_parts import Map, RefusedError, Region, Settings, is_held_out
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records import morton
@@ -22,7 +20,6 @@ from triquad_format.records.replay_rays import are_held_out
 from triquad_map.compiled.evidence.outcomes import outcome_counts
 from triquad_map.reference.evaluator import MapEvaluator
 
-GOLDEN = Path(__file__).parents[1] / "golden"
 NEIGHBOURS = ((0, 0, 0), (1, 0, 0), (0, -1, 0), (1, -1, 0), (0, 0, 1))
 WIDE = dataclasses.replace(SMALL, depth=10)
 """Four squares to a side."""
@@ -57,13 +54,7 @@ VARIANTS = {
     "many squares": map_records.random_record(
         8, settings=WIDE, indices=((0, 0, 0), (0, 1, 0)), points=3000
     ),
-    "levels": map_records.with_levels(
-        map_records.random_record(10, settings=WIDE, indices=((0, 0, 0), (0, 1, 0)), points=3000)
-    ),
-    "outcomes": map_records.with_outcomes(
-        map_records.random_record(11, settings=WIDE, indices=((0, 0, 0), (0, 1, 0)), points=3000)
-    ),
-    "margins": map_records.with_margins(
+    "support": map_records.with_support(
         map_records.random_record(12, settings=WIDE, indices=((0, 0, 0), (0, 1, 0)), points=3000)
     ),
     "no vertices": map_records.random_record(9, points=0),
@@ -87,7 +78,7 @@ def probes(answers: Map, count: int = 4000) -> NDArray[np.float64]:
     return np.concatenate([anywhere, on_borders, centres + 100 * settings.side])
 
 
-def surface_voxels(region: object) -> NDArray[np.float64]:
+def surface_voxels(region: Region) -> NDArray[np.float64]:
     """Middles of the voxels whose surface bit is set."""
     table, settings = region.surface, region.settings
     bits = np.unpackbits(table.values[:-1].reshape(-1, 8, 8, 1), axis=-1, bitorder="little")
@@ -108,28 +99,22 @@ def assert_agree(answers: Map, record: MapRecord, points: NDArray[np.float64]) -
 
 
 def assert_same_support(answers: Map, record: MapRecord) -> None:
-    """Levels and times are those of the record, voxel by voxel; 0 where it has none."""
+    """What is known of surface is that of the record, voxel by voxel."""
     for region in record.regions:
         evidence, have = region.evidence, answers.regions[region.index]
         blocks = morton.decode(evidence.codes, 3)
         bits = np.unpackbits(evidence.surface, axis=1, bitorder="little").astype(bool)
-        levels = have.levels(blocks)
-        assert not levels[~bits].any()
-        seen_s = have.seen(blocks)[:, 0]
-        np.testing.assert_array_equal(levels[bits], or_zeros(evidence.levels, bits.sum()))
-        np.testing.assert_array_equal(seen_s, or_zeros(evidence.seen_s, len(blocks)))
+        np.testing.assert_array_equal(have.seen(blocks)[:, 0], evidence.seen_s)
         outcomes = have.outcomes(blocks).reshape(*bits.shape, 3)
-        codes = or_zeros(evidence.outcomes, (bits.sum(), 3)).astype(np.uint8)
-        assert not outcomes[~bits].any()
-        np.testing.assert_array_equal(outcomes[bits].astype(np.int64), outcome_counts(codes))
         margins = have.margins(blocks).reshape(*bits.shape, 6)
-        assert not margins[~bits].any()
-        wanted = or_zeros(evidence.margins, (bits.sum(), 6))
-        np.testing.assert_array_equal(margins[bits], wanted)
-
-
-def or_zeros(column: NDArray | None, shape: int | tuple[int, ...]) -> NDArray:
-    return np.zeros(shape) if column is None else column
+        counts = outcome_counts(evidence.outcomes)
+        for column, wanted in (
+            (have.levels(blocks), evidence.levels),
+            (outcomes.astype(np.int64), counts),
+            (margins, evidence.margins),
+        ):
+            assert not column[~bits].any()
+            np.testing.assert_array_equal(column[bits], wanted)
 
 
 def write_variant(path: Path, name: str) -> Path:
@@ -138,34 +123,26 @@ def write_variant(path: Path, name: str) -> Path:
     return path
 
 
-SAMPLES = (
-    "map_v1",
-    "map_v1_next",
-    "map_v1_levels",
-    "map_v1_outcomes",
-    "map_v1_margins",
-    "map_v1_rays",
-)
-
-
-@pytest.mark.parametrize("name", [f"{name}.triquad" for name in SAMPLES])
+@pytest.mark.parametrize("name", [golden.TRAINED, golden.NEXT, golden.PLAIN])
 def test_the_samples(name: str) -> None:
-    answers = spec_reader.load(GOLDEN / name)
+    answers = spec_reader.load(golden.FOLDER / name)
     points = probes(answers)
     assert {0, 2} <= set(answers.status(points))
-    record = read_map(GOLDEN / name)
+    record = read_map(golden.FOLDER / name)
     assert_agree(answers, record, points)
     assert_same_support(answers, record)
 
 
 def test_rays_to_train_on() -> None:
-    path = GOLDEN / "map_v1_rays.triquad"
+    path = golden.FOLDER / golden.TRAINED
     record = read_map(path)
-    (training,) = (region.training for region in record.regions)
-    assert training is not None
-    rays = training.rays
-    origins = rays.origins[rays.origin_of]
-    want = np.column_stack([rays.ends_m(record.settings), origins, rays.slopes / 255])
+    tables = []
+    for region in record.regions:
+        assert region.training is not None
+        rays = region.training.rays
+        ends, origins = rays.ends_m(record.settings), rays.origins[rays.origin_of]
+        tables.append(np.column_stack([ends, origins, rays.slopes / 255]))
+    want = np.concatenate(tables)
     have = spec_reader.load_rays(path, spec_reader.load(path).settings)
     order = [np.lexsort(table.round(6).T) for table in (have, want)]
     np.testing.assert_allclose(have[order[0]], want[order[1]], atol=1e-6)
@@ -196,10 +173,6 @@ def test_maps_of_every_kind(tmp_path: Path, name: str) -> None:
     record = read_map(path)
     assert_agree(answers, record, points)
     assert_same_support(answers, record)
-    evidence = record.regions[0].evidence
-    assert (evidence.levels is not None) == (name in ("levels", "outcomes", "margins"))
-    assert (evidence.outcomes is not None) == (name in ("outcomes", "margins"))
-    assert (evidence.margins is not None) == (name == "margins")
 
 
 # Section 9
@@ -212,30 +185,29 @@ def test_one_place_is_read_by_the_index(tmp_path: Path) -> None:
     assert np.isfinite(MapEvaluator(record).query(points).sdf).sum() > 8
     for point in points:
         file, parts = spec_reader.read_near(path, point[None])
-        near = Map(file.manifest.values, parts)
+        near = Map(file.values, parts)
         have, want = near.distance(point[None])[0], MapEvaluator(record).query(point[None])
         np.testing.assert_allclose(have, want.sdf, rtol=1e-5, atol=1e-5)
         assert near.status(point[None]) == want.status
-        assert file.bytes_read < path.stat().st_size / 4
+        assert file.file.bytes_read < path.stat().st_size / 4
 
 
 def test_one_place_of_a_map_in_two_files() -> None:
-    path = GOLDEN / "map_v1_next.triquad"
+    path = golden.FOLDER / golden.NEXT
     points = probes(spec_reader.load(path), 500)
     file, parts = spec_reader.read_near(path, points)
     assert file.bases[1].bytes_read > 0
-    assert_agree(Map(file.manifest.values, parts), read_map(path), points)
+    assert_agree(Map(file.values, parts), read_map(path), points)
 
 
 def test_a_damaged_part_is_refused_by_the_index(tmp_path: Path) -> None:
     path = write_variant(tmp_path / "map.triquad", "a training state")
-    file = spec_reader.IndexedFile(path)
-    row = next(row for row in file.manifest.own if row.key[0] == "/triquad/region")
+    file = spec_reader.MapFile(path)
+    row = next(row for row in file.rows if row.key[0] == "/triquad/region")
     assert file.read(row)
-    start, size = file.chunks[file.manifest.own.index(row)]
-    path.write_bytes(flipped(path.read_bytes(), start + size - 1))
+    path.write_bytes(flipped(path.read_bytes(), row.offset + row.stored // 2))
     with pytest.raises((RefusedError, spec_reader.zstandard.ZstdError)):
-        spec_reader.IndexedFile(path).read(row)
+        spec_reader.MapFile(path).read(row)
 
 
 # What must be refused
@@ -244,114 +216,51 @@ def test_a_damaged_part_is_refused_by_the_index(tmp_path: Path) -> None:
 @pytest.mark.parametrize("at", [1000, -1000])
 def test_a_flipped_bit_of_data_or_summary_is_refused(tmp_path: Path, at: int) -> None:
     path = tmp_path / "map.triquad"
-    path.write_bytes(flipped((GOLDEN / "map_v1.triquad").read_bytes(), at))
+    path.write_bytes(flipped((golden.FOLDER / golden.TRAINED).read_bytes(), at))
     assert_refused(path)
 
 
 def test_a_file_without_its_base_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "next.triquad"
-    shutil.copyfile(GOLDEN / "map_v1_next.triquad", path)
+    shutil.copyfile(golden.FOLDER / golden.NEXT, path)
     with pytest.raises(FileNotFoundError):
         spec_reader.load(path)
 
 
-def test_another_base_with_the_same_parts_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "next.triquad"
-    shutil.copyfile(GOLDEN / "map_v1_next.triquad", path)
-    base = spec_reader.read_whole(GOLDEN / "map_v1.triquad")[0]
-    record = read_map(GOLDEN / "map_v1.triquad")
-    later = dataclasses.replace(record, epoch=record.epoch + 1)
-    stamp_ns = base.values["created_ns"]
-    write_map(later, tmp_path / "map_v1.triquad", stamp_ns=stamp_ns)
-    same = spec_reader.read_whole(tmp_path / "map_v1.triquad")[0]
-    assert [row.digest for row in same.rows[1:]] == [row.digest for row in base.rows[1:]]
-    assert_refused(path)
-
-
-def assert_refused(path: Path) -> None:
-    """The reader of the page refuses the file; test_mapfile_damage has the project's do so."""
-    with pytest.raises((RefusedError, spec_reader.zstandard.ZstdError)):
-        spec_reader.load(path)
-
-
-# Files as another MCAP tool may write them
-
-
-def unchunked_copy(
-    metadata: dict[str, str], parts: list[tuple[str, bytes]], extra: dict[str, str] | None = None
-) -> bytes:
-    """A map file without chunks, checksums and indexes."""
-    out = io.BytesIO()
-    out.write(spec_reader.MAGIC + record(1, text("") + text("a copy")))
-    topics = sorted({topic for topic, _ in parts})
-    for i, topic in enumerate(topics):
-        encoding = "protobuf" if topic == "/preview/mesh" else "msgpack"
-        channel = struct.pack("<HH", i, 0) + text(topic) + text(encoding) + bytes(4)
-        out.write(record(spec_reader.CHANNEL, channel))
-    pairs = b"".join(text(k) + text(v) for k, v in (metadata | (extra or {})).items())
-    body = text("triquad") + struct.pack("<I", len(pairs)) + pairs
-    out.write(record(spec_reader.METADATA, body))
-    for topic, payload in parts:
-        head = struct.pack("<HIQQ", topics.index(topic), 0, 0, 0)
-        out.write(record(spec_reader.MESSAGE, head + payload))
-    out.write(record(spec_reader.DATA_END, bytes(4)) + record(spec_reader.FOOTER, bytes(20)))
-    return out.getvalue() + spec_reader.MAGIC
-
-
-def record(code: int, content: bytes) -> bytes:
-    return struct.pack("<BQ", code, len(content)) + content
-
-
-def text(value: str) -> bytes:
-    return struct.pack("<I", len(value)) + value.encode()
-
-
-@pytest.fixture
-def sample() -> tuple[dict[str, str], list[tuple[str, bytes]]]:
-    return spec_reader.scan((GOLDEN / "map_v1.triquad").read_bytes())
-
-
-def test_a_copy_without_chunks(tmp_path: Path, sample: tuple) -> None:
-    path = tmp_path / "map.triquad"
-    path.write_bytes(unchunked_copy(*sample, extra={"format_version": "9", "weather": "fine"}))
-    answers = spec_reader.load(path)
-    assert_agree(answers, read_map(GOLDEN / "map_v1.triquad"), probes(answers))
-    assert_agree(answers, read_map(path), probes(answers))
-
-
-def test_digests_stand_alone(tmp_path: Path, sample: tuple) -> None:
-    metadata, parts = sample
-    for i, (topic, payload) in enumerate(parts[:-1]):
-        path = tmp_path / f"{i}.triquad"
-        altered = (topic, payload[:-1] + bytes([payload[-1] ^ 1]))
-        path.write_bytes(unchunked_copy(metadata, [*parts[:i], altered, *parts[i + 1 :]]))
-        assert_refused(path)
-        with pytest.raises(FormatError):
-            read_map(path)
-
-
 @pytest.mark.parametrize(
-    "extra",
+    "changes",
     [
         {"min_reader_version": "2"},
-        {"required_features": "holograms"},
-        {"required_features": "base-files,holograms"},
         {"epoch": "999"},
         {"map": "another"},
         {"units": "ft"},
+        {"manifest": "8 100"},
     ],
 )
-def test_facts_that_must_be_refused(tmp_path: Path, sample: tuple, extra: dict[str, str]) -> None:
+def test_metadata_that_must_be_refused(tmp_path: Path, changes: dict[str, str]) -> None:
     path = tmp_path / "map.triquad"
-    path.write_bytes(unchunked_copy(*sample, extra=extra))
+    data = (golden.FOLDER / golden.TRAINED).read_bytes()
+    path.write_bytes(rewritten(data, metadata=changes))
     assert_refused(path)
 
 
-def test_parts_that_are_missing_doubled_or_moved(tmp_path: Path, sample: tuple) -> None:
-    metadata, parts = sample
-    *own, manifest = parts
-    wrong = [own[:-1], [*own, own[-1]], own[::-1], [*own[:2], own[0], *own[3:]]]
-    for i, some in enumerate(wrong):
-        path = tmp_path / f"{i}.triquad"
-        path.write_bytes(unchunked_copy(metadata, [*some, manifest]))
+def test_later_minor_versions_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "map.triquad"
+    data = (golden.FOLDER / golden.TRAINED).read_bytes()
+    path.write_bytes(rewritten(data, metadata={"format_version": "9", "weather": "fine"}))
+    answers = spec_reader.load(path)
+    assert_agree(answers, read_map(path), probes(answers))
+
+
+def test_digests_are_checked(tmp_path: Path) -> None:
+    path = tmp_path / "map.triquad"
+    data = (golden.FOLDER / golden.TRAINED).read_bytes()
+    for number in range(len(spec_reader.MapFile(golden.FOLDER / golden.TRAINED).rows)):
+        path.write_bytes(rewritten(data, payloads={number: b"another"}, fitting=False))
         assert_refused(path)
+
+
+def assert_refused(path: Path) -> None:
+    """The reader of the page refuses the file; test_damage has the project's do so."""
+    with pytest.raises((RefusedError, spec_reader.zstandard.ZstdError)):
+        spec_reader.load(path)

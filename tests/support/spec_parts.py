@@ -227,11 +227,7 @@ def agrees(key: Key, part: dict[str, Any]) -> bool:
 def levels_of(part: dict[str, Any], surface: NDArray[np.bool_]) -> Array:
     """Section 5.4: levels [B, 512], where there are surface voxels; else 0."""
     levels = np.zeros(surface.shape, np.uint8)
-    if "levels" in part:
-        stored = np.unpackbits(plain(part["levels"]), axis=1, bitorder="little")
-        check(stored.shape == (3, (surface.sum() + 7) // 8 * 8), "levels of other voxels")
-        a, b, c = stored[:, : surface.sum()]
-        levels[surface] = 4 * a + 2 * (a ^ b) + (a ^ b ^ c)
+    levels[surface] = voxel_codes(part, "levels", [3], surface.sum())[0]
     return levels
 
 
@@ -253,27 +249,25 @@ def margins_of(part: dict[str, Any], surface: NDArray[np.bool_]) -> Array:
 
 
 def voxel_codes(part: dict[str, Any], name: str, bits: list[int], count: int) -> Array:
-    """Section 5.4: codes [columns, count] of so many bits each; 0 where the part has none."""
+    """Section 5.4: codes [columns, count], whose columns have these numbers of bits."""
     codes = np.zeros((len(bits), count), np.int64)
-    if name in part:
-        stored = np.unpackbits(plain(part[name]), axis=1, bitorder="little")
-        check(stored.shape == (sum(bits), (count + 7) // 8 * 8), f"{name} of other voxels")
-        for row, planes in enumerate(np.split(stored[:, :count], np.cumsum(bits)[:-1])):
-            bit = np.zeros(count, np.int64)
-            for plane in planes:
-                bit = plane ^ bit
-                codes[row] = 2 * codes[row] + bit
+    stored = np.unpackbits(plain(part[name]), axis=1, bitorder="little")
+    check(stored.shape == (sum(bits), (count + 7) // 8 * 8), f"{name} of other voxels")
+    for row, planes in enumerate(np.split(stored[:, :count], np.cumsum(bits)[:-1])):
+        bit = np.zeros(count, np.int64)
+        for plane in planes:
+            bit = plane ^ bit
+            codes[row] = 2 * codes[row] + bit
     return codes
 
 
 def times_of(part: dict[str, Any], touched: NDArray[np.bool_]) -> Array:
     """Section 5.4: times [B, 1] of the blocks that hold surface; else 0."""
     times = np.zeros((len(touched), 1), np.int64)
-    if "seen_s" in part:
-        planes = plain(part["seen_s"]).astype(np.int64)
-        check(1 <= len(planes) <= 5 and planes.shape[1] == touched.sum(), "times of other blocks")
-        since = sum(row << 8 * k for k, row in enumerate(planes))
-        times[touched, 0] = np.where(since > 0, since + part["seen_from_s"], 0)
+    planes = plain(part["seen_s"]).astype(np.int64)
+    check(1 <= len(planes) <= 5 and planes.shape[1] == touched.sum(), "times of other blocks")
+    since = sum(row << 8 * k for k, row in enumerate(planes))
+    times[touched, 0] = np.where(since > 0, since + part["seen_from_s"], 0)
     return times
 
 

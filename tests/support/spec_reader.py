@@ -18,18 +18,12 @@ import zstandard
 from support.spec_parts import Array, Key, Map, Settings, check, plain, rays_of
 
 MAGIC = b"\x89MCAP0\r\n"
-FOOTER, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX = 2, 4, 5, 6, 8
-ATTACHMENT, METADATA, METADATA_INDEX, DATA_END = 9, 12, 13, 15
-FEATURES = {"", "base-files"}
+FOOTER, MESSAGE, CHUNK, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = 2, 5, 6, 12, 13, 14, 15
 NAMES = "map region vertices evidence training moments samples rays manifest"
 TOPICS = {f"/triquad/{name}" for name in NAMES.split()}
 
 
-def sha256(data: bytes) -> bytes:
-    return hashlib.sha256(data).digest()
-
-
-# MCAP
+# Section 2
 
 
 def strings(data: bytes, count: int) -> list[str]:
@@ -43,125 +37,90 @@ def strings(data: bytes, count: int) -> list[str]:
     return found
 
 
-def records(data: bytes, at: int = 0) -> Iterator[tuple[int, int, bytes]]:
-    """Start, opcode and content of each record."""
+def records(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Opcode and content of each record."""
+    at = 0
     while at < len(data):
         code, size = struct.unpack_from("<BQ", data, at)
         check(at + 9 + size <= len(data), "a record is cut off")
-        yield at, code, data[at + 9 : at + 9 + size]
+        yield code, data[at + 9 : at + 9 + size]
         at += 9 + size
 
 
-def crc_matches(data: bytes, want: int) -> bool:
-    return want in (0, zlib.crc32(data))
-
-
-def unchunked(content: bytes) -> bytes:
-    """The records in a chunk."""
+def message_in(place: bytes) -> bytes:
+    """The data of the one message in the chunk at a place."""
+    code, content = next(records(place))
+    check(code == CHUNK, "no chunk")
     size, crc = struct.unpack_from("<QI", content, 16)
     compression = strings(content[28:], 1)[0]
     data = content[28 + 4 + len(compression) + 8 :]
     check(compression in ("", "zstd"), f"unknown compression {compression}")
     if compression:
         check(zstandard.frame_content_size(data) in (-1, size), "size of a zstd frame")
-        decompressor = zstandard.ZstdDecompressor(max_window_size=1 << 23)
-        data = decompressor.decompress(data, size, allow_extra_data=False)
-    check(len(data) == size and crc_matches(data, crc), "size or checksum of a chunk")
-    return data
+        data = zstandard.ZstdDecompressor().decompress(data, size)
+    check(len(data) == size and crc in (0, zlib.crc32(data)), "size or checksum of a chunk")
+    (message,) = (body for code, body in records(data) if code == MESSAGE)
+    return message[22:]
 
 
-def metadata_of(content: bytes) -> dict[str, str]:
-    """Values of the metadata record ``triquad``; empty for another."""
-    name = strings(content, 1)[0]
-    values = strings(content[4 + len(name.encode()) + 4 :], 1 << 20)
-    return dict(zip(values[::2], values[1::2], strict=True)) if name == "triquad" else {}
+def unpacked(topic: str, data: bytes) -> bytes:
+    """The payload in a message of a topic."""
+    if not topic.startswith("/triquad/"):
+        return data
+    decompressor = zstandard.ZstdDecompressor(max_window_size=1 << 23)
+    return decompressor.decompress(data, allow_extra_data=False)
 
 
-def footer_of(tail: bytes) -> tuple[int, int]:
-    """Where the summary begins, and its checksum, from the last 37 bytes."""
-    check(tail[29:] == MAGIC and tail[:9] == struct.pack("<BQ", FOOTER, 20), "footer")
-    return struct.unpack_from("<Q8xI", tail, 9)
+@dataclass
+class OpenFile:
+    """A file of which only what is asked for is read."""
+
+    path: Path
+    bytes_read: int = 0
+
+    def at(self, offset: int, size: int) -> bytes:
+        self.bytes_read += size
+        with self.path.open("rb") as file:
+            file.seek(offset)
+            data = file.read(size)
+        check(len(data) == size, "the file is cut off")
+        return data
+
+    def metadata(self) -> dict[str, str]:
+        """Values of the record ``triquad``, once the checksum of the summary is found right."""
+        size = self.path.stat().st_size
+        footer = self.at(size - 37, 37)
+        check(footer[29:] == MAGIC and footer[:9] == struct.pack("<BQ", FOOTER, 20), "footer")
+        start, offsets, crc = struct.unpack_from("<QQI", footer, 9)
+        summary = self.at(start, size - start - 8)
+        check(crc == zlib.crc32(summary[:-4]), "checksum of the summary")
+        groups = [
+            struct.unpack_from("<QQ", body, 1)
+            for code, body in records(summary[offsets - start :])
+            if code == SUMMARY_OFFSET and body[0] == METADATA_INDEX
+        ]
+        found = [
+            struct.unpack_from("<QQ", body)
+            for first, length in groups
+            for _, body in records(summary[first - start : first - start + length])
+            if strings(body[16:], 1) == ["triquad"]
+        ]
+        check(len(found) == 1, "one metadata record triquad")
+        code, content = next(records(self.at(*found[0])))
+        check(code == METADATA, "metadata")
+        _, values = strings(content, 1), strings(content[4 + len("triquad") + 4 :], 1 << 20)
+        return dict(zip(values[::2], values[1::2], strict=True))
+
+    def check_data(self) -> None:
+        """Compare the checksum of the data section."""
+        data = self.path.read_bytes()
+        (start,) = struct.unpack_from("<Q", data, len(data) - 28)
+        (code, crc) = next(records(data[start - 13 : start]))
+        check(code == DATA_END and data[:8] == MAGIC, "end of the data, or magic")
+        check(struct.unpack("<I", crc)[0] == zlib.crc32(data[: start - 13]), "data section")
 
 
-Channels = dict[int, tuple[str, str]]
-"""Topic and message encoding by the channel's number."""
-
-
-def channel_of(content: bytes) -> Channels:
-    topic, encoding = strings(content[4:], 2)
-    return {struct.unpack_from("<H", content)[0]: (topic, encoding)}
-
-
-def part_of(content: bytes, channels: Channels) -> list[tuple[str, bytes]]:
-    """Topic and payload of a message, if it is a part."""
-    topic, encoding = channels[struct.unpack_from("<H", content)[0]]
-    if not topic.startswith("/triquad/") and topic != "/preview/mesh":
-        return []
-    check(topic not in TOPICS or encoding == "msgpack", f"encoding of {topic}")
-    return [(topic, content[22:])]
-
-
-# Whole files
-
-
-def check_container(data: bytes) -> None:
-    """Magic and the checksums of the data section and the summary."""
-    check(data[:8] == MAGIC, "magic")
-    summary, crc = footer_of(data[-37:])
-    check(crc_matches(data[summary or len(data) - 37 : -12], crc), "checksum of the summary")
-    ends = [(at, body) for at, code, body in records(data[:-8], 8) if code == DATA_END]
-    check(len(ends) == 1, "one DataEnd")
-    check(crc_matches(data[: ends[0][0]], *struct.unpack("<I", ends[0][1])), "data section")
-
-
-def scan(data: bytes) -> tuple[dict[str, str], list[tuple[str, bytes]]]:
-    """Metadata and parts of a file."""
-    metadata: list[dict[str, str]] = []
-    channels: Channels = {}
-    parts: list[tuple[str, bytes]] = []
-    for _, code, content in records(data[:-8], 8):
-        inner = records(unchunked(content)) if code == CHUNK else [(0, code, content)]
-        for _, kind, body in inner:
-            if kind == CHANNEL:
-                channels |= channel_of(body)
-            elif kind == MESSAGE:
-                parts += part_of(body, channels)
-            elif kind == METADATA:
-                metadata += [values for values in (metadata_of(body),) if values]
-            elif kind == ATTACHMENT:
-                check(crc_matches(body[:-4], *struct.unpack("<I", body[-4:])), "attachment")
-    check(len(metadata) == 1, "one metadata record triquad")
-    return metadata[0], parts
-
-
-def read_whole(path: Path) -> tuple["Manifest", dict[Key, bytes]]:
-    """Manifest and payloads of a map, those of its base files among them."""
-    manifest, parts = read_file(path)
-    for i, base in enumerate(manifest.files, 1):
-        other, theirs = read_file(path.parent / base["name"])
-        check(other.digest == base["manifest"], "another base file")
-        parts |= {row.key: theirs.get(row.key, b"") for row in manifest.rows if row.file == i}
-    check(all(row.matches(row.key[0], parts[row.key]) for row in manifest.rows), "digest")
-    (map_part,) = (parts[row.key] for row in manifest.rows if row.key[0] == "/triquad/map")
-    check(msgpack.unpackb(map_part).items() <= manifest.values.items(), "facts of the map")
-    return manifest, parts
-
-
-def read_file(path: Path) -> tuple["Manifest", dict[Key, bytes]]:
-    """Manifest and payloads of one file."""
-    data = path.read_bytes()
-    check_container(data)
-    metadata, parts = scan(data)
-    check_versions(metadata)
-    check(parts and parts[-1][0] == "/triquad/manifest", "the manifest is the last part")
-    manifest = Manifest(parts.pop()[1], metadata)
-    check(len(parts) == len(manifest.own), "parts are missing or too many")
-    for (topic, payload), row in zip(parts, manifest.own, strict=True):
-        check(row.matches(topic, payload), f"another part for {row.key}")
-    return manifest, {row.key: part[1] for row, part in zip(manifest.own, parts, strict=True)}
-
-
-# Manifest
+# Section 7
 
 
 @dataclass(frozen=True)
@@ -172,25 +131,41 @@ class Row:
     size: int
     digest: bytes
     file: int
+    offset: int
+    stored: int
 
-    def matches(self, topic: str, payload: bytes) -> bool:
-        same = topic == self.key[0] and len(payload) == self.size
-        return same and sha256(payload) == self.digest
+    def read(self, file: OpenFile) -> bytes:
+        """The payload of the part."""
+        payload = unpacked(self.key[0], message_in(file.at(self.offset, self.stored)))
+        same = len(payload) == self.size and hashlib.sha256(payload).digest() == self.digest
+        check(same, f"another part for {self.key}")
+        if self.key[0] in TOPICS:
+            check(topic_of(payload) == self.key[0], "another topic")
+        return payload
 
 
-def check_versions(metadata: dict[str, str]) -> None:
-    check(int(metadata["min_reader_version"]) <= 1, "a newer version")
-    names = {name.strip() for name in metadata["required_features"].split(",")}
-    check(names <= FEATURES, f"required features {names}")
+def topic_of(payload: bytes) -> str:
+    key, value = next(iter(msgpack.unpackb(payload).items()))
+    check(key == "topic", "the topic comes first")
+    return str(value)
 
 
-class Manifest:
-    """Section 7, with what the metadata must say."""
+@dataclass
+class MapFile:
+    """A map file: its manifest, and what else is asked for."""
 
-    def __init__(self, payload: bytes, metadata: dict[str, str]) -> None:
-        self.digest = sha256(payload)
+    path: Path
+    bases: dict[int, OpenFile] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.file = OpenFile(self.path)
+        metadata = self.file.metadata()
+        check(int(metadata["min_reader_version"]) <= 1, "a newer version")
+        place = map(int, metadata["manifest"].split(" "))
+        payload = unpacked("/triquad/manifest", message_in(self.file.at(*place)))
+        check(topic_of(payload) == "/triquad/manifest", "no manifest")
         self.values: dict[str, Any] = msgpack.unpackb(payload)
-        self.files: list[dict[str, Any]] = self.values["files"]
+        check(self.values["min_reader_version"] <= 1, "a newer version")
         pairs = (("map", "name"), ("epoch", "epoch"), ("frame_id", "frame_id"), ("units", "units"))
         check(all(metadata[a] == str(self.values[b]) for a, b in pairs), "metadata")
         column = {name: plain(array).tolist() for name, array in self.values["parts"].items()}
@@ -198,83 +173,43 @@ class Manifest:
         regions = [tuple(index) for index in column["region"]]
         keys = list(zip(topics, regions, column["plane"], column["cell"], strict=True))
         check(len(set(keys)) == len(keys), "a key twice")
-        digests = map(bytes, column["sha256"])
-        columns = (keys, column["bytes"], digests, column["file"])
+        rest = [column[name] for name in ("file", "offset", "stored")]
+        columns = (keys, column["bytes"], map(bytes, column["sha256"]), *rest)
         self.rows = [Row(*values) for values in zip(*columns, strict=True)]
-        self.own = [row for row in self.rows if row.file == 0]
-
-
-# Section 9
-
-
-@dataclass
-class IndexedFile:
-    """A file of which only what is asked for is read."""
-
-    path: Path
-    bytes_read: int = 0
-    bases: dict[int, "IndexedFile"] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        self.size = self.path.stat().st_size
-        start, crc = footer_of(self.at(self.size - 37, 37))
-        summary = self.at(start, self.size - 12 - start)
-        check(crc and crc_matches(summary, crc), "checksum of the summary")
-        self.channels: Channels = {}
-        self.chunks: list[tuple[int, int]] = []
-        metadata: list[dict[str, str]] = []
-        for _, code, body in records(summary[:-25]):
-            if code == CHANNEL:
-                self.channels |= channel_of(body)
-            elif code == CHUNK_INDEX:
-                self.chunks.append(struct.unpack_from("<QQ", body, 16))
-            elif code == METADATA_INDEX and strings(body[16:], 1) == ["triquad"]:
-                metadata.append(metadata_of(self.at(*struct.unpack_from("<QQ", body))[9:]))
-        check(len(metadata) == 1, "one metadata record triquad")
-        check_versions(metadata[0])
-        topic, payload = self.part(len(self.chunks) - 1)
-        check(topic == "/triquad/manifest", "the manifest is in the last chunk")
-        self.manifest = Manifest(payload, metadata[0])
-
-    def at(self, offset: int, size: int) -> bytes:
-        self.bytes_read += size
-        with self.path.open("rb") as file:
-            file.seek(offset)
-            return file.read(size)
-
-    def part(self, chunk: int) -> tuple[str, bytes]:
-        _, _, content = next(records(self.at(*self.chunks[chunk])))
-        inner = [body for _, code, body in records(unchunked(content)) if code == MESSAGE]
-        check(len(inner) == 1, "one part to a chunk")
-        return part_of(inner[0], self.channels)[0]
-
-    def base(self, number: int) -> "IndexedFile":
-        if number not in self.bases:
-            stored = self.manifest.files[number - 1]
-            self.bases[number] = IndexedFile(self.path.parent / stored["name"])
-            check(self.bases[number].manifest.digest == stored["manifest"], "another base file")
-        return self.bases[number]
 
     def read(self, row: Row) -> bytes:
-        file = self.base(row.file) if row.file else self
-        i = [own.key for own in file.manifest.own].index(row.key)
-        topic, payload = file.part(i)
-        check(row.matches(topic, payload), f"another part for {row.key}")
-        return payload
+        """The payload of a part, in whichever file it lies."""
+        if row.file == 0:
+            return row.read(self.file)
+        if row.file not in self.bases:
+            name = self.values["files"][row.file - 1]
+            self.bases[row.file] = OpenFile(self.path.parent / name)
+        return row.read(self.bases[row.file])
 
 
-def read_near(path: Path, points: Array) -> tuple[IndexedFile, dict[Key, bytes]]:
-    """Only the parts which the answers at the points need."""
-    file = IndexedFile(path)
-    settings = Settings(file.manifest.values["settings"])
-    rows = (row for row in file.manifest.rows if settings.needs(row.key, points))
-    return file, {row.key: file.read(row) for row in rows}
+def read_whole(path: Path) -> tuple[MapFile, dict[Key, bytes]]:
+    """A map and the payloads of all its parts, all of whose checksums are right."""
+    whole = MapFile(path)
+    whole.file.check_data()
+    parts = {row.key: whole.read(row) for row in whole.rows}
+    (first,) = (msgpack.unpackb(parts[key]) for key in parts if key[0] == "/triquad/map")
+    facts = {key: value for key, value in first.items() if key != "topic"}
+    check(facts.items() <= whole.values.items(), "facts of the map")
+    return whole, parts
+
+
+def read_near(path: Path, points: Array) -> tuple[MapFile, dict[Key, bytes]]:
+    """Section 9: only the parts which the answers at the points need."""
+    whole = MapFile(path)
+    settings = Settings(whole.values["settings"])
+    rows = (row for row in whole.rows if settings.needs(row.key, points))
+    return whole, {row.key: whole.read(row) for row in rows}
 
 
 def load(path: Path) -> Map:
     """A map, all of whose files were read."""
-    manifest, parts = read_whole(path)
-    return Map(manifest.values, parts)
+    whole, parts = read_whole(path)
+    return Map(whole.values, parts)
 
 
 def load_rays(path: Path, settings: Settings) -> Array:
