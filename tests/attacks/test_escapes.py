@@ -9,7 +9,7 @@ import pytest
 import triquad_client
 from support.hostile_server import HostileServer, hostile_server, told
 from support.map_records import random_record
-from support.mapfile_edit import file_bytes, with_metadata
+from support.mapfile_edit import file_bytes, rewritten
 from triquad_format.errors import MapFileError
 from triquad_format.wire import codec, keys
 from triquad_tools.commands import inspect, pack, replay, top
@@ -52,7 +52,7 @@ def test_metadata_of_a_file(
     field: str, map_bytes: bytes, harmless: Callable[[Main, list[str]], str], tmp_path: Path
 ) -> None:
     path = tmp_path / "map.triquad"
-    path.write_bytes(with_metadata(map_bytes, {field: SENT}))
+    path.write_bytes(rewritten(map_bytes, metadata={field: SENT}))
     shown = harmless(inspect.main, [str(path)])
     assert "x1b" in shown or SENT[-5:] not in shown
     harmless(inspect.main, [str(path), "--json"])
@@ -65,7 +65,7 @@ def test_metadata_of_a_file(
 
 def test_metadata_on_a_real_terminal_stream(map_bytes: bytes, tmp_path: Path) -> None:
     path = tmp_path / "map.triquad"
-    path.write_bytes(with_metadata(map_bytes, {"producer": SENT}))
+    path.write_bytes(rewritten(map_bytes, metadata={"producer": SENT}))
     code = f"from triquad_tools.commands.inspect import main; main({[str(path)]})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
     assert b"\\x1b]0;owned\\x07" in done.stdout
@@ -77,7 +77,7 @@ def test_metadata_of_a_million_characters(
     map_bytes: bytes, harmless: Callable[[Main, list[str]], str], tmp_path: Path
 ) -> None:
     path = tmp_path / "map.triquad"
-    path.write_bytes(with_metadata(map_bytes, {"producer": "x" * 1_000_000}))
+    path.write_bytes(rewritten(map_bytes, metadata={"producer": "x" * 1_000_000}))
     assert len(harmless(inspect.main, [str(path)])) < 20_000
 
 

@@ -4,14 +4,11 @@ import dataclasses
 
 import msgpack
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.map_records import SMALL, assert_same, random_record, with_support
+from support.map_records import SMALL, assert_same, evidence_of, random_record, with_support
 from support.mapfile_edit import (
-    edited,
     file_bytes,
-    manifest_of,
     parts_of,
     read_bytes,
     stored,
@@ -20,7 +17,7 @@ from support.mapfile_edit import (
 from triquad_format.mapfile.parts.part import EVIDENCE
 from triquad_format.mapfile.reader import read_map
 from triquad_format.records.crop import crop_record
-from triquad_format.records.region import MAX_SEEN_S, Evidence, masked, seen_voxels, surface_counts
+from triquad_format.records.region import MAX_SEEN_S, masked, seen_voxels, surface_counts
 from triquad_format.records.seen_space import owned_evidence
 from triquad_format.recovery.recovered_map import recover
 from triquad_map.compiled.evidence.outcomes import outcome_codes
@@ -28,9 +25,7 @@ from triquad_map.compiled.evidence.outcomes import outcome_codes
 CUBES = dataclasses.replace(SMALL, depth=9)
 """Two cubes to a side."""
 
-RECORD = with_support(
-    random_record(21, settings=CUBES, indices=((0, 0, 0), (1, 0, 0)), points=500)
-)
+RECORD = with_support(random_record(21, settings=CUBES, indices=((0, 0, 0), (1, 0, 0)), points=500))
 
 
 def level_of(evidence):
@@ -65,7 +60,7 @@ def blocks(seed, count):
     rng = np.random.default_rng(seed)
     surface, free = rng.integers(0, 256, (2, count, 64)).astype(np.uint8)
     surface[rng.random(count) < 0.3] = 0
-    return Evidence(np.sort(rng.permutation(200)[:count]).astype(np.int64), surface, free)
+    return evidence_of(np.sort(rng.permutation(200)[:count]).astype(np.int64), surface, free)
 
 
 def record_of(evidence):
@@ -100,9 +95,9 @@ def test_any_levels_and_times_come_back(seed, count, draw):
     seen_s = np.array(draw.draw(st.lists(TIMES, min_size=count, max_size=count)), np.int64)
     evidence = dataclasses.replace(
         evidence,
-        levels=draw.draw(st.sampled_from([levels, None])),
-        seen_s=draw.draw(st.sampled_from([np.where(counts > 0, seen_s, 0), None])),
-        outcomes=draw.draw(st.sampled_from([outcomes, outcomes * (seed % 2), None])),
+        levels=levels,
+        seen_s=np.where(counts > 0, seen_s, 0),
+        outcomes=outcomes * (seed % 2),
     )
     (region,) = read_bytes(file_bytes(record_of(evidence))).regions
     assert_same(region.evidence, evidence)
@@ -114,7 +109,9 @@ def test_literal_bytes():
     surface[0, 0], surface[2, 63] = 0b1011, 0b1
     levels = np.array([0, 3, 4, 6], np.uint8)
     seen_s = np.array([1_700_000_300, 0, 1_700_000_000], np.int64)
-    evidence = Evidence(np.arange(3), surface, surface, levels, seen_s)
+    evidence = dataclasses.replace(
+        evidence_of(np.arange(3), surface, surface), levels=levels, seen_s=seen_s
+    )
     data = file_bytes(record_of(evidence))
     (part,) = (part for part in parts_of(data) if part.topic == EVIDENCE)
     body = msgpack.unpackb(part.payload)
@@ -128,48 +125,15 @@ def test_literal_bytes_of_outcomes():
     surface = np.zeros((1, 64), np.uint8)
     surface[0, 7] = 0b111
     counts = np.array([[120, 0, 0], [40, 330, 75], [1, 0, 0]], np.int32)
-    evidence = Evidence(np.arange(1), surface, surface, outcomes=outcome_codes(counts))
+    evidence = dataclasses.replace(
+        evidence_of(np.arange(1), surface, surface), outcomes=outcome_codes(counts)
+    )
     assert evidence.outcomes.tolist() == [[0, 0, 0], [0, 7, 5], [1, 0, 0]]
     data = file_bytes(record_of(evidence))
     (part,) = (part for part in parts_of(data) if part.topic == EVIDENCE)
     planes = b"\x00\x04\x00\x02\x00\x00\x00\x02\x02\x02"
     stored = {"dtype": "|u1", "shape": [10, 1], "data": planes}
     assert msgpack.unpackb(part.payload)["outcomes"] == stored
-
-
-def test_a_file_without_them_reads_as_not_known():
-    record = random_record(21)
-    data = file_bytes(record)
-    (part,) = (part for part in parts_of(data) if part.topic == EVIDENCE)
-    fields = {"region", "plane", "cell", "codes", "surface", "free"}
-    assert msgpack.unpackb(part.payload).keys() == fields
-    evidence = read_bytes(data).regions[0].evidence
-    assert evidence.levels is None
-    assert evidence.seen_s is None
-    assert evidence.outcomes is None
-
-
-def test_cubes_without_them_read_as_zero():
-    """As where an older release went on with a map."""
-
-    def older(body):
-        for key in ("levels", "seen_s", "seen_from_s", "outcomes"):
-            del body[key]
-
-    data = edited(file_bytes(RECORD), EVIDENCE, older, number=3)
-    entry = [e for e in manifest_of(data).entries if e.key.topic == EVIDENCE][3]
-    want, other = (region.evidence for region in RECORD.regions)
-    have, same = (region.evidence for region in read_bytes(data).regions)
-    assert entry.key.region == (0, 0, 0)
-    assert_same(same, other)
-    lost = want.codes >> 15 == entry.key.cell
-    voxels = np.repeat(lost, surface_counts(want.surface))
-    assert want.levels[voxels].any()
-    np.testing.assert_array_equal(have.levels, np.where(voxels, 0, want.levels))
-    assert want.outcomes[voxels].any()
-    outcomes = np.where(voxels[:, None], 0, want.outcomes)
-    np.testing.assert_array_equal(have.outcomes, outcomes)
-    np.testing.assert_array_equal(have.seen_s, np.where(lost, 0, want.seen_s))
 
 
 @settings(max_examples=60, deadline=None)
@@ -233,11 +197,3 @@ def test_what_is_recovered_has_its_levels(tmp_path):
     assert any(len(region.evidence.levels) for region in recovery.record.regions)
     for region in recovery.record.regions:
         assert_part_of(region.evidence, whole[region.index])
-
-
-@pytest.mark.parametrize("field", ["levels", "seen_s", "outcomes"])
-def test_one_may_be_known_without_the_other(field):
-    evidence = dataclasses.replace(RECORD.regions[0].evidence, **{field: None})
-    region = dataclasses.replace(RECORD.regions[0], evidence=evidence)
-    record = dataclasses.replace(RECORD, regions=(region, RECORD.regions[1]))
-    assert_same(read_bytes(file_bytes(record)), record)

@@ -19,19 +19,13 @@ from triquad_format.mapfile.metadata import MAX_MAP_BYTES, MapFacts, pack_facts,
 from triquad_format.mapfile.parts.pack import pack_part, pack_record, seams
 from triquad_format.mapfile.parts.part import (
     EVIDENCE,
-    MANIFEST,
     MAP,
     MAX_PART_BYTES,
     MESSAGE_ENCODING,
-    MOMENTS,
     PREVIEW,
     PREVIEW_ENCODING,
     PREVIEW_SCHEMA,
-    RAYS,
     REGION,
-    SAMPLES,
-    TRAINING,
-    VERTICES,
     Part,
     PartKey,
 )
@@ -41,17 +35,8 @@ from triquad_format.records.region import FLOATS, MapRecord
 
 # Levels of zstd: features and moments are noise but for their high bytes, on which level 1 is as
 # good as level 19 and better than level 3; masks and codes shrink by a fifth to level 12.
-_LEVELS = {
-    MAP: 3,
-    REGION: 3,
-    VERTICES: 1,
-    EVIDENCE: 12,
-    TRAINING: 1,
-    MOMENTS: 1,
-    SAMPLES: 1,
-    RAYS: 1,
-    MANIFEST: 3,
-}
+_LEVELS = {EVIDENCE: 12, REGION: 3}
+_USUAL_LEVEL = 1
 
 
 @dataclass(frozen=True)
@@ -236,7 +221,7 @@ class _PartsWriter:
         _check_total(self._total)
         data = part.payload
         if topic != PREVIEW:
-            data = compress(data, seams(part), _LEVELS[topic])
+            data = compress(data, seams(part), _LEVELS.get(topic, _USUAL_LEVEL))
         start = self._stream.size
         self._mcap.add_message(self._channel(topic), stamp_ns, data, stamp_ns)
         return start, self._stream.size - start

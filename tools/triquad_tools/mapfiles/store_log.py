@@ -151,16 +151,16 @@ class _Indices:
         )
 
     def _check_base(self, manifest: Manifest, file: str) -> None:
-        """Raise unless the file of this name lists the parts that it is to hold."""
+        """Raise unless the file of this name has the parts that it is to hold, where they are."""
         try:
             index = self._index(file)
         except FileNotFoundError as error:
             raise MapFileError(f"it needs {file}, which is missing") from error
         except (FormatError, OSError) as error:
             raise MapFileError(f"it needs {file}: {error}") from error
-        listed = {entry.key: entry.sha256 for entry in index.manifest.own}
+        places = {e.key: (e.sha256, e.offset, e.stored) for e in index.manifest.own}
         wanted = [entry for entry in manifest.entries if entry.file == file]
-        if any(listed.get(entry.key) != entry.sha256 for entry in wanted):
+        if any(places.get(e.key) != (e.sha256, e.offset, e.stored) for e in wanted):
             raise MapFileError(f"it needs {file}, but not the file that now has this name")
 
     def _index(self, name: str) -> MapIndex:
