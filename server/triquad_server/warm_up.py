@@ -11,7 +11,14 @@ import numpy as np
 from triquad_format.records import morton
 from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.records.field_settings import BLOCK_VOXELS
-from triquad_format.records.region import BLOCK_BYTES, Evidence, MapRecord
+from triquad_format.records.region import (
+    BLOCK_BYTES,
+    MARGIN_BITS,
+    OUTCOME_BITS,
+    Evidence,
+    MapRecord,
+    surface_counts,
+)
 from triquad_map.compiled.evidence.contradictions import Disbelief
 from triquad_map.compiled.evidence.live_evidence import LiveEvidence
 from triquad_map.compiled.kernel import compiled_marks
@@ -210,7 +217,17 @@ class WarmUp:
         block = np.full((1, 3), side // BLOCK_VOXELS // 2)
         surface = np.zeros((1, BLOCK_BYTES), np.uint8)
         surface[:, 0] = 255
-        return LiveEvidence.from_record(side, Evidence(morton.encode(block), surface, ~surface))
+        voxels = int(surface_counts(surface).sum())
+        record = Evidence(
+            morton.encode(block),
+            surface,
+            ~surface,
+            levels=np.zeros(voxels, np.uint8),
+            seen_s=np.zeros(1, np.int64),
+            outcomes=np.zeros((voxels, len(OUTCOME_BITS)), np.uint8),
+            margins=np.zeros((voxels, len(MARGIN_BITS)), np.uint8),
+        )
+        return LiveEvidence.from_record(side, record)
 
     def _points(self, count: int) -> Floats:
         """Points [count, 3] in the middle of a region."""

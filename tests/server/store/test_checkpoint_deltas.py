@@ -133,7 +133,7 @@ def corrupt(path):
     """Overwrite the middle of a file, and put its time back."""
     before = path.stat()
     data = path.read_bytes()
-    path.write_bytes(data[:2000] + bytes(5000) + data[7000:])
+    path.write_bytes(data[:2000] + bytes(len(data) - 4000) + data[-2000:])
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
 
 
@@ -231,7 +231,9 @@ def test_another_file_under_the_name_of_the_base_is_found_out(store):
     with closing(other):
         other.write(changes(grown(9, 1)))
         paths(store)[1].write_bytes(paths(other)[1].read_bytes())
-    with pytest.raises(DamagedMapFileError, match="is not the file that the map was made with"):
+    with pytest.raises(
+        DamagedMapFileError, match="epoch-000000001.triquad, .* is not the part listed"
+    ):
         read_map(paths(store)[2])
 
 
@@ -250,7 +252,7 @@ def test_folding_puts_all_into_one_file(store):
     after = grown(77, newest + 1, records[newest], ROW[:1])
     manifest = read_map_file(store.write(changes(after, ROW[:1])).path).manifest
     assert manifest is not None
-    assert [file.name for file in manifest.files] == [Path(info.path).name]
+    assert manifest.files == (Path(info.path).name,)
     for epoch, record in records.items():
         assert_same(read_map(checkpoint_at(store.folder, str(epoch)).path), record)
 
