@@ -15,11 +15,13 @@ PIP_FLAGS ?=
 CAMPAIGN_MINUTES ?= 5
 
 BIN = $(VENV)/bin
+# What is installed: without torch for the demonstration, with everything for all else.
+INSTALLED_DEMO = $(VENV)/.installed-demo
 INSTALLED = $(VENV)/.installed
 
 .PHONY: bench campaign check clean demo docs pictures pretrained test test-long
 
-demo: $(INSTALLED)
+demo: $(INSTALLED_DEMO)
 	$(BIN)/triquad-demo --out demo-out
 
 # Where several processes test, torch's threads would wait for each other: seven times as long.
@@ -49,11 +51,14 @@ check: $(INSTALLED)
 	$(BIN)/mypy
 	PYTHONPATH=. $(BIN)/lint-imports
 
-$(INSTALLED): pyproject.toml constraints.txt
+$(INSTALLED_DEMO): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install $(PIP_FLAGS) -c constraints.txt torch==2.13.0
+	$(BIN)/python -m pip install $(PIP_FLAGS) -c constraints.txt -e '.[demo]'
+	touch $@
+
+$(INSTALLED): $(INSTALLED_DEMO)
 	$(BIN)/python -m pip install $(PIP_FLAGS) -c constraints.txt -e '.[dev]'
-	touch $(INSTALLED)
+	touch $@
 
 pretrained: $(INSTALLED)
 	$(BIN)/python -m bench.studies.pretraining

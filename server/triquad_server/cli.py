@@ -21,7 +21,6 @@ from triquad_server.errors import (
 )
 from triquad_server.process.installed import require_libraries
 from triquad_server.process.log import LOG_FORMATS, TEXT, start_log
-from triquad_server.process.memory import put_off_collection
 
 _PROGRAM = "triquad-server"
 _LOG_FORMAT_VARIABLE = "TRIQUAD_LOG_FORMAT"
@@ -87,7 +86,6 @@ def _exit_code(options: argparse.Namespace) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     require_libraries()
-    put_off_collection()
     from triquad_format.wire.keys import check_name
 
     from triquad_server.launch_options import LaunchOptions

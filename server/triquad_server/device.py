@@ -13,13 +13,16 @@ def choose_device(wanted: str) -> str:
     """The device to compute on: ``wanted``, or for "auto" a GPU where there is one.
 
     Raises:
-        ServerError: there is no GPU, but one is wanted; or it is no device.
+        ServerError: there is no GPU or no torch, but one is wanted; or it is no device.
     """
     if wanted not in ("auto", "cpu", "cuda"):
         raise ServerError(f"device {wanted!r}: use auto, cpu or cuda")
     if wanted == "cpu":
         return "cpu"
-    if _has_driver() and _cuda_is_usable():
+    has_torch = importlib.util.find_spec("torch") is not None
+    if wanted == "cuda" and not has_torch:
+        raise ServerError('device cuda: torch is missing: pip install "triquad[gpu]"')
+    if has_torch and _has_driver() and _cuda_is_usable():
         return "cuda"
     if wanted == "cuda":
         raise ServerError("device cuda: no CUDA device is usable here; use cpu or auto")
@@ -39,8 +42,6 @@ def _has_driver() -> bool:
 
 
 def _cuda_is_usable() -> bool:
-    if importlib.util.find_spec("torch") is None:
-        return False
     import torch
 
     return torch.cuda.is_available()

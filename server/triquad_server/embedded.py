@@ -170,8 +170,7 @@ def serve(
 ) -> Server:
     """Start a map server within this program, and return once it serves.
 
-    The very first start compiles for half a minute or more, as a warning in the log says: it
-    answers after about half of that, and scans wait for the rest.
+    The very first start compiles for half a minute or more, as a warning in the log says.
 
     Args:
         store: folder for checkpoints; without one the map is not kept. The server goes on from

@@ -14,19 +14,17 @@ from triquad_format.wire.messages import ServerStatus
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper_thread import MapperThread
-from triquad_server.process.memory import give_back_compiler, give_back_free, resident_bytes
+from triquad_server.process.memory import resident_bytes
 from triquad_server.serving.operation_counts import OperationCounts
 from triquad_server.store.checkpoint_thread import CheckpointThread
 
 _log = logging.getLogger(__name__)
 
 STATUS_PERIOD_S = 1.0
-STUCK_S = 120.0  # longer waits of the mapper's thread are a fault; compiling takes others a minute
-ENDLESS_S = 1800.0  # longer than compiling or the checkpoint of a large map takes
+STUCK_S = 120.0  # longer waits of the mapper's thread are a fault
+ENDLESS_S = 1800.0  # longer than the checkpoint of a large map takes
 
 _BEATS_PER_LOG_LINE = 5
-_BEATS_PER_TRIM = 10  # of the memory; at once where it grew by so much:
-_TRIMMED_AT_BYTES = 16 << 20
 
 
 @dataclass(frozen=True)
@@ -119,7 +117,7 @@ class Health:
 
 
 class Heartbeat:
-    """Tells the network and the log how the server is doing, and keeps its memory small."""
+    """Tells the network and the log how the server is doing."""
 
     def __init__(self, session: zenoh.Session, health: Health) -> None:
         self._health = health
@@ -143,13 +141,9 @@ class Heartbeat:
         self._publisher.undeclare()
 
     def _run(self) -> None:
-        beat, trimmed_to = 0, resident_bytes()
+        beat = 0
         while not self._stopping.wait(STATUS_PERIOD_S):
             beat += 1
-            if beat % _BEATS_PER_TRIM == 0 or resident_bytes() > trimmed_to + _TRIMMED_AT_BYTES:
-                give_back_compiler()
-                give_back_free()
-                trimmed_to = resident_bytes()
             try:
                 self._health.mapper.wake()  # for a sign of life, even where nothing is to do
                 self._health.warnings.check()

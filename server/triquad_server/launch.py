@@ -1,6 +1,5 @@
 """Starting and stopping a server: one that is a process, or one within a program."""
 
-import functools
 import logging
 import sys
 import threading
@@ -18,8 +17,6 @@ from triquad_server.net.configuration import Configuration, configuration
 from triquad_server.net.session import open_session
 from triquad_server.network_defaults import network_defaults
 from triquad_server.phases import Phases
-from triquad_server.preparation import Preparation
-from triquad_server.process.memory import give_back_early, leave_out_blas
 from triquad_server.process.open_files import allow_open_files
 from triquad_server.process.service_manager import ServiceManager
 from triquad_server.process.stop import Stop, Stops, wait_for_stop
@@ -30,6 +27,7 @@ from triquad_server.settings import Settings
 from triquad_server.store.restore import ValidCheckpoint
 from triquad_server.store.store import Store
 from triquad_server.supervision import Supervision
+from triquad_server.warm_up import warm_up
 
 if TYPE_CHECKING:
     from triquad_server.monitoring.http_server import MonitoringServer
@@ -52,8 +50,6 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
         ServerError: the server cannot start; subclasses tell what is in the way.
     """
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
-    give_back_early()
-    leave_out_blas()
     allow_open_files()
     _stop_where_a_thread_ends(stops)
     if options.store is None:
@@ -110,11 +106,7 @@ def _open(options: LaunchOptions, stops: Stops, phases: Phases, stack: ExitStack
     if restored is not None:
         settings = _settings_of(restored.record, settings)
     teams = stack.enter_context(closing(Teams()))
-    preparation = Preparation(
-        settings, device, teams, starting=phases.starting, check=_stop_check(stops)
-    )
-    stack.callback(preparation.close)
-    preparation.for_answers()
+    warm_up(settings, device, teams, _before_each_step(stops, phases))
     phases.starting("opening the map")
     mapper = Mapper(
         options.map_name,
@@ -132,8 +124,7 @@ def _open(options: LaunchOptions, stops: Stops, phases: Phases, stack: ExitStack
         restored=restored.info if restored else None,
         teams=teams,
     )
-    failed = functools.partial(stops.put, Stop.INTERNAL_ERROR)
-    service = Service(session, served, settings, failed=failed, maps=False)
+    service = Service(session, served, settings, failed=lambda: stops.put(Stop.INTERNAL_ERROR))
     stack.enter_context(closing(service))
     if monitoring is not None:
         stack.enter_context(monitoring.showing(service.metrics))
@@ -141,8 +132,6 @@ def _open(options: LaunchOptions, stops: Stops, phases: Phases, stack: ExitStack
     _log_ready(options, network, service.epoch, device)
     question = SelfQuestion(session, options.map_name, service.own_name)
     phases.serving(service.health, question)
-    stack.callback(preparation.close)  # before the service closes
-    preparation.for_mapping(service.begin_to_map, failed)
 
 
 def _open_monitoring(settings: Settings, stack: ExitStack) -> "MonitoringServer | None":
@@ -202,14 +191,15 @@ def _settings_of(record: MapRecord, settings: Settings) -> Settings:
     return kept
 
 
-def _stop_check(stops: Stops) -> Callable[[], None]:
-    """What ends the start if the server is asked to stop."""
+def _before_each_step(stops: Stops, phases: Phases) -> Callable[[str], None]:
+    """Report a step of the warm-up, and end the start if the server is asked to stop."""
 
-    def check() -> None:
+    def begin(step: str) -> None:
         if not stops.empty():
             raise _StoppedEarlyError
+        phases.starting(f"preparing compiled code: {step}")
 
-    return check
+    return begin
 
 
 def _log_who_gets_in(network: Configuration) -> None:

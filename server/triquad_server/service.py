@@ -91,12 +91,8 @@ class Service:
         served: ServedMap,
         settings: Settings,
         failed: Callable[[], None] = lambda: None,
-        maps: bool = True,
     ) -> None:
-        """Begin to serve; ``failed`` is called where mapping stops by an internal error.
-
-        Unless it ``maps`` at once, scans wait until :meth:`begin_to_map`.
-        """
+        """Begin to serve; ``failed`` is called where mapping stops by an internal error."""
         self._session = session
         self._served = served
         self._settings = settings
@@ -107,7 +103,7 @@ class Service:
         self._warnings = ScanWarnings(self._scans, settings)
         self._parts = ExitStack()  # closed in reverse order of opening
         try:
-            self._open(failed, maps)
+            self._open(failed)
         except BaseException:
             self._parts.close()
             raise
@@ -122,10 +118,6 @@ class Service:
         """By which the server names itself in requests to itself."""
         return self._operations.own_name
 
-    def begin_to_map(self) -> None:
-        """Take in scans, and train, from now on."""
-        self._mapper.go_on()
-
     def close(self) -> None:
         """Refuse what still waits, stop mapping, and write a last checkpoint.
 
@@ -134,10 +126,10 @@ class Service:
         """
         self._parts.close()
 
-    def _open(self, failed: Callable[[], None], maps: bool) -> None:
+    def _open(self, failed: Callable[[], None]) -> None:
         """Open the parts, in the reverse of the order in which they have to be closed."""
         self._parts.callback(self._operations.close)
-        self._mapper = self._open_mapper(failed, maps)
+        self._mapper = self._open_mapper(failed)
         checkpoints = CheckpointThread(
             self._mapper,
             self._served.store,
@@ -189,7 +181,7 @@ class Service:
         self._parts.callback(self._session.liveliness().declare_token(alive).undeclare)
         self._parts.callback(self._operations.stop)  # before anything is waited for
 
-    def _open_mapper(self, failed: Callable[[], None], maps: bool) -> MapperThread:
+    def _open_mapper(self, failed: Callable[[], None]) -> MapperThread:
         mapper = MapperThread(
             self._served.mapper,
             self._scans,
@@ -198,9 +190,6 @@ class Service:
             warnings=self._warnings,
             memory=self._settings.memory,
         )
-        if not maps:
-            self._scans.hold()
-            mapper.rest()
         mapper.start()
         self._parts.callback(mapper.close)
         return mapper

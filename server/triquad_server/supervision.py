@@ -5,7 +5,6 @@ import threading
 
 from triquad_server.health import STUCK_S, Health
 from triquad_server.phases import Phases
-from triquad_server.process.memory import spare_from_collection
 from triquad_server.process.service_manager import ServiceManager
 from triquad_server.self_question import SelfQuestion
 
@@ -36,7 +35,6 @@ class Supervision(Phases):
 
     def serving(self, health: Health, question: SelfQuestion) -> None:
         """Tell that the server serves, and from now on how it does."""
-        spare_from_collection()
         self._manager.tell("READY=1", status=health.summary())
         if self._manager.listens:
             self._thread = threading.Thread(

@@ -10,6 +10,7 @@ import triquad_client
 from support import servers
 from triquad_client import InvalidInputError
 from triquad_format.mapfile.reader import read_map
+from triquad_map.compiled.kernel import CODE_FOLDER
 
 PROBES = np.concatenate([servers.sphere(50, radius) for radius in (2.0, 3.9, 4.0, 4.1)])
 POSE = np.eye(4)
@@ -73,24 +74,21 @@ def test_sigterm_keeps_the_map_and_the_next_server_gives_the_same_answers(tmp_pa
         assert_same_map(before, ask(server.endpoint))
 
 
-def test_at_the_very_first_start_it_serves_and_then_maps(tmp_path, arguments):
-    """Where nothing is compiled yet, others compile for it."""
-    nothing = {"XDG_CACHE_HOME": str(tmp_path / "cache")}
-    with servers.server_process(arguments, environment=nothing) as server:
-        assert "scans are taken in" not in server.log
-        assert ask(server.endpoint).epoch >= 1
-        with triquad_client.connect(server.endpoint) as client:
-            for _ in range(100):
-                client.publish_scan(servers.sphere(1000), POSE)
-            report = client.flush(servers.WAIT_S)
-        assert (report.lost, report.refused) == (0, 0)
-        assert server.log.count("compiling") == 1
-        told = [
-            server.log.index(text) for text in ("ready: ", "while scans wait", "scans are taken in")
-        ]
+def test_what_is_not_compiled_yet_is_compiled_before_it_serves_and_the_log_says_so(
+    tmp_path, arguments
+):
+    servers.compiled()
+    assert CODE_FOLDER is not None
+    cache = tmp_path / "cache"
+    code = cache / "triquad" / "kernels" / CODE_FOLDER.relative_to(CODE_FOLDER.parents[1])
+    shutil.copytree(CODE_FOLDER, code)
+    for file in code.rglob("ray_bins.*"):
+        file.unlink()
+    with servers.server_process(arguments, environment={"XDG_CACHE_HOME": str(cache)}) as server:
+        told = [server.log.index(text) for text in ("compiling, step", "once per mach", "ready: ")]
         assert told == sorted(told)
-        server.wait_for("all is compiled")
-    with servers.server_process(arguments, environment=nothing) as server:
+        learn(server.endpoint)
+    with servers.server_process(arguments, environment={"XDG_CACHE_HOME": str(cache)}) as server:
         assert "compiling" not in server.log
 
 

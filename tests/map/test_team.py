@@ -44,11 +44,11 @@ def test_an_error_of_one_part_is_raised_when_all_have_ended(team):
 
 
 @pytest.mark.parametrize("is_closed", [False, True])
-def test_what_runs_beside_has_ended_when_the_context_does(team, is_closed):
+def test_what_runs_in_parallel_has_ended_when_the_context_does(team, is_closed):
     if is_closed:
         team.close()
     ended = []
-    with team.beside() as hand_over:
+    with team.in_parallel() as hand_over:
         for number in range(5):
             hand_over(lambda number=number: ended.append(number))
     assert sorted(ended) == [0, 1, 2, 3, 4]
@@ -56,7 +56,7 @@ def test_what_runs_beside_has_ended_when_the_context_does(team, is_closed):
 
 def test_work_is_done_once_where_no_thread_can_be_started(team, monkeypatch):
     done = np.zeros(10_000, int)
-    beside = []
+    parallel = []
 
     def work(first, last):
         done[first:last] += 1
@@ -64,15 +64,15 @@ def test_work_is_done_once_where_no_thread_can_be_started(team, monkeypatch):
     def refuse(_):
         raise RuntimeError("can't start new thread")
 
-    with monkeypatch.context() as patched, team.beside() as hand_over:
+    with monkeypatch.context() as patched, team.in_parallel() as hand_over:
         patched.setattr(threading.Thread, "start", refuse)
-        hand_over(lambda: beside.append("done"))
+        hand_over(lambda: parallel.append("done"))
         team.split(len(done), work)
     assert (done == 1).all()
     team.split(len(done), work)
     team.close()  # what the pool still had waits no more
     assert (done == 2).all()
-    assert beside == ["done"]
+    assert parallel == ["done"]
 
 
 def test_the_caller_waits_for_no_thread_that_has_other_work(team):
@@ -83,7 +83,7 @@ def test_the_caller_waits_for_no_thread_that_has_other_work(team):
         busy.wait()
         go_on.wait()
 
-    with team.beside() as hand_over:
+    with team.in_parallel() as hand_over:
         for _ in range(threads):
             hand_over(work)
         busy.wait()
@@ -97,12 +97,11 @@ def test_the_caller_waits_for_no_thread_that_has_other_work(team):
 def test_threads_have_the_priority_of_a_caller_who_starts_them_at_the_same():
     lowered = Team("lowered", 3)
     met = threading.Barrier(THREADS)
-    niceness, policies = [], []
+    niceness = []
 
     def work(_):
         met.wait()  # so that each part has a thread of its own
         niceness.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
-        policies.append(os.sched_getscheduler(0))
 
     def call():
         lower_priority(3)
@@ -113,4 +112,3 @@ def test_threads_have_the_priority_of_a_caller_who_starts_them_at_the_same():
     caller.join()
     lowered.close()
     assert niceness == [os.getpriority(os.PRIO_PROCESS, os.getpid()) + 3] * THREADS
-    assert policies == [os.SCHED_BATCH] * THREADS

@@ -11,8 +11,7 @@ from typing import Any, TypeAlias
 
 from llvmlite import ir
 from numba.core import cgutils, types
-from numba.core.typing.templates import AbstractTemplate, infer_global
-from numba.extending import lower_builtin, models, register_model
+from numba.extending import lower_builtin, models, register_model, type_callable
 
 from triquad_map.compiled.kernel import kernel_code
 
@@ -43,16 +42,13 @@ class _LanesModel(models.PrimitiveModel):
 def _define(operation: Callable[[Any, Any], Any], instruction: str) -> None:
     """Have an operator of two vectors be an instruction."""
 
-    class Template(AbstractTemplate):
-        key = operation
-
-        def generic(self, args: Any, _: Any) -> Any:
-            return _KIND(*args) if args == (_KIND, _KIND) else None
+    def result(_: Any) -> Callable[[Any, Any], Any]:
+        return lambda first, second: _KIND if first == second == _KIND else None
 
     def generate(_: Any, builder: Any, __: Any, args: Any) -> Any:
         return getattr(builder, instruction)(*args, flags=_FAST)
 
-    infer_global(operation)(Template)
+    type_callable(operation)(result)
     lower_builtin(operation, _LanesType, _LanesType)(generate)
 
 

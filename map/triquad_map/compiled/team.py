@@ -72,8 +72,8 @@ class Team:
             self._run(lambda part: work(*share(count, part, parts)), parts)
 
     @contextlib.contextmanager
-    def beside(self) -> Iterator[Callable[[Callable[[], None]], None]]:
-        """Run work beside the caller: each that is handed over has ended when the context does."""
+    def in_parallel(self) -> Iterator[Callable[[Callable[[], None]], None]]:
+        """Run work in parallel to the caller; all of it has ended when the context does."""
         handed_over: list[_Part] = []
 
         def hand_over(work: Callable[[], None]) -> None:

@@ -63,13 +63,6 @@ class ScanQueue:
             for pushed_out in self._scans.put(Owner(scan.source), scan, _bytes_of(scan)):
                 self.ledger.push_out(pushed_out)
 
-    def hold(self) -> None:
-        """Let as many scans of a source wait as there are bytes for, until few wait again.
-
-        That is for a server which takes none in yet.
-        """
-        self._scans.limit_each = self._scans.limit
-
     def refuse(self, scan: Scan, reason: str, text: str) -> None:
         """Account for a scan that arrived but is not let in."""
         with self._taken:
@@ -85,8 +78,6 @@ class ScanQueue:
         is asked for.
         """
         with self._taken:
-            if len(self._scans) <= self.limit:
-                self._scans.limit_each = self.limit
             scan = self._scans.take(
                 lambda scan: scan.source not in passed_over or self._falls_behind(scan.source)
             )

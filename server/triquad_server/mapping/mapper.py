@@ -196,9 +196,9 @@ class Mapper:
     @shortages()
     def _take_in(self, rays: ScanRays, around: list[RegionIndex], stamp_s: int) -> None:
         regions = [self._region(index) for index in around]
-        with self._teams.mapping.beside() as beside:
+        with self._teams.mapping.in_parallel() as start:
             for region in regions:
-                beside(region.see(rays, stamp_s))
+                start(region.see(rays, stamp_s))
             normals = self._normals.add(rays.ends, rays.origin)
             self._share_out()  # by the voxels that are seen by now
             for region in regions:

@@ -134,11 +134,6 @@ class MapperThread:
         self._resting.set()
         self._wake.set()
 
-    def go_on(self) -> None:
-        """Rest no more."""
-        self._resting.clear()
-        self._wake.set()
-
     def close(self) -> None:
         """End after the current slice; pending commands are still carried out."""
         self._stopping.set()

@@ -161,19 +161,6 @@ def test_a_full_queue_pushes_out_the_oldest_scan_and_counts_it():
     assert len(queue) == 0
 
 
-def test_a_server_that_takes_none_in_yet_holds_more_until_few_wait_again():
-    scans = ScanQueue(limit=2)
-    scans.hold()
-    for sequence in range(4):
-        scans.put(servers.scan(sequence))
-    assert scans.ledger.lost() == {}
-    assert [scans.take().sequence for _ in range(3)] == [0, 1, 2]
-    for sequence in range(4, 7):
-        scans.put(servers.scan(sequence))
-    assert scans.ledger.lost() == {"lidar": 2}
-    assert [scans.take().sequence for _ in range(2)] == [5, 6]
-
-
 def test_waiting_for_an_outcome_ends_with_the_publication():
     ledger = SourceLedger()
     arrive_and_take(ledger, 0)
