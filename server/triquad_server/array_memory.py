@@ -17,7 +17,7 @@ def buffers_of(part: object, without: Buffers = NO_BUFFERS) -> dict[int, int]:
 
     Args:
         part: an object, or containers of some, which must not change meanwhile; only those of
-            classes of this program are looked into.
+            classes of this program are searched.
         without: memory that belongs to others.
     """
     found: dict[int, int] = {}
@@ -60,7 +60,7 @@ def _root(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
 
 
 def _within(part: object) -> Iterable[object]:
-    """What a container or an object of this program holds."""
+    """List the parts of a container or of an object of this program."""
     if isinstance(part, (tuple, list)):
         return part
     if isinstance(part, dict):

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger("triquad_server")
 
 _SWITCH_INTERVAL_S = 0.0005
-"""How long a thread may hold the interpreter while another waits: a query is to be answered in a
+"""How long a thread may keep the interpreter while another waits: a query is to be answered in a
 few milliseconds, which is Python's default for a single turn."""
 
 
@@ -145,7 +145,7 @@ def _open_monitoring(settings: Settings, stack: ExitStack) -> "MonitoringServer 
 
 
 def _open_store(options: LaunchOptions, phases: Phases, stack: ExitStack) -> Store | None:
-    """Where checkpoints are kept, if they are; taken back to an older one where that is asked."""
+    """Open the store of checkpoints, if there is one; restored to an older one where that is asked."""
     if options.store is None:
         return None
     store = Store(options.store, options.map_name, options.settings.store)

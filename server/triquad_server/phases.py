@@ -1,4 +1,4 @@
-"""The phases of a server's run, for whoever wants to hear of them; quick to import."""
+"""The phases of a server's run, and what is done about them; quick to import."""
 
 from __future__ import annotations
 

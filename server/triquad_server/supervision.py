@@ -11,7 +11,7 @@ from triquad_server.self_question import SelfQuestion
 _log = logging.getLogger(__name__)
 
 _STATUS_PERIOD_S = 10.0  # where the manager does not say how often it wants to hear anything
-_SOONER = 10  # times, a server is looked at again that was not well
+_SOONER = 10  # times sooner, a server is checked again that was not well
 
 
 class Supervision(Phases):

@@ -33,7 +33,7 @@ _CONSTANTS = (
     "triquad_map/surface.py",
     "triquad_map/view.py",
 )
-"""Files of which kernels take constants and records, beside those of other kernels."""
+"""Files of which kernels take constants and records, in addition to those that define kernels."""
 
 _LEAST_FREE_BYTES = 200 << 20
 """With less room on the disk no new folder is begun; the code of all kernels takes 25 MB."""

@@ -1,4 +1,4 @@
-"""Splits the loops of compiled code over the cores; kernels hold no Python lock."""
+"""Splits the loops of compiled code over the cores; kernels run without Python's lock."""
 
 import contextlib
 import os
@@ -17,7 +17,7 @@ _MIN_SHARE = 2048
 
 
 class _Part:
-    """A part of some work, which whoever comes to it first does: a thread, or the caller."""
+    """A part of some work, done by a thread or by the caller, whichever is free first."""
 
     def __init__(self, work: Callable[[], None]) -> None:
         self._work = work

@@ -1,4 +1,4 @@
-"""What the server needs beside the base installation."""
+"""What the server needs in addition to the base installation."""
 
 import importlib.util
 
