@@ -145,7 +145,7 @@ def _open_monitoring(settings: Settings, stack: ExitStack) -> "MonitoringServer 
 
 
 def _open_store(options: LaunchOptions, phases: Phases, stack: ExitStack) -> Store | None:
-    """Open the store of checkpoints, if there is one, at an older checkpoint if one is asked for."""
+    """Open the store, if there is one, restored to an older checkpoint if one is asked for."""
     if options.store is None:
         return None
     store = Store(options.store, options.map_name, options.settings.store)
