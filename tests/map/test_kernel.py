@@ -166,8 +166,15 @@ def imported_names(tree):
     }
 
 
-def names_in(statements):
-    return {node.id for part in statements for node in ast.walk(part) if isinstance(node, ast.Name)}
+def names_in(*parts, kind=ast.expr_context):
+    names = (node for part in parts for node in ast.walk(part) if isinstance(node, ast.Name))
+    return {name.id for name in names if isinstance(name.ctx, kind)}
+
+
+def names_from_outside(function):
+    """Names that the body of a function uses, and that are neither arguments nor assigned there."""
+    own = names_in(*function.body, kind=ast.Store) | {each.arg for each in function.args.args}
+    return names_in(*function.body, kind=ast.Load) - own
 
 
 @pytest.mark.parametrize("module", WITH_KERNELS)
@@ -176,8 +183,8 @@ def test_kernels_take_constants_from_files_that_are_in_the_digest_alone(module):
     tree = ast.parse(MODULES[module].read_text())
     kernels = [statement for statement in tree.body if is_kernel(statement)]
     assigned = [part for part in tree.body if isinstance(part, (ast.Assign, ast.AnnAssign))]
-    used = names_in(line for function in kernels for line in function.body)
-    used |= names_in(part.value for part in assigned if names_in([part]) & used and part.value)
+    used = {name for function in kernels for name in names_from_outside(function)}
+    used |= names_in(*(part.value for part in assigned if names_in(part) & used and part.value))
     for name, origin in imported_names(tree).items():
         if name in used and origin not in WITH_KERNELS:
             assert origin.replace(".", "/").startswith(
