@@ -8,12 +8,11 @@ import gc
 import logging
 import shutil
 from collections.abc import Callable
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.field_settings import BLOCK_VOXELS
-from triquad_format.records.region import MapRecord
 from triquad_map.compiled.kernel import CODE_FOLDER, count_compiled, is_first_use
 from triquad_map.questions.distance import DistanceOptions, distances
 
@@ -23,10 +22,7 @@ from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.process.threads import Teams
 from triquad_server.settings import MemorySettings, Settings
 
-COMPILING = (
-    "compiling, step %d of %d: %s; half a minute or more in all, once per machine and release"
-)
-
+_COMPILING = "compiling, step %d of %d: %s; half a minute or more, once per machine and release"
 _REMOVING_SCANS = 6  # of rays that pass the synthetic sphere, until it is removed
 _DIRECTIONS = 400  # of the rays of a synthetic scan
 _RADIUS_M = 3.0  # of the sphere that it sees
@@ -44,6 +40,8 @@ def warm_up(
 
     ``report`` is called with the name of each step before it begins; what it raises ends the work.
     """
+    _log.info("preparing compiled code")
+    before, compiles = count_compiled(), is_first_use()
     synthetic = _SyntheticMap(settings, device, teams or Teams())
     steps = [
         synthetic.scans,
@@ -53,16 +51,12 @@ def warm_up(
         synthetic.restored_training,
         synthetic.removal,
     ]
-    _log.info("preparing compiled code")
-    before = count_compiled()
-    is_first = is_first_use()
-    level = logging.WARNING  # of the first line, which is shown where no log is set up, too
     for number, step in enumerate(steps, start=1):
         name = step.__name__.replace("_", " ")
         report(name)
-        if is_first or count_compiled() > before:
-            _log.log(level, COMPILING, number, len(steps), name)
-            level = logging.INFO
+        compiles = compiles or count_compiled() > before
+        if compiles:
+            _log.warning(_COMPILING, number, len(steps), name)
         go_through(step)
 
 
@@ -89,20 +83,17 @@ class _SyntheticMap:
     def __init__(self, settings: Settings, device: str, teams: Teams) -> None:
         # With room for it, whatever the memory of the map itself is.
         self._settings = settings.model_copy(update={"memory": MemorySettings()})
-        self._device = device
         self._teams = teams
         scan = settings.scan
         directions = np.random.default_rng(0).normal(size=(min(_DIRECTIONS, scan.max_points), 3))
         self._directions: Doubles = directions / np.linalg.norm(directions, axis=1, keepdims=True)
         self._radius_m = min(max(_RADIUS_M, scan.range_min_m), scan.range_max_m)
-
-    @cached_property
-    def _mapper(self) -> Mapper:
-        return self._map_of(None)
+        self._map_of = partial(Mapper, "warm-up", self._settings, device, teams=teams)
+        self._mapper = self._map_of()
 
     @cached_property
     def _restored(self) -> Mapper:
-        return self._map_of(self._mapper.changes_since(None).record)
+        return self._map_of(record=self._mapper.changes_since(None).record)
 
     def scans(self) -> None:
         """Take in a scan of the sphere."""
@@ -150,9 +141,6 @@ class _SyntheticMap:
 
     def _ingest(self, radius_m: float) -> ScanRays:
         return self._mapper.ingest((self._directions * radius_m).astype(np.float32), np.eye(4))
-
-    def _map_of(self, record: MapRecord | None) -> Mapper:
-        return Mapper("warm-up", self._settings, self._device, record, self._teams)
 
 
 if __name__ == "__main__":
