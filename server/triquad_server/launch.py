@@ -17,6 +17,7 @@ from triquad_server.net.configuration import Configuration, configuration
 from triquad_server.net.session import open_session
 from triquad_server.network_defaults import network_defaults
 from triquad_server.phases import Phases
+from triquad_server.process.memory import give_back_early
 from triquad_server.process.open_files import allow_open_files
 from triquad_server.process.service_manager import ServiceManager
 from triquad_server.process.stop import Stop, Stops, wait_for_stop
@@ -50,6 +51,7 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
         ServerError: the server cannot start; subclasses tell what is in the way.
     """
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
+    give_back_early()
     allow_open_files()
     _stop_where_a_thread_ends(stops)
     if options.store is None:

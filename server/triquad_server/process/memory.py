@@ -1,9 +1,16 @@
-"""How much memory this process uses."""
+"""How much memory this process uses, and that it gives back what it has freed."""
 
+import contextlib
+import ctypes
 import os
 import resource
 import sys
 from pathlib import Path
+
+# Options of glibc's mallopt(3), and what they are set to.
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
+_LARGE_BYTES = 2 << 20
+_ARENAS = 2
 
 _STATM = Path("/proc/self/statm")
 
@@ -15,3 +22,18 @@ def resident_bytes() -> int:
     except (OSError, ValueError, IndexError):
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         return peak if sys.platform == "darwin" else peak * 1024
+
+
+def give_back_early() -> None:
+    """Have memory that is free go back to the system, where its C library is glibc.
+
+    By default it keeps arrays of up to 32 MB for later, for each of some 30 threads apart: with
+    100 m of street, at rest after its mesh was fetched, a server took 628 instead of 437 MB.
+    """
+    if sys.platform != "linux":
+        return
+    with contextlib.suppress(OSError, AttributeError):
+        options = ctypes.CDLL(None).mallopt
+        options(_M_ARENA_MAX, _ARENAS)
+        options(_M_MMAP_THRESHOLD, _LARGE_BYTES)
+        options(_M_TRIM_THRESHOLD, 2 * _LARGE_BYTES)
