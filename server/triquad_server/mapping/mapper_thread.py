@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from triquad_format.wire.messages import FieldFit, ResetReply, ResetRequest, Scan
+from triquad_map.box import check_box
 from triquad_map.compiled.priority import lower_priority
 
 from triquad_server.counter import Counter
@@ -22,7 +23,6 @@ from triquad_server.mapping.map_fit import map_fit
 from triquad_server.mapping.map_snapshot import MapSnapshot
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.thread_time import Activity, ThreadTime
-from triquad_server.mesh.mesher import check_box
 from triquad_server.process.threads import NICENESS
 from triquad_server.settings import MemorySettings, ServiceSettings
 

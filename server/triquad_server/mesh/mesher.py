@@ -178,16 +178,6 @@ def check_level(level: int) -> None:
         raise RefusedError("bad_request", f"level = {level} is out of range: use 0 to {LEVELS - 1}")
 
 
-def check_box(minimum: Doubles, maximum: Doubles) -> None:
-    """Refuse a box [3], [3] with NaN or with corners the wrong way round; infinite is allowed.
-
-    Raises:
-        RefusedError: it is such a box.
-    """
-    if np.isnan([minimum, maximum]).any() or (minimum > maximum).any():
-        raise RefusedError("bad_request", f"not a box: minimum {minimum}, maximum {maximum}")
-
-
 @dataclass(frozen=True)
 class TileMesh:
     """Triangles of one tile. Vertices are numbered in the order in which faces use them."""

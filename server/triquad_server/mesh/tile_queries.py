@@ -7,13 +7,14 @@ from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.wire.limits import MAX_TILES_ASKED, TILE_INDEX_LIMIT
 from triquad_format.wire.messages import MeshReply, MeshRequest, TileList, TileListRequest
 from triquad_format.wire.tile_codec import encode_tile
+from triquad_map.box import check_box
 from triquad_map.composition.composed_view import ComposedView
 
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.mesh.answered_tiles import AnsweredTile, AskedTile
 from triquad_server.mesh.holes import check_fill
-from triquad_server.mesh.mesher import TileLattice, check_box, check_level, mesh_tile
+from triquad_server.mesh.mesher import TileLattice, check_level, mesh_tile
 from triquad_server.mesh.tile_cache import TileCache
 
 MAX_TILES = 1_000_000

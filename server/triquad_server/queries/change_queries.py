@@ -6,12 +6,12 @@ import numpy as np
 from triquad_format.errors import RefusedError
 from triquad_format.records.arrays import Bools, Bytes, Longs
 from triquad_format.wire.query_messages import ChangesReply, ChangesRequest
+from triquad_map.box import check_box
 from triquad_map.clusters import Boxes, tight_boxes
 
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.epochs.surface_history import SurfaceHistory, VoxelChanges
-from triquad_server.mesh.mesher import check_box
 
 MAX_BOXES = 256
 """Boxes of one reply. Where there would be more, voxels twice as far apart share one, and boxes may

@@ -4,11 +4,11 @@ import logging
 
 from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import ResetReply, ResetRequest
+from triquad_map.box import check_box
 
 from triquad_server.errors import StoreError
 from triquad_server.mapping.map_snapshot import MapSnapshot
 from triquad_server.mapping.mapper_thread import MapperThread
-from triquad_server.mesh.mesher import check_box
 from triquad_server.store.checkpoint_thread import CheckpointThread
 from triquad_server.store.store import Store
 
