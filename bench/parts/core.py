@@ -9,13 +9,14 @@ from functools import partial
 import numpy as np
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.status import Status
+from triquad_map.compiled.mesh.mesher import mesh_tile
 from triquad_server.engine.live_field import Batch, Rates
 from triquad_server.engine.tensor_field import FieldTensors, TensorField
 from triquad_server.engine.tensor_trainer import TensorTrainer
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mesh.mesher import mesh_tile, tile_lattice
+from triquad_server.mesh.tile_cache import tile_lattice
 from triquad_server.mesh.tile_queries import surface_tiles
 from triquad_server.process.threads import Teams
 from triquad_server.settings import MeshSettings, Settings

@@ -11,8 +11,8 @@ from triquad_client import OfflineMap
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import MapFileInfo, write_map
 from triquad_format.records.region import MapRecord
+from triquad_map.preview import previews_of
 from triquad_server.epochs.epoch import Epoch
-from triquad_server.mesh.preview import previews_of
 from triquad_tools.mapfiles.field_change import field_change
 from triquad_tools.mapfiles.packing import INTEGER_ERROR_M
 from triquad_tools.mapfiles.quantise import quantise
@@ -74,7 +74,7 @@ def _sizes(epoch: Epoch, record: MapRecord, made: BenchStreet, folder: Path) -> 
 
 def _written(epoch: Epoch, record: MapRecord, path: Path) -> MapFileInfo:
     """Write a map as a server does, with its previews."""
-    return write_map(record, path, previews=previews_of(record, distances=epoch.distances))
+    return write_map(record, path, previews=previews_of(record, epoch))
 
 
 def _f_score(record: MapRecord, made: BenchStreet) -> float:

@@ -19,9 +19,9 @@ from triquad_client import OfflineMap
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.region import MapRecord
+from triquad_map.preview import previews_of
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mesh.preview import previews_of
 from triquad_server.settings import Settings
 from triquad_tools.console.arguments import picture, seed
 from triquad_tools.console.progress import progress
@@ -139,7 +139,7 @@ def _by_bytes(epoch: Epoch, made: BenchStreet) -> list[Scored]:
 
 def _written(record: MapRecord, epoch: Epoch, file: io.BytesIO) -> int:
     """Write a map as a server does, with its previews; returns its size in bytes."""
-    return write_map(record, file, previews=previews_of(record, distances=epoch.distances)).bytes
+    return write_map(record, file, previews=previews_of(record, epoch)).bytes
 
 
 def _score(record: MapRecord, made: BenchStreet, *, curve: str, cost: float) -> Scored:

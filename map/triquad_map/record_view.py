@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from triquad_format.records.region import MapRecord
 
+from triquad_map.composition.composed_view import ComposedView
 from triquad_map.reference.evaluator import MapEvaluator
-from triquad_map.view import MeshedView
 
 _log = logging.getLogger(__name__)
 
@@ -17,7 +17,7 @@ _log = logging.getLogger(__name__)
 class OpenView:
     """A map that can be asked until it is closed."""
 
-    view: MeshedView
+    view: ComposedView
     compiled: bool  # whether compiled code answers, as in a server; numpy is far slower
     close: Callable[[], None]
 

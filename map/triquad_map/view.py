@@ -77,15 +77,3 @@ class MapView(Protocol):
 
     def nearest_unknown(self, points: Doubles, max_distance_m: float) -> NearestUnknown:
         """The nearest unknown space, searched for as far as ``max_distance_m``."""
-
-
-class MeshedView(MapView, Protocol):
-    """A map of which meshes are made."""
-
-    def near_ends(self, points: Doubles, reach_m: float) -> Bools:
-        """Whether points [N, 3] lie where rays ended.
-
-        That is within ``reach_m`` of a voxel in which they did, on each axis, and on no side of it
-        beyond the last end, unless the surface goes on in a voxel there, or so few scans hit it
-        that all may have missed what lies beyond.
-        """

@@ -90,7 +90,7 @@ def test_all_public_names_exist():
         ("bench", (), "torch is missing: install triquad[demo]"),
         ("evaluate", (), "scipy is missing: install triquad[tools]"),
         ("inspect", ("MAP", "--plot", "plan.png"), "matplotlib is missing: install triquad[tools]"),
-        ("pack", ("MAP", "mesh.ply"), "scikit-image is missing: pip install 'triquad[mesh]'"),
+        ("pack", ("MAP", "mesh.ply"), "numba is missing: pip install 'triquad[fast]'"),
     ],
 )
 def test_a_tool_whose_libraries_are_missing_says_what_to_install(

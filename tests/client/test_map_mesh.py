@@ -3,6 +3,7 @@
 import dataclasses
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -127,50 +128,54 @@ def test_a_closed_map_has_no_mesh() -> None:
         offline.mesh()
 
 
-def test_without_scikit_image_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "skimage.measure", None)
-    with pytest.raises(InvalidInputError, match=r"scikit-image.*pip install 'triquad\[mesh\]'"):
-        mesh_of(RECORD)
-
-
 PLAIN = """
 import sys
-for name in ("numba", "llvmlite", "torch", "trimesh", "triquad_server", "triquad_tools"):
+for name in sys.argv[3:]:
     sys.modules[name] = None  # as if it were not installed
 import triquad_client
 with triquad_client.open_map(sys.argv[1]) as offline:
-    mesh = offline.mesh(cell_m=0.4)
-    mesh.save(sys.argv[2])
-    print(offline.compiled, len(mesh.faces))
+    offline.mesh(cell_m=0.4).save(sys.argv[2])
 """
 
 
-def test_it_needs_neither_numba_nor_torch_nor_the_tools(tmp_path: Path) -> None:
+@pytest.fixture
+def without(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Writes the mesh of a map to ``mesh.ply`` in a process without some libraries."""
     path = tmp_path / "map.triquad"
     write_map(RECORD, path)
-    done = subprocess.run(
-        [sys.executable, "-c", PLAIN, path, tmp_path / "mesh.ply"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+
+    def run(*libraries: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-c", PLAIN, path, tmp_path / "mesh.ply", *libraries]
+        return subprocess.run(command, capture_output=True, text=True, check=False)
+
+    return run
+
+
+def test_it_needs_neither_torch_nor_scikit_image_nor_the_tools(without, tmp_path: Path) -> None:
+    done = without("torch", "skimage", "scipy", "trimesh", "triquad_server", "triquad_tools")
     assert done.returncode == 0, done.stderr
-    compiled, faces = done.stdout.split()
-    assert compiled == "False"
-    assert int(faces) == len(mesh_of(RECORD, cell_m=0.4).faces)
-    assert (tmp_path / "mesh.ply").exists()
+    faces = len(mesh_of(RECORD, cell_m=0.4).faces)
+    assert f"element face {faces}\n".encode() in (tmp_path / "mesh.ply").read_bytes()
 
 
-def test_block_by_block_it_is_the_same_surface() -> None:
+def test_without_numba_the_error_names_the_extra(without) -> None:
+    done = without("numba", "llvmlite")
+    assert done.returncode == 1
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith("triquad_format.errors.InvalidInputError: meshes of map files")
+    assert last.endswith("numba is missing: pip install 'triquad[fast]'")
+
+
+def test_tile_by_tile_it_is_the_same_surface() -> None:
     with OfflineMap(RECORD) as offline:
         whole = offline.mesh(cell_m=0.2)
-        blocks = offline.mesh_blocks(cell_m=0.2)
-        parts = [(np.array(index) * blocks.side_m, blocks.mesh(index)) for index in blocks.indices]
+        tiles = offline.mesh_tiles(cell_m=0.2)
+        parts = [(np.array(index) * tiles.side_m, tiles.mesh(index)) for index in tiles.indices]
     assert len(parts) >= 4
     assert sum(len(part.faces) for _, part in parts) == len(whole.faces)
     for low, part in parts:
         middles = centroids(part)
-        assert ((middles >= low) & (middles <= low + blocks.side_m)).all()
+        assert ((middles >= low) & (middles <= low + tiles.side_m)).all()
     together = np.concatenate([centroids(part) for _, part in parts])
     sums = [np.sort(points @ [1.0, 2.0, 3.0]) for points in (together, centroids(whole))]
     np.testing.assert_allclose(*sums, atol=1e-6)

@@ -90,7 +90,7 @@ def test_obj_keeps_large_coordinates(tmp_path):
 
 @pytest.mark.parametrize("name", ["mesh.glb", "mesh.ply", "mesh.obj", "mesh.stl"])
 def test_other_programs_read_the_files(tmp_path, name):
-    near = Mesh(MESH.vertices - FAR, MESH.faces, MESH.epoch)
+    near = Mesh(MESH.vertices - FAR, MESH.faces, epoch=MESH.epoch)
     near.save(tmp_path / name)
     mesh = trimesh.load_mesh(tmp_path / name)
     assert len(mesh.faces) == 4

@@ -1,28 +1,28 @@
 from dataclasses import replace
 
 import numpy as np
-from triquad_client.mesh.mesh import Mesh, compacted
-from triquad_client.mesh.tile_join import TileJoin, joined
+from triquad_client.mesh.mesh import compacted
+from triquad_map.tile_join import TileJoin, joined
+from triquad_map.triangles import Triangles
 
 EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)
 
 
 def of(*corners):
     """The mesh of a tile with one triangle."""
-    return Mesh(np.array(corners, np.float64), np.array([[0, 1, 2]], np.int32))
+    return Triangles(np.array(corners, np.float64), np.array([[0, 1, 2]], np.int32))
 
 
 def test_vertices_on_a_common_face_become_one():
     # Two triangles in the tiles left and right of x = 1, which share an edge on that face.
     left = of([0.5, 0.5, 0.5], [1, 0.2, 0.3], [1, 0.8, 0.3])
     right = of([1, 0.2, 0.3], [1.5, 0.5, 0.5], [1, 0.8, 0.3])
-    mesh = joined([left, right], 1.0, box=EVERYWHERE, epoch=3)
+    mesh = joined([left, right], 1.0, box=EVERYWHERE)
     assert len(mesh.vertices) == 4
     assert len(mesh.faces) == 2
     assert len(set(mesh.faces.ravel())) == 4
     for face, tile in zip(mesh.faces, (left, right), strict=True):
         np.testing.assert_array_equal(mesh.vertices[face], tile.vertices)
-    assert mesh.epoch == 3
     assert mesh.filled is None
 
 
@@ -35,9 +35,9 @@ def test_rounding_boundaries_do_not_leave_cracks():
     count = len(edge)
     index = np.arange(count - 1)
     fan = np.stack([index, index + 1, np.full(count - 1, count)], axis=1).astype(np.int32)
-    left = Mesh(np.concatenate([edge, [[6.0, 3.0, 0.5]]]), fan)
-    right = Mesh(np.concatenate([copy, [[6.8, 3.0, 0.5]]]), fan[:, ::-1])
-    mesh = joined([left, right], 6.4, box=EVERYWHERE, epoch=1)
+    left = Triangles(np.concatenate([edge, [[6.0, 3.0, 0.5]]]), fan)
+    right = Triangles(np.concatenate([copy, [[6.8, 3.0, 0.5]]]), fan[:, ::-1])
+    mesh = joined([left, right], 6.4, box=EVERYWHERE)
     assert len(mesh.vertices) == count + 2
 
 
@@ -45,25 +45,25 @@ def test_faces_that_become_degenerate_are_left_out():
     join = TileJoin(1.0, EVERYWHERE, marked=True)
     join.add(of([1, 0, 0], [1, 1e-6, 0], [0.5, 0.5, 0.5]))
     join.add(replace(of([1, 0, 0], [1, 1, 0], [1.5, 0.5, 0.5]), filled=np.array([True])))
-    mesh = join.mesh(1)
+    mesh = join.mesh()
     assert mesh.faces.shape == (1, 3)
     assert len(mesh.vertices) == 3
     assert mesh.filled.tolist() == [True]
 
 
 def test_an_empty_mesh_stays_empty():
-    mesh = joined([], 6.4, box=EVERYWHERE, epoch=1)
+    mesh = joined([], 6.4, box=EVERYWHERE)
     assert mesh.vertices.shape == (0, 3)
     assert mesh.faces.shape == (0, 3)
     assert mesh.faces.dtype == np.int32
 
 
 def test_faces_out_of_the_box_go_with_their_vertices():
-    tile = Mesh(
+    tile = Triangles(
         np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [3, 0, 0], [3, 1, 0]], np.float64) + 0.1,
         np.array([[0, 1, 2], [1, 3, 4]], np.int32),
     )
-    mesh = joined([tile], 6.4, box=(np.zeros(3), np.full(3, 1.4)), epoch=1)
+    mesh = joined([tile], 6.4, box=(np.zeros(3), np.full(3, 1.4)))
     np.testing.assert_allclose(mesh.vertices, tile.vertices[:3])
     assert mesh.faces.tolist() == [[0, 1, 2]]
 

@@ -68,7 +68,7 @@ def imported(folder: str) -> set[str]:
     [
         ("format", ()),
         ("client", ("mesh",)),
-        ("map", ("fast",)),
+        ("map", ("fast", "preview")),
         ("sensors", ("ros",)),
         ("server", ("fast", "preview", "ros", "server")),
         ("tools", EVERY_EXTRA),

@@ -21,8 +21,8 @@ from triquad_format.mapfile.writer import write_map
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.map_progress import MapProgress
 from triquad_format.records.region import MapRecord
+from triquad_map.preview import previews_of
 from triquad_map.stored_map import StoredMap
-from triquad_server.mesh.preview import previews_of
 
 TINY = FieldSettings(
     depth=6, feature_levels=1, feature_size=2, frequencies=1, hidden=2, logit_scale_m=0.5

@@ -26,8 +26,8 @@ from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import WrittenMap, write_map, write_parts
 from triquad_format.records.region import MapRecord
 from triquad_format.wire.codec import pack_array, unpack_array
+from triquad_map.preview import previews_of
 from triquad_map.stored_map import StoredMap
-from triquad_server.mesh.preview import previews_of
 
 Edit = Callable[[dict[str, Any]], object]
 """Changes the msgpack map of a part."""
@@ -44,14 +44,14 @@ def file_bytes(
     record: MapRecord,
     *,
     preview: bool = False,
-    distances: Any = None,
+    view: Any = None,
     stamp_ns: int | None = None,
     **options: Any,
 ) -> bytes:
     """A complete map file."""
     stream = io.BytesIO()
     if preview:
-        options["previews"] = previews_of(record, distances=distances, stamp_ns=stamp_ns)
+        options["previews"] = previews_of(record, view, stamp_ns)
     write_map(record, stream, stamp_ns=stamp_ns, **options)
     return stream.getvalue()
 

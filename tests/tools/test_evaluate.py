@@ -16,7 +16,7 @@ EVERY = 3  # withheld
 def _plate(path, x, y, z):
     corners = [[x[0], y[0], z], [x[1], y[0], z], [x[1], y[1], z], [x[0], y[1], z]]
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
-    triquad_client.Mesh(np.array(corners, float), faces, 1).save(path)
+    triquad_client.Mesh(np.array(corners, float), faces, epoch=1).save(path)
     return path
 
 
@@ -35,7 +35,7 @@ def _evaluate(capsys, *arguments):
 def test_a_plate_scores_its_distance_from_a_cloud(tmp_path, capsys, suffix):
     mesh = _plate(tmp_path / f"plate{suffix}", (0, 4), (0, 2), 0.05)
     cloud = tmp_path / "cloud.ply"
-    triquad_client.Mesh(_grid(), np.empty((0, 3), np.int32), 1).save(cloud)
+    triquad_client.Mesh(_grid(), np.empty((0, 3), np.int32), epoch=1).save(cloud)
     scores = _evaluate(capsys, "mesh", mesh, "--reference", cloud)["mesh"]
     assert scores["accuracy_m"] == pytest.approx(0.05, abs=0.002)
     assert scores["completion_m"] == pytest.approx(0.05, abs=0.002)
@@ -138,7 +138,7 @@ def test_input_that_cannot_be_used_is_refused(tmp_path, capsys, sphere_folder):
 
     mesh = _plate(tmp_path / "plate.ply", (0, 1), (0, 1), 0.0)
     cloud = tmp_path / "cloud.ply"
-    triquad_client.Mesh(_grid(), np.empty((0, 3), np.int32), 1).save(cloud)
+    triquad_client.Mesh(_grid(), np.empty((0, 3), np.int32), epoch=1).save(cloud)
     assert "no such file" in refusal("mesh", tmp_path / "no.ply", "--street", 1)
     assert "has no faces" in refusal("mesh", cloud, "--reference", cloud)
     assert "no.ply" in refusal("mesh", mesh, "--reference", tmp_path / "no.ply")

@@ -12,15 +12,16 @@ from support.map_records import random_record
 from support.mapfile_edit import file_bytes
 from support.small_world import settings, settled_epoch
 from triquad_client import Mesh
-from triquad_client.mesh.tile_join import joined
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.crop import crop_record
 from triquad_format.records.seen_space import surface_voxels
 from triquad_format.records.status import Status
+from triquad_map.compiled.mesh.mesher import mesh_tile
 from triquad_map.reference.evaluator import MapEvaluator
+from triquad_map.tile_join import joined
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mesh.mesher import mesh_tile, tile_lattice
+from triquad_server.mesh.tile_cache import tile_lattice
 from triquad_server.mesh.tile_queries import surface_tiles
 from triquad_tools.commands.pack import main
 from triquad_tools.mapfiles.meshfile import read_mesh
@@ -101,7 +102,7 @@ def test_a_mesh_is_the_one_that_a_server_gives(map_file, tmp_path):
     indices = surface_tiles(epoch, lattice).tolist()
     tiles = [mesh_tile(epoch, tuple(index), lattice) for index in indices]
     parts = [Mesh(tile.origin + tile.vertices, tile.faces) for tile in tiles]
-    served = joined(parts, lattice.tile_side_m, box=everywhere, epoch=epoch.number)
+    served = joined(parts, lattice.tile_side_m, everywhere)
     written = read_mesh(export(map_file, tmp_path, "mesh.ply"))
     assert len(written.faces) == pytest.approx(len(served.faces), rel=0.01)
     for one, other in ((written, served), (served, written)):

@@ -15,7 +15,7 @@ TETRAHEDRON = Mesh(
 
 def test_ply_round_trip_keeps_the_precision(tmp_path: Path) -> None:
     vertices = TETRAHEDRON.vertices + 1e5 + 0.123456789
-    Mesh(vertices, TETRAHEDRON.faces, 1).save(tmp_path / "a.ply")
+    Mesh(vertices, TETRAHEDRON.faces, epoch=1).save(tmp_path / "a.ply")
     read = read_mesh(tmp_path / "a.ply")
     np.testing.assert_array_equal(read.vertices, vertices)
     np.testing.assert_array_equal(read.faces, TETRAHEDRON.faces)
@@ -23,7 +23,7 @@ def test_ply_round_trip_keeps_the_precision(tmp_path: Path) -> None:
 
 def test_ply_without_faces_is_a_cloud(tmp_path: Path) -> None:
     points = np.random.default_rng(0).normal(size=(100, 3))
-    Mesh(points, np.empty((0, 3), np.int32), 1).save(tmp_path / "cloud.ply")
+    Mesh(points, np.empty((0, 3), np.int32), epoch=1).save(tmp_path / "cloud.ply")
     read = read_mesh(tmp_path / "cloud.ply")
     np.testing.assert_array_equal(read.vertices, points)
     assert read.faces.shape == (0, 3)

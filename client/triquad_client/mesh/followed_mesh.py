@@ -12,13 +12,14 @@ from triquad_format.errors import InvalidInputError
 from triquad_format.records.arrays import Doubles
 from triquad_format.wire.limits import MAX_KNOWN_TILES
 from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
+from triquad_map.tile_join import joined
+from triquad_map.triangles import Triangles
 
 from triquad_client import checks
 from triquad_client.checks import Bounds
 from triquad_client.errors import BadReplyError
 from triquad_client.mesh.mesh import Mesh
 from triquad_client.mesh.tile_decoder import TileDecoder
-from triquad_client.mesh.tile_join import joined
 
 _REPLY_BYTES = 1_000_000
 
@@ -183,9 +184,9 @@ class FollowedMesh:
 
     def mesh(self) -> Mesh:
         """The tiles as one mesh, faces by their centroids within the bounds."""
-        tiles = (Mesh(tile.origin + tile.vertices, tile.faces) for tile in self.tiles.values())
-        box = self.minimum, self.maximum
-        return joined(tiles, self.tile_side_m, box=box, epoch=self.epoch)
+        tiles = (Triangles(tile.origin + tile.vertices, tile.faces) for tile in self.tiles.values())
+        whole = joined(tiles, self.tile_side_m, (self.minimum, self.maximum))
+        return Mesh.of(whole, self.epoch)
 
     def known_tiles(self) -> KnownTiles:
         """The tiles to go on with."""

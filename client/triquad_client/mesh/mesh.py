@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.errors import InvalidInputError
-from triquad_format.records.arrays import Bools, Doubles
+from triquad_format.records.arrays import Doubles
+from triquad_map.triangles import Triangles
 
 if TYPE_CHECKING:
     import trimesh
@@ -22,15 +23,15 @@ _PLY_MARKED_FACE = np.dtype([*_PLY_FACE.descr, ("filled", "u1")])
 
 
 @dataclass(frozen=True)
-class Mesh:
+class Mesh(Triangles):
     """Triangles of the map frame."""
 
-    vertices: NDArray[np.float64]  # [V, 3] metres
-    faces: NDArray[np.int32]  # [F, 3] counter-clockwise seen from free space
     epoch: int = 0  # number of the published state of the map that it shows; 0: of none
-    # [F] whether no ray has met the surface there: it is continued from what was seen, and the
-    # status there is UNKNOWN; None where no holes were to be filled
-    filled: Bools | None = None
+
+    @classmethod
+    def of(cls, triangles: Triangles, epoch: int) -> "Mesh":
+        """The triangles, which show the ``epoch``."""
+        return cls(triangles.vertices, triangles.faces, triangles.filled, epoch)
 
     def save(self, path: str | Path) -> None:
         """Write the mesh to a file: ``.ply``, or ``.glb``, ``.obj`` or ``.stl`` with trimesh.

@@ -6,13 +6,13 @@ import numpy as np
 from triquad_format.records.arrays import Bools, Ints
 from triquad_format.wire import keys
 from triquad_format.wire.messages import MeshReply, MeshRequest, TileList, TileListRequest
+from triquad_map.tile_join import TileJoin
 
 from triquad_client import checks
 from triquad_client.checks import Bounds
 from triquad_client.errors import BadReplyError
 from triquad_client.mesh.mesh import Mesh
 from triquad_client.mesh.tile_decoder import TileDecoder
-from triquad_client.mesh.tile_join import TileJoin
 from triquad_client.net.call import NEWEST, Ask, Call, ask, offload, retried, take_each
 
 _TILES_EACH = 8
@@ -68,7 +68,7 @@ def fetch_mesh(
         yield from take_each(
             parts, lambda tiles: _ask_mesh(tiles, listed.epoch, level, fill_m=fill_m), take
         )
-        return (yield from offload(lambda _: join.mesh(listed.epoch)))
+        return (yield from offload(lambda _: Mesh.of(join.mesh(), listed.epoch)))
 
     return (yield from retried("epoch_gone", fetch))
 
@@ -88,7 +88,7 @@ def _decoded(
     marks = _marks(reply, [len(surface.faces) for surface in surfaces])
     for index, surface, mark in zip(tiles.tolist(), surfaces, marks, strict=True):
         corner = np.array(index) * reply.tile_side_m
-        yield Mesh(corner + surface.positions(reply.cell_m), surface.faces, reply.epoch, mark)
+        yield Mesh(corner + surface.positions(reply.cell_m), surface.faces, mark, reply.epoch)
 
 
 def _marks(reply: MeshReply, faces: list[int]) -> list[Bools | None]:

@@ -4,10 +4,10 @@ import dataclasses
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from numpy.typing import ArrayLike
-from triquad_format.errors import RefusedError
+from triquad_format.errors import InvalidInputError, RefusedError
 from triquad_format.mapfile.checkpoint_folder import checkpoint_files, map_folder
 from triquad_format.mapfile.reader import read_map_file
 from triquad_format.records.arrays import Bools, Doubles
@@ -23,13 +23,13 @@ from triquad_client.checks import Bounds
 from triquad_client.errors import ClosedError
 from triquad_client.mesh.mesh import Mesh
 from triquad_client.net.call import Batch, BlockingDriver, Call, ResultT
-from triquad_client.offline.map_mesh import (
-    REACH_LEAVES,
-    MeshBlocks,
-    Report,
-    map_mesh,
-    mesh_blocks,
-)
+
+if TYPE_CHECKING:
+    from triquad_client.offline.map_mesh import MapTiles, Report
+
+CELL_RANGE_M = (0.005, 10.0)
+_CELL_LEAVES = 0.5
+_REACH_LEAVES = 0.1  # how far beside a voxel with seen surface the middle of a face may lie
 
 _NO_LIMITS = QuestionLimits(points=2**62, searches=2**62)
 """Nobody else waits."""
@@ -107,7 +107,7 @@ class OfflineMap(MapQueries):
         self,
         bounds: Bounds | None = None,
         cell_m: float | None = None,
-        report: Report | None = None,
+        report: "Report | None" = None,
         fill_m: float = 0.0,
     ) -> Mesh:
         """The surface where rays have seen one, by marching cubes: the faces centred in ``bounds``.
@@ -116,30 +116,44 @@ class OfflineMap(MapQueries):
             bounds: corners of a box, metres, map frame; ``None``: everywhere.
             cell_m: side of the cells, 0.005 to 10 m; ``None``: half a leaf, 0.1 m unless the map
                 was made with others, as in a server's mesh.
-            report: is told after each block how many are done, and of how many.
+            report: is told after each tile how many are done, and of how many.
             fill_m: also the surface up to so far from what was seen, 0 to 5 m, where the field
                 continues it into ``UNKNOWN`` space; those faces are marked in ``Mesh.filled``.
 
         Raises:
             InvalidInputError: the bounds are not a box, the cells or ``fill_m`` are out of range,
-                there are more than 50 million faces, or scikit-image is not installed.
+                there are more than 50 million faces, or numba is not installed.
             ClosedError: the map was closed.
         """
-        view = self._opened().view
-        return map_mesh(view, self._seen, bounds, cell_m=cell_m, report=report, fill_m=fill_m)
+        return self._tiles(cell_m, bounds, fill_m).joined(report)
 
-    def mesh_blocks(self, cell_m: float | None = None, fill_m: float = 0.0) -> MeshBlocks:
-        """The surface as :meth:`mesh` has it, everywhere, to be made block by block.
+    def mesh_tiles(self, cell_m: float | None = None, fill_m: float = 0.0) -> "MapTiles":
+        """The surface as :meth:`mesh` has it, everywhere, to be made tile by tile.
 
         Args:
             cell_m: as of :meth:`mesh`.
-            fill_m: as of :meth:`mesh`; the holes are found here, before any block is made.
+            fill_m: as of :meth:`mesh`.
 
         Raises:
-            InvalidInputError: the cells or ``fill_m`` are out of range.
+            InvalidInputError: the cells or ``fill_m`` are out of range, or numba is not installed.
             ClosedError: the map was closed.
         """
-        return mesh_blocks(self._opened().view, self._seen, cell_m, bounds=None, fill_m=fill_m)
+        return self._tiles(cell_m, None, fill_m)
+
+    def _tiles(self, cell_m: float | None, bounds: Bounds | None, fill_m: float) -> "MapTiles":
+        view = self._opened().view
+        chosen_m = _CELL_LEAVES * self.leaf_m if cell_m is None else cell_m
+        checked_m = checks.within("cell_m", chosen_m, CELL_RANGE_M[1], least=CELL_RANGE_M[0])
+        box, fill_m = checks.box(bounds), checks.length_to_fill(fill_m)
+        if not self.compiled:
+            raise InvalidInputError(
+                "meshes of map files are made by compiled code, and numba is missing: "
+                "pip install 'triquad[fast]'"
+            )
+        from triquad_client.offline.map_mesh import MapTiles
+
+        reach_m = _REACH_LEAVES * self.leaf_m
+        return MapTiles(view, self.surface_voxels(), checked_m, reach_m, box=box, fill_m=fill_m)
 
     def surface_voxels(self) -> Doubles:
         """Middles [N, 3] of the voxels in which rays ended, metres, map frame."""
@@ -156,7 +170,7 @@ class OfflineMap(MapQueries):
             ClosedError: the map was closed.
         """
         view = self._opened().view
-        return view.near_ends(checks.query_points(points), REACH_LEAVES * self.leaf_m)
+        return view.near_ends(checks.query_points(points), _REACH_LEAVES * self.leaf_m)
 
     def _answer(self, call: Call[ResultT]) -> ResultT:
         return self._opened().run(call)

@@ -177,7 +177,12 @@ class FieldView:
         return surface
 
     def near_ends(self, points: Doubles, reach_m: float) -> Bools:
-        """Whether points [N, 3] lie where rays ended; see :class:`triquad_map.view.MeshedView`."""
+        """Whether points [N, 3] lie where rays ended.
+
+        That is within ``reach_m`` of a voxel in which they did, on each axis, and on no side of it
+        beyond the last end, unless the surface goes on in a voxel there, or so few scans hit it
+        that all may have missed what lies beyond.
+        """
         reach = reach_m / self._settings.leaf_m
         near = np.zeros(len(points), np.bool_)
 

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from triquad_format.records.arrays import Bytes
-
-from triquad_server.mesh.mesher import TileIndex
+from triquad_map.compiled.mesh.tile_lattice import TileIndex
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,10 @@ from triquad_format.wire import keys
 from triquad_format.wire.limits import MAX_KNOWN_TILES
 from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
 from triquad_map.box import check_box
+from triquad_map.compiled.mesh.tile_lattice import TileIndex, TileLattice, check_level
 from triquad_map.compiled.priority import lower_priority
 
 from triquad_server.fair_queue import Owner
-from triquad_server.mesh.mesher import TileIndex, TileLattice, check_level
 from triquad_server.mesh.tile_cache import CachedTile
 from triquad_server.process.threads import NICENESS, submit
 from triquad_server.settings import MeshSettings

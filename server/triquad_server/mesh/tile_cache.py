@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.wire.limits import LEVELS
 from triquad_format.wire.tile_codec import encode_tile
+from triquad_map.compiled.mesh.mesher import mesh_tile
+from triquad_map.compiled.mesh.tile_border import TileBorder
+from triquad_map.compiled.mesh.tile_lattice import TileIndex, TileLattice
 from triquad_map.compiled.team import THREADS, Team
 from triquad_map.composition.composed_view import ComposedView
 
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mesh.answered_tiles import AnsweredTiles
-from triquad_server.mesh.mesher import TileBorder, TileIndex, TileLattice, mesh_tile, tile_lattice
 from triquad_server.mesh.surface_changes import Changes, SurfaceChanges
 from triquad_server.settings import MeshSettings
 
@@ -29,6 +31,12 @@ _ANSWERED_BYTES = 8_000_000
 
 TileKey = tuple[int, TileIndex]
 """Level of detail and index of a tile."""
+
+
+def tile_lattice(settings: MeshSettings, level: int) -> TileLattice:
+    """The lattice of a level of detail, ``0 <= level < LEVELS``."""
+    finest = TileLattice(settings.cell_m, settings.tile_cells, settings.reach_m)
+    return finest.at_level(level)
 
 
 class TileBytes:

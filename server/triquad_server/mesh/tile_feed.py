@@ -8,6 +8,7 @@ import time
 from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import TileUpdatesRequest
 from triquad_format.wire.metrics_messages import QueueMetrics
+from triquad_map.compiled.mesh.tile_lattice import TileIndex
 from triquad_map.compiled.priority import lower_priority
 
 from triquad_server.epochs.history import EpochHistory
@@ -22,7 +23,6 @@ from triquad_server.mesh.followers import (
     check_updates,
     new_follower,
 )
-from triquad_server.mesh.mesher import TileIndex
 from triquad_server.mesh.tile_cache import CachedTile, TileCache, TileDelta
 from triquad_server.process.threads import NICENESS
 from triquad_server.settings import MeshSettings

@@ -4,17 +4,17 @@ import numpy as np
 from triquad_format.errors import RefusedError
 from triquad_format.records.arrays import Ints
 from triquad_format.records.field_settings import BLOCK_VOXELS
-from triquad_format.wire.limits import MAX_TILES_ASKED, TILE_INDEX_LIMIT
+from triquad_format.wire.limits import MAX_FILL_M, MAX_TILES_ASKED, TILE_INDEX_LIMIT
 from triquad_format.wire.messages import MeshReply, MeshRequest, TileList, TileListRequest
 from triquad_format.wire.tile_codec import encode_tile
 from triquad_map.box import check_box
+from triquad_map.compiled.mesh.mesher import mesh_tile
+from triquad_map.compiled.mesh.tile_lattice import TileLattice, check_level
 from triquad_map.composition.composed_view import ComposedView
 
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.mesh.answered_tiles import AnsweredTile, AskedTile
-from triquad_server.mesh.holes import check_fill
-from triquad_server.mesh.mesher import TileLattice, check_level, mesh_tile
 from triquad_server.mesh.tile_cache import TileCache
 
 MAX_TILES = 1_000_000
@@ -37,7 +37,7 @@ class TileQueries:
         """
         check_box(request.minimum, request.maximum)
         check_level(request.level)
-        check_fill(request.fill_m)
+        _check_fill(request.fill_m)
         epoch = self._epochs.get(request.epoch)
         lattice = self._cache.lattice(request.level)
         tiles = surface_tiles(epoch, lattice, request.fill_m)
@@ -61,7 +61,7 @@ class TileQueries:
         """
         _check_tiles(request.tiles)
         check_level(request.level)
-        check_fill(request.fill_m)
+        _check_fill(request.fill_m)
         epoch = self._epochs.get(request.epoch)
         # On the thread that answers alone: of a box full of tiles, others make more of them.
         view, lattice = epoch.asked_with(), self._cache.lattice(request.level)
@@ -105,6 +105,18 @@ def _check_tiles(tiles: Ints) -> None:
             "bad_request",
             f"tile {tiles[beyond][0].tolist()} is out of range: "
             f"use -{TILE_INDEX_LIMIT} to {TILE_INDEX_LIMIT}",
+        )
+
+
+def _check_fill(fill_m: float) -> None:
+    """Refuse a length up to which holes cannot be filled.
+
+    Raises:
+        RefusedError: it is not in the range.
+    """
+    if not 0 <= fill_m <= MAX_FILL_M:
+        raise RefusedError(
+            "bad_request", f"fill_m = {fill_m} is out of range: use 0 to {MAX_FILL_M:g}"
         )
 
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from triquad_format.errors import RefusedError
 from triquad_format.mapfile.writer import write_map
 from triquad_format.wire.messages import MapChunk, MapChunkRequest, MapInfo, MapInfoRequest
+from triquad_map.preview import previews_of
 
 from triquad_server.mapping.mapper_thread import MapperThread
-from triquad_server.mesh.preview import previews_of
 from triquad_server.store.store import stamp_now_ns
 
 CHUNK_BYTES = 2**20
@@ -56,7 +56,7 @@ class MapDownloads:
         else:
             record = newest.record()
         buffer, stamp_ns = io.BytesIO(), stamp_now_ns()
-        previews = previews_of(record, distances=newest.distances, stamp_ns=stamp_ns)
+        previews = previews_of(record, newest, stamp_ns)
         written = write_map(record, buffer, stamp_ns=stamp_ns, previews=previews)
         info = MapInfo(
             epoch=written.epoch,

@@ -28,10 +28,10 @@ from triquad_format.mapfile.protections import Restored
 from triquad_format.mapfile.writer import WrittenMap, write_parts
 from triquad_format.records.record_check import check_record
 from triquad_format.wire.messages import CheckpointInfo
+from triquad_map.preview import preview_part, preview_schema
 
 from triquad_server.errors import StoreBaseError, StoreError
 from triquad_server.mapping.map_snapshot import MapChanges
-from triquad_server.mesh.preview import preview_part, preview_schema
 from triquad_server.settings import StoreSettings
 from triquad_server.store.kept_checkpoints import KeptCheckpoints
 from triquad_server.store.known_parts import KnownParts, own_bytes
@@ -293,7 +293,7 @@ def _changed_parts(
         region = changed.get(index)
         if region is not None:
             yield from pack_region(region, settings, _FEATURE_DTYPE)
-            yield preview_part(region, settings, changes.epoch.distances, stamp_ns=stamp_ns)
+            yield preview_part(region, settings, changes.epoch, stamp_ns=stamp_ns)
         elif known is not None:
             entries = known.of_region(index)
             yield from entries if others is None else _copied_parts(entries, others)

@@ -11,11 +11,12 @@ from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.region import Region
 from triquad_format.records.status import Status
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
+from triquad_map.compiled.mesh.marching_cubes import centroids
+from triquad_map.compiled.mesh.mesher import mesh_tile
 from triquad_map.compiled.surfels.surfel_map import surfel_voxels
 from triquad_server.epochs.epoch import Epoch, FrozenRegion
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mesh.marching_cubes import centroids
-from triquad_server.mesh.mesher import mesh_tile, tile_lattice
+from triquad_server.mesh.tile_cache import tile_lattice
 from triquad_server.settings import MeshSettings, Settings
 from triquad_tools.evaluation.metrics import mesh_area_m2
 from triquad_tools.simulation.lidar import Lidar

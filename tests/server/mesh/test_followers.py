@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from triquad_map.compiled.mesh.tile_border import TileBorder
 from triquad_server.mesh.followers import MAX_CLIENTS, Bandwidth, TileReply
-from triquad_server.mesh.mesher import TileBorder, tile_lattice
-from triquad_server.mesh.tile_cache import CachedTile, TileBytes
+from triquad_server.mesh.tile_cache import CachedTile, TileBytes, tile_lattice
 from triquad_server.settings import MeshSettings
 
 

@@ -15,10 +15,11 @@ from triquad_format.records.region import seen_voxels
 from triquad_format.records.status import Status
 from triquad_format.wire.limits import LEVELS
 from triquad_format.wire.tile_codec import TileSurface, decode_tile
+from triquad_map.compiled.mesh.mesher import mesh_tile
+from triquad_map.compiled.mesh.tile_lattice import TileIndex, TileLattice
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mesh.mesher import TileIndex, TileLattice, mesh_tile, tile_lattice
-from triquad_server.mesh.tile_cache import TileCache
+from triquad_server.mesh.tile_cache import TileCache, tile_lattice
 from triquad_server.process.threads import Teams
 from triquad_server.settings import MeshSettings, Settings
 from triquad_tools.simulation.lidar import SimulatedScan

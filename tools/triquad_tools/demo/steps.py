@@ -11,7 +11,7 @@ from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.crop import without_training
-from triquad_server.mesh.preview import previews_of
+from triquad_map.preview import previews_of
 
 from triquad_tools.console.progress import progress
 from triquad_tools.demo.probe import Probe, ProbeReport

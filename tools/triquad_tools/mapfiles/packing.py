@@ -69,7 +69,7 @@ def pack_map(source: SourceMap, precision: Precision, path: Path, bytes_before: 
 def _previews(record: MapRecord, stamp_ns: int | None) -> Previews | None:
     """What MCAP viewers show; nothing where the libraries for it are not installed."""
     try:
-        from triquad_server.mesh.preview import previews_of
+        from triquad_map.preview import previews_of
     except ModuleNotFoundError as error:
         if error.name is None or error.name.startswith("triquad"):
             raise

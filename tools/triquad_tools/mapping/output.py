@@ -6,7 +6,7 @@ from pathlib import Path
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.crop import without_training
 from triquad_format.records.region import MapRecord
-from triquad_server.mesh.preview import previews_of
+from triquad_map.preview import previews_of
 
 from triquad_tools.mapfiles.meshfile import MESH_SUFFIXES, export_mesh
 from triquad_tools.mapfiles.source import SourceMap

@@ -9,7 +9,7 @@ import numpy as np
 from triquad_client import OfflineMap
 from triquad_client.checks import Bounds
 from triquad_client.mesh.followed_mesh import TileIndex
-from triquad_client.offline.map_mesh import BLOCK_CELLS, MeshBlocks
+from triquad_client.offline.map_mesh import TILE_CELLS, MapTiles
 from triquad_format.mapfile.metadata import utc_time
 
 from triquad_tools.viewer.sources.map_source import COARSEST, MapState, TileSizes
@@ -31,7 +31,7 @@ class FileSource:
         self.queries = opened
         self.title = f"{opened.name} in {path.name}"
         cell_m = _CELL_LEAVES * opened.leaf_m
-        self.sizes = TileSizes(cell_m, BLOCK_CELLS * cell_m)
+        self.sizes = TileSizes(cell_m, TILE_CELLS * cell_m)
         self._maker = maker
         name = (path, opened.epoch, opened.stamp_ns)
         self._levels = [
@@ -70,7 +70,7 @@ class LevelTiles:
         self.level = level
         self.side_m = sizes.side_of(level)
         self._cell_m = sizes.cell_of(level)
-        self._blocks: MeshBlocks | None = None
+        self._tiles: MapTiles | None = None
         self._listing = threading.Lock()
 
     def listed(self) -> Collection[TileIndex]:
@@ -84,11 +84,11 @@ class LevelTiles:
         vertices = (mesh.vertices - origin).astype(np.float32)
         return MadeTile(self._opened.epoch, origin, vertices, faces=mesh.faces)
 
-    def _listed(self) -> MeshBlocks:
+    def _listed(self) -> MapTiles:
         with self._listing:
-            if self._blocks is None:
-                self._blocks = self._opened.mesh_blocks(self._cell_m)
-            return self._blocks
+            if self._tiles is None:
+                self._tiles = self._opened.mesh_tiles(self._cell_m)
+            return self._tiles
 
 
 @dataclass(frozen=True)

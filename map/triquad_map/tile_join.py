@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles, Longs
 
-from triquad_client.mesh.mesh import Mesh
+from triquad_map.triangles import Triangles
 
 WELD_M = 1e-4
 """Vertices closer than about this are one."""
@@ -36,7 +36,7 @@ class TileJoin:
         self._shared = [np.zeros(0, np.int64)]
         self._filled = [np.zeros(0, np.bool_)]
 
-    def add(self, tile: Mesh) -> None:
+    def add(self, tile: Triangles) -> None:
         """Add the mesh of a tile."""
         cut = _within(tile, self._box)
         self._vertices.append(cut.vertices)
@@ -46,8 +46,8 @@ class TileJoin:
         self._filled.append(filled)
         self._count += len(cut.vertices)
 
-    def mesh(self, epoch: int) -> Mesh:
-        """All tiles so far as one mesh, which shows the ``epoch``.
+    def mesh(self) -> Triangles:
+        """All tiles so far as one mesh.
 
         It has one vertex where tiles had several, and no faces that this made degenerate. Faces are
         gone through tile by tile: to touch fresh memory for all at once takes as long as the rest.
@@ -64,25 +64,24 @@ class TileJoin:
             pieces.append((corners[kept], filled[kept]))
             used[pieces[-1][0]] = True
         number = np.cumsum(used, dtype=np.int32) - np.int32(1)
-        return Mesh(
+        return Triangles(
             vertices[used],
             np.concatenate([number.take(corners) for corners, _ in pieces]),
-            epoch,
-            filled=np.concatenate([filled for _, filled in pieces]) if self._marked else None,
+            np.concatenate([filled for _, filled in pieces]) if self._marked else None,
         )
 
 
 def joined(
-    tiles: Iterable[Mesh], tile_side_m: float, *, box: tuple[Doubles, Doubles], epoch: int
-) -> Mesh:
+    tiles: Iterable[Triangles], tile_side_m: float, box: tuple[Doubles, Doubles]
+) -> Triangles:
     """The tiles' faces whose centroids lie in a box, given by its corners [3], as one mesh."""
     join = TileJoin(tile_side_m, box)
     for tile in tiles:
         join.add(tile)
-    return join.mesh(epoch)
+    return join.mesh()
 
 
-def _within(tile: Mesh, box: tuple[Doubles, Doubles]) -> Mesh:
+def _within(tile: Triangles, box: tuple[Doubles, Doubles]) -> Triangles:
     """The faces of a tile whose centroids lie in a box; all of its vertices stay."""
     low, high = box
     if ((tile.vertices >= low) & (tile.vertices <= high)).all():

@@ -13,17 +13,17 @@ Voxels have the side of a leaf and are named by integer coordinates in the map f
 
 import dataclasses
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Longs
-from triquad_format.records.cells import cell_names, cells_of_boxes, rows_by_cell
+from triquad_format.records.cells import cell_names, cells_of_boxes
 from triquad_format.records.status import Status
 
+from triquad_map.composition.composed_view import ComposedView
+from triquad_map.sorted_keys import rows_of
 from triquad_map.surface import FieldSample, SampleField, SurfelKind, fit_surfels
-from triquad_map.view import MapView
 
 _STEEPNESS = 0.7
 """From a voxel behind a surface to a voxel before it the field rises by at least so much of the
@@ -35,9 +35,6 @@ _COSINE = 0.9
 _OFF_PLANE = 0.25
 """How far the surface in each of them lies off the other's plane at most, in voxels."""
 
-_CUBE_VOXELS = 64
-"""Along the side of the part of a map that is worked at in one go."""
-
 _AROUND = np.array([step for step in np.ndindex(3, 3, 3) if step != (1, 1, 1)]) - 1  # [26, 3]
 
 
@@ -47,19 +44,7 @@ class FilledVoxels:
 
     voxels: Longs  # [M, 3]
     sources: Longs  # [M, 3] the voxel with seen surface from which each was reached
-
-    def chosen(self, rows: Bools | NDArray[np.intp]) -> "FilledVoxels":
-        """Some of them, ``rows``."""
-        return FilledVoxels(self.voxels[rows], self.sources[rows])
-
-    @classmethod
-    def joined(cls, parts: Iterable["FilledVoxels"]) -> "FilledVoxels":
-        """All of several parts."""
-        voxels, sources = [np.zeros((0, 3), np.int64)], [np.zeros((0, 3), np.int64)]
-        for part in parts:
-            voxels.append(part.voxels)
-            sources.append(part.sources)
-        return cls(np.concatenate(voxels), np.concatenate(sources))
+    fill_m: float  # how far from these the surface goes on
 
 
 @dataclass(frozen=True)
@@ -76,47 +61,48 @@ class _Patches:
         return _Patches(*(array[rows] for array in vars(self).values()))
 
 
-def filled_reach(fill_m: float, voxel_m: float) -> int:
-    """How many voxels the surface goes on at most along each axis."""
-    return math.ceil(fill_m / voxel_m)
-
-
-def filled_voxels(view: MapView, seen: Longs, fill_m: float) -> FilledVoxels:
-    """The voxels into which the surface goes on, at most ``fill_m`` metres from seen surface.
+def filled_voxels(view: ComposedView, low: Doubles, high: Doubles, fill_m: float) -> FilledVoxels:
+    """The voxels into which surface goes on that meet a box; there may be others around it.
 
     Args:
         view: the map.
-        seen: [N, 3] each once, the voxels with seen surface; of a part of the map, those in it and
-            up to :func:`filled_reach` voxels around it.
-        fill_m: metres; 0: none.
+        low: [3] metres, map frame: the box's minimum corner.
+        high: [3] the maximum corner.
+        fill_m: how far from seen surface, metres; 0: nowhere.
     """
-    reach = filled_reach(fill_m, view.voxel_m)
-    if reach == 0:
-        return FilledVoxels.joined([])
-    cubes, rows = cells_of_boxes((seen - reach) // _CUBE_VOXELS, (seen + reach) // _CUBE_VOXELS)
-    parts = []
-    for cube, here in rows_by_cell(cubes):
-        found = _continued(view, seen[rows[here]], fill_m / view.voxel_m, steps=reach)
-        parts.append(found.chosen((found.voxels // _CUBE_VOXELS == cube).all(axis=1)))
-    return FilledVoxels.joined(parts)
-
-
-def _continued(view: MapView, seen: Longs, limit: float, steps: int) -> FilledVoxels:
-    """Where the surface of ``seen`` [N, 3] goes on, up to ``limit`` voxels, in so many steps."""
+    parts = [np.zeros((2, 0, 3), np.int64)]
+    if fill_m == 0:
+        return FilledVoxels(parts[0][0], parts[0][1], fill_m)
+    limit = fill_m / view.voxel_m
+    steps = math.ceil(limit)
+    known = _seen_voxels(view, low, high, margin=steps)
     field = _field_in_voxels(view)
-    known = seen
-    front = _seen_patches(field, seen)
-    parts = []
-    for _ in range(steps):
+    front = _seen_patches(field, known)
+    while len(front.voxels) and len(parts) <= steps:
         front = _next_front(view, field, front, known, limit=limit)
-        if not len(front.voxels):
-            break
-        parts.append(FilledVoxels(front.voxels, front.sources))
+        parts.append(np.stack([front.voxels, front.sources]))
         known = np.concatenate([known, front.voxels])
-    return FilledVoxels.joined(parts)
+    voxels, sources = np.concatenate(parts, axis=1)
+    return FilledVoxels(voxels, sources, fill_m)
 
 
-def _field_in_voxels(view: MapView) -> SampleField:
+def cells_around(filled: FilledVoxels, voxel_m: float, cell_m: float, reach_m: float) -> Longs:
+    """The cells [C, 3] of a lattice that may hold faces up to ``reach_m`` from filled voxels."""
+    middles, away_m = _middles(filled.voxels) * voxel_m, (voxel_m + cell_m) / 2 + reach_m
+    first = np.ceil((middles - away_m) / cell_m - 0.5).astype(np.int64)
+    last = np.floor((middles + away_m) / cell_m - 0.5).astype(np.int64)
+    return cells_of_boxes(first, last)[0]
+
+
+def _seen_voxels(view: ComposedView, low: Doubles, high: Doubles, margin: int) -> Longs:
+    """The voxels [N, 3] with seen surface, up to ``margin`` voxels around a box at least."""
+    first = np.floor(low / view.voxel_m).astype(np.int64) - margin
+    last = np.floor(high / view.voxel_m).astype(np.int64) + margin
+    middles = _middles(first[:, None] + np.arange((last - first).max() + 1)) * view.voxel_m
+    return np.asarray(np.argwhere(view.surface_in_grid(middles, 0.0)) + first)
+
+
+def _field_in_voxels(view: ComposedView) -> SampleField:
     def sample(places: Doubles) -> FieldSample:
         answer = view.query(places * view.voxel_m, gradient=True)
         return FieldSample(answer.sdf / np.float32(view.voxel_m), answer.gradient)
@@ -138,7 +124,7 @@ def _patches(field: SampleField, voxels: Longs) -> tuple[_Patches, Bytes]:
 
 
 def _next_front(
-    view: MapView, field: SampleField, front: _Patches, known: Longs, limit: float
+    view: ComposedView, field: SampleField, front: _Patches, known: Longs, limit: float
 ) -> _Patches:
     """The surface of ``front`` where it goes on in voxels beside it that are not ``known``."""
     before = np.repeat(np.arange(len(front.voxels)), len(_AROUND))
@@ -148,7 +134,7 @@ def _next_front(
     _, first = np.unique(names, return_index=True)
     fresh = first[~np.isin(names[first], cell_names(known - least))]
     patches = _distance_like(view, field, voxels[fresh])
-    after = _rows(cell_names(patches.voxels - least), names)
+    after = rows_of(cell_names(patches.voxels - least), names)
     pairs = np.flatnonzero(after >= 0)
     pairs = pairs[_aligned(front.chosen(before[pairs]), patches.chosen(after[pairs]))]
     sources = front.sources[before[pairs]]
@@ -160,7 +146,7 @@ def _next_front(
     return dataclasses.replace(patches.chosen(reached), sources=sources[order[first]])
 
 
-def _distance_like(view: MapView, field: SampleField, voxels: Longs) -> _Patches:
+def _distance_like(view: ComposedView, field: SampleField, voxels: Longs) -> _Patches:
     """The surface in those of ``voxels`` [N, 3] that are unknown, where it is a distance's zero."""
     unknown = view.status(_middles(voxels) * view.voxel_m, 0.0) == Status.UNKNOWN
     patches, kinds = _patches(field, voxels[unknown])
@@ -179,51 +165,39 @@ def _aligned(one: _Patches, other: _Patches) -> Bools:
     return level
 
 
-def on_filled(
-    view: MapView, filled: FilledVoxels, points: Doubles, reach_m: float, fill_m: float
-) -> Bools:
+def on_filled(view: ComposedView, filled: FilledVoxels, points: Doubles, reach_m: float) -> Bools:
     """Whether points [N, 3], metres, map frame, of a surface lie where it was continued.
 
     That is up to ``reach_m`` beside a voxel with seen surface, of which they are in a part that was
     not seen; or so far beside a filled voxel on each axis, at most ``fill_m`` from the voxel with
     seen surface at which that began, and not in a ``FREE`` voxel.
     """
-    if fill_m == 0:
+    if filled.fill_m == 0:
         return np.zeros(len(points), np.bool_)
-    found = _beside_filled(view, filled, points, reach_m=reach_m, fill_m=fill_m)
+    found = _beside_filled(filled, points / view.voxel_m, view.voxel_m, reach_m=reach_m)
     found |= view.status(points, reach_m) == Status.SURFACE
     at = np.flatnonzero(found)
     found[at] = view.status(points[at], 0.0) != Status.FREE
     return found
 
 
-def _beside_filled(
-    view: MapView, filled: FilledVoxels, points: Doubles, reach_m: float, fill_m: float
-) -> Bools:
-    found = np.zeros(len(points), np.bool_)
+def _beside_filled(filled: FilledVoxels, places: Doubles, voxel_m: float, reach_m: float) -> Bools:
+    """As :func:`on_filled`, of filled voxels alone and of ``places`` [N, 3] in voxels."""
+    found = np.zeros(len(places), np.bool_)
     if not len(filled.voxels):
         return found
-    places = points / view.voxel_m
     least = filled.voxels.min(axis=0) - 2
     names = cell_names(filled.voxels - least)
-    reach, limit = reach_m / view.voxel_m, fill_m / view.voxel_m
+    order = np.argsort(names)
+    reach, limit = reach_m / voxel_m, filled.fill_m / voxel_m
     inside = ((places >= least + 1) & (places < filled.voxels.max(axis=0) + 2)).all(axis=1)
     for shift in np.ndindex(2, 2, 2):
         left = np.flatnonzero(inside & ~found)
         beside = np.floor(places[left] + (2 * np.array(shift) - 1) * reach).astype(np.int64)
-        rows = _rows(names, cell_names(beside - least))
-        near = _box_distances(places[left], filled.sources[rows]) <= limit
+        rows = rows_of(names[order], cell_names(beside - least))
+        near = _box_distances(places[left], filled.sources[order[rows]]) <= limit
         found[left] = (rows >= 0) & near
     return found
-
-
-def _rows(names: Longs, asked: Longs) -> NDArray[np.intp]:
-    """Where each of ``asked`` [N] is among different ``names`` [M]; -1 where it is not."""
-    if not len(names):
-        return np.full(len(asked), -1, np.intp)
-    order = np.argsort(names)
-    rows = order[np.minimum(np.searchsorted(names, asked, sorter=order), len(names) - 1)]
-    return np.where(names[rows] == asked, rows, -1)
 
 
 def _middles(voxels: Longs) -> Doubles:

@@ -1,4 +1,4 @@
-"""The mesh that MCAP viewers show, read back as they read it."""
+"""The mesh that MCAP viewers show: the surface of the map in few faces, read back as they do."""
 
 import dataclasses
 import io
@@ -8,15 +8,22 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 from support.map_records import SMALL, evidence_of, random_record, surface_evidence
 from support.mapfile_edit import file_bytes, parts_of, read_bytes, rewritten
+from support.other_field import OtherField
+from support.small_world import settings, settled_mapper, world
+from triquad_client import Mesh, OfflineMap
 from triquad_format.errors import DamagedMapFileError
+from triquad_format.mapfile.writer import write_map
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import BLOCK_BYTES, Evidence, MapRecord
 from triquad_map.height_scale import HeightScale
-from triquad_server.mesh.coarse_mesh import CLUSTER_LEVELS
-from triquad_server.mesh.surface_net import NET_LEAVES
+from triquad_map.preview import CELL_LEAVES, FACES_MIN, coarse_mesh, previews_of
+from triquad_tools.evaluation.metrics import mesh_area_m2, sample_mesh
 
 SETTINGS = FieldSettings()
 GROUND_M = 1.3
@@ -64,17 +71,19 @@ def mesh_of(scene: Any) -> tuple[Doubles, Longs]:
 def ground_file() -> bytes:
     indices = ((0, 0, 0), (1, 0, 0))
     record = seen_ground(random_record(60, settings=SETTINGS, indices=indices, points=50))
-    return file_bytes(record, preview=True, distances=ground, stamp_ns=1_700_000_000_000_000_005)
+    return file_bytes(
+        record, preview=True, view=OtherField(record, ground), stamp_ns=1_700_000_000_000_000_005
+    )
 
 
 def test_viewers_see_the_surface(ground_file: bytes) -> None:
-    cell = SETTINGS.leaf_m * NET_LEAVES * 2**CLUSTER_LEVELS
+    cell = 4 * SETTINGS.leaf_m * CELL_LEAVES
     found = scenes(ground_file)
     assert len(found) == 2
     for (name, scene), x in zip(found, (0.0, SETTINGS.region_pitch_m), strict=True):
         assert name == "foxglove.SceneUpdate"
         vertices, faces = mesh_of(scene)
-        assert 200 < len(faces) < 1000  # few where all is flat
+        assert 200 < len(faces) <= FACES_MIN
         assert faces.max() < len(vertices)
         np.testing.assert_allclose(vertices[:, 2], GROUND_M, atol=0.04)
         extent = np.abs(vertices[:, :2] - (x, 0)).max(axis=0)
@@ -106,7 +115,7 @@ def test_colours_tell_the_height() -> None:
     seen = surface_evidence(np.stack([x, y, GROUND_M + 0.1 * x], axis=1), SETTINGS)
     region = dataclasses.replace(record.regions[0], evidence=seen)
     record = dataclasses.replace(record, regions=(region,))
-    ((_, scene),) = scenes(file_bytes(record, preview=True, distances=slope))
+    ((_, scene),) = scenes(file_bytes(record, preview=True, view=OtherField(record, slope)))
     vertices, _ = mesh_of(scene)
     shown = scene.entities[0].triangles[0].colors
     colours = np.array([(colour.r, colour.g, colour.b) for colour in shown])
@@ -128,7 +137,7 @@ def test_schema_is_complete() -> None:
 
 
 def test_the_field_of_the_map_is_shown_where_no_other_is_given() -> None:
-    """Also at the border of all regions, where cells reach to where the field says nothing."""
+    """Also at the border of all regions."""
     record = random_record(62, points=400, training=False)
     full = np.full((8**3, BLOCK_BYTES), 255, np.uint8)
     seen = evidence_of(np.arange(8**3), full, full)
@@ -155,3 +164,89 @@ def test_readers_mind_a_preview_that_is_not_the_listed_one(ground_file: bytes) -
     }
     with pytest.raises(DamagedMapFileError, match="preview"):
         read_bytes(rewritten(ground_file, payloads=payloads, fitting=False))
+
+
+def mesh_of_seen(seen, sdf):
+    """The coarse mesh of a field where points [N, 3] of its surface have been seen."""
+    record = random_record(1, settings=SETTINGS, points=10)
+    region = dataclasses.replace(record.regions[0], evidence=surface_evidence(seen, SETTINGS))
+    view = OtherField(dataclasses.replace(record, regions=(region,)), sdf)
+    return coarse_mesh(region, SETTINGS, view)
+
+
+def samples(mesh):
+    return sample_mesh(mesh, 200_000, np.random.default_rng(0))
+
+
+def share_near(points, others, reach_m):
+    return float((cKDTree(others).query(points)[0] < reach_m).mean())
+
+
+def largest_piece(mesh):
+    """The share of the area of a mesh that its largest connected part has."""
+    a, b, c = mesh.faces.T
+    links = coo_matrix((np.ones(2 * len(a)), (np.r_[a, b], np.r_[b, c])), (len(mesh.vertices),) * 2)
+    piece = connected_components(links, directed=False)[1][a]
+    areas = [mesh_area_m2(Mesh(mesh.vertices, mesh.faces[piece == p])) for p in np.unique(piece)]
+    return max(areas) / sum(areas)
+
+
+@pytest.fixture(scope="module")
+def epoch():
+    field = dataclasses.replace(settings().field, depth=10)  # one region, as streets have
+    chosen = settings().model_copy(update={"field": field})
+    return settled_mapper(chosen, world(10)).publish()
+
+
+def area_m2(x, y):
+    """Points [N, 3] all over a rectangle at height 0."""
+    over = np.stack(np.meshgrid(np.arange(*x, 0.1), np.arange(*y, 0.1)), axis=-1).reshape(-1, 2)
+    return np.column_stack([over, np.zeros(len(over))])
+
+
+def test_the_preview_of_a_street_is_its_mesh_in_few_faces(epoch):
+    record = epoch.record()
+    (region,) = record.regions
+    coarse = coarse_mesh(region, record.settings, epoch)
+    with OfflineMap(record) as offline:
+        detailed = offline.mesh(cell_m=0.4)
+    assert 0 < 3 * len(coarse.faces) < len(detailed.faces)
+    shown, wanted = samples(coarse), samples(detailed)
+    assert share_near(wanted, shown, 0.2) > 0.75
+    assert share_near(shown, wanted, 0.4) > 0.95
+    assert largest_piece(coarse) > largest_piece(detailed)
+
+
+def test_surface_is_found_in_the_cell_beside_the_voxel_that_was_hit():
+    """Noise, and the field, put it on either side of a border of cells."""
+    mesh = mesh_of_seen(area_m2((-10, 10), (-10, 10)) + 0.01, lambda points: points[:, 2] + 0.01)
+    assert mesh_area_m2(mesh) == pytest.approx(20**2, rel=0.1)
+    np.testing.assert_allclose(mesh.vertices[:, 2], -0.01, atol=1e-6)
+
+
+def test_both_sides_of_a_thin_wall_stay():
+    half_m = 0.25
+    wall = area_m2((-10, 10), (0, 5))[:, [0, 2, 1]]
+    sides = np.concatenate([wall + [0, half_m, 0], wall - [0, half_m, 0]])
+    mesh = mesh_of_seen(sides, lambda points: np.abs(points[:, 1]) - half_m)
+    np.testing.assert_allclose(np.abs(mesh.vertices[:, 1]), half_m, atol=1e-6)
+    assert mesh_area_m2(mesh) == pytest.approx(2 * 20 * 5, rel=0.15)
+
+
+def test_a_preview_is_a_small_part_of_its_map(epoch):
+    record = epoch.record()
+    with_preview, without = io.BytesIO(), io.BytesIO()
+    previews = previews_of(record, epoch)
+    size = write_map(record, with_preview, previews=previews).bytes
+    assert write_map(record, without).bytes < size < 1.06 * write_map(record, without).bytes
+
+
+def test_a_preview_is_bounded_however_much_was_seen():
+    def bumps(points):
+        x, y, z = points.T
+        return z - 0.3 * np.sin(3 * x) * np.sin(3 * y)
+
+    seen = np.concatenate([area_m2((-75, 75), (-75, 75)) + [0, 0, z] for z in (-0.2, 0, 0.2)])
+    mesh = mesh_of_seen(seen, bumps)
+    assert FACES_MIN / 10 < len(mesh.faces) <= FACES_MIN  # of a field of few parameters
+    assert share_near(area_m2((-70, 70), (-70, 70))[::50], samples(mesh), 5.0) == 1.0

@@ -5,6 +5,7 @@ answers come from the field.
 """
 
 import math
+from contextlib import closing
 
 import numpy as np
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
@@ -15,12 +16,26 @@ from triquad_format.mapfile.parts.part import PREVIEW, Part, PartKey
 from triquad_format.mapfile.writer import Previews
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import MapRecord, Region
-from triquad_map.height_scale import HeightScale
-from triquad_map.reference.evaluator import MapEvaluator
+from triquad_format.records.region import MapRecord, Region, seen_voxels
 
-from triquad_server.mesh.coarse_mesh import coarse_mesh
-from triquad_server.mesh.surface_net import Distances
+from triquad_map.compiled.mesh.mesher import mesh_tile
+from triquad_map.compiled.mesh.tile_lattice import TileLattice
+from triquad_map.compiled.recorded_view import RecordedView
+from triquad_map.composition.composed_view import ComposedView
+from triquad_map.height_scale import HeightScale
+from triquad_map.tile_join import TileJoin
+from triquad_map.triangles import Triangles
+
+PARAMETERS_A_FACE = 75  # so that a preview takes some 5 % of a map file of fp16
+FACES_MIN, FACES_MAX = 2_000, 100_000
+"""How many faces a region has at most: one for so many parameters of its field, within these."""
+
+CELL_LEAVES = 2
+"""Side of the cells, in leaves: 0.4 m; of larger ones where there would be too many faces."""
+
+_LARGER = 1.1  # times that at least, each time
+_TILE_CELLS = 32
+_REACH_CELLS = 0.09  # centres of faces lie at most so far from voxels with seen surface
 
 _STEPS_A_LEAF = 2
 """Positions are rounded to a power of two, finer than a leaf by so much: zeros compress."""
@@ -47,29 +62,32 @@ def preview_schema() -> bytes:
 
 
 def previews_of(
-    record: MapRecord, *, distances: Distances | None = None, stamp_ns: int | None = None
+    record: MapRecord, view: ComposedView | None = None, stamp_ns: int | None = None
 ) -> Previews:
     """The previews of all regions of a map.
 
     Args:
         record: the map.
-        distances: a faster way to the map's signed distances than numpy.
+        view: what answers for it; None: it is opened for this.
         stamp_ns: time that viewers show, nanoseconds since 1970.
     """
-    shown = distances or MapEvaluator(record).distances
+    if view is None:
+        with closing(RecordedView(record)) as opened:
+            return previews_of(record, opened, stamp_ns)
     parts = {
-        region.index: preview_part(region, record.settings, shown, stamp_ns=stamp_ns or 0)
+        region.index: preview_part(region, record.settings, view, stamp_ns=stamp_ns or 0)
         for region in record.regions
     }
     return Previews(preview_schema(), parts)
 
 
 def preview_part(
-    region: Region, settings: FieldSettings, distances: Distances, stamp_ns: int
+    region: Region, settings: FieldSettings, view: ComposedView, stamp_ns: int
 ) -> Part:
-    """The preview of one region."""
-    vertices, faces = coarse_mesh(region, settings, distances)
+    """The preview of one region of the map that ``view`` answers for."""
+    mesh = coarse_mesh(region, settings, view)
     step_m = 2.0 ** math.floor(math.log2(settings.leaf_m / _STEPS_A_LEAF))
+    vertices = np.round(mesh.vertices / step_m) * step_m
     scale = HeightScale.around(vertices[:, 2])
     update = SceneUpdate()
     entity = update.entities.add()
@@ -80,13 +98,38 @@ def preview_part(
         entity.metadata.add(key=key, value=value)
     triangles = entity.triangles.add()
     triangles.pose.orientation.w = 1.0
-    for x, y, z in (np.round(vertices / step_m) * step_m).tolist():
+    for x, y, z in vertices.tolist():
         triangles.points.add(x=x, y=y, z=z)
     for red, green, blue in _colours(vertices[:, 2], scale).tolist():
         triangles.colors.add(r=red, g=green, b=blue, a=1.0)
-    triangles.indices.extend(faces.ravel().tolist())
+    triangles.indices.extend(mesh.faces.ravel().tolist())
     payload: bytes = update.SerializeToString(deterministic=True)
     return Part(PartKey(PREVIEW, region.index), payload)
+
+
+def coarse_mesh(region: Region, settings: FieldSettings, view: ComposedView) -> Triangles:
+    """The surface of a region, in cells that are large enough for few faces.
+
+    Faces on the border between two regions are of the one in which their middle lies.
+    """
+    faces_max = min(max(region.parameters // PARAMETERS_A_FACE, FACES_MIN), FACES_MAX)
+    cell_m = CELL_LEAVES * settings.leaf_m
+    while len((mesh := _mesh_of_cells(cell_m, region, settings, view)).faces) > faces_max:
+        cell_m *= max(_LARGER, math.sqrt(len(mesh.faces) / faces_max))
+    return mesh
+
+
+def _mesh_of_cells(
+    cell_m: float, region: Region, settings: FieldSettings, view: ComposedView
+) -> Triangles:
+    lattice = TileLattice(cell_m, _TILE_CELLS, reach_m=_REACH_CELLS * cell_m)
+    middle, half_m = settings.region_centre(region.index), settings.region_pitch_m / 2
+    join = TileJoin(lattice.tile_side_m, (middle - half_m, middle + half_m))
+    seen = seen_voxels(region.evidence, region.evidence.surface) * settings.leaf_m
+    low = settings.region_corner(region.index) + seen
+    for x, y, z in lattice.tiles_meeting(low, low + settings.leaf_m, lattice.reach_m).tolist():
+        join.add(mesh_tile(view, (x, y, z), lattice).triangles)
+    return join.mesh()
 
 
 def _colours(heights_m: Doubles, scale: HeightScale) -> Doubles:

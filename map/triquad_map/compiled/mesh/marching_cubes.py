@@ -15,6 +15,7 @@ takes 4 ms for a tile of 64^3 cells, without Python's lock: the other takes 8 ms
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Ints, Longs
+
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.voxel_index import EMPTY, empty_keys, find_slot
 

@@ -1,0 +1,1 @@
+"""The surface of a map as triangles, by marching cubes, tile by tile."""

@@ -1,0 +1,182 @@
+"""The mesh of one tile: marching cubes near the surface that rays have seen.
+
+Neighbouring tiles meet also where they were meshed at different times: the later one takes over
+the values of the earlier one at their common points. Only faces where rays ended are kept, and,
+where that is asked for, those where the surface goes on into unknown space, which are marked:
+elsewhere the field has zeros that no ray taught it.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from triquad_format.records.arrays import Bools, Doubles, Floats, Ints, Longs
+from triquad_format.records.status import Status
+from triquad_format.wire.tile_codec import STEPS, TileSurface
+
+from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.mesh.filling import cells_around, filled_voxels, on_filled
+from triquad_map.compiled.mesh.marching_cubes import Crossings, centroids
+from triquad_map.compiled.mesh.tile_border import TileBorder
+from triquad_map.compiled.mesh.tile_lattice import TileIndex, TileLattice, each_once
+from triquad_map.composition.composed_view import ComposedView
+from triquad_map.triangles import Triangles
+
+_FINE = 0.5
+"""Faces of larger cells, in voxels, stand for too much surface to end within a voxel."""
+
+
+@dataclass(frozen=True)
+class TileMesh:
+    """Triangles of one tile. Vertices are numbered in the order in which faces use them."""
+
+    first: Longs  # [3] the tile's minimum corner, in cells
+    cell_m: float
+    crossings: Crossings  # the mesh, in cells from the origin
+    border: TileBorder  # what it was made of on its faces
+    filled: Bools  # [F] which faces fill holes
+
+    @property
+    def origin(self) -> Doubles:
+        """The tile's minimum corner [3], metres, map frame."""
+        return np.asarray(self.first * self.cell_m, np.float64)
+
+    @property
+    def vertices(self) -> Floats:
+        """The vertices [V, 3], metres, relative to the origin."""
+        return (self.crossings.places * self.cell_m).astype(np.float32)
+
+    @property
+    def faces(self) -> Ints:
+        """Three vertices each [F, 3], counter-clockwise seen from free space."""
+        return self.crossings.faces
+
+    @property
+    def surface(self) -> TileSurface:
+        """The mesh as it travels."""
+        found = self.crossings
+        steps = np.rint(found.fractions * STEPS).astype(np.uint8)
+        return TileSurface(found.points, found.axes, steps, faces=found.faces)
+
+    @property
+    def triangles(self) -> Triangles:
+        """The mesh in the map frame, in double precision."""
+        vertices = (self.crossings.places + self.first) * self.cell_m
+        return Triangles(vertices, self.faces, self.filled)
+
+
+def mesh_tile(
+    view: ComposedView,
+    tile: TileIndex,
+    lattice: TileLattice,
+    around: TileBorder | None = None,
+    fill_m: float = 0.0,
+) -> TileMesh:
+    """The surface within one tile.
+
+    Args:
+        view: the map.
+        tile: indices of the tile, which covers ``[tile, tile + 1) * tile_side_m``.
+        lattice: that of its level.
+        around: distances at some lattice points, which are used instead of the map's.
+        fill_m: how far from seen surface it is continued into unknown space, metres.
+    """
+    first = np.asarray(tile, np.int64) * lattice.cells
+    origin = first.astype(np.float64) * lattice.cell_m
+    cells = _seen_cells(view, first, lattice)
+    reach_m = lattice.reach_m
+    filled = filled_voxels(view, origin - reach_m, origin + lattice.tile_side_m + reach_m, fill_m)
+    if len(filled.voxels):
+        near = cells_around(filled, view.voxel_m, lattice.cell_m, reach_m) - first
+        inside = ((near >= 0) & (near < lattice.cells)).all(axis=1)
+        cells = each_once(np.concatenate([cells, near[inside]]))
+    volume, points = _lattice_values(view, cells, first=first, lattice=lattice, around=around)
+    found = Crossings(cells, volume)
+    middles = centroids((found.places + first) * lattice.cell_m, found.faces)
+    kept = _are_seen(view, middles, lattice)
+    continued = ~kept
+    continued[continued] = on_filled(view, filled, middles[continued], reach_m)
+    kept |= continued
+    found.keep(kept)
+    return TileMesh(
+        first=first,
+        cell_m=lattice.cell_m,
+        crossings=found,
+        border=TileBorder.of_tile(points, volume),
+        filled=continued[kept],
+    )
+
+
+def _are_seen(view: ComposedView, middles: Doubles, lattice: TileLattice) -> Bools:
+    """Whether faces [F] with these ``middles`` [F, 3], metres, map frame, lie where rays ended."""
+    if lattice.cell_m <= _FINE * view.voxel_m:
+        return view.near_ends(middles, lattice.reach_m)
+    seen: Bools = view.status(middles, lattice.reach_m) == Status.SURFACE
+    return seen
+
+
+def _seen_cells(view: ComposedView, first: Longs, lattice: TileLattice) -> Longs:
+    """Cells [C, 3] of the tile that may hold faces which are near enough to seen surface."""
+    middles = (first[:, None] + np.arange(lattice.cells) + 0.5) * np.float64(lattice.cell_m)
+    near = view.surface_in_grid(middles, lattice.cell_m / 2 + lattice.reach_m)
+    return _by_group(np.flatnonzero(near), lattice.cells, lattice.group)
+
+
+@kernel()
+def _by_group(names: Longs, side: int, group: int) -> Longs:
+    """The cells [C, 3] of a tile with these numbers [C], increasing: group by group."""
+    groups = -(-side // group)
+    starts = np.zeros(groups**3 + 1, np.int64)
+    homes = np.empty(len(names), np.int64)
+    for i in range(len(names)):
+        x, y, z = names[i] // (side * side), names[i] // side % side, names[i] % side
+        homes[i] = (x // group * groups + y // group) * groups + z // group
+        starts[homes[i] + 1] += 1
+    starts = np.cumsum(starts)
+    cells = np.empty((len(names), 3), np.int64)
+    for i in range(len(names)):
+        at = starts[homes[i]]
+        starts[homes[i]] += 1
+        cells[at, 0] = names[i] // (side * side)
+        cells[at, 1] = names[i] // side % side
+        cells[at, 2] = names[i] % side
+    return cells
+
+
+@kernel()
+def _enter(values: Floats, points: Longs, volume: Floats) -> None:
+    """Put values [P] at lattice points [P, 3] into the volume."""
+    for i in range(len(points)):
+        volume[points[i, 0], points[i, 1], points[i, 2]] = values[i]
+
+
+@kernel()
+def _corners(seen: Longs, volume: Floats) -> Longs:
+    """The lattice points [P, 3] at the corners of cells [C, 3]; they become NaN in ``volume``."""
+    points = np.empty((8 * len(seen), 3), np.int64)
+    count = 0
+    for cell in seen:
+        for corner in range(8):
+            x, y, z = cell[0] + (corner >> 2), cell[1] + (corner >> 1 & 1), cell[2] + (corner & 1)
+            if not np.isnan(volume[x, y, z]):
+                volume[x, y, z] = np.nan
+                points[count, 0], points[count, 1], points[count, 2] = x, y, z
+                count += 1
+    return points[:count]
+
+
+def _lattice_values(
+    view: ComposedView, seen: Longs, first: Longs, lattice: TileLattice, around: TileBorder | None
+) -> tuple[Floats, Longs]:
+    """Distances on the tile's lattice points [cells + 1] * 3, and the points [P, 3] at seen cells.
+
+    Those of other points mean nothing.
+    """
+    volume = np.zeros((lattice.cells + 1,) * 3, np.float32)
+    points = _corners(seen, volume)
+    asked = points
+    if around is not None:
+        around.put(volume)
+        asked = points[np.isnan(volume[tuple(points.T)])]
+    axes = (first[:, None] + np.arange(lattice.cells + 1)) * np.float64(lattice.cell_m)
+    _enter(view.distances_in_grid(axes, asked), asked, volume)
+    return volume, points

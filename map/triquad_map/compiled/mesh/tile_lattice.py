@@ -1,0 +1,109 @@
+"""The lattices on which mesh tiles lie: at multiples of their sides, on each level of detail.
+
+Lattice points are multiples of the cell, whatever the tile, so neighbouring tiles share the
+points of their common face and meet without seams.
+"""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from triquad_format.errors import RefusedError
+from triquad_format.records.arrays import Bools, Doubles, Longs
+from triquad_format.records.cells import cells_of_boxes
+from triquad_format.wire.limits import LEVELS
+
+from triquad_map.compiled.kernel import kernel
+
+TileIndex = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class TileLattice:
+    """Where the cells and tiles of one level of detail lie."""
+
+    cell_m: float
+    cells: int  # along the side of a tile, the same on all levels
+    reach_m: float  # centres of faces lie at most this far from voxels with seen surface
+    group: int = 8  # cells along the side of the groups in whose order faces come
+
+    @property
+    def tile_side_m(self) -> float:
+        """Side of a tile."""
+        return self.cell_m * self.cells
+
+    @property
+    def margin_m(self) -> float:
+        """A change so far from a tile, or farther, does not concern it."""
+        return self.cell_m + self.reach_m
+
+    def at_level(self, level: int) -> "TileLattice":
+        """The lattice so many levels coarser: a tile covers ``2**level`` of these on each axis.
+
+        Groups of cells keep their size, so that no level searches farther around than this one.
+        """
+        scale = 1 << level
+        return dataclasses.replace(
+            self,
+            cell_m=self.cell_m * scale,
+            reach_m=self.reach_m * scale,
+            group=max(1, self.group // scale),
+        )
+
+    def meets(self, tiles: NDArray[np.integer], low: Doubles, high: Doubles) -> Bools:
+        """Which [T] of tiles [T, 3] meet the box between two corners [3], metres, map frame."""
+        corners = tiles * self.tile_side_m
+        return np.asarray(((corners <= high) & (corners + self.tile_side_m >= low)).all(axis=1))
+
+    def tiles_meeting(self, low: Doubles, high: Doubles, margin_m: float = 0.0) -> Longs:
+        """Tiles [T, 3], each once, that come within ``margin_m`` of any of N boxes.
+
+        ``low`` and ``high`` [N, 3] are the boxes' corners, metres, map frame.
+        """
+        boxes = each_once(_tile_boxes(low, high, margin_m, self.tile_side_m))
+        return each_once(cells_of_boxes(boxes[:, :3], boxes[:, 3:])[0])
+
+
+def check_level(level: int) -> None:
+    """Refuse a level of detail that there is not.
+
+    Raises:
+        RefusedError: there is no such level.
+    """
+    if not 0 <= level < LEVELS:
+        raise RefusedError("bad_request", f"level = {level} is out of range: use 0 to {LEVELS - 1}")
+
+
+def each_once(rows: Longs) -> Longs:
+    """The different ones of rows [N, D], in order."""
+    if len(rows) == 0:
+        return rows
+    columns = [np.ascontiguousarray(column) for column in rows.T]
+    lows = [int(column.min()) for column in columns]
+    sizes = [int(column.max()) - low + 1 for column, low in zip(columns, lows, strict=True)]
+    if math.prod(sizes) >= 2**62:
+        return np.asarray(np.unique(rows, axis=0))
+    # By one number each: numpy holds Python's lock while it sorts rows.
+    names = np.zeros(len(rows), np.int64)
+    for column, low, size in zip(columns, lows, sizes, strict=True):
+        names = names * size + (column - low)
+    each = np.stack(np.unravel_index(np.unique(names), sizes), axis=1) + lows
+    return np.asarray(each, np.int64)
+
+
+@kernel()
+def _tile_boxes(low: Doubles, high: Doubles, margin_m: float, side_m: float) -> Longs:
+    """The first and last tiles [B, 6] of boxes [N, 3]; once, where boxes in a row have the same."""
+    boxes = np.empty((len(low), 6), np.int64)
+    count = 0
+    for i in range(len(low)):
+        for axis in range(3):
+            boxes[count, axis] = np.floor((low[i, axis] - margin_m) / side_m)
+            boxes[count, 3 + axis] = np.floor((high[i, axis] + margin_m) / side_m)
+        is_new = count == 0
+        for k in range(6):
+            is_new = is_new or boxes[count, k] != boxes[count - 1, k]
+        count += int(is_new)
+    return boxes[:count]
