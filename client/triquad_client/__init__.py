@@ -37,9 +37,8 @@ from triquad_map.questions.segments import Polyline, Segments
 from triquad_map.questions.spheres import Spheres
 
 from triquad_client.async_client import AsyncClient
-from triquad_client.calls.async_queries import AsyncPinnedMap
 from triquad_client.calls.changes import ChangedBox, ChangeKind, ChangeReport
-from triquad_client.calls.queries import MapQueries, PinnedMap
+from triquad_client.calls.queries import AsyncPinnedMap, MapQueries, PinnedMap
 from triquad_client.calls.questions import SdfResult
 from triquad_client.calls.scans import FlushReport
 from triquad_client.calls.sources import NewestScan, ScanSource, SourceReport

@@ -16,10 +16,8 @@ from triquad_client import (
     AsyncMeshWatch,
     Client,
     ClosedError,
-    InvalidInputError,
     KnownTiles,
     MeshWatch,
-    RequestTimeoutError,
 )
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
@@ -89,107 +87,6 @@ def test_what_changes_is_told_while_the_loop_goes_on() -> None:
         connected(endpoint, use)
 
 
-def test_known_tiles_go_from_one_kind_of_watch_to_the_other(endpoint: str) -> None:
-    async def use(client: AsyncClient) -> KnownTiles:
-        async with client.watch_mesh(level=1) as watch:
-            assert watch.level == 1
-            await watch.catch_up(servers.WAIT_S)
-            known = watch.known_tiles()
-        async with client.watch_mesh(level=1, known=known) as watch:
-            assert watch.tiles.keys() == known.tiles.keys()
-            assert await watch.next(0.0) is None
-            assert watch.complete
-        return known
-
-    known = connected(endpoint, use)
-    assert known.tiles
-    with (
-        triquad_client.connect(endpoint) as client,
-        client.watch_mesh(level=1, known=known) as watch,
-    ):
-        assert watch.next(0.0) is None
-
-
-def test_iteration_ends_with_the_watch(endpoint: str) -> None:
-    async def use(client: AsyncClient) -> None:
-        watch = client.watch_mesh()
-        seen = asyncio.Event()
-
-        async def follow() -> int:
-            count = 0
-            async for update in watch:
-                count += len(update.changed)
-                seen.set()
-            return count
-
-        following = asyncio.ensure_future(follow())
-        await seen.wait()
-        await watch.close()
-        assert await following > 0
-        await watch.close()
-        assert await watch.next() is None
-        with pytest.raises(ClosedError, match="the watch is closed"):
-            await watch.catch_up()
-        assert len((await watch.mesh()).faces), "the tiles stay"
-
-    connected(endpoint, use)
-
-
-def test_a_cancelled_wait_leaves_the_watch_in_order(endpoint: str) -> None:
-    async def use(client: AsyncClient) -> None:
-        async with client.watch_mesh() as watch:
-            for steps in range(1, 12):  # cut off in the midst of what comes first
-                waiting = asyncio.ensure_future(watch.next())
-                for _ in range(steps):
-                    await asyncio.sleep(0)
-                waiting.cancel()
-                with pytest.raises(asyncio.CancelledError):
-                    await waiting
-            await watch.catch_up(servers.WAIT_S)
-            waiting = asyncio.ensure_future(watch.next())
-            await asyncio.sleep(0)
-            waiting.cancel()
-            with pytest.raises(asyncio.CancelledError):
-                await waiting
-            async with client.watch_mesh() as fresh:
-                await fresh.catch_up(servers.WAIT_S)
-                assert digests(fresh) == digests(watch)
-
-    connected(endpoint, use)
-
-
-def test_what_is_awaited_when_the_client_is_closed_says_so(endpoint: str) -> None:
-    async def use(client: AsyncClient) -> None:
-        watch = client.watch_mesh()
-        await watch.catch_up(servers.WAIT_S)
-        waiting = asyncio.ensure_future(watch.next())
-        await client.status()  # by then it waits at the server
-        await client.close()
-        with pytest.raises(ClosedError):
-            await waiting
-        with pytest.raises(ClosedError):
-            await watch.next(0.0)
-
-    connected(endpoint, use)
-
-
-def test_a_watch_is_caught_up_while_another_task_waits_for_changes(endpoint: str) -> None:
-    async def use(client: AsyncClient) -> None:
-        async with client.watch_mesh() as watch:
-            await watch.catch_up(servers.WAIT_S)
-            waiting = asyncio.ensure_future(watch.next())
-            await client.status()
-            await watch.catch_up(servers.WAIT_S)
-            assert not waiting.done()
-            async with client.watch_mesh() as fresh:
-                await fresh.catch_up(servers.WAIT_S)
-                assert digests(fresh) == digests(watch)
-            await watch.close()
-            assert await waiting is None
-
-    connected(endpoint, use)
-
-
 def removed(index: int, revision: int) -> bytes:
     """A reply without tiles, after which the tile ``(index, 0, 0)`` is gone."""
     side_m, none = 1.6, np.zeros(0, np.int64)
@@ -242,53 +139,59 @@ def test_an_old_reply_does_not_undo_what_a_later_one_told(endpoint: str) -> None
         connected(endpoint, use)
 
 
-def test_a_server_that_does_not_answer_is_an_error_and_its_tiles_stay(endpoint: str) -> None:
-    known = known_tiles(endpoint)
-    silent: list[zenoh.Query] = []
-    answers = {keys.TILE_UPDATES: lambda query, key: silent.append(query)}
-    with servers.answering(answers) as endpoint:
-
-        async def use(client: AsyncClient) -> None:
-            async with client.watch_mesh(known=known) as watch:
-                with pytest.raises(RequestTimeoutError):
-                    await watch.next(0.0)
-                assert watch.tiles.keys() == known.tiles.keys()
-
-        connected(endpoint, use, timeout_s=0.5)
-        for query in silent:
-            query.drop()
-
-
-def test_both_clients_fetch_all_levels(endpoint: str) -> None:
-    bounds = ((0.2, 0.2, -9), (9, 9, 9))
+def test_iteration_ends_with_the_watch(endpoint: str) -> None:
+    """Another task catches up meanwhile."""
 
     async def use(client: AsyncClient) -> None:
-        with triquad_client.connect(endpoint) as other:
-            faces = []
-            for level in range(3):
-                mesh, expected = await client.mesh(bounds, level), other.mesh(bounds, level=level)
-                np.testing.assert_array_equal(mesh.vertices, expected.vertices)
-                np.testing.assert_array_equal(mesh.faces, expected.faces)
-                assert (mesh.vertices[mesh.faces].mean(axis=1)[:, :2] >= 0.2).all()
-                error_m = np.abs(np.linalg.norm(mesh.vertices, axis=1) - servers.RADIUS_M)
-                assert error_m.mean() < 0.2
-                faces.append(len(mesh.faces))
-                listed = await client.tiles(bounds, level)
-                np.testing.assert_array_equal(listed.tiles, other.tiles(bounds, level).tiles)
-                assert listed.tile_side_m == pytest.approx(1.6 * 2**level)
-                x, y, z = listed.tiles[0].tolist()
-                tile = await client.mesh_tile(x, y, z, level)
-                np.testing.assert_array_equal(
-                    tile.vertices, other.mesh_tile(x, y, z, level=level).vertices
-                )
-                corner = np.array((x, y, z)) * listed.tile_side_m
-                assert (tile.vertices >= corner - 1e-4).all()
-                assert (tile.vertices <= corner + listed.tile_side_m + 1e-4).all()
-            assert faces[0] > 2 * faces[1] > 4 * faces[2] > 0
-            for call in (other.mesh, other.tiles):
-                with pytest.raises(InvalidInputError, match="level = 3: use 0 to 2"):
-                    call(level=3)
-            with pytest.raises(InvalidInputError, match=r"level = 1\.0"):
-                await client.mesh_tile(0, 0, 0, 1.0)  # type: ignore[arg-type]
+        watch = client.watch_mesh()
+        seen = asyncio.Event()
+
+        async def follow() -> int:
+            count = 0
+            async for update in watch:
+                count += len(update.changed)
+                seen.set()
+            return count
+
+        following = asyncio.ensure_future(follow())
+        await seen.wait()
+        await watch.catch_up(servers.WAIT_S)
+        async with client.watch_mesh() as fresh:
+            await fresh.catch_up(servers.WAIT_S)
+            assert digests(fresh) == digests(watch)
+        assert not following.done()
+        await watch.close()
+        assert await following > 0
+        await watch.close()
+        assert await watch.next() is None
+        with pytest.raises(ClosedError, match="the watch is closed"):
+            await watch.catch_up()
+        assert len((await watch.mesh()).faces), "the tiles stay"
+
+    connected(endpoint, use)
+
+
+def test_a_cancelled_wait_leaves_the_watch_in_order_until_the_client_is_closed(
+    endpoint: str,
+) -> None:
+    async def use(client: AsyncClient) -> None:
+        watch, fresh = client.watch_mesh(), client.watch_mesh()
+        for steps in range(1, 12):  # cut off in the midst of what comes first
+            waiting = asyncio.ensure_future(watch.next())
+            for _ in range(steps):
+                await asyncio.sleep(0)
+            waiting.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await waiting
+        await watch.catch_up(servers.WAIT_S)
+        await fresh.catch_up(servers.WAIT_S)
+        assert digests(fresh) == digests(watch)
+        waiting = asyncio.ensure_future(watch.next())
+        await client.status()  # by then it waits at the server
+        await client.close()
+        with pytest.raises(ClosedError):
+            await waiting
+        with pytest.raises(ClosedError):
+            await watch.next(0.0)
 
     connected(endpoint, use)

@@ -16,7 +16,7 @@ import triquad_client
 import zenoh
 from support import servers
 from support.requests import tile_updates
-from triquad_client import Client, InvalidInputError, MeshWatch
+from triquad_client import Client, InvalidInputError, MeshWatch, RequestTimeoutError
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import (
     ErrorReply,
@@ -463,3 +463,21 @@ def test_iteration_ends_with_the_watch(client: Client) -> None:
         assert seen.wait(servers.WAIT_S)
         watch.close()
         assert following.result(servers.WAIT_S) > 0
+
+
+def test_a_server_that_does_not_answer_is_an_error_and_the_tiles_stay(client: Client) -> None:
+    with client.watch_mesh() as watch:
+        watch.catch_up(servers.WAIT_S)
+        known = watch.known_tiles()
+    silent: list[zenoh.Query] = []
+    answers = {keys.TILE_UPDATES: lambda query, key: silent.append(query)}
+    with (
+        servers.answering(answers) as endpoint,
+        triquad_client.connect(endpoint, timeout_s=0.5) as other,
+        other.watch_mesh(known=known) as watch,
+    ):
+        with pytest.raises(RequestTimeoutError):
+            watch.next(0.0)
+        assert watch.tiles.keys() == known.tiles.keys()
+        for query in silent:
+            query.drop()

@@ -12,11 +12,12 @@ from triquad_map.questions.spheres import Spheres
 from triquad_client.calls import questions
 from triquad_client.calls.questions import SdfResult
 from triquad_client.checks import Bounds, PoseLike
-from triquad_client.net.call import Run
+from triquad_client.net.call import AsyncRun, Call, ResultT, Run
+from triquad_client.net.operation import Awaited, Blocking, operation
 
 
-class MapQueries:
-    """Asks about the map: of its newest epoch, or always of the same one.
+class QueryOperations:
+    """Questions about the map: of its newest epoch, or always of the same one.
 
     Positions are metres in the map frame. Questions of any size are answered from one epoch,
     a published state of the map that never changes. ``at_epoch`` is its number, ``None`` is the
@@ -24,14 +25,13 @@ class MapQueries:
     ``epoch_gone`` is raised, and :class:`InvalidInputError` where an argument cannot be used.
     """
 
-    def __init__(self, run: Run, epoch: int | None = None) -> None:
-        """``run`` answers the calls; ``epoch`` is asked where a query names none."""
-        self._run = run
-        self._epoch = epoch
+    _epoch: int | None
+    """Is asked where a query names none."""
 
+    @operation
     def query_sdf(
         self, points: ArrayLike, gradient: bool = False, at_epoch: int | None = None
-    ) -> SdfResult:
+    ) -> Call[SdfResult]:
         """The trained field at ``points`` [N, 3]: right near surfaces, saturated beyond.
 
         Where the map has no region, which is far from all that was seen, field and gradient are
@@ -42,8 +42,9 @@ class MapQueries:
             gradient: whether the gradient is wanted.
             at_epoch: see :class:`MapQueries`.
         """
-        return self._run(questions.sdf(points, gradient, self._chosen(at_epoch)))
+        return questions.sdf(points, gradient, self._chosen(at_epoch))
 
+    @operation
     def query_distance(
         self,
         points: ArrayLike,
@@ -53,7 +54,7 @@ class MapQueries:
         surface_point: bool = False,
         unknown_distance: bool = False,
         at_epoch: int | None = None,
-    ) -> Distances:
+    ) -> Call[Distances]:
         """The true distance to the nearest seen surface, with its gradient, at ``points`` [N, 3].
 
         Args:
@@ -69,16 +70,16 @@ class MapQueries:
             UnknownSpaceError: ``unknown`` is ``"error"`` and unknown space is nearer somewhere.
         """
         options = DistanceOptions(max_distance_m, surface_point, unknown_distance)
-        return self._run(
-            questions.distance(points, options, unknown, at_epoch=self._chosen(at_epoch))
-        )
+        return questions.distance(points, options, unknown, at_epoch=self._chosen(at_epoch))
 
+    @operation
     def query_spheres(
         self, centres: ArrayLike, radii_m: ArrayLike, at_epoch: int | None = None
-    ) -> Spheres:
+    ) -> Call[Spheres]:
         """What spheres around ``centres`` [N, 3] hold; ``radii_m`` are one, or [N], metres."""
-        return self._run(questions.spheres(centres, radii_m, self._chosen(at_epoch)))
+        return questions.spheres(centres, radii_m, self._chosen(at_epoch))
 
+    @operation
     def query_segments(
         self,
         starts: ArrayLike,
@@ -86,7 +87,7 @@ class MapQueries:
         radius_m: float = 0.0,
         max_distance_m: float = 5.0,
         at_epoch: int | None = None,
-    ) -> Segments:
+    ) -> Call[Segments]:
         """What a ball meets that moves straight from each of ``starts`` to ``ends`` [N, 3].
 
         Args:
@@ -97,19 +98,21 @@ class MapQueries:
             at_epoch: see :class:`MapQueries`.
         """
         options = SegmentOptions(radius_m, max_distance_m)
-        return self._run(questions.segments(starts, ends, options, at_epoch=self._chosen(at_epoch)))
+        return questions.segments(starts, ends, options, at_epoch=self._chosen(at_epoch))
 
+    @operation
     def query_polyline(
         self,
         points: ArrayLike,
         radius_m: float = 0.0,
         max_distance_m: float = 5.0,
         at_epoch: int | None = None,
-    ) -> Polyline:
+    ) -> Call[Polyline]:
         """What a ball meets that moves along ``points`` [N, 3], as :meth:`query_segments`."""
         options = SegmentOptions(radius_m, max_distance_m)
-        return self._run(questions.polyline(points, options, self._chosen(at_epoch)))
+        return questions.polyline(points, options, self._chosen(at_epoch))
 
+    @operation
     def query_rays(
         self,
         origins: ArrayLike,
@@ -117,7 +120,7 @@ class MapQueries:
         max_range_m: float = 50.0,
         through_unknown: bool = False,
         at_epoch: int | None = None,
-    ) -> RayRanges:
+    ) -> Call[RayRanges]:
         """How far rays reach from ``origins`` [3] or [N, 3] along ``directions`` [N, 3].
 
         Args:
@@ -128,13 +131,12 @@ class MapQueries:
             at_epoch: see :class:`MapQueries`.
         """
         options = RayOptions(max_range_m, through_unknown)
-        return self._run(
-            questions.rays(origins, directions, options, at_epoch=self._chosen(at_epoch))
-        )
+        return questions.rays(origins, directions, options, at_epoch=self._chosen(at_epoch))
 
+    @operation
     def query_ground(
         self, points: ArrayLike, max_drop_m: float = 2.0, at_epoch: int | None = None
-    ) -> Ground:
+    ) -> Call[Ground]:
         """The ground below ``points`` [N, 3]: its height and slope, or that there is none.
 
         Args:
@@ -143,15 +145,16 @@ class MapQueries:
             max_drop_m: the ground is looked for down to here, at most 100 m.
             at_epoch: see :class:`MapQueries`.
         """
-        return self._run(questions.ground(points, max_drop_m, self._chosen(at_epoch)))
+        return questions.ground(points, max_drop_m, self._chosen(at_epoch))
 
+    @operation
     def query_grid(
         self,
         bounds: Bounds,
         cell_m: float = 0.1,
         max_distance_m: float = 5.0,
         at_epoch: int | None = None,
-    ) -> Grid:
+    ) -> Call[Grid]:
         """Distance and status at the cubic cells that fill ``bounds``.
 
         Args:
@@ -160,17 +163,16 @@ class MapQueries:
             max_distance_m: surfaces are looked for up to here, at most 100 m.
             at_epoch: see :class:`MapQueries`.
         """
-        return self._run(
-            questions.grid(bounds, cell_m, max_distance_m, at_epoch=self._chosen(at_epoch))
-        )
+        return questions.grid(bounds, cell_m, max_distance_m, at_epoch=self._chosen(at_epoch))
 
+    @operation
     def align(
         self,
         points: ArrayLike,
         world_from_sensor_guess: PoseLike,
         max_distance_m: float = 6.0,
         at_epoch: int | None = None,
-    ) -> Alignment:
+    ) -> Call[Alignment]:
         """Where a scan was taken: its points are moved until they lie on surfaces of the map.
 
         Args:
@@ -180,13 +182,39 @@ class MapQueries:
             at_epoch: see :class:`MapQueries`.
         """
         options = AlignOptions(max_distance_m)
-        call = questions.align(
+        return questions.align(
             points, world_from_sensor_guess, options, at_epoch=self._chosen(at_epoch)
         )
-        return self._run(call)
 
     def _chosen(self, at_epoch: int | None) -> int | None:
         return self._epoch if at_epoch is None else at_epoch
+
+
+class MapQueries(QueryOperations, Blocking):
+    """Asks about the map: of its newest epoch, or always of the same one.
+
+    Errors and epochs are as :class:`QueryOperations` has them.
+    """
+
+    def __init__(self, run: Run, epoch: int | None = None) -> None:
+        """``run`` answers the calls; ``epoch`` is asked where a query names none."""
+        self._answer_call = run
+        self._epoch = epoch
+
+    def _run(self, call: Call[ResultT]) -> ResultT:
+        return self._answer_call(call)
+
+
+class AsyncMapQueries(QueryOperations, Awaited):
+    """Asks about the map: :class:`MapQueries` to be awaited."""
+
+    def __init__(self, run: AsyncRun, epoch: int | None = None) -> None:
+        """``run`` answers the calls; ``epoch`` is asked where a query names none."""
+        self._answer_call = run
+        self._epoch = epoch
+
+    async def _run(self, call: Call[ResultT]) -> ResultT:
+        return await self._answer_call(call)
 
 
 class PinnedMap(MapQueries):
@@ -198,5 +226,14 @@ class PinnedMap(MapQueries):
 
     def __init__(self, run: Run, epoch: int) -> None:
         """Use ``Client.pinned``."""
+        super().__init__(run, epoch)
+        self.epoch = epoch
+
+
+class AsyncPinnedMap(AsyncMapQueries):
+    """The map as it was in one epoch: :class:`PinnedMap` to be awaited."""
+
+    def __init__(self, run: AsyncRun, epoch: int) -> None:
+        """Use ``AsyncClient.pinned``."""
         super().__init__(run, epoch)
         self.epoch = epoch

@@ -9,10 +9,11 @@ from triquad_client.mesh.followed_mesh import FollowedMesh, MeshUpdate
 from triquad_client.mesh.mesh import Mesh
 from triquad_client.mesh.mesh_watch import MeshWatch, WatchClosedError, WatchedMesh
 from triquad_client.net.call import AsyncRun, Call, ResultT, offload
+from triquad_client.net.operation import Awaited
 
 
 @documented_as(MeshWatch)
-class AsyncMeshWatch(WatchedMesh):
+class AsyncMeshWatch(WatchedMesh, Awaited):
     """The mesh tiles of a box, kept up to date by :meth:`next`; nothing is asked in between.
 
     It is :class:`MeshWatch` to be awaited: use it in ``async with``, and ``async for``. Where the
@@ -48,9 +49,6 @@ class AsyncMeshWatch(WatchedMesh):
         with suppress(WatchClosedError):
             return await self._run(self._next(timeout_s))
         return None
-
-    async def catch_up(self, timeout_s: float = 60.0) -> None:
-        await self._run(self._catch_up(timeout_s))
 
     async def mesh(self) -> Mesh:
         followed = self._followed

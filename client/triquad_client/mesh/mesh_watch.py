@@ -24,6 +24,7 @@ from triquad_client.mesh.followed_mesh import (
 from triquad_client.mesh.mesh import Mesh
 from triquad_client.net.call import Ask, Call, ResultT, ask, offload
 from triquad_client.net.connection import Connection, RemoteDriver
+from triquad_client.net.operation import Blocking, operation
 
 _LONGEST_WAIT_S = 20.0  # of one request; then it is sent again
 
@@ -78,7 +79,14 @@ class WatchedMesh:
             if time.monotonic() >= ends:
                 return None
 
-    def _catch_up(self, timeout_s: float) -> Call[None]:
+    @operation
+    def catch_up(self, timeout_s: float = 60.0) -> Call[None]:
+        """Fetch all that changed until now.
+
+        Raises:
+            RequestTimeoutError: that was not all of it.
+            ClosedError: the watch was closed.
+        """
         ends = checks.deadline(timeout_s)
         wait_s = 0.0
         while not (update := (yield from self._update(wait_s))).complete:
@@ -110,7 +118,7 @@ class WatchedMesh:
         )
 
 
-class MeshWatch(WatchedMesh):
+class MeshWatch(WatchedMesh, Blocking):
     """The mesh tiles of a box, kept up to date by :meth:`next`; nothing is asked in between.
 
     Use it in a ``with`` statement, or :meth:`close` it. Where a method raises, the tiles stay,
@@ -151,15 +159,6 @@ class MeshWatch(WatchedMesh):
         with suppress(WatchClosedError):
             return self._run(self._next(timeout_s))
         return None
-
-    def catch_up(self, timeout_s: float = 60.0) -> None:
-        """Fetch all that changed until now.
-
-        Raises:
-            RequestTimeoutError: that was not all of it.
-            ClosedError: the watch was closed.
-        """
-        self._run(self._catch_up(timeout_s))
 
     def mesh(self) -> Mesh:
         """The tiles as one mesh, faces by their centroids within the bounds."""

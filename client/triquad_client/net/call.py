@@ -2,8 +2,8 @@
 
 A call is a generator. It yields steps, is sent what became of each, and returns the result. A
 driver takes the steps in one loop, and its kind decides how to wait. To add a call, write its
-generator with ``ask``, ``ask_each``, ``offload`` and ``retried``, and a line in ``Client`` and
-``AsyncClient``.
+generator with ``ask``, ``ask_each``, ``offload`` and ``retried``, and an operation in
+``ClientOperations``, which makes a method of both clients from it.
 """
 
 import time
@@ -76,7 +76,15 @@ class Pause:
     seconds: float
 
 
-Step: TypeAlias = Batch | Work | Pause
+@dataclass(frozen=True)
+class Put:
+    """A step: something that is handed to the network after all that was before. It is sent what
+    ``job`` returns."""
+
+    job: Callable[[], Any]
+
+
+Step: TypeAlias = Batch | Work | Pause | Put
 Call: TypeAlias = Generator[Step, Any, ResultT]
 
 
@@ -124,6 +132,12 @@ def offload(job: Callable[[Run], ResultT]) -> Call[ResultT]:
     return result
 
 
+def put(job: Callable[[], ResultT]) -> Call[ResultT]:
+    """What ``job`` returns, which hands something to the network, in the order of the calls."""
+    result: ResultT = yield Put(job)
+    return result
+
+
 def retried(code: str, attempt: Callable[[], Call[ResultT]]) -> Call[ResultT]:
     """What ``attempt`` returns; where the server refuses with ``code``, it is tried anew.
 
@@ -161,6 +175,8 @@ class Driver(ABC):
             return await self._replies(step)
         if isinstance(step, Pause):
             return await self._pause(step.seconds)
+        if isinstance(step, Put):
+            return await self.in_order(step.job)
         return await self._work(step.job)
 
     @abstractmethod
@@ -170,6 +186,10 @@ class Driver(ABC):
     @abstractmethod
     async def _pause(self, seconds: float) -> None:
         """Let time pass."""
+
+    @abstractmethod
+    async def in_order(self, job: Callable[[], ResultT]) -> ResultT:
+        """What ``job`` returns, run after all that was sent before."""
 
     @abstractmethod
     async def _work(self, job: Callable[[Run], Any]) -> Any:
@@ -192,6 +212,10 @@ class BlockingDriver(Driver):
 
     async def _pause(self, seconds: float) -> None:
         time.sleep(seconds)
+
+    async def in_order(self, job: Callable[[], ResultT]) -> ResultT:
+        """What ``job`` returns."""
+        return job()
 
     async def _work(self, job: Callable[[Run], Any]) -> Any:
         return job(self.run)

@@ -16,11 +16,16 @@ MAX_FACES = 50_000_000
 TILE_CELLS = 64
 """Along each side of a tile, as in a server's mesh."""
 
-_FILLED_TILE_CELLS = 128
-"""The same where holes are filled: larger tiles search less of what lies around them again."""
+WHOLE_TILE_CELLS = 128
+"""The same where all tiles are made in a row: larger ones search less around them again."""
 
 Report = Callable[[int, int], None]
 """Is told how many tiles are done, and of how many."""
+
+
+def map_lattice(cell_m: float, reach_m: float, *, whole: bool) -> TileLattice:
+    """The lattice of a map's tiles; ``whole``: all of them are made in a row."""
+    return TileLattice(cell_m, WHOLE_TILE_CELLS if whole else TILE_CELLS, reach_m)
 
 
 class MapTiles:
@@ -34,8 +39,7 @@ class MapTiles:
         self,
         view: ComposedView,
         ends: Doubles,
-        cell_m: float,
-        reach_m: float,
+        lattice: TileLattice,
         box: tuple[Doubles, Doubles],
         fill_m: float,
     ) -> None:
@@ -44,20 +48,18 @@ class MapTiles:
         Args:
             view: the map.
             ends: [N, 3] middles of the voxels in which rays ended, metres, map frame.
-            cell_m: side of the cells.
-            reach_m: middles of faces lie at most so far from voxels with seen surface.
+            lattice: where the tiles lie.
             box: corners [3] of what is to be meshed, metres, map frame.
             fill_m: how far from seen surface holes are filled, metres.
         """
         self._view = view
-        cells = TILE_CELLS if fill_m == 0 else _FILLED_TILE_CELLS
-        lattice = self._lattice = TileLattice(cell_m, cells, reach_m)
+        self._lattice = lattice
         self._box = box
         self._fill_m = fill_m
         self.side_m = lattice.tile_side_m
         """Of a tile."""
         half_m = view.voxel_m / 2
-        tiles = lattice.tiles_meeting(ends - half_m, ends + half_m, reach_m + fill_m)
+        tiles = lattice.tiles_meeting(ends - half_m, ends + half_m, lattice.reach_m + fill_m)
         self.indices: list[TileIndex] = [
             (x, y, z) for x, y, z in tiles[lattice.meets(tiles, *box)].tolist()
         ]

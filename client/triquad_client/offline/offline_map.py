@@ -125,7 +125,7 @@ class OfflineMap(MapQueries):
                 there are more than 50 million faces, or numba is not installed.
             ClosedError: the map was closed.
         """
-        return self._tiles(cell_m, bounds, fill_m).joined(report)
+        return self._tiles(cell_m, bounds, fill_m, whole=True).joined(report)
 
     def mesh_tiles(self, cell_m: float | None = None, fill_m: float = 0.0) -> "MapTiles":
         """The surface as :meth:`mesh` has it, everywhere, to be made tile by tile.
@@ -138,9 +138,11 @@ class OfflineMap(MapQueries):
             InvalidInputError: the cells or ``fill_m`` are out of range, or numba is not installed.
             ClosedError: the map was closed.
         """
-        return self._tiles(cell_m, None, fill_m)
+        return self._tiles(cell_m, None, fill_m, whole=False)
 
-    def _tiles(self, cell_m: float | None, bounds: Bounds | None, fill_m: float) -> "MapTiles":
+    def _tiles(
+        self, cell_m: float | None, bounds: Bounds | None, fill_m: float, *, whole: bool
+    ) -> "MapTiles":
         view = self._opened().view
         chosen_m = _CELL_LEAVES * self.leaf_m if cell_m is None else cell_m
         checked_m = checks.within("cell_m", chosen_m, CELL_RANGE_M[1], least=CELL_RANGE_M[0])
@@ -150,10 +152,10 @@ class OfflineMap(MapQueries):
                 "meshes of map files are made by compiled code, and numba is missing: "
                 "pip install 'triquad[fast]'"
             )
-        from triquad_client.offline.map_mesh import MapTiles
+        from triquad_client.offline.map_mesh import MapTiles, map_lattice
 
-        reach_m = _REACH_LEAVES * self.leaf_m
-        return MapTiles(view, self.surface_voxels(), checked_m, reach_m, box=box, fill_m=fill_m)
+        lattice = map_lattice(checked_m, _REACH_LEAVES * self.leaf_m, whole=whole)
+        return MapTiles(view, self.surface_voxels(), lattice, box, fill_m)
 
     def surface_voxels(self) -> Doubles:
         """Middles [N, 3] of the voxels in which rays ended, metres, map frame."""

@@ -19,9 +19,8 @@ from triquad_format.wire.messages import MapInfo
 from triquad_map.stored_map import StoredMap
 
 from triquad_client import checks
-from triquad_client.calls.async_queries import AsyncMapQueries
 from triquad_client.calls.download import RemoteBytes, newest_file
-from triquad_client.calls.queries import MapQueries
+from triquad_client.calls.queries import AsyncMapQueries, MapQueries
 from triquad_client.checks import Bounds
 from triquad_client.documentation import documented_as
 from triquad_client.errors import DownloadError, EmptierMapError
