@@ -14,10 +14,10 @@ from triquad_format.records.status import Status
 from triquad_format.wire.tile_codec import STEPS, TileSurface
 
 from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.mesh.filling import cells_around, filled_voxels, on_filled
+from triquad_map.compiled.mesh.filling import FilledVoxels, cells_around, filled_voxels, on_filled
 from triquad_map.compiled.mesh.marching_cubes import Crossings, centroids
 from triquad_map.compiled.mesh.tile_border import TileBorder
-from triquad_map.compiled.mesh.tile_lattice import TileIndex, TileLattice, each_once
+from triquad_map.compiled.mesh.tile_lattice import TileIndex, TileLattice
 from triquad_map.composition.composed_view import ComposedView
 from triquad_map.triangles import Triangles
 
@@ -82,13 +82,9 @@ def mesh_tile(
     """
     first = np.asarray(tile, np.int64) * lattice.cells
     origin = first.astype(np.float64) * lattice.cell_m
-    cells = _seen_cells(view, first, lattice)
     reach_m = lattice.reach_m
     filled = filled_voxels(view, origin - reach_m, origin + lattice.tile_side_m + reach_m, fill_m)
-    if len(filled.voxels):
-        near = cells_around(filled, view.voxel_m, lattice.cell_m, reach_m) - first
-        inside = ((near >= 0) & (near < lattice.cells)).all(axis=1)
-        cells = each_once(np.concatenate([cells, near[inside]]))
+    cells = _near_cells(view, filled, first, lattice)
     volume, points = _lattice_values(view, cells, first=first, lattice=lattice, around=around)
     found = Crossings(cells, volume)
     middles = centroids((found.places + first) * lattice.cell_m, found.faces)
@@ -114,10 +110,16 @@ def _are_seen(view: ComposedView, middles: Doubles, lattice: TileLattice) -> Boo
     return seen
 
 
-def _seen_cells(view: ComposedView, first: Longs, lattice: TileLattice) -> Longs:
-    """Cells [C, 3] of the tile that may hold faces which are near enough to seen surface."""
+def _near_cells(
+    view: ComposedView, filled: FilledVoxels, first: Longs, lattice: TileLattice
+) -> Longs:
+    """Cells [C, 3] of the tile that may hold faces near enough to seen or continued surface."""
     middles = (first[:, None] + np.arange(lattice.cells) + 0.5) * np.float64(lattice.cell_m)
     near = view.surface_in_grid(middles, lattice.cell_m / 2 + lattice.reach_m)
+    if len(filled.voxels):
+        around = cells_around(filled, view.voxel_m, lattice.cell_m, lattice.reach_m) - first
+        inside = ((around >= 0) & (around < lattice.cells)).all(axis=1)
+        near[tuple(around[inside].T)] = True
     return _by_group(np.flatnonzero(near), lattice.cells, lattice.group)
 
 

@@ -62,8 +62,8 @@ class TileLattice:
 
         ``low`` and ``high`` [N, 3] are the boxes' corners, metres, map frame.
         """
-        boxes = each_once(_tile_boxes(low, high, margin_m, self.tile_side_m))
-        return each_once(cells_of_boxes(boxes[:, :3], boxes[:, 3:])[0])
+        boxes = _each_once(_tile_boxes(low, high, margin_m, self.tile_side_m))
+        return _each_once(cells_of_boxes(boxes[:, :3], boxes[:, 3:])[0])
 
 
 def check_level(level: int) -> None:
@@ -76,7 +76,7 @@ def check_level(level: int) -> None:
         raise RefusedError("bad_request", f"level = {level} is out of range: use 0 to {LEVELS - 1}")
 
 
-def each_once(rows: Longs) -> Longs:
+def _each_once(rows: Longs) -> Longs:
     """The different ones of rows [N, D], in order."""
     if len(rows) == 0:
         return rows
