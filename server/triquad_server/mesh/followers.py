@@ -1,14 +1,8 @@
-"""Clients that follow the mesh: their pending requests, the replies to them, and sending these.
+"""Clients that follow the mesh: their pending requests, and the replies to them."""
 
-A client that does not read, or is slow, holds up no other.
-"""
-
-import logging
 import math
-import threading
 import time
-from collections import Counter, OrderedDict
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -20,20 +14,10 @@ from triquad_format.wire.limits import MAX_KNOWN_TILES
 from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
 from triquad_map.box import check_box
 from triquad_map.compiled.mesh.tile_lattice import TileIndex, TileLattice, check_level
-from triquad_map.compiled.priority import lower_priority
 
-from triquad_server.fair_queue import Owner
+from triquad_server.fair_queue import Owner, first_to_go
 from triquad_server.mesh.tile_cache import CachedTile
-from triquad_server.process.threads import NICENESS, submit
 from triquad_server.settings import MeshSettings
-
-_log = logging.getLogger(__name__)
-
-_SENDERS = 16
-"""Replies on their way at a time: clients that do not read them hold up no others."""
-
-MAX_CLIENTS = 1024
-"""Of more, those heard of longest ago are forgotten."""
 
 BURST_S = 1.0
 """A client that asked for nothing for so long may be sent as many seconds' worth at once."""
@@ -151,6 +135,24 @@ def check_updates(asks: TileUpdatesRequest, server: str, revision: int) -> None:
         )
 
 
+def one_too_many(pending: Sequence[Follower], sending: int, limit: int) -> tuple[int, str] | None:
+    """Which of the followers is to be refused, and why: the newest of the client that has most.
+
+    None: with the replies that are being sent they are no more than the ``limit``, and they do not
+    take too much memory.
+    """
+    held = sum(follower.nbytes for follower in pending)
+    if len(pending) + sending > limit:
+        sizes = [(follower.request.owner, 1) for follower in pending]
+        text = f"{limit} followers of the mesh wait already; try later"
+    elif held > MAX_HELD_BYTES:
+        sizes = [(follower.request.owner, follower.nbytes) for follower in pending]
+        text = f"followers of the mesh take {held} bytes already: name fewer known tiles"
+    else:
+        return None
+    return first_to_go(sizes), text
+
+
 def _check_held(asks: TileUpdatesRequest) -> None:
     if len(asks.known) != len(asks.known_versions):
         raise RefusedError(
@@ -207,95 +209,3 @@ class TileReply:
 
 def _indices(tiles: list[TileIndex]) -> Ints:
     return np.array(tiles, np.int32).reshape(-1, 3)
-
-
-@dataclass
-class _Bucket:
-    """What a client may be sent; less than nothing where it was sent more."""
-
-    tokens: float  # bytes
-    at_s: float
-
-
-class Bandwidth:
-    """How many bytes a second each client is sent: a token bucket for each, by its name.
-
-    Times are monotonic seconds. A rate of infinity sets no limit.
-    """
-
-    def __init__(self) -> None:
-        self._buckets: OrderedDict[str, _Bucket] = OrderedDict()
-
-    def may_send(self, client: str, bytes_per_s: float, now_s: float) -> bool:
-        """Whether it is time to send to a client again."""
-        return math.isinf(bytes_per_s) or self._filled(client, bytes_per_s, now_s).tokens > 0
-
-    def spend(self, client: str, count: int, bytes_per_s: float, now_s: float) -> None:
-        """Count bytes that are sent to a client."""
-        if not math.isinf(bytes_per_s):
-            self._filled(client, bytes_per_s, now_s).tokens -= count
-
-    def _filled(self, client: str, bytes_per_s: float, now_s: float) -> _Bucket:
-        most = bytes_per_s * BURST_S
-        bucket = self._buckets.setdefault(client, _Bucket(most, now_s))
-        self._buckets.move_to_end(client)
-        bucket.tokens = min(most, bucket.tokens + bytes_per_s * (now_s - bucket.at_s))
-        bucket.at_s = now_s
-        if len(self._buckets) > MAX_CLIENTS:
-            self._buckets.popitem(last=False)
-        return bucket
-
-
-class TileSenders:
-    """Sends replies, on threads of its own, to each client as fast as it may be sent to."""
-
-    def __init__(self) -> None:
-        self._bandwidth = Bandwidth()
-        self._lock = threading.Lock()
-        self._sending: Counter[Owner] = Counter()  # replies that are not sent yet
-        self._threads = ThreadPoolExecutor(
-            _SENDERS, "tile-sender", initializer=lower_priority, initargs=(NICENESS,)
-        )
-
-    @property
-    def sending(self) -> int:
-        """Replies that are not sent yet."""
-        with self._lock:
-            return self._sending.total()
-
-    def is_sending_to(self, follower: Follower) -> bool:
-        """Whether a reply to the same client is on its way: the next waits until it has arrived."""
-        with self._lock:
-            return self._sending[follower.request.owner] > 0
-
-    def may_send(self, follower: Follower) -> bool:
-        """Whether it is time to send to a follower's client again. For one thread."""
-        return self._bandwidth.may_send(
-            follower.asks.client, follower.bytes_per_s, time.monotonic()
-        )
-
-    def send(self, follower: Follower, reply: TileUpdates) -> None:
-        """Send a reply, in the background. For the thread that asks :meth:`may_send`."""
-        self._bandwidth.spend(
-            follower.asks.client, len(reply.data), follower.bytes_per_s, now_s=time.monotonic()
-        )
-        with self._lock:
-            self._sending[follower.request.owner] += 1
-        submit(self._threads, self._answer, follower, reply)
-
-    def refuse(self, follower: Follower, code: str, text: str) -> None:
-        """Refuse a request, in the background."""
-        submit(self._threads, follower.request.refuse, code, text)
-
-    def close(self) -> None:
-        """Send what is left, and end."""
-        self._threads.shutdown()
-
-    def _answer(self, follower: Follower, reply: TileUpdates) -> None:
-        try:
-            follower.request.answer(reply)
-        except Exception:
-            _log.exception("a reply to a follower of the mesh could not be sent")
-        finally:
-            with self._lock:
-                self._sending -= Counter([follower.request.owner])

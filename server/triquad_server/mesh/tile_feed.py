@@ -2,6 +2,7 @@
 there are tiles that they do not have."""
 
 import logging
+import math
 import threading
 import time
 
@@ -12,18 +13,17 @@ from triquad_map.compiled.mesh.tile_lattice import TileIndex
 from triquad_map.compiled.priority import lower_priority
 
 from triquad_server.epochs.history import EpochHistory
-from triquad_server.fair_queue import first_to_go
 from triquad_server.mesh.followers import (
     BURST_S,
-    MAX_HELD_BYTES,
     Follower,
     PendingRequest,
     TileReply,
-    TileSenders,
     check_updates,
     new_follower,
+    one_too_many,
 )
 from triquad_server.mesh.tile_cache import CachedTile, TileCache, TileDelta
+from triquad_server.mesh.tile_senders import TileSenders
 from triquad_server.process.threads import NICENESS
 from triquad_server.settings import MeshSettings
 
@@ -33,7 +33,9 @@ _STOPPING = "the server is stopping"
 _HOLDS_S = 5.0
 """For so long after the last follower an epoch is held, of which tiles may be made."""
 
-_PAUSE_S = 0.1
+_NOW_S = 0.0
+"""There may be something to do at once."""
+
 _SLICE_S = 0.2  # tiles are made so long for one follower, then for the next
 _GIVE_WAY_S = 0.1
 _MAX_REFRESH_SHARE = 4
@@ -66,11 +68,13 @@ class TileFeed:
         self._server = server
         self._settings = settings
         self._limit = limit
-        self._changed = threading.Condition()  # what is pending, or whether to stop
+        self._changed = threading.Condition()  # what is pending, woken, or whether to stop
+        self._woken = False  # there is a new request or epoch, or a reply was sent
         self._pending: list[Follower] = []
         self._stopping = False
         self._next_refresh_s = 0.0
-        self._senders = TileSenders()
+        self._senders = TileSenders(self._wake)
+        epochs.listen(self._wake)
         self._thread = threading.Thread(target=self._run, name="meshing")
         self._thread.start()
 
@@ -84,10 +88,7 @@ class TileFeed:
     def nbytes(self) -> int:
         """Bytes of the followers that wait."""
         with self._changed:
-            return self._held_bytes()
-
-    def _held_bytes(self) -> int:
-        return sum(follower.nbytes for follower in self._pending)
+            return sum(follower.nbytes for follower in self._pending)
 
     def close(self) -> None:
         """Refuse what is pending, and end."""
@@ -117,20 +118,18 @@ class TileFeed:
                 raise RefusedError("timeout", _STOPPING)
             self._pending.append(follower)
             self._refuse_excess()
+            self._woken = True
+            self._changed.notify_all()
+
+    def _wake(self) -> None:
+        with self._changed:
+            self._woken = True
             self._changed.notify_all()
 
     def _refuse_excess(self) -> None:
-        """Refuse what is too much, of whoever has most."""
-        while self._pending:
-            if len(self._pending) + self._senders.sending > self._limit:
-                sizes = [(follower.request.owner, 1) for follower in self._pending]
-                text = f"{self._limit} followers of the mesh wait already; try later"
-            elif (held := self._held_bytes()) > MAX_HELD_BYTES:
-                sizes = [(follower.request.owner, follower.nbytes) for follower in self._pending]
-                text = f"followers of the mesh take {held} bytes already: name fewer known tiles"
-            else:
-                return
-            self._senders.refuse(self._pending.pop(first_to_go(sizes)), "busy", text)
+        while refused := one_too_many(self._pending, self._senders.sending, self._limit):
+            row, text = refused
+            self._senders.refuse(self._pending.pop(row), "busy", text)
 
     def _run(self) -> None:
         lower_priority(NICENESS)
@@ -142,24 +141,28 @@ class TileFeed:
                 if self._stopping:
                     break
                 pending = list(self._pending)
-            self._refresh()
-            served = [self._serve_safely(follower) for follower in pending]
-            if not any(served):
-                with self._changed:
-                    if len(self._pending) == len(pending) and not self._stopping:
-                        self._changed.wait(_PAUSE_S)
+                self._woken = False
+            again_s = min([self._refresh(), *map(self._serve_safely, pending)])
+            with self._changed:
+                left_s = max(0.0, min(again_s - time.monotonic(), threading.TIMEOUT_MAX))
+                self._changed.wait_for(lambda: self._woken or self._stopping, left_s)
         for follower in self._pending:
             self._senders.refuse(follower, "timeout", _STOPPING)
 
     def _is_wanted(self) -> bool:
         return bool(self._pending) or self._stopping
 
-    def _refresh(self) -> None:
-        """Find out what changed, where there may be something and it is time."""
+    def _refresh(self) -> float:
+        """Find out what changed, where there may be something and it is time.
+
+        Returns when to do so again, monotonic seconds; infinity: after the next epoch.
+        """
         started = time.monotonic()
         newest = self._epochs.newest
-        if newest.number <= self._cache.made_from or started < self._next_refresh_s:
-            return
+        if newest.number <= self._cache.made_from:
+            return math.inf
+        if started < self._next_refresh_s:
+            return self._next_refresh_s
         try:
             self._cache.refresh(newest)
         except Exception:
@@ -168,52 +171,60 @@ class TileFeed:
         self._next_refresh_s = now + max(
             self._settings.update_period_s, _MAX_REFRESH_SHARE * (now - started)
         )
+        is_current = self._epochs.newest.number <= self._cache.made_from
+        return math.inf if is_current else self._next_refresh_s
 
-    def _serve_safely(self, follower: Follower) -> bool:
+    def _serve_safely(self, follower: Follower) -> float:
         """As :meth:`_serve`; an internal error ends this request only."""
         try:
             return self._serve(follower)
         except Exception as error:
             with self._changed:
                 if follower not in self._pending:  # it was refused
-                    return True
+                    return _NOW_S
                 self._pending.remove(follower)
             follower.request.fail(error)
-            return True
+            return _NOW_S
 
-    def _serve(self, follower: Follower) -> bool:
-        """Whether anything was done for a follower: it was answered, or tiles were made for it."""
+    def _serve(self, follower: Follower) -> float:
+        """Answer a follower, or make tiles for it, if that can be done now.
+
+        Returns when there may be more to do for it, monotonic seconds, unless something wakes the
+        feed before: a new epoch, or a reply that was sent.
+        """
         if self._senders.is_sending_to(follower):
-            return False
+            return math.inf
         state = (self._cache.epoch, self._cache.revision)
-        can_make = self._cache.made_from >= 0
-        if not can_make or follower.nothing_at == state or not self._senders.may_send(follower):
+        if self._cache.made_from < 0 or follower.nothing_at == state:
             return self._answer_if_late(follower, knows_all=follower.nothing_at == state)
+        ready_s = self._senders.ready_s(follower)
+        if ready_s > time.monotonic():
+            return min(ready_s, self._answer_if_late(follower, knows_all=False))
         asks = follower.asks
         delta = self._cache.delta(
             asks.level, asks.minimum, asks.maximum, known_to=follower.known_to, known=follower.known
         )
         if delta.ready or (delta.removed and not delta.to_make):
             self._send(follower, self._filled(follower, delta))
-            return True
-        if delta.to_make:
+        elif delta.to_make:
             self._make(asks.level, delta.missing or delta.outdated)
-            return True
-        if follower.restart and self._is_current_for(follower):
+        elif follower.restart and self._is_current_for(follower):
             self._send(follower, TileReply(complete=True, revision=delta.revision))
-            return True
-        follower.known_to = delta.revision
-        follower.nothing_at = state
-        return False
+        else:
+            follower.known_to = delta.revision
+            follower.nothing_at = state
+            return self._answer_if_late(follower, knows_all=True)
+        return _NOW_S
 
-    def _answer_if_late(self, follower: Follower, *, knows_all: bool) -> bool:
-        """Answer a follower without tiles, if its time is over."""
+    def _answer_if_late(self, follower: Follower, *, knows_all: bool) -> float:
+        """Answer a follower without tiles, if its time is over; returns when it is."""
         current = self._is_current_for(follower)
-        grace_s = 0.0 if current else _REFRESH_GRACE_S
-        if time.monotonic() < follower.deadline_s + grace_s:
-            return False
-        self._send(follower, TileReply(complete=current and knows_all, revision=follower.known_to))
-        return True
+        late_s = follower.deadline_s + (0.0 if current else _REFRESH_GRACE_S)
+        if time.monotonic() >= late_s:
+            reply = TileReply(complete=current and knows_all, revision=follower.known_to)
+            self._send(follower, reply)
+            return math.inf
+        return late_s
 
     def _is_current_for(self, follower: Follower) -> bool:
         """Whether the cache knows the epoch that was the newest when the request came."""

@@ -1,5 +1,6 @@
 """Who may wait for tiles, where too many do."""
 
+import math
 import threading
 from contextlib import closing
 
@@ -10,7 +11,7 @@ from triquad_format.wire.messages import TileUpdates
 from triquad_map.compiled.team import Team
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mesh import tile_feed
+from triquad_server.mesh import followers, tile_feed
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_feed import TileFeed
 from triquad_server.process.threads import Teams
@@ -25,7 +26,7 @@ def pending(owner: str, known: int = 0) -> PendingRequest:
 
 @pytest.fixture
 def feed(monkeypatch):
-    monkeypatch.setattr(TileFeed, "_serve_safely", lambda *_: False)  # all wait
+    monkeypatch.setattr(TileFeed, "_serve_safely", lambda *_: math.inf)  # all wait
     settings, teams = servers.SMALL, Teams()
     epochs = EpochHistory(Mapper("m", settings, "cpu", teams=teams).publish(), settings.service)
     cache = TileCache(settings.mesh, teams.meshing)
@@ -45,7 +46,7 @@ def test_who_follows_too_often_is_refused_and_no_other(feed):
 
 
 def test_who_names_too_many_tiles_is_refused_and_no_other(feed, monkeypatch):
-    monkeypatch.setattr(tile_feed, "MAX_HELD_BYTES", 100_000)
+    monkeypatch.setattr(followers, "MAX_HELD_BYTES", 100_000)
     greedy = [pending("greedy", known=150) for _ in range(2)]
     honest = [pending("honest") for _ in range(2)]
     for request in (*greedy, *honest):

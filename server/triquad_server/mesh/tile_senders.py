@@ -1,0 +1,127 @@
+"""Sending replies to clients that follow the mesh. One that does not read holds up no other."""
+
+import logging
+import math
+import threading
+import time
+from collections import Counter, OrderedDict
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+from triquad_format.wire.messages import TileUpdates
+from triquad_map.compiled.priority import lower_priority
+
+from triquad_server.fair_queue import Owner
+from triquad_server.mesh.followers import BURST_S, Follower
+from triquad_server.process.threads import NICENESS, submit
+
+_log = logging.getLogger(__name__)
+
+_SENDERS = 16
+"""Replies on their way at a time: clients that do not read them hold up no others."""
+
+MAX_CLIENTS = 1024
+"""Of more, those heard of longest ago are forgotten."""
+
+
+@dataclass
+class _Bucket:
+    """What a client may be sent; less than nothing where it was sent more."""
+
+    tokens: float  # bytes
+    at_s: float
+
+
+class Bandwidth:
+    """How many bytes a second each client is sent: a token bucket for each, by its name.
+
+    Times are monotonic seconds. A rate of infinity sets no limit.
+    """
+
+    def __init__(self) -> None:
+        self._buckets: OrderedDict[str, _Bucket] = OrderedDict()
+
+    def may_send(self, client: str, bytes_per_s: float, now_s: float) -> bool:
+        """Whether it is time to send to a client again."""
+        return math.isinf(bytes_per_s) or self._filled(client, bytes_per_s, now_s).tokens > 0
+
+    def ready_s(self, client: str, bytes_per_s: float, now_s: float) -> float:
+        """When it will be time to send to a client again, monotonic seconds."""
+        if self.may_send(client, bytes_per_s, now_s):
+            return now_s
+        return now_s + (1.0 - self._buckets[client].tokens) / bytes_per_s
+
+    def spend(self, client: str, count: int, bytes_per_s: float, now_s: float) -> None:
+        """Count bytes that are sent to a client."""
+        if not math.isinf(bytes_per_s):
+            self._filled(client, bytes_per_s, now_s).tokens -= count
+
+    def _filled(self, client: str, bytes_per_s: float, now_s: float) -> _Bucket:
+        most = bytes_per_s * BURST_S
+        bucket = self._buckets.setdefault(client, _Bucket(most, now_s))
+        self._buckets.move_to_end(client)
+        bucket.tokens = min(most, bucket.tokens + bytes_per_s * (now_s - bucket.at_s))
+        bucket.at_s = now_s
+        if len(self._buckets) > MAX_CLIENTS:
+            self._buckets.popitem(last=False)
+        return bucket
+
+
+class TileSenders:
+    """Sends replies, on threads of its own, to each client as fast as it may be sent to."""
+
+    def __init__(self, on_sent: Callable[[], None]) -> None:
+        """``on_sent`` is called after each reply, in the thread that sent it."""
+        self._on_sent = on_sent
+        self._bandwidth = Bandwidth()
+        self._lock = threading.Lock()
+        self._sending: Counter[Owner] = Counter()  # replies that are not sent yet
+        self._threads = ThreadPoolExecutor(
+            _SENDERS, "tile-sender", initializer=lower_priority, initargs=(NICENESS,)
+        )
+
+    @property
+    def sending(self) -> int:
+        """Replies that are not sent yet."""
+        with self._lock:
+            return self._sending.total()
+
+    def is_sending_to(self, follower: Follower) -> bool:
+        """Whether a reply to the same client is on its way: the next waits until it has arrived."""
+        with self._lock:
+            return self._sending[follower.request.owner] > 0
+
+    def ready_s(self, follower: Follower) -> float:
+        """When a follower's client may be sent something again, monotonic seconds: now, if it may.
+
+        For one thread.
+        """
+        return self._bandwidth.ready_s(follower.asks.client, follower.bytes_per_s, time.monotonic())
+
+    def send(self, follower: Follower, reply: TileUpdates) -> None:
+        """Send a reply, in the background. For the thread that asks :meth:`ready_s`."""
+        self._bandwidth.spend(
+            follower.asks.client, len(reply.data), follower.bytes_per_s, now_s=time.monotonic()
+        )
+        with self._lock:
+            self._sending[follower.request.owner] += 1
+        submit(self._threads, self._answer, follower, reply)
+
+    def refuse(self, follower: Follower, code: str, text: str) -> None:
+        """Refuse a request, in the background."""
+        submit(self._threads, follower.request.refuse, code, text)
+
+    def close(self) -> None:
+        """Send what is left, and end."""
+        self._threads.shutdown()
+
+    def _answer(self, follower: Follower, reply: TileUpdates) -> None:
+        try:
+            follower.request.answer(reply)
+        except Exception:
+            _log.exception("a reply to a follower of the mesh could not be sent")
+        finally:
+            with self._lock:
+                self._sending -= Counter([follower.request.owner])
+            self._on_sent()
