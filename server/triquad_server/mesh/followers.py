@@ -16,7 +16,7 @@ from triquad_map.box import check_box
 from triquad_map.compiled.mesh.tile_lattice import TileIndex, TileLattice, check_level
 
 from triquad_server.fair_queue import Owner, first_to_go
-from triquad_server.mesh.tile_cache import CachedTile
+from triquad_server.mesh.tile_level import CachedTile
 from triquad_server.settings import MeshSettings
 
 BURST_S = 1.0
@@ -24,6 +24,10 @@ BURST_S = 1.0
 
 MAX_HELD_BYTES = 64_000_000
 """Of all requests that are held together; more are refused, of the client that has most."""
+
+_REFRESH_GRACE_S = 10.0
+"""So long after its deadline, a request may wait for the epoch that was the newest when it came to
+be refreshed from; that takes a fraction of this."""
 
 _FOLLOWER_BYTES, _KNOWN_BYTES = 4096, 300
 """Of one that is held, and of each tile that it names as known."""
@@ -66,6 +70,14 @@ class Follower:
     known_to: int  # it knows everything up to this revision
     known: dict[TileIndex, int]  # versions of tiles that it has whatever the revision
     nothing_at: tuple[int, int] | None = None  # state of the cache that had nothing for it
+
+    def is_current(self, epoch: int) -> bool:
+        """Whether ``epoch`` is no older than the newest when the request came."""
+        return epoch >= self.needs_epoch
+
+    def late_s(self, epoch: int) -> float:
+        """When it has to be answered, with tiles or without, by a cache that knows ``epoch``."""
+        return self.deadline_s + (0.0 if self.is_current(epoch) else _REFRESH_GRACE_S)
 
     @property
     def nbytes(self) -> int:

@@ -1,5 +1,4 @@
-"""The feed of mesh tiles: requests of followers are pending, without holding up any worker, until
-there are tiles that they do not have."""
+"""The feed of mesh tiles: requests are pending, and hold up no worker, until there are tiles."""
 
 import logging
 import math
@@ -22,7 +21,8 @@ from triquad_server.mesh.followers import (
     new_follower,
     one_too_many,
 )
-from triquad_server.mesh.tile_cache import CachedTile, TileCache, TileDelta
+from triquad_server.mesh.tile_cache import TileCache
+from triquad_server.mesh.tile_level import CachedTile, TileDelta
 from triquad_server.mesh.tile_senders import TileSenders
 from triquad_server.process.threads import NICENESS
 from triquad_server.settings import MeshSettings
@@ -33,17 +33,11 @@ _STOPPING = "the server is stopping"
 _HOLDS_S = 5.0
 """For so long after the last follower an epoch is held, of which tiles may be made."""
 
-_NOW_S = 0.0
-"""There may be something to do at once."""
-
+_NOW_S = 0.0  # there may be something to do at once
 _SLICE_S = 0.2  # tiles are made so long for one follower, then for the next
 _GIVE_WAY_S = 0.1
 _MAX_REFRESH_SHARE = 4
 """Refreshing the cache takes at most one part in so many of the thread's time."""
-
-_REFRESH_GRACE_S = 10.0
-"""So long after its deadline, a request may wait for the epoch that was the newest when it came to
-be refreshed from; that takes a fraction of this."""
 
 
 class TileFeed:
@@ -208,7 +202,7 @@ class TileFeed:
             self._send(follower, self._filled(follower, delta))
         elif delta.to_make:
             self._make(asks.level, delta.missing or delta.outdated)
-        elif follower.restart and self._is_current_for(follower):
+        elif follower.restart and follower.is_current(self._cache.epoch):
             self._send(follower, TileReply(complete=True, revision=delta.revision))
         else:
             follower.known_to = delta.revision
@@ -218,17 +212,12 @@ class TileFeed:
 
     def _answer_if_late(self, follower: Follower, *, knows_all: bool) -> float:
         """Answer a follower without tiles, if its time is over; returns when it is."""
-        current = self._is_current_for(follower)
-        late_s = follower.deadline_s + (0.0 if current else _REFRESH_GRACE_S)
+        late_s = follower.late_s(self._cache.epoch)
         if time.monotonic() >= late_s:
-            reply = TileReply(complete=current and knows_all, revision=follower.known_to)
-            self._send(follower, reply)
+            complete = knows_all and follower.is_current(self._cache.epoch)
+            self._send(follower, TileReply(complete=complete, revision=follower.known_to))
             return math.inf
         return late_s
-
-    def _is_current_for(self, follower: Follower) -> bool:
-        """Whether the cache knows the epoch that was the newest when the request came."""
-        return self._cache.epoch >= follower.needs_epoch
 
     def _make(self, level: int, indices: list[TileIndex]) -> None:
         """Make tiles for a moment; queries come first."""
@@ -261,7 +250,7 @@ class TileFeed:
                 reply.add(tile, data)
         if reply.complete:
             reply.revision = delta.revision
-            reply.complete = self._is_current_for(follower)
+            reply.complete = follower.is_current(self._cache.epoch)
         return reply
 
     def _encoded(self, level: int, tile: CachedTile) -> bytes | None:

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from triquad_map.compiled.mesh.tile_border import TileBorder
 from triquad_server.mesh.followers import TileReply
-from triquad_server.mesh.tile_cache import CachedTile, TileBytes, tile_lattice
+from triquad_server.mesh.tile_cache import tile_lattice
+from triquad_server.mesh.tile_level import CachedTile, TileBytes
 from triquad_server.mesh.tile_senders import MAX_CLIENTS, Bandwidth
 from triquad_server.settings import MeshSettings
 

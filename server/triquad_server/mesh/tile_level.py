@@ -1,0 +1,145 @@
+"""The tiles of one level of detail as they were made, and which of them are out of date."""
+
+from collections import OrderedDict
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from triquad_format.records.arrays import Doubles
+from triquad_map.compiled.mesh.tile_border import TileBorder
+from triquad_map.compiled.mesh.tile_lattice import TileIndex, TileLattice
+
+from triquad_server.mesh.surface_changes import Changes
+
+_AROUND = [
+    (x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) != (0, 0, 0)
+]
+
+TileKey = tuple[int, TileIndex]
+"""Level of detail and index of a tile."""
+
+
+class TileBytes:
+    """Encoded tiles in memory; those unused for longest are dropped where there are too many."""
+
+    def __init__(self, limit: int) -> None:
+        """Keep at most ``limit`` bytes, or a single tile that is larger."""
+        self._limit = limit
+        self.size = 0  # bytes of the tiles that are kept
+        self._data: OrderedDict[TileKey, bytes] = OrderedDict()  # longest unused first
+
+    def get(self, key: TileKey) -> bytes | None:
+        """The bytes of a tile, None where they are gone."""
+        data = self._data.get(key)
+        if data is not None:
+            self._data.move_to_end(key)
+        return data
+
+    def put(self, key: TileKey, data: bytes) -> None:
+        """Keep the bytes of a tile."""
+        self.size += len(data) - len(self._data.pop(key, b""))
+        self._data[key] = data
+        while self.size > self._limit and len(self._data) > 1:
+            _, dropped = self._data.popitem(last=False)
+            self.size -= len(dropped)
+
+
+@dataclass(frozen=True)
+class CachedTile:
+    """A tile that was made. Its bytes may be gone; what neighbours need of it never is."""
+
+    index: TileIndex
+    version: int  # epoch of which its bytes are
+    revision: int  # its place in the order in which bytes came to differ
+    made: int  # epoch with which it was last found to agree
+    empty: bool  # without faces
+    digest: bytes
+    border: TileBorder
+
+
+@dataclass(frozen=True)
+class TileDelta:
+    """What somebody does not know of the tiles of a box."""
+
+    ready: list[CachedTile]  # by increasing revision; empty ones are to be removed
+    removed: list[TileIndex]  # that the other side has, and that were never here
+    missing: list[TileIndex]  # that were never made
+    outdated: list[TileIndex]  # that have to be made anew, those made longest ago first
+    revision: int  # who knows all of this knows everything up to here
+
+    @property
+    def to_make(self) -> list[TileIndex]:
+        """All that have to be made, the most needed first."""
+        return self.missing + self.outdated
+
+
+class TileLevel:
+    """The tiles of one level of detail: which there are, and which of them are out of date."""
+
+    def __init__(self, lattice: TileLattice) -> None:
+        self.lattice = lattice
+        self.tiles: dict[TileIndex, CachedTile] = {}  # as they were last made
+        self.changed: dict[TileIndex, int] = {}  # epoch in which the surface last changed
+        self._indices = np.zeros((0, 3), np.int64)  # of ``changed``
+
+    def clean(self, index: TileIndex) -> CachedTile | None:
+        """The tile where it shows what the map has; None where it has to be made."""
+        tile = self.tiles.get(index)
+        return tile if tile is not None and self.changed.get(index, 0) <= tile.made else None
+
+    def record(self, changes: Changes, half_m: float, epoch: int) -> None:
+        """Record what changed in ``epoch``; voxels have sides of twice ``half_m``."""
+        low, high = changes.places - half_m, changes.places + half_m
+        touched = [
+            *self.lattice.tiles_meeting(low, high, self.lattice.margin_m).tolist(),
+            *self.lattice.tiles_meeting(changes.drifted, changes.drifted).tolist(),
+        ]
+        known = len(self.changed)
+        for x, y, z in touched:
+            self.changed[x, y, z] = epoch
+        if len(self.changed) > known:
+            self._indices = np.array(list(self.changed), np.int64)
+
+    def delta(
+        self,
+        low: Doubles,
+        high: Doubles,
+        known_to: int,
+        known: Mapping[TileIndex, int],
+        revision: int,
+    ) -> TileDelta:
+        """As :meth:`TileCache.delta`; ``revision`` is that of the newest tile of any level."""
+        ready: list[CachedTile] = []
+        missing: list[TileIndex] = []
+        outdated: list[TileIndex] = []
+        inside = self._indices[self.lattice.meets(self._indices, low, high)]
+        for x, y, z in inside.tolist():
+            index = (x, y, z)
+            tile = self.clean(index)
+            if tile is None:
+                (outdated if index in self.tiles else missing).append(index)
+                continue
+            unknown = tile.revision > known_to and known.get(index) != tile.version
+            if unknown and (not tile.empty or known_to or index in known):
+                ready.append(tile)
+        ready.sort(key=lambda tile: tile.revision)
+        outdated.sort(key=lambda index: (self.tiles[index].made, index))
+        removed = [index for index in known if index not in self.changed]
+        return TileDelta(ready, removed, sorted(missing), outdated=outdated, revision=revision)
+
+    def borders_around(self, index: TileIndex) -> dict[TileIndex, TileBorder]:
+        """What a tile has to agree with, by the tiles whose it is, in its own lattice.
+
+        That is its own border where only its bytes are gone, and those of all neighbours that show
+        what the map has: these agree with each other. The others will be made to fit it.
+        """
+        found: dict[TileIndex, TileBorder] = {}
+        own = self.clean(index)
+        if own is not None:
+            found[index] = own.border
+        for offset in _AROUND:
+            x, y, z = (a + b for a, b in zip(index, offset, strict=True))
+            neighbour = self.clean((x, y, z))
+            if neighbour is not None:
+                found[x, y, z] = neighbour.border.seen_from(offset, self.lattice.cells)
+        return found
