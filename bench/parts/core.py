@@ -73,19 +73,19 @@ def seen_points(epoch: Epoch, made: BenchStreet, rng: np.random.Generator) -> Do
 
 
 def _training(region: LiveRegion, settings: Settings) -> list[Figure]:
-    training = settings.training
+    training, learning = settings.training, region.training
     trainer = TensorTrainer(region.field)
     rates = Rates(_RATE, training.beta1, training.beta2, young_rate=_RATE)
     rng = np.random.default_rng(0)
 
     def baseline() -> None:
-        batch = region.pool.draw(region.batch, 0)
-        order = rng.permutation(region.batch)  # tensors do not put it in order
+        batch = learning.rays.pool.draw(learning.batch, 0)
+        order = rng.permutation(learning.batch)  # tensors do not put it in order
         trainer.train(Batch(batch.points[order], batch.labels[order]), rates)
 
-    step = compare(region.train, baseline, _ROUNDS, repeats=15)
+    step = compare(region.take_step, baseline, _ROUNDS, repeats=15)
     return [
-        Figure("training", region.batch / step.seconds / 1e6, "M samples/s", at_least=1.0),
+        Figure("training", learning.batch / step.seconds / 1e6, "M samples/s", at_least=1.0),
         Figure("training, times eager torch", step.ratio, "", at_least=8),
     ]
 

@@ -1,4 +1,4 @@
-"""Boxes of requests, which are checked before anything is searched in them."""
+"""Boxes that requests name, in the map frame."""
 
 import numpy as np
 from triquad_format.errors import RefusedError

@@ -27,10 +27,6 @@ class MapperStoppedError(ServerError):
     """The mapper thread has ended and takes no more commands."""
 
 
-class MapLostError(ServerError):
-    """The live map is not what it should be; its checkpoints and epochs are."""
-
-
 class ScanRefusedError(TriquadError):
     """A scan that cannot be used; ``reason`` is the short key under which it is counted."""
 

@@ -11,6 +11,7 @@ import zenoh
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import ServerStatus
 
+from triquad_server.epochs.history import EpochHistory
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper_thread import MapperThread
@@ -38,13 +39,14 @@ class Health:
     scans: ScanQueue
     warnings: ScanWarnings
     mapper: MapperThread
+    epochs: EpochHistory
     checkpoints: CheckpointThread
     map_max_bytes: int  # beyond which the map does not grow
     started_s: float = field(default_factory=time.monotonic)  # monotonic
 
     def status(self) -> ServerStatus:
         """Return the status now."""
-        epoch = self.mapper.epochs.newest
+        epoch = self.epochs.newest
         progress = self.mapper.progress
         refused: Counter[str] = Counter()  # of all operations, by error code
         for counts in self.operations.copy().values():
@@ -56,14 +58,14 @@ class Health:
             device=self.device,
             epoch=epoch.number,
             settled=progress.settled and len(self.scans) == 0,
-            scans_taken=progress.scans_taken,
+            scans_taken=progress.map.scans_taken,
             scans_dropped=self.scans.dropped.counts(),
             scans_lost=self.scans.ledger.lost(),
             scans_waiting=len(self.scans),
-            points_dropped=self.mapper.points_dropped.counts(),
+            points_dropped=self.scans.points_dropped.counts(),
             requests_refused=dict(refused),
-            samples_trained=progress.samples_trained,
-            rays_kept=progress.rays_kept,
+            samples_trained=progress.map.samples_trained,
+            rays_kept=progress.map.rays_kept,
             loss=float(progress.loss),
             regions=epoch.regions,
             vertices=epoch.vertices,
@@ -73,13 +75,13 @@ class Health:
             last_checkpoint=self.checkpoints.last,
             store_error=self.checkpoints.error,
             warnings=self.warnings.all(),
-            samples_left=progress.samples_left,
-            map_bytes=progress.map_bytes,
+            samples_left=progress.map.samples_left,
+            map_bytes=progress.map.map_bytes,
             map_max_bytes=self.map_max_bytes,
             fit=progress.fit,
-            rays_discarded=progress.rays_discarded,
-            replay_share=progress.replay_share,
-            samples_discarded=progress.samples_discarded,
+            rays_discarded=progress.map.rays_discarded,
+            replay_share=progress.map.replay_share,
+            samples_discarded=progress.map.samples_discarded,
         )
 
     def mapping_problem(self, stuck_s: float = STUCK_S) -> str | None:
@@ -109,8 +111,8 @@ class Health:
     def summary(self) -> str:
         """Return in a line what the server does, and what keeps it from that."""
         doing = (
-            f"serving map '{self.map_name}': epoch {self.mapper.epochs.newest.number}, "
-            f"{self.mapper.progress.scans_taken} scans taken"
+            f"serving map '{self.map_name}': epoch {self.epochs.newest.number}, "
+            f"{self.mapper.progress.map.scans_taken} scans taken"
         )
         problem = self.problem()
         return doing if problem is None else f"{doing}; {problem}"

@@ -34,11 +34,15 @@ from triquad_format.wire.query_messages import (
 from triquad_format.wire.source_messages import SourcesRequest
 from triquad_map.questions.answers import Answers, QuestionLimits
 
+from triquad_server.epochs.history import EpochHistory
+from triquad_server.epochs.surface_history import SurfaceHistory
 from triquad_server.health import Health, Heartbeat
 from triquad_server.intake.flush import FlushHandler
 from triquad_server.intake.scan import ScanIntake
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
+from triquad_server.intake.source_trails import SourceTrails
+from triquad_server.mapping.listeners import MapListeners
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.mesh.tile_cache import TileCache
@@ -101,6 +105,12 @@ class Service:
             session, served.name, settings.service, give_way=self._scans.give_way
         )
         self._warnings = ScanWarnings(self._scans, settings)
+        first = served.mapper.publish()
+        self._epochs = EpochHistory(
+            first, settings.service, older_bytes=settings.memory.epochs_bytes
+        )
+        self._surface = SurfaceHistory(first, settings.service.changes_kept)
+        self._trails = SourceTrails(first.field_settings.leaf_m)
         self._parts = ExitStack()  # closed in reverse order of opening
         try:
             self._open(failed)
@@ -111,7 +121,7 @@ class Service:
     @property
     def epoch(self) -> int:
         """Number of the newest epoch."""
-        return self._mapper.epochs.newest.number
+        return self._epochs.newest.number
 
     @property
     def own_name(self) -> str:
@@ -144,6 +154,7 @@ class Service:
             scans=self._scans,
             warnings=self._warnings,
             mapper=self._mapper,
+            epochs=self._epochs,
             checkpoints=checkpoints,
             map_max_bytes=self._settings.memory.max_bytes,
         )
@@ -153,7 +164,12 @@ class Service:
         tiles = self._serve_mesh(health.server)
         downloads = self._serve_downloads(health.server)
         self.metrics = Metrics(
-            health, self._session, tiles=tiles, downloads=downloads, queues=self._operations.queues
+            health,
+            self._session,
+            self._surface,
+            tiles=tiles,
+            downloads=downloads,
+            queues=self._operations.queues,
         )
         self._serve_status()
         checkpoints.start()
@@ -167,6 +183,7 @@ class Service:
             checkpoints,
             self._served.store,
             protect_h=self._settings.store.protect_h,
+            trails=self._trails,
         )
         self._operations.serve(
             keys.CHECKPOINT, answering(CheckpointRequest, checkpoints.answer), Lane.SLOW
@@ -174,7 +191,7 @@ class Service:
         self._operations.serve(keys.RESET, answering(ResetRequest, resets.answer), Lane.SLOW)
         # Closed before the last checkpoint is written: it shows every reset that was answered.
         self._parts.callback(self._operations.close)
-        self._parts.callback(self._mapper.rest)
+        self._parts.callback(self._mapper.pause)
         self._open_intake()
         self._parts.callback(Heartbeat(self._session, health).close)
         alive = keys.alive_key(health.map_name, health.server)
@@ -185,10 +202,12 @@ class Service:
         mapper = MapperThread(
             self._served.mapper,
             self._scans,
-            self._settings.service,
+            self._epochs,
+            self._settings.service.publish_period_s,
             failed=failed,
-            warnings=self._warnings,
-            memory=self._settings.memory,
+            listeners=MapListeners(
+                scan_taken=(self._warnings.add, self._trails.add), published=(self._surface.add,)
+            ),
         )
         mapper.start()
         self._parts.callback(mapper.close)
@@ -205,16 +224,16 @@ class Service:
         self._parts.callback(intake.close)
 
     def _serve_queries(self) -> None:
-        answers = Answers(self._mapper.epochs.view, QuestionLimits())
+        answers = Answers(self._epochs.view, QuestionLimits())
         for name, kind in _QUESTIONS.items():
             self._operations.serve(name, answering(kind, answers.answer), max_bytes=_QUESTION_BYTES)
 
     def _serve_changes(self, server: str) -> None:
-        queries = ChangeQueries(self._mapper.epochs, self._mapper.surface, server)
+        queries = ChangeQueries(self._epochs, self._surface, server)
         self._operations.serve(keys.CHANGES, answering(ChangesRequest, queries.changes))
 
     def _serve_sources(self, server: str) -> None:
-        queries = SourceQueries(self._mapper.trails, server)
+        queries = SourceQueries(self._trails, server)
         self._operations.serve(keys.SOURCES, answering(SourcesRequest, queries.sources))
 
     def _serve_mesh(self, server: str) -> TileCache:
@@ -222,13 +241,13 @@ class Service:
         cache = TileCache(self._settings.mesh, self._served.teams.meshing)
         feed = TileFeed(
             cache,
-            self._mapper.epochs,
+            self._epochs,
             server=server,
             settings=self._settings.mesh,
             limit=self._settings.service.request_queue,
         )
         self._parts.callback(feed.close)
-        tiles = TileQueries(self._mapper.epochs, cache)
+        tiles = TileQueries(self._epochs, cache)
         self._operations.serve(keys.TILE_LIST, answering(TileListRequest, tiles.tiles))
         self._operations.serve(keys.MESH, answering(MeshRequest, tiles.mesh))
         self._operations.serve(
@@ -256,7 +275,7 @@ class Service:
             self._operations.serve(name, handler, Lane.ADMINISTRATION)
 
     def _serve_downloads(self, server: str) -> MapDownloads:
-        downloads = MapDownloads(self._mapper, server)
+        downloads = MapDownloads(self._mapper, self._epochs, server)
         self._operations.serve(keys.MAP_INFO, answering(MapInfoRequest, downloads.info), Lane.SLOW)
         self._operations.serve(keys.MAP_CHUNK, answering(MapChunkRequest, downloads.chunk))
         return downloads

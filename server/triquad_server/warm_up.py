@@ -124,14 +124,15 @@ class _SyntheticMap:
     def restored_training(self) -> None:
         """Train it further in part, as what is restored and then seen again."""
         (region, *_) = self._restored.regions
-        blocks = region.evidence.surface_blocks()
+        pool = region.training.rays.pool
+        blocks = region.evidence.live.surface_blocks()
         region.field.hold(region.field.tree.rows_under(blocks, BLOCK_VOXELS))
         region.field.live_view().evaluate(self._directions.astype(np.float32), gradient=True)
-        region.pool.focus(blocks)
+        pool.focus(blocks)
         self._restored.train()
-        region.pool.limit(len(region.pool) - 1)
-        new = np.arange(len(region.pool)) < len(region.pool) // 4
-        region.pool.add(region.pool.table.of(new))  # in place of others
+        pool.limit(len(pool) - 1)
+        new = np.arange(len(pool)) < len(pool) // 4
+        pool.add(pool.table.of(new))  # in place of others
 
     def removal(self) -> None:
         """Have rays pass the sphere until it is removed."""

@@ -33,7 +33,7 @@ class Watched:
         sighting = Sighting(sensor, 0.2, self.scans, scan=self.scans)
         marks = self.evidence.mark_surface(ends, sighting)
         passed = self.evidence.carve(sensor, ends, Reach(0.5, 2.5, self.scans))
-        gone = self.evidence.take_back(passed, RULE)
+        gone = self.evidence.remove_contradicted(passed, RULE)
         if normal is not None:
             self.evidence.set_normals(marks, np.tile(normal, (len(ends), 1)))
         return len(gone)

@@ -179,7 +179,7 @@ def test_what_was_taken_back_is_forgotten() -> None:
     def scan(number: int, ends: Doubles) -> None:
         evidence.mark_surface(ends, Sighting(sensor, 0.2, number, scan=number))
         passed = evidence.carve(sensor, ends, Reach(0.5, 2.5, number))
-        evidence.take_back(passed, Disbelief.of(scans=3, doubt=0.01))
+        evidence.remove_contradicted(passed, Disbelief.of(scans=3, doubt=0.01))
 
     for number in range(1, 11):
         scan(number, wide.points(rng))

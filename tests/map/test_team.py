@@ -44,19 +44,20 @@ def test_an_error_of_one_part_is_raised_when_all_have_ended(team):
 
 
 @pytest.mark.parametrize("is_closed", [False, True])
-def test_what_runs_in_parallel_has_ended_when_the_context_does(team, is_closed):
+def test_two_pieces_of_work_have_both_ended_when_they_return(team, is_closed):
     if is_closed:
         team.close()
+    assert team.both(lambda: 1, lambda: 2) == (1, 2)
+    with pytest.raises(ZeroDivisionError):
+        team.both(lambda: 1, lambda: 1 // 0)
     ended = []
-    with team.in_parallel() as hand_over:
-        for number in range(5):
-            hand_over(lambda number=number: ended.append(number))
-    assert sorted(ended) == [0, 1, 2, 3, 4]
+    with pytest.raises(ZeroDivisionError):
+        team.both(lambda: 1 // 0, lambda: ended.append(True))
+    assert ended
 
 
 def test_work_is_done_once_where_no_thread_can_be_started(team, monkeypatch):
     done = np.zeros(10_000, int)
-    parallel = []
 
     def work(first, last):
         done[first:last] += 1
@@ -64,15 +65,14 @@ def test_work_is_done_once_where_no_thread_can_be_started(team, monkeypatch):
     def refuse(_):
         raise RuntimeError("can't start new thread")
 
-    with monkeypatch.context() as patched, team.in_parallel() as hand_over:
+    with monkeypatch.context() as patched:
         patched.setattr(threading.Thread, "start", refuse)
-        hand_over(lambda: parallel.append("done"))
-        team.split(len(done), work)
+        both = team.both(lambda: team.split(len(done), work), lambda: "done")
     assert (done == 1).all()
     team.split(len(done), work)
     team.close()  # what the pool still had waits no more
     assert (done == 2).all()
-    assert parallel == ["done"]
+    assert both == (None, "done")
 
 
 def test_the_caller_waits_for_no_thread_that_has_other_work(team):
@@ -83,13 +83,19 @@ def test_the_caller_waits_for_no_thread_that_has_other_work(team):
         busy.wait()
         go_on.wait()
 
-    with team.in_parallel() as hand_over:
-        for _ in range(threads):
-            hand_over(work)
+    done = np.zeros(10_000, int)
+
+    def split():
         busy.wait()
-        done = np.zeros(10_000, int)
         team.split(len(done), lambda first, last: done.__setitem__(slice(first, last), 1))
         go_on.set()
+
+    others = [threading.Thread(target=team.both, args=(go_on.wait, work)) for _ in range(threads)]
+    for other in others:
+        other.start()
+    split()
+    for other in others:
+        other.join()
     assert done.all()
 
 

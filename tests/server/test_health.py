@@ -7,6 +7,7 @@ from threading import Event, Thread
 
 from support import servers
 from support.small_world import settings, world
+from triquad_server.epochs.history import EpochHistory
 from triquad_server.health import ENDLESS_S, STUCK_S, Health
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
@@ -34,7 +35,8 @@ def running(
 ) -> Iterator[tuple[MapperThread, Health]]:
     """A mapper's thread without a store, and its health."""
     scans = ScanQueue(8)
-    thread = MapperThread(mapper, scans, ServiceSettings(), (failed or Event()).set)
+    epochs = EpochHistory(mapper.publish(), ServiceSettings())
+    thread = MapperThread(mapper, scans, epochs, 0.5, (failed or Event()).set)
     thread.time = ThreadTime(clock)
     health = Health(
         map_name="test",
@@ -44,6 +46,7 @@ def running(
         scans=scans,
         warnings=ScanWarnings(scans, Settings()),
         mapper=thread,
+        epochs=epochs,
         checkpoints=CheckpointThread(thread, None, period_s=0, last=None),
         map_max_bytes=10**9,
     )

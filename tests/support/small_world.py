@@ -81,7 +81,7 @@ def damage(mapper: Mapper) -> None:
         region.field.thaw()  # what was published stays as it is
         values = region.field.features.values
         values += 0.5 * values.std() * np.random.default_rng(0).standard_normal(values.shape)
-        region.budget.samples = 1
+        region.training.budget.samples = 1
 
 
 def surface_error(

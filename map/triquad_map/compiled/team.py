@@ -3,14 +3,18 @@
 import contextlib
 import os
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import partial
+from typing import TypeVar
 
 from triquad_map.compiled.priority import lower_priority
 
 THREADS = max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1)
 """Threads that share the work: one per core that this process may use."""
+
+MineT = TypeVar("MineT")
+OtherT = TypeVar("OtherT")
 
 _MIN_SHARE = 2048
 """Points of a field below which splitting work costs more than it gains."""
@@ -71,20 +75,16 @@ class Team:
         else:
             self._run(lambda part: work(*share(count, part, parts)), parts)
 
-    @contextlib.contextmanager
-    def in_parallel(self) -> Iterator[Callable[[Callable[[], None]], None]]:
-        """Run work in parallel to the caller; all of it has ended when the context does."""
-        handed_over: list[_Part] = []
-
-        def hand_over(work: Callable[[], None]) -> None:
-            handed_over.append(self._offer(work))
-
+    def both(self, mine: Callable[[], MineT], other: Callable[[], OtherT]) -> tuple[MineT, OtherT]:
+        """What two pieces of work return, done in parallel: the caller does ``mine``."""
+        found: list[OtherT] = []
+        part = self._offer(lambda: found.append(other()))
         try:
-            yield hand_over
+            result = mine()
         finally:
-            _finish(handed_over)
-        for part in handed_over:
-            part.done.result()
+            _finish([part])
+        part.done.result()
+        return result, found[0]
 
     def _run(self, work: Callable[[int], None], parts: int) -> None:
         others = [self._offer(partial(work, part)) for part in range(1, parts)]

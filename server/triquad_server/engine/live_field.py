@@ -39,12 +39,10 @@ class Parameter:
     def append(self, values: Floats) -> None:
         """Add rows [N, ...] that took no step yet; the state of the others stays."""
         used, count = len(self), len(self) + len(values)
-        # All that takes memory comes first: where there is too little, nothing has changed.
-        added = self._memory.put(values)
         room = tuple(
             rows if count <= len(rows) else self._with_room(rows, count) for rows in self._room
         )
-        room[0][used:count] = added  # rows beyond those in use are in no frozen values
+        room[0][used:count] = self._memory.put(values)
         for state in room[1:]:
             state[used:count] = 0
         self._is_frozen = self._is_frozen and room[0] is self._room[0]
@@ -157,6 +155,7 @@ class LiveField:
         self.held: Rows | None = None
         """Which of the first rows of features [N] stay as they are, as does the MLP; None: none."""
 
+        self.version = 0  # rises with each step of training
         self._frequencies = memory.put(frequencies)
         self._vertices_held = 0
         self._generator = generator
@@ -236,6 +235,7 @@ class LiveField:
 
     def thaw(self) -> None:
         """Before a step: have numbers of its own, which may be changed in place."""
+        self.version += 1
         for parameter in (self.features, *self.mlp):
             parameter.thaw()
 

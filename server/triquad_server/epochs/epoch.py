@@ -28,9 +28,6 @@ class FrozenRegion:
     engine: FrozenField
     evidence: FrozenEvidence
     surfels: SurfelMap
-    surfels_fitted_to: object | None
-    """The state of the live field to which all of them are fitted; None: some to earlier ones."""
-
     vertices: int
     parameters: int
     changed: int  # epoch of its last change

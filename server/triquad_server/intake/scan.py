@@ -82,8 +82,6 @@ class ScanIntake:
         """As :meth:`_receive`; an internal error must not stop the intake of other scans."""
         try:
             self._receive(str(sample.key_expr), sample.payload)
-        except MemoryError:
-            self._drop("out_of_memory", str(sample.key_expr), "the system gives no more memory")
         except Exception:
             self._queue.dropped.add("internal")
             _log.exception("a scan on %s could not be received", sample.key_expr)

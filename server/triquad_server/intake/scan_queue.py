@@ -7,6 +7,7 @@ from triquad_format.wire.messages import Scan
 
 from triquad_server.counter import Counter
 from triquad_server.fair_queue import FairQueue, Owner
+from triquad_server.intake.rays import ScanRays
 from triquad_server.intake.source_ledger import SourceLedger
 
 MAX_SOURCES_WAITING = 64
@@ -38,6 +39,7 @@ class ScanQueue:
         self.limit_bytes = limit_bytes
         self.ledger = SourceLedger()
         self.dropped = Counter()  # scans that are not in the map, by reason
+        self.points_dropped = Counter()  # of scans that are in the map, by reason
         self.received_bytes = 0  # of all messages of scans that arrived
         self._taken = threading.Condition()
         self._scans: FairQueue[Scan] = FairQueue(
@@ -84,6 +86,17 @@ class ScanQueue:
             self._in_hand = scan is not None
             self._taken.notify_all()
             return scan
+
+    def taken(self, scan: Scan, rays: ScanRays) -> None:
+        """Account for a scan that is in the map; ``rays`` are what of it is used."""
+        for reason, count in rays.points_dropped.items():
+            self.points_dropped.add(reason, count)
+        self.ledger.take(scan)
+
+    def reject(self, scan: Scan, reason: str, text: str) -> None:
+        """Account for a scan that was taken, and that the map refused."""
+        self.dropped.add(reason)
+        self.ledger.refuse(scan, text)
 
     def give_way(self) -> None:
         """Return once no source is about to lose scans, or after a moment."""

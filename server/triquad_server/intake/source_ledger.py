@@ -49,7 +49,6 @@ class _Track:
     done: int = -1  # highest sequence that came out of the queue
     waiting: int = 0  # scans in the queue
     unpublished: int | None = None  # lowest sequence taken that no epoch shows yet
-    unpublished_scans: int = 0  # taken, that no epoch shows yet
     stamp_ns: int = -(2**63)
     taken: int = 0
     refused: int = 0
@@ -126,7 +125,6 @@ class SourceLedger:
         with self.changed:
             track = self._leave_queue(scan)
             track.taken += 1
-            track.unpublished_scans += 1
             if track.unpublished is None:
                 track.unpublished = scan.sequence
 
@@ -151,27 +149,12 @@ class SourceLedger:
         with self.changed:
             self._leave_queue(scan).pushed_out += 1
 
-    def take_back(self, why: str) -> int:
-        """Record that scans which no epoch shows yet are not in the map after all; how many."""
-        with self.changed:
-            count = 0
-            for track in self._tracks.values():
-                if track.unpublished is None:
-                    continue
-                count += track.unpublished_scans
-                track.taken -= track.unpublished_scans
-                track.refused += track.unpublished_scans
-                track.last_refusal = f"scan {track.unpublished} and later ones: {why}"
-                track.unpublished, track.unpublished_scans = None, 0
-            self.changed.notify_all()
-            return count
-
     def publish(self) -> None:
         """Record that an epoch shows all scans that were taken so far."""
         with self.changed:
             shown = [track for track in self._tracks.values() if track.unpublished is not None]
             for track in shown:
-                track.unpublished, track.unpublished_scans = None, 0
+                track.unpublished = None
             if shown:
                 self.changed.notify_all()
 

@@ -1,6 +1,6 @@
 """How well the whole map fits its held-out rays, as the status tells it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import numpy as np
 from triquad_format.wire.messages import FieldFit
@@ -9,9 +9,10 @@ from triquad_map import field_fit
 from triquad_server.mapping.live_region import LiveRegion
 
 
-def map_fit(regions: Sequence[LiveRegion]) -> FieldFit | None:
+def map_fit(regions: Iterable[LiveRegion]) -> FieldFit | None:
     """How regions fit, as they were judged last; ``None`` where none was."""
-    judged = [(region.centre, region.places) for region in regions if region.places is not None]
+    judgements = [(region.centre, region.training.judgement) for region in regions]
+    judged = [(centre, judgement.fit) for centre, judgement in judgements if judgement.fit]
     fit = field_fit.map_fit(judged)
     if fit is None:
         return None
@@ -22,6 +23,6 @@ def map_fit(regions: Sequence[LiveRegion]) -> FieldFit | None:
         worst=fit.worst,
         worst_median_m=fit.worst_median_m.astype(np.float32),
         repairing=sum(int(places.forgotten.sum()) for _, places in judged),
-        repaired=sum(region.repairs.done for region in regions),
-        given_up=sum(region.repairs.given_up for region in regions),
+        repaired=sum(judgement.repairs.done for _, judgement in judgements),
+        given_up=sum(judgement.repairs.given_up for _, judgement in judgements),
     )

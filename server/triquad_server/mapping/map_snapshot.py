@@ -8,8 +8,8 @@ from triquad_format.records.region import MapRecord, Region, TrainingState
 from triquad_map.compiled.team import Team
 
 from triquad_server.epochs.epoch import Epoch
-from triquad_server.mapping.ray_table import Placement, RayTable, draw_ordered_samples
-from triquad_server.mapping.replay_record import recorded_rays
+from triquad_server.mapping.replay.ray_table import Placement, RayTable, draw_ordered_samples
+from triquad_server.mapping.replay.replay_record import recorded_rays
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from triquad_format.wire.metrics_messages import QueueMetrics, ServerMetrics
 
 from triquad_server.array_memory import bytes_by_part
 from triquad_server.epochs.epoch import Epoch
+from triquad_server.epochs.surface_history import SurfaceHistory
 from triquad_server.health import Health
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.process.memory import resident_bytes
@@ -25,6 +26,7 @@ class Metrics:
 
     health: Health
     session: zenoh.Session
+    surface: SurfaceHistory
     tiles: TileCache
     downloads: MapDownloads
     queues: dict[str, ReadQueue]  # of requests, by name
@@ -32,7 +34,7 @@ class Metrics:
     def now(self) -> ServerMetrics:
         """Return the figures as they are now."""
         health, mapper, scans = self.health, self.health.mapper, self.health.scans
-        kept = mapper.epochs.kept()
+        kept = health.epochs.kept()
         queues = {name: read() for name, read in self.queues.copy().items()}
         transports = self.session.info.transports()[:_MAX_SESSIONS]
         return ServerMetrics(
@@ -76,8 +78,8 @@ class Metrics:
         return {
             **live,
             **bytes_by_part(frozen),
-            "normals": mapper.progress.normals_bytes,
-            "surface_history": mapper.surface.nbytes,
+            "normals": mapper.progress.map.normals_bytes,
+            "surface_history": self.surface.nbytes,
             "tile_cache": self.tiles.nbytes,
             "downloads": self.downloads.nbytes,
             "scan_queue": self.health.scans.bytes_waiting,

@@ -27,7 +27,6 @@ from triquad_server.store.store import Store
 
 _log = logging.getLogger(__name__)
 
-_NO_MEMORY = "the map cannot be copied for a checkpoint: out of memory"
 _NO_STORE = "the server was started without a store: the map is not kept"
 
 ResultT = TypeVar("ResultT")
@@ -201,7 +200,7 @@ class CheckpointThread:
             return last
         started = time.monotonic()
         try:
-            changes = _changes(snapshot)
+            changes = snapshot.changes()
             del snapshot  # the records have all of it, and memory is shortest now
             info = self._write_changes(self._store, changes)
         except Exception as error:
@@ -227,18 +226,11 @@ class CheckpointThread:
             return store.write(changes)
         except StoreBaseError as error:
             _log.warning("%s; all of the map is written instead", error)
-            return store.write(_changes(self._snapshot_since(None)))
+            return store.write(self._snapshot_since(None).changes())
 
     def _snapshot_since(self, base: int | None) -> MapSnapshot:
-        """What a checkpoint needs that follows the epoch ``base``.
-
-        Raises:
-            StoreError: memory does not suffice for a copy of it.
-        """
-        try:
-            return self._mapper.call(lambda mapper: mapper.snapshot_since(base))
-        except MemoryError as error:
-            raise StoreError(_NO_MEMORY) from error
+        """What a checkpoint needs that follows the epoch ``base``."""
+        return self._mapper.call(lambda mapper: mapper.snapshot_since(base))
 
     def _fold(self) -> None:
         """Put old checkpoints together, where there are many."""
@@ -269,15 +261,3 @@ class CheckpointThread:
     def _interrupted(self) -> bool:
         """Whether something is more urgent than folding, which can be begun again."""
         return self._stopping.is_set() or not self._asked.empty()
-
-
-def _changes(snapshot: MapSnapshot) -> MapChanges:
-    """The records of a snapshot.
-
-    Raises:
-        StoreError: memory does not suffice for them.
-    """
-    try:
-        return snapshot.changes()
-    except MemoryError as error:
-        raise StoreError(_NO_MEMORY) from error

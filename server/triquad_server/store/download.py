@@ -10,6 +10,7 @@ from triquad_format.mapfile.writer import write_map
 from triquad_format.wire.messages import MapChunk, MapChunkRequest, MapInfo, MapInfoRequest
 from triquad_map.preview import previews_of
 
+from triquad_server.epochs.history import EpochHistory
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.store.store import stamp_now_ns
 
@@ -29,8 +30,9 @@ class _MapBytes:
 class MapDownloads:
     """Serialises epochs on request; the files asked for last are kept."""
 
-    def __init__(self, mapper: MapperThread, server: str = "") -> None:
+    def __init__(self, mapper: MapperThread, epochs: EpochHistory, server: str = "") -> None:
         """``server`` is a name of this process."""
+        self._epochs = epochs
         self._server = server
         self._mapper = mapper
         self._lock = threading.Lock()
@@ -44,7 +46,7 @@ class MapDownloads:
 
     def info(self, request: MapInfoRequest) -> MapInfo:
         """Size and digest of the newest epoch's file, which is made unless it is there."""
-        newest = self._mapper.epochs.newest
+        newest = self._epochs.newest
         with self._lock:
             for file in self._files.values():
                 if file.info.epoch == newest.number and file.training == request.training:

@@ -7,7 +7,9 @@ from triquad_format.wire.messages import ResetReply, ResetRequest
 from triquad_map.box import check_box
 
 from triquad_server.errors import StoreError
+from triquad_server.intake.source_trails import SourceTrails
 from triquad_server.mapping.map_snapshot import MapSnapshot
+from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.store.checkpoint_thread import CheckpointThread
 from triquad_server.store.store import Store
@@ -26,9 +28,14 @@ class Resets:
         checkpoints: CheckpointThread,
         store: Store | None,
         protect_h: float,
+        trails: SourceTrails,
     ) -> None:
-        """Without a ``store``, or with ``protect_h`` = 0, nothing is kept."""
+        """Without a ``store``, or with ``protect_h`` = 0, nothing is kept.
+
+        Where sources have been in the box, ``trails`` forget.
+        """
         self._mapper = mapper
+        self._trails = trails
         self._checkpoints = checkpoints
         self._store = store
         self._protect_h = protect_h
@@ -54,26 +61,38 @@ class Resets:
         return reply
 
     def _unkept(self, request: ResetRequest, store: Store | None) -> ResetReply:
-        reply = self._mapper.reset(request)
+        epoch = self._mapper.call(lambda mapper: self._forget(mapper, request))
         why = "the server has no store" if store is None else "store.protect_h = 0"
         undo = f"the map before was not kept: {why}"
-        _log.warning("the map was reset as of epoch %d: %s", reply.epoch, undo)
-        return ResetReply(reply.epoch, undo=undo)
+        _log.warning("the map was reset as of epoch %d: %s", epoch, undo)
+        return ResetReply(epoch, undo=undo)
+
+    def _forget(self, mapper: Mapper, request: ResetRequest) -> int:
+        """Forget what lies in the box; the epoch that shows it. For the mapper's thread."""
+        mapper.reset(request.minimum, request.maximum)
+        self._trails.forget(request.minimum, request.maximum)
+        return mapper.publish().number
 
     def _keep_and_reset(self, store: Store, request: ResetRequest) -> ResetReply:
         kept = None
-        if self._mapper.epochs.newest.regions > 0:
+        if self._mapper.call(lambda mapper: len(mapper.regions)) > 0:
             kept = self._checkpoints.write().epoch
             store.protect(kept, _WHY)
-        forgotten = self._mapper.reset_after(request, store.base_epoch)
-        kept = self._keep_the_rest(store, forgotten.before, kept)
+        base = store.base_epoch
+
+        def forget(mapper: Mapper) -> tuple[MapSnapshot, int]:
+            """The map as it was just before: no scan comes in between."""
+            return mapper.snapshot_since(base), self._forget(mapper, request)
+
+        before, epoch = self._mapper.call(forget)
+        kept = self._keep_the_rest(store, before, kept)
         if kept is None:
-            return ResetReply(forgotten.epoch, undo="the map was empty before")
+            return ResetReply(epoch, undo="the map was empty before")
         undo = (
             f"epoch {kept}, the map before, is kept for {self._protect_h:g} h; to go back to it, "
             f"stop the server and start it with --restore {kept}"
         )
-        return ResetReply(forgotten.epoch, kept, undo)
+        return ResetReply(epoch, kept, undo)
 
     def _keep_the_rest(self, store: Store, before: MapSnapshot, kept: int | None) -> int | None:
         """Keep what was learnt while the checkpoint was written, too; returns the epoch kept."""

@@ -243,8 +243,6 @@ class Store:
             raise StoreBaseError(f"{failure}: {error}") from error
         except (FormatError, OSError) as error:
             raise StoreError(f"{failure}: {error}") from error
-        except MemoryError as error:
-            raise StoreError(f"{failure}: out of memory") from error
 
     def _set_newest(self, path: Path, written: WrittenMap, stored: Mapping[str, int]) -> None:
         """Record what was written; delete the oldest."""

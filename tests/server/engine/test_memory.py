@@ -115,41 +115,6 @@ def test_what_is_frozen_stays_where_rows_are_added_before_a_step(memory: Memory,
     assert len(parameter) == 8 + 1000 + more
 
 
-class LittleMemory(ArrayMemory):
-    """Memory that does not suffice for the next array, once it is told."""
-
-    is_full = False
-
-    def room(self, count: int, like: np.ndarray) -> np.ndarray:
-        if self.is_full:
-            raise MemoryError
-        return super().room(count, like)
-
-    def put(self, array: np.ndarray) -> np.ndarray:
-        if self.is_full:
-            raise MemoryError
-        return super().put(array)
-
-
-def test_where_memory_does_not_suffice_to_add_rows_what_is_frozen_stays() -> None:
-    memory = LittleMemory()
-    parameter = Parameter(np.zeros((8, 4), np.float32), memory)
-    frozen = parameter.freeze()
-    memory.is_full = True
-    for more in (1, 1000):
-        with pytest.raises(MemoryError):
-            parameter.append(np.ones((more, 4), np.float32))
-    memory.is_full = False
-    parameter.thaw()
-    parameter.values[:] = 3
-    assert not frozen.any()
-    parameter.append(np.ones((1000, 4), np.float32))
-    assert [len(rows) for rows in (parameter.values, parameter.means, parameter.steps)] == 3 * [
-        1008
-    ]
-    assert (parameter.values[:8] == 3).all()
-
-
 @pytest.mark.parametrize("memory", MEMORIES)
 def test_an_epoch_takes_little_more_than_its_numbers(memory: Memory) -> None:
     parameter = Parameter(np.zeros((8, 4), np.float32), memory)

@@ -1,8 +1,8 @@
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from triquad_server.mapping.fair_share import FairShare
-from triquad_server.mapping.replay_pool import RAY_BYTES
+from triquad_server.mapping.replay.kept_rays import RAY_BYTES
+from triquad_server.mapping.training.fair_share import FairShare
 from triquad_server.settings import TrainingSettings
 
 TRAINING = TrainingSettings(

@@ -7,11 +7,11 @@ from triquad_format.records import replay_rays
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.replay_rays import HELD_OUT
 from triquad_map.places import in_cube, place_keys
-from triquad_server.mapping.held_out import are_held_out, ends_in_steps
-from triquad_server.mapping.judgement import JudgedPlaces, Judgement
 from triquad_server.mapping.map_fit import map_fit
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mapping.ray_table import END
+from triquad_server.mapping.replay.held_out import are_held_out, ends_in_steps
+from triquad_server.mapping.replay.ray_table import END
+from triquad_server.mapping.training.judgement import JudgedPlaces, Judgement
 
 FIELD = FieldSettings()
 NOISE_M = 0.02
@@ -133,20 +133,21 @@ def test_rays_are_held_out_from_training_and_after_a_restart() -> None:
         mapper.ingest(scan.points, scan.world_from_sensor)
     restarted = Mapper("test", settings(), "cpu", mapper.changes_since(None).record)
     for region, again in zip(mapper.regions, restarted.regions, strict=True):
-        assert are_held_out(region.held_out.table.rows, settings().field).all()
+        assert are_held_out(region.training.rays.held_out.table.rows, settings().field).all()
         for kept in (region, again):
-            table = kept.pool.table
+            table = kept.training.rays.pool.table
             trained = table.rows[table.origin_of >= 0]
             assert not are_held_out(trained, settings().field).any()
-        assert len(again.held_out) == pytest.approx(len(region.held_out), rel=0.01)
-    assert sum(len(region.held_out) for region in mapper.regions) > 50
+        counts = [len(of.training.rays.held_out) for of in (region, again)]
+        assert counts[1] == pytest.approx(counts[0], rel=0.01)
+    assert sum(len(region.training.rays.held_out) for region in mapper.regions) > 50
 
 
 def test_a_region_is_not_judged_by_rays_that_end_beside_it() -> None:
     chosen = settings().model_copy(update={"field": FieldSettings(depth=6)})
     mapper = settled_mapper(chosen, world())
     mapper.publish()
-    ends = [region.held_out.table.rows[:, END : END + 3] for region in mapper.regions]
+    ends = [region.training.rays.held_out.table.rows[:, END : END + 3] for region in mapper.regions]
     inside = sum(in_cube(of_region, chosen.field).sum() for of_region in ends)
     assert inside < 0.95 * sum(map(len, ends))
     fit = map_fit(mapper.regions)
@@ -195,7 +196,7 @@ def test_where_all_rays_are_held_out_there_is_nothing_to_train_on() -> None:
     for shift_m in np.arange(0, 0.2, 0.002):
         mapper = Mapper("test", settings(), "cpu")
         mapper.ingest(np.array([[5.0 + shift_m, 0.1, 0.1]], np.float32), np.eye(4))
-        held = sum(len(region.held_out) for region in mapper.regions)
+        held = sum(len(region.training.rays.held_out) for region in mapper.regions)
         alone += held
         assert mapper.settled == (held == 1)
         mapper.train()

@@ -7,8 +7,8 @@ import numpy as np
 from support.small_world import WALLED, WALLED_BOUNDS, settle
 from triquad_format.records.arrays import Bools, Doubles, Floats
 from triquad_format.records.field_settings import FieldSettings
-from triquad_server.mapping.learnt_places import VISITS, LearntPlaces
 from triquad_server.mapping.mapper import Mapper
+from triquad_server.mapping.training.learnt_places import VISITS, LearntPlaces
 from triquad_server.settings import Settings
 from triquad_tools.simulation.lidar import Lidar
 from triquad_tools.simulation.scene import Scene
@@ -61,20 +61,20 @@ def learnt() -> LearntPlaces:
 
 def test_what_no_longer_gets_better_is_learnt() -> None:
     places = LearntPlaces(FIELD)
-    assert places.owing(ALL).all()
+    assert places.need_training(ALL).all()
     for look in range(4):
         judged(places, off(0.01, 0.2 / 2**look))
-    assert (places.owing(ALL) == ~FIRST).all()
+    assert (places.need_training(ALL) == ~FIRST).all()
     for _ in range(3):
         judged(places, off(0.01, 0.01))
-    assert not places.owing(ALL).any()
+    assert not places.need_training(ALL).any()
 
 
 def test_what_wavers_does_not_get_better() -> None:
     places = LearntPlaces(FIELD)
     for look in range(5):
         judged(places, off(0.03 if look % 2 else 0.01, 0.01))
-    assert not places.owing(ALL).any()
+    assert not places.need_training(ALL).any()
 
 
 def test_what_is_not_seen_is_not_said_to_be_learnt() -> None:
@@ -82,7 +82,7 @@ def test_what_is_not_seen_is_not_said_to_be_learnt() -> None:
     judged(places, off(0.01, 0.01))
     for _ in range(4):
         judged(places, off(0.01, 0.01), seen=FIRST)
-    assert (places.owing(ALL) == ~FIRST).all()
+    assert (places.need_training(ALL) == ~FIRST).all()
 
 
 def test_little_training_tells_nothing() -> None:
@@ -91,40 +91,40 @@ def test_little_training_tells_nothing() -> None:
         places.see(ALL)
         places.trained(VISITS / 10)
         places.judge(ENDS, NOISE, no_field, settled=False)
-    assert places.owing(ALL).all()
+    assert places.need_training(ALL).all()
 
 
 def test_where_surface_goes_all_is_to_be_learnt() -> None:
     places = learnt()
-    places.lose(ALL[[0, 1, -1]])
-    assert not places.owing(ALL).any(), "single voxels may have held noise"
-    places.lose(ALL[:3])
-    assert places.owing(ALL).all()
+    places.surface_removed(ALL[[0, 1, -1]])
+    assert not places.need_training(ALL).any(), "single voxels may have held noise"
+    places.surface_removed(ALL[:3])
+    assert places.need_training(ALL).all()
 
 
 def test_where_the_rays_fit_no_more_all_is_to_be_learnt() -> None:
     """As where a surface moved by less than a voxel."""
     places = learnt()
     places.judge(ENDS, NOISE + off(0.01, 0.04), no_field, settled=False)
-    assert not places.owing(ALL).any(), "what is being trained may waver"
+    assert not places.need_training(ALL).any(), "what is being trained may waver"
     places.judge(ENDS, NOISE + off(0.01, 0.01), no_field, settled=True)
-    assert not places.owing(ALL).any()
+    assert not places.need_training(ALL).any()
     places.judge(ENDS, NOISE + off(0.01, 0.04), no_field, settled=True)
-    assert places.owing(ALL).all()
+    assert places.need_training(ALL).all()
 
 
 def test_what_gets_better_slowly_is_not_learnt() -> None:
     places = LearntPlaces(FIELD)
     for step in range(8):
         judged(places, off(0.3 * 0.92**step, 0.01))
-    assert (places.owing(ALL) == FIRST).all()
+    assert (places.need_training(ALL) == FIRST).all()
 
 
 def test_what_becomes_worse_and_then_better_is_not_learnt() -> None:
     places = LearntPlaces(FIELD)
     for error_m in (0.05, 0.4, 0.2, 0.1, 0.05):
         judged(places, off(error_m, 0.01))
-    assert (places.owing(ALL) == FIRST).all()
+    assert (places.need_training(ALL) == FIRST).all()
 
 
 def test_without_rays_to_compare_nothing_is_said_to_be_learnt() -> None:
@@ -133,7 +133,7 @@ def test_without_rays_to_compare_nothing_is_said_to_be_learnt() -> None:
         places.see(ALL)
         places.trained(VISITS)
         places.judge(ENDS[:9], NOISE[:9], no_field, settled=False)
-    assert places.owing(ALL).all()
+    assert places.need_training(ALL).all()
 
 
 def test_places_of_few_rays_are_compared_as_one() -> None:
@@ -143,23 +143,23 @@ def test_places_of_few_rays_are_compared_as_one() -> None:
         for _ in range(4):  # each time it is noted of some rays
             places.see(scattered.astype(np.float64))
         places.trained(VISITS)
-        assert places.owing(scattered).all()
+        assert places.need_training(scattered).all()
         said = np.full(60, max(0.05, 0.2 / 2**step))
         places.judge(scattered, said, lambda points, said=said: said[: len(points)], settled=False)
-    assert not places.owing(scattered).any()
+    assert not places.need_training(scattered).any()
 
 
 def test_few_rays_elsewhere_owe_nothing_and_more_do() -> None:
     places, elsewhere = learnt(), ALL[FIRST] + 50.0
-    assert not places.owing(np.concatenate([ALL, elsewhere[:5]])).any()
-    owing = places.owing(np.concatenate([ALL, elsewhere[:50]]))
-    assert owing.sum() == owing[len(ALL) :].sum() == 50
+    assert not places.need_training(np.concatenate([ALL, elsewhere[:5]])).any()
+    needing = places.need_training(np.concatenate([ALL, elsewhere[:50]]))
+    assert needing.sum() == needing[len(ALL) :].sum() == 50
 
 
 def test_one_place_that_cannot_be_learnt_does_not_decide_for_all_that_have_few_rays() -> None:
     places = LearntPlaces(FIELD)
     scattered = RNG.uniform(-300, 300, (60, 3)).astype(np.float32)
-    owing = []
+    needing = []
     for step in range(8):
         for _ in range(4):
             places.see(scattered.astype(np.float64))
@@ -167,8 +167,8 @@ def test_one_place_that_cannot_be_learnt_does_not_decide_for_all_that_have_few_r
         said = np.full(60, max(0.025, 0.4 / 2**step))  # better by half four times
         said[0] = 2.0  # as where leaves move
         places.judge(scattered, said, lambda points, said=said: said[: len(points)], settled=False)
-        owing.append(places.owing(scattered).mean())
-    assert owing == [1.0] * 6 + [0.0] * 2
+        needing.append(places.need_training(scattered).mean())
+    assert needing == [1.0] * 6 + [0.0] * 2
 
 
 def test_the_map_of_a_robot_at_rest_settles_and_learns_what_is_put_before_it() -> None:

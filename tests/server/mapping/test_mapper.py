@@ -12,9 +12,9 @@ from triquad_server.engine.memory import ArrayMemory
 from triquad_server.errors import ScanRefusedError
 from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mapping.ray_table import END, VALUE
-from triquad_server.mapping.region_setup import RegionSetup
-from triquad_server.mapping.replay_pool import RAY_BYTES
+from triquad_server.mapping.replay.kept_rays import RAY_BYTES
+from triquad_server.mapping.replay.ray_table import END, VALUE
+from triquad_server.mapping.replay.region_setup import RegionSetup
 from triquad_server.process.threads import Teams
 from triquad_server.settings import Settings
 from triquad_tools.sensors.sweep import moved
@@ -127,7 +127,7 @@ def test_the_same_scans_across_a_corner_leave_the_same_rays() -> None:
         mapper = Mapper("test", chosen, "cpu")
         for scan in world(4).scans:
             mapper.ingest(scan.points, shift @ scan.world_from_sensor)
-        kept.append([region.pool.table.rows for region in mapper.regions])
+        kept.append([region.training.rays.pool.table.rows for region in mapper.regions])
     assert len(kept[0]) == 4
     for one, other in zip(*kept, strict=True):
         np.testing.assert_array_equal(one, other)
@@ -346,16 +346,16 @@ def test_the_replay_pool_is_bounded_after_a_restart_and_after_a_reset() -> None:
 
 def test_all_regions_keep_as_many_rays_for_each_voxel_and_tell_what_they_discarded() -> None:
     mapper = Mapper("test", settings(pool_bytes=20_000 * RAY_BYTES), "cpu")
-    assert mapper.replay_share == 1.0
+    assert mapper.figures().replay_share == 1.0
     for scan in world(6).scans:
         mapper.ingest(scan.points, scan.world_from_sensor)
-    assert mapper.replay_share < 1.0
-    sizes = [(len(region.pool), region.size.evidence.voxels) for region in mapper.regions]
+    assert mapper.figures().replay_share < 1.0
+    sizes = [(len(r.training.rays.pool), r.size.evidence.voxels) for r in mapper.regions]
     densities = [rays / voxels for rays, voxels in sizes if voxels > 100]
     assert len(densities) > 1
     assert max(densities) < 1.2 * min(densities)
     assert mapper.rays_kept <= 20_000
-    assert mapper.rays_discarded > 20_000
+    assert mapper.figures().rays_discarded > 20_000
 
 
 def test_training_beyond_what_the_area_may_owe_is_discarded_and_told() -> None:
@@ -365,7 +365,7 @@ def test_training_beyond_what_the_area_may_owe_is_discarded_and_told() -> None:
     mapper.ingest(scan.points, scan.world_from_sensor)
     voxels = sum(region.size.evidence.voxels for region in mapper.regions)
     assert 0.99 * 10 * voxels < mapper.samples_left <= 10 * voxels
-    assert mapper.samples_discarded > 0
+    assert mapper.figures().samples_discarded > 0
 
 
 def test_the_training_budget_survives_a_restart() -> None:
@@ -407,7 +407,7 @@ def test_where_no_normal_is_known_the_field_tells_how_steep_rays_fall() -> None:
     one_region = settings().model_copy(update={"field": Settings().field})
     mapper = settled_mapper(one_region, world())
     (region,) = mapper.regions
-    table = region.pool.table
+    table = region.training.rays.pool.table
     unsure = np.flatnonzero((table.rows[:, VALUE] < 0) & (table.origin_of >= 0))
     assert len(unsure) > 0.05 * len(table)
     ends = table.rows[unsure, END : END + 3].astype(np.float64)

@@ -31,17 +31,17 @@ def filled() -> tuple[Mapper, float]:
             full.ingest(sphere(), at(x))
         except ScanRefusedError:
             return full, float(x)
-    raise AssertionError(f"never full: {full.bytes_used} bytes")
+    raise AssertionError(f"never full: {full.regions.bytes_used} bytes")
 
 
 def test_a_scan_that_does_not_fit_is_refused_and_changes_nothing() -> None:
     full, x = filled()
-    used, epoch = full.bytes_used, full.publish()
+    used, epoch = full.regions.bytes_used, full.publish()
     assert 0.5 * LIMIT < used <= LIMIT
     with pytest.raises(ScanRefusedError, match=r"memory\.max_bytes = 8000000") as refusal:
         full.ingest(sphere(), at(x))
     assert refusal.value.reason == "map_full"
-    assert full.bytes_used == used
+    assert full.regions.bytes_used == used
     assert full.publish() is epoch
 
 
@@ -49,7 +49,7 @@ def test_a_full_map_goes_on_to_take_scans_of_what_it_knows() -> None:
     full, _ = filled()
     for _ in range(3):
         full.ingest(sphere(), at(0.0))
-    assert full.bytes_used <= LIMIT
+    assert full.regions.bytes_used <= LIMIT
 
 
 def take_open_rays(full: Mapper) -> None:
@@ -65,13 +65,13 @@ def test_free_space_counts_too() -> None:
     with pytest.raises(ScanRefusedError, match="max_bytes") as refusal:
         take_open_rays(full)
     assert refusal.value.reason == "map_full"
-    assert full.bytes_used <= LIMIT
+    assert full.regions.bytes_used <= LIMIT
 
 
 def test_room_comes_back_with_a_reset() -> None:
     full, x = filled()
     full.reset(np.full(3, -np.inf), np.full(3, np.inf))
-    assert full.bytes_used == 0
+    assert full.regions.bytes_used == 0
     full.ingest(sphere(), at(x))
 
 

@@ -160,8 +160,8 @@ def test_no_ray_that_ended_there_is_trained_on_again() -> None:
     watched = Watched()
     watched.scan(BOX, count=8)
     watched.scan(count=10)
-    region = max(watched.mapper.regions, key=lambda region: len(region.pool))
-    samples = region.pool.draw_on(np.arange(len(region.pool)))
+    region = max(watched.mapper.regions, key=lambda region: len(region.training.rays.pool))
+    samples = region.training.rays.pool.draw_on(np.arange(len(region.training.rays.pool)))
     points = samples.points + region.centre
     inside = (np.abs(points - CENTRE) < HALF - 0.25).all(axis=1)
     assert (samples.labels[inside] > 0).all()

@@ -1,5 +1,5 @@
 import numpy as np
-from triquad_server.mapping.normals import SurfaceNormals
+from triquad_server.mapping.replay.normals import SurfaceNormals
 from triquad_server.process.threads import Teams
 
 TEAM = Teams().mapping

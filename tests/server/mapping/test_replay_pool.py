@@ -1,11 +1,8 @@
 import numpy as np
-import pytest
 from triquad_format.records.field_settings import FieldSettings
 from triquad_server.engine.live_field import Batch
-from triquad_server.engine.memory import ArrayMemory, Memory
-from triquad_server.engine.tensor_memory import TensorMemory
-from triquad_server.mapping.ray_table import Placement, RayTable, samples_alone
-from triquad_server.mapping.replay_pool import ReplayPool
+from triquad_server.mapping.replay.ray_table import Placement, RayTable, samples_alone
+from triquad_server.mapping.replay.replay_pool import ReplayPool
 from triquad_server.process.threads import Teams
 
 PLACEMENT = Placement(
@@ -20,9 +17,8 @@ TEAM = Teams().mapping
 RNG = np.random.default_rng(0)
 
 
-def new_pool(capacity: int, memory: Memory | None = None) -> ReplayPool:
-    memory = memory or ArrayMemory()
-    pool = ReplayPool(PLACEMENT, settings=FieldSettings(), seed=0, team=TEAM, memory=memory)
+def new_pool(capacity: int) -> ReplayPool:
+    pool = ReplayPool(PLACEMENT, settings=FieldSettings(), seed=0, team=TEAM)
     pool.limit(capacity)
     return pool
 
@@ -88,9 +84,8 @@ def test_of_a_scan_that_is_too_large_any_part_is_kept() -> None:
     assert shares.min() > 0.1
 
 
-@pytest.mark.parametrize("memory", [ArrayMemory(), TensorMemory("cpu")])
-def test_the_newest_can_be_drawn_apart(memory: Memory) -> None:
-    pool = new_pool(100_000, memory)
+def test_the_newest_can_be_drawn_apart() -> None:
+    pool = new_pool(100_000)
     pool.add(labelled(place(0, 50_000)))
     pool.add(labelled(place(0, 100), 1))
     labels = pool.draw(1000, 400).labels
@@ -98,9 +93,8 @@ def test_the_newest_can_be_drawn_apart(memory: Memory) -> None:
     assert pool.draw(1000, 0).labels.sum() < 50
 
 
-@pytest.mark.parametrize("memory", [ArrayMemory(), TensorMemory("cpu")])
-def test_only_what_is_in_focus_is_drawn_on_whatever_comes_and_goes(memory: Memory) -> None:
-    pool = new_pool(100_000, memory)
+def test_only_what_is_in_focus_is_drawn_on_whatever_comes_and_goes() -> None:
+    pool = new_pool(100_000)
     pool.add(labelled(place(0, 50_000)))
     pool.add(labelled(place(30, 500), 1))
     middle = 1 << FieldSettings().depth - 1

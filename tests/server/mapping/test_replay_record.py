@@ -8,9 +8,9 @@ from scipy.spatial import cKDTree
 from triquad_format.records import replay_rays
 from triquad_format.records.field_settings import FieldSettings
 from triquad_map.compiled.team import Team
-from triquad_server.mapping.held_out import are_held_out, ends_in_steps
-from triquad_server.mapping.ray_table import COLUMNS, NO_ORIGIN, VALUE, RayTable
-from triquad_server.mapping.replay_record import recorded_rays, restored_rays
+from triquad_server.mapping.replay.held_out import are_held_out, ends_in_steps
+from triquad_server.mapping.replay.ray_table import COLUMNS, NO_ORIGIN, VALUE, RayTable
+from triquad_server.mapping.replay.replay_record import recorded_rays, restored_rays
 
 FIELD = FieldSettings()
 RAYS = 20_000

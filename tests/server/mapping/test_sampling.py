@@ -1,10 +1,8 @@
 import numpy as np
 import pytest
-import torch
 from triquad_server.engine.live_field import Batch
 from triquad_server.intake.rays import ScanRays
-from triquad_server.mapping.device_rays import TensorTable, draw_samples
-from triquad_server.mapping.ray_table import (
+from triquad_server.mapping.replay.ray_table import (
     Placement,
     RayTable,
     draw_ordered_samples,
@@ -40,25 +38,16 @@ def kept(rays: ScanRays, normals: np.ndarray, centre: np.ndarray, placement: Pla
     return rays_through(rays, normals, centre, placement, np.random.default_rng(2))
 
 
-def draw(engine: str, table: RayTable, chosen: np.ndarray, placement: Placement) -> Batch:
-    if engine == "compiled":
-        return draw_ordered_samples(table, chosen, placement, np.random.default_rng(1), TEAM)
-    generator = torch.Generator().manual_seed(1)
-    on_device = TensorTable.of(table, "cpu")
-    batch = draw_samples(on_device, torch.from_numpy(chosen), placement, generator)
-    return Batch(batch.points.numpy(), batch.labels.numpy())
+def draw(table: RayTable, chosen: np.ndarray, placement: Placement) -> Batch:
+    return draw_ordered_samples(table, chosen, placement, np.random.default_rng(1), TEAM)
 
 
-ENGINES = pytest.mark.parametrize("engine", ["compiled", "tensors"])
-
-
-@ENGINES
-def test_with_normals_the_label_is_the_distance_to_the_plane(engine: str) -> None:
+def test_with_normals_the_label_is_the_distance_to_the_plane() -> None:
     settings = ScanSettings()
     rays = rays_to_ground()
     down = np.tile([0.0, 0.0, -1.0], (500, 1))
     table = kept(rays, down, CENTRE, placed(settings))
-    batch = draw(engine, table, np.arange(500).repeat(20), placed(settings))
+    batch = draw(table, np.arange(500).repeat(20), placed(settings))
     heights = batch.points[:, 2] + CENTRE[2]
     labels = batch.labels
     assert abs(labels - heights).max() < 0.05, "up to the least cosine"
@@ -66,25 +55,23 @@ def test_with_normals_the_label_is_the_distance_to_the_plane(engine: str) -> Non
     assert (np.sign(labels) == np.sign(heights))[far].all(), "positive above the ground"
 
 
-@ENGINES
-def test_without_normals_the_label_is_the_distance_along_the_ray(engine: str) -> None:
+def test_without_normals_the_label_is_the_distance_along_the_ray() -> None:
     settings = ScanSettings()
     rays = rays_to_ground(1)
     table = kept(rays, np.full((1, 3), np.nan), CENTRE, placed(settings))
-    batch = draw(engine, table, np.zeros(3000, np.int64), placed(settings))
+    batch = draw(table, np.zeros(3000, np.int64), placed(settings))
     points = batch.points + CENTRE
     distance = np.linalg.norm(points - rays.ends[0], axis=1)
     np.testing.assert_allclose(np.abs(batch.labels), distance, atol=1e-4)
     assert (np.sign(batch.labels) == np.sign(points[:, 2]))[distance > 1e-3].all()
 
 
-@ENGINES
-def test_samples_lie_where_the_settings_say(engine: str) -> None:
+def test_samples_lie_where_the_settings_say() -> None:
     settings = ScanSettings(surface_share=0.7, spread_m=0.1)
     rays = rays_to_ground(1)
     range_m = np.linalg.norm(rays.ends[0] - rays.origin)
     table = kept(rays, np.full((1, 3), np.nan), CENTRE, placed(settings))
-    batch = draw(engine, table, np.zeros(20_000, np.int64), placed(settings))
+    batch = draw(table, np.zeros(20_000, np.int64), placed(settings))
     reach = np.linalg.norm(batch.points + CENTRE - rays.origin, axis=1)
     assert reach.min() >= 0.3 * range_m - 1e-4
     assert reach.max() <= range_m + 0.8 + 1e-4
@@ -94,15 +81,14 @@ def test_samples_lie_where_the_settings_say(engine: str) -> None:
     assert np.std(reach[near] - range_m) == pytest.approx(0.1, abs=0.02)
 
 
-@ENGINES
-def test_samples_stay_inside_the_cube(engine: str) -> None:
+def test_samples_stay_inside_the_cube() -> None:
     settings = ScanSettings()
     half = 8.0
     rays = rays_to_ground()
     table = kept(rays, np.full((500, 3), np.nan), np.zeros(3), placed(settings, half))
     ending = (np.abs(rays.ends) < half).all(axis=1).sum()
     assert len(table) > ending, "rays that only pass through teach free space"
-    batch = draw(engine, table, np.arange(len(table)).repeat(10), placed(settings, half))
+    batch = draw(table, np.arange(len(table)).repeat(10), placed(settings, half))
     assert np.abs(batch.points).max() <= half + 1e-4
 
 
@@ -113,8 +99,7 @@ def test_rays_that_miss_the_cube_teach_nothing() -> None:
     assert len(table) == 0
 
 
-@ENGINES
-def test_two_regions_draw_together_what_one_would(engine: str) -> None:
+def test_two_regions_draw_together_what_one_would() -> None:
     """Of rays across a border, neither more free space nor less of the surface."""
     settings = ScanSettings()
     rays = rays_to_ground(20_000)
@@ -128,7 +113,7 @@ def test_two_regions_draw_together_what_one_would(engine: str) -> None:
         placement = placed(settings, half_side_m)
         unknown = np.full((len(rays.ends), 3), np.nan)
         table = kept(rays, unknown, centre, placement)
-        batch = draw(engine, table, np.arange(len(table)), placement)
+        batch = draw(table, np.arange(len(table)), placement)
         points = batch.points + centre
         near = np.abs(batch.labels) < settings.truncation_m
         free, _ = np.histogram(points[~near, 0], np.arange(0, 25, 4))

@@ -1,5 +1,5 @@
 import pytest
-from triquad_server.mapping.training_budget import TrainingBudget
+from triquad_server.mapping.training.training_budget import TrainingBudget
 from triquad_server.settings import TrainingSettings
 
 SETTINGS = TrainingSettings(samples_per_ray=10.0, fresh_share=0.5, cooldown=4.0)

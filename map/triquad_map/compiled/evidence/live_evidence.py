@@ -56,19 +56,14 @@ class LiveEvidence:
         self._frozen: FrozenEvidence | None = None  # until anything changes
 
     @property
-    def blocks(self) -> int:
-        """Blocks in use."""
-        return self._blocks.count
-
-    @property
     def size(self) -> EvidenceSize:
         """How much it holds."""
         observed = self._observations
-        return EvidenceSize(self.blocks, observed.blocks, observed.voxels)
+        return EvidenceSize(self._blocks.count, observed.blocks, observed.voxels)
 
     def surface_blocks(self) -> Longs:
         """The blocks [B, 3] in which surface is believed."""
-        return self._blocks.cells()[self._seen.surface[: self.blocks].any(axis=1)]
+        return self._blocks.cells()[self._seen.surface[: self._blocks.count].any(axis=1)]
 
     def new_ends(self, ends: Doubles) -> NewEnds:
         """What rays that end at ``ends`` [N, 3] would add; nothing is recorded."""
@@ -91,7 +86,7 @@ class LiveEvidence:
                 voxels, done, self._seen, self._blocks.count, new, found
             )
             if done < len(voxels):
-                self._grow()
+                self._make_room(more=True)
         if sighting is None:
             return Marks(new[:found], np.zeros(len(voxels), np.int32))
         return Marks(new[:found], self._observations.record(voxels, self._seen, sighting))
@@ -138,7 +133,7 @@ class LiveEvidence:
             reach: how far the rays tell of what they cross.
 
         Returns:
-            What :meth:`take_back` asks for: where rays passed a surface.
+            Where rays passed a surface.
         """
         self._frozen = None
         passed = np.zeros(len(self._observations.arrays.voxels), np.int32)
@@ -155,34 +150,30 @@ class LiveEvidence:
                 passed,
             )
             if done < len(ends):
-                self._grow()
+                self._make_room(more=True)
         return passed[1 : 1 + passed[0]]
 
-    def take_back(self, passed: Ints, rule: Disbelief) -> Longs:
-        """Take back the surface of voxels that the rays of :meth:`carve` contradict.
+    def remove_contradicted(
+        self, passed: Ints, rule: Disbelief, field: SampleField | None = None
+    ) -> Longs:
+        """Remove the surface of voxels that the rays of :meth:`carve` contradict.
+
+        Args:
+            passed: where these rays passed a surface.
+            rule: when a surface is gone.
+            field: in voxels; it has learnt from all rays around. With it, surface goes that rays
+                crossed and that the field does not show either.
 
         Returns:
             These voxels [M, 3]; they are free.
         """
         self._frozen = None
-        return take_back(np.empty(0, np.int64), passed, self._seen, self._observations.arrays, rule)
-
-    def take_back_unseen(self, passed: Ints, rule: Disbelief, field: SampleField) -> Longs:
-        """Take back the surface that rays crossed and that the field does not show either.
-
-        Args:
-            passed: where the rays of :meth:`carve` passed a surface.
-            rule: when a surface is gone.
-            field: in voxels; it has learnt from all rays around.
-
-        Returns:
-            Voxels [M, 3]; they are free.
-        """
         seen, observed = self._seen, self._observations.arrays
+        if field is None:
+            return take_back(np.empty(0, np.int64), passed, seen, observed, rule)
         rows = np.unique(doubted(passed, seen, observed, rule))
         if len(rows):
             rows = rows[field(middles(rows, seen, observed)).values > _FIELD_FREE]
-            self._frozen = None
         return take_back(rows, np.empty(0, np.int32), seen, observed, rule)
 
     def mark_free(self, voxels: Doubles) -> None:
@@ -194,7 +185,7 @@ class LiveEvidence:
             free = self._seen._replace(surface=self._seen.free)
             done, self._blocks.count, _ = mark_ends(voxels, done, free, self._blocks.count, new, 0)
             if done < len(voxels):
-                self._grow()
+                self._make_room(more=True)
 
     def clear(self, low: Doubles, high: Doubles) -> None:
         """Forget the voxels whose centres lie between the corners ``low`` and ``high`` [3]."""
@@ -208,17 +199,17 @@ class LiveEvidence:
             keep = np.packbits(kept, axis=-1, bitorder="little").reshape(BLOCK_BYTES)
             self._seen.surface[row] &= keep
             self._seen.free[row] &= keep
-        self._observations.forget(np.flatnonzero(near), self._seen.surface[: self.blocks])
+        self._observations.forget(np.flatnonzero(near), self._seen.surface[: self._blocks.count])
 
     def freeze(self, split: Split = in_one) -> FrozenEvidence:
         """The evidence as it is now; the same object until anything changes."""
         if self._frozen is None:
             side, _, *masks = self._seen
-            surface, free = (mask[: self.blocks].copy() for mask in masks)
+            surface, free = (mask[: self._blocks.count].copy() for mask in masks)
             self._frozen = FrozenEvidence(
                 SeenVoxels(side, self._blocks.freeze(), surface, free),
                 *self._observations.support(surface, split),
-                self._observations.seen_s(self.blocks),
+                self._observations.seen_s(self._blocks.count),
             )
         return self._frozen
 
@@ -243,12 +234,10 @@ class LiveEvidence:
         evidence._make_room()
         return evidence
 
-    def _grow(self) -> None:
-        self._blocks.grow()
-        self._make_room()
-
-    def _make_room(self) -> None:
-        """Make room for as many blocks as the index has room for."""
+    def _make_room(self, more: bool = False) -> None:
+        """Make room for as many blocks as the index has room for, or for ``more``."""
+        if more:
+            self._blocks.grow()
         side, _, *masks = self._seen
         roomy = (with_room(mask, self._blocks.capacity) for mask in masks)
         self._seen = SeenVoxels(side, self._blocks.arrays, *roomy)

@@ -10,7 +10,7 @@ from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.row_access import prefetch_row
 from triquad_map.compiled.voxel_index import Index, block_key, find_row, pack
 
-from triquad_server.mapping.ray_table import COLUMNS, END, RayTable
+from triquad_server.mapping.replay.ray_table import COLUMNS, END, RayTable
 
 BIN_LEAVES = 4.0
 BINS = 1 << 18

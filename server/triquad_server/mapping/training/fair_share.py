@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from triquad_server.mapping.replay_pool import RAY_BYTES
+from triquad_server.mapping.replay.kept_rays import RAY_BYTES
 from triquad_server.settings import TrainingSettings
 
 _STEP = 1.1

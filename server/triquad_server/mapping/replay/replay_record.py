@@ -13,9 +13,9 @@ from triquad_format.records.replay_rays import SLOPE_SCALE, STEPS, ReplayRays
 from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.team import Team
 
-from triquad_server.mapping.held_out import end_in_steps, is_held_out
-from triquad_server.mapping.normals import SurfaceNormals
-from triquad_server.mapping.ray_table import LEAST_SLOPE, VALUE, RayTable
+from triquad_server.mapping.replay.held_out import end_in_steps, is_held_out
+from triquad_server.mapping.replay.normals import SurfaceNormals
+from triquad_server.mapping.replay.ray_table import LEAST_SLOPE, VALUE, RayTable
 
 _MOST_RAYS = 6_000_000  # so many fit into the parts of a single cube
 

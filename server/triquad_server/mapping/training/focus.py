@@ -7,7 +7,7 @@ from triquad_map.compiled.evidence.live_evidence import LiveEvidence
 from triquad_map.compiled.voxel_index import cells_of, keys_of
 
 from triquad_server.engine.live_field import LiveField
-from triquad_server.mapping.replay_pool import ReplayPool
+from triquad_server.mapping.replay.replay_pool import ReplayPool
 
 _GROWTH = 1.1
 """New blocks are taken into account once there are so many times as many: to find their rays and

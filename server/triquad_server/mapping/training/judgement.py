@@ -6,6 +6,7 @@ they did, the field has forgotten.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +16,9 @@ from triquad_map.field_fit import PlaceFits
 from triquad_map.places import Places
 from triquad_map.sorted_keys import rows_of
 
-from triquad_server.mapping.group_means import GroupMeans
-from triquad_server.mapping.held_out import ray_keys
-from triquad_server.mapping.ray_table import END
+from triquad_server.mapping.replay.held_out import ray_keys
+from triquad_server.mapping.replay.ray_table import END
+from triquad_server.mapping.training.group_means import GroupMeans
 
 _LEAST_RAYS = 24  # of a place that is judged
 _SURE = 5.0
@@ -30,7 +31,7 @@ _LEAST_SHARE = 0.15
 """And by this share of its mean square error, most of which is the sensor's noise: where leaves are
 small and a camera is noisy, far more than the rise above."""
 
-_SEEN_ANEW = 0.1
+_NEW_SHARE = 0.1
 """Where this share of the rays is new, the place is being learnt."""
 
 _REPAIRS = 3  # of a place in a row; then it is taken as it is
@@ -45,17 +46,31 @@ class JudgedPlaces(PlaceFits):
     repaired: int  # places that had forgotten before, and have not any more
     given_up: int  # places that had, and that training did not mend
 
+    @classmethod
+    def of_places(
+        cls,
+        places: Places,
+        sdf: NDArray[np.floating],
+        forgotten: Bools,
+        repaired: int = 0,
+        given_up: int = 0,
+    ) -> "JudgedPlaces":
+        """The fit of a field that says ``sdf`` [N], metres, where the rays of ``places`` end."""
+        fits = vars(PlaceFits.of(places, sdf))
+        return cls(
+            **fits,
+            forgotten=forgotten,
+            forgotten_keys=places.keys[forgotten],
+            repaired=repaired,
+            given_up=given_up,
+        )
 
-@dataclass(frozen=True)
-class Repairs:
+
+class Repairs(NamedTuple):
     """What became of places that had forgotten, so far."""
 
     done: int = 0  # places that were learnt again
     given_up: int = 0  # places that training did not mend
-
-    def after(self, places: JudgedPlaces) -> "Repairs":
-        """With what was found now."""
-        return Repairs(self.done + places.repaired, self.given_up + places.given_up)
 
 
 class Judgement:
@@ -64,10 +79,26 @@ class Judgement:
     def __init__(self, settings: FieldSettings) -> None:
         """Nothing is judged yet."""
         self._settings = settings
+        self.fit: JudgedPlaces | None = None  # as it was judged last
+        self.repairs = Repairs()
         # By ray, in the order of the keys: what the field said when it was best in that place.
         self._keys = np.zeros(0, np.int64)
         self._best = np.zeros(0)
-        self._repairs: dict[int, int] = {}  # in a row, of places that have forgotten
+        self._tries: dict[int, int] = {}  # in a row, of places that have forgotten
+
+    @classmethod
+    def restored(
+        cls, settings: FieldSettings, repairs: Repairs, rows: Floats, sdf: NDArray[np.floating]
+    ) -> "Judgement":
+        """What a field forgets from now on is judged by what it says now; as :meth:`judge`."""
+        judgement = cls(settings)
+        judgement.repairs = repairs
+        if len(rows):
+            judgement._remember(ray_keys(rows, settings), sdf.astype(np.float64))
+            places = Places.of(rows[:, END : END + 3], settings)
+            none = np.zeros(len(places.keys), np.bool_)
+            judgement.fit = JudgedPlaces.of_places(places, sdf, forgotten=none)
+        return judgement
 
     def judge(
         self, rows: Floats, sdf: NDArray[np.floating], *, may_repair: bool = True
@@ -75,7 +106,7 @@ class Judgement:
         """Judge the field by held-out rays.
 
         Args:
-            rows: [N, COLUMNS] of the rays' table.
+            rows: [N, COLUMNS] of the rays' table, one at least.
             sdf: [N] what the field says where they end, metres.
             may_repair: what has forgotten may be learnt again; else it is taken as it is.
         """
@@ -84,22 +115,19 @@ class Judgement:
         places = Places.of(rows[:, END : END + 3], self._settings)
         # By how much the squares rose at the same rays' ends.
         rises = _means(sdf.astype(np.float64) ** 2 - best**2, places)
-        seen_anew = rises.counts < (1 - _SEEN_ANEW) * places.rays
-        worse = self._are_sure(rises, _means(best**2, places).means) & ~seen_anew
+        is_new = rises.counts < (1 - _NEW_SHARE) * places.rays
+        worse = self._are_sure(rises, _means(best**2, places).means) & ~is_new
         still_worse = set(places.keys[worse].tolist())
-        repaired = sum(place not in still_worse for place in self._repairs)
+        repaired = sum(place not in still_worse for place in self._tries)
         forgotten = worse & may_repair
         forgotten &= self._may_be_repaired(places.keys, forgotten)
-        is_best = ((rises.means < 0) | seen_anew | worse) & ~forgotten
+        is_best = ((rises.means < 0) | is_new | worse) & ~forgotten
         now_best = is_best[places.place_of] | np.isnan(best)
         self._remember(keys, np.where(now_best, sdf, best))
-        return JudgedPlaces(
-            **vars(PlaceFits.of(places, sdf)),
-            forgotten=forgotten,
-            forgotten_keys=places.keys[forgotten],
-            repaired=repaired,
-            given_up=int((worse & ~forgotten).sum()),
-        )
+        given_up = int((worse & ~forgotten).sum())
+        self.repairs = Repairs(self.repairs.done + repaired, self.repairs.given_up + given_up)
+        self.fit = JudgedPlaces.of_places(places, sdf, forgotten, repaired, given_up)
+        return self.fit
 
     def _are_sure(self, rises: GroupMeans, before: Doubles) -> Bools:
         """Where the field is worse for sure than its mean square errors ``before`` [P]."""
@@ -120,10 +148,10 @@ class Judgement:
 
     def _may_be_repaired(self, places: Longs, worse: Bools) -> Bools:
         """Which places were not yet repaired in vain too often; counts the repairs."""
-        tried = [self._repairs.get(place, 0) for place in places.tolist()]
+        tried = [self._tries.get(place, 0) for place in places.tolist()]
         fine = np.array(tried, np.int64) < _REPAIRS
         again = zip(places.tolist(), tried, (worse & fine).tolist(), strict=True)
-        self._repairs = {place: count + 1 for place, count, repaired in again if repaired}
+        self._tries = {place: count + 1 for place, count, repaired in again if repaired}
         return fine
 
 

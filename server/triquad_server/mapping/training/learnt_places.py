@@ -1,7 +1,7 @@
 """The places of a region that are learnt: training on more of their rays makes them no better.
 
 A robot at rest sends the same surfaces again and again. They are taken in, since they tell what is
-still there, but once the error of a place falls no more, its rays owe no training: so the map
+still there, but once the error of a place falls no more, its rays need no training: so the map
 settles while scans come. When anything changes in sight, all is learnt again as if it were new.
 """
 
@@ -14,7 +14,7 @@ from triquad_format.records.field_settings import FieldSettings
 from triquad_map.places import place_keys
 from triquad_map.sorted_keys import rows_of
 
-from triquad_server.mapping.group_means import GroupMeans
+from triquad_server.mapping.training.group_means import GroupMeans
 
 AtEnds = Callable[[Floats], NDArray[np.floating]]
 
@@ -36,8 +36,8 @@ _LEAST_RISE = 0.5
 _LEAST_RAYS = 24
 """Of a place by itself: those that have fewer are compared as one."""
 
-_FEW_OWING = 0.01
-"""Where a smaller share of a scan's rays end in places that are not learnt, these owe nothing
+_FEW_NEEDING = 0.01
+"""Where a smaller share of a scan's rays end in places that are not learnt, these need none
 either: in a place of few rays, chance alone makes the error fall now and then."""
 
 _NOISE = 0.1  # of rays, in leaves: where errors are less, few rays tell of it alone
@@ -45,7 +45,7 @@ _NOISE = 0.1  # of rays, in leaves: where errors are less, few rays tell of it a
 _TURNS = 4
 """Of one scan's rays in so many it is told where they end, of others the next time."""
 
-_FEW_GONE = 2
+_FEW_REMOVED = 2
 """Where at once surface goes from more voxels of a place, all is learnt again: single ones hold the
 noise of rays."""
 
@@ -89,19 +89,19 @@ class LearntPlaces:
         if new.any():
             self._seen = np.union1d(self._seen, keys[new])
 
-    def owing(self, ends: Doubles | Floats) -> Bools:
-        """Which rays [N] of a scan owe training, that end at ``ends`` [N, 3]."""
+    def need_training(self, ends: Doubles | Floats) -> Bools:
+        """Which rays [N] of a scan need training, that end at ``ends`` [N, 3]."""
         if len(self._learnt) == 0:
             return np.ones(len(ends), np.bool_)
-        owing = rows_of(self._learnt, place_keys(ends, self._settings)) < 0
-        if owing.sum() < _FEW_OWING * len(owing):
-            owing[:] = False
-        return owing
+        needing = rows_of(self._learnt, place_keys(ends, self._settings)) < 0
+        if needing.sum() < _FEW_NEEDING * len(needing):
+            needing[:] = False
+        return needing
 
-    def lose(self, points: Doubles) -> None:
+    def surface_removed(self, points: Doubles) -> None:
         """Surface went from ``points`` [N, 3], one in each voxel."""
         _, counts = np.unique(place_keys(points, self._settings), return_counts=True)
-        if (counts > _FEW_GONE).any():
+        if (counts > _FEW_REMOVED).any():
             self.learn_all_again()
 
     def trained(self, visits: float) -> None:

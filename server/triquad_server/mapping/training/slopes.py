@@ -8,9 +8,9 @@ import numpy as np
 from triquad_format.records.arrays import Doubles, Floats, Longs
 
 from triquad_server.engine.live_field import LiveField
-from triquad_server.mapping.ray_table import END, LEAST_SLOPE, RayTable
-from triquad_server.mapping.replay_pool import ReplayPool
-from triquad_server.mapping.training_budget import Step
+from triquad_server.mapping.replay.ray_table import END, LEAST_SLOPE, RayTable
+from triquad_server.mapping.replay.replay_pool import ReplayPool
+from triquad_server.mapping.training.training_budget import Step
 
 _EVERY_SAMPLES = 1 << 15  # the field is asked
 _SHARE = 0.25  # of the samples, as many rays are looked at: each of them a few times

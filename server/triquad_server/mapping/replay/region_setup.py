@@ -4,11 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
+from triquad_map.compiled.evidence.contradictions import Disbelief
 from triquad_map.compiled.team import Team
 
 from triquad_server.engine.compiled_trainer import GradientSums
 from triquad_server.engine.memory import Memory
-from triquad_server.mapping.ray_table import Placement
+from triquad_server.mapping.replay.ray_table import Placement
 from triquad_server.settings import ChangeSettings, ScanSettings, TrainingSettings
 
 
@@ -35,6 +36,11 @@ class RegionSetup:
             behind_m=self.scan.behind_m,
             half_side_m=self.field.region_side_m / 2,
         )
+
+    @property
+    def disbelief(self) -> Disbelief:
+        """When rays contradict a surface."""
+        return Disbelief.of(self.change.scans, self.change.doubt)
 
     def seeds(self, index: RegionIndex) -> tuple[int, int]:
         """Seeds of a region's field and of its replay pool; no two regions share one."""

@@ -7,7 +7,7 @@ from triquad_format.records.arrays import Bools, Floats, Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_map.compiled.kernel import inner_kernel, kernel
 
-from triquad_server.mapping.ray_table import END, RayTable
+from triquad_server.mapping.replay.ray_table import END
 
 
 def ends_in_steps(rows: Floats, settings: FieldSettings) -> NDArray[np.int64]:
@@ -55,13 +55,3 @@ def _held_out(rows: Floats, leaf_m: float, corner: float) -> Bools:
 def are_held_out(rows: Floats, settings: FieldSettings) -> Bools:
     """Which rays are held out."""
     return _held_out(rows, settings.leaf_m, float(1 << settings.depth))
-
-
-def both_tables(trained: RayTable, held: RayTable) -> RayTable:
-    """All rays of a region."""
-    moved = np.where(held.origin_of >= 0, held.origin_of + len(trained.origins), held.origin_of)
-    return RayTable(
-        np.concatenate([trained.rows, held.rows]),
-        np.concatenate([trained.origin_of, moved.astype(np.int32)]),
-        np.concatenate([trained.origins, held.origins]),
-    )

@@ -1,0 +1,116 @@
+"""The regions of the live map: made as scans enter them, within the limits of the map."""
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+from triquad_format.records.arrays import Doubles
+from triquad_format.records.field_settings import RegionIndex
+from triquad_format.records.region import Region
+
+from triquad_server.errors import ScanRefusedError
+from triquad_server.intake.rays import ScanRays
+from triquad_server.mapping.live_region import LiveRegion
+from triquad_server.mapping.memory_budget import NO_SIZE, MemoryBudget
+from triquad_server.mapping.regions_around import regions_around
+from triquad_server.mapping.replay.region_setup import RegionSetup
+from triquad_server.mapping.training.fair_share import FairShare
+
+
+class LiveRegions:
+    """All regions of a map; only the thread that owns the map may use them."""
+
+    def __init__(self, setup: RegionSetup, max_bytes: int) -> None:
+        """There are none yet; they may take ``max_bytes``, with the newest epoch of them."""
+        self._setup = setup
+        self._budget = MemoryBudget(max_bytes, setup.field)
+        self._regions: dict[RegionIndex, LiveRegion] = {}
+        self._share = FairShare.of(0, setup.training)
+
+    def __len__(self) -> int:
+        return len(self._regions)
+
+    def __iter__(self) -> Iterator[LiveRegion]:
+        return iter(self._regions.values())
+
+    @property
+    def bytes_used(self) -> int:
+        """Memory of the regions with the newest epoch, without rays; an estimate."""
+        return self._budget.bytes_of(region.size for region in self)
+
+    @property
+    def samples_left(self) -> int:
+        """Training samples that are still to be trained on."""
+        return sum(region.training.budget.samples for region in self)
+
+    @property
+    def rays_share(self) -> float:
+        """Of the rays that each place is to keep, the share that memory has room for."""
+        return self._share.rays_share
+
+    @property
+    def next_to_learn(self) -> LiveRegion | None:
+        """The region with most to learn for what is there; None: all have settled."""
+        region = max(self, key=lambda r: r.training.samples_per_vertex, default=None)
+        return None if region is None or region.training.is_settled else region
+
+    def restore(self, records: Iterable[Region]) -> None:
+        """Have the regions of a record; what they may keep is told by :meth:`share_out`."""
+        for record in records:
+            self._regions[record.index] = LiveRegion.restored(record, self._setup)
+
+    def reached_by(self, rays: ScanRays) -> list[LiveRegion]:
+        """The regions that a scan enters; those that are new belong to the map from now on.
+
+        Raises:
+            ScanRefusedError: the map would have too many regions, or take too much memory.
+        """
+        around = regions_around(rays, self._regions, self._setup.field)
+        limit = self._setup.training.max_regions
+        count = len(self._regions.keys() | set(around))
+        if count > limit:
+            raise ScanRefusedError(
+                "too_many_regions",
+                f"the scan would make {count} regions of the map, more than "
+                f"training.max_regions = {limit}",
+            )
+        reached = {
+            index: self._regions.get(index) or LiveRegion.unseen(index, self._setup)
+            for index in around
+        }
+        self._check_memory(rays, list(reached.values()))
+        self._regions.update(reached)
+        return list(reached.values())
+
+    def share_out(self) -> None:
+        """Let all places keep as many rays, and be trained on as many samples at most."""
+        voxels = [(region, region.size.evidence.voxels) for region in self]
+        self._share = FairShare.of(sum(count for _, count in voxels), self._setup.training)
+        for region, count in voxels:
+            region.training.limit(self._share, count)
+
+    def forget(self, minimum: Doubles, maximum: Doubles) -> None:
+        """Forget what lies between two corners [3], map frame, and all regions that lie there."""
+        half = self._setup.field.region_side_m / 2
+        for index, region in list(self._regions.items()):
+            low, high = region.centre - half, region.centre + half
+            if ((minimum <= low) & (maximum >= high)).all():
+                del self._regions[index]
+            elif ((minimum < high) & (maximum > low)).all():
+                region.forget(np.maximum(minimum, low), np.minimum(maximum, high))
+        self.share_out()
+
+    def _check_memory(self, rays: ScanRays, reached: list[LiveRegion]) -> None:
+        """Refuse a scan that does not fit; the closer to the limit, the more exact the count.
+
+        Raises:
+            ScanRefusedError: ``map_full``.
+        """
+        used, budget = self.bytes_used, self._budget
+        if used + budget.most_added(rays, [len(rays.ends)] * len(reached)) <= budget.limit:
+            return
+        if used + budget.most_added(rays, [r.new_voxels(rays) for r in reached]) <= budget.limit:
+            return
+        unseen = budget.bytes_of(NO_SIZE for r in reached if r.index not in self._regions)
+        needed = unseen + sum(budget.grown(region.growth_by(rays)) for region in reached)
+        if needed and used + needed > budget.limit:
+            raise budget.refusal(used, needed)

@@ -1,0 +1,182 @@
+"""What rays have shown of one region of the live map: voxels, surfels, and surface that went."""
+
+import math
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from triquad_format.records.arrays import Doubles, Ints, Longs
+from triquad_format.records.region import Evidence
+from triquad_map.compiled.evidence.carving import Reach
+from triquad_map.compiled.evidence.evidence import FrozenEvidence
+from triquad_map.compiled.evidence.growth import EvidenceSize
+from triquad_map.compiled.evidence.live_evidence import LiveEvidence, Marks
+from triquad_map.compiled.evidence.sightings import Sighting
+from triquad_map.compiled.surfels.surfel_map import SurfelMap, first_surfels
+from triquad_map.compiled.voxel_index import empty_keys, thin
+from triquad_map.surface import SampleField, ShownByRays, nothing_shown
+
+from triquad_server.intake.rays import ScanRays
+from triquad_server.mapping.replay.region_setup import RegionSetup
+
+_CARVE_SHORT = 0.5  # voxels before its end, up to where a ray shows free space
+_CLEAR_SHORT = 2.5  # voxels before its end, up to where a ray shows that a surface is not there
+_FAR_THINNED_AT, _OPEN_THINNED_AT = 0.5, 0.25  # shares of the rays' length
+
+_NEW_SCANS = 10
+"""Scans after a surface was first seen, in which the field has had time to learn it."""
+
+_FEW_NEW = 2
+"""New surface in more voxels than these makes the region learn again what it had learnt."""
+
+_SURFELS_REFITTED = 8_000
+"""Surfels that are fitted again with each epoch while the field is trained: some 10 ms."""
+
+
+class SeenSurface(NamedTuple):
+    """Where the rays of a scan ended in a region."""
+
+    marks: Marks
+    is_new: bool  # on surface that the field has had no time to learn
+
+
+class PublishedEvidence(NamedTuple):
+    """The evidence of a region as an epoch shows it."""
+
+    evidence: FrozenEvidence
+    surfels: SurfelMap
+    removed: Longs  # [M, 3] voxels whose surface went since the epoch before
+
+
+class RegionEvidence:
+    """The evidence of one region, and how it was published last."""
+
+    def __init__(self, live: LiveEvidence, setup: RegionSetup, centre: Doubles, seed: int) -> None:
+        """``centre`` [3] is that of the region, map frame."""
+        self.live = live
+        self._setup = setup
+        self._centre = centre
+        self._random = np.random.default_rng(seed)
+        self._scans = 0  # in which the region was seen
+        self._scans_learnt = 0  # of these, those before the field was trained last
+        self._passed: list[Ints] = []  # where rays passed a surface since the last epoch
+        self._removed: list[Longs] = []  # voxels whose surface went since the last epoch
+        self._surfels: SurfelMap | None = None  # of the last epoch
+        self._fitted_to: int | None = None
+        """Version of the field to which all surfels are fitted; None: some to earlier ones."""
+
+        self._is_restored = False  # and not yet published: the field alone tells where surface lies
+
+    @classmethod
+    def restored(
+        cls, record: Evidence, setup: RegionSetup, centre: Doubles, seed: int
+    ) -> "RegionEvidence":
+        """The evidence of a record."""
+        live = LiveEvidence.from_record(1 << setup.field.depth, record)
+        evidence = cls(live, setup, centre, seed)
+        evidence._is_restored = True
+        return evidence
+
+    @property
+    def size(self) -> EvidenceSize:
+        """How much it holds."""
+        return self.live.size
+
+    def voxels(self, points: Doubles) -> Doubles:
+        """Voxel coordinates [N, 3] of points [N, 3], map frame."""
+        return self._setup.field.leaf_coordinates(points - self._centre)
+
+    def scan_taken(self, rays: ScanRays, stamp_s: int) -> SeenSurface:
+        """Record where rays ended and what they crossed, and remove surface that they contradict.
+
+        ``stamp_s`` is when the scan was taken, seconds since 1970.
+        """
+        self._scans += 1
+        ends, origin = self.voxels(rays.ends), self.voxels(rays.origin[None])[0]
+        leaf_m = self._setup.field.leaf_m
+        marks = self.live.mark_surface(ends, Sighting(origin, leaf_m, stamp_s, self._scans))
+        is_new = self.live.new_surface(marks, _NEW_SCANS) > _FEW_NEW
+        clear = math.inf if self._setup.change.static else _CLEAR_SHORT
+        reach = Reach(_CARVE_SHORT, clear, self._scans)
+        thinned = ends[thin(ends, 1.0, empty_keys(len(ends)))]
+        far_ends = self._thinned(origin, self.voxels(rays.far_ends), _FAR_THINNED_AT)
+        passed = self.live.carve(origin, thinned, reach)
+        passed_farther = self.live.carve(origin, far_ends, reach._replace(free=0.0))
+        passed = np.concatenate([passed, passed_farther])
+        if len(passed):
+            self._passed.append(passed)
+            self._removed.append(self.live.remove_contradicted(passed, self._setup.disbelief))
+        # Glass and black paint return nothing: these rays contradict no surface.
+        open_ends = self._thinned(origin, self.voxels(rays.open_ends), _OPEN_THINNED_AT)
+        self.live.carve(origin, open_ends, Reach(0.0))
+        if rays.robot is not None:
+            self.live.mark_free(self.voxels(rays.robot.voxel_centres(leaf_m)))
+        return SeenSurface(marks, is_new)
+
+    def step_taken(self) -> None:
+        """The field was trained on what was seen so far."""
+        self._scans_learnt = self._scans
+
+    def published(
+        self, samples: SampleField, version: int, epoch: int, *, is_settled: bool
+    ) -> PublishedEvidence:
+        """The evidence as it is now, to be published with ``epoch``.
+
+        Args:
+            samples: the field, in voxels.
+            version: of the field.
+            epoch: number of the epoch.
+            is_settled: there is nothing to train on.
+        """
+        if self._passed:
+            passed = np.concatenate(self._passed)
+            removed = self.live.remove_contradicted(passed, self._setup.disbelief, samples)
+            self._removed.append(removed)
+            self._passed.clear()
+        evidence = self.live.freeze(self._setup.team.split)
+        self._surfels = surfels = self._fitted_surfels(
+            evidence, samples, version, epoch, is_settled=is_settled
+        )
+        self._fitted_to = version if is_settled else None
+        if self._is_restored:
+            self.live.set_discs(surfels.voxels(), surfels.surfels)
+            self._is_restored = False
+        removed = np.unique(np.concatenate([np.zeros((0, 3), np.int64), *self._removed]), axis=0)
+        self._removed.clear()
+        if len(removed):
+            removed = removed[~evidence.ended_in(removed)]  # nothing ended there since
+        return PublishedEvidence(evidence, surfels, removed)
+
+    def forget(self, low: Doubles, high: Doubles) -> None:
+        """Forget what lies between two corners [3], map frame."""
+        self.live.clear(self.voxels(low[None])[0], self.voxels(high[None])[0])
+
+    def _thinned(self, origin: Doubles, ends: Doubles, share: float) -> Doubles:
+        """Some of the rays to ``ends`` [N, 3]: one per voxel at a share of their length.
+
+        Nearer, they leave no gaps. The voxels are shifted from scan to scan, so that a robot at
+        rest uses other rays each time.
+        """
+        near = origin + share * (ends - origin) + self._random.random(3)
+        thinned: Doubles = ends[thin(near, 1.0, empty_keys(len(ends)))]
+        return thinned
+
+    def _fitted_surfels(
+        self,
+        evidence: FrozenEvidence,
+        samples: SampleField,
+        version: int,
+        epoch: int,
+        *,
+        is_settled: bool,
+    ) -> SurfelMap:
+        """The surfels of an epoch; once the region has settled, all are fitted to its field."""
+        most: int | None = None
+        shown: ShownByRays = nothing_shown
+        if not is_settled or self._fitted_to == version:
+            most = 0 if is_settled else _SURFELS_REFITTED
+            since = max(1, self._scans_learnt - _NEW_SCANS)  # and not of before a restart
+            shown = partial(self.live.ray_surfels, since=since)
+        if self._surfels is None:
+            return first_surfels(evidence, samples, epoch, shown)
+        return self._surfels.updated(evidence, samples, epoch, most=most, by_rays=shown)

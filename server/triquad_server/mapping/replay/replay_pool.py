@@ -1,0 +1,166 @@
+"""Samples drawn on the rays that a region keeps to be trained on."""
+
+import numpy as np
+from triquad_format.records.arrays import Doubles, Longs
+from triquad_format.records.field_settings import FieldSettings
+from triquad_map.compiled.team import Team
+from triquad_map.compiled.voxel_index import Index, VoxelIndex
+from triquad_map.places import place_keys
+
+from triquad_server.engine.live_field import Batch
+from triquad_server.mapping.replay.kept_rays import KeptRays
+from triquad_server.mapping.replay.ray_bins import rays_ending_in
+from triquad_server.mapping.replay.ray_table import (
+    END,
+    VALUE,
+    Placement,
+    RayTable,
+    draw_ordered_samples,
+)
+
+_NONE = np.zeros(0, np.int64)
+
+
+class ReplayPool:
+    """Rays of one region; some can be drawn on more often than others."""
+
+    def __init__(
+        self, placement: Placement, settings: FieldSettings, seed: int, team: Team
+    ) -> None:
+        """There are no rays, and no limit yet; ``team`` draws samples on them."""
+        self._settings = settings
+        self._team = team
+        self.placement = placement
+        self._rng = np.random.default_rng(seed)
+        self._rays = KeptRays(settings, self._rng)
+        self._fresh = _NONE  # places of the newest
+        self._oversampled = _NONE
+        self._blocks: Index | None = None  # in which the rays end that are drawn on at random
+        self._focused: Longs | None = None  # their places; None: to be found
+
+    def __len__(self) -> int:
+        return len(self._rays)
+
+    @property
+    def table(self) -> RayTable:
+        """All that is kept; it changes with the pool."""
+        return self._rays.table
+
+    @property
+    def discarded(self) -> int:
+        """Rays so far, that gave way to others or were too many."""
+        return self._rays.discarded
+
+    def add(self, new: RayTable, fresh: bool = True) -> None:
+        """Take in rays; if ``fresh``, they become the newest."""
+        places = self._rays.add(new)
+        if len(self._oversampled) or self._focused is not None:
+            is_other = np.zeros(len(self), np.bool_)
+            is_other[places] = True
+            self._oversampled = self._oversampled[~is_other[self._oversampled]]
+            if self._focused is not None:
+                kept = self._focused[~is_other[self._focused]]
+                self._focused = np.concatenate([kept, self._ending_in_blocks(places)])
+        if fresh:
+            self._fresh = places
+
+    def focus(self, blocks: Longs | None) -> None:
+        """From now on, draw on rays that end in ``blocks`` [B, 3] of voxels alone; None: on all."""
+        self._blocks = None if blocks is None else VoxelIndex.of_cells(blocks).arrays
+        self._focused = None
+
+    @property
+    def rays_drawn_on(self) -> int:
+        """How many rays are drawn on at random."""
+        in_focus = self._in_focus()
+        return len(self) if in_focus is None else len(in_focus)
+
+    def oversample(self, places: Longs) -> int:
+        """From now on, some samples are drawn in ``places`` [P] on request; returns their rays."""
+        self._oversampled = _NONE
+        if len(places):
+            ends = self.table.rows[:, END : END + 3]
+            self._oversampled = np.flatnonzero(np.isin(place_keys(ends, self._settings), places))
+        return len(self._oversampled)
+
+    def draw(self, count: int, fresh: int, oversampled: int = 0) -> Batch:
+        """``count`` samples on rays at random.
+
+        ``fresh`` of them are on the newest, ``oversampled`` in the places that are oversampled.
+        """
+        places = self._at_random(count, fresh)
+        if oversampled and len(self._oversampled):
+            rows = self._rng.integers(len(self._oversampled), size=min(oversampled, count - fresh))
+            places[fresh : fresh + oversampled] = self._oversampled[rows]
+        return self.draw_on(places)
+
+    def draw_on(self, places: Longs) -> Batch:
+        """A sample on each of the rays of :attr:`table` at ``places`` [N]."""
+        return draw_ordered_samples(
+            self.table, places, self.placement, rng=self._rng, team=self._team
+        )
+
+    def unsure(self, count: int, fresh: int) -> Longs:
+        """The places of rays whose slope no normal told, among ``count`` that are drawn on.
+
+        They end in the cube: elsewhere a field knows no surface.
+        """
+        places, table = np.unique(self._at_random(count, fresh)), self.table
+        is_unsure = (table.rows[places, VALUE] < 0) & (table.origin_of[places] >= 0)
+        ends = table.rows[places, END : END + 3]
+        is_unsure &= (np.abs(ends) < self.placement.half_side_m).all(axis=1)
+        unsure: Longs = places[is_unsure]
+        return unsure
+
+    def set_slopes(self, places: Longs, slopes: Doubles) -> None:
+        """The rays at ``places`` [N] have these ``slopes`` [N], which no normal told."""
+        self.table.rows[places, VALUE] = -slopes
+
+    def limit(self, capacity: int) -> None:
+        """Change the capacity; what is too much goes at random."""
+        is_too_much = len(self) > capacity
+        self._rays.limit(capacity)
+        if is_too_much:
+            self._select_none()
+
+    def forget(self, low: Doubles, high: Doubles) -> None:
+        """Drop the rays that end between two corners [3], metres from the region's centre."""
+        self._rays.forget(low, high)
+        self._select_none()
+
+    def forget_ends(self, voxels: Longs) -> None:
+        """Drop the rays that end in ``voxels`` [N, 3]."""
+        self._rays.forget_ends(voxels)
+        self._fresh = self._fresh[self._fresh < len(self)]
+        self._oversampled = self._oversampled[self._oversampled < len(self)]
+        self._focused = None
+
+    def _at_random(self, count: int, fresh: int) -> Longs:
+        """Places [count] at random, ``fresh`` of them of the newest."""
+        in_focus = self._in_focus()
+        places: Longs = self._rng.integers(self.rays_drawn_on, size=count)
+        if in_focus is not None:
+            places = in_focus[places]
+        if fresh and len(self._fresh):
+            places[:fresh] = self._fresh[self._rng.integers(len(self._fresh), size=fresh)]
+        return places
+
+    def _in_focus(self) -> Longs | None:
+        """The places of the rays that are drawn on at random; None: all of them."""
+        if self._blocks is None:
+            return None
+        if self._focused is None:
+            self._focused = self._ending_in_blocks(np.arange(len(self)))
+        return self._focused if len(self._focused) else None
+
+    def _ending_in_blocks(self, places: Longs) -> Longs:
+        """Those of the rays at ``places`` [N] that end in the blocks in focus."""
+        assert self._blocks is not None
+        middle = float(1 << (self._settings.depth - 1))  # of the region, voxels
+        rows = self.table.rows[places]
+        return places[rays_ending_in(self._blocks, self._settings.leaf_m, middle, rows)]
+
+    def _select_none(self) -> None:
+        """Rays have other places now."""
+        self._fresh = self._oversampled = _NONE
+        self._focused = None

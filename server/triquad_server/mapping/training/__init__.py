@@ -1,0 +1,1 @@
+"""What regions have still to learn, where, and at which rates."""

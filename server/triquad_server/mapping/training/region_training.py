@@ -1,0 +1,250 @@
+"""What one region of the live map has still to learn, and where it has forgotten."""
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+from triquad_format.records.arrays import Doubles, Floats, Longs
+from triquad_format.records.region import TrainingState
+from triquad_map.compiled.evidence.live_evidence import LiveEvidence
+from triquad_map.compiled.surfels.surfel_map import SurfelMap
+from triquad_map.composition.region import no_surfels
+
+from triquad_server.engine.field_record import training_state
+from triquad_server.engine.live_field import LiveField
+from triquad_server.engine.memory import FrozenField
+from triquad_server.engine.trainer import Loss, trainer_of
+from triquad_server.intake.rays import ScanRays
+from triquad_server.mapping.replay.ray_table import END, rays_through, samples_alone
+from triquad_server.mapping.replay.region_rays import RegionRays
+from triquad_server.mapping.replay.region_setup import RegionSetup
+from triquad_server.mapping.training.fair_share import FairShare
+from triquad_server.mapping.training.focus import Focus
+from triquad_server.mapping.training.judgement import Judgement, Repairs
+from triquad_server.mapping.training.learnt_places import VISITS, LearntPlaces
+from triquad_server.mapping.training.slopes import Slopes
+from triquad_server.mapping.training.training_budget import TrainingBudget
+
+_log = logging.getLogger(__name__)
+
+_SAMPLES_PER_VOXEL = 16  # that teach the free space of a surface that is gone
+_VISITS = 4  # to each of them
+
+_VERTICES_PER_SAMPLE = 14
+"""Of a region, for each sample of a step: each vertex takes about as many steps wherever it is."""
+
+_LEAST_BATCH = 4096  # what a step costs however few its samples are matters below
+
+_JUDGED_AFTER_SAMPLES = 8_000_000
+"""A field that is being trained is judged after so many samples: a few seconds. Where few rays are
+kept, it is as soon as each was visited as often as makes a difference."""
+
+_JUDGED_AFTER_SHARE = 0.5
+"""A field that has settled is judged once this share of the rays that are held out is new."""
+
+_FEW_REMOVED = 32
+"""Where the surface of more voxels is gone, all of the region learns: rows that others use as well
+have to forget it."""
+
+
+class RegionTraining:
+    """The training of one region's field: it is told of scans, and has to be told of epochs."""
+
+    def __init__(
+        self,
+        field: LiveField,
+        evidence: LiveEvidence,
+        setup: RegionSetup,
+        centre: Doubles,
+        seed: int,
+        rays: RegionRays | None = None,
+    ) -> None:
+        """There is nothing to learn yet.
+
+        Args:
+            field: what is trained.
+            evidence: of the same region.
+            setup: what all regions have in common.
+            centre: [3] of the region, map frame.
+            seed: of all random choices.
+            rays: those that are kept already, if any.
+        """
+        self._field = field
+        self._setup = setup
+        self._centre = centre
+        self._random = np.random.default_rng([seed, 1])  # other numbers than those of the pool
+        self.rays = rays or RegionRays(setup, seed)
+        self.budget = TrainingBudget(setup.training)
+        self.judgement = Judgement(setup.field)
+        self._learnt = LearntPlaces(setup.field)
+        self._focus = Focus(field, evidence, self.rays.pool)
+        self._slopes = Slopes(field, self.rays.pool)
+        self._trainer = trainer_of(field, setup.sums, setup.team)
+        self._unjudged_samples = 0  # that were trained since it was judged
+        self._unjudged_rays = 0  # that were held out since
+
+    @classmethod
+    def restored(
+        cls,
+        state: TrainingState,
+        field: LiveField,
+        evidence: LiveEvidence,
+        setup: RegionSetup,
+        centre: Doubles,
+        seed: int,
+    ) -> "RegionTraining":
+        """Training goes on as recorded; what is forgotten is judged by what the field says now."""
+        rays = RegionRays.restored(state, setup, seed)
+        training = cls(field, evidence, setup, centre, seed, rays)
+        training.budget.restore(state.budget_samples, len(rays.pool))
+        repairs = Repairs(state.places_repaired, state.places_given_up)
+        judging = rays.judging
+        sdf = _sdf(field.freeze(), judging[:, END : END + 3])
+        training.judgement = Judgement.restored(setup.field, repairs, judging, sdf)
+        return training
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether there is nothing left to train on."""
+        return self.budget.samples == 0
+
+    @property
+    def samples_per_vertex(self) -> float:
+        """Samples that are still to be trained on for each vertex."""
+        return self.budget.samples / max(1, self._field.vertices)
+
+    @property
+    def batch(self) -> int:
+        """Samples of a step: fewer where little learns, or it would take too few steps.
+
+        And half while scans stream in: of as many samples, more and smaller steps learn sooner.
+        """
+        most = self._setup.training.batch
+        wanted = min(most, self._field.vertices_that_learn // _VERTICES_PER_SAMPLE)
+        if self.budget.learns_newest:
+            wanted //= 2
+        return min(most, max(_LEAST_BATCH, wanted))
+
+    def limit(self, share: FairShare, voxels: int) -> None:
+        """Keep as many rays and samples as is the share of so many ``voxels`` with surface."""
+        self.rays.limit(max(1, int(share.rays * voxels)))
+        self.budget.limit(int(share.samples * voxels))
+
+    def scan_taken(self, rays: ScanRays, normals: Doubles, *, is_new: bool) -> None:
+        """Keep the rays of a scan, to be trained on.
+
+        Args:
+            rays: N rays, map frame.
+            normals: [N, 3] of the surface at their ends, NaN where unknown.
+            is_new: they show surface that the field has had no time to learn.
+        """
+        if is_new and len(self._learnt):
+            self._learnt.learn_all_again()
+        if self.is_settled:
+            self._focus.narrow()
+        offsets = rays.ends - self._centre
+        self._learnt.see(offsets)
+        needing = self._learnt.need_training(offsets)
+        self._focus.widen_to(self._setup.field.leaf_coordinates(offsets[needing]))
+        placement = self._setup.placement
+        passing = rays_through(rays, normals, self._centre, placement, self._random)
+        if len(passing) == 0:
+            return
+        held = self.rays.keep(passing)
+        self._unjudged_rays += int(held.sum())
+        needing = self._learnt.need_training(passing.rows[:, END : END + 3])
+        self.budget.add(int((needing & ~held).sum()))
+
+    def take_step(self) -> tuple[Loss, int]:
+        """One optimiser step; returns its loss and samples. On a GPU, to read the loss waits."""
+        self._focus.apply(self.batch)
+        pool = self.rays.pool
+        step = self.budget.next_step(self.batch, pool.rays_drawn_on)
+        loss = self._trainer.train(pool.draw(step.samples, step.fresh, step.repair), step.rates)
+        self.budget.spend(step)
+        self._unjudged_samples += step.samples
+        self._learnt.trained(step.samples / pool.rays_drawn_on)
+        self._slopes.after(step)
+        return loss, step.samples
+
+    def published(self, field: FrozenField, surfels: SurfelMap, removed: Longs) -> None:
+        """An epoch shows the ``field`` and the ``surfels``, and no surface in ``removed`` [M, 3].
+
+        These are voxels in which the epoch before showed some. The field is judged from time to
+        time, and learns again what it has forgotten.
+        """
+        if len(removed):
+            self._unlearn(removed, surfels)
+        if self._is_to_be_judged:
+            self._judge(field)
+
+    def forget(self, low: Doubles, high: Doubles) -> None:
+        """Forget the rays that end between two corners [3], map frame."""
+        self._focus.release()
+        self._learnt.learn_all_again()
+        self.rays.forget(low - self._centre, high - self._centre)
+        if len(self.rays.pool) == 0:
+            self.budget.clear()
+
+    def state(self) -> TrainingState:
+        """What training needs beyond the field, but for rays and samples, sharing nothing."""
+        return replace(
+            training_state(self._field, self.budget.samples),
+            places_repaired=self.judgement.repairs.done,
+            places_given_up=self.judgement.repairs.given_up,
+        )
+
+    def _unlearn(self, removed: Longs, surfels: SurfelMap) -> None:
+        """Forget the rays that ended in voxels, and have the field learn what is there now."""
+        settings = self._setup.field
+        self._learnt.surface_removed(settings.offsets(removed.astype(np.float64) + 0.5))
+        self.rays.forget_ends(removed)
+        if len(removed) > _FEW_REMOVED:
+            self._focus.release()
+        else:
+            self._focus.widen_to(removed)
+        inside = self._random.random((_SAMPLES_PER_VOXEL, len(removed), 3))
+        points = (removed + inside).reshape(-1, 3)
+        nearest = no_surfels(np.full(len(points), self._setup.scan.truncation_m / settings.leaf_m))
+        surfels.find_nearest(points, nearest)
+        offsets = settings.offsets(points).astype(np.float32)
+        samples = samples_alone(offsets, nearest.distances * settings.leaf_m)
+        self.rays.pool.add(samples, fresh=False)
+        self.budget.add_samples(_VISITS * len(points))
+
+    @property
+    def _is_to_be_judged(self) -> bool:
+        if not self.is_settled:
+            enough = min(_JUDGED_AFTER_SAMPLES, VISITS * len(self.rays.pool))
+            return self._unjudged_samples >= enough
+        new = self._unjudged_rays >= _JUDGED_AFTER_SHARE * len(self.rays.held_out)
+        return self._unjudged_samples > 0 or new
+
+    def _judge(self, field: FrozenField) -> None:
+        """Find out where the field has forgotten what it knew, and have it learnt again."""
+        self._unjudged_samples = self._unjudged_rays = 0
+        rows = self.rays.judging
+        if len(rows) == 0:
+            return
+        ends = np.ascontiguousarray(rows[:, END : END + 3])
+        sdf = _sdf(field, ends)
+        places = self.judgement.judge(rows, sdf, may_repair=self.budget.may_repair)
+        rose = self._learnt.judge(
+            ends, sdf, lambda points: _sdf(field, points), settled=self.is_settled
+        )
+        if len(places.forgotten_keys):
+            _log.info(
+                "%d places fit held-out rays worse than before, and are learnt again: one is at "
+                "%.1f, %.1f, %.1f",
+                len(places.forgotten_keys),
+                *(places.centres[places.forgotten][0] + self._centre),
+            )
+        oversampled = self.rays.pool.oversample(places.forgotten_keys)
+        if oversampled or rose:
+            self._focus.release()
+        self.budget.repair(oversampled)
+
+
+def _sdf(field: FrozenField, points: Floats) -> Floats:
+    """What a field says at ``points`` [N, 3], metres from the region's centre."""
+    return field.evaluate(np.ascontiguousarray(points), gradient=False).sdf
