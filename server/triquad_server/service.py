@@ -16,6 +16,7 @@ from triquad_format.wire.messages import (
     MapInfoRequest,
     MeshRequest,
     ResetRequest,
+    Scan,
     SdfRequest,
     StatusRequest,
     TileListRequest,
@@ -38,6 +39,7 @@ from triquad_server.epochs.history import EpochHistory
 from triquad_server.epochs.surface_history import SurfaceHistory
 from triquad_server.health import Health, Heartbeat
 from triquad_server.intake.flush import FlushHandler
+from triquad_server.intake.rays import ScanRays
 from triquad_server.intake.scan import ScanIntake
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
@@ -206,12 +208,16 @@ class Service:
             self._settings.service.publish_period_s,
             failed=failed,
             listeners=MapListeners(
-                scan_taken=(self._warnings.add, self._trails.add), published=(self._surface.add,)
+                scan_taken=(self._add_to_warnings, self._trails.add),
+                published=(self._surface.add,),
             ),
         )
         mapper.start()
         self._parts.callback(mapper.close)
         return mapper
+
+    def _add_to_warnings(self, scan: Scan, rays: ScanRays) -> None:
+        self._warnings.add(scan.source, len(scan.points), rays)
 
     def _open_intake(self) -> None:
         intake = ScanIntake(

@@ -98,7 +98,7 @@ class _SyntheticMap:
     def scans(self) -> None:
         """Take in a scan of the sphere."""
         rays = self._ingest(self._radius_m)
-        self._mapper.regions[0].growth_by(rays)
+        next(iter(self._mapper.regions)).growth_by(rays)
         self._mapper.publish()
 
     def training(self) -> None:

@@ -1,5 +1,7 @@
 """``triquad-server`` as a process: signals, exit codes, restarts."""
 
+import contextlib
+import resource
 import shutil
 import signal
 from pathlib import Path
@@ -8,7 +10,7 @@ import numpy as np
 import pytest
 import triquad_client
 from support import servers
-from triquad_client import InvalidInputError
+from triquad_client import InvalidInputError, TriquadError
 from triquad_format.mapfile.reader import read_map
 from triquad_map.compiled.kernel import CODE_FOLDER
 
@@ -160,6 +162,26 @@ def test_after_sigkill_the_last_checkpoint_counts(tmp_path, arguments):
             client.flush(servers.WAIT_S)
         server.process.kill()
         server.wait()
+    with servers.server_process(arguments) as server:
+        assert_same_map(before, ask(server.endpoint))
+
+
+def test_where_memory_runs_out_it_ends_and_the_last_checkpoint_counts(tmp_path, arguments):
+    with servers.server_process(arguments) as server:
+        before = learn(server.endpoint)
+        pid = server.process.pid
+        with triquad_client.connect(server.endpoint, timeout_s=5.0) as client:
+            client.checkpoint()
+            pages = int(Path(f"/proc/{pid}/statm").read_text().split()[0])
+            most = pages * resource.getpagesize() + 8 * 2**20
+            resource.prlimit(pid, resource.RLIMIT_AS, (most, resource.RLIM_INFINITY))
+            pose = np.eye(4)
+            with contextlib.suppress(TriquadError):
+                while server.process.poll() is None:
+                    pose[0, 3] += 20.0
+                    client.publish_scan(servers.sphere(20_000, 30.0), pose)
+                    client.flush(5.0)
+        assert server.wait() != 0
     with servers.server_process(arguments) as server:
         assert_same_map(before, ask(server.endpoint))
 

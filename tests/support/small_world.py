@@ -54,19 +54,42 @@ def settings(**training: object) -> Settings:
     )
 
 
+def take_in(mapper: Mapper, *scans: SimulatedScan) -> None:
+    """Have a mapper take in scans."""
+    for scan in scans:
+        mapper.ingest(scan.points, scan.world_from_sensor)
+
+
+def mapper_of(*scans: SimulatedScan, chosen: Settings | None = None, device: str = "cpu") -> Mapper:
+    """A mapper that has taken in scans, with settings for small regions unless others are given."""
+    mapper = Mapper("test", chosen or settings(), device)
+    take_in(mapper, *scans)
+    return mapper
+
+
 def settled_mapper(chosen: Settings, drive_through: World, device: str = "cpu") -> Mapper:
     """A mapper that learnt all it can of a world."""
-    mapper = Mapper("test", chosen, device)
-    for scan in drive_through.scans:
-        mapper.ingest(scan.points, scan.world_from_sensor)
+    mapper = mapper_of(*drive_through.scans, chosen=chosen, device=device)
     settle(mapper)
     return mapper
 
 
 @cache
+def settled(scans: int = 6) -> Mapper:
+    """A mapper that learnt all it can of a short drive: all share it, and leave it as it is."""
+    mapper = settled_mapper(settings(), world(scans))
+    mapper.publish()
+    return mapper
+
+
+def settled_copy(scans: int = 6) -> Mapper:
+    """Such a mapper to do with as one likes: it goes on from the record of the other."""
+    return Mapper("test", settings(), "cpu", settled(scans).changes_since(None).record)
+
+
 def settled_epoch(scans: int = 6) -> Epoch:
     """All that can be learnt of a drive of a few scans: an epoch never changes, so all share it."""
-    return settled_mapper(settings(), world(scans)).publish()
+    return settled(scans).publish()
 
 
 def settle(mapper: Mapper) -> None:

@@ -24,6 +24,7 @@ _SPACING_M = 9.0
 _PLACES = 8
 _MOST_ROOM_BYTES = 48 * 2**20
 _SQUEEZE_S = 3.0
+_OUT_OF_MEMORY = "the system gives no more memory"  # what a server logs that ends for that
 
 
 @dataclass
@@ -57,7 +58,8 @@ def _serve_with_limits(turn: Turn, kept: _Kept) -> None:
                 room = int(_MOST_ROOM_BYTES * turn.random.random() ** 2)
                 with _address_space(pid, virtual_bytes(pid) + room):
                     _load(turn, client)
-                if server.process.poll() is not None:
+                if server.process.poll() is not None or _OUT_OF_MEMORY in server.log:
+                    server.wait()
                     turn.did("ended")
                     return
                 _expect_alive(client, kept)

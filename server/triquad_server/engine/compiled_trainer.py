@@ -33,6 +33,7 @@ from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.row_access import prefetch_row
 from triquad_map.compiled.team import THREADS, Team, share
 
+from triquad_server.engine.gradient_sums import GradientSums, Touched
 from triquad_server.engine.live_field import LAST_AGE, Batch, LiveField, Parameter, Rates
 
 EPSILON = 1e-10
@@ -40,15 +41,7 @@ EPSILON = 1e-10
 _NEGLIGIBLE = 1e-8
 _MAX_CORRECTED = 1 << 20
 _AHEAD = 12  # rows that are brought into the cache before their turn
-_LAST_STEP = 2**31 - 1
 _NONE_HELD = np.zeros(0, np.bool_)
-
-
-class Touched(NamedTuple):
-    """Which feature rows a thread has added a gradient to."""
-
-    stamps: Ints  # [rows] the step in which each row was touched last
-    rows: Ints  # [rows] those touched in this step, in the order in which they were
 
 
 class ParameterRows(NamedTuple):
@@ -161,36 +154,6 @@ def _step_touched(
             _step_row(row, sums[part], parameter, rates)
 
 
-class GradientSums:
-    """Room for the gradients of the feature rows, for each thread; all but row 0 are zero between
-    steps.
-
-    Trainers that do not train at the same time share it.
-    """
-
-    def __init__(self) -> None:
-        self.features: tuple[Floats, ...] = ()  # per thread [rows, size]
-        self.touched: tuple[Touched, ...] = ()  # per thread
-        self.step = 0
-
-    def begin(self, rows: int, size: int) -> None:
-        """Make room for a step with ``rows`` of ``size`` numbers."""
-        self.step += 1
-        known = self.features[0].shape if self.features else (0, 0)
-        if known[0] < rows or known[1] != size or self.step == _LAST_STEP:
-            room = rows + rows // 4
-            self.clear()  # first: memory may be short
-            self.touched = tuple(
-                Touched(np.zeros(room, np.int32), np.zeros(room, np.int32)) for _ in range(THREADS)
-            )
-            # Last: by these it is known that there is room.
-            self.features = tuple(np.zeros((room, size), np.float32) for _ in range(THREADS))
-
-    def clear(self) -> None:
-        """Forget a step that failed midway, and free the room."""
-        self.features, self.touched, self.step = (), (), 1
-
-
 @inner_kernel(fastmath=True)
 def _record_touched(batch: PointBatch, count: int, touched: Touched, step: int, known: int) -> int:
     """Add the rows of the first ``count`` points to the ``known`` ones; returns how many now."""
@@ -279,14 +242,8 @@ class CompiledTrainer:
 
     def train(self, batch: Batch, rates: Rates) -> float:
         """One optimiser step; returns the loss before it."""
+        points = batch.points
         wanted = batch.labels / np.float32(self._field.settings.logit_scale_m)
-        try:
-            return self._train(batch.points, wanted, rates)
-        except BaseException:
-            self._sums.clear()
-            raise
-
-    def _train(self, points: Floats, wanted: Floats, rates: Rates) -> float:
         self._field.thaw()
         field = make_field(self._field.settings, self._field.tree, self._field.arrays)
         sums = self._sums

@@ -4,7 +4,8 @@ from typing import Any, Protocol
 
 from triquad_map.compiled.team import Team
 
-from triquad_server.engine.compiled_trainer import CompiledTrainer, GradientSums
+from triquad_server.engine.compiled_trainer import CompiledTrainer
+from triquad_server.engine.gradient_sums import GradientSums
 from triquad_server.engine.live_field import Batch, LiveField, Rates
 from triquad_server.engine.memory import ArrayMemory
 

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from triquad_format.wire.messages import Scan
 
 from triquad_server.intake.rays import ScanRays
 from triquad_server.intake.scan_queue import ScanQueue
@@ -72,15 +71,15 @@ class ScanWarnings:
         # By source and cause, the newest last.
         self._warnings: OrderedDict[tuple[str, str], _Warning] = OrderedDict()
 
-    def add(self, scan: Scan, rays: ScanRays) -> None:
-        """A scan was taken into the map, and ``rays`` are what of it is used."""
+    def add(self, source: str, sent: int, rays: ScanRays) -> None:
+        """A scan of ``sent`` points was taken in, and ``rays`` are what of it is used."""
         with self._lock:
-            points = self._points.setdefault(scan.source, _Points())
-            self._points.move_to_end(scan.source)
+            points = self._points.setdefault(source, _Points())
+            self._points.move_to_end(source)
             if len(self._points) > _MAX_SOURCES:
                 self._points.popitem(last=False)
             points.scans += 1
-            points.sent += len(scan.points)
+            points.sent += sent
             for reason in points.dropped:
                 points.dropped[reason] += rays.points_dropped.get(reason, 0)
             if len(rays.ends):

@@ -1,4 +1,4 @@
-"""Commands for the thread that owns the live map, and whoever waits for what they return."""
+"""Commands for the thread that owns the live map, and the results that callers wait for."""
 
 import threading
 from collections import deque

@@ -7,7 +7,7 @@ from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.records.map_progress import MapProgress
 from triquad_format.records.region import MapRecord
 
-from triquad_server.engine.compiled_trainer import GradientSums
+from triquad_server.engine.gradient_sums import GradientSums
 from triquad_server.engine.memory import memory_on
 from triquad_server.engine.trainer import Loss
 from triquad_server.epochs.epoch import Epoch
@@ -105,7 +105,7 @@ class Mapper:
             samples_left=self.samples_left,
             samples_discarded=sum(one.budget.discarded for one in training),
             rays_kept=self.rays_kept,
-            rays_discarded=sum(one.rays.pool.discarded for one in training),
+            rays_discarded=sum(one.rays.pool.kept.discarded for one in training),
             replay_share=self.regions.rays_share,
             map_bytes=self.regions.bytes_used,
             normals_bytes=self._normals.nbytes,

@@ -39,7 +39,7 @@ class ThreadTime:
         self._computed_s = 0.0  # by the thread, until its activity began
 
     def begin(self, activity: Activity) -> None:
-        """The thread turns to another activity, or begins the same anew."""
+        """The thread turns to another activity, or begins the same again."""
         now, computed_s = self._clock(), time.thread_time()
         with self._lock:
             if self._cpu_clock is None:

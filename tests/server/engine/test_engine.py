@@ -8,7 +8,8 @@ from triquad_format.records.field_settings import FieldSettings
 from triquad_map.compiled.field.encoding import load, locate, new_batch
 from triquad_map.compiled.field.field import make_field
 from triquad_map.composition.region import in_grid
-from triquad_server.engine.compiled_trainer import CompiledTrainer, GradientSums
+from triquad_server.engine.compiled_trainer import CompiledTrainer
+from triquad_server.engine.gradient_sums import GradientSums
 from triquad_server.engine.live_field import Batch, LiveField, Parameter, Rates, initial_field
 from triquad_server.engine.memory import ArrayMemory
 from triquad_server.engine.tensor_field import FieldTensors, TensorField

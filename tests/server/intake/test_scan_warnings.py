@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from support import servers
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.wire.messages import Scan
 from triquad_server.intake.rays import usable_rays
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
@@ -40,8 +39,7 @@ def take_in(
     source = settings.sources.get("cam", SourceSettings())
     scan = settings.scan_of(source)
     for _ in range(scans):
-        rays = usable_rays(points, np.eye(4), scan, source=source)
-        warnings.add(Scan(points, np.eye(4), 0, "cam", 0, 0), rays)
+        warnings.add("cam", len(points), usable_rays(points, np.eye(4), scan, source=source))
 
 
 def test_points_that_range_min_m_takes_are_told_with_the_setting_to_change() -> None:
@@ -182,8 +180,7 @@ def test_a_warning_whose_cause_is_gone_is_no_longer_told() -> None:
 
 def test_sources_that_are_invented_take_no_memory_without_end() -> None:
     warnings = watch()
-    points = cloud((10, 8.0))
-    rays = usable_rays(points, np.eye(4), SETTINGS.scan)
+    rays = usable_rays(cloud((10, 8.0)), np.eye(4), SETTINGS.scan)
     for number in range(2000):
-        warnings.add(Scan(points, np.eye(4), 0, f"s{number}", 0, 0), rays)
+        warnings.add(f"s{number}", 10, rays)
     assert len(warnings._points) == 256

@@ -2,7 +2,15 @@
 
 import numpy as np
 import pytest
-from support.small_world import damage, settings, settle, settled_mapper, surface_error, world
+from support.small_world import (
+    damage,
+    settings,
+    settle,
+    settled_copy,
+    settled_mapper,
+    surface_error,
+    world,
+)
 from triquad_format.records import replay_rays
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.replay_rays import HELD_OUT
@@ -156,7 +164,7 @@ def test_a_region_is_not_judged_by_rays_that_end_beside_it() -> None:
 
 
 def test_forgetting_is_found_told_and_repaired() -> None:
-    mapper = settled_mapper(settings(), world())
+    mapper = settled_copy()
     before_m = surface_error(mapper.publish(), world())
     fit = map_fit(mapper.regions)
     assert fit is not None

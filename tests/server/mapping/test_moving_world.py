@@ -1,9 +1,10 @@
 """A world that moves: what is gone disappears from the map, with all that was made from it."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+import pytest
 from support.mapfile_edit import file_bytes, read_bytes
 from support.small_world import WALLED, WALLED_BOUNDS, settings, settle
 from triquad_client import Mesh
@@ -110,26 +111,37 @@ def mesh_area(epoch: Epoch) -> float:
     return area
 
 
-def test_what_is_gone_leaves_nothing_behind() -> None:
+@dataclass(frozen=True)
+class Course:
+    """A box stood there, and is gone."""
+
+    watched: Watched
+    before: Epoch  # with the box
+    soon: Epoch  # 10 scans after it went
+    later: Epoch  # 31 scans after it went
+
+
+@pytest.fixture(scope="module")
+def gone() -> Course:
     watched = Watched()
-    before = watched.scan(BOX, count=8)
-    assert share(before, Status.SURFACE) > 0.95
-    assert mesh_area(before) > 1.0
-    assert mesh_area(watched.scan(count=10)) < 0.05
+    before, soon = watched.scan(BOX, count=8), watched.scan(count=10)
     assert share(watched.scan(count=1), Status.FREE, front=True) > 0.95
-    after = watched.scan(count=30)
-    assert share(after, Status.FREE) > 0.9
-    assert mesh_area(after) < 0.05
-    nearest = after.nearest_surface(CENTRE[None], 2.0)
+    return Course(watched, before, soon, watched.scan(count=20))
+
+
+def test_what_is_gone_leaves_nothing_behind(gone: Course) -> None:
+    assert share(gone.before, Status.SURFACE) > 0.95
+    assert mesh_area(gone.before) > 1.0
+    assert mesh_area(gone.soon) < 0.05
+    assert share(gone.later, Status.FREE) > 0.9
+    assert mesh_area(gone.later) < 0.05
+    nearest = gone.later.nearest_surface(CENTRE[None], 2.0)
     assert nearest.distance[0] > 0.4  # the ground, and no surfel of the box
 
 
-def test_the_field_learns_that_it_is_free_there() -> None:
-    watched = Watched()
-    watched.scan(BOX, count=8)
-    after = watched.scan(count=20)
+def test_the_field_learns_that_it_is_free_there(gone: Course) -> None:
     free = faces()[faces()[:, 2] > 0.5]
-    assert np.median(after.query(free).sdf) > 0.1
+    assert np.median(gone.later.query(free).sdf) > 0.1
 
 
 def test_a_settled_map_that_is_seen_anew_in_part_unlearns_what_went() -> None:
@@ -156,22 +168,17 @@ def test_a_settled_map_that_is_seen_anew_in_part_unlearns_what_went() -> None:
     assert np.median(after.query(free).sdf) > 0.07
 
 
-def test_no_ray_that_ended_there_is_trained_on_again() -> None:
-    watched = Watched()
-    watched.scan(BOX, count=8)
-    watched.scan(count=10)
-    region = max(watched.mapper.regions, key=lambda region: len(region.training.rays.pool))
+def test_no_ray_that_ended_there_is_trained_on_again(gone: Course) -> None:
+    region = max(gone.watched.mapper.regions, key=lambda region: len(region.training.rays.pool))
     samples = region.training.rays.pool.draw_on(np.arange(len(region.training.rays.pool)))
     points = samples.points + region.centre
     inside = (np.abs(points - CENTRE) < HALF - 0.25).all(axis=1)
     assert (samples.labels[inside] > 0).all()
 
 
-def test_what_stands_keeps_its_surface() -> None:
-    watched = Watched()
-    watched.scan(BOX, count=8)
-    voxels = surface_voxels(main_region(watched.mapper.publish()).evidence)
-    now = main_region(watched.scan(count=30))
+def test_what_stands_keeps_its_surface(gone: Course) -> None:
+    voxels = surface_voxels(main_region(gone.before).evidence)
+    now = main_region(gone.later)
     centres = voxel_centres(now, voxels)
     standing = Scene(WALLED, WALLED_BOUNDS).sdf(centres) < 0.05
     away = (np.abs(centres - CENTRE) > HALF + 0.4).any(axis=1)

@@ -1,9 +1,12 @@
 """What has just appeared is known at once: after one scan, before the field has learnt it."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from support.small_world import WALLED, WALLED_BOUNDS, settings, settle
 from triquad_format.records.arrays import Doubles
+from triquad_format.records.region import MapRecord
 from triquad_format.records.status import Status
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.questions.ground import ground
@@ -24,22 +27,38 @@ NEW = {
 }
 
 
+LIDAR = Lidar(columns=1024, elevation_min_deg=-45.0)
+CHOSEN = settings(samples_per_ray=6.0)
+
+
+def pose_of(number: int) -> Doubles:
+    pose = np.eye(4)
+    pose[:3, 3] = (0.1 * number - 1.0, 0.1, 1.4)
+    return pose
+
+
+@cache
+def empty_place() -> MapRecord:
+    """What a map has learnt of the place."""
+    mapper = Mapper("test", CHOSEN, "cpu")
+    for number in range(8):
+        pose, rng = pose_of(number), np.random.default_rng(number)
+        scan = LIDAR.scan(Scene(WALLED, WALLED_BOUNDS), pose, rng)
+        mapper.ingest(scan.points, pose, stamp_s=number)
+    settle(mapper)
+    return mapper.changes_since(None).record
+
+
 class Seen:
     """A map of an empty place in which something has just been seen, by one scan or a few."""
 
     def __init__(self, solid: Solid, steps: int, scans: int = 1) -> None:
-        mapper = Mapper("test", settings(samples_per_ray=6.0), "cpu")
-        pose = np.eye(4)
-        lidar = Lidar(columns=1024, elevation_min_deg=-45.0)
-        for number in range(8):
-            pose[:3, 3] = (0.1 * number - 1.0, 0.1, 1.4)
-            scan = lidar.scan(Scene(WALLED, WALLED_BOUNDS), pose, np.random.default_rng(number))
-            mapper.ingest(scan.points, pose, stamp_s=number)
-        settle(mapper)
+        mapper = Mapper("test", CHOSEN, "cpu", empty_place())
         mapper.publish()
+        pose = pose_of(7)
         self.scene = Scene((*WALLED, solid), WALLED_BOUNDS)
         for number in range(8, 8 + scans):
-            scan = lidar.scan(self.scene, pose, np.random.default_rng(91 + number))
+            scan = LIDAR.scan(self.scene, pose, np.random.default_rng(91 + number))
             mapper.ingest(scan.points, pose, stamp_s=number)
             mapper.publish()
         for _ in range(steps):

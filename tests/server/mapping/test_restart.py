@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.small_world import World, damage, settings, settle, settled_mapper, world
+from support.small_world import damage, settings, settle, settled, world
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.map_progress import MapProgress
@@ -18,21 +18,9 @@ SCANS = 6
 
 
 @cache
-def stayed() -> Mapper:
-    """A mapper that has learnt a short drive, and goes on as it is."""
-    mapper = settled_mapper(settings(), drive())
-    mapper.publish()
-    return mapper
-
-
-@cache
 def learnt() -> MapRecord:
-    """What its checkpoint is made of."""
-    return stayed().changes_since(None).record
-
-
-def drive() -> World:
-    return world(SCANS)
+    """What the checkpoint of a short drive is made of."""
+    return settled(SCANS).changes_since(None).record
 
 
 @pytest.fixture
@@ -44,7 +32,7 @@ def restarted(tmp_path: Path) -> Mapper:
 
 
 def take_one_more(mapper: Mapper) -> None:
-    scan = drive().scans[-1]
+    scan = world(SCANS).scans[-1]
     mapper.ingest(scan.points, scan.world_from_sensor)
 
 
@@ -78,7 +66,7 @@ def test_a_map_that_was_reset_begins_anew(restarted: Mapper) -> None:
 
 def test_a_map_is_judged_before_anything_is_trained(restarted: Mapper) -> None:
     """By the rays of the file, which are the same but for their rounding."""
-    live, now = map_fit(stayed().regions), map_fit(restarted.regions)
+    live, now = map_fit(settled(SCANS).regions), map_fit(restarted.regions)
     assert now.rays == pytest.approx(live.rays, rel=0.01)
     assert now.median_m == pytest.approx(live.median_m, abs=5e-4)
     assert now.upper_m == pytest.approx(live.upper_m, abs=2e-3)

@@ -22,7 +22,7 @@ from triquad_map.compiled.voxel_index import (
 
 _FINE_LEAVES, _COARSE_LEAVES = 0.75, 2.5  # sides of the cells
 _FULL = 65_536  # points of a cell, above which older ones count for less
-_RENEWAL = 2.0  # a normal is estimated anew once its cell has so many times the points
+_RENEWAL = 2.0  # factor by which a cell's points become more until its normal is estimated again
 
 
 @kernel()

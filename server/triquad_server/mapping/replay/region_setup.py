@@ -7,7 +7,7 @@ from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_map.compiled.evidence.contradictions import Disbelief
 from triquad_map.compiled.team import Team
 
-from triquad_server.engine.compiled_trainer import GradientSums
+from triquad_server.engine.gradient_sums import GradientSums
 from triquad_server.engine.memory import Memory
 from triquad_server.mapping.replay.ray_table import Placement
 from triquad_server.settings import ChangeSettings, ScanSettings, TrainingSettings

@@ -32,28 +32,23 @@ class ReplayPool:
         self._team = team
         self.placement = placement
         self._rng = np.random.default_rng(seed)
-        self._rays = KeptRays(settings, self._rng)
+        self.kept = KeptRays(settings, self._rng)
         self._fresh = _NONE  # places of the newest
         self._oversampled = _NONE
         self._blocks: Index | None = None  # in which the rays end that are drawn on at random
         self._focused: Longs | None = None  # their places; None: to be found
 
     def __len__(self) -> int:
-        return len(self._rays)
+        return len(self.kept)
 
     @property
     def table(self) -> RayTable:
         """All that is kept; it changes with the pool."""
-        return self._rays.table
-
-    @property
-    def discarded(self) -> int:
-        """Rays so far, that gave way to others or were too many."""
-        return self._rays.discarded
+        return self.kept.table
 
     def add(self, new: RayTable, fresh: bool = True) -> None:
         """Take in rays; if ``fresh``, they become the newest."""
-        places = self._rays.add(new)
+        places = self.kept.add(new)
         if len(self._oversampled) or self._focused is not None:
             is_other = np.zeros(len(self), np.bool_)
             is_other[places] = True
@@ -119,18 +114,18 @@ class ReplayPool:
     def limit(self, capacity: int) -> None:
         """Change the capacity; what is too much goes at random."""
         is_too_much = len(self) > capacity
-        self._rays.limit(capacity)
+        self.kept.limit(capacity)
         if is_too_much:
             self._select_none()
 
     def forget(self, low: Doubles, high: Doubles) -> None:
         """Drop the rays that end between two corners [3], metres from the region's centre."""
-        self._rays.forget(low, high)
+        self.kept.forget(low, high)
         self._select_none()
 
     def forget_ends(self, voxels: Longs) -> None:
         """Drop the rays that end in ``voxels`` [N, 3]."""
-        self._rays.forget_ends(voxels)
+        self.kept.forget_ends(voxels)
         self._fresh = self._fresh[self._fresh < len(self)]
         self._oversampled = self._oversampled[self._oversampled < len(self)]
         self._focused = None

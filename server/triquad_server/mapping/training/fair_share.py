@@ -1,4 +1,4 @@
-"""What each voxel with surface has of the rays that are kept and of the training that is owed."""
+"""What each voxel with surface has of the rays that are kept and of the training that is left."""
 
 import math
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ class FairShare:
     """What a voxel with surface has, wherever it is, so that all places are learnt alike."""
 
     rays: float  # that are kept
-    samples: float  # that may be owed
+    samples: float  # that may be left to train on
     rays_share: float  # of `training.rays_per_voxel`, that memory has room for
 
     @classmethod

@@ -1,4 +1,4 @@
-"""Where a region learns: everywhere, or only where it is seen anew since all of it had settled."""
+"""Where a region learns: everywhere, or only where it was seen since all of it had settled."""
 
 import numpy as np
 from triquad_format.records.arrays import Doubles, Longs
@@ -10,17 +10,17 @@ from triquad_server.engine.live_field import LiveField
 from triquad_server.mapping.replay.replay_pool import ReplayPool
 
 _GROWTH = 1.1
-"""New blocks are taken into account once there are so many times as many: to find their rays and
+"""Factor by which blocks become more until new ones are taken into account: to find their rays and
 rows is expensive."""
 
 _LATEST_SAMPLES = 1 << 19
-"""Or once so many samples were trained on without them."""
+"""Samples that are trained on without new blocks, at most."""
 
 _MOST_SHARE = 0.25
-"""Where more of the blocks with surface are seen anew, all of the region learns."""
+"""Where more of the blocks with surface were seen since, all of the region learns."""
 
 _LEAST_FREE = 0.25
-"""Or where, of the rows under what is seen anew, fewer are under nothing else: in a small place,
+"""Or where, of the rows under what was seen since, fewer are under nothing else: in a small place,
 nearly all rows are shared, and so they are under a small thing."""
 
 _LEARNT_STEPS = 300
@@ -28,11 +28,11 @@ _LEARNT_STEPS = 300
 
 
 class Focus:
-    """The blocks of a region in which anything is seen anew since all of it had settled.
+    """The blocks of a region in which anything was seen since all of it had settled.
 
     The region learns there alone: on rays that end there, in rows of features that no surface
     elsewhere uses, and with the MLP that it has. Everything else stays as it is, to the bit. Once
-    much is seen anew, be it scan by scan, or where there are few such rows, all of the region
+    much is seen, be it scan by scan, or where there are few such rows, all of the region
     learns, with an MLP that suits all of it.
     """
 
@@ -41,54 +41,54 @@ class Focus:
         self._field = field
         self._evidence = evidence
         self._pool = pool
-        self._seen_anew: Longs | None = None  # keys [B] of blocks; None: all learns
+        self._seen_since: Longs | None = None  # keys [B] of blocks; None: all learns
         self._blocks_applied = 0  # of them, those that the field and the pool know of
         self._samples_since = 0  # that were trained on since
 
     def narrow(self) -> None:
-        """Nothing is owed any more: where all learnt, only what is seen anew does from now on."""
+        """There is nothing left to learn: from now on, only what is seen later learns."""
         has_features = self._field.settings.encoding != "fourier"
         has_learnt = self._field.mlp_steps >= _LEARNT_STEPS
-        if self._seen_anew is None and has_features and has_learnt:
-            self._seen_anew = np.zeros(0, np.int64)
+        if self._seen_since is None and has_features and has_learnt:
+            self._seen_since = np.zeros(0, np.int64)
         self._blocks_applied = 0
 
     def widen_to(self, positions: Doubles | Longs) -> None:
-        """Something is seen anew at ``positions`` [N, 3], in voxels; outside it does not count."""
-        if self._seen_anew is not None:
+        """Something is seen at ``positions`` [N, 3], in voxels; outside it does not count."""
+        if self._seen_since is not None:
             side = 1 << self._field.settings.depth
             is_inside = ((positions >= 0) & (positions < side)).all(axis=1)
             blocks = (positions[is_inside] // BLOCK_VOXELS).astype(np.int64)
-            self._seen_anew = np.union1d(self._seen_anew, keys_of(blocks))
+            self._seen_since = np.union1d(self._seen_since, keys_of(blocks))
 
     def release(self) -> None:
         """All of the region learns."""
-        self._seen_anew = None
+        self._seen_since = None
         self._field.hold(None)
         self._pool.focus(None)
 
     def apply(self, samples: int) -> None:
-        """Have the field and the pool keep to what is seen anew, before ``samples`` are trained."""
-        if self._seen_anew is None:
+        """Before ``samples`` are trained on: the field and the pool keep to what was seen since."""
+        if self._seen_since is None:
             return
         self._samples_since += samples
-        blocks, applied = len(self._seen_anew), self._blocks_applied
+        blocks, applied = len(self._seen_since), self._blocks_applied
         is_late = self._samples_since >= _LATEST_SAMPLES
         if blocks > (applied if is_late else _GROWTH * applied):
             self._blocks_applied, self._samples_since = blocks, 0
-            self._keep_to(self._seen_anew)
+            self._keep_to(self._seen_since)
 
-    def _keep_to(self, seen_anew: Longs) -> None:
+    def _keep_to(self, seen_since: Longs) -> None:
         surface = self._evidence.surface_blocks()
-        elsewhere = surface[~np.isin(keys_of(surface), seen_anew)]
+        elsewhere = surface[~np.isin(keys_of(surface), seen_since)]
         if len(elsewhere) <= (1 - _MOST_SHARE) * len(surface):
             self.release()
             return
-        anew = cells_of(seen_anew)
+        seen = cells_of(seen_since)
         held = self._field.tree.rows_under(elsewhere, BLOCK_VOXELS)
-        learning = self._field.tree.rows_under(anew, BLOCK_VOXELS)
+        learning = self._field.tree.rows_under(seen, BLOCK_VOXELS)
         if (learning & ~held).sum() < _LEAST_FREE * learning.sum():
             self.release()
             return
         self._field.hold(held)
-        self._pool.focus(anew)
+        self._pool.focus(seen)

@@ -43,7 +43,7 @@ either: in a place of few rays, chance alone makes the error fall now and then."
 _NOISE = 0.1  # of rays, in leaves: where errors are less, few rays tell of it alone
 
 _TURNS = 4
-"""Of one scan's rays in so many it is told where they end, of others the next time."""
+"""One in so many of a scan's rays is taken into account, and another the next time."""
 
 _FEW_REMOVED = 2
 """Where at once surface goes from more voxels of a place, all is learnt again: single ones hold the

@@ -28,12 +28,12 @@ class TrainingBudget:
     def __init__(self, settings: TrainingSettings) -> None:
         self._settings = settings
         self.samples = 0
-        self.discarded = 0  # samples so far, that were more than may be owed
-        self._most = 0  # that may be owed
+        self.discarded = 0  # samples so far, that were more than may be left
+        self._most = 0  # that may be left
         self._fresh = 0  # of the samples, those that are to be on rays of the newest scan
         self._repair = 0  # and those in places that have forgotten
         self._rounds = 0  # of repair, since there were new rays
-        self._new_rays = 0  # since nothing was owed
+        self._new_rays = 0  # since nothing was left
 
     @property
     def learns_newest(self) -> bool:
@@ -58,7 +58,7 @@ class TrainingBudget:
         self.limit(self._most)
 
     def add_samples(self, samples: int) -> None:
-        """There is more to learn from what is known; not once nothing is owed any more."""
+        """There is more to learn from what is known; not once nothing is left."""
         if self.samples:
             self.samples += samples
 
@@ -68,7 +68,7 @@ class TrainingBudget:
         self._new_rays = rays
 
     def limit(self, most: int) -> None:
-        """From now on, owe at most so many samples."""
+        """From now on, at most ``most`` samples are left."""
         self._most = most
         too_many = max(0, self.samples - most)
         self.samples -= too_many
@@ -83,7 +83,7 @@ class TrainingBudget:
         self.samples = max(self.samples, min(needed, self._most))
 
     def clear(self) -> None:
-        """Owe nothing any more."""
+        """There is nothing left to learn."""
         self.samples = 0
 
     def next_step(self, count: int, kept_rays: int) -> Step:
@@ -113,7 +113,7 @@ class TrainingBudget:
         """Share of the learning rate: falls as the budget is used up, so that the field settles.
 
         It falls the later, the fewer the ``rays`` are from which there is something to learn: so
-        what is new learns quickly, beside much that has settled.
+        what is new learns quickly where much has settled.
         """
         enough = self._settings.cooldown * max(1, rays)
         return min(1.0, max(_LEAST_RATE, (self.samples / enough) ** 2))

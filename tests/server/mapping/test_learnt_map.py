@@ -1,0 +1,186 @@
+"""What a map has learnt of a street: how right it is, and what stays as it was."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from support.small_world import (
+    World,
+    mapper_of,
+    settings,
+    settle,
+    settled,
+    settled_mapper,
+    surface_error,
+    take_in,
+    world,
+)
+from triquad_format.records.region import MapRecord
+from triquad_format.records.status import Status
+from triquad_server.mapping.mapper import Mapper
+from triquad_server.mapping.replay.kept_rays import RAY_BYTES
+from triquad_server.mapping.replay.ray_table import END, VALUE
+from triquad_server.settings import Settings
+from triquad_tools.sensors.sweep import moved
+
+ONE_REGION = Settings.model_validate(
+    {"field": {"depth": 11}, "training": {"batch": 4096, "samples_per_ray": 18.0}}
+)
+
+
+@pytest.fixture(scope="module")
+def mapped() -> Mapper:
+    return settled()
+
+
+@cache
+def drive_in_one_region() -> MapRecord:
+    """What was learnt of a longer drive in a single region."""
+    mapper = settled_mapper(ONE_REGION, world(10))
+    mapper.publish()
+    return mapper.changes_since(None).record
+
+
+@pytest.fixture
+def driven() -> Mapper:
+    """A mapper that goes on from that."""
+    return Mapper("test", ONE_REGION, "cpu", drive_in_one_region())
+
+
+def test_the_map_is_right_near_surfaces(mapped: Mapper) -> None:
+    assert surface_error(mapped.publish(), world()) < 0.02
+
+
+def test_gradients_point_away_from_surfaces(mapped: Mapper) -> None:
+    scene, hits = world().scene, world().hits[::50]
+    normals = scene.gradient(hits)
+    answer = mapped.publish().query(hits + 0.03 * normals, gradient=True)
+    unit = answer.gradient / np.linalg.norm(answer.gradient, axis=1, keepdims=True)
+    angles = np.degrees(np.arccos(np.clip((unit * normals).sum(axis=1), -1, 1)))
+    assert np.median(angles) < 12
+
+
+def test_what_was_seen_is_told_from_what_was_not(mapped: Mapper) -> None:
+    epoch, scene = mapped.publish(), world().scene
+    hits = world().hits
+    assert (epoch.status(hits) == Status.SURFACE).mean() > 0.99
+    between = [
+        scan.world_from_sensor[:3, 3] + 0.5 * (hit - scan.world_from_sensor[:3, 3])
+        for scan in world().scans
+        for hit in scan.true_hits[::500]
+    ]
+    assert (epoch.status(np.array(between)) != Status.UNKNOWN).mean() > 0.95
+    rng = np.random.default_rng(0)
+    inside = rng.uniform(hits.min(axis=0), hits.max(axis=0), (200_000, 3))
+    inside = inside[scene.is_inside_house(inside, 0.5)]
+    assert len(inside) > 1000
+    assert (epoch.status(inside) == Status.UNKNOWN).mean() > 0.98
+
+
+def test_ghost_cells_are_unknown(mapped: Mapper) -> None:
+    """Points all of whose projections are occupied, but that no ray has seen."""
+    epoch = mapped.publish()
+    hits = world().hits
+    occupied = [
+        {tuple(cell) for cell in np.floor(hits[:, axes] / 0.2).astype(int).tolist()}
+        for axes in ([0, 1], [0, 2], [1, 2])
+    ]
+    rng = np.random.default_rng(1)
+    cells = np.floor(rng.uniform(hits.min(axis=0), hits.max(axis=0), (400_000, 3)) / 0.2)
+    ghosts = np.array(
+        [
+            (x, y, z)
+            for x, y, z in cells.astype(int).tolist()
+            if (x, y) in occupied[0] and (x, z) in occupied[1] and (y, z) in occupied[2]
+        ],
+    )
+    centres = (ghosts + 0.5) * 0.2
+    hidden = centres[world().scene.is_inside_house(centres, 0.5)]
+    assert len(hidden) > 20, "the scene has ghosts"
+    assert (epoch.status(hidden) == Status.UNKNOWN).mean() > 0.98
+
+
+def test_a_place_left_behind_is_not_forgotten() -> None:
+    chosen = settings(pool_bytes=75_000 * RAY_BYTES)
+    here = world(3)
+    mapper = settled_mapper(chosen, here)
+    before = surface_error(mapper.publish(), here)
+    for scan in world(14, 1.5).scans[6:]:
+        take_in(mapper, scan)
+        for _ in range(10):
+            mapper.train()
+    settle(mapper)
+    assert mapper.rays_kept <= 75_000
+    assert surface_error(mapper.publish(), here) < before + 0.004
+
+
+def test_what_is_new_is_learnt_as_well_where_much_has_settled(driven: Mapper) -> None:
+    scan = world(30, 1.5).scans[-1]
+    there = World(world().scene, (scan,))
+    alone = Mapper("test", ONE_REGION, "cpu")
+    for mapper in (alone, driven):
+        take_in(mapper, scan)
+        settle(mapper)
+    assert surface_error(driven.publish(), there) < 1.25 * surface_error(alone.publish(), there)
+
+
+def test_where_no_normal_is_known_the_field_tells_how_steep_rays_fall() -> None:
+    one_region = settings().model_copy(update={"field": Settings().field})
+    mapper = settled_mapper(one_region, world())
+    (region,) = mapper.regions
+    table = region.training.rays.pool.table
+    unsure = np.flatnonzero((table.rows[:, VALUE] < 0) & (table.origin_of >= 0))
+    assert len(unsure) > 0.05 * len(table)
+    ends = table.rows[unsure, END : END + 3].astype(np.float64)
+    ways = ends - table.origins[table.origin_of[unsure]]
+    cosines = (ways * world().scene.gradient(ends)).sum(axis=1) / np.linalg.norm(ways, axis=1)
+    off = np.abs(np.abs(cosines) + table.rows[unsure, VALUE]).mean()
+    assert off < 0.4 * np.abs(np.abs(cosines) - 1).mean()
+
+
+def test_where_little_is_new_all_else_stays_to_the_bit(driven: Mapper) -> None:
+    mapper, alone = driven, Mapper("test", ONE_REGION, "cpu")
+    before = mapper.publish()
+    scan = world(30, 1.5).scans[-1]
+    reach_m = 10.0
+    is_near = np.linalg.norm(scan.points, axis=1) < reach_m
+    for learning in (alone, mapper):
+        learning.ingest(scan.points[is_near], scan.world_from_sensor)
+        settle(learning)
+    after = mapper.publish()
+    seen = np.concatenate([moved(s.points, s.world_from_sensor) for s in world(10).scans])
+    away = np.linalg.norm(seen - scan.world_from_sensor[:3, 3], axis=1) > reach_m + 3
+    np.testing.assert_array_equal(after.query(seen[away]).sdf, before.query(seen[away]).sdf)
+    here = scan.true_hits[is_near]
+    off = [float(np.abs(of.query(here).sdf).mean()) for of in (after, alone.publish())]
+    # A region in which nothing is held learns the scan to 0.9 cm, this one to 1.1.
+    assert off[0] < 1.4 * off[1]
+    take_in(mapper, *world(30, 1.5).scans[-10:])
+    settle(mapper)
+    later = mapper.publish()
+    assert (later.query(seen[away]).sdf != before.query(seen[away]).sdf).any()
+
+
+def test_who_looks_again_at_what_is_known_leaves_all_else_to_the_bit(driven: Mapper) -> None:
+    mapper = driven
+    before = mapper.publish()
+    scan = world(10).scans[5]
+    reach_m = 6.0
+    near = scan.points[np.linalg.norm(scan.points, axis=1) < reach_m]
+    mapper.ingest(near, scan.world_from_sensor)
+    settle(mapper)
+    after = mapper.publish()
+    seen = np.concatenate([moved(s.points, s.world_from_sensor) for s in world(10).scans])
+    away = np.linalg.norm(seen - scan.world_from_sensor[:3, 3], axis=1) > reach_m + 3
+    np.testing.assert_array_equal(after.query(seen[away]).sdf, before.query(seen[away]).sdf)
+    assert (after.query(seen[~away]).sdf != before.query(seen[~away]).sdf).any()
+
+
+@pytest.mark.parametrize("encoding", ["features", "fourier"])
+def test_the_parts_of_the_field_can_be_switched(encoding: str) -> None:
+    chosen = settings(samples_per_ray=3.0)
+    field = type(chosen.field)(depth=8, encoding=encoding)
+    scan = world().scans[0]
+    mapper = mapper_of(scan, chosen=type(chosen)(field=field, training=chosen.training))
+    settle(mapper)
+    assert np.isfinite(mapper.publish().query(scan.true_hits[::100], gradient=True).sdf).all()
