@@ -40,7 +40,7 @@ class LiveRegion:
         self.training = training
         self._setup = setup
         self._published: FrozenRegion | None = None
-        self._is_changed = True  # since it was published
+        self.is_changed = True  # since it was published
 
     @classmethod
     def unseen(cls, index: RegionIndex, setup: RegionSetup) -> "LiveRegion":
@@ -89,7 +89,7 @@ class LiveRegion:
         seen = self.evidence.scan_taken(rays, stamp_s)
         # A leaf of the trees is the shadow of a voxel: where a ray ended before, nothing grows.
         self.field.grow(seen.marks.new)
-        self._is_changed = True
+        self.is_changed = True
         return seen
 
     def scan_taken(self, rays: ScanRays, normals: Doubles, seen: SeenSurface) -> None:
@@ -104,23 +104,18 @@ class LiveRegion:
         """One optimiser step; returns its loss and samples. On a GPU, to read the loss waits."""
         taken = self.training.take_step()
         self.evidence.step_taken()
-        self._is_changed = True
+        self.is_changed = True
         return taken
 
     def forget(self, low: Doubles, high: Doubles) -> None:
         """Forget evidence and samples between two corners [3]."""
         self.evidence.forget(low, high)
         self.training.forget(low, high)
-        self._is_changed = True
-
-    @property
-    def is_changed(self) -> bool:
-        """Whether it is no longer as it was published."""
-        return self._is_changed
+        self.is_changed = True
 
     def publish(self, epoch: int) -> FrozenRegion:
         """The region as it is now, for ``epoch``; the same as before where nothing changed."""
-        if self._published is not None and not self._is_changed:
+        if self._published is not None and not self.is_changed:
             return self._published
         field = self.field.freeze()
         samples = field_samples(field, self._setup.field, self._setup.team.split)
@@ -147,7 +142,7 @@ class LiveRegion:
             live_bytes=bytes_by_part(live, without=own),
             buffers=own,
         )
-        self._is_changed = False
+        self.is_changed = False
         return self._published
 
     def snapshot(self) -> RegionSnapshot:
