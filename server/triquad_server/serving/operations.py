@@ -157,8 +157,6 @@ class Operations:
             return
         try:
             self._take(key, query)
-        except MemoryError:
-            _log.warning("a request on %s goes unanswered: too little memory", key)
         except Exception:  # the next one may be answered
             _log.exception("a request on %s could not be received", key)
 

@@ -90,13 +90,7 @@ class Request:
         self._finish(lambda: self._query.reply_err(payload, encoding=keys.encoding(ErrorReply)))
 
     def fail(self, error: Exception) -> None:
-        """Reply that handling the request met an internal error, which is being handled.
-
-        Too little memory is none: another request may be answered.
-        """
-        if isinstance(error, MemoryError):
-            self.refuse("busy", "the server has too little memory for this; ask for less, or later")
-            return
+        """Reply that handling the request met an internal error, which is being handled."""
         _log.exception("a request on %s met an internal error", self.key)
         self.refuse("internal", f"{type(error).__name__}: {error}")
 
