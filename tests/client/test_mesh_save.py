@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from triquad_client import InvalidInputError, Mesh
+from triquad_client.mesh.mesh_files import GlbMesh, glb_bytes
 
 FAR = np.array([500_000.25, 4_000_000.5, 10.125])
 MESH = Mesh(
@@ -63,6 +64,15 @@ def test_glb_holds_two_meshes():
     np.testing.assert_allclose(scene.bounds - y_up, [(0, 0, -2), (1, 3, 0)], rtol=0, atol=1e-6)
 
 
+def test_a_glb_with_colours_holds_them_as_they_are():
+    colours = np.array([[0.0, 0.5, 1.0], [1.5, 0.2, -0.1], [0.1, 0.2, 0.3], [1.0, 1.0, 1.0]])
+    data = glb_bytes([GlbMesh("ball", MESH.vertices - FAR, MESH.faces, colours)])
+    (read,) = trimesh.load(io.BytesIO(data), file_type="glb", process=False).geometry.values()
+    np.testing.assert_array_equal(read.vertices, MESH.vertices - FAR)
+    np.testing.assert_array_equal(read.faces, MESH.faces)
+    np.testing.assert_allclose(read.visual.vertex_attributes["color"][:, :3], colours, atol=1e-7)
+
+
 def test_obj_holds_two_objects():
     _, seen, filled = MARKED.file_bytes(".obj").decode().split("\no ")
     for name, part in (("seen", seen), ("filled", filled)):
@@ -110,9 +120,12 @@ def test_other_names_are_refused(tmp_path):
         MESH.save(tmp_path / "mesh.las")
 
 
-def test_without_trimesh_ply_is_written_and_the_others_name_the_remedy(tmp_path, monkeypatch):
+def test_without_trimesh_ply_and_glb_are_written_and_the_others_name_the_remedy(
+    tmp_path, monkeypatch
+):
     monkeypatch.setitem(sys.modules, "trimesh", None)
-    MESH.save(tmp_path / "mesh.ply")
+    for name in ("mesh.ply", "mesh.glb"):
+        MESH.save(tmp_path / name)
     with pytest.raises(InvalidInputError, match=r"pip install 'triquad\[mesh\]'"):
-        MESH.save(tmp_path / "mesh.glb")
-    assert not (tmp_path / "mesh.glb").exists()
+        MESH.save(tmp_path / "mesh.obj")
+    assert not (tmp_path / "mesh.obj").exists()

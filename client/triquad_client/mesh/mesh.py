@@ -1,6 +1,5 @@
 """A surface as triangles, and how it is written to files."""
 
-import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,14 +11,13 @@ from triquad_format.errors import InvalidInputError
 from triquad_format.records.arrays import Doubles
 from triquad_map.triangles import Triangles
 
+from triquad_client.mesh.mesh_files import GlbMesh, glb_bytes, ply_bytes
+
 if TYPE_CHECKING:
     import trimesh
 
 _Y_UP = np.array([(1, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0, 0, 0, 1.0)])
 """The map's axes, of which z points upwards, as those of a glTF scene."""
-
-_PLY_FACE = np.dtype([("count", "u1"), ("indices", "<i4", (3,))])
-_PLY_MARKED_FACE = np.dtype([*_PLY_FACE.descr, ("filled", "u1")])
 
 
 @dataclass(frozen=True)
@@ -34,7 +32,7 @@ class Mesh(Triangles):
         return cls(triangles.vertices, triangles.faces, triangles.filled, epoch)
 
     def save(self, path: str | Path) -> None:
-        """Write the mesh to a file: ``.ply``, or ``.glb``, ``.obj`` or ``.stl`` with trimesh.
+        """Write the mesh to a file: ``.ply`` or ``.glb``, or ``.obj`` or ``.stl`` with trimesh.
 
         A ``.ply`` is exact (double precision), an ``.obj`` has eight decimals, an ``.stl`` is of
         single precision: half a metre where coordinates are as large as UTM northings. So are
@@ -84,35 +82,25 @@ def compacted(vertices: Doubles, faces: NDArray[np.integer]) -> Mesh:
 
 
 def _ply(mesh: Mesh) -> bytes:
-    """Binary PLY in double precision; that of trimesh is single, and this one needs no library."""
-    marked = mesh.filled is not None
-    header = (
-        "ply\nformat binary_little_endian 1.0\ncomment triquad, metres\n"
-        f"element vertex {len(mesh.vertices)}\n"
-        "property double x\nproperty double y\nproperty double z\n"
-        f"element face {len(mesh.faces)}\n"
-        "property list uchar int vertex_indices\n"
-        f"{'property uchar filled' + chr(10) if marked else ''}end_header\n"
-    )
-    rows = np.empty(len(mesh.faces), _PLY_MARKED_FACE if marked else _PLY_FACE)
-    rows["count"] = 3
-    rows["indices"] = mesh.faces
-    if marked:
-        rows["filled"] = mesh.filled
-    return header.encode("ascii") + mesh.vertices.astype("<f8").tobytes() + rows.tobytes()
+    return ply_bytes(mesh.vertices, mesh.faces, mesh.filled)
 
 
 def _glb(mesh: Mesh) -> bytes:
-    middle = mesh.to_trimesh().bounds.mean(axis=0) if len(mesh.faces) else np.zeros(3)
-    scene = _scene(dataclasses.replace(mesh, vertices=mesh.vertices - middle))
+    """Relative to its middle, where single precision is fine enough."""
+    if not len(mesh.faces):
+        return glb_bytes([])
+    middle = 0.5 * (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0))
     back = _Y_UP.copy()
     back[:3, 3] = _Y_UP[:3, :3] @ middle
-    scene.apply_transform(back)
-    return _exported(scene, "glb")
+    parts = _parts(mesh).items()
+    return glb_bytes(
+        [GlbMesh(name, part.vertices - middle, part.faces) for name, part in parts], back
+    )
 
 
 def _obj(mesh: Mesh) -> bytes:
-    return _exported(mesh.to_trimesh() if mesh.filled is None else _scene(mesh), "obj")
+    whole = mesh.to_trimesh()
+    return _exported(whole if mesh.filled is None or not len(mesh.faces) else _scene(mesh), "obj")
 
 
 def _stl(mesh: Mesh) -> bytes:
@@ -123,18 +111,24 @@ def _stl(mesh: Mesh) -> bytes:
     return _exported(mesh.to_trimesh(), "stl")
 
 
+def _parts(mesh: Mesh) -> dict[str, Mesh]:
+    """The mesh by itself; where holes were filled, in two parts, ``seen`` and ``filled``."""
+    if mesh.filled is None:
+        return {"mesh": mesh}
+    chosen = {"seen": ~mesh.filled, "filled": mesh.filled}
+    return {
+        name: compacted(mesh.vertices, mesh.faces[faces])
+        for name, faces in chosen.items()
+        if faces.any()
+    }
+
+
 def _scene(mesh: Mesh) -> "trimesh.Scene":
-    """The mesh in a scene; where holes were filled, in two parts, ``seen`` and ``filled``."""
-    whole = mesh.to_trimesh()
-    if mesh.filled is None or not len(mesh.faces):
-        return whole.scene(camera=None)
     import trimesh
 
     scene = trimesh.Scene()
-    for name, chosen in (("seen", ~mesh.filled), ("filled", mesh.filled)):
-        if chosen.any():
-            part = compacted(mesh.vertices, mesh.faces[chosen])
-            scene.add_geometry(part.to_trimesh(), node_name=name, geom_name=name)
+    for name, part in _parts(mesh).items():
+        scene.add_geometry(part.to_trimesh(), node_name=name, geom_name=name)
     return scene
 
 
