@@ -17,10 +17,8 @@ import trimesh
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from PIL import Image
-from triquad_client import Mesh
 from triquad_server import serve
-from triquad_tools.plots.framing import framed
-from triquad_tools.plots.render import render_mesh
+from triquad_tools.plots.mesh_view import Picture, view_along
 from triquad_tools.simulation.lidar import SimulatedDrive
 from triquad_tools.simulation.solids import Solid, box
 from triquad_tools.simulation.street import street_drive
@@ -28,7 +26,7 @@ from triquad_tools.simulation.street import street_drive
 IMAGES = Path(__file__).with_name("images")
 ROOT = IMAGES.parents[1]
 
-_WIDTH, _HEIGHT, _COLOURS = 1200, 600, 256
+_WIDTH, _COLOURS = 1200, 256
 _DEMO, _STREET, _SCANS = "demo-out", 1, 25
 _AROUND_M = ((-1.0, -8.0, -1.0), (24.0, 8.0, 4.0))
 _BOX_HALF_M = (0.6, 0.5, 0.9)
@@ -79,11 +77,9 @@ def preview(out: Path) -> None:
         scene = example["preview"](make_reader(file, decoder_factories=[DecoderFactory()]))
     shown: Any = trimesh.util.concatenate(list(scene.geometry.values()))
     colours = shown.visual.vertex_colors[:, :3] / 255.0
-    camera = framed(Mesh(shown.vertices, shown.faces), _WIDTH / _HEIGHT).camera
-    picture = render_mesh(
-        shown.vertices, shown.faces, colours, camera=camera, width=_WIDTH, height=_HEIGHT
-    )
-    Image.fromarray(picture).save(out)
+    picture = Picture(view_along(shown.vertices, shown.vertices[shown.faces]))
+    picture.add_mesh(shown.vertices, shown.faces, colours)
+    Image.fromarray(picture.pixels()).save(out)
 
 
 def tradeoffs(out: Path) -> None:

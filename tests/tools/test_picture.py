@@ -11,35 +11,52 @@ from triquad_client import Mesh
 from triquad_format.mapfile.writer import write_map
 from triquad_map.height_scale import HEIGHT_STOPS
 from triquad_tools.commands.pack import main
-from triquad_tools.plots.framing import framed
-from triquad_tools.plots.mesh_sheet import (
+from triquad_tools.plots.mesh_sheet import Legend, save_mesh_sheet
+from triquad_tools.plots.mesh_view import (
+    BACKGROUND,
     HEIGHT,
     WIDTH,
-    ColourBar,
-    Heading,
-    Legend,
-    save_mesh_sheet,
+    Picture,
+    vertex_normals,
+    view_along,
 )
-from triquad_tools.plots.picture import draw_mesh, outside_notes
-from triquad_tools.plots.render import BACKGROUND
+from triquad_tools.plots.picture import draw_mesh
+from triquad_tools.plots.plan import HEIGHTS, Scale
 
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
 SQUARE_FACES = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
-ASPECT = WIDTH / HEIGHT
 EMPTY = np.broadcast_to((255 * BACKGROUND).astype(np.uint8), (HEIGHT, WIDTH, 3))
+TEAL, RED = np.array([0.15, 0.6, 0.5]), np.array([1.0, 0.0, 0.0])
 
 
 def squares(*corners, side_m=1.0):
     """Level squares, each with its corner of smallest x and y at one of ``corners``."""
     vertices = np.concatenate([side_m * SQUARE + corner for corner in corners])
     faces = np.concatenate([SQUARE_FACES + 4 * i for i in range(len(corners))])
-    return Mesh(vertices, faces)
+    return Mesh(vertices, faces.astype(np.int32))
 
 
 def ground(width_m, depth_m):
     """Level squares of a metre."""
-    places = [(x, y, 0.0) for x in range(width_m) for y in range(depth_m)]
-    return squares(*places)
+    return squares(*[(x, y, 0.0) for x in range(width_m) for y in range(depth_m)])
+
+
+def both(one, other):
+    vertices = np.concatenate([one.vertices, other.vertices])
+    return Mesh(vertices, np.concatenate([one.faces, other.faces + len(one.vertices)]))
+
+
+def view_of(mesh):
+    return view_along(mesh.vertices, mesh.vertices[mesh.faces])
+
+
+def rendered(mesh, colour, view, points=()):
+    """The pixels of a mesh in one colour, and of red points."""
+    picture = Picture(view)
+    picture.add_mesh(mesh.vertices, mesh.faces, np.tile(colour, (len(mesh.vertices), 1)))
+    if len(points):
+        picture.add_points(np.array(points), np.tile(RED, (len(points), 1)))
+    return picture.pixels().astype(int)
 
 
 def read_picture(path):
@@ -59,79 +76,110 @@ def near(pixels, colour, within=12):
     return np.abs(pixels - 255 * np.asarray(colour)).max(axis=-1) <= within
 
 
+# The view
+
+
 @pytest.mark.parametrize("mesh", [ground(40, 3), ground(3, 40), ground(12, 12), ground(1, 1)])
-def test_the_camera_has_all_of_a_map_in_its_picture(mesh):
-    view = framed(mesh, ASPECT)
-    assert view.outside_share == 0.0
-    column, row, _ = view.camera.project(mesh.vertices, WIDTH, HEIGHT).T
-    assert column.min() >= 0
+def test_the_view_has_all_of_a_map_in_its_picture(mesh):
+    view = view_of(mesh)
+    assert view.outside(mesh.vertices) == ""
+    column, row, _ = view.project(mesh.vertices).T
+    assert min(column.min(), row.min()) >= 0
     assert column.max() <= WIDTH
-    assert row.min() >= 0
     assert row.max() <= HEIGHT
     # As near as can be: along one axis it goes from edge to edge, but for a margin.
-    filled = max(np.ptp(column) / WIDTH, np.ptp(row) / HEIGHT)
-    assert filled > 0.9
-    assert outside_notes(view) == []
+    assert max(np.ptp(column) / WIDTH, np.ptp(row) / HEIGHT) > 0.9
 
 
 def test_a_long_map_lies_along_the_picture():
     for mesh in (ground(40, 3), ground(3, 40)):
-        column, row, _ = framed(mesh, ASPECT).camera.project(mesh.vertices, WIDTH, HEIGHT).T
+        column, row, _ = view_of(mesh).project(mesh.vertices).T
         assert np.ptp(column) > 1.5 * np.ptp(row)
 
 
 def test_what_lies_far_away_is_left_out_and_told():
     mesh = ground(20, 20)
-    far = squares((900.0, 0.0, 0.0), side_m=0.5)
-    both = Mesh(
-        np.concatenate([mesh.vertices, far.vertices]),
-        np.concatenate([mesh.faces, far.faces + len(mesh.vertices)]),
+    view = view_of(both(mesh, squares((900.0, 0.0, 0.0), side_m=0.5)))
+    assert view.height_m < 1.3 * view_of(mesh).height_m
+    told = view.outside(np.concatenate([mesh.vertices, [[900.0, 0.0, 0.0]]]))
+    assert told.startswith("beyond the edges: 0.062 %, up to 8")
+
+
+def test_a_metre_is_as_long_everywhere_and_up_is_up():
+    view = view_of(ground(12, 12))
+    places = np.random.default_rng(0).uniform(-50.0, 50.0, (20, 3))
+    for direction in np.eye(3):
+        ends = (view.project(places + step * direction) for step in (0.0, 1.0))
+        lengths = np.linalg.norm(np.subtract(*ends)[:, :2], axis=1)
+        np.testing.assert_allclose(lengths, lengths[0])
+    low, high = view.project(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
+    assert high[1] < low[1]
+    assert high[0] == pytest.approx(low[0])
+
+
+# What it shows
+
+
+def test_level_ground_has_its_own_colour_and_slopes_another_brightness():
+    level = ground(4, 4)
+    view = view_of(level)
+    assert near(rendered(level, TEAL, view)[HEIGHT // 2, WIDTH // 2], TEAL, within=3)
+    pixels = []
+    for axis, slope in np.ndindex(2, 2):
+        rise = np.outer((0.7, -0.7)[slope] * level.vertices[:, axis], [0, 0, 1])
+        tilted = Mesh(level.vertices + rise, level.faces)
+        pixels.append(rendered(tilted, TEAL, view_of(tilted))[HEIGHT // 2, WIDTH // 2])
+        assert np.argmax(pixels[-1]) == np.argmax(TEAL)
+    assert np.ptp(pixels, axis=0).max() > 8
+
+
+def test_nearer_things_hide_farther_ones_and_backs_are_left_out():
+    floor, plate = ground(8, 8), squares((-4.0, -4.0, 3.0), side_m=16.0)
+    view = view_of(floor)
+    seen = rendered(both(floor, plate), TEAL, view)
+    np.testing.assert_array_equal(seen, rendered(both(plate, floor), TEAL, view))
+    ceiling = Mesh(plate.vertices, plate.faces[:, ::-1])  # seen from below
+    np.testing.assert_array_equal(
+        rendered(both(floor, ceiling), TEAL, view), rendered(floor, TEAL, view)
     )
-    alone, view = framed(mesh, ASPECT), framed(both, ASPECT)
-    assert view.camera.height_m < 1.3 * alone.camera.height_m
-    assert view.outside_share == pytest.approx(1 / 401)
-    assert outside_notes(view)[0].startswith("beyond the edges: 0.25 % of the faces, up to 8")
+    above, below = [[4.0, 4.0, 4.0]], [[4.0, 4.0, 1.0]]
+    assert near(rendered(plate, TEAL, view, above), RED).any()
+    assert not near(rendered(plate, TEAL, view, below), RED).any()
 
 
-def test_a_ceiling_does_not_hide_the_floor(tmp_path):
-    floor = ground(10, 10)
-    ceiling = Mesh(floor.vertices + [0, 0, 3], floor.faces[:, ::-1])  # seen from below
-    both = Mesh(
-        np.concatenate([floor.vertices, ceiling.vertices]),
-        np.concatenate([floor.faces, ceiling.faces + len(floor.vertices)]),
-    )
-    draw_mesh(Heading("map 'room'"), both, tmp_path / "room.png")
-    pixels = read_picture(tmp_path / "room.png")[90 : 90 + HEIGHT, :WIDTH]
-    assert near(pixels, HEIGHT_STOPS[4]).mean() > 0.3  # the middle of its own scale
-    assert not near(pixels, HEIGHT_STOPS[-1]).any()
+def test_a_square_covers_its_pixels_once():
+    mesh = ground(6, 6)
+    view = view_of(mesh)
+    covered = (np.abs(rendered(mesh, TEAL, view) - EMPTY).max(axis=-1) > 20).sum()
+    corners = view.project(np.array([[0.0, 0, 0], [6, 0, 0], [6, 6, 0], [0, 6, 0]]))[:, :2]
+    x, y = corners.T
+    area = 0.5 * abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1)))
+    assert covered == pytest.approx(area, rel=0.01)
 
 
-@pytest.mark.parametrize("below", ["", "down to -1 m"])
-@pytest.mark.parametrize("above", ["", "up to 2 m"])
-def test_the_legend_marks_values_beyond_its_scale(tmp_path, above, below):
-    bar = ColourBar("height in m", HEIGHT_STOPS, low=0.0, high=1.0, above=above, below=below)
-    save_mesh_sheet(tmp_path / "sheet.png", EMPTY, Legend(Heading("map"), bar))
+def test_normals_of_vertices_are_those_around_them():
+    normals = vertex_normals(SQUARE, SQUARE_FACES)
+    np.testing.assert_allclose(normals, np.tile([0.0, 0.0, 1.0], (4, 1)))
+
+
+@pytest.mark.parametrize("beyond", [(False, False), (True, False), (False, True), (True, True)])
+def test_the_legend_marks_values_beyond_its_scale(tmp_path, beyond):
+    scale = Scale("height in m", HEIGHTS, 0.0, 1.0)
+    view = view_of(ground(3, 3))
+    save_mesh_sheet(tmp_path / "sheet.png", EMPTY, view, Legend("map", scale, beyond, [""]))
     pixels = read_picture(tmp_path / "sheet.png")
     # The bar ends in an arrow, which has no corners.
-    assert near(pixels[194, 1360], BACKGROUND) == bool(above)
-    assert near(pixels[515, 1360], BACKGROUND) == bool(below)
-    assert near(pixels[508, 1371], HEIGHT_STOPS[0], within=16)
-    words_above, words_below = pixels[158:182, 1350:1600], pixels[530:560, 1350:1600]
-    assert (words_above < 128).any() == bool(above)
-    assert (words_below < 128).any() == bool(below)
+    assert near(pixels[153, 1365], BACKGROUND) == beyond[1]
+    assert near(pixels[506, 1365], BACKGROUND) == beyond[0]
+    assert near(pixels[480, 1377], HEIGHT_STOPS[0], within=24)
 
 
 def test_the_legend_tells_heights_beyond_the_scale(tmp_path):
     """A mast of few faces over a plain: its colour is that of the scale's end."""
-    plain = ground(30, 30)
-    mast = squares((15.0, 15.0, 50.0), side_m=0.5)
-    mesh = Mesh(
-        np.concatenate([plain.vertices, mast.vertices]),
-        np.concatenate([plain.faces, mast.faces + len(plain.vertices)]),
-    )
-    draw_mesh(Heading("map"), mesh, tmp_path / "mast.png")
-    draw_mesh(Heading("map"), ground(30, 30), tmp_path / "plain.png")
-    corners = [read_picture(tmp_path / f"{name}.png")[194, 1360] for name in ("mast", "plain")]
+    mast = both(ground(30, 30), squares((15.0, 15.0, 50.0), side_m=0.5))
+    draw_mesh("map", mast, tmp_path / "mast.png")
+    draw_mesh("map", ground(30, 30), tmp_path / "plain.png")
+    corners = [read_picture(tmp_path / f"{name}.png")[153, 1365] for name in ("mast", "plain")]
     assert [bool(near(corner, BACKGROUND)) for corner in corners] == [True, False]
 
 

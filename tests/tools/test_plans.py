@@ -6,16 +6,24 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from support import servers
-from support.checkpoint_folder import FIRST, SECOND, write_checkpoints
+from support.checkpoint_folder import write_checkpoints
 from support.exact_maps import SEEN_M, exact_map, flat, table
 from support.map_records import random_record
-from triquad_format.mapfile.reader import read_map_file
 from triquad_format.mapfile.writer import write_map
 from triquad_map.height_scale import HEIGHT_STOPS
 from triquad_tools.commands.inspect import main
 from triquad_tools.plots.diff_plan import APPEARED, VANISHED
-from triquad_tools.plots.map_plan import latest_epochs, sample_errors, seen_columns
-from triquad_tools.plots.plan import FREE, UNKNOWN, Layer, PlanGrid, Scale, draw_layers, draw_values
+from triquad_tools.plots.map_plan import sample_errors, seen_columns
+from triquad_tools.plots.plan import (
+    FREE,
+    HEIGHTS,
+    UNKNOWN,
+    Layer,
+    PlanGrid,
+    Scale,
+    draw_layers,
+    draw_values,
+)
 from triquad_tools.plots.slice_plan import SURFACE
 
 
@@ -61,15 +69,6 @@ def test_cells_are_where_their_points_are():
     assert not grid.marked(points[:0]).any()
 
 
-def test_a_window_covers_the_cells_between_its_corners():
-    grid = PlanGrid(np.array([-1.0, -2.0]), 0.5, rows=8, columns=4)
-    covered = np.zeros((8, 4), bool)
-    covered[grid.window(np.array([-0.5, 1.0]), np.array([0.5, 99.0]))] = True
-    expected = np.zeros((8, 4), bool)
-    expected[6:, 1:3] = True
-    np.testing.assert_array_equal(covered, expected)
-
-
 # Colours and legends
 
 
@@ -88,7 +87,7 @@ def test_what_is_not_known_has_a_colour_of_its_own(name):
 )
 def test_a_scale_says_what_lies_beyond_it(values, extend):
     axes = Figure().subplots()
-    draw_values(axes, np.array([[*values, np.nan]]), Scale("height in m", "viridis", 0.0, 1.0))
+    draw_values(axes, np.array([[*values, np.nan]]), Scale("height in m", HEIGHTS, 0.0, 1.0))
     (image,) = axes.images
     assert image.colorbar.extend == extend
     assert image.colorbar.ax.get_ylabel() == "height in m"
@@ -118,15 +117,6 @@ def test_columns_have_their_highest_surface():
     np.testing.assert_allclose(columns.tops[~inside], 0.1)
     assert np.abs(columns.middles).max() == pytest.approx(SEEN_M - 0.1)
     assert seen_columns(record).tops.max() == pytest.approx(1.1 + 10 * 0.2)
-
-
-def test_each_place_shows_the_epoch_in_which_it_last_changed(tmp_path):
-    file = read_map_file(write_checkpoints(tmp_path, (9, 12, 15))[-1])
-    grid = PlanGrid(np.array([-18.0, -6.0]), 0.25, rows=48, columns=96)
-    epochs = latest_epochs(grid, file.manifest)
-    assert (FIRST, SECOND) == ((0, 0, 0), (-1, 0, 0))  # the second one is to the left
-    assert np.unique(epochs[:, :48]).tolist() == [15]
-    assert np.unique(epochs[:, 48:]).tolist() == [9]
 
 
 def test_errors_are_those_of_the_labels():

@@ -1,7 +1,7 @@
 """A browser for all tests of a module, and pages that show a map."""
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -10,7 +10,7 @@ from playwright.sync_api import Browser, Page, expect
 from support.browser import running_browser
 from triquad_tools.viewer.sources.history import History
 from triquad_tools.viewer.sources.live_source import LiveSource
-from triquad_tools.viewer.sources.open_maps import OpenMaps
+from triquad_tools.viewer.sources.stored_source import StoredMap, StoredSource
 from triquad_tools.viewer.viewer import Viewer
 
 from bench.clients.browser import opened_page
@@ -30,8 +30,7 @@ def page_without_server(browser: Browser) -> Iterator[Callable[[Path], Page]]:
     with ExitStack() as opened:
 
         def open_viewer(path: Path) -> Page:
-            maps = opened.enter_context(closing(OpenMaps()))
-            shown = History(path, maps) if path.is_dir() else maps.use(path)
+            shown = History(path) if path.is_dir() else StoredSource(StoredMap(path), path.name)
             viewer = Viewer(shown, "127.0.0.1", 0)
             opened.callback(viewer.close)
             return opened.enter_context(opened_page(browser, viewer.url))

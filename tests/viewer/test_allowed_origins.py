@@ -1,14 +1,16 @@
 """Pages of others in a browser cannot reach the map that is shown beside them."""
 
 import asyncio
+import multiprocessing
 from collections.abc import Iterator
 from contextlib import closing
+from pathlib import Path
 
 import pytest
 import viser
 import websockets.asyncio.client
 from support.changing_store import EMPTY, write_checkpoint
-from triquad_tools.viewer.sources.open_maps import OpenMaps
+from triquad_tools.viewer.sources.stored_source import StoredMap, StoredSource
 from triquad_tools.viewer.viewer import Viewer
 from websockets.exceptions import InvalidStatus
 from websockets.typing import Subprotocol
@@ -20,10 +22,9 @@ ALLOWED = "maps.example"
 def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Address and port of a viewer."""
     path = write_checkpoint(tmp_path_factory.mktemp("map"), 1, EMPTY)
-    with closing(OpenMaps()) as maps:
-        viewer = Viewer(maps.use(path), "127.0.0.1", 0, allowed_hosts=[ALLOWED])
-        with closing(viewer):
-            yield viewer.url.removeprefix("http://")
+    source = StoredSource(StoredMap(path), path.name)
+    with closing(Viewer(source, "127.0.0.1", 0, allowed_hosts=[ALLOWED])) as viewer:
+        yield viewer.url.removeprefix("http://")
 
 
 async def page_status(place: str, head: list[str]) -> int:
@@ -91,3 +92,15 @@ def test_pages_of_others_are_refused(place: str, origin: str) -> None:
 def test_a_program_and_an_allowed_page_are_let_in(place: str) -> None:
     assert isinstance(asyncio.run(first_message(place, place, None)), bytes)
     assert isinstance(asyncio.run(first_message(place, place, f"https://{ALLOWED}")), bytes)
+
+
+def test_nobody_who_reaches_the_page_can_show_it_to_the_internet(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def start(_: object) -> None:
+        raise AssertionError("a process for a tunnel is started")
+
+    monkeypatch.setattr(multiprocessing.Process, "start", start)
+    source = StoredSource(StoredMap(write_checkpoint(tmp_path, 1, EMPTY)), "file")
+    with closing(Viewer(source, "127.0.0.1", 0)) as viewer:
+        viewer._server.request_share_url()  # as a message from a page has it done

@@ -16,68 +16,13 @@ PageWithoutServer = Callable[[Path], Page]
 SKY_BLUE, VERMILION = (86, 180, 233), (213, 94, 0)
 
 
-def test_a_file_is_drawn_and_answers(
+def test_a_file_is_drawn_and_saved_as_a_picture(
     tmp_path: Path, page_without_server: PageWithoutServer
 ) -> None:
     page = page_without_server(write_checkpoint(tmp_path, 7, box_at(3, 3)))
     expect(page.get_by_text("ground in epoch-000000007.triquad")).to_be_visible()
     wait_until_drawn(page)
     expect(page.get_by_text("Checkpoint")).to_be_hidden()
-    page.get_by_role("combobox", name="Colour").click()
-    page.get_by_role("option", name="confidence").click()
-    expect(page.get_by_text("confidence", exact=True).first).to_be_visible()
-    expect(page.get_by_text("⚠")).to_be_hidden()
-
-
-def test_a_store_is_shown_as_it_was(tmp_path: Path, page_without_server: PageWithoutServer) -> None:
-    write_checkpoint(tmp_path, 1, EMPTY)
-    write_checkpoint(tmp_path, 2, box_at(3, 3))
-    damaged = write_checkpoint(tmp_path, 3, EMPTY)
-    damaged.write_bytes(damaged.read_bytes()[:-1000])
-    page = page_without_server(tmp_path)
-    expect(page.get_by_text("epoch 2, 2026-01-31T14:00:00Z 2 of 2")).to_be_visible()
-    expect(page.get_by_text("epoch-000000003.triquad is left out")).to_be_visible()
-    wait_until_drawn(page)
-    with_box = picture(page)
-    page.get_by_role("button", name="Previous").click()
-    expect(page.get_by_text("epoch 1, 2026-01-31T13:00:00Z 1 of 2")).to_be_visible()
-    wait_until(page, lambda: _differs(page, with_box) > 500, "the box is gone")
-    # A server goes on.
-    write_checkpoint(tmp_path, 4, box_at(-3, 3))
-    expect(page.get_by_text("1 of 3")).to_be_visible()
-    slider = page.get_by_role("slider").first
-    slider.focus()
-    page.keyboard.press("End")
-    expect(page.get_by_text("epoch 4, 2026-01-31T16:00:00Z 3 of 3")).to_be_visible()
-
-
-def test_what_changed_is_drawn_and_listed(
-    tmp_path: Path, page_without_server: PageWithoutServer
-) -> None:
-    write_checkpoint(tmp_path, 1, EMPTY)
-    write_checkpoint(tmp_path, 2, box_at(4, 4))
-    write_checkpoint(tmp_path, 3, EMPTY)
-    page = page_without_server(tmp_path)
-    wait_until_drawn(page)
-    page.get_by_role("checkbox", name="Show changes").check()
-    expect(page.get_by_text("vanished (V): free space in epoch 3")).to_be_visible()
-    expect(page.get_by_text("1 vanished")).to_be_visible()
-    wait_until(page, lambda: _pixels(page, VERMILION) > 50, "the box is outlined")
-    assert _pixels(page, SKY_BLUE) < 20
-    page.get_by_role("button", name="Previous").click()
-    expect(page.get_by_text("1 appeared")).to_be_visible()
-    wait_until(page, lambda: _pixels(page, SKY_BLUE) > 50, "the box is outlined")
-    page.get_by_role("combobox", name="Since").click()
-    page.get_by_role("option", name="epoch 3").click()
-    expect(page.get_by_text("1 vanished")).to_be_visible()  # from the box to the later epoch
-    page.get_by_role("checkbox", name="Show changes").uncheck()
-    expect(page.get_by_text("1 vanished")).to_be_hidden()
-    wait_until(page, lambda: _pixels(page, VERMILION) < 20, "nothing is outlined")
-
-
-def test_a_picture_is_saved(tmp_path: Path, page_without_server: PageWithoutServer) -> None:
-    page = page_without_server(write_checkpoint(tmp_path, 7, box_at(3, 3)))
-    wait_until_drawn(page)
     with page.expect_download() as started:
         page.get_by_role("button", name="Save picture").click()
     download = started.value
@@ -91,6 +36,47 @@ def test_a_picture_is_saved(tmp_path: Path, page_without_server: PageWithoutServ
     mesh, caption = pixels[:height], pixels[height:]
     assert (mesh.min(axis=-1) < 200).mean() > drawn_share(page) / 4
     assert (caption.min(axis=-1) < 100).mean() > 0.005
+    page.get_by_role("combobox", name="Colour").click()
+    page.get_by_role("option", name="confidence").click()
+    expect(page.get_by_text("confidence", exact=True).first).to_be_visible()
+    expect(page.get_by_text("⚠")).to_be_hidden()
+
+
+def test_a_store_is_shown_as_it_was_and_what_changed(
+    tmp_path: Path, page_without_server: PageWithoutServer
+) -> None:
+    write_checkpoint(tmp_path, 1, EMPTY)
+    write_checkpoint(tmp_path, 2, box_at(4, 4))
+    write_checkpoint(tmp_path, 3, EMPTY)
+    damaged = write_checkpoint(tmp_path, 4, EMPTY)
+    damaged.write_bytes(damaged.read_bytes()[:-1000])
+    page = page_without_server(tmp_path)
+    expect(page.get_by_text("epoch 3, 2026-01-31T15:00:00Z 3 of 3")).to_be_visible()
+    expect(page.get_by_text("epoch-000000004.triquad is left out")).to_be_visible()
+    wait_until_drawn(page)
+    without_box = picture(page)
+    page.get_by_role("checkbox", name="Show changes").check()
+    expect(page.get_by_text("vanished (V): free space in epoch 3")).to_be_visible()
+    expect(page.get_by_text("1 vanished")).to_be_visible()
+    wait_until(page, lambda: _pixels(page, VERMILION) > 50, "the box is outlined")
+    assert _pixels(page, SKY_BLUE) < 20
+    page.get_by_role("button", name="Previous").click()
+    expect(page.get_by_text("epoch 2, 2026-01-31T14:00:00Z 2 of 3")).to_be_visible()
+    expect(page.get_by_text("1 appeared")).to_be_visible()
+    wait_until(page, lambda: _pixels(page, SKY_BLUE) > 50, "the box is outlined")
+    page.get_by_role("combobox", name="Since").click()
+    page.get_by_role("option", name="epoch 3").click()
+    expect(page.get_by_text("1 vanished")).to_be_visible()  # from the box to the later epoch
+    page.get_by_role("checkbox", name="Show changes").uncheck()
+    expect(page.get_by_text("1 vanished")).to_be_hidden()
+    wait_until(page, lambda: _pixels(page, VERMILION) < 20, "nothing is outlined")
+    wait_until(page, lambda: _differs(page, without_box) > 500, "the box is drawn")
+    # A server goes on.
+    write_checkpoint(tmp_path, 5, box_at(-3, 3))
+    expect(page.get_by_text("2 of 4")).to_be_visible()
+    page.get_by_role("slider").first.focus()
+    page.keyboard.press("End")
+    expect(page.get_by_text("epoch 5, 2026-01-31T17:00:00Z 4 of 4")).to_be_visible()
 
 
 def _differs(page: Page, before: np.ndarray) -> int:

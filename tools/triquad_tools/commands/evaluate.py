@@ -120,13 +120,12 @@ def _compared(
     comparison = compare_mesh(mesh, truth, settings)
     if options.plot is not None:
         from triquad_tools.plots.error_picture import draw_mesh_errors  # slow to import
-        from triquad_tools.plots.mesh_sheet import Heading
 
         against = f"street {options.street}" if options.street is not None else options.reference
         rows = [row for row in mesh_rows(comparison.scores) if row.name in _DRAWN]
         with progress("drawing"):
-            heading = Heading(f"{name}, against {against}", _summary(rows))
-            draw_mesh_errors(heading, comparison, options.plot)
+            title = f"{name}, against {against}\n{_summary(rows)}"
+            draw_mesh_errors(title, comparison, options.plot)
     return comparison.scores
 
 
@@ -162,13 +161,12 @@ def _at_withheld(options: argparse.Namespace) -> Results:
 def _drawn(options: argparse.Namespace, name: str, answers: list[WithheldAnswer]) -> WithheldScores:
     """Scores at withheld scans, drawn into ``--plot``."""
     from triquad_tools.plots.error_picture import draw_withheld  # slow to import
-    from triquad_tools.plots.mesh_sheet import Heading
 
     scores = score_withheld(answers)
     summary = _summary([row for row in withheld_rows(scores) if row.note != TRUSTED])
-    heading = Heading(f"{name}, at withheld scans of {options.withheld}", summary)
+    title = f"{name}, at withheld scans of {options.withheld}\n{summary}"
     with progress("drawing"):
-        draw_withheld(heading, answers, scores, path=options.plot)
+        draw_withheld(title, answers, scores, path=options.plot)
     return scores
 
 

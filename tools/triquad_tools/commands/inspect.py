@@ -163,7 +163,7 @@ def _show(options: argparse.Namespace) -> int:
     if options.plot:
         from triquad_tools.plots.map_plan import draw_map  # slow to import
 
-        draw_map(_title(name, file), file, options.plot)
+        draw_map(_title(name, file), file.record, options.plot)
     if options.json:
         print_line(json_text(summary))
     else:

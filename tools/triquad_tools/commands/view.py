@@ -14,16 +14,13 @@ from triquad_tools.console.command import OK, complain, refuse, run
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.progress import progress
 from triquad_tools.console.server_arguments import DEFAULT_MAP, add_server, server_name
-from triquad_tools.viewer.sources.file_source import FileSource
 from triquad_tools.viewer.sources.history import History
-from triquad_tools.viewer.sources.history_source import newest_of
 from triquad_tools.viewer.sources.live_source import LiveSource
 from triquad_tools.viewer.sources.map_source import MapSource
-from triquad_tools.viewer.sources.open_maps import OpenMaps
+from triquad_tools.viewer.sources.stored_source import StoredMap, StoredSource
 from triquad_tools.viewer.viewer import DEFAULT_PORT, Viewer
 
 _COMMAND = "triquad-view"
-_PREPARED_S = 10.0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -58,31 +55,29 @@ def _shown(options: argparse.Namespace) -> Iterator[MapSource | History]:
         name = options.map or DEFAULT_MAP
         with triquad_client.connect(options.connect, name, config=options.config) as client:
             yield LiveSource(client, server_name(options))
-        return
-    with closing(OpenMaps()) as maps:
-        yield _store(options.file, maps) if options.file.is_dir() else _file(options.file, maps)
+    elif options.file.is_dir():
+        yield _store(options.file)
+    else:
+        with progress(f"opening {options.file}") as report:
+            source = StoredSource(StoredMap(options.file), options.file.name)
+            report(1, _name(source.shown))
+        yield source
 
 
-def _file(path: Path, maps: OpenMaps) -> FileSource:
-    """The map in a file, ready to be shown."""
+def _store(path: Path) -> History:
+    """The checkpoints of a store, of which the newest that can be shown is opened."""
+    history = History(path)
     with progress(f"opening {path}") as report:
-        source = maps.use(path)
-        source.prepare(_PREPARED_S)
-        report(1, f"map {source.opened.name!r}, epoch {source.opened.epoch}")
-    return source
-
-
-def _store(path: Path, maps: OpenMaps) -> History:
-    """The checkpoints of a store; the newest that can be shown is ready."""
-    history = History(path, maps)
-    with progress(f"opening {path}") as report, closing(newest_of(history)) as source:
-        state = source.state()
-        report(1, f"map {state.map_name!r}, epoch {state.epoch}")
+        report(1, _name(history.newest()))
     for problem in history.damaged:
         complain(_COMMAND, problem, OK)
     moments = history.moments
     print_line(f"{len(moments)} checkpoints: {moments[0]} to {moments[-1]}")
     return history
+
+
+def _name(shown: StoredMap) -> str:
+    return f"map {shown.opened.name!r}, epoch {shown.opened.epoch}"
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -24,9 +24,7 @@ from triquad_tools.evaluation.metrics import (
     drive_truth,
     scored_box,
 )
-from triquad_tools.plots.camera import PerspectiveCamera
-from triquad_tools.plots.mesh_sheet import Heading
-from triquad_tools.plots.picture import draw_view
+from triquad_tools.plots.picture import draw_mesh
 from triquad_tools.recordings.publishing import publish_all, wait_until_settled
 
 MAP = "demo"
@@ -35,12 +33,6 @@ _SEED = 0  # of the points that are asked
 _SETTLE_LIMIT_S = 70.0
 _QUERY_POINTS = 1_000
 _RESTART_POINTS = 50_000
-
-# The picture: over the start of the drive, down the street.
-_EYE_M = (-14.0, 0.8, 12.0)
-_TARGET_M = (17.0, -0.3, 0.3)
-_VIEW_DEG = 46.0
-_SUMMARY = "from the start of the drive; dark: surface that is seen from behind, inside of houses"
 
 
 @dataclass(frozen=True)
@@ -143,6 +135,4 @@ def draw(surface: Mesh, paths: Sequence[Path], picture: Path) -> None:
             report(0.0, path.name)
             surface.save(path)
         report(0.0, picture.name)
-        camera = PerspectiveCamera(np.array(_EYE_M), np.array(_TARGET_M), _VIEW_DEG)
-        heading = Heading(f"map {MAP!r}, epoch {surface.epoch}", _SUMMARY)
-        draw_view(heading, surface, camera, notes=[], path=picture)
+        draw_mesh(f"map {MAP!r}, epoch {surface.epoch}", surface, picture)

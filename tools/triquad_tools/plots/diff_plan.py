@@ -11,6 +11,7 @@ from triquad_format.records.status import Status
 from triquad_tools.mapfiles.diff import Comparison
 from triquad_tools.mapfiles.object_changes import Cluster, Move, ObjectChanges
 from triquad_tools.plots.plan import (
+    ERRORS,
     FREE,
     Layer,
     Plan,
@@ -55,7 +56,7 @@ def _draw_movement(grid: PlanGrid, comparison: Comparison, axes: Axes) -> None:
     cells = grid.statistic(old.points[near], moved_cm, "mean")
     high = float(np.nanquantile(cells, 0.99)) if len(moved_cm) else 0.0
     label = "movement in cm, mean over the height"
-    scale = Scale(label, "plasma_r", low=0.0, high=max(np.ceil(high), _LEAST_RANGE_CM))
+    scale = Scale(label, ERRORS, low=0.0, high=max(np.ceil(high), _LEAST_RANGE_CM))
     draw_values(axes, cells, scale)
 
 

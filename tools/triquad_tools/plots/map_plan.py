@@ -1,59 +1,46 @@
-"""A picture of what a map file holds: what was seen, when it last changed, and how well it fits."""
+"""A picture of what a map file holds: what was seen, and how well it fits."""
 
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.colors import LinearSegmentedColormap, to_hex
-from triquad_format.mapfile.manifest import Manifest
-from triquad_format.mapfile.metadata import utc_time
-from triquad_format.mapfile.parts.part import CELL_LEAVES, EVIDENCE, VERTICES, PartKey, extent
-from triquad_format.mapfile.reader import MapFile
 from triquad_format.records import morton
-from triquad_format.records.arrays import Doubles, Longs
+from triquad_format.records.arrays import Doubles
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
 from triquad_format.records.region import MapRecord
 from triquad_format.records.seen_space import owned_evidence
-from triquad_map.height_scale import HEIGHT_STOPS, HeightScale
+from triquad_map.height_scale import HeightScale
 from triquad_map.reference.evaluator import MapEvaluator
 
 from triquad_tools.console.report import centimetres
 from triquad_tools.plots.plan import (
+    ERRORS,
     FREE,
+    HEIGHTS,
     Layer,
     Plan,
     PlanGrid,
     Scale,
-    Window,
     draw_layers,
     draw_values,
     save_sheet,
 )
 
-_NEVER = -1
-_MOST_COLOURS = 6
-_PLAN_PLANE = 0  # XY
 _MOST_SAMPLES = 500_000
 _LEAST_RANGE_CM = 2.0  # of errors
 
 
-def draw_map(title: str, file: MapFile, path: Path) -> None:
-    """Draw plans of a map's coverage, of its latest changes and of its errors.
-
-    Where all of it changed in one epoch, or it has no training samples, there is no such plan.
+def draw_map(title: str, record: MapRecord, path: Path) -> None:
+    """Draw plans of a map's coverage and, where it has training samples, of its errors.
 
     Raises:
         OSError: ``path`` cannot be written.
     """
-    record = file.record
     surface, seen = seen_columns(record, surface_only=True), seen_columns(record)
     grid = PlanGrid.around(seen.middles, record.settings.leaf_m)
     plans = [Plan("Coverage", partial(_draw_coverage, grid, surface, seen))]
-    if len({entry.epoch for entry in file.manifest.entries}) > 1:
-        plans.append(_ages_plan(grid, file.manifest, seen))
     errors = sample_errors(record)
     if len(errors.points):
         plans.append(_errors_plan(grid, errors, record.settings))
@@ -87,55 +74,8 @@ def seen_columns(record: MapRecord, surface_only: bool = False) -> Columns:
 def _draw_coverage(grid: PlanGrid, surface: Columns, seen: Columns, axes: Axes) -> None:
     draw_layers(axes, [Layer("only free space was seen", FREE, grid.marked(seen.middles))])
     heights = HeightScale.around(surface.tops)
-    colours = LinearSegmentedColormap.from_list("height", HEIGHT_STOPS.tolist())
-    scale = Scale("height of the topmost surface in m", colours, heights.low_m, heights.high_m)
+    scale = Scale("height of the topmost surface in m", HEIGHTS, heights.low_m, heights.high_m)
     draw_values(axes, grid.statistic(surface.middles, surface.tops, "max"), scale)
-
-
-def _ages_plan(grid: PlanGrid, manifest: Manifest, seen: Columns) -> Plan:
-    """A plan of the epochs in which places last changed, square by square."""
-    epochs = np.where(grid.marked(seen.middles), latest_epochs(grid, manifest), _NEVER)
-    layers = _age_layers(epochs, manifest)
-    side_m = manifest.facts.settings.leaf_m * CELL_LEAVES
-    note = f"told apart in squares of {side_m:g} m"
-    return Plan("Last changed", lambda axes: draw_layers(axes, layers[::-1]), note)
-
-
-def _age_layers(epochs: Longs, manifest: Manifest) -> list[Layer]:
-    """The epochs in a plan, oldest first, so few layers that colours can tell them apart."""
-    stamps_ns = {entry.epoch: entry.stamp_ns for entry in manifest.entries}
-    found = np.unique(epochs[epochs != _NEVER])
-    groups = np.array_split(found, min(len(found), _MOST_COLOURS)) if len(found) else []
-    colours = colormaps["viridis"](np.linspace(0.0, 1.0, len(groups)))[::-1]  # the latest is dark
-    layers = []
-    for group, colour in zip(groups, colours, strict=True):
-        first, last = int(group[0]), int(group[-1])
-        name = f"epoch {last}" if first == last else f"epochs {first} to {last}"
-        label = f"{name}, {utc_time(stamps_ns[last])}" if stamps_ns[last] else name
-        layers.append(Layer(label, to_hex(colour), (epochs >= first) & (epochs <= last)))
-    return layers
-
-
-def latest_epochs(grid: PlanGrid, manifest: Manifest) -> Longs:
-    """``[rows, columns]``: the epoch in which a place last changed; -1 where there is none."""
-    latest = np.full((grid.rows, grid.columns), _NEVER, np.int64)
-    for entry in manifest.entries:
-        window = _window(grid, manifest.facts.settings, entry.key)
-        if window is not None:
-            latest[window] = np.maximum(latest[window], entry.epoch)
-    return latest
-
-
-def _window(grid: PlanGrid, settings: FieldSettings, key: PartKey) -> Window | None:
-    """What a part covers in the plan, as far as answers of its region hang on it."""
-    if key.topic != EVIDENCE and (key.topic, key.plane) != (VERTICES, _PLAN_PLANE):
-        return None
-    box = extent(settings, key)
-    corner = settings.region_corner(key.region)[:2]
-    low, high = (corner + settings.leaf_m * end[:2] for end in (box.low, box.high))
-    centre = settings.region_centre(key.region)[:2]
-    half = settings.region_pitch_m / 2
-    return grid.window(np.maximum(low, centre - half), np.minimum(high, centre + half))
 
 
 @dataclass(frozen=True)
@@ -170,7 +110,7 @@ def _errors_plan(grid: PlanGrid, found: SampleErrors, settings: FieldSettings) -
     """A plan of the mean error in each column."""
     cells = grid.statistic(found.points, 100 * found.errors_m, "mean")
     high = max(float(np.ceil(np.nanquantile(cells, 0.99))), _LEAST_RANGE_CM)
-    scale = Scale("mean |signed distance - label| in cm", "plasma_r", low=0.0, high=high)
+    scale = Scale("mean |signed distance - label| in cm", ERRORS, low=0.0, high=high)
     mean, p95 = found.errors_m.mean(), np.quantile(found.errors_m, 0.95)
     note = (
         f"mean {centimetres(mean)}, 95 % {centimetres(p95)} at {len(found.points):,} samples "

@@ -12,35 +12,32 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from matplotlib import rc_context
+from matplotlib import colormaps, rc_context
 from matplotlib.axes import Axes
-from matplotlib.colors import Colormap, ListedColormap
+from matplotlib.colors import Colormap, LinearSegmentedColormap, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 from scipy.stats import binned_statistic_2d
 from triquad_format.records.arrays import Bools, Doubles
+from triquad_map.height_scale import HEIGHT_STOPS
 
 UNKNOWN = "#bdbdbd"
 FREE = "#f3f3f3"
+HEIGHTS: Colormap = LinearSegmentedColormap.from_list("heights", HEIGHT_STOPS.tolist())
+ERRORS: Colormap = colormaps["plasma_r"]
 
-MOST_CELLS = 1200
-"""Along the longer side of a plan."""
-
+_MOST_CELLS = 1200  # along the longer side of a plan
 _LEAST_CELLS = 40  # along each side
 _LEAST_SIDE = 0.25  # the shorter side's share of the longer one
 _WIDE = 2.0  # the plans of a map that is wider stand below each other
-_LONGEST_IN, _LONGEST_BESIDE_IN = 11.0, 6.5  # longer side of a plan
+_LONGEST_IN, _LONGEST_ASIDE_IN = 11.0, 6.5  # longer side of a plan
 _ROOM_IN = (2.3, 1.7)  # beside a plan for its scale, below it for its legend
-_DPI = 110
 _LETTERS_PT = 13  # can be read in half the size, too
 
 Values = Doubles
 """One value for each cell ``[rows, columns]``, row 0 that of the smallest y; NaN where none is."""
-
-Draw = Callable[[Axes], None]
-Window = tuple[slice, slice]
 
 
 @dataclass(frozen=True)
@@ -58,7 +55,7 @@ class PlanGrid:
         points = points if len(points) else np.zeros((1, 2))
         low, high = points.min(axis=0), points.max(axis=0)
         longest = math.ceil(float((high - low).max()) / leaf_m) + 1
-        cell_m = leaf_m * 2.0 ** max(math.ceil(math.log2(longest / MOST_CELLS)), 0)
+        cell_m = leaf_m * 2.0 ** max(math.ceil(math.log2(longest / _MOST_CELLS)), 0)
         first = np.floor(low / cell_m).astype(np.int64)
         count = np.floor(high / cell_m).astype(np.int64) - first + 1
         wanted = np.maximum(count, max(math.ceil(_LEAST_SIDE * count.max()), _LEAST_CELLS))
@@ -70,12 +67,6 @@ class PlanGrid:
         """``[2]`` corner of largest x and y."""
         corner: Doubles = self.low_m + self.cell_m * np.array([self.columns, self.rows])
         return corner
-
-    def window(self, low_m: NDArray[np.floating], high_m: NDArray[np.floating]) -> Window:
-        """The cells with their middle between two corners [2], as an index into a plan."""
-        ends = (np.ceil((end - self.low_m) / self.cell_m - 0.5) for end in (low_m, high_m))
-        first, last = (np.clip(end, 0, [self.columns, self.rows]).astype(int) for end in ends)
-        return slice(first[1], last[1]), slice(first[0], last[0])
 
     def marked(self, points: NDArray[np.floating]) -> Bools:
         """``[rows, columns]``: whether a cell holds any of the points ``[N, 2 or 3]``."""
@@ -103,7 +94,7 @@ class Scale:
     """Colours for values from ``low`` to ``high``."""
 
     label: str
-    colours: str | Colormap  # a name that matplotlib knows, or colours
+    colours: Colormap
     low: float
     high: float
 
@@ -113,7 +104,7 @@ class Plan:
     """One plan of a sheet."""
 
     heading: str
-    draw: Draw  # onto axes of the grid
+    draw: Callable[[Axes], None]  # onto axes of the grid
     note: str = ""
 
 
@@ -127,18 +118,18 @@ class Layer:
 
 
 def save_sheet(path: Path, title: str, grid: PlanGrid, plans: Sequence[Plan]) -> None:
-    """Draw plans of one grid beside each other, or below each other where the map is wide.
+    """Draw plans of one grid at each other's side, or below each other where the map is wide.
 
     Raises:
         OSError: ``path`` cannot be written.
     """
     wide = grid.columns > _WIDE * grid.rows
-    inches = (_LONGEST_IN if wide else _LONGEST_BESIDE_IN) / max(grid.columns, grid.rows)
+    inches = (_LONGEST_IN if wide else _LONGEST_ASIDE_IN) / max(grid.columns, grid.rows)
     shape = (len(plans), 1) if wide else (1, len(plans))
     width = shape[1] * (inches * grid.columns + _ROOM_IN[0])
     height = shape[0] * (inches * grid.rows + _ROOM_IN[1])
     with rc_context({"font.size": _LETTERS_PT}):
-        figure = Figure((width, height), _DPI, layout="constrained")
+        figure = Figure((width, height), dpi=110, layout="constrained")
         figure.suptitle(title, x=0.01, ha="left", parse_math=False)
         drawn = []
         for plan, part in zip(plans, figure.subfigures(*shape, squeeze=False).flat, strict=True):
@@ -164,14 +155,18 @@ def _align(figure: Figure, drawn: Sequence[Axes]) -> None:
         axes.set_position((left, low, width * (top - low) / height, top - low))
 
 
+def extend(below: bool, above: bool) -> Literal["neither", "min", "max", "both"]:
+    """The ends of a scale that have an arrow, since there are values beyond."""
+    return (("neither", "max"), ("min", "both"))[below][above]
+
+
 def draw_values(axes: Axes, values: Values, scale: Scale) -> None:
     """Colour the cells that have a value, and show the scale."""
     known = values[np.isfinite(values)]
-    below, above = bool((known < scale.low).any()), bool((known > scale.high).any())
-    extend = ("neither", "min", "max", "both")[below + 2 * above]
+    ends = extend(bool((known < scale.low).any()), bool((known > scale.high).any()))
     image = _draw_cells(axes, values, cmap=scale.colours, vmin=scale.low, vmax=scale.high)
-    beside = axes.inset_axes((1.02, 0.0, 0.025, 1.0))
-    axes.figure.colorbar(image, cax=beside, label=scale.label, extend=extend)
+    aside = axes.inset_axes((1.02, 0.0, 0.025, 1.0))
+    axes.figure.colorbar(image, cax=aside, label=scale.label, extend=ends)
 
 
 def draw_layers(axes: Axes, layers: Sequence[Layer]) -> None:

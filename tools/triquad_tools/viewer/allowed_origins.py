@@ -34,20 +34,15 @@ class AllowedOrigins:
     def refusal(self, headers: Headers) -> str | None:
         """Why a request is not answered, or ``None``."""
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
-        if len(hosts) != 1 or not self._is_own(_name(hosts[0])):
+        name = _name(hosts[0]) if len(hosts) == 1 else ""
+        # Addresses cannot be made to point here by others.
+        if name not in self._own and not _is_address(name):
             return "this page is not served under that name: triquad-view --allow-host NAME"
-        if any(not self._is_same(origin, hosts[0]) for origin in origins):
-            return "another page may not use this one: triquad-view --allow-host NAME of its host"
+        for origin in origins:
+            place = urlsplit(origin).netloc.lower()
+            if place != hosts[0].lower() and _name(place) not in self._given:
+                return "another page may not use this one: triquad-view --allow-host its NAME"
         return None
-
-    def _is_own(self, name: str) -> bool:
-        """Whether nobody else can have made a name point here: addresses cannot be made to."""
-        return name in self._own or _is_address(name)
-
-    def _is_same(self, origin: str, host: str) -> bool:
-        """Whether a page from ``origin`` is the one that is served as ``host``."""
-        place = urlsplit(origin).netloc.lower()
-        return place == host.lower() or _name(place) in self._given
 
 
 @contextmanager
@@ -59,7 +54,15 @@ def serving_only(allowed: AllowedOrigins) -> Iterator[None]:
     serve = websockets.asyncio.server.serve
 
     def guarded(*arguments: Any, process_request: _Answer, **options: Any) -> Any:
-        return serve(*arguments, process_request=_guard(allowed, process_request), **options)
+        def answer_allowed(connection: Any, request: Request) -> Any:
+            reason = allowed.refusal(request.headers)
+            if reason is None:
+                return process_request(connection, request)
+            forbidden, body = http.HTTPStatus.FORBIDDEN, f"{reason}\n".encode()
+            headers = Headers({"Content-Type": "text/plain", "Content-Length": str(len(body))})
+            return Response(forbidden, forbidden.phrase, headers, body)
+
+        return serve(*arguments, process_request=answer_allowed, **options)
 
     with _patching:
         websockets.asyncio.server.serve = guarded  # type: ignore[assignment, misc]
@@ -67,19 +70,6 @@ def serving_only(allowed: AllowedOrigins) -> Iterator[None]:
             yield
         finally:
             websockets.asyncio.server.serve = serve  # type: ignore[misc]
-
-
-def _guard(allowed: AllowedOrigins, answer: _Answer) -> _Answer:
-    def answer_allowed(connection: Any, request: Request) -> Any:
-        reason = allowed.refusal(request.headers)
-        if reason is not None:
-            forbidden = http.HTTPStatus.FORBIDDEN
-            body = f"{reason}\n".encode()
-            headers = Headers({"Content-Type": "text/plain", "Content-Length": str(len(body))})
-            return Response(forbidden, forbidden.phrase, headers, body)
-        return answer(connection, request)
-
-    return answer_allowed
 
 
 def _name(host: str) -> str:
@@ -92,7 +82,6 @@ def _name(host: str) -> str:
 
 def _is_address(name: str) -> bool:
     try:
-        ipaddress.ip_address(name)
+        return bool(ipaddress.ip_address(name))
     except ValueError:
         return False
-    return True

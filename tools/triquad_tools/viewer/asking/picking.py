@@ -1,7 +1,6 @@
 """What is seen of a map in some direction, where the backs of surfaces are not drawn."""
 
 import numpy as np
-from numpy.typing import NDArray
 from triquad_client.calls.queries import MapQueries
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.status import Status
@@ -10,15 +9,12 @@ from triquad_tools.viewer.page.page import Page
 
 _REACH_M = 1000.0  # the longest ray that a map answers
 _BEFORE_M = 250.0  # where the eye is far away, a ray starts so far before what it looks at
-
 _BACKS = 24  # of surfaces that a ray passes
 _BEFORE_FRONT_M = 0.2
 _BEYOND_BACK_M = 0.4  # where a ray goes on: a surface seen from behind is that thick
-_A_LITTLE_ABOVE = np.array([0.0, 0.0, 1.0])  # metres: what it is turned about may lie below it
-_DOWN = np.array([0.0, 0.0, -1.0])
 
 
-def surface_along(page: Page, origin: NDArray[np.floating], towards: Doubles) -> Doubles | None:
+def surface_along(page: Page, origin: Doubles, towards: Doubles) -> Doubles | None:
     """The first surface [3], metres, map frame, whose front a ray meets; ``None``: it meets none.
 
     Args:
@@ -29,13 +25,17 @@ def surface_along(page: Page, origin: NDArray[np.floating], towards: Doubles) ->
     Raises:
         TriquadError: the map does not answer.
     """
-    direction = towards / np.linalg.norm(towards)
-    camera = page.client.camera
-    distance_m = float(np.linalg.norm(camera.look_at - camera.position))
-    start = origin + max(distance_m - _BEFORE_M, 0.0) * direction
+    direction, queries = towards / np.linalg.norm(towards), page.source.queries
+    away_m = float(np.linalg.norm(page.focus.middle - page.eye))
+    start = origin + max(away_m - _BEFORE_M, 0.0) * direction
     for _ in range(_BACKS):
-        met = _first_surface(page.source.queries, start, direction)
-        if met is None or not _is_back(page.source.queries, met, direction):
+        met = _first_surface(queries, start, direction)
+        if met is None:
+            return None
+        # Before a front there is seen space; behind a surface distances are negative, or unknown.
+        before = queries.query_distance(np.stack([met - _BEFORE_FRONT_M * direction, met]), 1.0)
+        is_seen = before.status[0] != Status.UNKNOWN and before.distance_m[0] > 0
+        if is_seen and float(before.gradient[1] @ direction) <= 0:
             return met
         start = met + _BEYOND_BACK_M * direction
     return None
@@ -47,8 +47,9 @@ def ground_in_view(page: Page) -> Doubles:
     Raises:
         TriquadError: the map does not answer.
     """
-    middle = page.in_map(page.client.camera.look_at)
-    below = _first_surface(page.source.queries, middle + _A_LITTLE_ABOVE, _DOWN)
+    middle, up = page.focus.middle, np.array([0.0, 0.0, 1.0])
+    # From a metre above: what the camera is turned about may lie below the ground.
+    below = _first_surface(page.source.queries, middle + up, -up)
     return middle if below is None else below
 
 
@@ -57,14 +58,3 @@ def _first_surface(queries: MapQueries, start: Doubles, direction: Doubles) -> D
     if seen.status[0] != Status.SURFACE:
         return None
     return np.asarray(start + float(seen.range_m[0]) * direction, np.float64)
-
-
-def _is_back(queries: MapQueries, place: Doubles, direction: Doubles) -> bool:
-    """Whether the surface at a place [3] is met from behind, along a unit vector [3].
-
-    Before a front there is seen space; behind a surface distances are negative or nothing was seen.
-    """
-    before = place - _BEFORE_FRONT_M * direction
-    answer = queries.query_distance(np.stack([before, place]), 1.0)
-    seen = answer.status[0] != Status.UNKNOWN and answer.distance_m[0] > 0
-    return not seen or float(answer.gradient[1] @ direction) > 0

@@ -1,92 +1,102 @@
-"""Where unknown space begins, in a scene."""
+"""Where free space ends without a surface: the faces between free and unknown cells."""
 
 import numpy as np
-import viser
 from matplotlib.colors import to_rgb
-from triquad_map.height_scale import GAMMA
+from triquad_client.calls.queries import MapQueries
+from triquad_format.records.arrays import Bytes, Floats, Ints
+from triquad_format.records.status import Status
 
-from triquad_tools.viewer.asking.questions import Pace, newest_epoch
-from triquad_tools.viewer.asking.unknown_boundary import (
-    Boundary,
-    CellBox,
-    ask_boundary,
-    face_triangles,
-)
-from triquad_tools.viewer.page.focus import focus_of
-from triquad_tools.viewer.page.legends import Legend, LineMeaning
+from triquad_tools.viewer.asking.cell_box import CellBox
+from triquad_tools.viewer.page.layer import Layer
+from triquad_tools.viewer.page.legends import Legend, LineMeaning, text_html
 from triquad_tools.viewer.page.page import Page
-from triquad_tools.viewer.page.panel_html import text_html
-from triquad_tools.viewer.page.refresher import Refresher
-from triquad_tools.viewer.page.unlit_glb import unlit_glb
 
 _PERIOD_S = 1.0
-_COLOUR_HEX = "#cc79a7"
-_LEGEND = Legend(lines=(LineMeaning(_COLOUR_HEX, False, "between free and unknown space"),))
-_NAME = "unknown space"
-_COLOUR = np.array(to_rgb(_COLOUR_HEX))
-_SHADES = np.array([0.8, 0.65, 1.0])  # of faces across x, y and z: else no edge would be seen
-_OPACITY = 0.4
+_COUNTS = (64, 64, 24)  # cells: they bound how much is asked
+_MOST_CELL_M = 0.75
 _VOXEL_CELLS = 2  # a cell of the mesh is half a voxel, as fine as what is known is told
+_NO_DISTANCE_M = 0.01  # status is what is asked for; searching far costs most
+_COLOUR, _OPACITY = "#cc79a7", 0.4
+_LEGEND = Legend(lines=(LineMeaning(_COLOUR, "between free and unknown space"),))
 
 
-class UnknownLayer:
+class UnknownLayer(Layer):
     """Draws the boundary of free against unknown space around what the camera looks at."""
 
     def __init__(self, page: Page) -> None:
-        self._page = page
-        self._pace = Pace()
-        self._drawn: CellBox | None = None
-        self._epoch = 0
-        self._surface: viser.GlbHandle | None = None
-        self._folder = page.gui.add_folder("Unknown space")
-        with self._folder:
-            self._shown = page.gui.add_checkbox("Show border", False)
-            self._legend = page.gui.add_html("", visible=False)
-        self._refresher = Refresher(
-            "unknown space", self._refresh, period_s=_PERIOD_S, failed=page.failed
-        )
-        self._shown.on_update(lambda _: self._refresher.wake())
+        super().__init__(page, "Unknown space", _PERIOD_S)
+        with self.folder:
+            self._on = page.gui.add_checkbox("Show border", False)
+            self._text = page.gui.add_html("", visible=False)
+        self.start(self._on)
 
-    def close(self) -> None:
-        """Draw no more; what was drawn and the folder go."""
-        self._refresher.close()
-        self._erase()
-        self._folder.remove()
-
-    def _refresh(self) -> None:
-        self._legend.visible = self._shown.value
-        if not self._shown.value:
-            self._erase()
+    def refresh(self) -> None:
+        """Ask where what is looked at, or the map, has changed."""
+        self._text.visible = self._on.value
+        if not self._on.value:
+            self.erase()
             return
-        source = self._page.source
-        box = CellBox.around(focus_of(self._page), _VOXEL_CELLS * source.sizes.cell_m)
-        if box != self._drawn or (self._pace.due and newest_epoch(source.queries) != self._epoch):
-            with self._pace.asking():
-                boundary = ask_boundary(source.queries, box)
-            self._draw(box, boundary)
-
-    def _draw(self, box: CellBox, boundary: Boundary) -> None:
-        self._erase()
-        if len(boundary.faces.cells):
-            triangles = face_triangles(boundary.faces)
-            shades = _COLOUR * _SHADES[np.abs(boundary.faces.steps).argmax(axis=1), None]
-            glb = unlit_glb(triangles, shades.repeat(4, axis=0) ** GAMMA, _OPACITY)
-            corner = np.array(box.corner)
-            self._surface = self._page.add_glb("/unknown", glb, corner, scale=box.cell_m)
-        self._legend.content = _LEGEND.html + text_html(_extent(box, boundary))
-        self._page.legends.show(_NAME, _LEGEND)
-        self._drawn, self._epoch = box, boundary.epoch
-
-    def _erase(self) -> None:
-        if self._surface is not None:
-            self._surface.remove()
-        self._surface = self._drawn = None
-        self._page.legends.hide(_NAME)
+        source, focus = self.page.source, self.page.focus
+        least_m = _VOXEL_CELLS * source.sizes.cell_m
+        cell_m = max(min(focus.side_m / _COUNTS[0], _MOST_CELL_M), least_m)
+        box = CellBox.around(focus.middle, cell_m, _COUNTS)
+        if not self.outdated(box):
+            return
+        cells, steps, epoch = ask_boundary(source.queries, box)
+        self.answered(box, epoch)
+        marks = []
+        if len(cells):
+            surface = self.page.scene.add_mesh_simple(
+                self.node("border"), *face_triangles(cells, steps), color=np.array(to_rgb(_COLOUR)),
+                opacity=_OPACITY, flat_shading=True, side="double", scale=cell_m,
+                cast_shadow=False, receive_shadow=False,
+                position=self.page.in_scene(np.array(box.corner)),
+            )  # fmt: skip
+            marks.append(surface)
+        self.draw(marks, _LEGEND)
+        wide, _, high = box.size_m
+        extent = f"{wide:.3g} x {wide:.3g} x {high:.3g} m around the middle of the view"
+        told = f"{extent}, in cells of {cell_m:.2g} m; epoch {epoch}"
+        self._text.content = _LEGEND.html + text_html(told)
 
 
-def _extent(box: CellBox, boundary: Boundary) -> str:
-    wide, high = box.size_m
-    return (
-        f"{wide:.3g} x {wide:.3g} x {high:.3g} m around the middle of the view, "
-        f"in cells of {box.cell_m:.2g} m; epoch {boundary.epoch}"
-    )
+def ask_boundary(queries: MapQueries, box: CellBox) -> tuple[Ints, Ints, int]:
+    """The faces of a box through which one passes from free into unknown space, and the epoch.
+
+    Faces are as of :func:`border_faces`. Cells are coarse: where there is a surface between their
+    middles, there is no such face.
+
+    Raises:
+        TriquadError: the map does not answer.
+    """
+    answer = box.ask(queries, _NO_DISTANCE_M)
+    cells, steps = border_faces(answer.status)
+    if len(cells):
+        rays = queries.query_rays(box.places(cells + 0.5), steps, box.cell_m)
+        passed = rays.status != Status.SURFACE
+        cells, steps = cells[passed], steps[passed]
+    return cells, steps, answer.epoch
+
+
+def border_faces(status: Bytes) -> tuple[Ints, Ints]:
+    """The faces of free cells beyond which the cell is unknown, for the status [x, y, z].
+
+    Returns:
+        The free cells [N, 3], and the steps [N, 3] from there to the unknown ones.
+    """
+    free, unknown = (np.pad(status == kind, 1) for kind in (Status.FREE, Status.UNKNOWN))
+    steps = np.concatenate([np.eye(3, dtype=np.int32), -np.eye(3, dtype=np.int32)])
+    cells = [np.argwhere(free & np.roll(unknown, tuple(-step), (0, 1, 2))) - 1 for step in steps]
+    counts = [len(found) for found in cells]
+    return np.concatenate(cells).astype(np.int32), steps.repeat(counts, axis=0)
+
+
+def face_triangles(cells: Ints, steps: Ints) -> tuple[Floats, Ints]:
+    """Vertices [4 N, 3], in cells, and rows of them [2 N, 3]: two triangles of each face."""
+    across = np.roll(np.abs(steps), 1, axis=1)
+    up = np.roll(across, 1, axis=1)
+    corner = cells + np.maximum(steps, 0)
+    quads = np.stack([corner, corner + across, corner + across + up, corner + up], axis=1)
+    first = 4 * np.arange(len(quads), dtype=np.int32)[:, None, None]
+    rows = first + np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    return quads.reshape(-1, 3).astype(np.float32), rows.reshape(-1, 3)

@@ -8,7 +8,7 @@ import numpy as np
 import viser
 from triquad_format.records.arrays import Doubles
 
-from triquad_tools.plots.camera import view_axes
+from triquad_tools.plots.mesh_view import view_axes
 from triquad_tools.viewer.page.page import Page
 
 _NEAR_M, _FAR_M = 0.1, 20_000.0
@@ -48,9 +48,7 @@ class OverviewCamera:
         self._page = page
         self._taken = False
         camera = page.client.camera
-        camera.fov = _VIEW_RAD
-        camera.near = _NEAR_M
-        camera.far = _FAR_M
+        camera.fov, camera.near, camera.far = _VIEW_RAD, _NEAR_M, _FAR_M
         # The browser tells of each place late: only one where it never was put is a person's.
         self._eyes = deque([np.array(camera.position)], _EYES)  # [3] in the scene
         camera.on_update(self._moved)

@@ -1,126 +1,81 @@
-"""What the colours of the mesh say."""
+"""What the colours of the mesh say, and how to have them in a browser as they are."""
 
 import math
-from collections.abc import Hashable, Iterable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from triquad_client.calls.queries import MapQueries
+from triquad_client.mesh.followed_mesh import MeshTile
 from triquad_format.records.arrays import Doubles
-from triquad_map.height_scale import HeightScale
+from triquad_map.height_scale import GAMMA, HeightScale
 
-from triquad_tools.plots.mesh_normals import vertex_normals
-from triquad_tools.viewer.page.colour_scale import ColourScale, scale_colours
-from triquad_tools.viewer.page.unlit_glb import Triangles
-from triquad_tools.viewer.sources.map_source import Tile
+from triquad_tools.plots.mesh_view import vertex_normals
+from triquad_tools.plots.plan import HEIGHTS
+from triquad_tools.viewer.page.legends import ColourScale
 
 _TOWARDS_SUN = np.array([-0.50, -0.58, 0.64]) / np.linalg.norm([-0.50, -0.58, 0.64])
 _SUN, _SKY = 0.55, 0.5
 _STEP_M = 0.5  # of the ends of the scale: it stays the same as the map grows a little
-_OLDEST_LOG2 = 10  # of ages, in epochs
 _NEAR_M = 1.0  # around a vertex, where its surface is looked for
 
+# The browser's tone mapping, ACES Filmic as three.js has it, which viser cannot be asked to leave
+# out: a fit by Stephen Hill of the ACES reference and output transforms.
+_EXPOSURE = 1.0 / 0.6
+_IN = np.array([[59719, 35458, 4823], [7600, 90834, 1566], [2840, 13383, 83777]]) / 1e5
+_OUT = np.array([[160475, -53108, -7367], [-10208, 110813, -605], [-327, -7276, 107602]]) / 1e5
+_FIT = (0.0245786, -0.000090537, 0.983729, 0.4329510, 0.238081)
+_BRIGHTEST = 0.98  # of what it lets through: white itself would have to be infinitely bright
 
-class TileColours(Protocol):
+
+@dataclass(frozen=True)
+class TileColours:
     """Colours of mesh tiles."""
 
-    @property
-    def scale(self) -> ColourScale:
-        """What they mean."""
-
-    def key(self, tile: Tile) -> Hashable:
-        """Where this is another one, the tile has other colours."""
-
-    def values(self, tile: Tile, triangles: Triangles) -> Doubles:
-        """[V] places on the scale, of the vertices of a mesh of the tile."""
+    scale: ColourScale
+    key: Callable[[MeshTile], Hashable]  # where this is another one, a tile has other colours
+    values: Callable[[MeshTile], NDArray[np.floating]]  # [V] places of the vertices on the scale
 
 
-@dataclass(frozen=True)
-class HeightColours:
-    """By height in the map frame."""
-
-    low_m: float
-    high_m: float
-
-    @classmethod
-    def of_heights(cls, heights: NDArray[np.floating]) -> "HeightColours":
-        """A scale for nearly all of heights [N], metres, to half a metre."""
-        scale = HeightScale.around(heights)
-        low_m = math.floor(scale.low_m / _STEP_M) * _STEP_M
-        return cls(low_m, math.ceil(scale.high_m / _STEP_M) * _STEP_M)
-
-    @property
-    def scale(self) -> ColourScale:
-        """Metres; what is beyond has the colour of the end."""
-        return ColourScale("height, m", self.low_m, self.high_m, open_below=True, open_above=True)
-
-    def key(self, tile: Tile) -> Hashable:  # noqa: ARG002
-        """The scale, which is that of all tiles."""
-        return self
-
-    def values(self, tile: Tile, triangles: Triangles) -> Doubles:
-        """Heights of the vertices."""
-        return np.asarray(tile.origin[2] + triangles.vertices[:, 2], np.float64)
+def height_colours(heights_m: NDArray[np.floating]) -> TileColours:
+    """By height in the map frame, on a scale for nearly all of heights [N], to half a metre."""
+    around = HeightScale.around(heights_m)
+    low_m = math.floor(around.low_m / _STEP_M) * _STEP_M
+    high_m = math.ceil(around.high_m / _STEP_M) * _STEP_M
+    return TileColours(
+        ColourScale("height, m", HEIGHTS, low_m, high_m, open_below=True, open_above=True),
+        key=lambda _: (low_m, high_m),
+        values=lambda tile: tile.origin[2] + tile.vertices[:, 2],
+    )
 
 
-@dataclass(frozen=True)
-class AgeColours:
-    """By how long ago the surface of a tile last changed, in epochs."""
-
-    newest: int  # epoch of the newest tile
-
-    @classmethod
-    def of_tiles(cls, tiles: Iterable[Tile]) -> "AgeColours":
-        """Ages seen from the newest of some tiles."""
-        return cls(max((tile.version for tile in tiles), default=0))
-
-    @property
-    def scale(self) -> ColourScale:
-        """Powers of two, since most changes are recent."""
-        ticks = ["1", "4", "16", "64", "256", "1024"]
-        return ColourScale(
-            "epochs since it changed", 0.0, _OLDEST_LOG2, open_above=True, ticks=ticks
-        )
-
-    def key(self, tile: Tile) -> Hashable:
-        """The power of two."""
-        return self._log2(tile)
-
-    def values(self, tile: Tile, triangles: Triangles) -> Doubles:
-        """One for the whole tile."""
-        return np.full(len(triangles.vertices), float(self._log2(tile)))
-
-    def _log2(self, tile: Tile) -> int:
-        return min(max(self.newest - tile.version, 1).bit_length() - 1, _OLDEST_LOG2)
-
-
-@dataclass(frozen=True)
-class ConfidenceColours:
+def confidence_colours(queries: MapQueries) -> TileColours:
     """By how much the rays have shown of the surface, as the map answers for its distances."""
-
-    queries: MapQueries
-
-    @property
-    def scale(self) -> ColourScale:
-        """From 0 to 1."""
-        return ColourScale("confidence", 0.0, 1.0)
-
-    def key(self, tile: Tile) -> Hashable:
-        """That of the tile's own version."""
-        return tile.version
-
-    def values(self, tile: Tile, triangles: Triangles) -> Doubles:
-        """Asked for at the vertices."""
-        points = tile.origin + triangles.vertices
-        answer = self.queries.query_distance(points, max_distance_m=_NEAR_M)
-        return answer.confidence.astype(np.float64)
+    return TileColours(
+        ColourScale("confidence", HEIGHTS, 0.0, 1.0),
+        key=lambda tile: tile.version,
+        values=lambda t: queries.query_distance(t.origin + t.vertices, _NEAR_M).confidence,
+    )
 
 
-def lit_colours(colours: TileColours, tile: Tile, triangles: Triangles) -> Doubles:
-    """Linear colours [V, 3] of the vertices of a tile, in the light of a sun and a bright sky."""
-    plain = scale_colours(colours.scale, colours.values(tile, triangles))
-    up = vertex_normals(triangles.vertices.astype(np.float64), triangles.faces)
+def lit_colours(colours: TileColours, tile: MeshTile) -> Doubles:
+    """Linear colours [V, 3] for the browser, in the light of a sun and a bright sky.
+
+    They are drawn without lights, which would cost a browser most of all.
+    """
+    scale = colours.scale
+    places = (np.asarray(colours.values(tile), np.float64) - scale.low) / (scale.high - scale.low)
+    up = vertex_normals(tile.vertices.astype(np.float64), tile.faces)
     light = _SUN * np.maximum(up @ _TOWARDS_SUN, 0.0) + _SKY * (0.75 + 0.25 * up[:, 2])
-    return np.asarray(plain * light[:, None], np.float64)
+    return before_tone_mapping(scale.colours(places)[:, :3] ** GAMMA * light[:, None])
+
+
+def before_tone_mapping(shown: Doubles) -> Doubles:
+    """The linear colours [N, 3] that the browser shows as linear colours ``shown`` [N, 3]."""
+    a, b, c, d, e = _FIT
+    wanted = np.clip(np.clip(shown, 0.0, 1.0) @ np.linalg.inv(_OUT).T, 0.0, _BRIGHTEST)
+    # (1 - c y) x^2 + (a - d y) x + (b - e y) = 0
+    square, linear, constant = 1.0 - c * wanted, a - d * wanted, b - e * wanted
+    bright = (-linear + np.sqrt(linear**2 - 4.0 * square * constant)) / (2.0 * square)
+    return np.asarray(bright @ np.linalg.inv(_IN).T / _EXPOSURE, np.float64)

@@ -2,81 +2,116 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
-from triquad_client.mesh.followed_mesh import TileIndex
+from triquad_client.mesh.followed_mesh import MeshTile, TileIndex
+from triquad_format.records.arrays import Doubles
 
-from triquad_tools.viewer.mesh.detail import Viewpoint, wanted_levels
-from triquad_tools.viewer.mesh.near_tiles import NearTiles
-from triquad_tools.viewer.sources.map_source import COARSEST, MapSource, Tile
-
-_THINNED_LEVELS = 2  # coarser than those that tiles come in
+from triquad_tools.viewer.sources.map_source import COARSEST, MapSource, TileFollower
 
 
 @dataclass(frozen=True)
 class TileName:
     """A tile among those of all levels."""
 
-    level: int  # of detail, as it came
+    level: int
     index: TileIndex
 
 
-class WantedTile(NamedTuple):
-    """A tile that ought to be in the scene."""
+class NearTiles:
+    """The tiles of a finer level around the eye."""
 
-    tile: Tile
-    level: int  # of detail, as it is drawn: also of those that are thinned here
+    def __init__(self, source: MapSource, level: int) -> None:
+        self._source = source
+        self.level = level
+        self._follower: TileFollower | None = None
+        self._roots: set[TileIndex] = set()  # tiles of the coarsest level that are followed
+        self.ready: set[TileIndex] = set()
+        """Tiles of the coarsest level within which all of this one are there."""
+
+    @property
+    def loaded(self) -> bool:
+        """Whether all that is followed was there once."""
+        return self._roots <= self.ready
+
+    def refresh(self, roots: list[TileIndex]) -> None:
+        """Fetch some of the tiles within ``roots``, of the coarsest level; none: as before."""
+        if roots:
+            self._follow(roots)
+        if self._follower is not None:
+            self._follower.refresh()
+            if self._follower.complete:
+                self.ready = self._roots
+
+    def within(self, root: TileIndex) -> Iterator[tuple[TileName, MeshTile]]:
+        """The tiles within a tile of the coarsest level."""
+        tiles = {} if self._follower is None else self._follower.tiles
+        count = 1 << (COARSEST - self.level)
+        for step in np.ndindex(count, count, count):
+            x, y, z = (count * at + by for at, by in zip(root, step, strict=True))
+            if (x, y, z) in tiles:
+                yield TileName(self.level, (x, y, z)), tiles[x, y, z]
+
+    def close(self) -> None:
+        """Follow no longer."""
+        if self._follower is not None:
+            self._follower.close()
+
+    def _follow(self, roots: list[TileIndex]) -> None:
+        """Follow the box around some tiles of the coarsest level."""
+        low, high = np.min(roots, axis=0), np.max(roots, axis=0)
+        steps = np.ndindex(*(high - low + 1))
+        around = {(int(low[0] + x), int(low[1] + y), int(low[2] + z)) for x, y, z in steps}
+        if around == self._roots:
+            return
+        # To the middles of the outermost tiles: those at their side do not meet the box.
+        sizes = self._source.sizes
+        side_m, inwards_m = sizes.side_of(COARSEST), 0.5 * sizes.side_of(self.level)
+        ends = (low * side_m + inwards_m).tolist(), ((high + 1) * side_m - inwards_m).tolist()
+        if self._follower is None:
+            self._follower = self._source.follow(self.level, ends)
+        else:
+            self._follower = self._follower.moved(ends)
+        self._roots, self.ready = around, self.ready & around
 
 
 class TilesInView:
     """Follows the tiles of a map. Not for several threads."""
 
     def __init__(self, source: MapSource) -> None:
-        self._side_m = source.sizes.side_of(COARSEST)
+        self._sizes = source.sizes
         self._whole = source.follow(COARSEST)
         self._whole_loaded = False
         self._near = [NearTiles(source, level) for level in range(COARSEST)]
-        levels = range(COARSEST + 1 + _THINNED_LEVELS)
-        self._cells_m = np.array([source.sizes.cell_of(level) for level in levels])
 
     @property
-    def roots(self) -> Mapping[TileIndex, Tile]:
+    def roots(self) -> Mapping[TileIndex, MeshTile]:
         """The tiles of the coarsest level, of which the whole map consists."""
         return self._whole.tiles
-
-    @property
-    def roots_complete(self) -> bool:
-        """Whether the last refresh left none of them waiting."""
-        return self._whole.complete
 
     @property
     def loaded(self) -> bool:
         """Whether all that is in view was there once; from then on only changes come."""
         return self._whole_loaded and all(near.loaded for near in self._near)
 
-    def refresh_roots(self) -> None:
-        """Fetch some of what is new."""
-        self._whole.refresh()
-        self._whole_loaded |= self._whole.complete
-
-    def refresh_near(self, viewpoint: Viewpoint, pixels: float) -> dict[TileName, WantedTile]:
-        """Fetch some of the finer tiles near an eye; returns what of all tiles is to be drawn.
+    def refresh(self, eye: Doubles, coarsest_m: float) -> dict[TileName, MeshTile]:
+        """Fetch some of what is new; returns what of all tiles is to be drawn.
 
         Args:
-            viewpoint: of the eye.
-            pixels: that a cell may cover on the screen.
+            eye: [3] metres, map frame.
+            coarsest_m: side that a cell may have at a distance of one metre.
         """
-        roots = self.roots
-        corners = np.array(list(roots), np.float64).reshape(-1, 3) * self._side_m
-        wanted = wanted_levels(
-            corners, self._side_m, self._cells_m, viewpoint=viewpoint, pixels=pixels
-        )
-        levels = dict(zip(roots, wanted.tolist(), strict=True))
-        for near in self._near:
-            near.move([index for index, level in levels.items() if level <= near.level])
-            near.refresh()
-        return dict(self._wanted(roots, levels))
+        self._whole.refresh()
+        self._whole_loaded |= self._whole.complete
+        roots = list(self.roots)
+        parts = {root: {TileName(COARSEST, root): tile} for root, tile in self.roots.items()}
+        for near in reversed(self._near):  # finer ones replace coarser ones
+            reach_m = self._sizes.cell_of(near.level + 1) / coarsest_m
+            chosen = near_columns(roots, self._sizes.side_of(COARSEST), eye, reach_m)
+            near.refresh(chosen)
+            for root in near.ready.intersection(chosen):
+                parts[root] = dict(near.within(root))
+        return {name: tile for tiles in parts.values() for name, tile in tiles.items()}
 
     def close(self) -> None:
         """Follow no longer."""
@@ -84,15 +119,16 @@ class TilesInView:
         for near in self._near:
             near.close()
 
-    def _wanted(
-        self, roots: Mapping[TileIndex, Tile], levels: Mapping[TileIndex, int]
-    ) -> Iterator[tuple[TileName, WantedTile]]:
-        for root, tile in roots.items():
-            level = levels[root]
-            ready = [near for near in self._near if near.level >= level and root in near.ready]
-            if ready:
-                finest = ready[0]
-                for index, part in finest.within(root):
-                    yield TileName(finest.level, index), WantedTile(part, finest.level)
-            else:
-                yield TileName(COARSEST, root), WantedTile(tile, max(level, COARSEST))
+
+def near_columns(
+    roots: list[TileIndex], side_m: float, eye: Doubles, reach_m: float
+) -> list[TileIndex]:
+    """The tiles above and below which there is one no farther from the eye than ``reach_m``.
+
+    Tiles above each other have one level: where the ground lies in the side between two of them,
+    as at z = 0, meshes of two levels would leave holes all over it.
+    """
+    corners = np.array(roots, np.float64).reshape(-1, 3) * side_m
+    away_m = np.linalg.norm(np.clip(eye, corners, corners + side_m) - eye, axis=1)
+    columns = {(x, y) for (x, y, _), far_m in zip(roots, away_m, strict=True) if far_m <= reach_m}
+    return [root for root in roots if root[:2] in columns]

@@ -1,1 +1,1 @@
-"""What every part of a page works with: the scene, texts and legends, and threads that refresh."""
+"""What every part of a page works with: scene, panel, colours, and threads that refresh."""

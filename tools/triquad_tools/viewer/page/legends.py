@@ -1,21 +1,47 @@
-"""What colours and lines of a scene mean: in the panel, and for who saves a picture of it."""
+"""What colours and lines of a scene mean, and texts in the panel of a page.
 
-import threading
-from collections.abc import Sequence
+What comes from the network is shown as it is, whatever it is.
+"""
+
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from html import escape
+from typing import Literal, NamedTuple
 
-from matplotlib.colors import to_hex
+import numpy as np
+from matplotlib.colors import Colormap, to_hex
+from triquad_format.printable import printable_lines
 
-from triquad_tools.viewer.page.colour_scale import ColourScale
+_TICKS = 5
+_TEXT = "padding: 0.2em 1em; font-size: 0.8em; line-height: 1.4; overflow-wrap: anywhere"
+
+
+@dataclass(frozen=True)
+class ColourScale:
+    """Colours for values from ``low`` to ``high``; what is beyond has those of the ends."""
+
+    label: str  # with its unit
+    colours: Colormap
+    low: float
+    high: float
+    open_below: bool = False  # there may be values below
+    open_above: bool = False
+
+    @property
+    def ticks(self) -> list[str]:
+        """What stands at equal steps from the lower to the upper end."""
+        texts = [f"{value:.3g}" for value in np.linspace(self.low, self.high, _TICKS)]
+        texts[0] = f"≤ {texts[0]}" if self.open_below else texts[0]
+        texts[-1] = f"≥ {texts[-1]}" if self.open_above else texts[-1]
+        return texts
 
 
 class LineMeaning(NamedTuple):
     """What lines that look alike say."""
 
     colour: str  # as in #rrggbb
-    dashed: bool
     text: str
+    style: Literal["solid", "dashed"] = "solid"
 
 
 @dataclass(frozen=True)
@@ -29,47 +55,46 @@ class Legend:
     def html(self) -> str:
         """The legend for the panel."""
         scale = "" if self.scale is None else _scale_html(self.scale)
-        return scale + "".join(map(_line_html, self.lines))
-
-
-class ShownLegends:
-    """The legends of all that one page shows now; for several threads."""
-
-    def __init__(self) -> None:
-        self._legends: dict[str, Legend] = {}
-        self._changing = threading.Lock()
-
-    def show(self, name: str, legend: Legend) -> None:
-        """Enter or replace the legend of what a part of the page draws."""
-        with self._changing:
-            self._legends[name] = legend
-
-    def hide(self, name: str) -> None:
-        """Take it away, where there is one."""
-        with self._changing:
-            self._legends.pop(name, None)
-
-    def shown(self) -> tuple[Legend, ...]:
-        """All of them."""
-        with self._changing:
-            return tuple(self._legends.values())
+        return scale + "".join(
+            f'<div style="padding: 0 1.3em; font-size: 0.8em"><span style="display: inline-block; '
+            "width: 2.5em; vertical-align: middle; margin-right: 0.6em; "
+            f'border-top: 3px {line.style} {line.colour}"></span>{line.text}</div>'
+            for line in self.lines
+        )
 
 
 def _scale_html(scale: ColourScale) -> str:
-    stops = ", ".join(to_hex(stop) for stop in scale.stops)
-    ticks = "".join(f"<span>{text}</span>" for text in scale.tick_texts)
+    stops = ", ".join(to_hex(colour) for colour in scale.colours(np.linspace(0.0, 1.0, 17)))
+    ticks = "".join(f"<span>{text}</span>" for text in scale.ticks)
     return (
-        '<div style="padding: 0.2em 1em; font-size: 0.8em">'
-        f"<div>{scale.label}</div>"
+        f'<div style="padding: 0.2em 1em; font-size: 0.8em"><div>{scale.label}</div>'
         f'<div style="height: 0.8em; background: linear-gradient(to right, {stops})"></div>'
         f'<div style="display: flex; justify-content: space-between">{ticks}</div></div>'
     )
 
 
-def _line_html(line: LineMeaning) -> str:
-    return (
-        '<div style="padding: 0 1.3em; font-size: 0.8em">'
-        '<span style="display: inline-block; width: 2.5em; vertical-align: middle; '
-        f"margin-right: 0.6em; border-top: 3px {'dashed' if line.dashed else 'solid'} "
-        f'{line.colour}"></span>{line.text}</div>'
+def text_html(text: str) -> str:
+    """A text, line by line; nothing where it is empty."""
+    shown = f'<div style="{_TEXT}; white-space: pre-line">{_shown(text)}</div>'
+    return shown if text else ""
+
+
+def problem_html(text: str) -> str:
+    """What goes wrong, with a sign before it; nothing where the text is empty."""
+    style = f"{_TEXT}; color: #9a3412; font-weight: bold"
+    return f'<div style="{style}">⚠ {_shown(text)}</div>' if text else ""
+
+
+def table_html(rows: Iterable[tuple[str, str]]) -> str:
+    """Names and values, in two columns."""
+    cells = "".join(
+        f'<tr><td style="padding-right: 1em; opacity: 0.7">{_shown(name)}</td>'
+        f"<td>{_shown(value)}</td></tr>"
+        for name, value in rows
     )
+    return f'<table style="{_TEXT}">{cells}</table>'
+
+
+def _shown(text: str) -> str:
+    """A text of others that neither makes elements of the page nor turns its writing around."""
+    return escape(printable_lines(text))

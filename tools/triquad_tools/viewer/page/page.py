@@ -1,86 +1,72 @@
 """A page: one scene and one panel in one browser, and where the scene has its zero."""
 
+import math
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles, Floats
 
-from triquad_tools.viewer.page.legends import ShownLegends
+from triquad_tools.viewer.page.legends import Legend
 from triquad_tools.viewer.sources.map_source import MapSource
 
 _GRID_M = 100.0
+_LEAST_SIDE_M, _MOST_SIDE_M = 2.0, 128.0
 
 
-class SceneOrigin:
-    """Where in the map frame a scene has its zero: near the first point that is drawn.
+class Focus(NamedTuple):
+    """The middle of a view."""
 
-    A browser computes in single precision, half a metre where coordinates are as large as UTM
-    northings.
-    """
+    middle: Doubles  # [3] metres, map frame
+    side_m: float  # about what is in view at that distance: a power of two, 2 to 128 m
 
-    def __init__(self) -> None:
-        self._place: Doubles | None = None
+
+class Page:
+    """What each part of a page draws on; for several threads."""
+
+    def __init__(
+        self, client: viser.ClientHandle, source: MapSource, failed: Callable[[str, str], None]
+    ) -> None:
+        """``failed`` is told which part has which problem; an empty text: none any more."""
+        self.client = client
+        self.scene = client.scene
+        self.gui = client.gui
+        self.source = source
+        self.failed = failed
+        self.legends: dict[str, Legend] = {}  # of what is drawn now, by part
+        # [3] metres, map frame: the zero of the scene, near the first point that is drawn, since a
+        # browser computes in single precision: half a metre in coordinates as large as UTM's
+        self._origin: Doubles | None = None
         self._choosing = threading.Lock()
 
-    @property
-    def place(self) -> Doubles:
-        """[3] metres, map frame; zero as long as nothing was drawn."""
-        return np.zeros(3) if self._place is None else self._place
-
-    def near(self, points: NDArray[np.floating]) -> Doubles:
-        """The place, chosen beside ``points`` [..., 3] where there is none yet."""
+    def in_scene(self, points: NDArray[np.floating]) -> Floats:
+        """Points [..., 3] of the map frame as the scene has them."""
         with self._choosing:
-            if self._place is None and points.size:
+            if self._origin is None and points.size:
                 first = np.asarray(points, np.float64).reshape(-1, 3)[0]
-                self._place = np.round(first / _GRID_M) * _GRID_M
-            return self.place
-
-    def in_scene(self, points: NDArray[np.floating]) -> Floats:
-        """Points [..., 3] of the map frame as the scene has them."""
-        return np.asarray(points - self.near(points), np.float32)
-
-
-@dataclass(frozen=True)
-class Page:
-    """What each part of a page draws on: a scene, the panel beside it, and the map they show."""
-
-    client: viser.ClientHandle
-    source: MapSource
-    failed: Callable[[str], None]  # shows what went wrong; an empty text: nothing does any more
-    origin: SceneOrigin
-    legends: ShownLegends
-
-    @property
-    def scene(self) -> viser.SceneApi:
-        """What is drawn."""
-        return self.client.scene
-
-    @property
-    def gui(self) -> viser.GuiApi:
-        """The panel beside it."""
-        return self.client.gui
-
-    def in_scene(self, points: NDArray[np.floating]) -> Floats:
-        """Points [..., 3] of the map frame as the scene has them."""
-        return self.origin.in_scene(points)
-
-    def add_glb(
-        self, name: str, glb: bytes, origin: NDArray[np.floating], scale: float = 1.0
-    ) -> viser.GlbHandle:
-        """Draw a mesh whose zero is ``origin`` [3], metres, map frame; without shadows."""
-        return self.scene.add_glb(
-            name,
-            glb,
-            scale=scale,
-            position=self.in_scene(origin),
-            cast_shadow=False,
-            receive_shadow=False,
-        )
+                self._origin = np.round(first / _GRID_M) * _GRID_M
+        return np.asarray(points - (0.0 if self._origin is None else self._origin), np.float32)
 
     def in_map(self, points: NDArray[np.floating]) -> Doubles:
         """Points [..., 3] of the scene in the map frame."""
-        return np.asarray(points, np.float64) + self.origin.place
+        origin = np.zeros(3) if self._origin is None else self._origin
+        return np.asarray(points, np.float64) + origin
+
+    @property
+    def eye(self) -> Doubles:
+        """Where the camera is [3], metres, map frame."""
+        return self.in_map(self.client.camera.position)
+
+    @property
+    def focus(self) -> Focus:
+        """What the camera is turned about."""
+        camera = self.client.camera
+        middle = self.in_map(camera.look_at)
+        aspect = camera.image_width / max(camera.image_height, 1)
+        away_m = float(np.linalg.norm(middle - self.eye))
+        seen_m = 2.0 * away_m * math.tan(0.5 * camera.fov) * max(aspect, 1.0)
+        side_m = 2.0 ** round(math.log2(max(seen_m, _LEAST_SIDE_M)))
+        return Focus(middle, min(side_m, _MOST_SIDE_M))

@@ -1,9 +1,9 @@
 """The checkpoints of a store that can be shown, in the order of time."""
 
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 from triquad_format.errors import FormatError
@@ -17,8 +17,9 @@ from triquad_format.mapfile.checkpoint_folder import (
 from triquad_format.mapfile.metadata import utc_time
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.viewer.sources.file_source import FileSource
-from triquad_tools.viewer.sources.open_maps import OpenMaps
+from triquad_tools.viewer.sources.stored_source import StoredMap
+
+_MAX_OPEN = 4  # maps that stay in memory beyond those that pages show
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class DamagedError(ToolError):
 class History:
     """The checkpoints of one map in a store, to which a server may add; for several threads."""
 
-    def __init__(self, store: Path, maps: OpenMaps) -> None:
+    def __init__(self, store: Path) -> None:
         """Read the folder.
 
         Raises:
@@ -48,20 +49,19 @@ class History:
             OSError: the folder cannot be read.
         """
         self.folder = map_folder(store)
-        self._maps = maps
         self._moments: dict[CheckpointFile, Moment] = {}
         self._damaged: dict[CheckpointFile, str] = {}
         self._reading = threading.Lock()
+        self._opening = threading.Lock()  # one at a time: it takes all cores
+        self._opened = lru_cache(_MAX_OPEN)(StoredMap)
         self.refresh()
 
     @property
     def moments(self) -> tuple[Moment, ...]:
         """What can be shown as far as is known, the oldest first."""
         with self._reading:
-            intact = [file for file in self._moments if file not in self._damaged]
-            return tuple(
-                self._moments[file] for file in sorted(newest_of_each(sorted(intact)[::-1]))
-            )
+            files = sorted(self._moments.keys() - self._damaged.keys(), reverse=True)
+            return tuple(self._moments[file] for file in sorted(newest_of_each(files)))
 
     @property
     def damaged(self) -> tuple[str, ...]:
@@ -87,14 +87,15 @@ class History:
                 for file in known.keys() - set(found):
                     known.pop(file)
 
-    def use(self, moment: Moment) -> FileSource:
-        """The map as it was, until :meth:`release`.
+    def opened(self, moment: Moment) -> StoredMap:
+        """The map as it was.
 
         Raises:
             DamagedError: it cannot be shown; it is a moment no longer.
         """
         try:
-            return self._maps.use(moment.path)
+            with self._opening:
+                return self._opened(moment.path)
         except (FormatError, OSError) as error:
             problem = f"{moment.path.name} is left out: {error}"
             with self._reading:
@@ -102,18 +103,19 @@ class History:
                     self._damaged[file] = problem
             raise DamagedError(problem) from error
 
-    def release(self, moment: Moment) -> None:
-        """It is shown no longer."""
-        self._maps.release(moment.path)
+    def newest(self) -> StoredMap:
+        """The map as it was at the newest moment that can be shown.
 
-    @contextmanager
-    def using(self, moment: Moment) -> Iterator[FileSource]:
-        """The map as it was; errors as of :meth:`use`."""
-        source = self.use(moment)
-        try:
-            yield source
-        finally:
-            self.release(moment)
+        Raises:
+            ToolError: there is none.
+        """
+        while moments := self.moments:
+            with suppress(DamagedError):
+                return self.opened(moments[-1])
+        raise ToolError(
+            f"{self.folder}: no checkpoint can be shown; triquad-pack --recover saves what is "
+            "intact"
+        )
 
     def _read(self, file: CheckpointFile) -> None:
         try:
@@ -121,5 +123,5 @@ class History:
         except (FormatError, OSError) as error:
             self._damaged[file] = f"{file.path.name} is left out: {error}"
             return
-        time = utc_time(stamp_ns) if stamp_ns else ""
-        self._moments[file] = Moment(file.epoch, time, file.path)
+        stamp = utc_time(stamp_ns) if stamp_ns else ""
+        self._moments[file] = Moment(file.epoch, stamp, file.path)

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 from triquad_client import Client
 from triquad_client.checks import Bounds
-from triquad_client.mesh.followed_mesh import KnownTiles, MeshTile, TileIndex
+from triquad_client.mesh.followed_mesh import MeshTile, TileIndex
 from triquad_client.mesh.mesh_watch import MeshWatch
 from triquad_format.mapfile.metadata import utc_time
 
@@ -26,8 +26,7 @@ class LiveSource:
         Raises:
             TriquadError: it does not answer.
         """
-        self.client = client
-        self.queries = client
+        self.client = self.queries = client
         self.title = f"{client.map_name} at {endpoint}"
         with client.watch_mesh(_POINT) as watch:
             watch.catch_up()
@@ -35,28 +34,21 @@ class LiveSource:
 
     def state(self) -> MapState:
         """What the server has published last; it is asked."""
-        now = utc_time(time.time_ns())
-        return MapState(self.client.map_name, self.client.status().epoch, now)
+        epoch = self.client.status().epoch
+        return MapState(self.client.map_name, epoch, utc_time(time.time_ns()))
 
     def follow(self, level: int, bounds: Bounds | None = None) -> "LiveFollower":
         """The mesh tiles of a level that meet ``bounds``, as the server makes them."""
-        return LiveFollower(self.client, level, bounds)
+        return LiveFollower(self.client, self.client.watch_mesh(bounds, level))
 
 
 class LiveFollower:
     """Mesh tiles of a server within a box."""
 
-    def __init__(
-        self,
-        client: Client,
-        level: int,
-        bounds: Bounds | None,
-        known: KnownTiles | None = None,
-    ) -> None:
+    def __init__(self, client: Client, watch: MeshWatch) -> None:
         self._client = client
-        self._loaded = False  # all was there once: from then on only changes come
+        self._watch = watch
         self._due_s = 0.0  # monotonic
-        self._watch: MeshWatch = client.watch_mesh(bounds, level, known=known)
 
     @property
     def tiles(self) -> Mapping[TileIndex, MeshTile]:
@@ -71,17 +63,16 @@ class LiveFollower:
     def refresh(self) -> None:
         """Fetch what one reply brings; once all was there, no more than one a second."""
         now_s = time.monotonic()
-        if self._loaded and now_s < self._due_s:
-            return
-        self._due_s = now_s + _PERIOD_S
-        self._watch.next(timeout_s=0.0)
-        self._loaded |= self._watch.complete
+        if now_s >= self._due_s:
+            self._watch.next(timeout_s=0.0)
+            self._due_s = now_s + _PERIOD_S if self._due_s or self._watch.complete else 0.0
 
     def moved(self, bounds: Bounds) -> "LiveFollower":
         """Follow another box instead."""
         known = self._watch.known_tiles()
         self.close()
-        return LiveFollower(self._client, self._watch.level, bounds, known=known)
+        watch = self._client.watch_mesh(bounds, self._watch.level, known=known)
+        return LiveFollower(self._client, watch)
 
     def close(self) -> None:
         """Follow no longer."""

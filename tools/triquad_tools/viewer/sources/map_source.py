@@ -4,42 +4,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
 from triquad_client.calls.queries import MapQueries
 from triquad_client.checks import Bounds
-from triquad_client.mesh.followed_mesh import TileIndex
+from triquad_client.mesh.followed_mesh import MeshTile, TileIndex
 from triquad_format.wire.limits import LEVELS
 
 COARSEST = LEVELS - 1
 """Level of detail of the tiles of which a whole map is shown."""
 
 
-class Tile(Protocol):
-    """The mesh of one tile."""
-
-    @property
-    def version(self) -> int:
-        """Epoch (a published state of the map) in which it last changed."""
-
-    @property
-    def origin(self) -> NDArray[np.float64]:
-        """[3] metres, map frame: the minimum corner."""
-
-    @property
-    def vertices(self) -> NDArray[np.float32]:
-        """[V, 3] metres, relative to the origin."""
-
-    @property
-    def faces(self) -> NDArray[np.int32]:
-        """[F, 3] counter-clockwise seen from free space."""
-
-
 class TileFollower(Protocol):
     """The mesh tiles of a level within a box, kept up to date by :meth:`refresh`."""
 
     @property
-    def tiles(self) -> Mapping[TileIndex, Tile]:
+    def tiles(self) -> Mapping[TileIndex, MeshTile]:
         """The tiles as of the last refresh, by their indices."""
 
     @property
@@ -82,7 +60,7 @@ class MapState:
 
     map_name: str
     epoch: int  # number of a published state of the map
-    time: str  # when that was, UTC as in RFC 3339; empty: nobody knows
+    time: str  # when that was, UTC as in RFC 3339; empty: it is not known
 
 
 class MapSource(Protocol):
@@ -108,7 +86,7 @@ class MapSource(Protocol):
         """What is shown now.
 
         Raises:
-            TriquadError: nobody can tell.
+            TriquadError: the server does not answer.
         """
 
     def follow(self, level: int, bounds: Bounds | None = None) -> TileFollower:

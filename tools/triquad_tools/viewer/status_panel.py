@@ -1,36 +1,32 @@
-"""How the server is doing, beside a scene."""
+"""How the server is doing, in the panel of a page."""
 
 import time
 
 from triquad_format.wire.messages import ServerStatus
 
 from triquad_tools.console.amounts import duration
+from triquad_tools.viewer.page.layer import Layer
+from triquad_tools.viewer.page.legends import problem_html, table_html
 from triquad_tools.viewer.page.page import Page
-from triquad_tools.viewer.page.panel_html import problem_html, table_html
-from triquad_tools.viewer.page.refresher import Refresher
 from triquad_tools.viewer.sources.live_source import LiveSource
 
 _PERIOD_S = 1.0
 
 
-class StatusPanel:
+class StatusPanel(Layer):
     """Shows what the server is doing, and how far away it is."""
 
     def __init__(self, source: LiveSource, page: Page) -> None:
+        super().__init__(page, "Server", _PERIOD_S)
         self._client = source.client
         self._before: ServerStatus | None = None
-        self._folder = page.gui.add_folder("Server")
-        with self._folder:
+        with self.folder:
             self._figures = page.gui.add_html("")
             self._warnings = page.gui.add_html("")
-        self._refresher = Refresher("status", self._refresh, period_s=_PERIOD_S, failed=page.failed)
+        self.start()
 
-    def close(self) -> None:
-        """Show no more."""
-        self._refresher.close()
-        self._folder.remove()
-
-    def _refresh(self) -> None:
+    def refresh(self) -> None:
+        """Ask the server."""
         asked_s = time.perf_counter()
         status = self._client.status()
         answered_ms = 1e3 * (time.perf_counter() - asked_s)
@@ -44,40 +40,30 @@ class StatusPanel:
 def _rows(
     status: ServerStatus, samples_per_s: float | None, answered_ms: float
 ) -> list[tuple[str, str]]:
-    dropped = sum(status.scans_dropped.values())
-    lost = sum(status.scans_lost.values())
+    dropped, lost = sum(status.scans_dropped.values()), sum(status.scans_lost.values())
     regions = "1 region" if status.regions == 1 else f"{status.regions} regions"
+    learning = f"{status.samples_left / 1e6:.1f} M samples left"
+    if samples_per_s is not None:
+        learning = f"{samples_per_s / 1e6:.2f} M samples/s, {learning}"
+    last, checkpoint = status.last_checkpoint, "none yet"
+    if last is not None:
+        age = duration(max(0.0, time.time() - last.stamp_ns / 1e9))
+        checkpoint = f"epoch {last.epoch}, {last.bytes / 1e6:.1f} MB, {age} ago"
     return [
         ("epoch", f"{status.epoch}"),
-        ("learning", _learning(status, samples_per_s)),
+        ("learning", "settled: nothing is left to learn" if status.settled else learning),
         ("scans", f"{status.scans_taken:,} taken, {status.scans_waiting} waiting"),
         ("not taken", f"{dropped:,} refused, {lost:,} lost"),
         ("map", f"{regions}, {status.parameters / 1e6:.2f} M parameters"),
         ("memory", f"{status.memory_bytes / 1e6:,.0f} MB"),
-        ("last checkpoint", _checkpoint(status)),
+        ("last checkpoint", checkpoint),
         ("link", f"answers in {answered_ms:.1f} ms"),
     ]
 
 
-def _learning(status: ServerStatus, samples_per_s: float | None) -> str:
-    if status.settled:
-        return "settled: nothing is left to learn"
-    left = f"{status.samples_left / 1e6:.1f} M samples left"
-    return left if samples_per_s is None else f"{samples_per_s / 1e6:.2f} M samples/s, {left}"
-
-
 def _samples_per_s(before: ServerStatus | None, now: ServerStatus) -> float | None:
-    """Return how fast the server learns, ``None`` where it was restarted since."""
+    """How fast the server learns; ``None`` where it was restarted since."""
     if before is None or before.server != now.server or now.uptime_s <= before.uptime_s:
         return None
-    return max(
-        0.0, (now.samples_trained - before.samples_trained) / (now.uptime_s - before.uptime_s)
-    )
-
-
-def _checkpoint(status: ServerStatus) -> str:
-    last = status.last_checkpoint
-    if last is None:
-        return "none yet"
-    age_s = max(0.0, time.time() - last.stamp_ns / 1e9)
-    return f"epoch {last.epoch}, {last.bytes / 1e6:.1f} MB, {duration(age_s)} ago"
+    trained = now.samples_trained - before.samples_trained
+    return max(0.0, trained / (now.uptime_s - before.uptime_s))

@@ -1,0 +1,76 @@
+"""The robot in a scene: where each source of scans has been, and its newest scan."""
+
+import numpy as np
+import viser
+from matplotlib.colors import to_rgb
+from triquad_client.calls.sources import ScanSource, SourceReport
+from triquad_format.records.arrays import Doubles
+
+from triquad_tools.viewer.page.layer import Layer
+from triquad_tools.viewer.page.legends import text_html
+from triquad_tools.viewer.page.page import Page
+from triquad_tools.viewer.sources.live_source import LiveSource
+
+_PERIOD_S = 0.5
+_SCAN_POINTS = 4000
+_COLOURS = ("#d55e00", "#cc79a7", "#000000", "#e69f00")
+"""Of sources in turn: of those of Okabe and Ito, which everybody tells apart, what no mesh has."""
+
+_POINT_M, _LINE_PIXELS = 0.08, 3.0
+
+
+class TrailLayer(Layer):
+    """Draws trails and newest scans, and keeps them up to date."""
+
+    def __init__(self, source: LiveSource, page: Page) -> None:
+        super().__init__(page, "Robot", _PERIOD_S)
+        self._client = source.client
+        self._report: SourceReport | None = None
+        self._shown: tuple[object, ...] = ()
+        with self.folder:
+            self._trails = page.gui.add_checkbox("Trail", True)
+            self._scans = page.gui.add_checkbox("Newest scan", True)
+            self._list = page.gui.add_html(text_html("No scan has come yet."))
+        self.start(self._trails, self._scans)
+
+    def refresh(self) -> None:
+        """Ask for what is new, and draw all where anything is."""
+        report = self._report = self._client.sources(since=self._report, max_points=_SCAN_POINTS)
+        wanted = (report.server, report.revision, self._trails.value, self._scans.value)
+        if wanted == self._shown:
+            return
+        marks: list[viser.SceneNodeHandle] = []
+        for number, source in enumerate(report.sources.values()):
+            marks += self._marks_of(source, np.array(to_rgb(_COLOURS[number % len(_COLOURS)])))
+        self.draw(marks)
+        self._shown = wanted
+        if report.sources:
+            self._list.content = text_html("\n".join(map(_line, report.sources.values())))
+
+    def _marks_of(self, source: ScanSource, colour: Doubles) -> list[viser.SceneNodeHandle]:
+        """The trail of a source, and points of its newest scan."""
+        scene, in_scene = self.page.scene, self.page.in_scene
+        marks: list[viser.SceneNodeHandle] = []
+        lines = [line for line in source.lines() if len(line) > 1] if self._trails.value else []
+        if lines:
+            pieces = np.concatenate([np.stack([line[:-1], line[1:]], axis=1) for line in lines])
+            trail = scene.add_line_segments(
+                self.node("trail"), in_scene(pieces), colour,
+                thickness=_LINE_PIXELS, thickness_units="screen",
+            )  # fmt: skip
+            marks.append(trail)
+        if source.newest is not None and self._scans.value:
+            points = in_scene(source.newest.points)
+            cloud = scene.add_point_cloud(
+                self.node("scan"), points, colour, point_size=_POINT_M, precision="float32"
+            )
+            marks.append(cloud)
+        return marks
+
+
+def _line(source: ScanSource) -> str:
+    """What the panel says of a source."""
+    if source.newest is None:
+        return f"{source.name}: {source.scans:,} scans"
+    x, y, z = source.newest.position_m
+    return f"{source.name}: {source.scans:,} scans, now at {x:.1f}, {y:.1f}, {z:.1f} m"
