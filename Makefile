@@ -24,8 +24,10 @@ INSTALLED = $(VENV)/.installed
 demo: $(INSTALLED_DEMO)
 	$(BIN)/triquad-demo --out demo-out
 
-# Where several processes test, torch's threads would wait for each other: seven times as long.
+# Kernels are compiled once, not by every process that tests. Where several do, torch's threads
+# would wait for each other: seven times as long.
 test: check
+	$(BIN)/python -m triquad_server.warm_up
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --maxprocesses 4 -m "not long" --durations=10
 
 test-long: $(INSTALLED)
@@ -53,11 +55,11 @@ check: $(INSTALLED)
 
 $(INSTALLED_DEMO): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install $(PIP_FLAGS) -c constraints.txt -e '.[demo]'
+	$(BIN)/python -m pip install --no-compile $(PIP_FLAGS) -c constraints.txt -e '.[demo]'
 	touch $@
 
 $(INSTALLED): $(INSTALLED_DEMO)
-	$(BIN)/python -m pip install $(PIP_FLAGS) -c constraints.txt -e '.[dev]'
+	$(BIN)/python -m pip install --no-compile $(PIP_FLAGS) -c constraints.txt -e '.[dev]'
 	touch $@
 
 pretrained: $(INSTALLED)

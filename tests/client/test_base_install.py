@@ -86,8 +86,7 @@ def test_all_public_names_exist():
 @pytest.mark.parametrize(
     ("command", "arguments", "message"),
     [
-        ("demo", (), "torch is missing: install triquad[demo]"),
-        ("bench", (), "torch is missing: install triquad[demo]"),
+        ("demo", (), "numba is missing: install triquad[demo]"),
         ("evaluate", (), "scipy is missing: install triquad[tools]"),
         ("inspect", ("MAP", "--plot", "plan.png"), "matplotlib is missing: install triquad[tools]"),
         ("pack", ("MAP", "mesh.ply"), "numba is missing: pip install 'triquad[fast]'"),

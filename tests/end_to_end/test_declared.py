@@ -24,7 +24,7 @@ DISTRIBUTIONS = {
     "pydantic_settings": "pydantic-settings",
 }
 USED_BY_OTHERS = {"tomli"}  # by pydantic-settings, before Python 3.11
-EVERY_EXTRA = ("browser", "fast", "keys", "mesh", "preview", "ros", "server", "tools", "viewer")
+EVERY_EXTRA = ("fast", "gpu", "keys", "mesh", "preview", "ros", "server", "tools", "viewer")
 WITHOUT_TORCH = (
     "commands",
     "console",
@@ -32,6 +32,8 @@ WITHOUT_TORCH = (
     "mapfiles",
     "plots",
     "recordings",
+    "ros2",
+    "sensors",
     "simulation",
     "top",
 )
@@ -69,8 +71,7 @@ def imported(folder: str) -> set[str]:
         ("format", ()),
         ("client", ("mesh",)),
         ("map", ("fast", "preview")),
-        ("sensors", ("ros",)),
-        ("server", ("fast", "preview", "ros", "server")),
+        ("server", ("fast", "gpu", "preview", "server")),
         ("tools", EVERY_EXTRA),
         ("tools/triquad_tools/credentials", ("keys",)),
         ("tools/triquad_tools/viewer", ("fast", "mesh", "preview", "ros", "tools", "viewer")),
@@ -85,6 +86,6 @@ def test_what_is_imported_is_declared(folder: str, extras: tuple[str, ...]) -> N
 
 
 def test_what_is_declared_is_imported() -> None:
-    folders = ("format", "map", "sensors", "client", "server", "tools")
+    folders = ("format", "map", "client", "server", "tools")
     used = set().union(*(imported(folder) for folder in folders))
     assert declared(*EVERY_EXTRA) <= used | USED_BY_OTHERS

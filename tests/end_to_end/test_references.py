@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("format", "map", "sensors", "client", "server", "tools")
+PACKAGES = ("format", "map", "client", "server", "tools")
 SOURCES = [
     (ROOT / package, path) for package in PACKAGES for path in (ROOT / package).rglob("*.py")
 ]
-IN_FULL = re.compile(r"\btriquad_(?:format|map|sensors|client|server|tools)(?:\.\w+)+")
+IN_FULL = re.compile(r"\btriquad_(?:format|map|client|server|tools)(?:\.\w+)+")
 BY_ROLE = re.compile(r":(?:mod|func|class|meth|attr|data|exc):`~?([^`]*)`")
 
 
