@@ -46,7 +46,7 @@ def measure_core(made: BenchStreet) -> list[Figure]:
         points = seen_points(epoch, made, np.random.default_rng(0))
         region = max(mapper.regions, key=lambda region: region.field.parameters)
         report(1, "training")
-        figures = _training(region, settings)
+        figures = _training(region)
         report(2, "queries")
         figures += _queries(epoch, region, points)
         report(3, "publishing")
@@ -72,10 +72,10 @@ def seen_points(epoch: Epoch, made: BenchStreet, rng: np.random.Generator) -> Do
     return np.concatenate(found)[:_QUERY_POINTS]
 
 
-def _training(region: LiveRegion, settings: Settings) -> list[Figure]:
-    training, learning = settings.training, region.training
+def _training(region: LiveRegion) -> list[Figure]:
+    learning = region.training
     trainer = TensorTrainer(region.field)
-    rates = Rates(_RATE, training.beta1, training.beta2, young_rate=_RATE)
+    rates = Rates(_RATE, young_rate=_RATE)
     rng = np.random.default_rng(0)
 
     def baseline() -> None:

@@ -36,7 +36,7 @@ from triquad_format.wire.source_messages import SourcesRequest
 from triquad_map.questions.answers import Answers, QuestionLimits
 
 from triquad_server.epochs.history import EpochHistory
-from triquad_server.epochs.surface_history import SurfaceHistory
+from triquad_server.epochs.surface_history import CHANGES_KEPT, SurfaceHistory
 from triquad_server.health import Health, Heartbeat
 from triquad_server.intake.flush import FlushHandler
 from triquad_server.intake.rays import ScanRays
@@ -111,7 +111,7 @@ class Service:
         self._epochs = EpochHistory(
             first, settings.service, older_bytes=settings.memory.epochs_bytes
         )
-        self._surface = SurfaceHistory(first, settings.service.changes_kept)
+        self._surface = SurfaceHistory(first, CHANGES_KEPT)
         self._trails = SourceTrails(first.field_settings.leaf_m)
         self._parts = ExitStack()  # closed in reverse order of opening
         try:
@@ -267,7 +267,6 @@ class Service:
         flush = FlushHandler(
             self._scans.ledger,
             self._mapper.publish_soon,
-            timeout_max_s=self._settings.service.flush_timeout_max_s,
             limit=self._settings.service.request_queue,
             warnings=self._warnings.of,
         )

@@ -1,5 +1,11 @@
 """Limits of requests that clients check before they send, and servers before they answer."""
 
+MAX_WAIT_S = 60.0
+"""For how long a request may wait for its answer, or for a change of the mesh."""
+
+MAX_FLUSH_S = 600.0
+"""For how long a client may wait for its scans to be in the map."""
+
 MIN_LENGTH_M = 1e-6
 """Of distances, ranges and grid cells: what is smaller is a mistake."""
 

@@ -90,10 +90,10 @@ class Rates(NamedTuple):
     """How fast values and moments follow the gradients."""
 
     learning_rate: float
-    mean_decay: float  # in [0, 1), as is the next
-    variance_decay: float
     young_rate: float
     """The learning rate of rows that took few steps yet; at least that of the others."""
+    mean_decay: float = 0.9  # beta1 of Adam, in [0, 1), as is the next
+    variance_decay: float = 0.99  # beta2
 
     def by_age(self, ages: Rows) -> Rows:
         """The learning rates, shaped as ``ages``, of rows that took so many steps: one at least."""

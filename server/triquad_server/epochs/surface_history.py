@@ -56,6 +56,10 @@ class _Flips(NamedTuple):
 
 
 _NO_SURFACE = _Surface(np.zeros(0, np.int64), np.zeros((0, BLOCK_BYTES), np.uint8))
+CHANGES_KEPT = 1_000_000
+"""Voxels whose surface appeared or vanished that are remembered, each change of each, for clients
+that ask what changed: 13 bytes each."""
+
 _VOXEL_BYTES = 13  # three numbers of 32 bits, and whether it appeared
 _NO_VOXELS = np.zeros((0, 3), np.int32)
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 from triquad_format.errors import FormatError, RefusedError
 from triquad_format.wire import keys
+from triquad_format.wire.limits import MAX_FLUSH_S
 from triquad_format.wire.messages import FlushReply, FlushRequest
 from triquad_format.wire.metrics_messages import QueueMetrics
 
@@ -65,7 +66,6 @@ class FlushHandler:
         self,
         ledger: SourceLedger,
         publish_soon: Callable[[], None],
-        timeout_max_s: float,
         limit: int,
         warnings: Callable[[str], str | None] = lambda _: None,
     ) -> None:
@@ -76,7 +76,6 @@ class FlushHandler:
         """
         self._ledger = ledger
         self._publish_soon = publish_soon
-        self._timeout_max_s = timeout_max_s
         self._limit = limit
         self._warnings = warnings
         self._pending: list[_Pending] = []
@@ -130,10 +129,10 @@ class FlushHandler:
                 f"sequence = {asks.sequence} is out of range: use 0 to {MAX_SEQUENCE - 1}",
             )
         # Written so that NaN is refused as well.
-        if not 0 <= asks.timeout_s <= self._timeout_max_s:
+        if not 0 <= asks.timeout_s <= MAX_FLUSH_S:
             raise RefusedError(
                 "bad_request",
-                f"timeout_s = {asks.timeout_s} is out of range: use 0 to {self._timeout_max_s:g}",
+                f"timeout_s = {asks.timeout_s} is out of range: use 0 to {MAX_FLUSH_S:g}",
             )
 
     def _run(self) -> None:

@@ -10,14 +10,13 @@ import numpy as np
 from triquad_format.errors import FormatError, RefusedError
 from triquad_format.records.arrays import Ints
 from triquad_format.wire import keys
-from triquad_format.wire.limits import MAX_KNOWN_TILES
+from triquad_format.wire.limits import MAX_KNOWN_TILES, MAX_WAIT_S
 from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
 from triquad_map.box import check_box
 from triquad_map.compiled.mesh.tile_lattice import TileIndex, TileLattice, check_level
 
 from triquad_server.fair_queue import Owner, first_to_go
 from triquad_server.mesh.tile_level import CachedTile
-from triquad_server.settings import MeshSettings
 
 BURST_S = 1.0
 """A client that asked for nothing for so long may be sent as many seconds' worth at once."""
@@ -91,7 +90,6 @@ def new_follower(
     *,
     server: str,
     epoch: int,
-    settings: MeshSettings,
 ) -> Follower:
     """A request that begins to wait; it has passed its checks.
 
@@ -99,13 +97,12 @@ def new_follower(
     """
     restart = asks.server not in ("", server)
     known = zip(asks.known.tolist(), asks.known_versions.tolist(), strict=True)
-    limits = (settings.client_bytes_per_s, asks.max_bytes_per_s)
     return Follower(
         request=request,
         asks=asks,
         needs_epoch=epoch,
-        deadline_s=time.monotonic() + min(asks.timeout_s, settings.update_timeout_max_s),
-        bytes_per_s=min((limit for limit in limits if limit), default=math.inf),
+        deadline_s=time.monotonic() + min(asks.timeout_s, MAX_WAIT_S),
+        bytes_per_s=asks.max_bytes_per_s or math.inf,
         restart=restart,
         known_to=0 if restart else asks.revision,
         known={} if restart else {(x, y, z): version for (x, y, z), version in known},

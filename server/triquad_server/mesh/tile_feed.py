@@ -30,6 +30,7 @@ from triquad_server.settings import MeshSettings
 _log = logging.getLogger(__name__)
 
 _STOPPING = "the server is stopping"
+_REPLY_BYTES = 1_000_000  # of the tiles of one reply; a single tile may be larger
 _HOLDS_S = 5.0
 """For so long after the last follower an epoch is held, of which tiles may be made."""
 
@@ -105,7 +106,6 @@ class TileFeed:
             asks,
             server=self._server,
             epoch=self._epochs.newest.number,
-            settings=self._settings,
         )
         with self._changed:
             if self._stopping:
@@ -233,7 +233,7 @@ class TileFeed:
         """As many of the tiles as a reply may have, at least one."""
         limit = min(
             follower.asks.max_bytes,
-            self._settings.reply_bytes,
+            _REPLY_BYTES,
             max(1.0, follower.bytes_per_s * BURST_S),
         )
         reply = TileReply(

@@ -13,6 +13,7 @@ import zenoh
 from triquad_format.errors import RefusedError
 from triquad_format.wire import keys
 from triquad_format.wire.codec import Message
+from triquad_format.wire.limits import MAX_WAIT_S
 from triquad_format.wire.metrics_messages import QueueMetrics
 from triquad_map.compiled.team import THREADS
 
@@ -29,6 +30,7 @@ _log = logging.getLogger(__name__)
 
 _WORKERS = max(2, THREADS)  # for questions: one per core
 _ADMINISTRATION_WORKERS = 2
+_QUEUE_BYTES = 64_000_000  # of the requests of all clients that wait
 _PLAIN_BYTES = 16_384  # of a request that holds neither points nor tiles
 _SLOW = "slow"
 """The group of all requests that may take seconds: one of all clients is worked at."""
@@ -84,14 +86,13 @@ class Operations:
         """``give_way`` returns when a question may begin, as far as other work goes."""
         self._session = session
         self._map_name = map_name
-        self._longest_s = settings.request_timeout_max_s
         self._give_way = give_way
         self._sessions = ClientSessions(session)
         self._refusals = Refusals()
         self._operations: dict[str, _Operation] = {}  # by key
         self._queryables: list[zenoh.Queryable[Any]] = []
         self._pools: list[ThreadPoolExecutor] = []
-        limits = QueueLimits(settings.request_queue, settings.request_queue_bytes)
+        limits = QueueLimits(settings.request_queue, _QUEUE_BYTES)
         self._questions = self._queue("worker", _WORKERS, limits)
         self._administration = self._queue("administration", _ADMINISTRATION_WORKERS, limits)
         self._stopping = self._closed = False
@@ -163,7 +164,7 @@ class Operations:
     def _take(self, key: str, query: zenoh.Query) -> None:
         """Have a request wait."""
         operation = self._operations[key]
-        source = self._sessions.source(query, self._longest_s)
+        source = self._sessions.source(query, MAX_WAIT_S)
         owner = source.owner
         if operation.lane is Lane.SLOW:
             owner = Owner(_SLOW, owner.name)

@@ -29,14 +29,5 @@ class MeshSettings(BaseModel):
     update_period_s: Annotated[float, Field(ge=0.01, le=3600)] = 0.5
     """Time between searches for changed tiles, while somebody follows the mesh."""
 
-    update_timeout_max_s: Annotated[float, Field(ge=0.1, le=3600)] = 60.0
-    """Longest time that a request for changes may wait, whatever the client asks for."""
-
-    reply_bytes: Annotated[int, Field(ge=1000, le=100_000_000)] = 1_000_000
-    """Bytes of tiles in one reply; a single tile may be larger."""
-
-    client_bytes_per_s: Annotated[int, Field(ge=0, le=2**40)] = 0
-    """Bytes of tiles that each client is sent per second; 0: no limit but its own."""
-
     cache_bytes: Annotated[int, Field(ge=0, le=2**40)] = 200_000_000
     """Bytes of encoded tiles that are cached; others are made again when they are asked for."""

@@ -37,9 +37,6 @@ class ScanSettings(BaseModel):
     truncation_m: float = length(0.3, least_m=0.01, most_m=20)
     """Largest distance of such samples from their end point."""
 
-    free_from: Annotated[float, Field(ge=0, le=1)] = 0.3
-    """Samples of free space begin at this share of the range."""
-
     behind_m: float = length(0.8, least_m=0, most_m=100)
     """Samples of free space end so far behind the end point."""
 

@@ -23,13 +23,6 @@ class ServiceSettings(BaseModel):
     """Requests of each client that wait, and an eighth of those of all; of more, the newest of the
     client that has most of them is refused."""
 
-    request_queue_bytes: Annotated[int, Field(ge=0, le=2**40)] = 64_000_000
-    """Bytes of the requests of all clients that wait, likewise."""
-
-    request_timeout_max_s: Annotated[float, Field(ge=0.1, le=1e6)] = 60.0
-    """A request is given up after this time, or after the shorter one for which its client
-    waits."""
-
     publish_period_s: Annotated[float, Field(ge=0.01, le=3600)] = 0.5
     """Time between epochs while the map changes."""
 
@@ -43,10 +36,3 @@ class ServiceSettings(BaseModel):
 
     pin_s: Annotated[float, Field(ge=0, le=1e6)] = 30.0
     """Time for which an epoch stays after it was last asked for by number."""
-
-    changes_kept: Annotated[int, Field(ge=0, le=100_000_000)] = 1_000_000
-    """Voxels whose surface appeared or vanished that are remembered, each change of each, for
-    clients that ask what changed: 13 bytes each."""
-
-    flush_timeout_max_s: Annotated[float, Field(ge=0.1, le=1e6)] = 600.0
-    """Longest time that a client may ask to wait in a flush."""

@@ -2,7 +2,7 @@
 
 from typing import Annotated
 
-from pydantic import BaseModel, Field, model_validator
+from pydantic import BaseModel, Field
 
 from triquad_server.settings.section import SECTION
 
@@ -19,12 +19,6 @@ class TrainingSettings(BaseModel):
 
     learning_rate: Annotated[float, Field(ge=0, le=1)] = 0.01
     """Learning rate of Adam, before it cools."""
-
-    beta1: Annotated[float, Field(ge=0.001, le=0.9999)] = 0.9
-    """Decay of Adam's mean of gradients."""
-
-    beta2: Annotated[float, Field(ge=0.001, le=0.99999)] = 0.99
-    """Decay of Adam's mean of squared gradients; at least the square of `beta1`."""
 
     pool_rays: Annotated[int, Field(ge=100, le=1_000_000_000)] = 1_200_000
     """Rays that are kept for training, over the whole map, spread evenly over its surface; a large
@@ -57,13 +51,3 @@ class TrainingSettings(BaseModel):
 
     seed: Annotated[int, Field(ge=0, le=2**31)] = 42
     """Seed of all random choices."""
-
-    @model_validator(mode="after")
-    def _steps_are_bounded(self) -> "TrainingSettings":
-        """Kingma and Ba, section 4."""
-        if self.beta2 < self.beta1**2:
-            raise ValueError(
-                f"training.beta2 = {self.beta2} is too small for training.beta1 = {self.beta1}: "
-                f"use at least {self.beta1**2:.6g}"
-            )
-        return self

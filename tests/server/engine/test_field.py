@@ -17,7 +17,7 @@ from triquad_server.engine.tensor_memory import TensorMemory
 from triquad_server.engine.tensor_trainer import TensorTrainer
 
 TENSORS = TensorMemory("cpu")
-RATES = Rates(learning_rate=0.01, mean_decay=0.9, variance_decay=0.99, young_rate=0.02)
+RATES = Rates(learning_rate=0.01, young_rate=0.02)
 
 
 def small(encoding: str = "both", depth: int = 8) -> FieldSettings:

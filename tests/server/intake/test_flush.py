@@ -20,7 +20,7 @@ def ledger():
 @pytest.fixture
 def handler(ledger, monkeypatch):
     monkeypatch.setattr(flush, "ARRIVAL_GRACE_S", 0.0)
-    with closing(FlushHandler(ledger, lambda: None, 600.0, 8)) as handler:
+    with closing(FlushHandler(ledger, lambda: None, 8)) as handler:
         yield handler
 
 
@@ -79,7 +79,7 @@ def test_a_scan_that_stays_out_of_the_map_ends_in_a_timeout(handler, ledger):
 
 def test_an_epoch_is_asked_for_once_the_scan_is_in_the_map(ledger):
     asked = threading.Event()
-    with closing(FlushHandler(ledger, asked.set, 600.0, 8)) as handler:
+    with closing(FlushHandler(ledger, asked.set, 8)) as handler:
         request = PendingRequest(asks())
         ledger.arrive(servers.scan(0))
         handler.add(request)
@@ -91,7 +91,7 @@ def test_an_epoch_is_asked_for_once_the_scan_is_in_the_map(ledger):
 
 def test_who_flushes_too_much_is_refused_and_no_other(ledger):
     ledger.arrive(servers.scan(0))
-    with closing(FlushHandler(ledger, lambda: None, 600.0, limit=8)) as handler:
+    with closing(FlushHandler(ledger, lambda: None, limit=8)) as handler:
         greedy = [PendingRequest(asks(), owner="greedy") for _ in range(8)]
         honest = PendingRequest(asks(), owner="honest")
         for request in (*greedy, honest):
@@ -107,7 +107,7 @@ def test_a_client_that_does_not_read_its_reply_holds_up_no_other(ledger, monkeyp
     reads = threading.Event()
     stuck, other = PendingRequest(asks()), PendingRequest(asks(1))
     stuck.answer = lambda _: reads.wait(servers.WAIT_S)
-    with closing(FlushHandler(ledger, lambda: None, 600.0, limit=8)) as handler:
+    with closing(FlushHandler(ledger, lambda: None, limit=8)) as handler:
         for request in (stuck, other):
             handler.add(request)
         lost = other.reply.lost
@@ -117,7 +117,7 @@ def test_a_client_that_does_not_read_its_reply_holds_up_no_other(ledger, monkeyp
 
 def test_pending_requests_are_refused_when_the_server_stops(ledger):
     request = PendingRequest(asks())
-    with closing(FlushHandler(ledger, lambda: None, 600.0, 8)) as handler:
+    with closing(FlushHandler(ledger, lambda: None, 8)) as handler:
         ledger.arrive(servers.scan(0))
         handler.add(request)
     assert request.reply == "timeout"

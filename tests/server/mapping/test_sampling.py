@@ -8,6 +8,7 @@ from triquad_server.mapping.replay.ray_table import (
     draw_ordered_samples,
     rays_through,
 )
+from triquad_server.mapping.replay.region_setup import FREE_FROM
 from triquad_server.process.threads import Teams
 from triquad_server.settings import ScanSettings
 
@@ -28,7 +29,7 @@ def placed(settings: ScanSettings, half_side_m: float = HALF_SIDE_M) -> Placemen
         settings.surface_share,
         settings.spread_m,
         settings.truncation_m,
-        settings.free_from,
+        FREE_FROM,
         settings.behind_m,
         half_side_m,
     )

@@ -379,8 +379,3 @@ def test_the_page_is_the_one_that_the_settings_make() -> None:
     page = (ROOT / "docs" / "settings.md").read_text()
     with_tables = runpy.run_path(str(ROOT / "docs" / "settings_tables.py"))["with_tables"]
     assert with_tables(page) == page, "run `make docs`"
-
-
-def test_an_optimiser_that_would_diverge_is_refused() -> None:
-    with pytest.raises(SettingsError, match="beta2 = 0.1 is too small for training.beta1 = 0.9"):
-        load_settings(assignments=["training.beta2=0.1"])

@@ -12,6 +12,9 @@ from triquad_server.engine.memory import Memory
 from triquad_server.mapping.replay.ray_table import Placement
 from triquad_server.settings import ChangeSettings, ScanSettings, TrainingSettings
 
+FREE_FROM = 0.3
+"""Share of the range from which on samples of free space are drawn."""
+
 
 @dataclass(frozen=True)
 class RegionSetup:
@@ -32,7 +35,7 @@ class RegionSetup:
             surface_share=self.scan.surface_share,
             spread_m=self.scan.spread_m,
             truncation_m=self.scan.truncation_m,
-            free_from=self.scan.free_from,
+            free_from=FREE_FROM,
             behind_m=self.scan.behind_m,
             half_side_m=self.field.region_side_m / 2,
         )

@@ -91,8 +91,6 @@ class TrainingBudget:
         settings = self._settings
         rates = Rates(
             settings.learning_rate * self._cooling(kept_rays),
-            settings.beta1,
-            settings.beta2,
             young_rate=settings.learning_rate * self._cooling(min(self._new_rays, kept_rays)),
         )
         return Step(
