@@ -42,7 +42,7 @@ _MAX_CELLS = 100_000_000  # of a grid
 
 
 def query_points(points: ArrayLike) -> Doubles:
-    """Points [N, 3] as float64, all finite and at most ``MAX_POSITION_M`` from the map's origin."""
+    """Return points [N, 3] as float64, finite, at most ``MAX_POSITION_M`` from the map's origin."""
     array = _points(points, np.float64, InvalidInputError)
     # All at once, as point by point takes ten times as long.
     if not np.isfinite(array).all():
@@ -58,7 +58,7 @@ def query_points(points: ArrayLike) -> Doubles:
 
 
 def scan_points(points: ArrayLike, *, least: int = 1) -> Floats:
-    """Points [N, 3] of a scan as float32; points that are not finite may be among them.
+    """Return points [N, 3] of a scan as float32; points that are not finite may be among them.
 
     Columns after the third, such as intensities and colours, are left out.
     """
@@ -69,7 +69,7 @@ def scan_points(points: ArrayLike, *, least: int = 1) -> Floats:
 
 
 def open_directions(vectors: ArrayLike) -> Floats:
-    """Unit vectors [M, 3] along the rays of a scan that met nothing, as float32."""
+    """Return unit vectors [M, 3] along the rays of a scan that met nothing, as float32."""
     array = _points(vectors, np.float64, InvalidScanError, what="no_return")
     longest = np.abs(array).max(axis=1, keepdims=True)
     good = np.isfinite(longest[:, 0]) & (longest[:, 0] > 0)
@@ -86,7 +86,7 @@ def open_directions(vectors: ArrayLike) -> Floats:
 
 
 def rigid_pose(world_from_sensor: PoseLike) -> Doubles:
-    """A pose [4, 4] as float64: a rotation and a translation, within 1e-3."""
+    """Return a pose [4, 4] as float64: a rotation and a translation, within 1e-3."""
     if isinstance(world_from_sensor, Pose):
         return world_from_sensor.matrix()
     try:
@@ -112,7 +112,7 @@ def rigid_pose(world_from_sensor: PoseLike) -> Doubles:
 
 
 def stamp_ns(stamp_s: float) -> int:
-    """A stamp in seconds since 1970 as nanoseconds."""
+    """Return a stamp in seconds since 1970 as nanoseconds."""
     try:
         seconds = _number(stamp_s)
     except NO_NUMBER:
@@ -123,12 +123,12 @@ def stamp_ns(stamp_s: float) -> int:
 
 
 def deadline(timeout_s: float) -> float:
-    """When so many seconds from now are over, on the monotonic clock; they may be infinite."""
+    """Return when ``timeout_s`` from now is over, on the monotonic clock; it may be infinite."""
     return time.monotonic() + within("timeout_s", timeout_s, math.inf, least=-math.inf)
 
 
 def chosen_epoch(at_epoch: int | None, name: str = "at_epoch") -> int:
-    """The number of an epoch as it is sent: 0 is the newest. ``name`` is the argument's."""
+    """Return the number of an epoch as it is sent: 0 is the newest. ``name`` is the argument's."""
     if at_epoch is None:
         return 0
     try:
@@ -145,7 +145,7 @@ def chosen_epoch(at_epoch: int | None, name: str = "at_epoch") -> int:
 
 
 def box(bounds: Bounds | None) -> tuple[Doubles, Doubles]:
-    """The corners [3] of ``bounds``; ``None`` is everywhere."""
+    """Return the corners [3] of ``bounds``; ``None`` is everywhere."""
     if bounds is None:
         return np.full(3, -np.inf), np.full(3, np.inf)
     try:
@@ -160,21 +160,21 @@ def box(bounds: Bounds | None) -> tuple[Doubles, Doubles]:
 
 
 def flag(name: str, value: bool) -> bool:
-    """``value`` where it is a truth value, also one of numpy's."""
+    """Return ``value`` where it is a truth value, also one of numpy's."""
     if not isinstance(value, bool | np.bool_):
         raise InvalidInputError(f"{name} = {_shown(value)}: use True or False")
     return bool(value)
 
 
 def level_of_detail(level: int) -> int:
-    """``level`` where the mesh has such a level of detail."""
+    """Return ``level`` where the mesh has such a level of detail."""
     if type(level) is not int or not 0 <= level < LEVELS:
         raise InvalidInputError(f"level = {_shown(level)}: use 0 to {LEVELS - 1}")
     return level
 
 
 def tile_indices(index: Sequence[int]) -> Ints:
-    """The index of one tile, as a row [1, 3] of several."""
+    """Return the index of one tile, as a row [1, 3] of several."""
     for axis, number in zip("xyz", index, strict=True):
         is_whole = isinstance(number, int | np.integer) and not isinstance(number, bool)
         if not is_whole or not -TILE_INDEX_LIMIT <= number <= TILE_INDEX_LIMIT:
@@ -186,26 +186,26 @@ def tile_indices(index: Sequence[int]) -> Ints:
 
 
 def length_to_fill(fill_m: float) -> float:
-    """How far from seen surface a mesh is continued, metres."""
+    """Return how far from seen surface a mesh is continued, metres."""
     return within("fill_m", fill_m, MAX_FILL_M, least=0.0)
 
 
 def count(name: str, value: int, most: int) -> int:
-    """``value`` where it is a number of things, ``most`` at most."""
+    """Return ``value`` where it is a number of things, ``most`` at most."""
     if type(value) is not int or not 0 <= value <= most:
         raise InvalidInputError(f"{name} = {_shown(value)}: use 0 to {most}")
     return value
 
 
 def bytes_per_second(limit: int | None) -> int:
-    """A limit as it is sent: 0 is none."""
+    """Return a limit as it is sent: 0 is none."""
     if limit is not None and (type(limit) is not int or limit < 1):
         raise InvalidInputError(f"max_bytes_per_s = {limit!r}: use 1 or more, or None")
     return limit or 0
 
 
 def finite_box(bounds: Bounds) -> tuple[Doubles, Doubles]:
-    """The corners [3] of ``bounds``, infinite sides at ``MAX_POSITION_M``."""
+    """Return the corners [3] of ``bounds``, infinite sides at ``MAX_POSITION_M``."""
     minimum, maximum = (np.clip(corner, -MAX_POSITION_M, MAX_POSITION_M) for corner in box(bounds))
     if not (minimum < maximum).all():
         raise InvalidInputError(
@@ -216,7 +216,7 @@ def finite_box(bounds: Bounds) -> tuple[Doubles, Doubles]:
 
 
 def grid_shape(bounds: Bounds, cell_m: float) -> GridShape:
-    """The grid of cells that fill ``bounds``; a flat box lies in the middle of one layer."""
+    """Return the grid of cells that fill ``bounds``; a flat box lies in the middle of one layer."""
     side_m = within("cell_m", cell_m)
     low, high = box(bounds)
     if not np.isfinite([low, high]).all():
@@ -232,7 +232,7 @@ def grid_shape(bounds: Bounds, cell_m: float) -> GridShape:
 
 
 def unknown_policy(unknown: UnknownLike) -> Unknown:
-    """How unknown space is to count."""
+    """Return how unknown space is to count."""
     try:
         return Unknown(unknown)
     except ValueError as error:
@@ -243,7 +243,7 @@ def unknown_policy(unknown: UnknownLike) -> Unknown:
 def within(
     name: str, value: float, most: float = MAX_DISTANCE_M, *, least: float = MIN_LENGTH_M
 ) -> float:
-    """A number from ``least`` to ``most``."""
+    """Return a number from ``least`` to ``most``."""
     try:
         number = _number(value)
     except NO_NUMBER as error:
@@ -254,7 +254,7 @@ def within(
 
 
 def radii(values: ArrayLike, count: int) -> Floats:
-    """Radii [count], from as many or a single one."""
+    """Return radii [count], from as many or a single one."""
     try:
         array = np.broadcast_to(np.asarray(values, np.float32), (count,))
     except NO_NUMBER as error:
@@ -269,7 +269,7 @@ def radii(values: ArrayLike, count: int) -> Floats:
 
 
 def directions(vectors: ArrayLike) -> Doubles:
-    """Unit vectors [N, 3] along ``vectors``."""
+    """Return unit vectors [N, 3] along ``vectors``."""
     array = query_points(vectors)
     lengths = np.linalg.norm(array, axis=1)
     if not (lengths > 0).all():
@@ -279,7 +279,7 @@ def directions(vectors: ArrayLike) -> Doubles:
 
 
 def ray_origins(origins: ArrayLike, count: int) -> Doubles:
-    """Origins [count, 3], from as many or a single one."""
+    """Return origins [count, 3], from as many or a single one."""
     try:
         is_one = np.shape(origins) == (3,)
     except ValueError:  # rows of different lengths, which are refused below
@@ -291,7 +291,7 @@ def ray_origins(origins: ArrayLike, count: int) -> Doubles:
 
 
 def organised(name: str, values: ArrayLike) -> Doubles:
-    """An array [rows, columns, 3] as float64; values that are not finite may be in it."""
+    """Return an array [rows, columns, 3] as float64; values that are not finite may be in it."""
     try:
         array = _real_numbers(values).astype(np.float64, copy=False)
     except NO_NUMBER as error:
@@ -309,7 +309,7 @@ def _points(
     what: str = "points",
     columns: int = 3,
 ) -> NDArray[Any]:
-    """The first three of up to so many columns."""
+    """Return the first three of up to ``columns`` columns."""
     try:
         array = _real_numbers(points)
     except NO_NUMBER as cause:
@@ -330,7 +330,7 @@ def _real_numbers(values: ArrayLike) -> NDArray[Any]:
 
 
 def _number(value: Any) -> float:
-    """``value`` as a float; an integer that is too large for one is infinite."""
+    """Return ``value`` as a float; an integer that is too large for one is infinite."""
     try:
         return float(value)
     except OverflowError:
@@ -338,7 +338,7 @@ def _number(value: Any) -> float:
 
 
 def _shown(value: Any) -> str:
-    """``value`` for a text, cut short; Python does not write integers of thousands of digits."""
+    """Return ``value`` for a text, cut short; Python writes no integers of thousands of digits."""
     try:
         return reprlib.repr(value)
     except ValueError:

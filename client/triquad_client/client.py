@@ -38,7 +38,7 @@ class Client(ClientOperations, MapQueries):
         self._connection.close()
 
     def pinned(self) -> PinnedMap:
-        """The map as it is now, for queries that belong together."""
+        """Return the map as it is now, for queries that belong together."""
         return PinnedMap(self._run, self._run(questions.pin_newest()))
 
     def watch_mesh(
@@ -65,7 +65,7 @@ class Client(ClientOperations, MapQueries):
     def sync(self, bounds: Bounds, path: str | Path, accept_emptier: bool = False) -> SyncedMap:
         """Keep a copy of what the map needs to answer within ``bounds``, and ask that.
 
-        What is in the file already is taken up: only the parts that changed are sent. The copy
+        What is in the file already is used: only the parts that changed are sent. The copy
         goes on answering when the link drops, and when this client is closed.
 
         Args:
@@ -77,7 +77,7 @@ class Client(ClientOperations, MapQueries):
                 than half as much of the box.
 
         Raises:
-            InvalidInputError: the bounds are not a box, or hold nothing.
+            InvalidInputError: the bounds are not a box, or contain nothing.
             EmptierMapError: the file has a copy that knows far more, and stays as it is.
             DownloadError: what arrived is not valid.
             OSError: the file cannot be read or written.
@@ -87,5 +87,5 @@ class Client(ClientOperations, MapQueries):
         return synced
 
     def maps(self) -> list[str]:
-        """Names of all maps that can be reached, also those of other servers."""
+        """Return names of all maps that can be reached, also those of other servers."""
         return self._driver.maps()

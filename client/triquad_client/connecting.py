@@ -1,4 +1,4 @@
-"""How a program gets a client: connected to a server, at once or awaited."""
+"""Functions that give a program a client: connected to a server, at once or awaited."""
 
 import asyncio
 from collections.abc import Callable, Generator
@@ -12,7 +12,7 @@ from triquad_client.net.async_driver import AsyncDriver
 from triquad_client.net.connection import Connection, open_connection
 
 MAX_DOWNLOAD_BYTES = 2**30
-"""Some hundred times the map of a town; larger ones are taken by who says so."""
+"""Some hundred times the map of a town; larger ones need a limit of the caller's."""
 
 
 def connect(
@@ -32,7 +32,7 @@ def connect(
         map: name of the map.
         timeout_s: for connecting and for each request.
         config: Zenoh configuration file (JSON5), such as one of triquad-keys with credentials.
-        max_download_bytes: the largest map file that is taken from the server, and the most that
+        max_download_bytes: the largest map file that is fetched from the server, and the most that
             the mesh of a box may take of memory, whatever the server announces.
 
     Raises:

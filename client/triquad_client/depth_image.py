@@ -32,7 +32,7 @@ class Intrinsics:
 
     @classmethod
     def from_matrix(cls, camera_matrix: ArrayLike) -> "Intrinsics":
-        """Those of a camera matrix [3, 3], as OpenCV's ``K`` or the ``k`` of ``CameraInfo``.
+        """Return those of a camera matrix [3, 3], as OpenCV's ``K`` or the ``k`` of ``CameraInfo``.
 
         Raises:
             InvalidScanError: it is no such matrix, or has skew.
@@ -51,7 +51,7 @@ class Intrinsics:
 
 
 def depth_points(depth: ArrayLike, intrinsics: Intrinsics, stride: int = 1) -> Floats:
-    """The points [N, 3] that a depth image shows, row by row.
+    """Return the points [N, 3] that a depth image shows, row by row.
 
     Args:
         depth: [rows, columns] along the optical axis: metres as floating numbers, or millimetres

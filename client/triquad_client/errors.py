@@ -3,7 +3,7 @@
 from triquad_format.errors import InvalidInputError, TriquadError
 
 NO_NUMBER = (TypeError, ValueError, OverflowError)
-"""What conversions to numbers raise: Python's integers may be larger than any float."""
+"""The errors of conversions to numbers: Python's integers may be larger than any float."""
 
 _MAPS_NAMED = 20
 _NO_MAPS = "none (is this a router without a triquad server?)"

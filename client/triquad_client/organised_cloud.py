@@ -9,7 +9,7 @@ from triquad_client.errors import InvalidScanError
 
 
 def empty_returns(cloud: ArrayLike, directions: ArrayLike) -> Doubles:
-    """The rays of an organised cloud that met nothing, as ``publish_scan(no_return=)`` takes them.
+    """Return the rays of an organised cloud that met nothing, for ``publish_scan(no_return=)``.
 
     Use it only where the sensor leaves a point empty because its ray met nothing.
 

@@ -9,18 +9,18 @@ from triquad_format.records.arrays import Doubles
 from triquad_client.errors import NO_NUMBER, InvalidScanError
 
 _UNIT_TOLERANCE = 1e-2
-"""By how much a quaternion's length may be off: files of three digits are."""
+"""The allowed error of a quaternion's length: files of three digits have it."""
 
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a sensor is and how it is turned, in the map frame: stands for a matrix [4, 4]."""
+    """The place and rotation of a sensor in the map frame: it stands for a matrix [4, 4]."""
 
     position_m: ArrayLike  # [3] x, y, z
     quaternion_xyzw: ArrayLike  # [4] x, y, z, w: the order of ROS; made a unit quaternion
 
     def matrix(self) -> Doubles:
-        """The pose as a matrix [4, 4], ``world_from_sensor``.
+        """Return the pose as a matrix [4, 4], ``world_from_sensor``.
 
         Raises:
             InvalidScanError: it is not 3 and 4 finite numbers, or no rotation.
@@ -28,7 +28,7 @@ class Pose:
         return pose_matrices(*self.numbers())
 
     def numbers(self) -> tuple[Doubles, Doubles]:
-        """The position [3] and the unit quaternion [4].
+        """Return the position [3] and the unit quaternion [4].
 
         Raises:
             InvalidScanError: as :meth:`matrix`.
@@ -45,7 +45,7 @@ class Pose:
 
 
 def pose_matrices(positions: Doubles, quaternions: Doubles) -> Doubles:
-    """Poses [..., 4, 4] of positions [..., 3] and unit quaternions [..., 4] x, y, z, w.
+    """Return poses [..., 4, 4] of positions [..., 3] and unit quaternions [..., 4] x, y, z, w.
 
     Diebel 2006, "Representing attitude", section 5.6.
     """

@@ -13,7 +13,7 @@ ERROR_CODES = {
     "store": "the checkpoint could not be written, or the map not be kept before a reset",
     "internal": "an error inside the server; its log has the details",
 }
-"""Why a request is refused; they travel in :class:`triquad_format.wire.messages.ErrorReply`."""
+"""The reasons to refuse a request, in :class:`triquad_format.wire.messages.ErrorReply`."""
 
 
 class TriquadError(Exception):
@@ -24,7 +24,7 @@ class TriquadError(Exception):
     """
 
     def __str__(self) -> str:
-        """The text, control characters in it as escapes."""
+        """Return the text, control characters in it as escapes."""
         return printable_lines(super().__str__())
 
 

@@ -4,7 +4,7 @@ _CUT = "..."
 
 
 def printable(text: str, most: int | None = None) -> str:
-    r"""``text`` with what would steer a terminal, or be invisible on it, as escapes: ``\x1b``.
+    r"""Return ``text`` with what steers a terminal, or is invisible on it, as escapes: ``\x1b``.
 
     So are line breaks, what turns the direction of writing around, and halves of surrogate pairs.
     Of more than ``most`` characters, those at the end are left out.
@@ -17,7 +17,7 @@ def printable(text: str, most: int | None = None) -> str:
 
 
 def printable_lines(text: str) -> str:
-    """``text`` as :func:`printable`, but for its line breaks."""
+    """Return ``text`` as :func:`printable`, but for its line breaks."""
     return "\n".join(map(printable, text.split("\n")))
 
 

@@ -12,7 +12,7 @@ class NotAskedError(TriquadError, AttributeError):
 
 
 def asked(name: str, part: PartT | None, argument: str) -> PartT:
-    """The part called ``name``, so that who asked for it need not prove that it is there.
+    """Return the part called ``name``, so that who asked for it need not prove that it is there.
 
     Raises:
         NotAskedError: it is ``None``, as the query's ``argument`` was left out.

@@ -31,7 +31,7 @@ class Boxes:
 
 
 def clusters(voxels: Longs, scale: int = 1) -> NDArray[np.intp]:
-    """The cluster [N] of each of ``voxels`` [N, 3], numbered from 0.
+    """Return the cluster [N] of each of ``voxels`` [N, 3], numbered from 0.
 
     Voxels that are at most two apart along each axis, ``scale`` times, are in one cluster; those
     that are more than three apart are not, unless others lie between.
@@ -40,7 +40,7 @@ def clusters(voxels: Longs, scale: int = 1) -> NDArray[np.intp]:
 
 
 def tight_boxes(voxels: Longs, longest: int, scale: int = 1) -> Boxes:
-    """The boxes around the :func:`clusters` of ``voxels`` [N, 3].
+    """Return the boxes around the :func:`clusters` of ``voxels`` [N, 3].
 
     One that would be longer than ``longest`` voxels, ``scale`` times, is cut into equal pieces.
     """
@@ -54,7 +54,7 @@ def tight_boxes(voxels: Longs, longest: int, scale: int = 1) -> Boxes:
 
 
 def connected(cells: Longs) -> NDArray[np.intp]:
-    """The cluster [N] of each of ``cells`` [N, 3], numbered from 0: those that touch share it.
+    """Return the cluster [N] of each of ``cells`` [N, 3], from 0: those that touch share it.
 
     Cells touch at a corner, too.
     """
@@ -77,7 +77,7 @@ def connected(cells: Longs) -> NDArray[np.intp]:
 
 
 def same_cells(cells: Longs) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """One row [K] for each different cell of ``cells`` [N, 3], and the number [N] of each."""
+    """Return one row [K] for each different cell of ``cells`` [N, 3], and each's number [N]."""
     known = _CellSet(cells)
     return known.first, known.number
 
@@ -85,7 +85,7 @@ def same_cells(cells: Longs) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 class _CellSet:
     """The different cells among some, found in two steps: the column, then the height in it.
 
-    So the coordinates may be as large as they like: no number has to hold all three.
+    So the coordinates may be of any size: no number has to contain all three.
     """
 
     first: NDArray[np.intp]  # [K] a row of each different cell
@@ -101,7 +101,7 @@ class _CellSet:
         self.number = number.reshape(-1)
 
     def neighbours(self, step: tuple[int, int, int]) -> NDArray[np.intp]:
-        """Pairs [2, P] of numbers of cells of which the second lies a ``step`` from the first."""
+        """Return pairs [2, P] of numbers of cells, the second a ``step`` from the first."""
         x, y, z = step
         column = rows_of(self._columns, self._columns + x * self._width + y)
         beside = column[self._keys // self._height]

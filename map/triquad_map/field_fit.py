@@ -1,4 +1,4 @@
-"""How well a map fits rays that it was not trained on: where such a ray ends, its field is zero."""
+"""The fit of a map to rays that it was not trained on: where such a ray ends, its field is zero."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,14 +9,14 @@ from triquad_format.records.arrays import Doubles, Longs
 
 from triquad_map.places import Places
 
-_WORST = 5  # places that are told
+_WORST = 5  # places that are reported
 _LEAST_RAYS = 24  # of such a place
 _UPPER = 0.9
 
 
 @dataclass(frozen=True)
 class PlaceFits:
-    """How well the field of a region fits the held-out rays of each of P places."""
+    """The fit of a region's field to the held-out rays of each of P places."""
 
     centres: Doubles  # [P, 3] metres from the region's centre
     rays: Longs  # [P]
@@ -25,7 +25,7 @@ class PlaceFits:
 
     @classmethod
     def of(cls, places: Places, sdf: NDArray[np.floating]) -> "PlaceFits":
-        """The fit of a field that says ``sdf`` [N], metres, where the rays of ``places`` end."""
+        """Return the fit of a field with ``sdf`` [N], metres, where the rays of ``places`` end."""
         errors_m = np.abs(sdf)
         return cls(
             places.centres,
@@ -37,7 +37,7 @@ class PlaceFits:
 
 @dataclass(frozen=True)
 class MapFit:
-    """How well a map fits its held-out rays."""
+    """The fit of a map to its held-out rays."""
 
     rays: int
     places: int  # in which they end
@@ -48,7 +48,7 @@ class MapFit:
 
 
 def map_fit(regions: Sequence[tuple[Doubles, PlaceFits]]) -> MapFit | None:
-    """How well regions, by centre [3] and fit, fit together; ``None`` where there are none."""
+    """Return how well regions, by centre [3] and fit, fit together; ``None`` if there are none."""
     if not regions:
         return None
     errors_m = np.concatenate([fits.errors_m for _, fits in regions])

@@ -1,8 +1,8 @@
 """Colours of heights, the same in all that shows a map: pictures, viewers, previews in map files.
 
 They are the upper three quarters of viridis, from blue below to yellow above: steps of the same
-height look the same, also to those who see no red or no green, and the darkest is bright enough to
-be shaded.
+height appear the same, also to those who see no red or no green, and the darkest is bright enough
+to be shaded.
 """
 
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ HEIGHT_STOPS: Doubles = np.array(
 """``[9, 3]`` sRGB in [0, 1], evenly spaced from the bottom of a scale to its top."""
 
 GAMMA = 2.2
-"""From sRGB to linear light: colours to this power, near enough."""
+"""The power of colours that takes sRGB to linear light, near enough."""
 
 _MOST = (0.01, 0.99)  # a treetop or a hole does not take the colours from all else
 _LEAST_RANGE_M = 0.1  # noise on a floor is no relief
@@ -42,7 +42,7 @@ class HeightScale:
 
     @classmethod
     def around(cls, heights_m: NDArray[np.floating]) -> "HeightScale":
-        """The scale for 98 % of heights ``[N]``, at least 0.1 m of them."""
+        """Return the scale for 98 % of heights ``[N]``, at least 0.1 m of them."""
         if not len(heights_m):
             return cls(0.0, _LEAST_RANGE_M)
         low, high = (float(end) for end in np.quantile(heights_m, _MOST))
@@ -50,13 +50,13 @@ class HeightScale:
         return cls(low - short / 2, high + short / 2)
 
     def colours(self, heights_m: NDArray[np.floating]) -> Doubles:
-        """Colours ``[N, 3]``, sRGB in [0, 1], of heights ``[N]``."""
+        """Return colours ``[N, 3]``, sRGB in [0, 1], of heights ``[N]``."""
         place = (np.asarray(heights_m, np.float64) - self.low_m) / (self.high_m - self.low_m)
         return colours_between(HEIGHT_STOPS, place)
 
 
 def colours_between(stops: Doubles, places: Doubles) -> Doubles:
-    """Colours ``[N, 3]`` of places ``[N]`` from 0 to 1 along ``stops`` ``[S, 3]``, evenly spaced.
+    """Return colours ``[N, 3]`` of places ``[N]`` from 0 to 1 along even ``stops`` ``[S, 3]``.
 
     What lies beyond has the colours of the ends.
     """

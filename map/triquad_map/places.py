@@ -1,4 +1,4 @@
-"""Places of a region: cubes of some metres, for each of which is told how well it was learnt."""
+"""Places of a region: cubes of some metres, each with how well it was learnt."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ _AXIS_BITS = 20
 
 
 def place_keys(ends: NDArray[np.floating], settings: FieldSettings) -> Longs:
-    """The place [N] in which each ray ends, at ``ends`` [N, 3], metres from the region's centre."""
+    """Return the place [N] of each ray, which ends at ``ends`` [N, 3], metres from the centre."""
     side_m = _PLACE_LEAVES * settings.leaf_m
     cells = np.floor(ends / side_m).astype(np.int64) + (1 << (_AXIS_BITS - 1))
     keys: Longs = cells[:, 0] << 2 * _AXIS_BITS | cells[:, 1] << _AXIS_BITS | cells[:, 2]
@@ -20,9 +20,9 @@ def place_keys(ends: NDArray[np.floating], settings: FieldSettings) -> Longs:
 
 
 def in_cube(ends: NDArray[np.floating], settings: FieldSettings) -> Bools:
-    """Whether rays [N] end in the region's cube, at ``ends`` [N, 3], metres from its centre.
+    """Return whether rays [N] end in the region's cube, at ``ends`` [N, 3], metres from its centre.
 
-    Of one that crosses it and ends beside it, nothing is learnt where it ends.
+    Of one that crosses it and ends next to it, nothing is learnt where it ends.
     """
     inside: Bools = (np.abs(ends) < settings.region_side_m / 2).all(axis=1)
     return inside
@@ -39,7 +39,7 @@ class Places:
 
     @classmethod
     def of(cls, ends: Floats, settings: FieldSettings) -> "Places":
-        """The places of rays that end at ``ends`` [N, 3], metres from the region's centre."""
+        """Return places of rays that end at ``ends`` [N, 3], metres from the region's centre."""
         keys, place_of, rays = np.unique(
             place_keys(ends, settings), return_inverse=True, return_counts=True
         )
@@ -54,7 +54,7 @@ class Places:
         return centres
 
     def medians(self, values: NDArray[np.floating]) -> Doubles:
-        """The median of the rays' ``values`` [N] in each place [P]."""
+        """Return the median of the rays' ``values`` [N] in each place [P]."""
         ordered = values[np.lexsort([values, self.place_of])]
         middles = np.cumsum(self.rays) - self.rays + self.rays // 2
         medians: Doubles = ordered[middles].astype(np.float64)

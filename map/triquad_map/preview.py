@@ -28,7 +28,7 @@ from triquad_map.triangles import Triangles
 
 PARAMETERS_A_FACE = 75  # so that a preview takes some 5 % of a map file of fp16
 FACES_MIN, FACES_MAX = 2_000, 100_000
-"""How many faces a region has at most: one for so many parameters of its field, within these."""
+"""The bounds of a region's most faces: one for ``PARAMETERS_A_FACE`` parameters of its field."""
 
 CELL_LEAVES = 2
 """Side of the cells, in leaves: 0.4 m; of larger ones where there would be too many faces."""
@@ -38,14 +38,14 @@ _TILE_CELLS = 32
 _REACH_CELLS = 0.09  # centres of faces lie at most so far from voxels with seen surface
 
 _STEPS_A_LEAF = 2
-"""Positions are rounded to a power of two, finer than a leaf by so much: zeros compress."""
+"""Positions are rounded to a power of two, finer than a leaf by this factor: zeros compress."""
 
 _BANDS = 32
 """Different colours, at most: they compress, too."""
 
 
 def preview_schema() -> bytes:
-    """The schema as MCAP wants it: a ``FileDescriptorSet``, dependencies first."""
+    """Return the schema as MCAP wants it: a ``FileDescriptorSet``, dependencies first."""
     files: dict[str, FileDescriptor] = {}
 
     def collect(file: FileDescriptor) -> None:
@@ -64,7 +64,7 @@ def preview_schema() -> bytes:
 def previews_of(
     record: MapRecord, view: ComposedView | None = None, stamp_ns: int | None = None
 ) -> Previews:
-    """The previews of all regions of a map.
+    """Return the previews of all regions of a map.
 
     Args:
         record: the map.
@@ -84,7 +84,7 @@ def previews_of(
 def preview_part(
     region: Region, settings: FieldSettings, view: ComposedView, stamp_ns: int
 ) -> Part:
-    """The preview of one region of the map that ``view`` answers for."""
+    """Return the preview of one region of the map that ``view`` answers for."""
     mesh = coarse_mesh(region, settings, view)
     step_m = 2.0 ** math.floor(math.log2(settings.leaf_m / _STEPS_A_LEAF))
     vertices = np.round(mesh.vertices / step_m) * step_m
@@ -108,7 +108,7 @@ def preview_part(
 
 
 def coarse_mesh(region: Region, settings: FieldSettings, view: ComposedView) -> Triangles:
-    """The surface of a region, in cells that are large enough for few faces.
+    """Return the surface of a region, in cells that are large enough for few faces.
 
     Faces on the border between two regions are of the one in which their middle lies.
     """
@@ -133,13 +133,13 @@ def _mesh_of_cells(
 
 
 def _colours(heights_m: Doubles, scale: HeightScale) -> Doubles:
-    """Colours [N, 3], sRGB in [0, 1], of heights [N], few of them different."""
+    """Return colours [N, 3], sRGB in [0, 1], of heights [N], few of them different."""
     band_m = (scale.high_m - scale.low_m) / _BANDS
     return scale.colours(scale.low_m + np.round((heights_m - scale.low_m) / band_m) * band_m)
 
 
 def _words(scale: HeightScale) -> dict[str, str]:
-    """What a viewer tells who clicks on the mesh."""
+    """Return the text that a viewer shows for a click on the mesh."""
     return {
         "shows": "surface that rays have seen, coarsely: to look at, not to measure",
         "axes": "metres, z up",

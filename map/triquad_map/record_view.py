@@ -23,9 +23,9 @@ class OpenView:
 
 
 def open_view(record: MapRecord) -> OpenView:
-    """The map that a record holds: answered by compiled code where numba is installed, else numpy.
+    """Return the map of a record: answered by compiled code where numba is installed, else numpy.
 
-    This is the one door to compiled code for whoever must do without numba.
+    This is the one door to compiled code for those who must do without numba.
     """
     try:
         from triquad_map.compiled.recorded_view import RecordedView

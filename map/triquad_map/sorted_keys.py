@@ -5,7 +5,7 @@ from triquad_format.records.arrays import Longs
 
 
 def rows_of(keys: Longs, wanted: Longs) -> Longs:
-    """The rows [N] of ``wanted`` [N] in ``keys`` [K], which increase; -1 for what is not there."""
+    """Return rows [N] of ``wanted`` [N] in increasing ``keys`` [K]; -1 for what is not there."""
     if len(keys) == 0:
         return np.full(len(wanted), -1, np.int64)
     rows = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)

@@ -54,7 +54,7 @@ class StoredMap:
 
     @classmethod
     def open(cls, path: Path | str) -> "StoredMap":
-        """The map in a file; other files that it needs lie in the same folder.
+        """Return the map in a file; other files that it needs lie in the same folder.
 
         Raises:
             MapFileError: it is not a map file, is damaged, or needs a newer reader.
@@ -83,7 +83,7 @@ class StoredMap:
         self._index.close()
 
     def query(self, points: NDArray[np.floating], gradient: bool = False) -> FieldAnswer:
-        """Distance, status and, on request, gradient: as :class:`MapEvaluator` gives them.
+        """Return distance, status and, on request, gradient: as :class:`MapEvaluator` gives them.
 
         Raises:
             MapFileError: a part that is needed is damaged.
@@ -94,7 +94,7 @@ class StoredMap:
         return self._view.query(positions, gradient)
 
     def record(self, training: bool = True) -> MapRecord:
-        """The whole map, read part by part.
+        """Return the whole map, read part by part.
 
         Raises:
             MapFileError: a part is damaged.
@@ -105,9 +105,9 @@ class StoredMap:
         )
 
     def box(self, minimum: ArrayLike, maximum: ArrayLike) -> MapRecord:
-        """The part of the map that answers in a box, without training state.
+        """Return the part of the map that answers in a box, without training state.
 
-        It holds whole squares and cubes: :func:`triquad_format.records.crop.crop_record` takes off
+        It has whole squares and cubes: :func:`triquad_format.records.crop.crop_record` takes off
         what the box does not need.
 
         Args:
@@ -121,7 +121,7 @@ class StoredMap:
         return self._assembled(self.parts_in(minimum, maximum))
 
     def parts_in(self, minimum: ArrayLike, maximum: ArrayLike) -> tuple[Entry, ...]:
-        """The parts that :meth:`box` consists of; arguments and errors are the same."""
+        """Return the parts that :meth:`box` consists of; arguments and errors are the same."""
         low, high = check_box(minimum, maximum)
         boxes = {index: leaf_box(self._settings, index, low, high) for index in self._indices}
         return tuple(
@@ -133,10 +133,10 @@ class StoredMap:
         )
 
     def payload(self, entry: Entry) -> bytes:
-        """The payload of a part that the manifest lists, as it is written.
+        """Return the payload of a part that the manifest lists, as it is written.
 
         Raises:
-            MapFileError: the part is damaged, or the file that holds it is missing or another.
+            MapFileError: the part is damaged, or the file that contains it is missing or another.
         """
         with named(self.name):
             return self._index.payload(entry)
@@ -149,12 +149,12 @@ class StoredMap:
         return record
 
     def _reaches(self, key: PartKey, box: LeafBox) -> bool:
-        """Whether a part holds something that answers in a box."""
+        """Return whether a part contains something that answers in a box."""
         slack = vertex_reach(self._settings) if key.topic == VERTICES else 1
         return box.meets(extent(self._settings, key), slack)
 
     def _needed_at(self, points: Doubles) -> set[PartKey]:
-        """Parts on which answers at points [N, 3] depend."""
+        """Return parts on which answers at points [N, 3] depend."""
         needed: set[PartKey] = set()
         half = self._settings.region_side_m / 2
         reach = vertex_reach(self._settings) + SLACK_LEAVES
@@ -193,7 +193,7 @@ class PartialRegion:
     """Field and status of a region; they are right where all is there that they depend on."""
 
     def __init__(self, settings: FieldSettings, index: RegionIndex, head: bytes) -> None:
-        """A region of which nothing is there but its ``head``: the part ``/triquad/region``.
+        """Begin a region of which nothing is there but its ``head``: the part ``/triquad/region``.
 
         Raises:
             FormatError: it is malformed.
@@ -219,7 +219,7 @@ class PartialRegion:
         self.evidence.add(region.evidence)
 
     def _read(self, cells: Mapping[PartKey, bytes]) -> Region:
-        """A region of these cells alone."""
+        """Return a region of these cells alone."""
         parts = RegionParts(self.index, self._settings)
         parts.add(PartKey(REGION, self.index), self._head)
         for key, payload in cells.items():

@@ -4,7 +4,7 @@ The field is right within the band where it is trained and saturates beyond it. 
 any range are measured to surfels, one in each voxel in which rays ended: where the field crosses
 zero there, and which way it faces. A surfel depends on the field around one voxel alone, which
 makes it cheap to keep up to date. Surface that has just appeared the field has still to learn:
-until then the rays themselves tell where it lies. Surfels are in voxel units: one is the side of a
+until then the rays themselves show where it lies. Surfels are in voxel units: one is the side of a
 leaf, and the voxel at integer coordinates ``v`` is the cube ``[v, v + 1)`` of leaf coordinates (see
 :mod:`triquad_format.records.region`).
 
@@ -23,14 +23,14 @@ from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Longs
 from triquad_format.records.region import MAX_LEVEL
 
 DISC_RADIUS = 0.45
-"""Of a surfel, in voxels: discs of neighbours overlap where a surface goes on, and jut out little
-where it ends."""
+"""The radius of a disc, in voxels: discs of neighbours overlap where a surface goes on, and jut out
+little where it ends."""
 
 MARGIN_STEP = 0.25
-"""Margins of voxels, beyond which no ray ended, are told in so many voxels."""
+"""Margins of voxels, beyond which no ray ended, are given in steps of as many voxels."""
 
 OUTSIDE = 0.5
-"""How far a surfel reaches out of its voxel at most, in voxels."""
+"""The most that a surfel reaches out of its voxel, in voxels."""
 
 SMOOTHING = 0.3
 """Surfels that are farther than the nearest by less than this, in voxels, count in the direction:
@@ -39,10 +39,10 @@ on a wall many are nearly as near, and each is a little off."""
 _STEPS = 3
 _LONGEST_STEP = 0.5
 _FLATTEST = 0.3
-"""Where the field is flatter than this, it was not trained."""
+"""A field that is flatter than this was not trained there."""
 
 _ON_SURFACE = 0.15
-"""Of where the steps end, the field's value at most, in voxels."""
+"""The largest value of the field where the steps end, in voxels."""
 
 _IN_VOXEL = 0.525
 _NEXT_VOXEL = 1.0
@@ -54,23 +54,23 @@ behind it, in voxels."""
 LEVELS = MAX_LEVEL + 1
 
 NEAR_M = 10.0
-"""At this range a ray counts half as much as at the sensor."""
+"""The range at which a ray counts half as much as at the sensor."""
 
 SECTORS_COUNTED = 5
-"""Of the eight sectors of the horizon that a surface was looked at from; more add nothing."""
+"""The most of the eight sectors of the horizon that count for a surface seen from them."""
 
 LEAST_STRENGTH = 0.25
-"""Of level 1; each further level is twice as strong."""
+"""The strength of level 1; each further level is twice as strong."""
 
 UNLEARNT_SHARE = 0.5
-"""Of the confidence, where rays ended but the field shows no surface."""
+"""The share of the confidence where rays ended but the field shows no surface."""
 
 HALF_LIFE_S = 86_400.0
 """While the rest of the map was seen again, confidence in what was not halves in this time."""
 
 
 class SurfelKind(IntEnum):
-    """What stands for the surface that was seen in a voxel."""
+    """The kinds of surfels for the surface that was seen in a voxel."""
 
     NONE = 0  # nothing: the surface lies in the next voxel, which has its own
     DISC = 1
@@ -100,14 +100,14 @@ SampleField = Callable[[Doubles], FieldSample]
 """The field at leaf coordinates [N, 3]."""
 
 Seen = Callable[[Longs], Bools]
-"""Whether rays ended in voxels [N, 3]."""
+"""A function that returns whether rays ended in voxels [N, 3]."""
 
 ShownByRays = Callable[[Longs], Surfels]
 """The surfels of voxels [N, 3] by what rays alone have shown; NONE where that is not known."""
 
 
 def nothing_shown(voxels: Longs) -> Surfels:
-    """Of a map from a file: which voxels rays ended in is known, but not where in them."""
+    """Return no surfels, as of a map from a file: where in voxels rays ended is not known."""
     offsets, normals = np.zeros((2, len(voxels), 3), np.float32)
     return Surfels(offsets, normals, np.full(len(voxels), SurfelKind.NONE, np.uint8))
 
@@ -115,7 +115,7 @@ def nothing_shown(voxels: Longs) -> Surfels:
 def fit_surfels(
     voxels: Longs, field: SampleField, seen: Seen, by_rays: ShownByRays = nothing_shown
 ) -> Surfels:
-    """The surfels of ``voxels`` [N, 3]: the field's, or where it shows no surface, the rays'."""
+    """Return surfels of ``voxels`` [N, 3]: the field's, or where it shows no surface, the rays'."""
     surfels = _surfels_of_field(voxels, field, seen)
     rows = np.flatnonzero(surfels.kinds != SurfelKind.DISC)
     shown = by_rays(voxels[rows])
@@ -130,7 +130,7 @@ def fit_surfels(
 
 
 def _surfels_of_field(voxels: Longs, field: SampleField, seen: Seen) -> Surfels:
-    """The surfels of ``voxels`` [N, 3], by Newton's method from their middles."""
+    """Return the surfels of ``voxels`` [N, 3], by Newton's method from their middles."""
     middles = (voxels + 0.5).astype(np.float64)
     points: Doubles = middles
     for _ in range(_STEPS):
@@ -152,7 +152,7 @@ def _surfels_of_field(voxels: Longs, field: SampleField, seen: Seen) -> Surfels:
 
 
 def _step(sample: FieldSample) -> Doubles:
-    """The step [N, 3] to where the field is zero, if it were linear."""
+    """Return the step [N, 3] to where the field is zero, if it were linear."""
     squares = np.maximum((sample.gradients**2).sum(axis=1), _FLATTEST**2)
     steps = -(sample.values / squares)[:, None] * sample.gradients
     lengths = np.linalg.norm(steps, axis=1)
@@ -161,12 +161,12 @@ def _step(sample: FieldSample) -> Doubles:
 
 
 def support_confidence(levels: Bytes, kinds: Bytes) -> Floats:
-    """The confidence [N] of surfels of some :class:`SurfelKind` at these levels, just seen."""
+    """Return the confidence [N] of surfels of a :class:`SurfelKind` at these levels, just seen."""
     shares = np.where(kinds == SurfelKind.DISC, np.float32(1), np.float32(UNLEARNT_SHARE))
     return np.asarray(level_confidence()[levels] * shares, np.float32)
 
 
 def level_confidence() -> Floats:
-    """The confidence [LEVELS] of each level, just seen."""
+    """Return the confidence [LEVELS] of each level, just seen."""
     strength = LEAST_STRENGTH * 2.0 ** (np.arange(LEVELS) - 0.5)
     return np.asarray(strength / (strength + 1.0), np.float32)

@@ -23,9 +23,9 @@ class TileJoin:
     def __init__(
         self, tile_side_m: float, box: tuple[Doubles, Doubles], *, marked: bool = False
     ) -> None:
-        """Faces stay whose centroids lie in the ``box``, given by its corners [3], metres.
+        """Keep the faces whose centroids lie in the ``box``, given by its corners [3], metres.
 
-        Where tiles are ``marked``, the mesh tells which of its faces fill holes.
+        Where tiles are ``marked``, the mesh marks which of its faces fill holes.
         """
         self._tile_side_m = tile_side_m
         self._box = box
@@ -47,10 +47,10 @@ class TileJoin:
         self._count += len(cut.vertices)
 
     def mesh(self) -> Triangles:
-        """All tiles so far as one mesh.
+        """Return all tiles so far as one mesh.
 
         It has one vertex where tiles had several, and no faces that this made degenerate. Faces are
-        gone through tile by tile: to touch fresh memory for all at once takes as long as the rest.
+        processed tile by tile: to touch fresh memory for all at once takes as long as the rest.
         """
         vertices, shared = np.concatenate(self._vertices), np.concatenate(self._shared)
         target = np.arange(len(vertices), dtype=np.int32)
@@ -74,7 +74,7 @@ class TileJoin:
 def joined(
     tiles: Iterable[Triangles], tile_side_m: float, box: tuple[Doubles, Doubles]
 ) -> Triangles:
-    """The tiles' faces whose centroids lie in a box, given by its corners [3], as one mesh."""
+    """Return the tiles' faces whose centroids lie in a box, by its corners [3], as one mesh."""
     join = TileJoin(tile_side_m, box)
     for tile in tiles:
         join.add(tile)
@@ -82,7 +82,7 @@ def joined(
 
 
 def _within(tile: Triangles, box: tuple[Doubles, Doubles]) -> Triangles:
-    """The faces of a tile whose centroids lie in a box; all of its vertices stay."""
+    """Return the faces of a tile whose centroids lie in a box; all of its vertices stay."""
     low, high = box
     if ((tile.vertices >= low) & (tile.vertices <= high)).all():
         return tile
@@ -93,7 +93,7 @@ def _within(tile: Triangles, box: tuple[Doubles, Doubles]) -> Triangles:
 
 
 def _on_sides(vertices: Doubles, tile_side_m: float) -> Longs:
-    """Which of vertices [V, 3], metres, lie on the sides of tiles: others may have them, too."""
+    """Return which vertices [V, 3], metres, lie on tiles' sides: others may have them, too."""
     steps = vertices / tile_side_m
     steps -= np.rint(steps)
     near = np.abs(steps, out=steps) < WELD_M / tile_side_m
@@ -101,7 +101,7 @@ def _on_sides(vertices: Doubles, tile_side_m: float) -> Longs:
 
 
 def _representatives(points: Doubles) -> NDArray[np.intp]:
-    """For each point [N, 3], the index of the point that stands for it."""
+    """Return the index of the point that stands for each point [N, 3]."""
     chosen = np.arange(len(points))
     for shift in _SHIFTS:
         left, at = _numbered(chosen, len(points))
@@ -111,14 +111,14 @@ def _representatives(points: Doubles) -> NDArray[np.intp]:
 
 
 def _numbered(chosen: NDArray[np.intp], count: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """The different ones of [N] numbers below ``count``, and which of these each is."""
+    """Return the different numbers of [N] below ``count``, and which of these each is."""
     used = np.zeros(count, np.bool_)
     used[chosen] = True
     return np.flatnonzero(used), (np.cumsum(used) - 1)[chosen]
 
 
 def _firsts(names: Longs) -> NDArray[np.intp]:
-    """For each name [N], where it is found first."""
+    """Return where each name [N] is found first."""
     if len(names) == 0:
         return np.zeros(0, np.intp)
     order = np.argsort(names)
@@ -130,7 +130,7 @@ def _firsts(names: Longs) -> NDArray[np.intp]:
 
 
 def _names(cells: Longs) -> Longs:
-    """A number for each of cells [N, 3], the same one for the same cell alone."""
+    """Return a number for each of cells [N, 3], the same one for the same cell alone."""
     if len(cells) == 0:
         return np.zeros(0, np.int64)
     x, y, z = (axis - axis.min() for axis in cells.T)

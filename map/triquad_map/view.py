@@ -1,4 +1,4 @@
-"""What every map answers, live or from a file; all questions are put together from this."""
+"""The interface of every map, live or from a file; all questions are put together from this."""
 
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
@@ -8,12 +8,12 @@ from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats
 from triquad_map.asked import asked
 
 NO_LENGTH_M = 1e-6
-"""What is no longer has no direction."""
+"""A vector of no more than this length has no direction."""
 
 
 @dataclass(frozen=True)
 class FieldAnswer:
-    """What the map says of N points."""
+    """The field and the status of N points."""
 
     sdf: Floats  # [N] metres, positive in free space; NaN where no region is
     status: Bytes  # [N] triquad_format.records.status.Status
@@ -63,17 +63,17 @@ class MapView(Protocol):
         """Side of the voxels in which rays ended."""
 
     def query(self, points: Doubles, gradient: bool = False) -> FieldAnswer:
-        """The trained field and the status at points."""
+        """Return the trained field and the status at points."""
 
     def status(self, points: Doubles, reach_m: float | None = None) -> Bytes:
-        """Status values [N] of points.
+        """Return status values [N] of points.
 
         ``SURFACE`` reaches ``reach_m`` beyond the voxels in which rays ended; half a voxel if
         not given.
         """
 
     def nearest_surface(self, points: Doubles, max_distance_m: float) -> NearestSurface:
-        """The nearest seen surface, searched for as far as ``max_distance_m``."""
+        """Return the nearest seen surface, searched for as far as ``max_distance_m``."""
 
     def nearest_unknown(self, points: Doubles, max_distance_m: float) -> NearestUnknown:
-        """The nearest unknown space, searched for as far as ``max_distance_m``."""
+        """Return the nearest unknown space, searched for as far as ``max_distance_m``."""

@@ -1,1 +1,1 @@
-"""What a client may ask: each call yields messages and is sent replies."""
+"""The calls of a client: each yields messages and is sent replies."""

@@ -1,4 +1,4 @@
-"""What concerns the server itself: how it is doing, checkpoints, and forgetting."""
+"""Calls that concern the server itself: how it is doing, checkpoints, and forgetting."""
 
 from dataclasses import replace
 
@@ -19,26 +19,26 @@ from triquad_client.checks import Bounds
 from triquad_client.net.call import Ask, Call, ask
 
 _SLOW_S = 60.0
-"""For requests that write to the server's disk."""
+"""The least timeout of requests that write to the server's disk."""
 
 
 def status() -> Call[ServerStatus]:
-    """How the server is doing."""
+    """Return how the server is doing."""
     return ask(Ask(keys.STATUS, StatusRequest(), ServerStatus))
 
 
 def metrics() -> Call[ServerMetrics]:
-    """How the server is doing, in figures."""
+    """Return how the server is doing, in figures."""
     return ask(Ask(keys.METRICS, MetricsRequest(), ServerMetrics))
 
 
 def checkpoint() -> Call[CheckpointInfo]:
-    """A checkpoint that is written now."""
+    """Return a checkpoint that is written now."""
     return ask(Ask(keys.CHECKPOINT, CheckpointRequest(), CheckpointInfo, min_timeout_s=_SLOW_S))
 
 
 def reset(bounds: Bounds | None) -> Call[ResetReply]:
-    """Forgets what was learnt in the bounds."""
+    """Forget what was learnt in the bounds."""
     request = ResetRequest(*checks.box(bounds))
     reply = yield from ask(Ask(keys.RESET, request, ResetReply, min_timeout_s=_SLOW_S))
     return reply if reply.undo is None else replace(reply, undo=printable(reply.undo))

@@ -1,4 +1,4 @@
-"""Where surface appeared and vanished."""
+"""The changes of a map: where surface appeared and vanished."""
 
 from dataclasses import dataclass
 from enum import Enum
@@ -14,7 +14,7 @@ Corner = tuple[float, float, float]
 
 
 class ChangeKind(Enum):
-    """What became of the surface."""
+    """The kind of a change of surface."""
 
     APPEARED = "appeared"
     VANISHED = "vanished"
@@ -38,7 +38,7 @@ class ChangedBox:
 
 @dataclass(frozen=True)
 class ChangeReport:
-    """How the surface in one epoch, a published state of the map, differs from that in another."""
+    """The difference of the surface in one epoch, a published state of the map, from another."""
 
     epoch: int  # up to here: ask for changes since this one next time
     since: int
@@ -47,7 +47,7 @@ class ChangeReport:
 
 
 def changes(since: int | ChangeReport | None, bounds: Bounds | None) -> Call[ChangeReport]:
-    """What changed within ``bounds`` since an epoch, or since an earlier report."""
+    """Return what changed within ``bounds`` since an epoch, or since an earlier report."""
     if isinstance(since, ChangeReport):
         epoch, server = since.epoch, since.server
     else:
@@ -59,7 +59,7 @@ def changes(since: int | ChangeReport | None, bounds: Bounds | None) -> Call[Cha
 
 
 def _boxes(reply: ChangesReply) -> tuple[ChangedBox, ...]:
-    """The boxes of a reply, those of most voxels first."""
+    """Return the boxes of a reply, those of most voxels first."""
     columns = (reply.appeared, reply.minimum, reply.maximum, reply.epochs, reply.voxels)
     boxes = [
         ChangedBox(

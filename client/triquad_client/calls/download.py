@@ -25,7 +25,7 @@ _BLOCK_BYTES = 2**23
 
 
 def newest_file(training: bool, max_bytes: int) -> Call[MapInfo]:
-    """The file of the newest epoch, which the server keeps for a while.
+    """Return the file of the newest epoch, which the server keeps for a while.
 
     Raises:
         DownloadError: it is larger than ``max_bytes``.
@@ -46,7 +46,7 @@ class RemoteBytes:
     """The bytes of one map file on the server; see :class:`RandomAccess`."""
 
     def __init__(self, run: Run, info: MapInfo, max_bytes: int) -> None:
-        """``max_bytes`` may be read in all."""
+        """Open a file of which ``max_bytes`` may be read in all."""
         self.name = f"the map of epoch {info.epoch}"
         self.size = info.bytes
         self.bytes_read = 0
@@ -55,10 +55,10 @@ class RemoteBytes:
         self._max_bytes = max_bytes
 
     def read(self, offset: int, length: int) -> bytes:
-        """Exactly ``length`` bytes from ``offset`` on.
+        """Return exactly ``length`` bytes from ``offset`` on.
 
         Raises:
-            DamagedMapFileError: the file does not have so many.
+            DamagedMapFileError: the file does not have as many.
             RefusedError: ``chunk_gone``, where the server does not keep the file any more.
             DownloadError: other bytes came than were asked for, or it is too much in all.
         """
@@ -75,7 +75,7 @@ class RemoteBytes:
         return b"".join(chunk.data for chunk in chunks)
 
     def close(self) -> None:
-        """Nothing is held but the connection, which is not this object's."""
+        """Do nothing: only the connection is open, which is not this object's."""
 
     def _ask(self, offset: int, end: int) -> Ask[MapChunk]:
         length = min(self._info.chunk_bytes, end - offset)
@@ -101,7 +101,7 @@ def fetch(path: Path, training: bool, max_bytes: int) -> Call[MapInfo]:
                 raise DownloadError(f"the file's SHA-256 is {found}, not {info.sha256}")
         return info
 
-    # Newer map files may push this one out of the server: then the newest is taken.
+    # Newer map files may push this one out of the server: then the newest is used.
     return retried("chunk_gone", lambda: offload(job))
 
 

@@ -84,7 +84,7 @@ class ClientOperations(QueryOperations):
     ) -> Call[None]:
         """Send a depth image to be learnt. Returns once it is handed to the network.
 
-        Servers ignore what is nearer than 1.5 m unless told otherwise: see ``range_min_m`` in
+        Servers ignore what is nearer than 1.5 m unless set otherwise: see ``range_min_m`` in
         docs/settings.md, which each source can have for itself.
 
         Args:
@@ -126,7 +126,7 @@ class ClientOperations(QueryOperations):
         Args:
             timeout_s: how long, at most.
             pending: number of scans that may still be under way: more than 0 lets a fast
-                publisher run ahead of the server by so many.
+                publisher run ahead of the server by as many.
 
         Returns:
             What became of the scans so far.
@@ -149,7 +149,7 @@ class ClientOperations(QueryOperations):
     def changes(
         self, since: int | ChangeReport | None = None, bounds: Bounds | None = None
     ) -> Call[ChangeReport]:
-        """Where surface appeared or vanished since an epoch, a published state of the map.
+        """Return where surface appeared or vanished since an epoch, a published state of the map.
 
         What appeared and vanished again is not listed. To follow the map, give the report before:
         its epoch, and its server, so that a restart is noticed whatever the epochs' numbers.
@@ -161,7 +161,7 @@ class ClientOperations(QueryOperations):
 
         Raises:
             RefusedError: ``epoch_gone``: the server was restarted, does not remember as far back,
-                or has not published that epoch. Ask for what you need of the map anew.
+                or has not published that epoch. Ask for what you need of the map again.
         """
         return changes.changes(since, bounds)
 
@@ -169,13 +169,13 @@ class ClientOperations(QueryOperations):
     def sources(
         self, since: SourceReport | None = None, max_points: int = 5_000
     ) -> Call[SourceReport]:
-        """Where each source of scans has been, and what its newest scan looks like.
+        """Return where each source of scans has been, and its newest scan.
 
         To follow them, give the report before: only what is new travels, and the report has all.
 
         Args:
             since: the report before; ``None``: nothing is known yet.
-            max_points: of each newest scan, 0 to 10,000: as many of its points come, evenly drawn.
+            max_points: 0 to 10,000: as many points of each newest scan come, evenly drawn.
 
         Raises:
             NoReplyError: the server may be of a release that does not know this question.
@@ -184,7 +184,7 @@ class ClientOperations(QueryOperations):
 
     @operation
     def tiles(self, bounds: Bounds | None = None, level: int = 0) -> Call[TileList]:
-        """The mesh tiles that meet ``bounds``, with the epoch in which each last changed.
+        """Return the mesh tiles that meet ``bounds``, with the epoch in which each last changed.
 
         Args:
             bounds: corners of a box, metres, map frame; ``None``: everywhere.
@@ -194,12 +194,12 @@ class ClientOperations(QueryOperations):
 
     @operation
     def mesh_tile(self, x: int, y: int, z: int, level: int = 0) -> Call[Mesh]:
-        """The newest mesh of one tile of a level's lattice, as :meth:`tiles` names it."""
+        """Return the newest mesh of one tile of a level's lattice, as :meth:`tiles` names it."""
         return fetch_tile((x, y, z), level, self._connection.max_download_bytes)
 
     @operation
     def mesh(self, bounds: Bounds | None = None, level: int = 0, fill_m: float = 0.0) -> Call[Mesh]:
-        """The mesh within ``bounds`` (faces by their centroids), its tiles joined, of one epoch.
+        """Return the mesh in ``bounds`` (faces by their centroids), its tiles joined, of one epoch.
 
         Args:
             bounds: corners of a box, metres, map frame; ``None``: everywhere.
@@ -212,12 +212,12 @@ class ClientOperations(QueryOperations):
 
     @operation
     def status(self) -> Call[ServerStatus]:
-        """How the server is doing."""
+        """Return how the server is doing."""
         return admin.status()
 
     @operation
     def metrics(self) -> Call[ServerMetrics]:
-        """How the server is doing, in figures: requests and their times, queues, memory.
+        """Return how the server is doing, in figures: requests and their times, queues, memory.
 
         Counts and times only grow while a server runs: take the difference of two answers.
         """
@@ -277,7 +277,7 @@ class ClientOperations(QueryOperations):
             bounds: corners of a box, metres, map frame.
 
         Raises:
-            InvalidInputError: the bounds are not a box, or hold nothing.
+            InvalidInputError: the bounds are not a box, or contain nothing.
             DownloadError: nothing of the map lies in the box, or what arrived is not valid.
             OSError: the file cannot be written.
         """
@@ -290,7 +290,7 @@ class ClientOperations(QueryOperations):
         max_bytes_per_s: int | None,
         known: KnownTiles | None,
     ) -> FollowedMesh:
-        """The mesh of a watch that begins; arguments as of ``Client.watch_mesh``."""
+        """Return the mesh of a watch that begins; arguments as of ``Client.watch_mesh``."""
         return FollowedMesh.initial(
             bounds,
             level,

@@ -19,7 +19,7 @@ MapReplyT = TypeVar("MapReplyT", bound=MapReply)
 def in_parts(
     request: Callable[[slice, int], Ask[MapReplyT]], count: int, *, most: int, at_epoch: int | None
 ) -> Call[Sequence[MapReplyT]]:
-    """The replies about ``count`` items, ``most`` at a time, all from one epoch.
+    """Return the replies about ``count`` items, ``most`` at a time, all from one epoch.
 
     ``request`` makes what is asked about some of the items, of the epoch of some number.
 
@@ -27,7 +27,7 @@ def in_parts(
         InvalidInputError: ``at_epoch`` is neither the number of an epoch nor ``None``, the newest.
     """
 
-    # Its annotation is quoted: it would be evaluated anew with each call.
+    # Its annotation is quoted: it would be evaluated again with each call.
     def parts(epoch: int) -> "Call[Sequence[MapReplyT]]":
         first = yield from ask(request(slice(0, most), epoch))
         if count <= most:
@@ -50,7 +50,7 @@ def joined(
     flags: Sequence[str] = (),
     asked_for: Mapping[str, bool] | None = None,
 ) -> dict[str, Any]:
-    """The fields of replies about parts as one, arrays end to end, as a result takes them.
+    """Return the fields of replies about parts as one, arrays end to end, as a result takes them.
 
     Args:
         replies: one or more.
@@ -79,7 +79,7 @@ def joined(
 
 
 def origin_of(points: Doubles) -> Doubles:
-    """An origin [3] among points [N, 3], from which they travel in single precision."""
+    """Return an origin [3] among points [N, 3], from which they travel in single precision."""
     if not len(points):
         return np.zeros(3)
     # The median, so that a few far points do not cost the others their precision; of a sample,
@@ -90,5 +90,5 @@ def origin_of(points: Doubles) -> Doubles:
 
 
 def offsets_from(points: Doubles, origin: Doubles) -> Floats:
-    """Points [N, 3] as they travel: relative to an origin [3]."""
+    """Return points [N, 3] as they travel: relative to an origin [3]."""
     return (points - origin).astype(np.float32)

@@ -17,7 +17,7 @@ from triquad_client.net.operation import Awaited, Blocking, operation
 
 
 class QueryOperations:
-    """Questions about the map: of its newest epoch, or always of the same one.
+    """The questions about the map: of its newest epoch, or always of the same one.
 
     Positions are metres in the map frame. Questions of any size are answered from one epoch,
     a published state of the map that never changes. ``at_epoch`` is its number, ``None`` is the
@@ -26,13 +26,13 @@ class QueryOperations:
     """
 
     _epoch: int | None
-    """Is asked where a query names none."""
+    """The epoch that is asked where a query names none."""
 
     @operation
     def query_sdf(
         self, points: ArrayLike, gradient: bool = False, at_epoch: int | None = None
     ) -> Call[SdfResult]:
-        """The trained field at ``points`` [N, 3]: right near surfaces, saturated beyond.
+        """Return the trained field at ``points`` [N, 3]: right near surfaces, saturated beyond.
 
         Where the map has no region, which is far from all that was seen, field and gradient are
         NaN.
@@ -55,11 +55,11 @@ class QueryOperations:
         unknown_distance: bool = False,
         at_epoch: int | None = None,
     ) -> Call[Distances]:
-        """The true distance to the nearest seen surface, with its gradient, at ``points`` [N, 3].
+        """Return true distances to the nearest seen surface, with gradients, at ``points`` [N, 3].
 
         Args:
             points: metres, map frame.
-            max_distance_m: surfaces are looked for up to here, at most 100 m.
+            max_distance_m: surfaces are searched for up to here, at most 100 m.
             unknown: ``"obstacle"`` lets unknown space count as a surface, ``"error"`` refuses
                 points to which it is nearer.
             surface_point: whether the nearest points of the surface are wanted.
@@ -76,7 +76,7 @@ class QueryOperations:
     def query_spheres(
         self, centres: ArrayLike, radii_m: ArrayLike, at_epoch: int | None = None
     ) -> Call[Spheres]:
-        """What spheres around ``centres`` [N, 3] hold; ``radii_m`` are one, or [N], metres."""
+        """Return what spheres at ``centres`` [N, 3] contain; ``radii_m`` are one or [N], metres."""
         return questions.spheres(centres, radii_m, self._chosen(at_epoch))
 
     @operation
@@ -88,13 +88,13 @@ class QueryOperations:
         max_distance_m: float = 5.0,
         at_epoch: int | None = None,
     ) -> Call[Segments]:
-        """What a ball meets that moves straight from each of ``starts`` to ``ends`` [N, 3].
+        """Return what a ball meets that moves straight from each of ``starts`` to ``ends`` [N, 3].
 
         Args:
             starts: metres, map frame.
             ends: as many.
             radius_m: of the ball.
-            max_distance_m: clearance is looked for up to here, at most 100 m.
+            max_distance_m: clearance is searched for up to here, at most 100 m.
             at_epoch: see :class:`MapQueries`.
         """
         options = SegmentOptions(radius_m, max_distance_m)
@@ -108,7 +108,7 @@ class QueryOperations:
         max_distance_m: float = 5.0,
         at_epoch: int | None = None,
     ) -> Call[Polyline]:
-        """What a ball meets that moves along ``points`` [N, 3], as :meth:`query_segments`."""
+        """Return what a ball meets that moves along ``points`` [N, 3]: :meth:`query_segments`."""
         options = SegmentOptions(radius_m, max_distance_m)
         return questions.polyline(points, options, self._chosen(at_epoch))
 
@@ -121,7 +121,7 @@ class QueryOperations:
         through_unknown: bool = False,
         at_epoch: int | None = None,
     ) -> Call[RayRanges]:
-        """How far rays reach from ``origins`` [3] or [N, 3] along ``directions`` [N, 3].
+        """Return how far rays reach from ``origins`` [3] or [N, 3] along ``directions`` [N, 3].
 
         Args:
             origins: metres, map frame.
@@ -137,12 +137,12 @@ class QueryOperations:
     def query_ground(
         self, points: ArrayLike, max_drop_m: float = 2.0, at_epoch: int | None = None
     ) -> Call[Ground]:
-        """The ground below ``points`` [N, 3]: its height and slope, or that there is none.
+        """Return the ground below ``points`` [N, 3]: its height and slope, or that there is none.
 
         Args:
             points: metres, map frame, in free space above the ground, or at most half a voxel
                 below it.
-            max_drop_m: the ground is looked for down to here, at most 100 m.
+            max_drop_m: the ground is searched for down to here, at most 100 m.
             at_epoch: see :class:`MapQueries`.
         """
         return questions.ground(points, max_drop_m, self._chosen(at_epoch))
@@ -155,12 +155,12 @@ class QueryOperations:
         max_distance_m: float = 5.0,
         at_epoch: int | None = None,
     ) -> Call[Grid]:
-        """Distance and status at the cubic cells that fill ``bounds``.
+        """Return distance and status at the cubic cells that fill ``bounds``.
 
         Args:
             bounds: corners of a box; where both have the same z, the grid is a slice there.
             cell_m: side of a cell.
-            max_distance_m: surfaces are looked for up to here, at most 100 m.
+            max_distance_m: surfaces are searched for up to here, at most 100 m.
             at_epoch: see :class:`MapQueries`.
         """
         return questions.grid(bounds, cell_m, max_distance_m, at_epoch=self._chosen(at_epoch))
@@ -173,7 +173,7 @@ class QueryOperations:
         max_distance_m: float = 6.0,
         at_epoch: int | None = None,
     ) -> Call[Alignment]:
-        """Where a scan was taken: its points are moved until they lie on surfaces of the map.
+        """Return the pose of a scan: its points are moved until they lie on surfaces of the map.
 
         Args:
             points: [N, 3] metres, sensor frame; any number, of which some 2,000 are used.
@@ -221,7 +221,7 @@ class PinnedMap(MapQueries):
     """The map as it was in one epoch.
 
     The server keeps an epoch for some time after it was last asked (``service.pin_s``, 30 s):
-    every query renews it. Once it is gone, queries raise :class:`RefusedError` ``epoch_gone``.
+    every query renews it. Once it is removed, queries raise :class:`RefusedError` ``epoch_gone``.
     """
 
     def __init__(self, run: Run, epoch: int) -> None:

@@ -62,7 +62,7 @@ _MOST_WAYS = 1_000
 
 @dataclass(frozen=True)
 class SdfResult:
-    """What the map says of N points, all of it from one epoch."""
+    """The field and the status of N points, all of it from one epoch."""
 
     sdf: NDArray[np.float32]  # [N] metres, positive in free space; NaN where the map has nothing
     status: NDArray[np.uint8]  # [N] Status values
@@ -80,7 +80,7 @@ class SdfResult:
 
 
 def sdf(points: ArrayLike, gradient: bool, at_epoch: int | None) -> Call[SdfResult]:
-    """The trained field at ``points`` [N, 3]."""
+    """Return the trained field at ``points`` [N, 3]."""
     gradient = checks.flag("gradient", gradient)
     if isinstance(points, np.ndarray) and points.size > 3 * MAX_QUERY_POINTS:
         checked = yield from offload(lambda _: checks.query_points(points))
@@ -98,7 +98,7 @@ def sdf(points: ArrayLike, gradient: bool, at_epoch: int | None) -> Call[SdfResu
 
 
 def pin_newest() -> Call[int]:
-    """The newest epoch, once the server keeps it for us: it was asked for by number."""
+    """Return the newest epoch, once the server keeps it for us: it was asked for by number."""
     nowhere = np.zeros((0, 3))
 
     def pin() -> Call[int]:
@@ -117,7 +117,7 @@ def _ask_sdf(points: Doubles, gradient: bool, epoch: int) -> Ask[SdfReply]:
 def distance(
     points: ArrayLike, options: DistanceOptions, unknown: UnknownLike, at_epoch: int | None
 ) -> Call[Distances]:
-    """True distances to the nearest surface at ``points`` [N, 3]."""
+    """Return true distances to the nearest surface at ``points`` [N, 3]."""
     checked = checks.query_points(points)
     policy = checks.unknown_policy(unknown)
     surface_point = checks.flag("surface_point", options.surface_point)
@@ -151,14 +151,14 @@ def distance(
 
 
 def _origins(points: Doubles, counts: list[int]) -> Doubles:
-    """The origin [N, 3] from which each of ``points`` [N, 3] was sent, in parts of ``counts``."""
+    """Return the origin [N, 3] from which each point of N was sent, in parts of ``counts``."""
     starts = range(0, max(1, len(points)), MAX_SEARCHES)
     origins = [origin_of(points[start : start + MAX_SEARCHES]) for start in starts]
     return np.repeat(origins, counts, axis=0)
 
 
 def spheres(centres: ArrayLike, radii_m: ArrayLike, at_epoch: int | None) -> Call[Spheres]:
-    """What spheres around ``centres`` [N, 3] hold; ``radii_m`` are one number or [N]."""
+    """Return what spheres around ``centres`` [N, 3] contain; ``radii_m`` are one number or [N]."""
     checked = checks.query_points(centres)
     radii = checks.radii(radii_m, len(checked))
 
@@ -176,7 +176,7 @@ def spheres(centres: ArrayLike, radii_m: ArrayLike, at_epoch: int | None) -> Cal
 def segments(
     starts: ArrayLike, ends: ArrayLike, options: SegmentOptions, at_epoch: int | None
 ) -> Call[Segments]:
-    """What a ball meets that moves from ``starts`` to ``ends`` [N, 3]."""
+    """Return what a ball meets that moves from ``starts`` to ``ends`` [N, 3]."""
     first, last = checks.query_points(starts), checks.query_points(ends)
     if len(first) != len(last):
         raise InvalidInputError(f"{len(first)} starts and {len(last)} ends: give as many")
@@ -202,12 +202,12 @@ def segments(
 
 
 def _ways_at_once(searches: float) -> int:
-    """How many ways that take as many ``searches`` each one request may ask about."""
+    """Return how many ways that take as many ``searches`` each one request may ask about."""
     return max(1, min(_MOST_WAYS, int(MAX_SEARCHES / max(1.0, searches))))
 
 
 def polyline(points: ArrayLike, options: SegmentOptions, at_epoch: int | None) -> Call[Polyline]:
-    """What a ball meets that moves along ``points`` [N, 3]."""
+    """Return what a ball meets that moves along ``points`` [N, 3]."""
     checked = checks.query_points(points)
     if len(checked) < 2:
         raise InvalidInputError(f"a polyline of {len(checked)} points: give two or more")
@@ -218,7 +218,7 @@ def polyline(points: ArrayLike, options: SegmentOptions, at_epoch: int | None) -
 def rays(
     origins: ArrayLike, directions: ArrayLike, options: RayOptions, at_epoch: int | None
 ) -> Call[RayRanges]:
-    """How far rays reach from ``origins`` [3] or [N, 3] along ``directions`` [N, 3]."""
+    """Return how far rays reach from ``origins`` [3] or [N, 3] along ``directions`` [N, 3]."""
     ways = checks.directions(directions)
     starts = checks.ray_origins(origins, len(ways))
     reach_m = checks.within("max_range_m", options.max_range_m, MAX_RANGE_M)
@@ -242,7 +242,7 @@ def rays(
 
 
 def ground(points: ArrayLike, max_drop_m: float, at_epoch: int | None) -> Call[Ground]:
-    """What lies at most ``max_drop_m`` below ``points`` [N, 3]."""
+    """Return what lies at most ``max_drop_m`` below ``points`` [N, 3]."""
     checked = checks.query_points(points)
     drop_m = checks.within("max_drop_m", max_drop_m)
 
@@ -260,7 +260,7 @@ def ground(points: ArrayLike, max_drop_m: float, at_epoch: int | None) -> Call[G
 
 
 def grid(bounds: Bounds, cell_m: float, max_distance_m: float, at_epoch: int | None) -> Call[Grid]:
-    """The map at the cells that fill ``bounds``; a flat box is one layer of them."""
+    """Return the map at the cells that fill ``bounds``; a flat box is one layer of them."""
     shape = checks.grid_shape(bounds, cell_m)
     reach_m = checks.within("max_distance_m", max_distance_m)
     blocks = _blocks(shape.counts)
@@ -292,7 +292,7 @@ class _Block:
 
 
 def _blocks(counts: tuple[int, int, int]) -> list[_Block]:
-    """A grid in blocks that one request may ask about: layers of one x each, or parts of one."""
+    """Return a grid in blocks for one request each: layers of one x each, or parts of one."""
     columns, rows, height = counts
     rows_each = min(rows, max(1, MAX_SEARCHES // height))
     columns_each = max(1, MAX_SEARCHES // (rows * height))
@@ -306,7 +306,7 @@ def _blocks(counts: tuple[int, int, int]) -> list[_Block]:
 def align(
     points: ArrayLike, guess: PoseLike, options: AlignOptions, at_epoch: int | None
 ) -> Call[Alignment]:
-    """The pose of ``points`` [N, 3], metres, sensor frame, near a guess [4, 4]."""
+    """Return the pose of ``points`` [N, 3], metres, sensor frame, near a guess [4, 4]."""
     epoch = checks.chosen_epoch(at_epoch)
     cloud = checks.scan_points(points)
     # Here, not only where it is answered: a hundredth of a scan travels.

@@ -24,7 +24,7 @@ from triquad_client.net.connection import Connection
 _log = logging.getLogger("triquad_client")
 
 _REPLY_MARGIN_S = 5.0
-"""By how much the server's answer that the time is over may be late."""
+"""The delay that the server's answer that the time is over may have."""
 
 _SETTLE_FLUSH_S = 5.0
 _SETTLE_PAUSE_S = 0.2
@@ -32,7 +32,7 @@ _SETTLE_PAUSE_S = 0.2
 
 @dataclass(frozen=True)
 class FlushReport:
-    """What became of the scans that this client published."""
+    """The outcome of the scans that this client published."""
 
     taken: int  # learnt from
     refused: int  # seen by the server, but of no use
@@ -43,7 +43,7 @@ class FlushReport:
 
 @dataclass
 class _Source:
-    """How far a source has come."""
+    """The progress of a source."""
 
     session: int = field(default_factory=lambda: secrets.randbits(62))
     next_sequence: int = 0
@@ -56,7 +56,7 @@ class ScanPublisher:
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
         self._sending = threading.Lock()
-        self._lock = threading.Lock()  # of the dictionary, never held for long
+        self._lock = threading.Lock()  # of the dictionary, never locked for long
         self._sources: dict[str, _Source] = {}
         self._warned: set[str] = set()  # what was logged
 
@@ -80,7 +80,7 @@ class ScanPublisher:
         least = 1 if directions is None or len(directions) == 0 else 0
         cloud = np.ascontiguousarray(checks.scan_points(points, least=least))
         stamp_ns = time.time_ns() if stamp_s is None else checks.stamp_ns(stamp_s)
-        # Held while sending: the server takes a scan that is overtaken by its successor for lost.
+        # Locked while sending: the server takes a scan that is overtaken by its successor for lost.
         with self._sending:
             with self._lock:
                 state = self._sources.setdefault(source, _Source())
@@ -152,7 +152,7 @@ class ScanPublisher:
             _log.warning("%s", printable(text))
 
     def _dealt_with_by(self, deadline: float) -> Call[bool]:
-        """Whether the scans are, after some waiting: servers bound the time that one may ask."""
+        """Return whether the scans are, after some waiting: servers bound the time of a request."""
         wait_s = min(max(deadline - time.monotonic(), 0.0), _SETTLE_FLUSH_S)
         try:
             yield from self.flush(wait_s, pending=0)
@@ -163,7 +163,7 @@ class ScanPublisher:
         return True
 
     def _requests(self, timeout_s: float, pending: int) -> Iterator[FlushRequest]:
-        """One request per source; the scans that may be pending are shared out among them."""
+        """Yield one request per source; the scans that may be pending are shared out among them."""
         with self._lock:
             states = dict(self._sources)
         for source, state in states.items():

@@ -1,4 +1,4 @@
-"""Where scans come from: the trail of each source, and its newest scan."""
+"""The sources of scans: the trail of each, and its newest scan."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from triquad_client.net.call import Ask, Call, ask
 
 @dataclass(frozen=True)
 class NewestScan:
-    """The scan of a source that was taken into the map last."""
+    """The scan of a source that was accepted into the map last."""
 
     stamp_ns: int  # when it was taken, nanoseconds since 1970, as its publisher said
     world_from_sensor: Doubles  # [4, 4] pose of the sensor in the map frame
@@ -31,7 +31,7 @@ class NewestScan:
 
     @property
     def position_m(self) -> Doubles:
-        """Where the sensor was: [3] metres, map frame."""
+        """The position of the sensor: [3] metres, map frame."""
         return self.world_from_sensor[:3, 3]
 
 
@@ -40,13 +40,13 @@ class ScanSource:
     """A source of scans, and where its sensor has been."""
 
     name: str
-    scans: int  # that were taken into the map since the server heard of the source
+    scans: int  # that were accepted into the map since the server heard of the source
     trail: Doubles  # [N, 3] positions of the sensor, metres, map frame, oldest first
     pieces: Longs  # [N] the piece of the trail each is part of: rises where the sensor jumped
     newest: NewestScan | None  # None: a reset forgot it, and no scan has come since
 
     def lines(self) -> list[Doubles]:
-        """The trail as lines to draw: [K, 3] for each piece, the last one up to the newest scan."""
+        """Return the trail as lines to draw: [K, 3] a piece, the last one up to the newest scan."""
         lines = np.split(self.trail, np.flatnonzero(np.diff(self.pieces)) + 1)
         if self.newest is not None:
             lines[-1] = np.concatenate([lines[-1], self.newest.position_m[None]])
@@ -58,12 +58,12 @@ class SourceReport:
     """All sources of scans that a server knows of, with their whole trails."""
 
     server: str  # the run of the server, within which revisions compare
-    revision: int  # rises with each scan that is taken into the map
+    revision: int  # rises with each scan that is accepted into the map
     sources: Mapping[str, ScanSource]  # by name
 
 
 def sources(since: SourceReport | None, max_points: int) -> Call[SourceReport]:
-    """All sources; of what ``since`` told, only what is new travels."""
+    """Return all sources; only what is new since ``since`` travels."""
     if since is not None and not isinstance(since, SourceReport):
         raise InvalidInputError(f"since = {since!r}: give what an earlier call returned")
     limit = checks.count("max_points", max_points, MAX_SAMPLE_POINTS)
@@ -79,10 +79,10 @@ def sources(since: SourceReport | None, max_points: int) -> Call[SourceReport]:
 
 
 def _source(name: str, state: SourceState, before: Mapping[str, ScanSource]) -> ScanSource:
-    """A source after what is new of it.
+    """Return a source after what is new of it.
 
     Raises:
-        BadReplyError: that does not fit with what was told before.
+        BadReplyError: that does not fit with what was reported before.
     """
     newest = None if state.newest is None else _newest(state.newest)
     if state.whole:

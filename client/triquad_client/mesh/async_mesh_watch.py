@@ -18,8 +18,8 @@ class AsyncMeshWatch(WatchedMesh, Awaited):
 
     It is :class:`MeshWatch` to be awaited: use it in ``async with``, and ``async for``. Where the
     client is closed, what is awaited raises :class:`ClosedError`. Several tasks may use it: each
-    change is told to one of them. A task that is cancelled may take a change with it, which then
-    is in :attr:`tiles` without having been told; a ``timeout_s`` does not. A thread joins the
+    change is reported to one of them. A cancelled task may take a change with it, which then
+    is in :attr:`tiles` without having been reported; a ``timeout_s`` does not. A thread joins the
     tiles to a mesh.
     """
 
@@ -36,7 +36,7 @@ class AsyncMeshWatch(WatchedMesh, Awaited):
         await self.close()
 
     def __aiter__(self) -> "AsyncMeshWatch":
-        """Updates as they come, until the watch is closed."""
+        """Yield updates as they come, until the watch is closed."""
         return self
 
     async def __anext__(self) -> MeshUpdate:

@@ -49,7 +49,7 @@ class KnownTiles:
     """Tiles for a later watch to go on with.
 
     :meth:`MeshWatch.known_tiles` gives them, :meth:`Client.watch_mesh` takes them. They are of one
-    level of one server process: where that was restarted, they are fetched anew.
+    level of one server process: where that was restarted, they are fetched again.
     """
 
     server: str
@@ -60,7 +60,7 @@ class KnownTiles:
 
 @dataclass(frozen=True)
 class MeshUpdate:
-    """What one reply changed."""
+    """The changes by one reply."""
 
     changed: tuple[TileIndex, ...]  # tiles that are new or different
     removed: tuple[TileIndex, ...]
@@ -71,7 +71,7 @@ class MeshUpdate:
 
 @dataclass(frozen=True, eq=False)
 class FollowedMesh:
-    """What is known of the mesh tiles of a box; a reply gives another one."""
+    """The known mesh tiles of a box; a reply gives another one."""
 
     minimum: Doubles  # [3] metres, map frame
     maximum: Doubles  # [3]
@@ -79,7 +79,7 @@ class FollowedMesh:
     max_bytes_per_s: int  # 0: whatever the server allows
     name: str  # on which the server counts these bytes
     max_bytes: int  # of memory, for all tiles
-    server: str = ""  # which told all below
+    server: str = ""  # which reported all below
     tile_side_m: float = math.nan
     cell_m: float = math.nan
     tiles: Mapping[TileIndex, MeshTile] = field(default_factory=dict)
@@ -98,7 +98,7 @@ class FollowedMesh:
         *,
         max_bytes: int,
     ) -> "FollowedMesh":
-        """Nothing, or the ``known`` tiles; arguments as of :meth:`Client.watch_mesh`.
+        """Begin with nothing, or ``known`` tiles; arguments as of :meth:`Client.watch_mesh`.
 
         Raises:
             InvalidInputError: an argument cannot be used.
@@ -124,8 +124,8 @@ class FollowedMesh:
         return replace(empty, server=known.server, tile_side_m=side_m, tiles=tiles)
 
     def request(self, wait_s: float) -> TileUpdatesRequest:
-        """What to ask; the server answers once something changed, or after ``wait_s``."""
-        # Until all is known, the server has to be told which tiles are; then the revision says it.
+        """Return what to ask; the server answers once something changed, or after ``wait_s``."""
+        # Until all is known, the server has to know which tiles are; then the revision says it.
         # Of more than may be named, the rest travels again.
         known = [] if self.complete else list(self.known_tiles().tiles.values())[:MAX_KNOWN_TILES]
         return TileUpdatesRequest(
@@ -143,11 +143,11 @@ class FollowedMesh:
         )
 
     def after(self, reply: TileUpdates) -> "FollowedMesh":
-        """What is known after the reply to :meth:`request`.
+        """Return what is known after the reply to :meth:`request`.
 
         Raises:
             BadReplyError: its parts do not fit together, or it contradicts the reply before.
-            DownloadError: it holds more than may be kept.
+            DownloadError: it has more than may be kept.
         """
         self._check_order(reply)
         kept = sum(tile.nbytes for tile in self.tiles.values())
@@ -183,13 +183,13 @@ class FollowedMesh:
             )
 
     def mesh(self) -> Mesh:
-        """The tiles as one mesh, faces by their centroids within the bounds."""
+        """Return the tiles as one mesh, faces by their centroids within the bounds."""
         tiles = (Triangles(tile.origin + tile.vertices, tile.faces) for tile in self.tiles.values())
         whole = joined(tiles, self.tile_side_m, (self.minimum, self.maximum))
         return Mesh.of(whole, self.epoch)
 
     def known_tiles(self) -> KnownTiles:
-        """The tiles to go on with."""
+        """Return the tiles to go on with."""
         tiles = {index: tile for index, tile in self.tiles.items() if index not in self.stale}
         return KnownTiles(
             server=self.server, level=self.level, tile_side_m=self.tile_side_m, tiles=tiles
@@ -197,7 +197,7 @@ class FollowedMesh:
 
 
 def _unpacked(updates: TileUpdates, decoder: TileDecoder) -> dict[TileIndex, MeshTile]:
-    """The tiles of a reply; errors as of :meth:`TileDecoder.decode`."""
+    """Return the tiles of a reply; errors as of :meth:`TileDecoder.decode`."""
     tiles: dict[TileIndex, MeshTile] = {}
     decoded = decoder.decode(updates.sizes, updates.data)
     for row, (tile, (x, y, z)) in enumerate(zip(decoded, updates.tiles.tolist(), strict=True)):

@@ -28,7 +28,7 @@ class Mesh(Triangles):
 
     @classmethod
     def of(cls, triangles: Triangles, epoch: int) -> "Mesh":
-        """The triangles, which show the ``epoch``."""
+        """Return the triangles, which show the ``epoch``."""
         return cls(triangles.vertices, triangles.faces, triangles.filled, epoch)
 
     def save(self, path: str | Path) -> None:
@@ -44,13 +44,13 @@ class Mesh(Triangles):
 
         Raises:
             InvalidInputError: the name ends otherwise, trimesh is not installed, or holes were
-                filled, which an ``.stl`` cannot tell.
+                filled, which an ``.stl`` cannot say.
             OSError: the file cannot be written.
         """
         Path(path).write_bytes(self.file_bytes(Path(path).suffix))
 
     def file_bytes(self, suffix: str) -> bytes:
-        """What :meth:`save` writes to a file whose name ends in ``suffix``, such as ``".ply"``.
+        """Return what :meth:`save` writes to a file whose name ends in ``suffix``, as ``".ply"``.
 
         Raises:
             InvalidInputError: there is no such format, or trimesh is not installed.
@@ -61,7 +61,7 @@ class Mesh(Triangles):
         return encode(self)
 
     def to_trimesh(self) -> "trimesh.Trimesh":
-        """A copy for the library trimesh.
+        """Return a copy for the library trimesh.
 
         Raises:
             InvalidInputError: trimesh is not installed.
@@ -74,7 +74,7 @@ class Mesh(Triangles):
 
 
 def compacted(vertices: Doubles, faces: NDArray[np.integer]) -> Mesh:
-    """The mesh without vertices that no face uses."""
+    """Return the mesh without vertices that no face uses."""
     used = np.zeros(len(vertices), bool)
     used[faces] = True
     number = np.cumsum(used, dtype=np.int32) - np.int32(1)
@@ -86,7 +86,7 @@ def _ply(mesh: Mesh) -> bytes:
 
 
 def _glb(mesh: Mesh) -> bytes:
-    """Relative to its middle, where single precision is fine enough."""
+    """Return a mesh relative to its middle, where single precision is fine enough."""
     if not len(mesh.faces):
         return glb_bytes([])
     middle = 0.5 * (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0))
@@ -112,7 +112,7 @@ def _stl(mesh: Mesh) -> bytes:
 
 
 def _parts(mesh: Mesh) -> dict[str, Mesh]:
-    """The mesh by itself; where holes were filled, in two parts, ``seen`` and ``filled``."""
+    """Return the mesh by itself; where holes were filled, in two parts, ``seen`` and ``filled``."""
     if mesh.filled is None:
         return {"mesh": mesh}
     chosen = {"seen": ~mesh.filled, "filled": mesh.filled}

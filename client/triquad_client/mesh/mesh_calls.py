@@ -21,7 +21,7 @@ are filled, each may take a part of a second, and goes alone."""
 
 
 def fetch_tiles(bounds: Bounds | None, level: int, fill_m: float = 0.0) -> Call[TileList]:
-    """The tiles that meet the bounds."""
+    """Return the tiles that meet the bounds."""
     minimum, maximum = checks.box(bounds)
     request = TileListRequest(
         minimum,
@@ -34,7 +34,7 @@ def fetch_tiles(bounds: Bounds | None, level: int, fill_m: float = 0.0) -> Call[
 
 
 def fetch_tile(index: Sequence[int], level: int, max_bytes: int) -> Call[Mesh]:
-    """The newest mesh of one tile; errors as of :func:`fetch_mesh`."""
+    """Return the newest mesh of one tile; errors as of :func:`fetch_mesh`."""
     level, tiles = checks.level_of_detail(level), checks.tile_indices(index)
     reply = yield from ask(_ask_mesh(tiles, NEWEST, level, fill_m=0.0))
     (tile,) = _decoded(reply, tiles, TileDecoder(max_bytes), filled=False)
@@ -44,7 +44,7 @@ def fetch_tile(index: Sequence[int], level: int, max_bytes: int) -> Call[Mesh]:
 def fetch_mesh(
     bounds: Bounds | None, level: int, max_bytes: int, fill_m: float = 0.0
 ) -> Call[Mesh]:
-    """The faces whose centroids lie in the bounds, from one epoch.
+    """Return the faces whose centroids lie in the bounds, from one epoch.
 
     Raises:
         BadReplyError: a reply is not valid.
@@ -81,7 +81,7 @@ def _ask_mesh(tiles: Ints, epoch: int, level: int, fill_m: float) -> Ask[MeshRep
 def _decoded(
     reply: MeshReply, tiles: Ints, decoder: TileDecoder, *, filled: bool
 ) -> Iterator[Mesh]:
-    """The meshes of the tiles [T, 3] that were asked for, maybe ``filled``."""
+    """Yield the meshes of the tiles [T, 3] that were asked for, maybe ``filled``."""
     if filled != (reply.filled is not None):
         raise BadReplyError("filled: it came unasked, or did not come although it was asked for")
     surfaces = [tile.surface for tile in decoder.decode(reply.sizes, reply.data)]
@@ -92,7 +92,7 @@ def _decoded(
 
 
 def _marks(reply: MeshReply, faces: list[int]) -> list[Bools | None]:
-    """Which faces fill holes, for each tile, given the number of its ``faces``; None: not asked."""
+    """Return which faces fill holes, by tile, given the numbers of ``faces``; None: not asked."""
     if reply.filled is None:
         return [None] * len(faces)
     if len(reply.filled) != sum(faces):

@@ -22,7 +22,7 @@ _NOT_MOVED = np.eye(4)
 
 
 def ply_bytes(vertices: Doubles, faces: NDArray[np.integer], filled: Bools | None = None) -> bytes:
-    """A binary PLY file in double precision.
+    """Return a binary PLY file in double precision.
 
     Args:
         vertices: [V, 3] metres.
@@ -59,7 +59,7 @@ class GlbMesh:
 
 
 def glb_bytes(meshes: Sequence[GlbMesh], placed: Doubles = _NOT_MOVED) -> bytes:
-    """A GLB file that shows meshes, which a matrix [4, 4] takes to where they are in the scene."""
+    """Return a GLB file of meshes, which a matrix [4, 4] takes to where they are in the scene."""
     file = _GlbFile()
     matrix = placed.T.ravel().tolist()  # glTF has columns one after the other
     nodes = [{"mesh": file.add(mesh), "name": mesh.name, "matrix": matrix} for mesh in meshes]

@@ -47,7 +47,7 @@ class WatchedMesh:
 
     @property
     def complete(self) -> bool:
-        """Whether the last reply left nothing waiting."""
+        """True where the last reply left nothing waiting."""
         return self._followed.complete
 
     @property
@@ -66,7 +66,7 @@ class WatchedMesh:
         return self._followed.tile_side_m
 
     def known_tiles(self) -> KnownTiles:
-        """The tiles, for a later watch to go on with."""
+        """Return the tiles, for a later watch to go on with."""
         return self._followed.known_tiles()
 
     def _next(self, timeout_s: float | None) -> Call[MeshUpdate | None]:
@@ -96,7 +96,7 @@ class WatchedMesh:
             wait_s = 0.0 if update.changed else 1.0
 
     def _update(self, wait_s: float) -> Call[MeshUpdate]:
-        """What one reply changed: nothing where that of another call came first."""
+        """Return what one reply changed: nothing where that of another call came first."""
         before = self._followed
         request = before.request(wait_s)
         reply = yield from ask(
@@ -122,8 +122,8 @@ class MeshWatch(WatchedMesh, Blocking):
     """The mesh tiles of a box, kept up to date by :meth:`next`; nothing is asked in between.
 
     Use it in a ``with`` statement, or :meth:`close` it. Where a method raises, the tiles stay,
-    and it may be called again: after the server was restarted, all tiles are fetched anew, and the
-    old ones stay until then. Several threads may use it: each change is told to one of them.
+    and it may be called again: after the server was restarted, all tiles are fetched again, and the
+    old ones stay until then. Several threads may use it: each change is reported to one of them.
     """
 
     def __init__(self, connection: Connection, followed: FollowedMesh) -> None:
@@ -140,7 +140,7 @@ class MeshWatch(WatchedMesh, Blocking):
         self.close()
 
     def __iter__(self) -> Iterator[MeshUpdate]:
-        """Updates as they come, until the watch is closed."""
+        """Yield updates as they come, until the watch is closed."""
         return iter(self.next, None)
 
     def next(self, timeout_s: float | None = None) -> MeshUpdate | None:
@@ -161,7 +161,7 @@ class MeshWatch(WatchedMesh, Blocking):
         return None
 
     def mesh(self) -> Mesh:
-        """The tiles as one mesh, faces by their centroids within the bounds."""
+        """Return the tiles as one mesh, faces by their centroids within the bounds."""
         return self._followed.mesh()
 
     def close(self) -> None:

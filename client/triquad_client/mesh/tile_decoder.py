@@ -19,7 +19,7 @@ class DecodedTile(NamedTuple):
 
 
 class TileDecoder:
-    """Decodes tiles, which take so much memory and no more, in however many replies they come."""
+    """Decodes tiles, which take a given memory and no more, in however many replies they come."""
 
     def __init__(self, max_bytes: int, kept_bytes: int = 0) -> None:
         """Decode up to ``max_bytes``, of which others take ``kept_bytes`` already."""
@@ -27,7 +27,7 @@ class TileDecoder:
         self._taken = kept_bytes
 
     def decode(self, sizes: Longs, data: bytes) -> Iterator[DecodedTile]:
-        """Tiles whose ``sizes`` [T] in bytes add up to ``data``, one after the other.
+        """Yield tiles whose ``sizes`` [T] in bytes add up to ``data``, one after the other.
 
         Raises:
             BadReplyError: they are not valid.

@@ -1,1 +1,1 @@
-"""How calls travel: a Zenoh connection, and the drivers that run calls."""
+"""The way of calls to a server: a Zenoh connection, and the drivers that run calls."""

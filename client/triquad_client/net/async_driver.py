@@ -1,6 +1,6 @@
-"""Runs calls in tasks of an event loop, which none of them holds up.
+"""Runs calls in tasks of an event loop, which none of them blocks.
 
-Zenoh is told of a request in a thread of its own, one for all: sending blocks where the network is
+Zenoh is given a request in a thread of its own, one for all: sending blocks where the network is
 slow, and scans keep their order. Replies come back through callbacks, which leave nothing to wait
 for where a program ends without closing its client.
 """
@@ -41,7 +41,7 @@ class AsyncDriver(Driver):
     """Runs calls over a connection; for one event loop."""
 
     def __init__(self, connection: Connection, sender: ThreadPoolExecutor) -> None:
-        """``sender`` has one thread, and is used for nothing else."""
+        """Send in ``sender``, which has one thread, and is used for nothing else."""
         self._connection = connection
         self._sender = sender
         self._workers = ThreadPoolExecutor(_WORKERS, "triquad-worker")
@@ -50,11 +50,11 @@ class AsyncDriver(Driver):
         )
 
     async def in_order(self, job: Callable[[], DoneT]) -> DoneT:
-        """What ``job`` returns, run in the sending thread after all that was sent before."""
+        """Return what ``job`` returns, run in the sending thread after all that was sent before."""
         return await _in_thread(self._sender, job)
 
     async def maps(self) -> list[str]:
-        """Names of the maps of all servers that can be reached."""
+        """Return names of the maps of all servers that can be reached."""
         with _cancelled_on_error() as cancellation:
             arrival = _Arrival.expected()
             await self.in_order(
@@ -98,7 +98,7 @@ class AsyncDriver(Driver):
         raise self._connection.no_reply_error(ask, await self.maps())
 
     async def _work(self, job: Callable[[Run], Any]) -> Any:
-        """What a job returns; where the task is cancelled, so are the requests of the job."""
+        """Return what a job returns; where the task is cancelled, so are the job's requests."""
         with _cancelled_on_error() as cancellation:
             run = RemoteDriver(self._connection, cancellation).run
             working = asyncio.ensure_future(_in_thread(self._workers, lambda: job(run)))
@@ -112,14 +112,14 @@ class AsyncDriver(Driver):
 
 @dataclass(frozen=True)
 class _Arrival:
-    """Where the replies to a request will be, and what Zenoh shall do with them."""
+    """The place of the replies to a request, and what Zenoh shall do with them."""
 
     replies: _Replies
     receiver: Receiver
 
     @classmethod
     def expected(cls) -> "_Arrival":
-        """For the running event loop."""
+        """Make one for the running event loop."""
         loop = asyncio.get_running_loop()
         future: _Replies = loop.create_future()
         replies: list[zenoh.Reply] = []
@@ -145,7 +145,7 @@ async def _in_thread(threads: ThreadPoolExecutor, job: Callable[[], DoneT]) -> D
 
 @contextmanager
 def _cancelled_on_error() -> Iterator[zenoh.CancellationToken]:
-    """A token for requests, which are cancelled where the block fails or its task is cancelled."""
+    """Yield a token for requests, which are cancelled where the block fails or is cancelled."""
     token = zenoh.CancellationToken()
     try:
         yield token

@@ -37,7 +37,7 @@ class Ask(Generic[ReplyT]):
     """A request.
 
     Bulky ones go in the ``background``: a reply has the priority of its request, and a slow reader
-    of large replies must not hold up the distance queries of others.
+    of large replies must not delay the distance queries of others.
     """
 
     operation: str  # of triquad_format.wire.keys
@@ -45,7 +45,7 @@ class Ask(Generic[ReplyT]):
     kind: type[ReplyT]  # of the reply
     background: bool = False
     min_timeout_s: float = 0.0  # waits that long for the reply, where the connection would not
-    server_wait_s: float = 0.0  # and so much longer: the server may answer as late as that
+    server_wait_s: float = 0.0  # and that much longer: the server may answer as late as that
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Batch:
 
 @dataclass(frozen=True)
 class Work:
-    """A step: what would hold up an event loop. It is sent what ``job`` returns.
+    """A step: what would block an event loop. It is sent what ``job`` returns.
 
     The job runs in a thread where calls are awaited, and may run calls of its own.
     """
@@ -92,18 +92,18 @@ class Run(Protocol):
     """Runs calls to their end, in the thread that makes them."""
 
     def __call__(self, call: Call[ResultT]) -> ResultT:
-        """What the call returns; raises what it raises."""
+        """Return what the call returns; raises what it raises."""
 
 
 class AsyncRun(Protocol):
-    """Runs calls to their end, without holding up the event loop."""
+    """Runs calls to their end, without blocking the event loop."""
 
     async def __call__(self, call: Call[ResultT]) -> ResultT:
-        """What the call returns; raises what it raises."""
+        """Return what the call returns; raises what it raises."""
 
 
 def ask(request: Ask[ReplyT]) -> Call[ReplyT]:
-    """The reply to one request."""
+    """Return the reply to one request."""
     (reply,) = yield from ask_each([request], lambda only: only)
     return reply
 
@@ -111,7 +111,7 @@ def ask(request: Ask[ReplyT]) -> Call[ReplyT]:
 def ask_each(
     items: Iterable[ItemT], request: Callable[[ItemT], Ask[ReplyT]], at_once: int = _PARTS_IN_FLIGHT
 ) -> Call[list[ReplyT]]:
-    """The replies to one request per item; each is made when its turn comes, maybe in a thread."""
+    """Return the replies to one request per item; each is made in its turn, maybe in a thread."""
     return (yield from take_each(items, request, lambda _, reply: reply, at_once))
 
 
@@ -121,27 +121,27 @@ def take_each(
     take: Callable[[ItemT, ReplyT], ResultT],
     at_once: int = _PARTS_IN_FLIGHT,
 ) -> Call[list[ResultT]]:
-    """As :func:`ask_each`: what ``take``, which must be quick, makes of each item and its reply."""
+    """Return what ``take``, which must be quick, makes of each item and its reply."""
     taken: list[ResultT] = yield Batch(items, request, take, at_once)
     return taken
 
 
 def offload(job: Callable[[Run], ResultT]) -> Call[ResultT]:
-    """What ``job`` returns: long computing, or files."""
+    """Return what ``job`` returns: long computing, or files."""
     result: ResultT = yield Work(job)
     return result
 
 
 def put(job: Callable[[], ResultT]) -> Call[ResultT]:
-    """What ``job`` returns, which hands something to the network, in the order of the calls."""
+    """Return what ``job`` returns, which gives something to the network, in the order of calls."""
     result: ResultT = yield Put(job)
     return result
 
 
 def retried(code: str, attempt: Callable[[], Call[ResultT]]) -> Call[ResultT]:
-    """What ``attempt`` returns; where the server refuses with ``code``, it is tried anew.
+    """Return what ``attempt`` returns; where the server refuses with ``code``, it is tried again.
 
-    For questions of several requests, which the server can forget while they are under way.
+    This is for questions of several requests, which the server can forget meanwhile.
     """
     for _ in range(_ATTEMPTS - 1):
         try:
@@ -156,7 +156,7 @@ class Driver(ABC):
     """Takes the steps of calls, one after the other; subclasses say how."""
 
     async def run_call(self, call: Call[ResultT]) -> ResultT:
-        """What the call returns; raises what it raises."""
+        """Return what the call returns; raises what it raises."""
         with closing(call):
             resume = partial(call.send, None)
             while True:
@@ -181,7 +181,7 @@ class Driver(ABC):
 
     @abstractmethod
     async def _replies(self, batch: Batch) -> list[Any]:
-        """What is made of the replies to the requests, in the order of the items."""
+        """Return what is made of the replies to the requests, in the order of the items."""
 
     @abstractmethod
     async def _pause(self, seconds: float) -> None:
@@ -189,18 +189,18 @@ class Driver(ABC):
 
     @abstractmethod
     async def in_order(self, job: Callable[[], ResultT]) -> ResultT:
-        """What ``job`` returns, run after all that was sent before."""
+        """Return what ``job`` returns, run after all that was sent before."""
 
     @abstractmethod
     async def _work(self, job: Callable[[Run], Any]) -> Any:
-        """What ``job`` returns."""
+        """Return what ``job`` returns."""
 
 
 class BlockingDriver(Driver):
     """Takes the steps in the thread that makes the call. None of its coroutines ever waits."""
 
     def run(self, call: Call[ResultT]) -> ResultT:
-        """What the call returns; raises what it raises."""
+        """Return what the call returns; raises what it raises."""
         coroutine = self.run_call(call)
         try:
             coroutine.send(None)  # to its end: it waits for nothing, so it needs no event loop
@@ -214,7 +214,7 @@ class BlockingDriver(Driver):
         time.sleep(seconds)
 
     async def in_order(self, job: Callable[[], ResultT]) -> ResultT:
-        """What ``job`` returns."""
+        """Return what ``job`` returns."""
         return job()
 
     async def _work(self, job: Callable[[Run], Any]) -> Any:
@@ -226,7 +226,7 @@ async def exchange(
     send: Callable[[Ask[Any]], Awaitable[PendingT]],
     receive: Callable[[Ask[Any], PendingT], Awaitable[Any]],
 ) -> list[Any]:
-    """What is made of the replies to a batch, of which ``batch.at_once`` are awaited at a time."""
+    """Return what is made of a batch's replies; ``batch.at_once`` are awaited at a time."""
     waiting: deque[tuple[Any, Ask[Any], PendingT]] = deque()
     taken = []
 

@@ -38,7 +38,7 @@ _OF_CLIENTS: Mapping[str, Any] = {
     "connect/timeout_ms": 0,  # one attempt, not retries
     "transport/link/rx/max_message_size": codec.MAX_MESSAGE_BYTES,
 }
-"""How Zenoh is set up for a client, besides what a file says."""
+"""The settings of Zenoh for a client, besides what a file says."""
 
 Receiver: TypeAlias = Any
 """``None``, or a ``zenoh.handlers.Callback[zenoh.Reply]``: the overloads of Zenoh take no union."""
@@ -61,10 +61,10 @@ class Connection:
 
     @property
     def is_closed(self) -> bool:
-        """Whether the connection was closed.
+        """True where the connection was closed.
 
-        Zenoh is not asked: its answer waits for a lock and holds Python's meanwhile, while a thread
-        of Zenoh that has the former may want the latter, to tell that a request has ended.
+        Zenoh is not asked: its answer waits for a lock and keeps Python's meanwhile, while a thread
+        of Zenoh that has the former may want the latter, to report that a request has ended.
         """
         return not self._close.alive
 
@@ -103,7 +103,7 @@ class Connection:
         return replies
 
     def read(self, ask: Ask[ReplyT], reply: zenoh.Reply) -> ReplyT:
-        """The message of a reply. Nothing of it is used before all of it was checked.
+        """Return the message of a reply. Nothing of it is used before all of it was checked.
 
         Raises:
             RefusedError: the server refused.
@@ -128,7 +128,7 @@ class Connection:
         )
 
     def no_reply_error(self, ask: Ask[Any], available: list[str]) -> Exception:
-        """The error for a request that got no reply, where there are these maps."""
+        """Return the error for a request that got no reply, where there are these maps."""
         if self.is_closed:
             return closed_error()
         info = self._session.info
@@ -207,12 +207,12 @@ class RemoteDriver(BlockingDriver):
     def __init__(
         self, connection: Connection, cancellation: zenoh.CancellationToken | None = None
     ) -> None:
-        """Once ``cancellation`` is cancelled, every call ends with an error."""
+        """Run calls; once ``cancellation`` is cancelled, each ends with an error."""
         self._connection = connection
         self._cancellation = cancellation
 
     def maps(self) -> list[str]:
-        """Names of the maps of all servers that can be reached."""
+        """Return names of the maps of all servers that can be reached."""
         return map_names(self._connection.look_for_maps(cancellation=self._cancellation))
 
     async def _replies(self, batch: Batch) -> list[Any]:
@@ -228,12 +228,12 @@ class RemoteDriver(BlockingDriver):
 
 
 def closed_error() -> ClosedError:
-    """The error for what is asked of a closed client."""
+    """Return the error for what is asked of a closed client."""
     return ClosedError("the client is closed")
 
 
 def map_names(replies: Iterable[zenoh.Reply]) -> list[str]:
-    """The maps that the replies to :meth:`Connection.look_for_maps` name."""
+    """Return the maps that the replies to :meth:`Connection.look_for_maps` name."""
     names = {str(reply.ok.key_expr).split("/")[1] for reply in replies if reply.ok}
     return sorted(filter(keys.is_name, names))
 
@@ -246,7 +246,7 @@ def open_connection(
     *,
     max_download_bytes: int,
 ) -> Connection:
-    """A connection to a server; arguments and errors as of ``triquad_client.connect``."""
+    """Return a connection to a server; arguments and errors as of ``triquad_client.connect``."""
     timeout_s = checks.within("timeout_s", timeout_s, checks.LONGEST_S, least=0.0)
     most = checks.count("max_download_bytes", max_download_bytes, MAX_COUNT)
     where = f"with {config}" if endpoint is None and config else f"to {endpoint or _HERE}"
@@ -297,5 +297,5 @@ def _read_configuration(file: str | Path) -> zenoh.Config:
 
 
 def _reason(error: zenoh.ZError) -> str:
-    """What Zenoh says, on one line, without where in Zenoh it happened."""
+    """Return what Zenoh says, on one line, without where in Zenoh it happened."""
     return " ".join(str(error).split(" at /", 1)[0].split())

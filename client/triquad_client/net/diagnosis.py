@@ -1,4 +1,4 @@
-"""Why no link came about, in words that say what to do; Zenoh itself names the endpoint alone."""
+"""The reason why no link came about, and what to do; Zenoh itself names the endpoint alone."""
 
 import base64
 import json
@@ -27,11 +27,11 @@ _HINTS = {
     **dict.fromkeys((18, 19, 20), _OTHER_AUTHORITY),
     **dict.fromkeys((62, 64), _OTHER_HOST),
 }
-"""What to do, by the codes of OpenSSL."""
+"""The advice on what to do, by the codes of OpenSSL."""
 
 
 def why_no_link(config: zenoh.Config, timeout_s: float) -> str | None:
-    """What stands in the way of a link with ``config``, where that can be told."""
+    """Return what stands in the way of a link with ``config``, where that can be known."""
     found = list(_of_files(config))
     for endpoint in _endpoints(config):
         why = _of_endpoint(endpoint, config, max(0.01, min(timeout_s, _LONGEST_S)))
@@ -48,7 +48,7 @@ def _endpoints(config: zenoh.Config) -> list[str]:
 
 
 def _of_files(config: zenoh.Config) -> Iterator[str]:
-    """Credentials that cannot be read."""
+    """Yield credentials that cannot be read."""
     for name in _FILES:
         path = _tls(config, name)
         if path is None:
@@ -86,7 +86,7 @@ def _of_endpoint(endpoint: str, config: zenoh.Config, timeout_s: float) -> str |
 
 
 def _of_tcp(link: socket.socket) -> str:
-    """Why something that listens lets no link by plain TCP come about."""
+    """Return why something that listens lets no link by plain TCP come about."""
     if _speaks_tls(link):
         return (
             "the server wants an encrypted link and a certificate: connect with the file of a "
@@ -96,7 +96,7 @@ def _of_tcp(link: socket.socket) -> str:
 
 
 def _speaks_tls(link: socket.socket) -> bool:
-    """Whether the other side speaks TLS. Nothing is sent, so it does not matter who it is."""
+    """Return whether the other side speaks TLS. Nothing is sent: it does not matter who it is."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname = False
     context.verify_mode = ssl.CERT_NONE
@@ -108,7 +108,7 @@ def _speaks_tls(link: socket.socket) -> bool:
 
 
 def _of_tls(link: socket.socket, host: str, config: zenoh.Config) -> str:
-    """Why something that listens lets no link by TLS come about."""
+    """Return why something that listens lets no link by TLS come about."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname = _tls(config, "verify_name_on_connect") is not False
     try:
@@ -143,5 +143,5 @@ def _trust_authority(context: ssl.SSLContext, config: zenoh.Config) -> None:
 
 
 def _tls(config: zenoh.Config, key: str) -> Any:
-    """A value of the configuration; ``None`` where it has none."""
+    """Return a value of the configuration; ``None`` where it has none."""
     return json.loads(config.get_json(f"transport/link/tls/{key}"))

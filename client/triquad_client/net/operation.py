@@ -14,19 +14,19 @@ ArgumentsP = ParamSpec("ArgumentsP")
 
 
 class Blocking(ABC):
-    """Its operations return once they are done."""
+    """A class whose operations return once they are done."""
 
     @abstractmethod
     def _run(self, call: Call[ResultT]) -> ResultT:
-        """What the call returns; raises what it raises."""
+        """Return what the call returns; raises what it raises."""
 
 
 class Awaited(ABC):
-    """Its operations are coroutines."""
+    """A class whose operations are coroutines."""
 
     @abstractmethod
     async def _run(self, call: Call[ResultT]) -> ResultT:
-        """What the call returns; raises what it raises."""
+        """Return what the call returns; raises what it raises."""
 
 
 class operation(Generic[OwnerT, ArgumentsP, ResultT]):  # noqa: N801 - used as a decorator
@@ -64,13 +64,13 @@ class operation(Generic[OwnerT, ArgumentsP, ResultT]):  # noqa: N801 - used as a
     ) -> Callable[ArgumentsP, Coroutine[Any, Any, ResultT]]: ...
 
     def __get__(self, instance: object, owner: type) -> Callable[..., Any]:
-        """The method for objects of the class ``owner``, bound to ``instance`` if there is one."""
+        """Return the method for objects of class ``owner``, bound to ``instance`` if given."""
         method = self._awaited if issubclass(owner, Awaited) else self._blocking
         return method if instance is None else MethodType(method, instance)
 
 
 def _described(function: Callable[..., Any], method: Callable[..., Any]) -> Callable[..., Any]:
-    """``function`` with the name, documentation and signature of ``method``."""
+    """Return ``function`` with the name, documentation and signature of ``method``."""
     signature = inspect.signature(method)
     *_, result = get_args(signature.return_annotation)  # Call[result] is a generator's alias
     described = functools.update_wrapper(function, method)

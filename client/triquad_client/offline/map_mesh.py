@@ -14,17 +14,17 @@ from triquad_client.mesh.mesh import Mesh
 MAX_FACES = 50_000_000
 
 TILE_CELLS = 64
-"""Along each side of a tile, as in a server's mesh."""
+"""The cells along each side of a tile, as in a server's mesh."""
 
 WHOLE_TILE_CELLS = 128
 """The same where all tiles are made in a row: larger ones search less around them again."""
 
 Report = Callable[[int, int], None]
-"""Is told how many tiles are done, and of how many."""
+"""A function that is called with how many tiles are done, and of how many."""
 
 
 def map_lattice(cell_m: float, reach_m: float, *, whole: bool) -> TileLattice:
-    """The lattice of a map's tiles; ``whole``: all of them are made in a row."""
+    """Return the lattice of a map's tiles; ``whole``: all of them are made in a row."""
     return TileLattice(cell_m, WHOLE_TILE_CELLS if whole else TILE_CELLS, reach_m)
 
 
@@ -57,7 +57,7 @@ class MapTiles:
         self._box = box
         self._fill_m = fill_m
         self.side_m = lattice.tile_side_m
-        """Of a tile."""
+        """The side of a tile."""
         half_m = view.voxel_m / 2
         tiles = lattice.tiles_meeting(ends - half_m, ends + half_m, lattice.reach_m + fill_m)
         self.indices: list[TileIndex] = [
@@ -66,12 +66,12 @@ class MapTiles:
         """The tiles in which there may be faces: their least corners, in sides of a tile."""
 
     def mesh(self, index: TileIndex) -> Mesh:
-        """All faces in one of :attr:`indices`."""
+        """Return all faces in one of :attr:`indices`."""
         made = mesh_tile(self._view, index, self._lattice, fill_m=self._fill_m)
         return Mesh.of(made.triangles, self._view.epoch)
 
     def joined(self, report: Report | None) -> Mesh:
-        """The faces of all tiles whose centroids lie in the box.
+        """Return the faces of all tiles whose centroids lie in the box.
 
         Raises:
             InvalidInputError: there are more than 50 million faces.

@@ -29,10 +29,10 @@ if TYPE_CHECKING:
 
 CELL_RANGE_M = (0.005, 10.0)
 _CELL_LEAVES = 0.5
-_REACH_LEAVES = 0.1  # how far beside a voxel with seen surface the middle of a face may lie
+_REACH_LEAVES = 0.1  # how far from a voxel with seen surface the middle of a face may lie
 
 _NO_LIMITS = QuestionLimits(points=2**62, searches=2**62)
-"""Nobody else waits."""
+"""No limits, since nobody else waits."""
 
 
 class LocalDriver(BlockingDriver):
@@ -55,7 +55,7 @@ class LocalDriver(BlockingDriver):
 
     @contextmanager
     def _epoch(self, number: int) -> Iterator[MapView]:
-        """The view, where its epoch is asked for, or the newest."""
+        """Yield the view, where its epoch is asked for, or the newest."""
         if number not in (0, self.view.epoch):
             raise RefusedError(
                 "epoch_gone", f"epoch {number} is not kept; kept is [{self.view.epoch}]"
@@ -87,9 +87,9 @@ class OfflineMap(MapQueries):
         self.leaf_m = record.settings.leaf_m
         """Side of the voxels in which rays ended."""
         self.stamp_ns = stamp_ns
-        """When its epoch was written, nanoseconds since 1970; 0: the file does not tell."""
+        """The time when its epoch was written, nanoseconds since 1970; 0: the file does not say."""
         self.compiled = driver.opened.compiled
-        """Whether compiled code answers, as in the server; else numpy, which is far slower."""
+        """True where compiled code answers, as in the server; else numpy, which is far slower."""
 
     def __enter__(self) -> "OfflineMap":
         return self
@@ -98,7 +98,7 @@ class OfflineMap(MapQueries):
         self.close()
 
     def close(self) -> None:
-        """Let go of the map; later queries raise :class:`ClosedError`."""
+        """Release the map; later queries raise :class:`ClosedError`."""
         driver, self._driver = self._driver, None
         if driver is not None:
             driver.close()
@@ -110,13 +110,13 @@ class OfflineMap(MapQueries):
         report: "Report | None" = None,
         fill_m: float = 0.0,
     ) -> Mesh:
-        """The surface where rays have seen one, by marching cubes: the faces centred in ``bounds``.
+        """Return the surface that rays have seen, by marching cubes: faces centred in ``bounds``.
 
         Args:
             bounds: corners of a box, metres, map frame; ``None``: everywhere.
             cell_m: side of the cells, 0.005 to 10 m; ``None``: half a leaf, 0.1 m unless the map
                 was made with others, as in a server's mesh.
-            report: is told after each tile how many are done, and of how many.
+            report: is called after each tile with how many are done, and of how many.
             fill_m: also the surface up to so far from what was seen, 0 to 5 m, where the field
                 continues it into ``UNKNOWN`` space; those faces are marked in ``Mesh.filled``.
 
@@ -128,7 +128,7 @@ class OfflineMap(MapQueries):
         return self._tiles(cell_m, bounds, fill_m, whole=True).joined(report)
 
     def mesh_tiles(self, cell_m: float | None = None, fill_m: float = 0.0) -> "MapTiles":
-        """The surface as :meth:`mesh` has it, everywhere, to be made tile by tile.
+        """Return the surface as :meth:`mesh` has it, everywhere, to be made tile by tile.
 
         Args:
             cell_m: as of :meth:`mesh`.
@@ -158,14 +158,14 @@ class OfflineMap(MapQueries):
         return MapTiles(view, self.surface_voxels(), lattice, box, fill_m)
 
     def surface_voxels(self) -> Doubles:
-        """Middles [N, 3] of the voxels in which rays ended, metres, map frame."""
+        """Return middles [N, 3] of the voxels in which rays ended, metres, map frame."""
         return surface_voxels(self._seen)
 
     def has_surface(self, points: ArrayLike) -> Bools:
-        """Whether :meth:`mesh` may have faces [N] at ``points`` [N, 3], metres, map frame.
+        """Return whether :meth:`mesh` may have faces [N] at ``points`` [N, 3], metres, map frame.
 
         It has where the field is zero within a tenth of a leaf of a voxel in which rays ended, and
-        not beside where they ended in it.
+        not next to where they ended in it.
 
         Raises:
             InvalidInputError: the points are not [N, 3], or not finite.
@@ -185,16 +185,16 @@ class OfflineMap(MapQueries):
 
 
 def open_map(path: str | Path) -> OfflineMap:
-    """The map in a file, read whole and checked.
+    """Return the map in a file, read whole and checked.
 
     With numba installed (``pip install 'triquad[fast]'``) it answers as fast as a server; without
     it some forty times as slowly, as a warning in the log says. The surfels, on which distances
-    hang, are made at the first question that needs them: half a second for 100 m of street, or ten
-    seconds without numba.
+    depend, are made at the first question that needs them: half a second for 100 m of street, or
+    ten seconds without numba.
 
     Args:
-        path: a map file, beside which the other files lie that hold parts of it; or a server's
-            store, of which the newest checkpoint is taken.
+        path: a map file, next to which the other files lie that contain parts of it; or a server's
+            store, of which the newest checkpoint is read.
 
     Raises:
         MapFileError: it is no map file, is damaged, or needs a newer reader.

@@ -34,7 +34,7 @@ last checkpoint knows nearly as much."""
 
 @dataclass(frozen=True)
 class SyncReport:
-    """What it took to bring a copy up to date."""
+    """The cost of bringing a copy up to date."""
 
     epoch: int  # of the copy now
     bytes_received: int  # of the map file, its index included
@@ -43,13 +43,13 @@ class SyncReport:
 
     @property
     def parts(self) -> int:
-        """All that the copy holds."""
+        """All that the copy contains."""
         return self.parts_received + self.parts_kept
 
 
 @dataclass(frozen=True)
 class _State:
-    """What a copy is, as a whole: threads see one or the next."""
+    """The state of a copy, as a whole: threads see one or the next."""
 
     sha256: str  # of the file on the server that it was made from
     driver: LocalDriver
@@ -63,12 +63,12 @@ class LocalCopy:
     """The copy; for several threads. It is empty until :meth:`_update` has run."""
 
     def __init__(self, path: Path, bounds: Bounds, max_bytes: int) -> None:
-        """``path`` is the file, ``bounds`` are the corners of the box.
+        """Take the ``path`` of the file and the corners ``bounds`` of the box.
 
         ``max_bytes`` may be fetched at a time.
 
         Raises:
-            InvalidInputError: the bounds are not a box, or hold nothing.
+            InvalidInputError: the bounds are not a box, or contain nothing.
         """
         self._path = path
         self._max_bytes = max_bytes
@@ -88,7 +88,7 @@ class LocalCopy:
 
     @property
     def report(self) -> SyncReport:
-        """What it took to bring the copy up to date the last time."""
+        """The cost of bringing the copy up to date the last time."""
         return self._current().report
 
     def _answer(self, call: Call[ResultT]) -> ResultT:
@@ -149,10 +149,10 @@ class LocalCopy:
             return report
 
     def _refuse_emptier(self, info: MapInfo, seen_bytes: int) -> None:
-        """Raise where a server that was started again has lost what the copy holds.
+        """Raise where a server that was started again has lost what the copy has.
 
-        The run that the copy was made from may forget as it likes: somebody has told it to. Of
-        which run a file is that was there before, is not known.
+        The run that the copy was made from may forget as it likes: somebody has asked it to. It is
+        not known of which run a file is that was there before.
 
         Raises:
             EmptierMapError: it has.
@@ -170,19 +170,19 @@ class LocalCopy:
             )
 
     def _seen_before(self) -> int:
-        """What the file that is there knows of the box; it may be no map file."""
+        """Return what the file that is there knows of the box; it may be no map file."""
         with suppress(FormatError, FileNotFoundError), StoredMap.open(self._path) as older:
             return _seen_bytes(older.parts_in(self._low, self._high))
         return 0
 
 
 def _seen_bytes(parts: Iterable[Entry]) -> int:
-    """Bytes of what rays have shown: a measure of how much of the world a map knows."""
+    """Return the bytes of what rays have shown: a measure of how much of the world a map knows."""
     return sum(part.size for part in parts if part.key.topic == EVIDENCE)
 
 
 def _kept(path: Path, wanted: Sequence[Entry]) -> dict[PartKey, bytes]:
-    """The wanted parts that a file has already; it may be no map file."""
+    """Return the wanted parts that a file has already; it may be no map file."""
     kept: dict[PartKey, bytes] = {}
     with suppress(FormatError, FileNotFoundError), StoredMap.open(path) as older:
         known = {entry.key: entry for entry in older.manifest.entries}

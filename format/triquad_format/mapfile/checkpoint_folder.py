@@ -1,6 +1,6 @@
 """A folder of checkpoints: the epochs of a map that can be read back.
 
-A checkpoint is complete, or holds what changed and names the files that hold the rest.
+A checkpoint is complete, or contains what changed and names the files that contain the rest.
 """
 
 import re
@@ -29,12 +29,12 @@ class CheckpointFile:
 
 
 def checkpoint_name(epoch: int, complete: bool) -> str:
-    """Name of a checkpoint's file."""
+    """Return the name of a checkpoint's file."""
     return f"epoch-{epoch:09d}{'' if complete else '.delta'}.triquad"
 
 
 def checkpoint_file(path: Path) -> CheckpointFile | None:
-    """The checkpoint of that name; ``None`` where it is not the name of one."""
+    """Return the checkpoint of that name; ``None`` where it is not the name of one."""
     match = _NAME.fullmatch(path.name)
     if match is None or int(match[1]) >= 2**63:
         return None
@@ -42,7 +42,7 @@ def checkpoint_file(path: Path) -> CheckpointFile | None:
 
 
 def checkpoint_files(folder: Path) -> list[CheckpointFile]:
-    """The checkpoints in a folder, newest first; a complete one before a delta.
+    """Return the checkpoints in a folder, newest first; a complete one before a delta.
 
     What is no file, or a link to none, is left out.
 
@@ -54,7 +54,7 @@ def checkpoint_files(folder: Path) -> list[CheckpointFile]:
 
 
 def set_aside(folder: Path) -> list[Path]:
-    """Checkpoints in a folder that a server found damaged and renamed, in the order of names.
+    """Return checkpoints in a folder that a server found damaged and renamed, in order of names.
 
     Raises:
         OSError: the folder cannot be read.
@@ -64,7 +64,7 @@ def set_aside(folder: Path) -> list[Path]:
 
 
 def newest_of_each(files: Iterable[CheckpointFile]) -> list[CheckpointFile]:
-    """One file for each epoch: the complete one where there are two."""
+    """Return one file for each epoch: the complete one where there are two."""
     by_epoch: dict[int, CheckpointFile] = {}
     for file in files:
         by_epoch.setdefault(file.epoch, file)
@@ -72,7 +72,7 @@ def newest_of_each(files: Iterable[CheckpointFile]) -> list[CheckpointFile]:
 
 
 def map_folder(store: Path) -> Path:
-    """The folder of checkpoints that ``store`` is, or the only one that it holds.
+    """Return the folder of checkpoints that ``store`` is, or the only one that it contains.
 
     Raises:
         MapFileError: there is none, or there are several; the text names them.
@@ -88,7 +88,7 @@ def map_folder(store: Path) -> Path:
 
 
 def open_manifest(file: CheckpointFile) -> Manifest:
-    """The manifest of a checkpoint, found by the file's index.
+    """Return the manifest of a checkpoint, found by the file's index.
 
     Raises:
         MapFileError: the file is damaged, or needs a newer reader.
@@ -99,10 +99,10 @@ def open_manifest(file: CheckpointFile) -> Manifest:
 
 
 def checkpoint_of(folder: Path, epoch: int) -> CheckpointFile:
-    """The checkpoint of an epoch; the complete one where there are two.
+    """Return the checkpoint of an epoch; the complete one where there are two.
 
     Raises:
-        MapFileError: there is none; the text tells which there are.
+        MapFileError: there is none; the text says which there are.
         OSError: the folder cannot be read.
     """
     files = newest_of_each(checkpoint_files(folder))
@@ -115,14 +115,14 @@ def checkpoint_of(folder: Path, epoch: int) -> CheckpointFile:
 
 
 def checkpoint_at(folder: Path, when: str) -> CheckpointFile:
-    """The newest checkpoint that is not after ``when``.
+    """Return the newest checkpoint that is not after ``when``.
 
     Args:
-        folder: of checkpoints.
+        folder: the folder of checkpoints.
         when: number of an epoch, or a time as in RFC 3339 (local time where it has no offset).
 
     Raises:
-        MapFileError: ``when`` is neither, or there is no such checkpoint; the text tells which
+        MapFileError: ``when`` is neither, or there is no such checkpoint; the text says which
             there are.
         OSError: the folder or a file cannot be read.
     """

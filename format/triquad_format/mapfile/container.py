@@ -1,7 +1,7 @@
 """The MCAP file around a map's parts, as the ``mcap`` library parses it.
 
 A part is found by its place: a chunk record of one message, whose data is one zstd frame. Sizes
-are checked before memory is taken for them.
+are checked before memory is allocated for them.
 """
 
 import contextlib
@@ -54,13 +54,13 @@ _RecordT = TypeVar("_RecordT", bound=McapRecord)
 
 
 class RandomAccess(Protocol):
-    """Where a file's bytes come from."""
+    """The source of a file's bytes."""
 
     name: str
     size: int  # bytes
 
     def read(self, offset: int, length: int) -> bytes:
-        """Exactly ``length`` bytes from ``offset`` on.
+        """Return exactly ``length`` bytes from ``offset`` on.
 
         Raises:
             DamagedMapFileError: there are fewer.
@@ -73,7 +73,7 @@ class RandomAccess(Protocol):
 
 @dataclass(frozen=True)
 class FileEnd:
-    """What the end of a map file tells."""
+    """The summary at the end of a map file."""
 
     metadata: dict[str, str]  # of the record "triquad"
     data_bytes: int  # of the file before its record DataEnd
@@ -112,7 +112,7 @@ def read_end(source: RandomAccess) -> FileEnd:
 
 
 def _metadata_place(tail: bytes, start: int, footer: Footer) -> MetadataIndex:
-    """Where the metadata ``triquad`` lies, by the summary in ``tail``, from byte ``start`` on."""
+    """Return where the metadata ``triquad`` lies, by the summary in ``tail`` from ``start`` on."""
     offsets = _records(tail[max(footer.summary_offset_start - start, 0) :], "the summary offsets")
     places: list[MetadataIndex] = []
     for offset in offsets:
@@ -127,7 +127,7 @@ def _metadata_place(tail: bytes, start: int, footer: Footer) -> MetadataIndex:
 
 
 def read_message(source: RandomAccess, offset: int, stored: int) -> bytes:
-    """The data of the message in the chunk record at a place.
+    """Return the data of the message in the chunk record at a place.
 
     Raises:
         DamagedMapFileError: there is no intact chunk of one message.
@@ -141,7 +141,7 @@ def read_message(source: RandomAccess, offset: int, stored: int) -> bytes:
 
 
 def chunk_messages(data: bytes, where: int) -> list[bytes]:
-    """The data of the messages in the chunk record with which ``data`` begins.
+    """Return the data of the messages in the chunk record with which ``data`` begins.
 
     ``where`` is its place in the file, for messages.
 
@@ -164,7 +164,7 @@ def chunk_messages(data: bytes, where: int) -> list[bytes]:
 
 
 def compress(data: bytes, seams: Sequence[int], level: int) -> bytes:
-    """One zstd frame in which a block ends at each seam.
+    """Return one zstd frame in which a block ends at each seam.
 
     A block has one Huffman table: noise and numbers in one block compress badly.
 
@@ -182,7 +182,7 @@ def compress(data: bytes, seams: Sequence[int], level: int) -> bytes:
 
 
 def decompress(frame: bytes, limit: int = MAX_PART_BYTES) -> bytes:
-    """The content of a zstd frame, which states its size: at most ``limit`` bytes.
+    """Return the content of a zstd frame, which states its size: at most ``limit`` bytes.
 
     Raises:
         DamagedMapFileError: it is no whole frame, or is larger.
@@ -196,7 +196,7 @@ def decompress(frame: bytes, limit: int = MAX_PART_BYTES) -> bytes:
 
 
 def _first(data: bytes, kind: type[_RecordT], name: str) -> _RecordT:
-    """The record with which ``data`` begins, which must be of a kind."""
+    """Return the record with which ``data`` begins, which must be of a kind."""
     record = next(_parsed(data, name), None)
     if not isinstance(record, kind):
         raise DamagedMapFileError(f"{name} is missing or damaged: the file may be incomplete")
@@ -204,7 +204,7 @@ def _first(data: bytes, kind: type[_RecordT], name: str) -> _RecordT:
 
 
 def _records(data: bytes, name: str) -> list[McapRecord]:
-    """The records in ``data``, which ends with the footer and the closing magic."""
+    """Return the records in ``data``, which ends with the footer and the closing magic."""
     return list(_parsed(data, name))
 
 

@@ -10,7 +10,7 @@ from typing import BinaryIO
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """A stream whose bytes replace the file at ``path``, durably, where nothing is raised.
+    """Yield a stream whose bytes replace the file at ``path``, durably, where nothing is raised.
 
     Raises:
         OSError: the file cannot be written; it is named, and the one that was there stays.

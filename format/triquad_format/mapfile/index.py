@@ -50,7 +50,7 @@ def named(name: str) -> Iterator[None]:
 
 
 def open_regular(path: Path) -> io.FileIO:
-    """A file for reading; a pipe or device, which could keep its reader waiting, is refused.
+    """Return a file for reading; a pipe or device, which could keep its reader waiting, is refused.
 
     Raises:
         MapFileError: it is no regular file.
@@ -73,7 +73,7 @@ class FileBytes:
         self.size = os.fstat(self._stream.fileno()).st_size
 
     def read(self, offset: int, length: int) -> bytes:
-        """As :meth:`RandomAccess.read`; threads may read at the same time."""
+        """Read as :meth:`RandomAccess.read`; threads may read at the same time."""
         check_range(offset, length, self.size)
         data = os.pread(self._stream.fileno(), length, offset)
         while len(data) < length:
@@ -101,7 +101,7 @@ class MemoryBytes:
         self.data = data
 
     def read(self, offset: int, length: int) -> bytes:
-        """As :meth:`RandomAccess.read`."""
+        """Read as :meth:`RandomAccess.read`."""
         check_range(offset, length, self.size)
         return self.data[offset : offset + length]
 
@@ -110,7 +110,7 @@ class MemoryBytes:
 
 
 def check_range(offset: int, length: int, size: int) -> None:
-    """Raise :class:`DamagedMapFileError` unless the file's ``size`` bytes hold that range."""
+    """Raise :class:`DamagedMapFileError` unless the file's ``size`` bytes contain that range."""
     if offset < 0 or length < 0 or offset + length > size:
         raise DamagedMapFileError(
             f"bytes {offset} to {offset + length} are needed, but it has {size}: it is incomplete"
@@ -118,7 +118,7 @@ def check_range(offset: int, length: int, size: int) -> None:
 
 
 def files_in(folder: Path) -> OpenFile:
-    """Opens the other files that hold parts of a map, in the folder of the map file.
+    """Opens the other files that contain parts of a map, in the folder of the map file.
 
     One that was set aside as damaged is opened, too: its parts are checked one by one.
     """
@@ -127,13 +127,13 @@ def files_in(folder: Path) -> OpenFile:
 
 
 def file_in(folder: Path, name: str) -> Path:
-    """The file of this name; where it was set aside as damaged, under its new name."""
+    """Return the file of this name; where it was set aside as damaged, under its new name."""
     aside = folder / (name + DAMAGED_SUFFIX)
     return aside if aside.exists() and not (folder / name).exists() else folder / name
 
 
 def _payload(source: RandomAccess, entry: Entry) -> bytes:
-    """The payload of a part in the file that holds it.
+    """Return the payload of a part in the file that contains it.
 
     Raises:
         DamagedMapFileError: it is not there, or not the part that is listed.
@@ -149,14 +149,14 @@ def _payload(source: RandomAccess, entry: Entry) -> bytes:
 
 
 class OtherFiles:
-    """The other files that hold parts of a map; each is opened when it is needed."""
+    """The other files that contain parts of a map; each is opened when it is needed."""
 
     def __init__(self, open_file: OpenFile | None) -> None:
         self._open_file = open_file
         self._open: dict[str, RandomAccess] = {}
 
     def payload(self, entry: Entry) -> bytes:
-        """The payload of a part that another file holds.
+        """Return the payload of a part that another file contains.
 
         Raises:
             MapFileError: that file is missing, damaged or another.
@@ -194,7 +194,7 @@ class MapIndex:
 
         Args:
             source: the file; it is closed with this index.
-            open_file: opens the other files that hold parts; needed where there are any.
+            open_file: opens the other files that contain parts; needed where there are any.
 
         Raises:
             MapFileError: it is not a map file, is damaged, or needs a newer reader.
@@ -218,10 +218,10 @@ class MapIndex:
         self._others.close()
 
     def payload(self, entry: Entry) -> bytes:
-        """The payload of a part that the manifest lists.
+        """Return the payload of a part that the manifest lists.
 
         Raises:
-            MapFileError: the part is damaged, or the file that holds it is missing or another.
+            MapFileError: the part is damaged, or the file that contains it is missing or another.
             OSError: a file cannot be read.
         """
         return _payload(self._source, entry) if entry.file is None else self._others.payload(entry)

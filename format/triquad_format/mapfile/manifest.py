@@ -1,4 +1,4 @@
-"""The manifest: the list of all parts of a map, and the files that hold them."""
+"""The manifest: the list of all parts of a map, and the files that contain them."""
 
 import dataclasses
 import hashlib
@@ -59,7 +59,7 @@ class Entry:
     sha256: bytes  # of its payload
     epoch: int  # in which it last changed
     stamp_ns: int  # time of that epoch, nanoseconds since 1970; 0 if not known
-    file: str | None = None  # name of the file of the same folder that holds it; None: this one
+    file: str | None = None  # name of the file of the same folder that contains it; None: this one
     offset: int = 0  # where its chunk record begins in that file, bytes
     stored: int = 0  # bytes of that record, and of the message index after it
 
@@ -88,12 +88,12 @@ class Manifest:
         return tuple(entry for entry in self.entries if entry.file is None)
 
     def elsewhere(self, own: str) -> dict[PartKey, Entry]:
-        """The parts as another file lists them; ``own`` names the manifest's own file."""
+        """Return the parts as another file lists them; ``own`` names the manifest's own file."""
         return {e.key: dataclasses.replace(e, file=e.file or own) for e in self.entries}
 
 
 def pack_manifest(manifest: Manifest) -> Part:
-    """The manifest as the last part of its file.
+    """Return the manifest as the last part of its file.
 
     Raises:
         FormatError: it lists more than a manifest may.
@@ -134,10 +134,10 @@ def pack_manifest(manifest: Manifest) -> Part:
 
 
 def unpack_manifest(payload: bytes, file_bytes: int) -> Manifest:
-    """The manifest in a payload.
+    """Return the manifest in a payload.
 
     Args:
-        payload: of the part ``/triquad/manifest``.
+        payload: that of the part ``/triquad/manifest``.
         file_bytes: size of its file, which bounds how many parts it can list.
 
     Raises:
@@ -197,7 +197,7 @@ def _check_keys(keys: list[PartKey]) -> None:
 
 
 def _check_sizes(entries: tuple[Entry, ...], file_bytes: int) -> None:
-    """Refuse a file that unpacks to too much, or does not hold its first part itself."""
+    """Refuse a file that unpacks to too much, or does not contain its first part itself."""
     own = [entry for entry in entries if entry.file is None]
     if PartKey(MAP) not in {entry.key for entry in own}:
         raise DamagedMapFileError(f"{MANIFEST}: it does not list the part {MAP}")
@@ -211,7 +211,7 @@ def _check_sizes(entries: tuple[Entry, ...], file_bytes: int) -> None:
 
 
 def total_limit(file_bytes: int) -> int:
-    """Bytes to which all parts of a file of ``file_bytes`` may decompress together."""
+    """Return the bytes to which all parts of a file of ``file_bytes`` may decompress together."""
     return _FREE_TOTAL_BYTES + _MAX_TOTAL_RATIO * file_bytes
 
 

@@ -1,6 +1,6 @@
-"""What a map file says of itself: the version that its readers need, and facts of the whole map.
+"""The metadata of a map file: the version that its readers need, and facts of the whole map.
 
-The MCAP metadata record ``triquad`` holds both; the facts stand in the first part and in the
+The MCAP metadata record ``triquad`` contains both; the facts stand in the first part and in the
 manifest, too.
 """
 
@@ -50,12 +50,12 @@ class MapFacts:
 
     @classmethod
     def of(cls, record: MapRecord) -> "MapFacts":
-        """The facts of a record."""
+        """Return the facts of a record."""
         return cls(record.name, record.epoch, record.settings, record.progress)
 
 
 def pack_facts(facts: MapFacts) -> dict[str, object]:
-    """The facts as a msgpack map."""
+    """Return the facts as a msgpack map."""
     defaults = dataclasses.asdict(FieldSettings())
     settings = dataclasses.asdict(facts.settings)
     return {
@@ -70,7 +70,7 @@ def pack_facts(facts: MapFacts) -> dict[str, object]:
 
 
 def unpack_facts(body: PartBody) -> MapFacts:
-    """The facts in a part.
+    """Return the facts in a part.
 
     Raises:
         UnsupportedMapFileError: the part needs a newer reader.
@@ -87,7 +87,7 @@ def unpack_facts(body: PartBody) -> MapFacts:
 
 
 def check_map_part(payload: bytes, facts: MapFacts) -> None:
-    """Raise :class:`FormatError` unless the part ``/triquad/map`` tells the same facts."""
+    """Raise :class:`FormatError` unless the part ``/triquad/map`` states the same facts."""
     if unpack_facts(unpack_body(MAP, payload)) != facts:
         raise DamagedMapFileError(f"{MAP} and {MANIFEST} contradict each other")
 
@@ -107,7 +107,7 @@ def _unpack_progress(body: PartBody) -> MapProgress:
 
 
 def _unpack_settings(body: Mapping[str, object]) -> FieldSettings:
-    """The settings of a field; all must be there."""
+    """Return the settings of a field; all must be there."""
     values: dict[str, Any] = {}
     for name, default in dataclasses.asdict(FieldSettings()).items():
         value = body.get(name)
@@ -122,7 +122,7 @@ def _unpack_settings(body: Mapping[str, object]) -> FieldSettings:
 def pack_metadata(
     facts: MapFacts, *, stamp_ns: int | None, offset: int, stored: int
 ) -> dict[str, str]:
-    """The metadata of a file, whose manifest lies in the ``stored`` bytes from ``offset`` on.
+    """Return the metadata of a file, whose manifest is the ``stored`` bytes from ``offset`` on.
 
     ``stamp_ns`` is the time of its epoch, nanoseconds since 1970; ``None``: not known.
     """
@@ -139,7 +139,7 @@ def pack_metadata(
 
 
 def utc_time(stamp_ns: int) -> str:
-    """A time in nanoseconds since 1970 as in RFC 3339, to the second."""
+    """Return a time in nanoseconds since 1970 as in RFC 3339, to the second."""
     return datetime.fromtimestamp(stamp_ns // 10**9, timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
@@ -152,7 +152,7 @@ def check_readable(metadata: dict[str, str]) -> None:
 
     Raises:
         UnsupportedMapFileError: it needs a newer reader; the text names what is missing.
-        DamagedMapFileError: the metadata does not tell.
+        DamagedMapFileError: the metadata does not say.
     """
     needed = metadata.get("min_reader_version", "")
     if not _NUMBER.fullmatch(needed):
@@ -169,10 +169,10 @@ def _check_version(needed: int, producer: str) -> None:
 
 
 def manifest_place(metadata: dict[str, str]) -> tuple[int, int]:
-    """Where the manifest lies: offset and bytes.
+    """Return where the manifest lies: offset and bytes.
 
     Raises:
-        DamagedMapFileError: the metadata does not tell.
+        DamagedMapFileError: the metadata does not say.
     """
     offset, _, stored = metadata.get("manifest", "").partition(" ")
     if not (_NUMBER.fullmatch(offset) and _NUMBER.fullmatch(stored)):

@@ -1,6 +1,6 @@
-"""Checkpoints that must stay for a while: what the map was before a reset, or was gone back to.
+"""Checkpoints that must stay for a while: what the map was before a reset, or was restored to.
 
-They are listed in the file ``protected.json`` beside the checkpoints, so that they outlive the
+They are listed in the file ``protected.json`` next to the checkpoints, so that they outlive the
 server that listed them.
 """
 
@@ -32,7 +32,7 @@ class Protection:
 
 @dataclass(frozen=True)
 class Restored:
-    """A checkpoint that the map was taken back to."""
+    """A checkpoint that the map was restored to."""
 
     epoch: int
     as_epoch: int  # under which the map went on
@@ -44,11 +44,11 @@ class Protections:
 
     listed_ns: int = 0  # when it was made, nanoseconds since 1970, by that machine's clock
     checkpoints: tuple[Protection, ...] = ()
-    restored: Restored | None = None  # the last time that the map was taken back
+    restored: Restored | None = None  # the last time that the map was restored
 
 
 def read_protections(folder: Path) -> Protections:
-    """The list of a folder of checkpoints; an empty one where there is none.
+    """Return the list of a folder of checkpoints; an empty one where there is none.
 
     Raises:
         MapFileError: it is damaged, or of a later version.

@@ -32,7 +32,7 @@ class MapFile:
 
 
 def read_map(source: Path | str | BinaryIO, *, max_bytes: int = MAX_MAP_BYTES) -> MapRecord:
-    """The record in a map file; arguments and errors are those of :func:`read_map_file`."""
+    """Return the record in a map file; arguments and errors are those of :func:`read_map_file`."""
     return read_map_file(source, max_bytes=max_bytes).record
 
 
@@ -41,7 +41,7 @@ def read_map_file(source: Path | str | BinaryIO, *, max_bytes: int = MAX_MAP_BYT
 
     Args:
         source: a path, or a binary stream, which is read to its end. Parts in other files are
-            looked for in the folder of the path.
+            searched for in the folder of the path.
         max_bytes: limit on the file's size and, decompressed, on its parts together.
 
     Raises:
@@ -64,7 +64,7 @@ def read_map_file(source: Path | str | BinaryIO, *, max_bytes: int = MAX_MAP_BYT
 
 
 def _in_memory(stream: BinaryIO, max_bytes: int) -> MemoryBytes:
-    """The bytes of a stream, no more than it takes to see that there are too many."""
+    """Return the bytes of a stream, no more than it takes to see that there are too many."""
     blocks: list[bytes] = []
     # Block by block: one read of the limit's size would reserve all of it.
     while sum(map(len, blocks)) <= max_bytes and (block := stream.read(_BLOCK_BYTES)):
@@ -90,7 +90,7 @@ def _read(file: RandomAccess, index: MapIndex, max_bytes: int) -> MapFile:
 
 
 def assemble(manifest: Manifest, payload_of: Callable[[Entry], bytes]) -> MapRecord:
-    """The record of the parts of regions that a manifest lists.
+    """Return the record of the parts of regions that a manifest lists.
 
     Args:
         manifest: the list; regions come in the order of their parts ``/triquad/region``.

@@ -41,7 +41,7 @@ _USUAL_LEVEL = 1
 
 @dataclass(frozen=True)
 class Previews:
-    """What MCAP viewers show of a map. Map files carry it as it is handed in."""
+    """The previews that MCAP viewers show of a map. Map files carry them as they are given."""
 
     schema: bytes  # of foxglove.SceneUpdate, a FileDescriptorSet
     parts: Mapping[RegionIndex, Part]  # of the topic PREVIEW
@@ -75,14 +75,14 @@ def write_map(
     """Write a map file that needs no other.
 
     A path is written under a temporary name (``.<name>.<random>.tmp``) in the same folder, synced
-    and renamed, so that the final name never holds half a file.
+    and renamed, so that the final name never has half a file.
 
     Args:
         record: the map; it is checked first.
         file: a path, or a binary stream at the place where the file begins.
         feature_dtype: ``"<f2"`` or ``"<f4"``, the precision of features that are not int8.
-        stamp_ns: time of creation, nanoseconds since 1970; left out, the file holds no time.
-        previews: what MCAP viewers are to show; left out, the file holds nothing of the kind.
+        stamp_ns: time of creation, nanoseconds since 1970; left out, the file has no time.
+        previews: what MCAP viewers are to show; left out, the file has nothing of the kind.
 
     Raises:
         FormatError: the record is not valid, or exceeds a limit of the format.
@@ -115,7 +115,7 @@ def write_parts(
         facts: what the file says of the whole map.
         parts: what the map consists of. An entry stands for a part that lies in another file,
             and is one of ``known``.
-        stamp_ns: time of its epoch, nanoseconds since 1970; left out, the file holds no time.
+        stamp_ns: time of its epoch, nanoseconds since 1970; left out, the file has no time.
         known: parts of earlier epochs: an equal one keeps its epoch and time, and is not stored
             again where the entry names a file.
         preview_schema: that of :class:`Previews`; needed where there are previews among ``parts``.
@@ -172,7 +172,7 @@ class _PartsWriter:
         self._total = 0
 
     def write(self, parts: Iterable[Part | Entry], stamp_ns: int | None) -> WrittenMap:
-        """Write the file; the metadata tells the time ``stamp_ns``, if it is given."""
+        """Write the file; the metadata has the time ``stamp_ns``, if it is given."""
         self._mcap.start(library="triquad")
         entries = [self._stored(pack_part(PartKey(MAP), pack_facts(self._facts)))]
         for part in parts:
@@ -193,7 +193,7 @@ class _PartsWriter:
         return WrittenMap(info, manifest)
 
     def _stored(self, part: Part) -> Entry:
-        """The entry of a part, which is written unless another file has it."""
+        """Return the entry of a part, which is written unless another file has it."""
         entry = Entry(
             part.key,
             size=len(part.payload),
@@ -210,7 +210,7 @@ class _PartsWriter:
         return dataclasses.replace(entry, offset=offset, stored=stored)
 
     def _put(self, part: Part, stamp_ns: int) -> tuple[int, int]:
-        """Write a part; where its chunk begins, and bytes up to the next."""
+        """Write a part; return where its chunk begins, and bytes up to the next."""
         topic = part.key.topic
         if len(part.payload) > MAX_PART_BYTES:
             raise FormatError(
@@ -227,7 +227,7 @@ class _PartsWriter:
         return start, self._stream.size - start
 
     def _channel(self, topic: str) -> int:
-        """The number of a topic's channel, which is described before its first message."""
+        """Return the number of a topic's channel, which is described before its first message."""
         if topic not in self._channels:
             schema, encoding = 0, MESSAGE_ENCODING
             if topic == PREVIEW:

@@ -1,4 +1,4 @@
-"""Short names for arrays by what they hold; comments and docstrings give the shapes."""
+"""Short names for arrays by what they contain; comments and docstrings give the shapes."""
 
 import numpy as np
 from numpy.typing import NDArray

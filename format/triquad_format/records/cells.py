@@ -9,7 +9,7 @@ from triquad_format.records.arrays import Longs
 
 
 def cells_of_boxes(first: Longs, last: Longs) -> tuple[Longs, NDArray[np.intp]]:
-    """All cells [C, 3] from ``first`` to ``last`` [N, 3] of each box, and the boxes' rows [C]."""
+    """Return all cells [C, 3] from ``first`` to ``last`` [N, 3] of boxes, and boxes' rows [C]."""
     cells, rows = [np.zeros((0, 3), np.int64)], [np.zeros(0, np.intp)]
     for step in np.ndindex(*((last - first).max(axis=0, initial=0) + 1)):
         cell = first + step
@@ -20,7 +20,7 @@ def cells_of_boxes(first: Longs, last: Longs) -> tuple[Longs, NDArray[np.intp]]:
 
 
 def rows_by_cell(cells: Longs) -> Iterator[tuple[Longs, NDArray[np.intp]]]:
-    """Each different cell [3] of ``cells`` [N, 3], in order, with its rows [K], which ascend."""
+    """Yield each different cell [3] of ``cells`` [N, 3], in order, with its ascending rows [K]."""
     different, numbers = np.unique(cells, axis=0, return_inverse=True)
     ends = np.cumsum(np.bincount(numbers.reshape(-1)))
     rows = np.split(np.argsort(numbers.reshape(-1), kind="stable"), ends)
@@ -28,5 +28,5 @@ def rows_by_cell(cells: Longs) -> Iterator[tuple[Longs, NDArray[np.intp]]]:
 
 
 def cell_names(cells: Longs) -> Longs:
-    """One number for each of cells [N, 3], whose coordinates are 0 to 2**21 - 1."""
+    """Return one number for each of cells [N, 3], whose coordinates are 0 to 2**21 - 1."""
     return np.asarray((cells[:, 0] << 42) + (cells[:, 1] << 21) + cells[:, 2])

@@ -38,18 +38,18 @@ class LeafBox:
     high: NDArray[np.floating]  # [3]
 
     def meets(self, other: "LeafBox", slack: float = 0.0) -> bool:
-        """Whether the two come as near as ``slack`` leaves on every axis."""
+        """Return whether the two come as near as ``slack`` leaves on every axis."""
         near = (self.low <= other.high + slack) & (self.high >= other.low - slack)
         return bool(near.all())
 
 
 def whole_region(settings: FieldSettings) -> LeafBox:
-    """A region's cube."""
+    """Return a region's cube."""
     return LeafBox(np.zeros(3), np.full(3, float(1 << settings.depth)))
 
 
 def leaf_box(settings: FieldSettings, index: RegionIndex, low: Doubles, high: Doubles) -> LeafBox:
-    """The box between corners [3], metres, map frame, grown by what rounding may need."""
+    """Return the box between corners [3], metres, map frame, grown by what rounding may need."""
     centre = settings.region_centre(index)
     return LeafBox(
         settings.leaf_coordinates(low - centre) - SLACK_LEAVES,
@@ -58,7 +58,7 @@ def leaf_box(settings: FieldSettings, index: RegionIndex, low: Doubles, high: Do
 
 
 def check_box(minimum: ArrayLike, maximum: ArrayLike) -> tuple[Doubles, Doubles]:
-    """The corners [3] of a box, metres, as arrays.
+    """Return the corners [3] of a box, metres, as arrays.
 
     Raises:
         FormatError: they are not finite, or not in order.
@@ -70,7 +70,7 @@ def check_box(minimum: ArrayLike, maximum: ArrayLike) -> tuple[Doubles, Doubles]
 
 
 def crop_record(record: MapRecord, minimum: ArrayLike, maximum: ArrayLike) -> MapRecord:
-    """What a map needs to answer inside a box, to the last bit as before.
+    """Return what a map needs to answer inside a box, to the last bit as before.
 
     Regions whose cube meets the box stay, with the vertices whose hat functions reach into it,
     the evidence in it, and the replay samples in it with their share of the training budget.
@@ -93,7 +93,7 @@ def crop_record(record: MapRecord, minimum: ArrayLike, maximum: ArrayLike) -> Ma
 
 
 def without_training(record: MapRecord) -> MapRecord:
-    """The map without the state that training needs: it answers as before."""
+    """Return the map without the state that training needs: it answers as before."""
     regions = tuple(dataclasses.replace(region, training=None) for region in record.regions)
     return dataclasses.replace(record, regions=regions)
 
@@ -112,7 +112,7 @@ def _crop_region(settings: FieldSettings, region: Region, box: LeafBox) -> Regio
 
 
 def _reaching(settings: FieldSettings, table: VertexTable, box: LeafBox) -> NDArray[np.intp]:
-    """Rows of the vertices that have a hat function that is not zero all over the box."""
+    """Return rows of the vertices that have a hat function that is not zero all over the box."""
     axes = list(AXES[table.plane])
     vertices = morton.decode(table.codes, 2)
     scale = 1 << (settings.depth - table.level)
@@ -149,7 +149,7 @@ def _rows(
 
 
 def status_voxels(evidence: Evidence, box: LeafBox) -> Bytes:
-    """Bits [B, BLOCK_BYTES] of the voxels that decide the status in a box."""
+    """Return bits [B, BLOCK_BYTES] of the voxels that decide the status in a box."""
     first = morton.decode(evidence.codes, 3) * BLOCK_VOXELS
     voxels = first[:, :, None] + np.arange(BLOCK_VOXELS)  # [B, 3, 8]
     low, high = box.low - _REACH_VOXELS, box.high + _REACH_VOXELS

@@ -1,4 +1,4 @@
-"""What a map was made of so far. It goes on with the map, whichever process goes on with it."""
+"""The training progress of a map. It goes on with the map, whichever process goes on with it."""
 
 import math
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ _MOST = 2**62
 
 @dataclass(frozen=True)
 class MapProgress:
-    """How far a map has come."""
+    """The progress of a map."""
 
     scans_taken: int = 0
     samples_trained: int = 0

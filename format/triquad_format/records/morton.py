@@ -25,11 +25,11 @@ SPREAD_3D = (
     (4, 0x10C30C30C30C30C3),
     (2, 0x1249249249249249),
 )
-"""The same to bit ``3 * i``."""
+"""Return shifts and masks that move bit ``i`` of a number to bit ``3 * i``."""
 
 
 def encode(cells: NDArray[np.integer]) -> Longs:
-    """Morton codes of integer cells.
+    """Return Morton codes of integer cells.
 
     Args:
         cells: ``[..., D]`` with ``D`` 2 or 3, each coordinate in ``[0, 2**31)`` or ``[0, 2**20)``.
@@ -51,7 +51,7 @@ def encode(cells: NDArray[np.integer]) -> Longs:
 
 
 def decode(codes: NDArray[np.integer], dimensions: int) -> Longs:
-    """Integer cells ``[..., D]`` of Morton codes ``[...]``; the inverse of :func:`encode`."""
+    """Return cells ``[..., D]`` of Morton codes ``[...]``; the inverse of :func:`encode`."""
     spread = SPREAD_2D if dimensions == 2 else SPREAD_3D
     shifts = [shift for shift, _ in spread]
     top = 0x00000000FFFFFFFF if dimensions == 2 else 0x00000000001FFFFF

@@ -5,30 +5,30 @@ import numpy as np
 from triquad_format.records.arrays import Doubles
 
 RIGID_TOLERANCE = 1e-3
-"""By how much an element of R R^T may be off: files of 6 digits and single precision are."""
+"""The allowed error of an element of R R^T: files of 6 digits and single precision have it."""
 
 
 def rotation_error(pose: Doubles) -> float:
-    """By how much an element of R R^T is off, at most, for the rotation R of a pose [4, 4]."""
+    """Return the largest error of an element of R R^T, for the rotation R of a pose [4, 4]."""
     rotation = np.clip(pose[:3, :3], -2, 2)  # no larger number can be part of a rotation
     return float(np.abs(rotation @ rotation.T - np.eye(3)).max())
 
 
 def is_rotation(pose: Doubles) -> bool:
-    """Whether the upper left of a finite pose [4, 4] is a rotation, within the tolerance."""
+    """Return whether the upper left of a finite pose [4, 4] is a rotation, within the tolerance."""
     proper = np.linalg.det(np.clip(pose[:3, :3], -2, 2)) > 0
     return bool(proper and rotation_error(pose) <= RIGID_TOLERANCE)
 
 
 def is_rigid(pose: Doubles) -> bool:
-    """Whether a matrix is a pose [4, 4]: finite, a rotation, and with the last row 0 0 0 1."""
+    """Return whether a matrix is a pose [4, 4]: finite, a rotation, the last row 0 0 0 1."""
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         return False
     return is_rotation(pose) and bool((pose[3] == (0, 0, 0, 1)).all())
 
 
 def orthonormal(pose: Doubles) -> Doubles:
-    """A rigid pose as a new array, its rotation without the tolerance.
+    """Return a rigid pose as a new array, its rotation without the tolerance.
 
     Raises:
         ValueError: it is not rigid.

@@ -1,4 +1,4 @@
-"""What a map record must hold to be valid: checked before it is written and after it is read."""
+"""The check that a map record is valid, made before it is written and after it is read."""
 
 from collections.abc import Sequence
 
@@ -71,7 +71,7 @@ def _check_region(settings: FieldSettings, region: Region) -> None:
 
 
 def _mlp_shapes(settings: FieldSettings) -> list[tuple[int, ...]]:
-    """Shapes of the MLP's arrays: weights, then biases."""
+    """Return shapes of the MLP's arrays: weights, then biases."""
     hidden = settings.hidden
     weights = [(settings.input_size, hidden), (hidden, hidden), (hidden, 1)]
     return [*weights, (hidden,), (hidden,), (1,)]

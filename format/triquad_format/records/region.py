@@ -1,6 +1,6 @@
-"""A region as plain arrays: what the map file holds and what the evaluator reads.
+"""A region as plain arrays: what the map file contains and what the evaluator reads.
 
-Where it lies and what its coordinates are, :mod:`triquad_format.records.field_settings` tells. At
+:mod:`triquad_format.records.field_settings` says where it lies and what its coordinates are. At
 level ``l`` a node has side ``2**(depth - l)`` leaves; vertex ``(a, b)`` of a plane lies at
 ``(a, b) * 2**(depth - l)``. Evidence voxels have the side of a leaf.
 """
@@ -33,7 +33,7 @@ MARGIN_BITS = (2,) * 6
 """Bits of the margins of a surface voxel, one for each of its sides."""
 
 OUTCOME_BITS = (2, 4, 4)
-"""Bits of the codes that tell how often rays hit, passed and missed a surface voxel."""
+"""Bits of the codes for how often rays hit, passed and missed a surface voxel."""
 
 MAX_INTEGER = 32_639
 """Largest integer feature: its two bytes, both signed, reach no further."""
@@ -57,7 +57,7 @@ class VertexTable:
     scale: float | None = None  # of integer features: one step, in single precision
 
     def vectors(self) -> Floats:
-        """The feature vectors [V, feature_size] themselves: integers count steps of ``scale``."""
+        """Return the feature vectors [V, feature_size]: integers count steps of ``scale``."""
         vectors = self.features.astype(np.float32)
         return vectors if self.scale is None else vectors * np.float32(self.scale)
 
@@ -72,7 +72,7 @@ class Mlp:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What rays have shown, as bit masks of voxels with the side of a leaf, in sparse blocks."""
+    """The evidence of rays, as bit masks of voxels with the side of a leaf, in sparse blocks."""
 
     codes: Longs  # [B] 3-D Morton codes of blocks, strictly increasing
     surface: Bytes  # [B, BLOCK_BYTES] a ray ended in the voxel
@@ -99,16 +99,16 @@ class Evidence:
 
     In the order of :func:`seen_voxels`; the sides towards lesser x, y, z, then towards greater
     ones. 0 as well where the surface goes on beyond that side, or too few scans hit the voxel to
-    tell.
+    decide.
     """
 
 
 @dataclass(frozen=True)
 class TrainingState:
-    """What training needs beyond the field, to go on as if it had not stopped.
+    """The state that training needs beyond the field, to go on as if it had not stopped.
 
-    Adam's moments follow the order of the tables' rows and of the MLP's arrays. Samples are of what
-    no ray tells: that a surface is gone.
+    Adam's moments follow the order of the tables' rows and of the MLP's arrays. Samples show what
+    no ray does: that a surface was removed.
     """
 
     table_means: tuple[NDArray[np.floating], ...]  # per table [V, feature_size]
@@ -121,7 +121,7 @@ class TrainingState:
     sample_labels: NDArray[np.floating]  # [S] signed distance, metres
     budget_samples: int  # training budget: samples still to be trained on; 0: all is learnt
     rays: ReplayRays = field(default_factory=no_rays)
-    places_repaired: int = 0  # that had forgotten what they knew, and were learnt again
+    places_repaired: int = 0  # that had forgotten what they knew, and were trained again
     places_given_up: int = 0  # that had, and that training did not mend
 
 
@@ -145,7 +145,7 @@ class Region:
 
 @dataclass(frozen=True)
 class MapRecord:
-    """A map at one epoch: what a map file holds."""
+    """A map at one epoch: the content of a map file."""
 
     name: str
     epoch: int
@@ -155,19 +155,19 @@ class MapRecord:
 
     @property
     def has_evidence(self) -> bool:
-        """Whether rays have shown anything; without evidence all is ``UNKNOWN``."""
+        """True where rays have shown anything; without evidence all is ``UNKNOWN``."""
         return any(len(region.evidence.codes) for region in self.regions)
 
 
 def no_evidence() -> Evidence:
-    """Evidence of a region of which rays have shown nothing."""
+    """Return evidence of a region of which rays have shown nothing."""
     masks, none = np.zeros((0, BLOCK_BYTES), np.uint8), np.zeros(0, np.int64)
     outcomes, margins = (np.zeros((0, len(bits)), np.uint8) for bits in (OUTCOME_BITS, MARGIN_BITS))
     return Evidence(none, masks, masks, np.zeros(0, np.uint8), none, outcomes, margins)
 
 
 def seen_voxels(evidence: Evidence, masks: Bytes) -> Longs:
-    """Voxels [N, 3] of a region whose bit is set in ``masks`` [B, BLOCK_BYTES] of its evidence."""
+    """Return voxels [N, 3] of a region whose bit is set in evidence ``masks`` [B, BLOCK_BYTES]."""
     bits = np.unpackbits(masks, axis=1, bitorder="little")
     rows, voxel = np.nonzero(bits)
     inner = np.stack(np.unravel_index(voxel, (BLOCK_VOXELS,) * 3), axis=1)
@@ -176,14 +176,14 @@ def seen_voxels(evidence: Evidence, masks: Bytes) -> Longs:
 
 
 def used_blocks(masks: Bytes) -> NDArray[np.intp]:
-    """Rows of ``masks`` [B, BLOCK_BYTES] with any bit set."""
+    """Return rows of ``masks`` [B, BLOCK_BYTES] with any bit set."""
     # Of surface most rows are empty: they are of open air. Eight bytes at a time, by columns, takes
     # a quarter of the time of ``any``.
     return np.flatnonzero(reduce(np.bitwise_or, masks.view(np.uint64).T))
 
 
 def surface_counts(surface: Bytes) -> Longs:
-    """Numbers [B] of surface voxels in blocks with these masks [B, BLOCK_BYTES]."""
+    """Return numbers [B] of surface voxels in blocks with these masks [B, BLOCK_BYTES]."""
     counts = np.zeros(len(surface), np.int64)
     used = used_blocks(surface)
     counts[used] = _BITS_SET[surface[used]].sum(axis=1, dtype=np.int64)
@@ -191,7 +191,7 @@ def surface_counts(surface: Bytes) -> Longs:
 
 
 def masked(evidence: Evidence, mask: Bytes) -> Evidence:
-    """The evidence of the voxels whose bit is set in ``mask`` [B, BLOCK_BYTES]."""
+    """Return the evidence of the voxels whose bit is set in ``mask`` [B, BLOCK_BYTES]."""
     surface, free = evidence.surface & mask, evidence.free & mask
     rows = np.flatnonzero((surface | free).any(axis=1))
     before, after = (

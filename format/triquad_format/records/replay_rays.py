@@ -1,4 +1,4 @@
-"""Rays that training draws from again, as a record holds them."""
+"""Rays that training draws from again, as a record has them."""
 
 from dataclasses import dataclass, replace
 
@@ -10,12 +10,12 @@ from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Ints, L
 from triquad_format.records.field_settings import FieldSettings
 
 STEPS = 128
-"""Steps of a leaf in which the ends of rays are told: 1.6 mm at the default leaf."""
+"""Steps of a leaf in which the ends of rays are given: 1.6 mm at the default leaf."""
 
 SLOPE_SCALE = 255
 
 HELD_OUT = 32
-"""One ray in so many is held out: it is never trained on, and tells how good the field is."""
+"""One ray of this many is held out: it is never trained on, and shows how good the field is."""
 
 _AT_ONCE = 1 << 16
 
@@ -23,12 +23,12 @@ AXIS_BITS = 21
 AXIS_MASK = (1 << AXIS_BITS) - 1
 MIXED = np.uint64(0x9E3779B97F4A7C15)  # 2**64 over the golden section
 MIXED_SHIFT = 59
-"""The five upper bits hang on all of an end; rays are held out where they are zero."""
+"""The five upper bits depend on all of an end; rays are held out where they are zero."""
 
 
 def ray_keys(ends: NDArray[np.integer]) -> Longs:
-    """A number for each ray that ends at so many steps [N, 3], from the lower corner of a cube with
-    twice the region's side around its centre.
+    """Return a number for each ray that ends at ``ends`` [N, 3], in steps from the lower corner of
+    a cube with twice the region's side around its centre.
     """
     x, y, z = (ends.astype(np.int64) & AXIS_MASK).T
     keys: Longs = x << 2 * AXIS_BITS | y << AXIS_BITS | z
@@ -36,9 +36,9 @@ def ray_keys(ends: NDArray[np.integer]) -> Longs:
 
 
 def are_held_out(ends: NDArray[np.integer]) -> Bools:
-    """Which rays that end at so many steps [N, 3], counted as there, are held out.
+    """Return which rays that end at ``ends`` [N, 3], in steps as there, are held out.
 
-    It hangs on their ends alone: rays that are read back are held out as before.
+    It depends on their ends alone: rays that are read back are held out as before.
     """
     mixed = ray_keys(ends).astype(np.uint64) * MIXED
     chosen: Bools = mixed >> np.uint64(MIXED_SHIFT) == 0
@@ -57,7 +57,7 @@ class ReplayRays:
     slopes: Bytes
     """[R] by how much the signed distance falls for each metre of the ray, ``1 / SLOPE_SCALE``:
     the cosine of its angle to the surface's normal, or to the field's gradient where no normal is
-    known; SLOPE_SCALE also where neither is, and where the ends around tell the normal."""
+    known; SLOPE_SCALE also where neither is, and where the ends around give the normal."""
 
     origins: Floats  # [K, 3] where the sensor was, metres from the region's centre
 
@@ -74,19 +74,19 @@ class ReplayRays:
         return codes
 
     def ends_m(self, settings: FieldSettings) -> Doubles:
-        """Where they end [R, 3], metres from the region's centre: the middles of the steps."""
+        """Return the ends [R, 3], metres from the region's centre: the middles of the steps."""
         leaves = (self.ends + 0.5) / STEPS - (1 << settings.depth)
         return np.asarray(leaves * settings.leaf_m, np.float64)
 
     def chosen(self, rows: NDArray[np.intp]) -> "ReplayRays":
-        """Some of the rays, with the origins that they have."""
+        """Return some of the rays, with the origins that they have."""
         some = replace(
             self, ends=self.ends[rows], origin_of=self.origin_of[rows], slopes=self.slopes[rows]
         )
         return some.with_own_origins()
 
     def with_own_origins(self) -> "ReplayRays":
-        """The rays without origins of which none comes."""
+        """Return the rays without origins of which none comes."""
         used = np.bincount(self.origin_of, minlength=len(self.origins)) > 0
         numbers = np.cumsum(used, dtype=np.int32) - np.int32(1)
         return replace(self, origin_of=numbers[self.origin_of], origins=self.origins[used])

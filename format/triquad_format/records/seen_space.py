@@ -9,14 +9,14 @@ from triquad_format.records.region import Evidence, MapRecord, Region, masked, s
 
 
 def owned_evidence(settings: FieldSettings, region: Region) -> Evidence:
-    """The evidence that answers of the region hang on; the rest lies in its neighbours' space."""
+    """Return the evidence that answers of the region depend on, without its neighbours' space."""
     blocks, mine = morton.decode(region.evidence.codes, 3), settings.owned_blocks
     owned = ((blocks >= mine.start) & (blocks < mine.stop)).all(axis=1, keepdims=True)
     return masked(region.evidence, np.where(owned, np.uint8(0xFF), np.uint8(0)))
 
 
 def evidence_box(settings: FieldSettings, region: Region) -> Doubles | None:
-    """Corners [2, 3] of the box around a region's evidence, to whole blocks, metres, map frame.
+    """Return the box [2, 3] around a region's evidence, to whole blocks, metres, map frame.
 
     ``None`` where there is no evidence.
     """
@@ -28,7 +28,7 @@ def evidence_box(settings: FieldSettings, region: Region) -> Doubles | None:
 
 
 def evidence_bounds(record: MapRecord) -> Doubles | None:
-    """The same box around all that rays have shown of a map."""
+    """Return the same box around all that rays have shown of a map."""
     found = [evidence_box(record.settings, region) for region in record.regions]
     boxes = [box for box in found if box is not None]
     if not boxes:
@@ -37,7 +37,7 @@ def evidence_bounds(record: MapRecord) -> Doubles | None:
 
 
 def surface_voxels(record: MapRecord) -> Doubles:
-    """Middles [N, 3] of the voxels in which rays ended, metres, map frame."""
+    """Return middles [N, 3] of the voxels in which rays ended, metres, map frame."""
     settings, parts = record.settings, [np.empty((0, 3))]
     for region in record.regions:
         evidence = owned_evidence(settings, region)

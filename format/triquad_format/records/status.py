@@ -1,4 +1,4 @@
-"""What the evidence says of a queried point."""
+"""The status of a queried point, by the evidence."""
 
 from enum import IntEnum
 

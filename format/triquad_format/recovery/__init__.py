@@ -1,1 +1,1 @@
-"""What is intact of a damaged file."""
+"""The recovery of what is intact of a damaged file."""

@@ -1,6 +1,6 @@
 """The intact parts of a damaged map file, and of the other files that it needs.
 
-Nothing in a file tells where a chunk is: each is found by how it begins, and told from chance by
+Nothing in a file says where a chunk is: each is found by how it begins, and checked by
 its checksum. So nothing that is damaged hides what lies behind it.
 """
 
@@ -45,7 +45,7 @@ class PartsOfRegion:
     """The parts of one region."""
 
     found: dict[PartKey, bytes] = field(default_factory=dict)  # payloads of those that are intact
-    missing: set[PartKey] = field(default_factory=set)  # as far as the manifest tells
+    missing: set[PartKey] = field(default_factory=set)  # as far as the manifest says
 
 
 @dataclass(frozen=True)
@@ -54,12 +54,12 @@ class IntactParts:
 
     facts: MapFacts
     payloads: Mapping[PartKey, bytes]
-    missing: frozenset[PartKey] = frozenset()  # as far as the manifest tells
+    missing: frozenset[PartKey] = frozenset()  # as far as the manifest says
     parts_listed: int | None = None  # in the manifest; None: it is lost
     stamp_ns: int = 0  # when the epoch was written, nanoseconds since 1970; 0 if not known
 
     def by_region(self) -> dict[RegionIndex, PartsOfRegion]:
-        """The regions of which there is a part, or was one."""
+        """Return the regions of which there is a part, or was one."""
         regions: dict[RegionIndex, PartsOfRegion] = {}
         for key, data in self.payloads.items():
             regions.setdefault(key.region, PartsOfRegion()).found[key] = data
@@ -69,7 +69,7 @@ class IntactParts:
 
 
 def intact_parts(path: Path, max_bytes: int) -> IntactParts:
-    """The intact parts of a file, and of those in its folder that it needs.
+    """Return the intact parts of a file, and of those in its folder that it needs.
 
     Args:
         path: the file.
@@ -78,7 +78,7 @@ def intact_parts(path: Path, max_bytes: int) -> IntactParts:
     Raises:
         UnsupportedMapFileError: the file needs a newer reader.
         TooLargeMapFileError: it exceeds ``max_bytes``.
-        MapFileError: nothing tells what map this is.
+        MapFileError: nothing says what map this is.
         OSError: it cannot be read.
     """
     payloads = list(_payloads(path, max_bytes))
@@ -109,7 +109,7 @@ def _manifest(payloads: list[bytes]) -> Manifest | None:
 def _listed_parts(
     manifest: Manifest, payloads: list[bytes], folder: Path, max_bytes: int
 ) -> IntactParts:
-    """The parts that a manifest lists, known by their digests."""
+    """Return the parts that a manifest lists, known by their digests."""
     entries = [entry for entry in manifest.entries if entry.key.topic in REGION_TOPICS]
     wanted = {entry.sha256 for entry in entries}
     found = _by_digest(payloads, wanted)
@@ -131,7 +131,7 @@ def _by_digest(payloads: Iterator[bytes] | list[bytes], wanted: set[bytes]) -> d
 
 
 def _own_key(payload: bytes) -> PartKey | None:
-    """The key that a part of a region tells itself."""
+    """Return the key that a part of a region names itself."""
     topic = part_topic(payload)
     if topic not in REGION_TOPICS:
         return None
@@ -144,7 +144,7 @@ def _own_key(payload: bytes) -> PartKey | None:
 
 
 def _payloads(path: Path, max_bytes: int) -> Iterator[bytes]:
-    """The payloads in all intact chunks of a file, in their order.
+    """Yield the payloads in all intact chunks of a file, in their order.
 
     Raises:
         TooLargeMapFileError: the file is larger than ``max_bytes``, or unpacks to more.
@@ -167,13 +167,13 @@ def _payloads(path: Path, max_bytes: int) -> Iterator[bytes]:
 
 
 def _intact_messages(data: bytes) -> Iterator[bytes]:
-    """The data of the messages in all intact chunks."""
+    """Yield the data of the messages in all intact chunks."""
     budget = _LEAST_BUDGET + _BUDGET_RATIO * len(data)
     at = 0
     while match := _CHUNK.search(data, at):
         start, at = match.start(), match.start() + 1
         end = start + 9 + int.from_bytes(match[1], "little")
-        # Told by its head alone, at no cost: what only looks like a chunk takes no budget.
+        # Checked by its head alone, at no cost: what only resembles a chunk takes no budget.
         fills = match.end() + int.from_bytes(match[3], "little") == end
         if not fills or end > len(data) or end - start > budget:
             continue

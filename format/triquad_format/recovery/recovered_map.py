@@ -1,6 +1,6 @@
-"""What is intact in a damaged map file, as a valid map; and what is lost, and where.
+"""Recovery of what is intact in a damaged map file, as a valid map; and what is lost, and where.
 
-Where the manifest is intact, it tells what each part is and what is missing; else the parts tell of
+Where the manifest is intact, it says what each part is and what is missing; else the parts say it
 themselves.
 """
 
@@ -35,8 +35,8 @@ from triquad_format.records.region import AXES, MapRecord, Region, masked, seen_
 from triquad_format.recovery.intact_parts import IntactParts, intact_parts
 
 STATUS_REACH_LEAVES = 2
-"""How far beyond lost vertices a status may change: voxels that have an effect there are dropped
-whole, and had an effect half a leaf beyond."""
+"""Leaves beyond lost vertices in which a status may change: voxels that have an effect there are
+dropped whole, and had an effect half a leaf beyond."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Loss:
 
 @dataclass(frozen=True)
 class RecoveredMap:
-    """What was saved of a map, and what was not."""
+    """The saved part of a map, and a list of what was not saved."""
 
     record: MapRecord
     losses: tuple[Loss, ...]  # those that are known
@@ -65,12 +65,12 @@ class RecoveredMap:
 
     @property
     def complete(self) -> bool:
-        """Whether nothing was lost."""
+        """True where nothing was lost."""
         return not self.losses and self.parts_intact == self.parts_listed
 
 
 def recover(path: Path, *, max_bytes: int = MAX_MAP_BYTES) -> RecoveredMap:
-    """All that is intact in a map file, and in the files of its folder that it needs.
+    """Return all that is intact in a map file, and in the files of its folder that it needs.
 
     The result is valid. It answers as the whole map did wherever no loss reaches. Where vertices
     are lost, evidence goes with them: so nothing there passes for known. Training state stays
@@ -129,7 +129,7 @@ def _region(
     *,
     missing: set[PartKey],
 ) -> Region | None:
-    """The region of these parts, with its training state where that is complete."""
+    """Return the region of these parts, with its training state where that is complete."""
     choices = [REGION_TOPICS, FIELD_TOPICS]
     if any(key.topic in (VERTICES, *TRAINING_TOPICS) for key in missing):
         choices = [FIELD_TOPICS]
@@ -150,7 +150,7 @@ def _region(
 def _missing_squares(
     settings: FieldSettings, region: Region, payloads: Mapping[PartKey, bytes]
 ) -> set[PartKey]:
-    """Squares that held vertices: every node in which a surface was seen has its four corners."""
+    """Return squares that had vertices: every node with a seen surface has its four corners."""
     if settings.encoding == "fourier":
         return set()
     voxels = seen_voxels(region.evidence, region.evidence.surface)
@@ -169,7 +169,7 @@ def _missing_squares(
 def _masked_where_lost(
     settings: FieldSettings, regions: list[Region], losses: Sequence[Loss]
 ) -> list[Region]:
-    """The regions without evidence where vertices are lost, their own or a neighbour's."""
+    """Return the regions without evidence where vertices are lost, their own or a neighbour's."""
     vertices = [loss for loss in losses if loss.key.topic == VERTICES]
     low = np.array([loss.minimum for loss in vertices]).reshape(-1, 3)
     high = np.array([loss.maximum for loss in vertices]).reshape(-1, 3)
@@ -187,14 +187,14 @@ def _masked_where_lost(
 
 
 def loss_of(key: PartKey, settings: FieldSettings) -> Loss:
-    """The loss of a part; its box reaches as far as a status may change."""
+    """Return the loss of a part; its box reaches as far as a status may change."""
     low, high = effect_box(key, settings)
     reach_m = STATUS_REACH_LEAVES * settings.leaf_m
     return Loss(key, low - reach_m, high + reach_m)
 
 
 def effect_box(key: PartKey, settings: FieldSettings) -> Doubles:
-    """Corners [2, 3] of the box in which a part has an effect itself, metres, map frame."""
+    """Return corners [2, 3] of the box in which a part has an effect itself, metres, map frame."""
     box = extent(settings, key)
     if key.topic == VERTICES:
         # A vertex has an effect as far as the side of its level's nodes; those at the upper border

@@ -1,4 +1,4 @@
-"""Who may do what: Zenoh's ``access_control``, from rules that name what is done on which keys.
+"""Rights as Zenoh's ``access_control``, from rules that name what is done on which keys.
 
 All is denied but what a rule allows. Zenoh lets a message pass where the key expression of a rule
 *includes* that of the message. A list of what is forbidden would not do: the selector
@@ -13,7 +13,7 @@ from typing import Any
 from triquad_format.wire import keys
 
 LOOPBACK = "lo"
-"""The network interface by which programs of the same machine come, on Linux."""
+"""The network interface of links from programs of the same machine, on Linux."""
 
 _EVERY_MESSAGE = (
     "put",
@@ -29,7 +29,7 @@ _EVERY_MESSAGE = (
 
 
 class Verb(Enum):
-    """What is done on a key: messages of Zenoh from who does it, and messages to them."""
+    """An action on a key: messages of Zenoh from who does it, and messages to them."""
 
     ASK = (("query",), ("reply", "declare_queryable"))
     ANSWER = (("reply", "declare_queryable"), ("query",))
@@ -42,7 +42,7 @@ class Verb(Enum):
 
 @dataclass(frozen=True)
 class Rule:
-    """Something that is allowed; or forbidden, whatever else allows it."""
+    """A rule that allows something; or forbids it, whatever else allows it."""
 
     verb: Verb
     keys: tuple[str, ...]  # key expressions; a wildcard does not include chunks that begin with @
@@ -51,13 +51,13 @@ class Rule:
 
 @dataclass(frozen=True)
 class Subject:
-    """Who is at the other end of a link: all that is given has to hold, one of each.
+    """The other end of a link: all that is given has to match, one of each.
 
     Where nothing is given, it is everybody.
     """
 
     name: str
-    interfaces: tuple[str, ...] = ()  # of this machine, by which the link comes
+    interfaces: tuple[str, ...] = ()  # of this machine, over which the link comes
     cert_common_names: tuple[str, ...] = ()  # of the certificate shown, with mTLS
     usernames: tuple[str, ...] = ()
 
@@ -68,14 +68,14 @@ EVERYBODY = Subject("everybody")
 
 @dataclass(frozen=True)
 class Grant:
-    """What a subject may do. What fits several subjects may do what any of them may."""
+    """The rights of a subject. What fits several subjects may do what any of them may."""
 
     subject: Subject
     rules: tuple[Rule, ...]
 
 
 def access_control(grants: Sequence[Grant]) -> dict[str, Any]:
-    """The section ``access_control`` of the configuration of a server or a router.
+    """Return the section ``access_control`` of the configuration of a server or a router.
 
     The names of subjects have to differ.
     """
@@ -100,7 +100,7 @@ def access_control(grants: Sequence[Grant]) -> dict[str, Any]:
 
 
 def without_credentials(map_name: str, *, ros2: Sequence[Rule] = ()) -> tuple[Grant, ...]:
-    """Who may do what with a map server that tells people apart only by where they come from.
+    """Return the rights at a map server that distinguishes people only by where they come from.
 
     Programs of this machine may do everything. What comes from beyond may question the map, follow
     it and publish scans, and what ``ros2`` allows besides.
@@ -110,7 +110,7 @@ def without_credentials(map_name: str, *, ros2: Sequence[Rule] = ()) -> tuple[Gr
 
 
 def view(map_name: str) -> tuple[Rule, ...]:
-    """To question a map and to follow it."""
+    """Return the rules to query a map and to follow it."""
     return (
         Rule(Verb.ASK, (keys.all_queries_key(map_name),)),
         Rule(Verb.RECEIVE, (keys.status_key(map_name),)),
@@ -119,19 +119,19 @@ def view(map_name: str) -> tuple[Rule, ...]:
 
 
 def publish(map_name: str, sources: Sequence[str] | None = None) -> tuple[Rule, ...]:
-    """To publish the scans of these sources, or of all; nobody reads the scans of others."""
+    """Return the rules to publish the scans of these sources, or of all; nobody reads others'."""
     if sources is None:
         return (Rule(Verb.PUBLISH, (keys.all_scans_key(map_name),)),)
     return (Rule(Verb.PUBLISH, tuple(keys.scan_key(map_name, source) for source in sources)),)
 
 
 def administer(map_name: str) -> tuple[Rule, ...]:
-    """To change a map otherwise than by scans, and what its server keeps on disk."""
+    """Return the rules to change a map but by scans, and what its server keeps on disk."""
     return (Rule(Verb.ASK, (keys.all_admin_key(map_name),)),)
 
 
 def serve(map_name: str) -> tuple[Rule, ...]:
-    """To be the server of a map, behind a router."""
+    """Return the rules to be the server of a map, behind a router."""
     return (
         Rule(Verb.ANSWER, (keys.all_queries_key(map_name), keys.all_admin_key(map_name))),
         Rule(Verb.RECEIVE, (keys.all_scans_key(map_name),)),
@@ -143,7 +143,7 @@ def serve(map_name: str) -> tuple[Rule, ...]:
 def take_part_in_ros2(
     map_name: str, domain: int, published: Sequence[str] = ()
 ) -> tuple[Rule, ...]:
-    """To be nodes of rmw_zenoh in a domain, or bridges that publish topics of any name.
+    """Return the rules for nodes of rmw_zenoh in a domain, or bridges that publish any topics.
 
     ``published`` are the keys on which bridges receive what the server publishes. Since a topic may
     have any name, bridges may publish on all keys, but not on those of the server of the map.
@@ -161,14 +161,14 @@ def take_part_in_ros2(
 
 
 def everything() -> tuple[Rule, ...]:
-    """To do what one likes; Zenoh has no wildcard for chunks of keys that begin with ``@``."""
+    """Return rules for everything; Zenoh has no wildcard for chunks that begin with ``@``."""
     own = ("**/@alive/**", "**/@adv/**", "@/**")
     of_ros2 = ("@ros2_lv/**", "@/*/@ros2_lv/**", "@/*/@ros2_pub_cache/**")
     return (Rule(Verb.ALL, ("**", *own, *of_ros2)),)
 
 
 def _entries(name: str, rule: Rule) -> list[dict[str, Any]]:
-    """A rule as Zenoh writes it: an entry for each direction."""
+    """Return a rule as Zenoh writes it: an entry for each direction."""
     return [
         {
             "id": f"{name} {flow}",

@@ -1,13 +1,13 @@
 """Encoding of messages: one generic pair of functions, driven by the dataclasses' annotations.
 
-A message is a msgpack map that holds ``triquad`` (the protocol version), ``kind`` (the name of
+A message is a msgpack map that has ``triquad`` (the protocol version), ``kind`` (the name of
 its class) and its fields; an array is one of its dtype, shape and raw little-endian bytes. The
 messages themselves are in :mod:`triquad_format.wire.messages`; ``docs/wire-protocol.md`` is the
 specification.
 
-Before a message is unpacked, its structure is checked. A few megabytes can hold millions of tiny
-objects, or nest thousands deep; unpacking them would hold up everything else for seconds and take
-a hundred times their size. The headers alone tell, whose bytes are those of
+Before a message is unpacked, its structure is checked. A few megabytes can contain millions of tiny
+objects, or nest thousands deep; unpacking them would block everything else for seconds and take
+a hundred times their size. The headers alone are read, whose bytes are those of
 https://github.com/msgpack/msgpack/blob/master/spec.md
 """
 
@@ -50,7 +50,7 @@ _COUNT_BYTES = {0xDC: 2, 0xDD: 4, 0xDE: 2, 0xDF: 4}  # arrays and maps
 
 
 def _sizes() -> bytes:
-    """The size of an object, by its first byte; 0: that does not tell it, or it holds others."""
+    """Return an object's size by its first byte; 0: it does not give it, or contains others."""
     sizes = bytearray(256)
     for code in (*range(0x80), *range(0xE0, 0x100), 0xC0, 0xC2, 0xC3):  # small numbers, nil, truth
         sizes[code] = 1
@@ -72,19 +72,19 @@ class Message:
     @classmethod
     @functools.cache
     def annotations(cls) -> dict[str, Any]:
-        """The fields' names and annotations."""
+        """Return the fields' names and annotations."""
         return typing.get_type_hints(cls, include_extras=True)
 
     @classmethod
     @functools.cache
     def forms(cls) -> dict[str, "Form"]:
-        """How each field travels, by its name."""
+        """Return how each field travels, by its name."""
         return {name: _form(annotation) for name, annotation in cls.annotations().items()}
 
 
 @dataclass(frozen=True)
 class ArraySpec:
-    """What a field of a message accepts: one dtype, and sizes per axis (``None``: any)."""
+    """The arrays that a message's field accepts: one dtype, and sizes per axis (``None``: any)."""
 
     dtype: str
     shape: tuple[int | None, ...]
@@ -107,7 +107,7 @@ class ArraySpec:
 
 
 def encode(message: Message) -> bytes:
-    """The bytes of a message.
+    """Return the bytes of a message.
 
     Raises:
         WireError: a field does not fit its annotation.
@@ -118,7 +118,7 @@ def encode(message: Message) -> bytes:
 
 
 def decode(expected: type[MessageT], payload: bytes) -> MessageT:
-    """The message in ``payload``, which must be of the class ``expected``.
+    """Return the message in ``payload``, which must be of the class ``expected``.
 
     Unknown fields are ignored, so that a later minor revision can add some.
 
@@ -141,7 +141,7 @@ def decode(expected: type[MessageT], payload: bytes) -> MessageT:
 
 
 def pack_array(array: NDArray[np.generic]) -> dict[str, object]:
-    """The msgpack form of an array, little endian and C order."""
+    """Return the msgpack form of an array, little endian and C order."""
     dtype = array.dtype.str
     if dtype not in _ITEM_BYTES:
         array = array.astype(array.dtype.newbyteorder("<"))
@@ -153,7 +153,7 @@ def pack_array(array: NDArray[np.generic]) -> dict[str, object]:
 
 
 def unpack_array(name: str, packed: object) -> NDArray[np.generic]:
-    """The array of a msgpack form; read-only, sharing the message's bytes.
+    """Return the array of a msgpack form; read-only, sharing the message's bytes.
 
     Raises:
         WireError: the form is not complete or its sizes contradict each other. Nothing is
@@ -211,7 +211,7 @@ def check_structure(payload: bytes, max_objects: int = MAX_OBJECTS) -> None:
 
 
 def binary_offsets(payload: bytes) -> Iterator[range]:
-    """Where the bytes of each binary lie in a valid msgpack object, in their order."""
+    """Yield where the bytes of each binary lie in a valid msgpack object, in their order."""
     at, objects = 0, 1
     while objects:
         code = payload[at]
@@ -240,7 +240,7 @@ def _unpack_map(payload: bytes) -> dict[str, object]:
 
 
 def _header(payload: bytes, at: int) -> tuple[int, int]:
-    """Where the next header is, and how many objects the one at ``at`` announces."""
+    """Return where the next header is, and how many objects the one at ``at`` announces."""
     code = payload[at]
     if _SIZES[code]:
         return at + _SIZES[code], 0
@@ -261,7 +261,7 @@ def _header(payload: bytes, at: int) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class Form:
-    """How the values of a field travel. Both take the field's name, for errors, and a value."""
+    """The encoding of a field's values. Both take the field's name, for errors, and a value."""
 
     pack: Callable[[str, Any], object]
     unpack: Callable[[str, object], Any]
@@ -364,12 +364,12 @@ def _array_spec(annotation: Any) -> ArraySpec | None:
 
 
 def _plain(annotation: Any) -> Any:
-    """The type in an annotation, without what is noted beside it."""
+    """Return the type in an annotation, without its metadata."""
     return annotation.__origin__ if hasattr(annotation, "__metadata__") else annotation
 
 
 def _scalar(annotation: Any, name: str, value: object) -> Any:
-    """``value`` where it is exactly an ``annotation`` (an int also serves as a float)."""
+    """Return ``value`` where it is exactly an ``annotation`` (an int also serves as a float)."""
     if annotation is float and type(value) is int:
         return float(value)
     if type(value) is not annotation:

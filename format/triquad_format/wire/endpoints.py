@@ -1,4 +1,4 @@
-"""Where a server listens and is found, as people write it and as Zenoh takes it."""
+"""Endpoints where a server listens and is found, as people write them and as Zenoh takes them."""
 
 from typing import NamedTuple
 
@@ -20,14 +20,14 @@ class Locator(NamedTuple):
 
     @classmethod
     def of(cls, endpoint: str) -> "Locator":
-        """The parts of an endpoint, such as ``tcp/robot:7447``, whatever they are."""
+        """Return the parts of an endpoint, such as ``tcp/robot:7447``, whatever they are."""
         protocol, _, address = endpoint.partition("/")
         host, _, port = address.partition("#")[0].partition("?")[0].rpartition(":")
         return cls(protocol, host, port)
 
 
 def full_endpoint(text: str, protocol: str = "tcp") -> str:
-    """The endpoint of Zenoh that ``text`` stands for.
+    """Return the endpoint of Zenoh that ``text`` stands for.
 
     A host, such as ``robot``, ``192.168.0.7:7448`` or ``[::1]:7447``, is reached by ``protocol``,
     on port 7447 unless it names one. What has a ``/`` is an endpoint already and comes back as it
@@ -65,7 +65,7 @@ def _is_port(text: str) -> bool:
 
 
 def is_of_this_machine(endpoint: str) -> bool:
-    """Whether only programs of this machine reach an endpoint of Zenoh that is listened on."""
+    """Return whether only programs of this machine reach a Zenoh endpoint that is listened on."""
     protocol, host, _ = Locator.of(endpoint)
     if protocol.startswith("unix"):
         return True
@@ -73,7 +73,7 @@ def is_of_this_machine(endpoint: str) -> bool:
 
 
 def _host_and_port(text: str) -> tuple[str, str]:
-    """A host and its port; an address of IPv6 is in brackets then."""
+    """Return a host and its port; an address of IPv6 is in brackets then."""
     if text.startswith("["):
         host, _, rest = text.partition("]")
         return f"{host}]", rest.removeprefix(":") if rest else str(DEFAULT_PORT)

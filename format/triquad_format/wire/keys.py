@@ -1,4 +1,4 @@
-"""Zenoh key expressions: one key per operation, so that access control can tell them apart.
+"""Zenoh key expressions: one key per operation, so that access control can distinguish them.
 
 A map or source whose name cannot stand in a key is refused with a :class:`FormatError`.
 """
@@ -11,7 +11,7 @@ from triquad_format.wire.codec import PROTOCOL_VERSION, Message
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 
 EVERY_MAP = "*"
-"""In place of a map's name in key expressions of all maps."""
+"""The wildcard for a map's name in key expressions of all maps."""
 
 SCHEMA_PREFIX = "application/msgpack;triquad."
 
@@ -40,12 +40,12 @@ RESET = "admin/reset"
 
 
 def is_name(name: str) -> bool:
-    """Whether a map or source can have this name."""
+    """Return whether a map or source can have this name."""
     return _NAME.fullmatch(name) is not None
 
 
 def check_name(kind: str, name: str) -> str:
-    """``name``, where it can stand in a key."""
+    """Return ``name``, where it can stand in a key."""
     if not isinstance(name, str) or not is_name(name):
         raise FormatError(
             f"{kind} name {name!r} is not allowed: use a text of 1 to 64 letters, digits, "
@@ -55,42 +55,42 @@ def check_name(kind: str, name: str) -> str:
 
 
 def operation_key(map_name: str, operation: str) -> str:
-    """Key of a query, such as ``triquad/default/query/sdf``."""
+    """Return the key of a query, such as ``triquad/default/query/sdf``."""
     return f"triquad/{check_name('map', map_name)}/{operation}"
 
 
 def all_queries_key(map_name: str) -> str:
-    """Key expression of all operations that read a map."""
+    """Return the key expression of all operations that read a map."""
     return f"triquad/{_map_chunk(map_name)}/query/*"
 
 
 def all_admin_key(map_name: str) -> str:
-    """Key expression of all operations that change a map or the disk."""
+    """Return the key expression of all operations that change a map or the disk."""
     return f"triquad/{_map_chunk(map_name)}/admin/*"
 
 
 def scan_key(map_name: str, source: str) -> str:
-    """Key on which a source publishes its scans."""
+    """Return the key on which a source publishes its scans."""
     return f"triquad/{_map_chunk(map_name)}/scan/{check_name('source', source)}"
 
 
 def all_scans_key(map_name: str) -> str:
-    """Key expression of the scans of all sources."""
+    """Return the key expression of the scans of all sources."""
     return f"triquad/{_map_chunk(map_name)}/scan/*"
 
 
 def status_key(map_name: str) -> str:
-    """Key on which the server publishes its status about once a second."""
+    """Return the key on which the server publishes its status about once a second."""
     return f"triquad/{_map_chunk(map_name)}/status"
 
 
 def alive_key(map_name: str, server: str) -> str:
-    """Liveliness token of a server; ``*`` for both lists all servers and their maps."""
+    """Return the liveliness token of a server; ``*`` for both lists all servers and their maps."""
     return f"triquad/{map_name}/@alive/{server}"
 
 
 def encoding(message: type[Message]) -> str:
-    """Zenoh encoding of a message, such as ``application/msgpack;triquad.SdfRequest.v1``."""
+    """Return a message's Zenoh encoding, such as ``application/msgpack;triquad.SdfRequest.v1``."""
     return f"{SCHEMA_PREFIX}{message.__name__}.v{PROTOCOL_VERSION}"
 
 

@@ -1,25 +1,25 @@
 """Limits of requests that clients check before they send, and servers before they answer."""
 
 MAX_WAIT_S = 60.0
-"""For how long a request may wait for its answer, or for a change of the mesh."""
+"""The longest time that a request may wait for its answer, or for a change of the mesh."""
 
 MAX_FLUSH_S = 600.0
-"""For how long a client may wait for its scans to be in the map."""
+"""The longest time that a client may wait for its scans to be in the map."""
 
 MIN_LENGTH_M = 1e-6
-"""Of distances, ranges and grid cells: what is smaller is a mistake."""
+"""The least distance, range or grid cell: what is smaller is a mistake."""
 
 MAX_POSITION_M = 1e9
-"""Of a coordinate that is asked about: what is larger is hardly one in metres of the map frame."""
+"""The largest coordinate of a query: what is larger is hardly one in metres of the map frame."""
 
 MAX_DISTANCE_M = 100.0
-"""How far around a point surfaces may be looked for; also the largest radius and grid cell."""
+"""The largest distance of a search for surfaces; also the largest radius and grid cell."""
 
 MAX_RANGE_M = 1_000.0
-"""Of rays; also the longest segment."""
+"""The longest range of a ray; also the longest segment."""
 
 MAX_ITERATIONS = 200
-"""Steps of an alignment."""
+"""The most steps of an alignment."""
 
 MAX_QUERY_POINTS = 100_000
 """Points of one request for the field, which takes a server a tenth of a second of one core at
@@ -40,7 +40,7 @@ LEVELS = 3
 """Levels of detail of meshes: cells of level ``l`` are ``2**l`` times as large as those of 0."""
 
 MAX_SAMPLE_POINTS = 10_000
-"""Points of the newest scan of a source that are told of, at most."""
+"""The most points of the newest scan of a source in a reply."""
 
 TILE_INDEX_LIMIT = 1_000_000
 """Tile indices lie in ``[-TILE_INDEX_LIMIT, TILE_INDEX_LIMIT]``."""
@@ -58,15 +58,15 @@ MAX_TILE_M = 1e5
 """Side of a mesh tile."""
 
 MAX_FILL_M = 5.0
-"""How far from seen surface a mesh may be continued."""
+"""The farthest that a mesh may be continued from seen surface."""
 
 MAX_CHUNK_BYTES = 64 * 2**20
-"""Of a map file, in one reply."""
+"""The most bytes of a map file in one reply."""
 
 _POINT_BYTES = 12
 _OTHER_BYTES = 4096  # the largest message takes less without its points
 
 
 def payload_limit(points: int) -> int:
-    """Most bytes of a message of ``points`` points: what is larger is not decoded."""
+    """Return the most bytes of a message of ``points`` points: what is larger is not decoded."""
     return points * _POINT_BYTES + _OTHER_BYTES

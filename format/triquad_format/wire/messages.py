@@ -1,7 +1,7 @@
 """The wire messages. ``docs/wire-protocol.md`` says on which key each travels.
 
 Positions are ``float32`` offsets from a ``float64`` origin, so that a map in large coordinates
-(UTM, say) loses nothing on the way. ``epoch`` in a request pins an epoch; 0 asks for the newest.
+(UTM, say) keeps its precision. ``epoch`` in a request pins an epoch; 0 asks for the newest.
 Numbers of epochs compare only within one ``ServerStatus.server``.
 """
 
@@ -31,7 +31,7 @@ Pose = Annotated[NDArray[np.float64], ArraySpec("<f8", (4, 4))]
 TileIndices = Annotated[NDArray[np.int32], ArraySpec("<i4", (None, 3))]
 Integers = Annotated[NDArray[np.int64], ArraySpec("<i8", (None,))]
 
-# What replies hold, within its bounds: triquad_format.wire.reply.
+# What replies contain, within its bounds: triquad_format.wire.reply.
 Count = Annotated[int, Within(0, MAX_COUNT)]
 Epoch = Annotated[int, Within(0, MAX_COUNT)]
 Epochs = Annotated[Integers, Within(0, MAX_COUNT)]
@@ -65,7 +65,7 @@ class Scan(Message):
 
 @dataclass(frozen=True)
 class MapReply(Message):
-    """What a question about the map is answered with, all of it from one epoch."""
+    """The answer to a question about the map, all of it from one epoch."""
 
     # number of the published, immutable state of the map that answered
     epoch: Annotated[Epoch, SameAsAsked("epoch")]
@@ -94,7 +94,7 @@ class SdfReply(MapReply):
 
 @dataclass(frozen=True)
 class TileListRequest(Message):
-    """Which mesh tiles meet a box of the map frame; an open side is infinite."""
+    """Ask which mesh tiles meet a box of the map frame; an open side is infinite."""
 
     minimum: Point
     maximum: Point
@@ -139,7 +139,7 @@ class MeshReply(MapReply):
 
 @dataclass(frozen=True)
 class TileUpdatesRequest(Message):
-    """What changed of the mesh tiles in a box; answered once something did, or in time."""
+    """Ask which mesh tiles in a box changed; answered once something did, or in time."""
 
     minimum: Point
     maximum: Point  # of the box, map frame; an open side is infinite
@@ -175,7 +175,7 @@ class TileUpdates(Message):
 
 @dataclass(frozen=True)
 class StatusRequest(Message):
-    """How the server is doing."""
+    """Ask how the server is doing."""
 
 
 @dataclass(frozen=True)
@@ -191,7 +191,7 @@ class CheckpointInfo(Message):
 
 @dataclass(frozen=True)
 class FieldFit(Message):
-    """How well the field fits rays that it is never trained on, by place: a cube of 32 leaves.
+    """The fit of the field to rays that it is never trained on, by place: a cube of 32 leaves.
 
     The field should be zero where such a ray ends; medians are of how far it is from that, the
     sensor's noise included.
@@ -202,7 +202,7 @@ class FieldFit(Message):
     upper_m: Length  # what 90 % of them keep below
     worst: FinitePoints  # [K, 3] map frame, metres: centres of the places with the largest medians
     worst_median_m: Lengths  # [K]
-    repairing: Count  # places that have forgotten and are being learnt again
+    repairing: Count  # places that have forgotten and are being trained again
     repaired: Count  # places that were, so far
     given_up: Count  # and places that training did not mend
 
@@ -221,7 +221,7 @@ class ServerStatus(Message):
     scans_dropped: dict[Name, Count]  # by reason
     scans_lost: dict[Name, Count]  # by source: never arrived, or pushed out of the full queue
     scans_waiting: Count
-    points_dropped: dict[Name, Count]  # by reason, points and rays of scans that were taken
+    points_dropped: dict[Name, Count]  # by reason, points and rays of scans that were accepted
     requests_refused: dict[Name, Count]  # by error code
     samples_trained: Count  # of the map, likewise
     rays_kept: Count  # rays whose lessons are in the replay pools
@@ -236,13 +236,13 @@ class ServerStatus(Message):
     warnings: str | None = None  # what goes wrong with scans, and what helps: a line each
     samples_left: Count = 0  # training samples until nothing is left to learn
     map_bytes: Count = 0  # memory of the map with its newest epoch
-    map_max_bytes: Count = 0  # beyond which scans are refused as map_full; 0: not told
+    map_max_bytes: Count = 0  # beyond which scans are refused as map_full; 0: not known
     fit: FieldFit | None = None  # as it was judged last, None: not yet
     rays_discarded: Count = 0  # that gave way to others, since the server started
     replay_share: Annotated[float, Within(0, 1)] = 1.0
-    """Of the rays that each place is to keep, the share that memory has room for."""
+    """The share of the rays that each place is to keep for which memory has room."""
 
-    samples_discarded: Count = 0  # that more than a region may owe would have been
+    samples_discarded: Count = 0  # above the limit of a region's training budget
 
 
 @dataclass(frozen=True)
@@ -303,7 +303,7 @@ class MapInfo(Message):
     bytes: Count
     sha256: Digest
     chunk_bytes: Annotated[int, Within(1, MAX_CHUNK_BYTES)]
-    server: Name = ""  # a name of this server process; empty where it does not tell
+    server: Name = ""  # a name of this server process; empty where it is not known
 
 
 @dataclass(frozen=True)
@@ -325,7 +325,7 @@ class MapChunk(Message):
 
 @dataclass(frozen=True)
 class ErrorReply(Message):
-    """What an operation answers, as a Zenoh error reply, where it cannot do what was asked."""
+    """The answer of an operation, as a Zenoh error reply, where it cannot do what was asked."""
 
     code: str  # one of triquad_format.errors.ERROR_CODES
     message: str

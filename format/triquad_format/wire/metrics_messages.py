@@ -1,6 +1,6 @@
-"""The messages in which a server tells how it is doing, in figures.
+"""The messages in which a server reports how it is doing, in figures.
 
-Counts, sums and times only grow while a server runs: the difference of two answers tells of the
+Counts, sums and times only grow while a server runs: the difference of two answers is for the
 seconds between them. ``docs/wire-protocol.md`` says more.
 """
 
@@ -20,12 +20,12 @@ Seconds = Annotated[NDArray[np.float64], ArraySpec("<f8", (None,))]
 
 @dataclass(frozen=True)
 class MetricsRequest(Message):
-    """How is the server doing, in figures?"""
+    """Ask how the server is doing, in figures."""
 
 
 @dataclass(frozen=True)
 class TimeHistogram(Message):
-    """How long things took, as counts in the buckets of ``ServerMetrics.bounds_s``."""
+    """A histogram of times, as counts in the buckets of ``ServerMetrics.bounds_s``."""
 
     # [B + 1] of each bucket; the last one is of what took longer than all bounds
     counts: Annotated[Integers, Within(0, MAX_COUNT), RowsOf("bounds_s", more=1)]
@@ -33,7 +33,7 @@ class TimeHistogram(Message):
 
     @property
     def count(self) -> int:
-        """How many things were timed."""
+        """The number of things that were timed."""
         return int(self.counts.sum())
 
 
@@ -50,13 +50,13 @@ class OperationMetrics(Message):
 
     @property
     def answered(self) -> int:
-        """How many requests were answered."""
+        """The number of requests that were answered."""
         return self.answers.count
 
 
 @dataclass(frozen=True)
 class QueueMetrics(Message):
-    """What waits in a queue now."""
+    """The items that wait in a queue now."""
 
     waiting: Count
     limit: Count
@@ -110,7 +110,7 @@ class ServerMetrics(Message):
     def answer_time_s(
         self, operation: str, quantile: float, since: "ServerMetrics | None" = None
     ) -> float | None:
-        """Within which time a share of an operation's requests was answered, seconds.
+        """Return the time within which a share of an operation's requests was answered, seconds.
 
         Args:
             operation: its name, such as ``"query/sdf"``.

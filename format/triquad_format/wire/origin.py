@@ -1,4 +1,4 @@
-"""Who asks, and for how long: the attachment of a request."""
+"""The attachment of a request: who asks, and for how long."""
 
 import functools
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ class RequestOrigin(Message):
 
 
 def read_origin(attachment: bytes) -> RequestOrigin | None:
-    """The origin that an attachment names; ``None`` where it names none."""
+    """Return the origin that an attachment names; ``None`` where it names none."""
     return None if len(attachment) > MAX_ORIGIN_BYTES else _decoded(attachment)
 
 

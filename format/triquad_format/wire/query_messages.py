@@ -57,7 +57,7 @@ class DistanceRequest(Message):
 
     origin: Point  # metres, map frame
     points: Positions  # [N, 3] metres, relative to origin
-    max_distance_m: float  # a surface is looked for up to here
+    max_distance_m: float  # a surface is searched for up to here
     surface_point: bool  # the nearest points of the surface are wanted, too
     unknown_distance: bool  # so is the nearest unknown space
     epoch: int
@@ -85,7 +85,7 @@ class DistanceReply(MapReply):
 
 @dataclass(frozen=True)
 class SpheresRequest(Message):
-    """What spheres hold."""
+    """Ask what spheres contain."""
 
     origin: Point  # metres, map frame
     centres: Positions  # [N, 3] metres, relative to origin
@@ -102,13 +102,13 @@ class SpheresReply(MapReply):
 
 @dataclass(frozen=True)
 class SegmentsRequest(Message):
-    """What a ball meets that moves along segments."""
+    """Ask what a ball meets that moves along segments."""
 
     origin: Point  # metres, map frame
     starts: Positions  # [N, 3] metres, relative to origin
     ends: Positions  # [N, 3]
     radius_m: float  # of the ball
-    max_distance_m: float  # clearance is looked for up to here
+    max_distance_m: float  # clearance is searched for up to here
     epoch: int
 
 
@@ -129,7 +129,7 @@ class SegmentsReply(MapReply):
 
 @dataclass(frozen=True)
 class RaysRequest(Message):
-    """How far rays reach."""
+    """Ask how far rays reach."""
 
     origin: Point  # metres, map frame
     starts: Positions  # [N, 3] metres, relative to origin
@@ -154,7 +154,7 @@ class GroundRequest(Message):
 
     origin: Point  # metres, map frame
     points: Positions  # [N, 3] metres, relative to origin
-    max_drop_m: float  # the ground is looked for up to here
+    max_drop_m: float  # the ground is searched for up to here
     epoch: int
 
 
@@ -221,10 +221,10 @@ class AlignReply(MapReply):
 
 @dataclass(frozen=True)
 class ChangesRequest(Message):
-    """Where surface appeared or vanished since an epoch."""
+    """Ask where surface appeared or vanished since an epoch."""
 
     since: int  # number of an epoch; 0: the newest, after which nothing has changed yet
-    server: str  # of the reply or status that told of it; empty where that is not known
+    server: str  # of the reply or status that named it; empty where that is not known
     minimum: Point
     maximum: Point  # of the box that is of interest, map frame; an open side is infinite
 

@@ -1,6 +1,6 @@
-"""What the fields of replies keep to, and the check that a reply does, by whoever asked.
+"""The bounds of the fields of replies, and the check that the client makes of a reply.
 
-A field's annotation names its bounds beside its type, so that a message says all of it in one
+A field's annotation names its bounds next to its type, so that a message says all of it in one
 place. A server may be wrong or hostile: what does not answer the question is refused whole.
 """
 
@@ -17,10 +17,10 @@ from triquad_format.errors import WireError
 from triquad_format.wire.codec import Message
 
 MAX_COUNT = 2**53
-"""Of epochs and of anything that is counted: doubles hold all whole numbers up to here."""
+"""The largest epoch or count: doubles represent all whole numbers up to here."""
 
 _ROUNDING = 1e-4
-"""By how much of it a number may exceed what was asked for: single precision rounds."""
+"""The share by which a number may exceed what was asked for: single precision rounds."""
 
 _RIGID_TOLERANCE = 1e-3
 
@@ -33,14 +33,14 @@ class Exchange:
     around: tuple[Message, ...]  # the messages that the field is in, innermost first
 
     def number(self, bound: float | str) -> float:
-        """A bound, which may be a number of the question, or the negative of one."""
+        """Return a bound, which may be a number of the question, or the negative of one."""
         if not isinstance(bound, str):
             return bound
         asked = float(getattr(self.question, bound.removeprefix("-"))) * (1 + _ROUNDING)
         return -asked if bound.startswith("-") else asked
 
     def rows(self, field: str) -> int:
-        """The rows of an array that stands beside the field, or around it."""
+        """Return the rows of an array that stands next to the field, or around it."""
         holder = next(message for message in self.around if field in message.annotations())
         return len(getattr(holder, field))
 
@@ -49,7 +49,7 @@ class Check(Protocol):
     """A bound of a field; an annotation may have several."""
 
     def problem(self, value: Any, exchange: Exchange) -> str | None:
-        """What is wrong with a value, or ``None``."""
+        """Return what is wrong with a value, or ``None``."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Within:
     nan: bool = False  # some may be no numbers
 
     def problem(self, value: Any, exchange: Exchange) -> str | None:
-        """What is out of bounds, or not finite."""
+        """Return what is out of bounds, or not finite."""
         if isinstance(value, np.ndarray):
             if value.size == 0:
                 return None
@@ -86,13 +86,13 @@ class Within:
 
 @dataclass(frozen=True)
 class Text:
-    """A text of at most so many characters, which may have to be of some form."""
+    """A text of at most ``most`` characters, which may have to be of some form."""
 
     most: int
     form: str = ""  # a regular expression
 
     def problem(self, value: Any, exchange: Exchange) -> str | None:  # noqa: ARG002
-        """What is too long, or of another form."""
+        """Return what is too long, or of another form."""
         if len(value) > self.most:
             return f"{len(value)} characters are more than {self.most}"
         if self.form and not re.fullmatch(self.form, value):
@@ -102,12 +102,12 @@ class Text:
 
 @dataclass(frozen=True)
 class AskedBy:
-    """As many rows as an array of the question has, or bytes as one of its numbers says."""
+    """The bound of as many rows as an array of the question has, or bytes as a number says."""
 
     field: str
 
     def problem(self, value: Any, exchange: Exchange) -> str | None:
-        """Where the numbers differ."""
+        """Return how the numbers differ, or ``None``."""
         asked = getattr(exchange.question, self.field)
         count = asked if isinstance(asked, int) else len(asked)
         return None if len(value) == count else f"{len(value)} came for {count}"
@@ -115,12 +115,12 @@ class AskedBy:
 
 @dataclass(frozen=True)
 class AtMostAsked:
-    """At most as many rows as a number of the question says."""
+    """The bound of at most as many rows as a number of the question says."""
 
     field: str
 
     def problem(self, value: Any, exchange: Exchange) -> str | None:
-        """Where there are more."""
+        """Return how there are more rows, or ``None``."""
         most: int = getattr(exchange.question, self.field)
         return None if len(value) <= most else f"{len(value)} came, and {most} were asked for"
 
@@ -132,7 +132,7 @@ class ShapeAskedBy:
     field: str
 
     def problem(self, value: Any, exchange: Exchange) -> str | None:
-        """Where the sizes differ."""
+        """Return how the sizes differ, or ``None``."""
         shape, asked = list(value.shape), getattr(exchange.question, self.field).tolist()
         return None if shape == asked else f"{shape} came for {asked}"
 
@@ -144,32 +144,32 @@ class SameAsAsked:
     field: str
 
     def problem(self, value: Any, exchange: Exchange) -> str | None:
-        """Where it is another one."""
+        """Return how the value differs, or ``None``."""
         asked = getattr(exchange.question, self.field, 0)
         return f"{value} came for {asked}" if asked and value != asked else None
 
 
 @dataclass(frozen=True)
 class RowsOf:
-    """As many rows as another array of the reply, and ``more``."""
+    """The bound of as many rows as another array of the reply has, and ``more``."""
 
     field: str
     more: int = 0
 
     def problem(self, value: Any, exchange: Exchange) -> str | None:
-        """Where the numbers differ."""
+        """Return how the numbers differ, or ``None``."""
         count = exchange.rows(self.field) + self.more
         return None if len(value) == count else f"{len(value)} rows do not go with {count}"
 
 
 @dataclass(frozen=True)
 class PartsOf:
-    """How many rows of another array of the reply each of some parts has: all of its rows."""
+    """The numbers of rows that parts have of another array of the reply: all of its rows."""
 
     field: str
 
     def problem(self, value: Any, exchange: Exchange) -> str | None:
-        """Where the sum differs."""
+        """Return how the sum differs, or ``None``."""
         parts, count = int(value.sum()), exchange.rows(self.field)
         return None if parts == count else f"parts of {parts} rows do not go with {count}"
 
@@ -179,7 +179,7 @@ class RigidPose:
     """A rotation and a translation."""
 
     def problem(self, value: Any, exchange: Exchange) -> str | None:
-        """Where it is neither."""
+        """Return what is wrong where it is neither."""
         if problem := Within(-1e12, 1e12).problem(value, exchange):
             return problem
         rotation = np.clip(value[:3, :3], -2, 2)
@@ -208,14 +208,14 @@ def _problems(
 
 @dataclass(frozen=True)
 class _Bounds:
-    """What the values of a field keep to; of a map, its keys and its items."""
+    """The bounds of a field's values; of a map, those of its keys and its items."""
 
     checks: tuple[Check, ...] = ()
     key: "_Bounds | None" = None
     item: "_Bounds | None" = None
 
     def problems(self, name: str, value: Any, exchange: Exchange) -> Iterator[tuple[str, str]]:
-        """Where in the value of the field ``name`` something is wrong, and what."""
+        """Yield where in the value of the field ``name`` something is wrong, and what."""
         if value is None:
             return
         if isinstance(value, Message):
@@ -233,7 +233,7 @@ class _Bounds:
 
 @functools.cache
 def _bounds_of(kind: type[Any]) -> dict[str, _Bounds]:
-    """Those of a message's fields: to look them up by annotation takes longer than to check."""
+    """Return the bounds of a message's fields: to find them takes longer than to check them."""
     return {field: _bounds(annotation) for field, annotation in kind.annotations().items()}
 
 
@@ -245,7 +245,7 @@ def _bounds(annotation: Any) -> _Bounds:
 
 
 def _checks(annotation: Any) -> tuple[Check, ...]:
-    """The checks in an annotation, that of a field which may be ``None`` included."""
+    """Return the checks in an annotation, that of a field which may be ``None`` included."""
     if hasattr(annotation, "__metadata__"):
         return tuple(extra for extra in annotation.__metadata__ if hasattr(extra, "problem"))
     return tuple(check for choice in get_args(annotation) for check in _checks(choice))

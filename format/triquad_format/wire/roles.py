@@ -1,4 +1,4 @@
-"""What each role may do on a network where certificates tell everybody apart.
+"""The rights of each role on a network where certificates identify everybody.
 
 Servers and routers enforce it: they allow a client what its role may do, on all maps, and the
 rest is denied. Clients keep one of their own: they take nothing but from a server or a router.
@@ -27,7 +27,7 @@ ROUTER = "router"
 
 
 class Role(Enum):
-    """What a client is for; all may do what a viewer may."""
+    """The role of a client; all may do what a viewer may."""
 
     VIEWER = "viewer"  # questions the map, and follows it
     ROBOT = "robot"  # publishes scans as its own sources
@@ -42,7 +42,7 @@ class Holder:
     role: Role
     sources: tuple[str, ...] = ()  # of scans that it publishes, and nobody else
     ros2_domain: int | None = None  # of ROS 2, in which its nodes take part
-    issue: str = ""  # tells it from who had this name before, and may still have a certificate
+    issue: str = ""  # to distinguish it from an earlier client of this name with a certificate
 
     def __post_init__(self) -> None:
         keys.check_name("role", self.name)
@@ -51,24 +51,24 @@ class Holder:
 
     @property
     def common_name(self) -> str:
-        """The common name of its certificate, which tells Zenoh who it is."""
+        """The common name of its certificate, which identifies it to Zenoh."""
         return f"{self.role.value}:{self.name}:{self.issue}"
 
 
 def server_grants(holders: Sequence[Holder]) -> tuple[Grant, ...]:
-    """What a server or a router lets others do; those who are none of these may do nothing."""
+    """Return what a server or a router lets others do; all who are none of these do nothing."""
     domains = sorted({h.ros2_domain for h in holders if h.ros2_domain is not None})
     topics = tuple(_take_part(domain) for domain in domains)
     return (
         Grant(_known_as(SERVER), (*serve(keys.EVERY_MAP), *topics)),
-        # Who comes through a router was told apart there, and beyond it may be servers, too.
+        # Who comes through a router was identified there, and beyond it may be servers, too.
         Grant(_known_as(ROUTER), everything()),
         *(Grant(_known_as(holder.common_name), _allowed(holder)) for holder in holders),
     )
 
 
 def client_grants() -> tuple[Grant, ...]:
-    """What a client lets others do: servers and routers all, and nobody else anything."""
+    """Return what a client lets others do: servers and routers all, and nobody else anything."""
     return tuple(Grant(_known_as(name), everything()) for name in (SERVER, ROUTER))
 
 
@@ -84,7 +84,7 @@ def _allowed(holder: Holder) -> tuple[Rule, ...]:
 
 
 def _take_part(domain: int) -> Rule:
-    """In a domain of ROS 2, by rmw_zenoh: its topics, their history, and the graph of nodes."""
+    """Return rights to a ROS 2 domain, by rmw_zenoh: topics, their history, the graph of nodes."""
     return Rule(Verb.ALL, (f"{domain}/**", f"{domain}/**/@adv/**", f"@ros2_lv/{domain}/**"))
 
 

@@ -11,10 +11,10 @@ from triquad_format.wire.reply import MAX_COUNT, AtMostAsked, RigidPose, RowsOf,
 
 @dataclass(frozen=True)
 class SourcesRequest(Message):
-    """Where the sources of scans have been, and what the newest scan of each looks like."""
+    """Ask where the sources of scans have been, and for the newest scan of each."""
 
     server: str  # of the reply before, to which revision belongs; empty at first
-    revision: int  # of the reply before: what was told up to it is known; 0 at first
+    revision: int  # of the reply before: what was reported up to it is known; 0 at first
     max_points: int  # of each newest scan
 
 
@@ -31,10 +31,10 @@ class ScanSample(Message):
 
 @dataclass(frozen=True)
 class SourceState(Message):
-    """What is new of one source of scans."""
+    """The changes of one source of scans."""
 
-    scans: Count  # that were taken into the map since the server heard of the source
-    whole: bool  # what was told of this source before is void
+    scans: Count  # that were accepted into the map since the server heard of the source
+    whole: bool  # what was reported of this source before is void
     trail: FiniteCorners  # [N, 3] metres, map frame: positions of the sensor, oldest first
     # [N] the piece of the trail each is part of: rises where the sensor jumped
     pieces: Annotated[Integers, Within(0, MAX_COUNT), RowsOf("trail")]

@@ -24,27 +24,27 @@ _HEADER = struct.Struct("<II")  # vertices, faces
 _MAX_COUNT = 1 << 25
 _VERTEX_BYTES = 8  # three coordinates of two bytes, the axis, the step
 _LEVEL = 3
-"""Of zstandard: level 9 makes 6 % less of it, and takes twice and a half the time in all."""
+"""The level of zstandard: 9 makes 6 % less of it, and takes twice and a half the time in all."""
 
 
 @dataclass(frozen=True)
 class TileSurface:
     """Triangles of a tile, on its lattice."""
 
-    points: NDArray[np.uint16]  # [V, 3] lower lattice point of the edge that holds each vertex
+    points: NDArray[np.uint16]  # [V, 3] lower lattice point of the edge on which each vertex lies
     axes: NDArray[np.uint8]  # [V] axis of the edge
     steps: NDArray[np.uint8]  # [V] how far along it, in parts of STEPS
     faces: NDArray[np.int32]  # [F, 3] counter-clockwise seen from free space
 
     def positions(self, cell_m: float) -> NDArray[np.float32]:
-        """The vertices [V, 3], metres from the tile's minimum corner."""
+        """Return the vertices [V, 3], metres from the tile's minimum corner."""
         places = self.points.astype(np.float64)
         places[np.arange(len(places)), self.axes] += self.steps / STEPS
         return (places * cell_m).astype(np.float32)
 
 
 def encode_tile(surface: TileSurface) -> bytes:
-    """The bytes of a tile; vertices MUST be numbered in the order in which faces first use them.
+    """Return the bytes of a tile; vertices MUST be numbered in the order of first use by faces.
 
     The same surface always gives the same bytes.
     """
@@ -60,7 +60,7 @@ def encode_tile(surface: TileSurface) -> bytes:
 
 
 def decoded_bytes(data: bytes) -> int:
-    """Bytes that a tile's positions and faces will take, from its header alone.
+    """Return how many bytes a tile's positions and faces will take, from its header alone.
 
     Raises:
         WireError: these are not the bytes of a tile.
@@ -69,7 +69,7 @@ def decoded_bytes(data: bytes) -> int:
 
 
 def decode_tile(data: bytes) -> TileSurface:
-    """The inverse of :func:`encode_tile`.
+    """Invert :func:`encode_tile`.
 
     Raises:
         WireError: these are not the bytes of a tile.
@@ -95,7 +95,7 @@ def decode_tile(data: bytes) -> TileSurface:
 
 
 def _counts(data: bytes) -> tuple[int, int]:
-    """Vertices and faces, as the header has them."""
+    """Return vertices and faces, as the header has them."""
     if len(data) < _HEADER.size:
         raise WireError(f"a tile of {len(data)} bytes has no header")
     vertices, faces = _HEADER.unpack_from(data)
@@ -105,7 +105,7 @@ def _counts(data: bytes) -> tuple[int, int]:
 
 
 def _decompressed(data: bytes, size: int) -> bytes:
-    """A zstd frame's content, which must be ``size`` bytes."""
+    """Return a zstd frame's content, which must be ``size`` bytes."""
     try:
         declared = zstandard.frame_content_size(data)
         if declared != size:
@@ -116,7 +116,7 @@ def _decompressed(data: bytes, size: int) -> bytes:
 
 
 def _zigzag(values: NDArray[np.int16]) -> NDArray[np.uint16]:
-    """Small numbers of either sign as small numbers: 0, -1, 1, -2 become 0, 1, 2, 3."""
+    """Return small numbers of either sign as small numbers: 0, -1, 1, -2 become 0, 1, 2, 3."""
     return ((values << 1) ^ (values >> 15)).astype(np.uint16)
 
 
@@ -125,12 +125,12 @@ def _unzigzag(values: NDArray[np.uint16]) -> NDArray[np.int16]:
 
 
 def _planes(values: NDArray[np.unsignedinteger]) -> bytes:
-    """The lowest byte of each value, then the next of each, and so on."""
+    """Return the lowest byte of each value, then the next of each, and so on."""
     little = values.astype(values.dtype.newbyteorder("<"), copy=False)
     planes: bytes = little.reshape(-1, 1).view(np.uint8).T.tobytes()
     return planes
 
 
 def _joined(planes: NDArray[np.uint8], dtype: str) -> NDArray[np.unsignedinteger]:
-    """The values of byte planes [B, N]."""
+    """Return the values of byte planes [B, N]."""
     return np.frombuffer(np.ascontiguousarray(planes.T).tobytes(), dtype)

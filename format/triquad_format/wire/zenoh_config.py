@@ -14,17 +14,17 @@ QUIET: Mapping[str, Any] = {
     # tenth of a second, which training does to it.
     "transport/shared_memory/enabled": False,
 }
-"""Neither to look for others nor to be found by them, and no shared memory."""
+"""Settings to search for no others nor to be found by them, and without shared memory."""
 
 _MADE_UP_OF_ONE = ("access_control", "transport/shared_memory")
 """Sections of which a part makes no sense without the others: a file sets all or nothing."""
 
 
 class ZenohConfig(Protocol):
-    """What is used of ``zenoh.Config``."""
+    """The methods of ``zenoh.Config`` that are used."""
 
     def get_json(self, key: str) -> str:
-        """The value at a path, as JSON."""
+        """Return the value at a path, as JSON."""
 
     def insert_json5(self, key: str, value: str) -> None:
         """Set the value at a path."""
@@ -42,7 +42,7 @@ def fill(config: ZenohConfig, values: Mapping[str, Any], unset: ZenohConfig) -> 
 
 
 def is_set(config: ZenohConfig, path: str, unset: ZenohConfig) -> bool:
-    """Whether a value differs from that of ``unset``, a new configuration."""
+    """Return whether a value differs from that of ``unset``, a new configuration."""
     for section in _MADE_UP_OF_ONE:
         if path.startswith(section):
             path = section

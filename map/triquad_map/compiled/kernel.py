@@ -1,4 +1,4 @@
-"""How kernels are compiled, and where their compiled code is kept.
+"""The compilation of kernels, and the folder of their compiled code.
 
 numba finds compiled code on disk as long as the file of a kernel is the same, whatever became of
 the functions and constants that the kernel takes from other files. So the folder of the cache is
@@ -36,7 +36,7 @@ _CONSTANTS = (
 """Files of which kernels take constants and records, in addition to those that define kernels."""
 
 _LEAST_FREE_BYTES = 200 << 20
-"""With less room on the disk no new folder is begun; the code of all kernels takes 25 MB."""
+"""The least room on the disk for a new folder; the code of all kernels takes 25 MB."""
 
 _log = logging.getLogger(__name__)
 
@@ -80,17 +80,17 @@ def inner_kernel(**options: Any) -> Callable[[FunctionT], FunctionT]:
 
 
 def is_first_use() -> bool:
-    """Whether nothing was compiled here yet, or nothing of it could be kept."""
+    """Return whether nothing was compiled here yet, or nothing of it could be kept."""
     return CODE_FOLDER is None or not any(CODE_FOLDER.rglob("*.nbc"))
 
 
 def count_compiled() -> int:
-    """How many kernels this process had to compile, counted for each combination of types."""
+    """Return how many kernels this process had to compile, counted by combination of types."""
     return sum(sum(jit.stats.cache_misses.values()) for jit in _kernels)
 
 
 def _code_folder() -> Path | None:
-    """The folder for these sources, without those of earlier ones; ``None``: nowhere to write."""
+    """Return the folder for these sources, without earlier ones; ``None``: nowhere to write."""
     base = _base_folder()
     if base is None:
         return None
@@ -107,7 +107,7 @@ def _code_folder() -> Path | None:
 
 
 def _base_folder() -> Path | None:
-    """The folder that the user chose for numba, that of the user's caches, or a temporary one."""
+    """Return the folder that the user chose for numba, the user's caches, or a temporary one."""
     caches = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
     chosen = Path(_config.CACHE_DIR) if _config.CACHE_DIR else caches / "triquad" / "kernels"
     user = getattr(os, "getuid", int)()
@@ -126,7 +126,7 @@ def _base_folder() -> Path | None:
 
 
 def _source_digest() -> str:
-    """A digest of the files that kernels are made of, and of the compiler's versions."""
+    """Return a digest of the files that kernels are made of, and of the compiler's versions."""
     digest = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__} {np.__version__}".encode())
     for package in ("triquad_map", "triquad_format", "triquad_server", "triquad_tools"):
         spec = find_spec(package)  # without importing it
@@ -143,4 +143,4 @@ def _source_digest() -> str:
 
 
 CODE_FOLDER = _code_folder()
-"""Where the compiled code of all kernels is kept; ``None``: in memory alone."""
+"""The folder of the compiled code of all kernels; ``None``: it is in memory alone."""

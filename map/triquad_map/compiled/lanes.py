@@ -65,7 +65,7 @@ def _call(builder: Any, name: str, result: Any, args: Any) -> Any:
 
 
 def _address(context: Any, builder: Any, kinds: Any, args: Any) -> Any:
-    """Where the lanes from ``array[place]`` on lie, given the array and the place."""
+    """Return where the lanes from ``array[place]`` on lie, given the array and the place."""
     array = context.make_array(kinds[0])(context, builder, args[0])
     numbers = cgutils.unpack_tuple(builder, args[1])
     indices = [
@@ -78,7 +78,7 @@ def _address(context: Any, builder: Any, kinds: Any, args: Any) -> Any:
 
 @kernel_code
 def load(_: Any, array: Any, place: Any) -> Any:
-    """The lanes from ``array[place]`` on; a place has an index for each axis."""
+    """Return the lanes from ``array[place]`` on; a place has an index for each axis."""
 
     def generate(context: Any, builder: Any, kind: Any, args: Any) -> Any:
         return builder.load(_address(context, builder, kind.args, args), align=4)
@@ -99,7 +99,7 @@ def store(_: Any, array: Any, place: Any, lanes: Any) -> Any:
 
 @kernel_code
 def fill(_: Any, number: Any) -> Any:
-    """The same number in all lanes."""
+    """Return the same number in all lanes."""
 
     def generate(context: Any, builder: Any, kind: Any, args: Any) -> Any:
         single = context.cast(builder, args[0], kind.args[0], types.float32)
@@ -113,7 +113,7 @@ def fill(_: Any, number: Any) -> Any:
 
 @kernel_code
 def larger(_: Any, first: Any, second: Any) -> Any:
-    """The larger number of each lane."""
+    """Return the larger number of each lane."""
 
     def generate(_: Any, builder: Any, __: Any, args: Any) -> Any:
         return builder.select(builder.fcmp_ordered(">", *args, flags=_FAST), *args)
@@ -123,7 +123,7 @@ def larger(_: Any, first: Any, second: Any) -> Any:
 
 @kernel_code
 def root(_: Any, lanes: Any) -> Any:
-    """The square roots."""
+    """Return the square roots."""
 
     def generate(_: Any, builder: Any, __: Any, args: Any) -> Any:
         return _call(builder, f"llvm.sqrt.v{LANES}f32", _VECTOR, args)
@@ -133,7 +133,7 @@ def root(_: Any, lanes: Any) -> Any:
 
 @kernel_code
 def whole(_: Any, lanes: Any) -> Any:
-    """The nearest whole numbers."""
+    """Return the nearest whole numbers."""
 
     def generate(_: Any, builder: Any, __: Any, args: Any) -> Any:
         return _call(builder, f"llvm.nearbyint.v{LANES}f32", _VECTOR, args)
@@ -143,7 +143,7 @@ def whole(_: Any, lanes: Any) -> Any:
 
 @kernel_code
 def least(_: Any, lanes: Any) -> Any:
-    """The least number of all."""
+    """Return the least number of all."""
 
     def generate(_: Any, builder: Any, __: Any, args: Any) -> Any:
         return _call(builder, f"llvm.vector.reduce.fmin.v{LANES}f32", _FLOAT, args)
@@ -153,7 +153,7 @@ def least(_: Any, lanes: Any) -> Any:
 
 @kernel_code
 def total(_: Any, lanes: Any) -> Any:
-    """Their sum."""
+    """Return the sum of all numbers."""
 
     def generate(_: Any, builder: Any, __: Any, args: Any) -> Any:
         args = [ir.Constant(_FLOAT, 0.0), *args]
@@ -164,7 +164,7 @@ def total(_: Any, lanes: Any) -> Any:
 
 @kernel_code
 def at_most(_: Any, lanes: Any, limit: Any) -> Any:
-    """In which lanes numbers are at most those of ``limit``, as bits, the lowest for lane 0."""
+    """Return the lanes whose numbers are at most those of ``limit``, as bits from lane 0 up."""
 
     def generate(_: Any, builder: Any, __: Any, args: Any) -> Any:
         bits = builder.bitcast(builder.fcmp_ordered("<=", *args), ir.IntType(LANES))
@@ -175,7 +175,7 @@ def at_most(_: Any, lanes: Any, limit: Any) -> Any:
 
 @kernel_code
 def lowest_bit(_: Any, bits: Any) -> Any:
-    """Number of the lowest bit that is set; there is one."""
+    """Return the number of the lowest bit that is set; there is one."""
 
     def generate(context: Any, builder: Any, kind: Any, args: Any) -> Any:
         wide = context.cast(builder, args[0], kind.args[0], types.int64)

@@ -17,7 +17,7 @@ _MIN_WIDTH = 0.1  # ratio of the middle to the greatest: less is a line, not a p
 
 @kernel(inline="always")
 def add_points(m: Doubles, at: tuple[float, float, float], count: float) -> None:
-    """Add so many points at one place to the moments ``m``."""
+    """Add ``count`` points at one place to the moments ``m``."""
     a, b, c = at
     m[0] += count
     m[1] += count * a
@@ -33,7 +33,7 @@ def add_points(m: Doubles, at: tuple[float, float, float], count: float) -> None
 
 @inner_kernel()
 def plane_normal(m: Doubles | tuple[float, ...], normal: Doubles) -> bool:
-    """The unit normal, of either sign, of the plane of points with the moments ``m``.
+    """Return the unit normal, of either sign, of the plane of points with the moments ``m``.
 
     False: they lie in none, and ``normal`` [3] means nothing.
     """

@@ -1,4 +1,4 @@
-"""How soon the system lets a thread compute, compared with those for which somebody waits."""
+"""The priority of a thread, compared with those for which somebody waits."""
 
 import contextlib
 import os

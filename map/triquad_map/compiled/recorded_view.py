@@ -1,4 +1,4 @@
-"""A map as a file holds it, answered by compiled code."""
+"""A map as a file has it, answered by compiled code."""
 
 import logging
 

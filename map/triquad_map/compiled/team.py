@@ -21,7 +21,7 @@ _MIN_SHARE = 2048
 
 
 class _Part:
-    """A part of some work, done by a thread or by the caller, whichever is free first."""
+    """A part of some work, done by a thread or by the caller: by the first that is free."""
 
     def __init__(self, work: Callable[[], None]) -> None:
         self._work = work
@@ -48,7 +48,7 @@ class Team:
     """
 
     def __init__(self, name: str, niceness: int = 0) -> None:
-        """Threads start with the first work; ``niceness`` is as of :func:`lower_priority`."""
+        """Start threads with the first work; ``niceness`` is as of :func:`lower_priority`."""
         self._pool = ThreadPoolExecutor(
             max(1, THREADS - 1),  # the caller is the other one
             thread_name_prefix=name,
@@ -76,7 +76,7 @@ class Team:
             self._run(lambda part: work(*share(count, part, parts)), parts)
 
     def both(self, mine: Callable[[], MineT], other: Callable[[], OtherT]) -> tuple[MineT, OtherT]:
-        """What two pieces of work return, done in parallel: the caller does ``mine``."""
+        """Return what two pieces of work return, done in parallel: the caller does ``mine``."""
         found: list[OtherT] = []
         part = self._offer(lambda: found.append(other()))
         try:
@@ -104,12 +104,12 @@ class Team:
 
 
 def _finish(parts: Sequence[_Part]) -> None:
-    """Whatever happens, nobody goes on with what the caller has left."""
+    """Let nobody go on with what the caller has left, whatever happens."""
     for part in parts:
         part.do()
     wait([part.done for part in parts])
 
 
 def share(count: int, part: int, parts: int = THREADS) -> tuple[int, int]:
-    """Where a part of ``range(count)`` begins and ends."""
+    """Return where a part of ``range(count)`` begins and ends."""
     return -(-count * part // parts), -(-count * (part + 1) // parts)

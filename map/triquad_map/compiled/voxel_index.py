@@ -22,9 +22,9 @@ CELL_LIMIT = 1 << 20
 
 SHIFT = BLOCK_VOXELS.bit_length() - 1
 LOW = BLOCK_VOXELS - 1
-"""The bits of a voxel's coordinates that tell its place in its block."""
+"""The bits of a voxel's coordinates that give its place in its block."""
 
-_KEY_LOW = (1 << 21) - 1  # the bits of a key that tell one coordinate
+_KEY_LOW = (1 << 21) - 1  # the bits of a key for one coordinate
 
 
 class Index(NamedTuple):
@@ -36,19 +36,19 @@ class Index(NamedTuple):
 
 
 def empty_keys(cells: int) -> Longs:
-    """Slots of a set with room for so many cells, at a load of one half."""
+    """Return the slots of a set with room for ``cells`` cells, at a load of one half."""
     return np.full(1 << max(4, int(2 * cells - 1).bit_length()), EMPTY)
 
 
 @kernel(inline="always")
 def pack(x: int, y: int, z: int) -> int:
-    """Key of a cell."""
+    """Return the key of a cell."""
     return int(((x + CELL_LIMIT) << 42) | ((y + CELL_LIMIT) << 21) | (z + CELL_LIMIT))
 
 
 @kernel()
 def unpack(key: int) -> tuple[int, int, int]:
-    """The cell of a key."""
+    """Return the cell of a key."""
     return (
         (key >> 42) - CELL_LIMIT,
         (key >> 21 & _KEY_LOW) - CELL_LIMIT,
@@ -58,7 +58,7 @@ def unpack(key: int) -> tuple[int, int, int]:
 
 @register_jitable
 def home_slot(key: Any, mask: int) -> Any:
-    """Where a key is looked for first: a number, or an array or tensor of int64.
+    """Return where a key is searched for first: a number, or an array or tensor of int64.
 
     What is multiplied carries to higher bits only, and a key has the x of its cell from bit 42 on.
     """
@@ -67,7 +67,7 @@ def home_slot(key: Any, mask: int) -> Any:
 
 @kernel(inline="always")
 def find_slot(keys: Longs, key: int) -> int:
-    """Slot that holds ``key``, or the empty slot where it belongs."""
+    """Return the slot of ``key``, or the empty slot where it belongs."""
     mask = len(keys) - 1
     slot: int = home_slot(key, mask)
     while keys[slot] != key and keys[slot] != EMPTY:
@@ -77,14 +77,14 @@ def find_slot(keys: Longs, key: int) -> int:
 
 @kernel(inline="always")
 def find_row(index: Index, key: int) -> int:
-    """Row of ``key``, -1 where it has none."""
+    """Return the row of ``key``, -1 where it has none."""
     slot = find_slot(index.keys, key)
     return -1 if index.keys[slot] == EMPTY else int(index.rows[slot])
 
 
 @kernel(inline="always")
 def make_row(index: Index, count: int, key: int) -> int:
-    """Row of ``key``; a new one is row ``count``, or -1 where there is no more room."""
+    """Return the row of ``key``; a new one is row ``count``, or -1 where there is no more room."""
     slot = find_slot(index.keys, key)
     if index.keys[slot] == EMPTY:
         if count == len(index.row_keys):
@@ -105,7 +105,7 @@ def _reindex(index: Index, count: int) -> None:
 
 @kernel()
 def longest_probe(index: Index) -> int:
-    """Slots that the look-up of any key in the index may have to read."""
+    """Return how many slots the search for any key in the index may have to read."""
     mask = len(index.keys) - 1
     longest = 0
     for slot in range(len(index.keys)):
@@ -116,12 +116,12 @@ def longest_probe(index: Index) -> int:
 
 
 def cells_of(keys: Longs) -> Longs:
-    """The cells [N, 3] of ``keys`` [N]."""
+    """Return the cells [N, 3] of ``keys`` [N]."""
     return np.stack([keys >> 42, keys >> 21 & _KEY_LOW, keys & _KEY_LOW], axis=1) - CELL_LIMIT
 
 
 def keys_of(cells: Longs) -> Longs:
-    """The keys [N] of ``cells`` [N, 3]."""
+    """Return the keys [N] of ``cells`` [N, 3]."""
     x, y, z = cells.T + CELL_LIMIT
     keys: Longs = (x << 42) | (y << 21) | z
     return keys
@@ -143,7 +143,7 @@ class VoxelIndex:
         return len(self.arrays.row_keys)
 
     def cells(self) -> Longs:
-        """The cells [count, 3], by row."""
+        """Return the cells [count, 3], by row."""
         return cells_of(self.arrays.row_keys[: self.count])
 
     def grow(self) -> None:
@@ -151,13 +151,13 @@ class VoxelIndex:
         self._refill(self.arrays.row_keys[: self.count], 2 * self.capacity)
 
     def freeze(self) -> Index:
-        """A copy of the arrays, with no room for more cells."""
+        """Return a copy of the arrays, with no room for more cells."""
         keys, rows, row_keys = self.arrays
         return Index(keys.copy(), rows.copy(), row_keys[: self.count].copy())
 
     @classmethod
     def of_cells(cls, cells: Longs) -> "VoxelIndex":
-        """An index whose rows belong to different ``cells`` [N, 3], in their order."""
+        """Return an index whose rows belong to different ``cells`` [N, 3], in their order."""
         index = cls(1)
         index._refill(keys_of(cells), max(256, 2 * len(cells)))
         return index
@@ -171,7 +171,7 @@ class VoxelIndex:
 
 
 def with_room(rows: NDArray[Any], capacity: int) -> NDArray[Any]:
-    """A copy of ``rows`` [N, ...] with room for ``capacity`` of them; the new ones are zero."""
+    """Return a copy of ``rows`` [N, ...] with room for ``capacity``; the new ones are zero."""
     roomy = np.zeros((capacity, *rows.shape[1:]), rows.dtype)
     roomy[: len(rows)] = rows
     return roomy
@@ -190,7 +190,7 @@ def enter(keys: Longs, x: float, y: float, z: float, cell_m: float) -> bool:
 
 @kernel()
 def thin(points: Doubles, cell_m: float, keys: Longs) -> Bools:
-    """Mask [N] of the first of the points [N, 3] in each cell that is not in the set yet."""
+    """Return the mask [N] of the first of points [N, 3] in each cell that is not in the set yet."""
     chosen = np.zeros(len(points), np.bool_)
     for i in range(len(points)):
         chosen[i] = enter(keys, points[i, 0], points[i, 1], points[i, 2], cell_m)
@@ -199,32 +199,32 @@ def thin(points: Doubles, cell_m: float, keys: Longs) -> Bools:
 
 @kernel(inline="always")
 def is_inside(x: int, y: int, z: int, side: int) -> bool:
-    """Whether a voxel lies in a region of ``side`` voxels."""
+    """Return whether a voxel lies in a region of ``side`` voxels."""
     return min(x, y, z) >= 0 and max(x, y, z) < side
 
 
 @kernel(inline="always")
 def block_key(x: int, y: int, z: int) -> int:
-    """Key of the block that holds a voxel."""
+    """Return the key of the block that contains a voxel."""
     return int(pack(x >> SHIFT, y >> SHIFT, z >> SHIFT))
 
 
 @kernel(inline="always")
 def byte_of(x: int, y: int) -> int:
-    """The byte of the mask in which a voxel's bit stands."""
+    """Return the byte of the mask in which a voxel's bit stands."""
     return ((x & LOW) << SHIFT) | (y & LOW)
 
 
 @kernel(inline="always")
 def bit_of(z: int) -> int:
-    """The byte in which a voxel's bit alone is set, as a ``uint8``."""
+    """Return the byte in which a voxel's bit alone is set, as a ``uint8``."""
     bit: int = np.uint8(1 << (z & LOW))
     return bit
 
 
 @kernel(inline="always")
 def find_block(index: Index, x: int, y: int, z: int, side: int) -> int:
-    """Row of the block that holds a voxel, -1 where there is none."""
+    """Return the row of the block that contains a voxel, -1 where there is none."""
     if not is_inside(x, y, z, side):
         return -1
     return find_row(index, block_key(x, y, z))
@@ -232,6 +232,6 @@ def find_block(index: Index, x: int, y: int, z: int, side: int) -> int:
 
 @kernel(inline="always")
 def is_set(masks: Bytes, row: int, x: int, y: int, z: int) -> int:
-    """Whether the bit of a voxel is set in the block ``row``: 0 or 1."""
+    """Return whether the bit of a voxel is set in the block ``row``: 0 or 1."""
     bit: int = (masks[row, byte_of(x, y)] >> (z & LOW)) & 1
     return bit

@@ -29,7 +29,7 @@ class ComposedView(FieldView):
         regions: Sequence[MapRegion],
         split: Split = in_one,
     ) -> None:
-        """``split`` shares the work of a question among threads."""
+        """Compose regions; ``split`` shares the work of a question among threads."""
         super().__init__(settings, regions, split)
         self.epoch = epoch
         self.region_views = tuple(regions)
@@ -42,7 +42,7 @@ class ComposedView(FieldView):
         return self._settings.leaf_m
 
     def nearest_surface(self, points: Doubles, max_distance_m: float) -> NearestSurface:
-        """The nearest seen surface to points [N, 3], searched for as far as ``max_distance_m``."""
+        """Return the nearest seen surface to points [N, 3], as far as ``max_distance_m``."""
         count = len(points)
         nearest = NearestSurface(
             found=np.zeros(count, np.bool_),
@@ -69,7 +69,7 @@ class ComposedView(FieldView):
         return nearest
 
     def nearest_unknown(self, points: Doubles, max_distance_m: float) -> NearestUnknown:
-        """The nearest unknown space to points [N, 3], searched for as far as ``max_distance_m``.
+        """Return the nearest unknown space to points [N, 3], as far as ``max_distance_m``.
 
         What lies in no region is unknown, too.
         """
@@ -84,7 +84,7 @@ class ComposedView(FieldView):
         return nearest
 
     def _regions_near(self, points: Doubles, reach_m: float) -> Iterator[MapRegion]:
-        """Regions that come within ``reach_m`` of the box around the points [N, 3]."""
+        """Yield regions that come within ``reach_m`` of the box around the points [N, 3]."""
         if not len(points):
             return
         low, high = _box_around(points, reach_m)
@@ -94,7 +94,7 @@ class ComposedView(FieldView):
                 yield region
 
     def _frame(self, region: MapRegion) -> RegionFrame:
-        """Where the region's leaf coordinates lie, for its surfels."""
+        """Return where the region's leaf coordinates lie, for its surfels."""
         x, y, z = self._settings.region_corner(region.index).tolist()
         return RegionFrame((x, y, z), self._settings.leaf_m, self._newest_s)
 
@@ -119,7 +119,7 @@ class ComposedView(FieldView):
             found.distance[rows], found.point[rows] = near.distance, near.point
 
     def _improve_in_cell(self, found: NearestUnknown, points: Doubles, home: RegionIndex) -> None:
-        """As :meth:`_improve_unknown`, of points in the cell of one region."""
+        """Do as :meth:`_improve_unknown`, of points in the cell of one region."""
         # Mostly that is all: what it finds is nearer than the other cells.
         self._search_region(found, points, self._by_index[home])
         for cell in self._cells_around(points, float(found.distance.max())):
@@ -130,18 +130,18 @@ class ComposedView(FieldView):
                 self._search_region(found, points, region)
 
     def _cells_of(self, points: Doubles) -> Longs:
-        """Cells [N, 3] of the region lattice that hold the points; far ones at its ends."""
+        """Return cells [N, 3] of the region lattice that contain points; far ones at its ends."""
         cells = np.floor(points / self._settings.region_pitch_m + 0.5)
         return np.clip(cells, -_FARTHEST_CELL, _FARTHEST_CELL).astype(np.int64)
 
     def _cells_around(self, points: Doubles, reach_m: float) -> list[RegionIndex]:
-        """Cells that come within ``reach_m`` of the box around the points."""
+        """Return cells that come within ``reach_m`` of the box around the points."""
         low, high = (self._cells_of(corner).tolist() for corner in _box_around(points, reach_m))
         x, y, z = (range(first, last + 1) for first, last in zip(low, high, strict=True))
         return list(itertools.product(x, y, z))
 
     def _search_empty_cell(self, found: NearestUnknown, points: Doubles, cell: RegionIndex) -> None:
-        """Nothing is known of a cell without a region."""
+        """Improve ``found`` by a cell without a region, of which nothing is known."""
         pitch = self._settings.region_pitch_m
         middle = np.asarray(cell) * pitch
         nearest = np.clip(points, middle - pitch / 2, middle + pitch / 2)
@@ -167,7 +167,7 @@ class ComposedView(FieldView):
 
 
 def _box_around(points: Doubles, reach_m: float) -> tuple[Doubles, Doubles]:
-    """The least and the largest corner [3] of a box around points [N, 3], of which N is at least 1.
+    """Return the least and largest corner [3] of a box around points [N, 3], with N at least 1.
 
     It reaches ``reach_m`` beyond them on each side.
     """

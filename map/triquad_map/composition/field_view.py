@@ -27,7 +27,7 @@ from triquad_map.surface import FieldSample, SampleField
 from triquad_map.view import FieldAnswer
 
 _REACH_VOXELS = 0.5
-"""How far a surface is felt beyond the voxels in which rays ended."""
+"""The reach of a surface beyond the voxels in which rays ended, in voxels."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class _Owned:
 
 @dataclass(frozen=True)
 class _Owners:
-    """Who answers for N points."""
+    """The regions that answer for N points."""
 
     groups: Sequence[_Owned]  # the points that have an owner, region by region
     shared: NDArray[np.intp]  # points that other regions may cover, too
@@ -60,7 +60,7 @@ _ALL = slice(None)
 
 
 def in_one(count: int, work: Work, least: int = 0) -> None:  # noqa: ARG001
-    """A :class:`Split` for the caller's thread alone."""
+    """Do all work on the caller's thread alone: a :class:`Split`."""
     work(0, count)
 
 
@@ -70,7 +70,7 @@ class FieldView:
     def __init__(
         self, settings: FieldSettings, regions: Sequence[FieldRegion], split: Split = in_one
     ) -> None:
-        """``split`` shares the work of a question among threads."""
+        """View regions; ``split`` shares the work of a question among threads."""
         self._settings = settings
         self._field_regions = tuple(regions)
         self._split = split
@@ -78,7 +78,7 @@ class FieldView:
         self._cells = np.array([region.index for region in regions], np.float64).reshape(-1, 3).T
 
     def query(self, points: Doubles, gradient: bool = False) -> FieldAnswer:
-        """Signed distance, status and, on request, gradient at points [N, 3] of the map frame."""
+        """Return signed distance, status and, on request, gradient at points [N, 3], map frame."""
         count = len(points)
         sdf = np.empty(count, np.float32)
         status = np.empty(count, np.uint8)
@@ -97,7 +97,7 @@ class FieldView:
         return FieldAnswer(sdf, status, slopes)
 
     def distances(self, points: Doubles) -> Floats:
-        """Signed distances [N] alone at points [N, 3] of the map frame."""
+        """Return signed distances [N] alone at points [N, 3] of the map frame."""
         distances = np.empty(len(points), np.float32)
 
         def work(first: int, last: int) -> None:
@@ -108,7 +108,7 @@ class FieldView:
         return distances
 
     def distances_in_grid(self, axes: Doubles, points: Longs) -> Floats:
-        """As :meth:`distances`, but for rounding, at points of a grid: in half the time.
+        """Do as :meth:`distances`, but for rounding, at points of a grid: in half the time.
 
         Args:
             axes: [3, S] its coordinates on each axis, metres, map frame.
@@ -127,7 +127,7 @@ class FieldView:
         return distances
 
     def _only_region(self, low: Doubles, high: Doubles) -> FieldRegion | None:
-        """The region that alone covers the box between two corners [3], if one does."""
+        """Return the region that alone covers the box between two corners [3], if one does."""
         pitch_m = self._settings.region_pitch_m
         core_m = self._settings.region_side_m / 2 - self._settings.overlap_m
         cells = []
@@ -142,7 +142,7 @@ class FieldView:
         return self._regions_at.get((cells[0], cells[1], cells[2]))
 
     def status(self, points: Doubles, reach_m: float | None = None) -> Bytes:
-        """Status values [N] of points [N, 3]: what the evidence of each point's region says.
+        """Return status values [N] of points [N, 3]: what the evidence of each point's region says.
 
         ``SURFACE`` reaches ``reach_m`` beyond the voxels in which rays ended; half a voxel if
         not given.
@@ -158,7 +158,7 @@ class FieldView:
         return status
 
     def surface_in_grid(self, axes: Doubles, reach_m: float) -> Bools:
-        """Which points [S, S, S] of a grid have the status ``SURFACE``, as :meth:`status` has it.
+        """Return which points [S, S, S] of a grid have the status ``SURFACE``, by :meth:`status`.
 
         ``axes`` [3, S] are their coordinates on each axis, increasing, metres, map frame.
         """
@@ -177,7 +177,7 @@ class FieldView:
         return surface
 
     def near_ends(self, points: Doubles, reach_m: float) -> Bools:
-        """Whether points [N, 3] lie where rays ended.
+        """Return whether points [N, 3] lie where rays ended.
 
         That is within ``reach_m`` of a voxel in which they did, on each axis, and on no side of it
         beyond the last end, unless the surface goes on in a voxel there, or so few scans hit it
@@ -197,7 +197,7 @@ class FieldView:
         return near
 
     def _owners(self, points: Doubles) -> _Owners:
-        """Who answers for points [N, 3], metres, map frame."""
+        """Return which regions answer for points [N, 3], metres, map frame."""
         # Axis by axis, which makes every step here one of long vectors.
         by_axis = np.ascontiguousarray(points.T)
         only = self._only_region(
@@ -239,7 +239,7 @@ class FieldView:
         return region.evidence.status(voxels, reach)
 
     def _values(self, points: Doubles, owners: _Owners, gradient: bool) -> FieldValues:
-        """The field at points [N, 3], whose owners are known."""
+        """Return the field at points [N, 3], whose owners are known."""
         if owners.only is not None:
             return _values_in(owners.only, points, gradient)
         count = len(points)
@@ -284,7 +284,7 @@ class FieldView:
 
 
 def _values_in(region: FieldRegion, points: Doubles, gradient: bool) -> FieldValues:
-    """The field of a region at points [N, 3]."""
+    """Return the field of a region at points [N, 3]."""
     return region.engine.evaluate((points - region.centre).astype(np.float32), gradient)
 
 
@@ -296,7 +296,7 @@ def _put(values: FieldValues, where: slice | NDArray[np.intp], new: FieldValues)
 
 
 def _ramp_gradient(offsets: Doubles, ramps: Doubles, overlap_m: float) -> Doubles:
-    """Gradient [N, 3] of the product of the three ramps."""
+    """Return gradient [N, 3] of the product of the three ramps."""
     slopes = np.where((ramps > 0) & (ramps < 1), -np.sign(offsets) / overlap_m, 0.0)
     others = np.stack(
         [ramps[:, 1] * ramps[:, 2], ramps[:, 0] * ramps[:, 2], ramps[:, 0] * ramps[:, 1]], axis=1
@@ -305,7 +305,7 @@ def _ramp_gradient(offsets: Doubles, ramps: Doubles, overlap_m: float) -> Double
 
 
 def field_samples(engine: FieldEngine, settings: FieldSettings, split: Split) -> SampleField:
-    """The field of a region in voxels, at its leaf coordinates."""
+    """Return the field of a region in voxels, at its leaf coordinates."""
 
     def sample(voxels: Doubles) -> FieldSample:
         local = settings.offsets(voxels).astype(np.float32)

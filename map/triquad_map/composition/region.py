@@ -1,4 +1,4 @@
-"""What one region of a map can do; the composition is put together from this alone."""
+"""The interface of one region of a map; the composition is put together from this alone."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -24,13 +24,13 @@ class FieldValues:
 
 
 class FieldEngine(Protocol):
-    """What computes the field of one region."""
+    """An engine that computes the field of one region."""
 
     def evaluate(self, points: Floats, gradient: bool) -> FieldValues:
-        """The field at points [N, 3], metres from the region's centre."""
+        """Return the field at points [N, 3], metres from the region's centre."""
 
     def evaluate_in_grid(self, axes: Floats, points: Longs) -> Floats:
-        """The signed distance at points of a grid, as :meth:`evaluate` has it but for rounding.
+        """Return the distance at points of a grid, as :meth:`evaluate` has it but for rounding.
 
         Args:
             axes: [3, S] coordinates of the grid on each axis, metres from the region's centre.
@@ -39,26 +39,26 @@ class FieldEngine(Protocol):
 
 
 class SeenSpace(Protocol):
-    """What rays have shown of a region."""
+    """The space that rays have shown of a region."""
 
     @property
     def newest_s(self) -> int:
-        """When a ray last ended anywhere, seconds since 1970; 0: never, or not known."""
+        """The time when a ray last ended anywhere, seconds since 1970; 0: never, or not known."""
 
     def status(self, voxels: Doubles, reach: float) -> Bytes:
-        """Values of :class:`Status` [N] at leaf coordinates [N, 3].
+        """Return values of :class:`Status` [N] at leaf coordinates [N, 3].
 
         ``SURFACE`` reaches ``reach`` voxels beyond those in which rays ended.
         """
 
     def surface_in_grid(self, axes: Sequence[Doubles], reach: float) -> Bools:
-        """Which points [X, Y, Z] of a grid have the status ``SURFACE``, as :meth:`status` has it.
+        """Return which points [X, Y, Z] of a grid have the status ``SURFACE``, by :meth:`status`.
 
         ``axes`` are their leaf coordinates [X], [Y] and [Z], increasing.
         """
 
     def near_ends(self, voxels: Doubles, reach: float) -> Bools:
-        """Whether leaf coordinates [N, 3] lie where rays ended.
+        """Return whether leaf coordinates [N, 3] lie where rays ended.
 
         That is within ``reach`` voxels of one in which they did, on each axis, and not in its
         margins (:attr:`triquad_format.records.region.Evidence.margins`).
@@ -84,7 +84,7 @@ class NearestSurfels(NamedTuple):
 
 
 def no_surfels(limits: Doubles) -> NearestSurfels:
-    """What is known of points before surfels less than ``limits`` [N] voxels away are found."""
+    """Return what is known of points before surfels within ``limits`` [N] voxels are found."""
     count = len(limits)
     return NearestSurfels(
         limits.copy(), np.zeros((count, 3)), np.zeros((count, 3)), np.full(count, -1, np.int32)
@@ -92,7 +92,7 @@ def no_surfels(limits: Doubles) -> NearestSurfels:
 
 
 class RegionFrame(NamedTuple):
-    """Where a region's leaf coordinates lie in the map, and as of when it is looked at."""
+    """The place of a region's leaf coordinates in the map, and the time of the query."""
 
     corner: tuple[float, float, float]  # where they are 0, metres, map frame
     leaf_m: float
@@ -113,7 +113,7 @@ class FieldRegion(Protocol):
 
     @property
     def index(self) -> RegionIndex:
-        """Which region."""
+        """The index of the region."""
 
     @property
     def centre(self) -> Doubles:
@@ -121,11 +121,11 @@ class FieldRegion(Protocol):
 
     @property
     def engine(self) -> FieldEngine:
-        """What computes its field."""
+        """The engine that computes its field."""
 
     @property
     def evidence(self) -> SeenSpace:
-        """What rays have shown of it."""
+        """The space that rays have shown of it."""
 
 
 class MapRegion(FieldRegion, Protocol):
@@ -133,11 +133,11 @@ class MapRegion(FieldRegion, Protocol):
 
     @property
     def surfels(self) -> RegionSurfels:
-        """What stands for its surface. Not to be asked for within a :class:`Split`."""
+        """The surfels of its surface. They must not be asked for within a :class:`Split`."""
 
 
 def in_grid(axes: NDArray[_Float], points: Longs) -> NDArray[_Float]:
-    """The points [N, 3] of a grid with coordinates ``axes`` [3, S], by their numbers on them."""
+    """Return points [N, 3] of a grid with coordinates ``axes`` [3, S], by their numbers there."""
     places = [axis[numbers] for axis, numbers in zip(axes, points.T, strict=True)]
     return np.stack(places, axis=1)
 
@@ -150,11 +150,11 @@ class Split(Protocol):
     """Runs work over ``range(count)``, in parts at the same time where it is worth it."""
 
     def __call__(self, count: int, work: Work, least: int = ...) -> None:
-        """``least`` is how many a part has at least, where the default is too many."""
+        """Run work; ``least`` is how many a part has at least, where the default is too many."""
 
 
 class RecordedRegion:
-    """A region as a file holds it, whose surfels are fitted when they are first asked for."""
+    """A region as a file has it, whose surfels are fitted when they are first asked for."""
 
     def __init__(
         self,
@@ -164,7 +164,7 @@ class RecordedRegion:
         evidence: SeenSpace,
         fit: Callable[[], RegionSurfels],
     ) -> None:
-        """``fit`` makes the surfels, which takes a while; it is called once at most."""
+        """Take ``fit`` to make the surfels, which takes a while; it is called once at most."""
         self.index = index
         self.centre = settings.region_centre(index)
         self.engine = engine
@@ -175,7 +175,7 @@ class RecordedRegion:
 
     @property
     def surfels(self) -> RegionSurfels:
-        """What stands for its surface; the first who asks waits until all are fitted."""
+        """The surfels of its surface; the first who asks waits until all are fitted."""
         with self._fitting:
             if self._surfels is None:
                 self._surfels = self._fit()

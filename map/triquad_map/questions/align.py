@@ -1,4 +1,4 @@
-"""Where a scan was taken: it is moved until its points lie on surfaces of the map."""
+"""The pose of a scan: it is moved until its points lie on surfaces of the map."""
 
 import math
 from dataclasses import dataclass
@@ -12,20 +12,20 @@ from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.view import MapView
 
 _COARSE_POINTS = 500
-"""So many find the way; all that follows asks for a few millimetres."""
+"""The number of points that find the way; all that follows asks for a few millimetres."""
 
 FINE_POINTS = 2000
-"""Some so many are used in the end, however many are given."""
+"""About the number of points that are used in the end, however many are given."""
 
 _PER_RANGE = 0.1
-"""At first a point's distance counts less by this share a metre of its range: a wrong guess of the
-rotation moves far points most."""
+"""The share a metre of its range by which a point's distance counts less at first: a wrong guess
+of the rotation moves far points most."""
 
 _REACH_SCALES = 3.0
-"""Farther than so many scales, a distance has hardly any weight."""
+"""A distance of more scales than this has hardly any weight."""
 
 _SURE_VOXELS = 5.0
-"""From this scale on, points count by the map's confidence: not at all in unknown space. Before,
+"""The scale from which points count by the map's confidence: not at all in unknown space. Before,
 those count, too: of a scan that is off by a metre they lie behind walls, and lead back."""
 
 _FINAL_VOXELS = 0.5
@@ -33,10 +33,10 @@ _FINAL_VOXELS = 0.5
 
 _SHRINK_LEAST, _SHRINK_MOST = 0.8, 0.4
 _SCALE_STEPS = 3.0
-"""The scale follows the steps: what is left is seldom more than so many of the last."""
+"""The scale follows the steps: what is left is seldom more than this many of the last."""
 
 _OVERSHOOT = 1.5
-"""Nearest points hold a scan back a little; going farther than they ask comes out sooner."""
+"""Nearest points keep a scan back a little; going farther than they ask comes out sooner."""
 
 _COARSE_STEP_M, _FINE_STEP_M = 0.01, 0.002
 """A step that moves the points by less is the last with few points, and the last."""
@@ -47,11 +47,11 @@ _LEAST_INLIERS = 50
 
 _OBSERVABLE = 0.01
 """A motion under which distances change by less (mean square, by that of the points) is not seen:
-the map's normals are off by some degrees, which look like as much."""
+the map's normals are off by some degrees, which appear as much."""
 
 _CORRELATED = 5.0
-"""So many points say as much as one whose error were its own: neighbours share the map's. With this
-the squared errors at real scans are on average what the covariance says."""
+"""The number of points that count as one with an error of its own: neighbours share the map's. With
+this the squared errors at real scans are on average what the covariance says."""
 
 _UNSEEN_M, _UNSEEN_RAD = 100.0, math.pi
 """Standard deviations along what is not seen at all."""
@@ -59,7 +59,7 @@ _UNSEEN_M, _UNSEEN_RAD = 100.0, math.pi
 
 @dataclass(frozen=True)
 class AlignOptions:
-    """How far a scan may be off, and how long to look."""
+    """The limits of how far a scan may be off, and of how long to search."""
 
     max_distance_m: float = 6.0
     """Points farther than this from any surface do not count."""
@@ -69,19 +69,19 @@ class AlignOptions:
 
 @dataclass(frozen=True)
 class Alignment:
-    """Where a scan fits best near a guess, in one epoch of the map.
+    """The pose where a scan fits best near a guess, in one epoch of the map.
 
     The covariance is that of an error ``(t, r)``: the true position is ``t`` away from the one
     found, metres, map frame, and the true rotation is the one found turned by the rotation vector
-    ``r``, radians, map frame, about the sensor. Along what the surfaces do not tell (along a
+    ``r``, radians, map frame, about the sensor. Along what the surfaces do not fix (along a
     corridor) the guess is kept and the variance is that of 100 m or half a turn.
     """
 
     world_from_sensor: Doubles  # [4, 4]
     covariance: Doubles  # [6, 6] of translation, rotation; see above
-    inlier_share: float  # of the points that the map can tell about, those on a surface
+    inlier_share: float  # of the points of which the map knows, those on a surface
     rms_m: float  # of their distances; 0 where there are none
-    converged: bool  # it came to rest, most points are on surfaces, and these tell all directions
+    converged: bool  # it came to rest, most points are on surfaces, and these fix all directions
     iterations: int
     points: int  # that were used, of those given
     epoch: int
@@ -123,19 +123,19 @@ class _Normal:
     variance: float  # of the weighted distances
 
     def seen(self) -> tuple[Doubles, Doubles]:
-        """Directions [6, S] that the surfaces tell, as columns, and their information [S]."""
+        """Return directions [6, S] that the surfaces fix, as columns, and their information [S]."""
         values, vectors = np.linalg.eigh(self.matrix)
         seen = values > _OBSERVABLE
         return vectors[:, seen], values[seen]
 
     def step(self) -> Doubles:
-        """The motion [6], none along what is not seen."""
+        """Return the motion [6], none along what is not seen."""
         vectors, values = self.seen()
         step: Doubles = -vectors @ ((vectors.T @ self.vector) / values)
         return step
 
     def covariance(self) -> Doubles:
-        """Of translation and rotation [6, 6]."""
+        """Return the covariance of translation and rotation [6, 6]."""
         vectors, values = self.seen()
         scaling = np.repeat([1.0, self.arm_m], 3)
         information = (vectors * values) @ vectors.T * np.outer(scaling, scaling)
@@ -148,7 +148,7 @@ class _Normal:
 
 @dataclass(frozen=True)
 class _Found:
-    """Where the search ended."""
+    """The pose at which the search ended."""
 
     pose: Doubles  # [4, 4]
     iterations: int
@@ -189,7 +189,7 @@ def _normal(
     options: AlignOptions,
     is_final: bool,
 ) -> _Normal | None:
-    """The normal equations at a pose; None where no point counts."""
+    """Return the normal equations at a pose; None where no point counts."""
     turned = points @ pose[:3, :3].T
     reach_m = min(options.max_distance_m, _REACH_SCALES * scale)
     answer = distances(view, turned + pose[:3, 3], DistanceOptions(reach_m))
@@ -217,7 +217,7 @@ def _normal(
 
 
 def _judged(view: MapView, points: Doubles, found: _Found, options: AlignOptions) -> Alignment:
-    """What to think of where the search ended."""
+    """Return the alignment at the pose where the search ended."""
     final = _FINAL_VOXELS * view.voxel_m
     world = points @ found.pose[:3, :3].T + found.pose[:3, 3]
     answer = distances(view, world, DistanceOptions(options.max_distance_m))
@@ -248,11 +248,11 @@ def _judged(view: MapView, points: Doubles, found: _Found, options: AlignOptions
 
 _CELLS = 1 << 20  # along an axis
 _MARGIN = 1.1
-"""More than are wanted, by so much, are as good: to thin once more changes nothing."""
+"""Points up to this multiple of those wanted are as good: to thin once more changes nothing."""
 
 
 def thinned(points: Doubles, most: int) -> Doubles:
-    """Some ``most`` of points [N, 3], evenly in space: the first of each cell of a grid.
+    """Return about ``most`` of points [N, 3], evenly in space: the first of each cell of a grid.
 
     Points that are not finite are left out. What was thinned before stays as it is. With numpy
     alone: clients thin scans with it before they send them, and they may be without numba.
@@ -280,7 +280,7 @@ def thinned(points: Doubles, most: int) -> Doubles:
 
 
 def moved(pose: Doubles, translation: Doubles, rotation: Doubles) -> Doubles:
-    """A pose moved [3], and turned about itself by a rotation vector [3], both in the map frame."""
+    """Return a pose moved [3], and turned about itself by a rotation vector [3], map frame."""
     result: Doubles = pose.copy()
     result[:3, :3] = _rotation(rotation) @ pose[:3, :3]
     result[:3, 3] += translation
@@ -288,7 +288,7 @@ def moved(pose: Doubles, translation: Doubles, rotation: Doubles) -> Doubles:
 
 
 def _rotation(vector: Doubles) -> Doubles:
-    """The rotation [3, 3] about a vector [3] by its length (Rodrigues)."""
+    """Return the rotation [3, 3] about a vector [3] by its length (Rodrigues)."""
     angle = float(np.linalg.norm(vector))
     x, y, z = vector
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

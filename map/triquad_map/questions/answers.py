@@ -1,4 +1,4 @@
-"""From the message of a question to the message of its answer, for any map.
+"""Turns the message of a question into the message of its answer, for any map.
 
 A server answers with this from its epochs, and a client from a map file: so the two cannot differ.
 """
@@ -56,7 +56,7 @@ _DECIMALS = 5  # of positions, metres
 
 @dataclass(frozen=True)
 class QuestionLimits:
-    """How much one question may ask."""
+    """The most that one question may ask."""
 
     points: int = MAX_QUERY_POINTS  # at which the field is evaluated
     searches: int = MAX_SEARCHES  # points around which something is searched for
@@ -69,7 +69,7 @@ Views = Callable[[int], AbstractContextManager[MapView]]
 class Answers:
     """Answers questions; as many threads may ask as the views allow.
 
-    Whatever is asked for, :class:`RefusedError` tells which argument is out of bounds.
+    Whatever is asked for, :class:`RefusedError` says which argument is out of bounds.
     """
 
     def __init__(self, views: Views, limits: QuestionLimits) -> None:
@@ -77,7 +77,7 @@ class Answers:
         self._limits = limits
 
     def answer(self, request: Message) -> Message:
-        """The answer to a question of any kind.
+        """Return the answer to a question of any kind.
 
         Raises:
             RefusedError: an argument is out of bounds, or its epoch is not kept.
@@ -86,7 +86,7 @@ class Answers:
         return _ANSWERS[type(request)](self, request)
 
     def sdf(self, request: SdfRequest) -> SdfReply:
-        """The trained field, and status."""
+        """Return the trained field, and status."""
         points = _points("point", request.origin, request.points, most=self._limits.points)
         with self._view(request.epoch) as view:
             answer = view.query(points, request.gradient)
@@ -98,7 +98,7 @@ class Answers:
             )
 
     def distance(self, request: DistanceRequest) -> DistanceReply:
-        """Distances to the nearest surface."""
+        """Return distances to the nearest surface."""
         points = self._searched("point", request.origin, request.points)
         reach_m = _within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M)
         options = DistanceOptions(reach_m, request.surface_point, request.unknown_distance)
@@ -123,7 +123,7 @@ class Answers:
         )
 
     def spheres(self, request: SpheresRequest) -> SpheresReply:
-        """What spheres hold."""
+        """Return what spheres contain."""
         centres = self._searched("sphere", request.origin, request.centres)
         _same_length(request.centres, "radii_m", request.radii_m)
         good = (request.radii_m >= 0) & (request.radii_m <= MAX_DISTANCE_M)
@@ -138,7 +138,7 @@ class Answers:
         return SpheresReply(answer.epoch, answer.status)
 
     def segments(self, request: SegmentsRequest) -> SegmentsReply:
-        """What a ball meets on segments."""
+        """Return what a ball meets on segments."""
         starts = self._searched("start", request.origin, request.starts)
         _same_length(request.starts, "ends", request.ends)
         ends = self._searched("end", request.origin, request.ends)
@@ -169,7 +169,7 @@ class Answers:
         )
 
     def rays(self, request: RaysRequest) -> RaysReply:
-        """How far rays reach."""
+        """Return how far rays reach."""
         starts = self._searched("start", request.origin, request.starts)
         _same_length(request.starts, "directions", request.directions)
         directions = request.directions.astype(np.float64)
@@ -190,7 +190,7 @@ class Answers:
         return RaysReply(answer.epoch, answer.range_m, answer.status)
 
     def ground(self, request: GroundRequest) -> GroundReply:
-        """What lies below points."""
+        """Return what lies below points."""
         points = self._searched("point", request.origin, request.points)
         drop_m = _within("max_drop_m", request.max_drop_m, MAX_DISTANCE_M)
         self._check_count(
@@ -207,7 +207,7 @@ class Answers:
         )
 
     def grid(self, request: GridRequest) -> GridReply:
-        """Distance and status at a grid's cells."""
+        """Return distance and status at a grid's cells."""
         counts = (int(request.counts[0]), int(request.counts[1]), int(request.counts[2]))
         cell_m = _within("cell_m", request.cell_m, MAX_DISTANCE_M)
         if min(counts) < 1 or not np.isfinite(request.corner).all():
@@ -222,7 +222,7 @@ class Answers:
         return GridReply(answer.epoch, answer.distance_m, answer.status)
 
     def align(self, request: AlignRequest) -> AlignReply:
-        """The pose of a scan near a guess."""
+        """Return the pose of a scan near a guess."""
         self._check_count(len(request.points), f"{len(request.points)} points")
         if not is_rigid(request.world_from_sensor):
             raise RefusedError(
@@ -272,7 +272,7 @@ _ANSWERS: dict[type[Message], Callable[[Answers, Any], Message]] = {
 
 
 def _points(what: str, origin: Doubles, offsets: Floats, most: int) -> Doubles:
-    """Points [N, 3] of the map frame.
+    """Return points [N, 3] of the map frame.
 
     Raises:
         RefusedError: they are too many, or not all of them are places.
@@ -282,7 +282,7 @@ def _points(what: str, origin: Doubles, offsets: Floats, most: int) -> Doubles:
             "too_large", f"{len(offsets)} points exceed the limit of {most}: split the request"
         )
     points = origin + offsets.astype(np.float64)
-    # Of NaN, neither holds.
+    # Of NaN, neither is true.
     if points.min(initial=0.0) >= -MAX_POSITION_M and points.max(initial=0.0) <= MAX_POSITION_M:
         # Single precision from an origin is good to that. Unrounded, a point that somebody chose on
         # a face of voxels would lie on one side or the other by what else is in the request.

@@ -20,13 +20,13 @@ from triquad_map.view import NO_LENGTH_M, MapView, NearestSurface
 _SURFACE, _UNKNOWN = int(Status.SURFACE), int(Status.UNKNOWN)
 
 _FIELD_VOXELS = 0.5
-"""Up to here the trained field counts alone."""
+"""The distance up to which the trained field counts alone, in voxels."""
 
 _SURFEL_VOXELS = 1.5
-"""From here on the distance to the surfels counts alone."""
+"""The distance from which on the surfels count alone, in voxels."""
 
 _WIDENED_VOXELS = float(np.sqrt(0.5)) - DISC_RADIUS
-"""From the rim of a disc to where it meets those of the voxels beside it, at their corners."""
+"""The way from a disc's rim to where it meets those of the next voxels, at their corners."""
 
 _PART_POINTS = 1 << 17
 """Points that are answered together: meanwhile each takes ten times the bytes of its answer."""
@@ -35,7 +35,7 @@ Rows = NDArray[np.intp]
 
 
 class UnknownSpaceError(TriquadError):
-    """What was asked about meets unknown space, which was to count as an error."""
+    """The query meets unknown space, which was to count as an error."""
 
     def __init__(self, what: str, index: int, count: int) -> None:
         others = f", and {count - 1} others do" if count > 1 else ""
@@ -48,7 +48,7 @@ class UnknownSpaceError(TriquadError):
 
 
 class Unknown(str, Enum):
-    """What unknown space counts as."""
+    """The ways in which unknown space may count."""
 
     OBSTACLE = "obstacle"
     FREE = "free"
@@ -67,7 +67,7 @@ def refuse_unknown(what: str, meets: Bools) -> None:
 
 @dataclass(frozen=True)
 class DistanceOptions:
-    """What is asked of a map."""
+    """The options of a query for distances."""
 
     max_distance_m: float = 5.0
     surface_point: bool = False
@@ -108,7 +108,7 @@ class Distances:
 
 
 def distances(view: MapView, points: Doubles, options: DistanceOptions) -> Distances:
-    """Distances from ``points`` [N, 3], metres, map frame, to the nearest seen surface."""
+    """Return distances from ``points`` [N, 3], metres, map frame, to the nearest seen surface."""
     firsts = range(0, max(1, len(points)), _PART_POINTS)
     return joined([_distances(view, points[at : at + _PART_POINTS], options) for at in firsts])
 
@@ -143,7 +143,7 @@ def _distances(view: MapView, points: Doubles, options: DistanceOptions) -> Dist
 
 
 def with_unknown(answer: Distances, points: Doubles, unknown: Unknown) -> Distances:
-    """The answer for ``points`` [N, 3] where unknown space counts as asked.
+    """Return the answer for ``points`` [N, 3] where unknown space counts as asked.
 
     As an obstacle it is a surface like others, of confidence 0.
 
@@ -172,7 +172,7 @@ def with_unknown(answer: Distances, points: Doubles, unknown: Unknown) -> Distan
 def _join_field(
     view: MapView, points: Doubles, rows: Rows, distance: Doubles, gradient: Doubles
 ) -> None:
-    """At the ``rows`` near a surface, take its side from the field, and gradually its value."""
+    """Take the side of ``rows`` near a surface from the field, and gradually its value."""
     if not len(rows):
         return
     low, high = _FIELD_VOXELS * view.voxel_m, _SURFEL_VOXELS * view.voxel_m
@@ -198,9 +198,9 @@ def _join_rays(
     distance: Doubles,
     gradient: Doubles,
 ) -> None:
-    """At the ``rows`` near a surface that the field has not learnt, tell sides and close gaps.
+    """Find sides and close gaps at ``rows`` near a surface that the field has not learnt.
 
-    A disc is widened there up to the corners of its voxel, where it meets those beside it.
+    A disc is widened there up to the corners of its voxel, where it meets those next to it.
     """
     if not len(rows):
         return
@@ -225,14 +225,14 @@ def _join_rays(
 
 
 def _surfel_share(view: MapView, distance: Doubles) -> Doubles:
-    """How much the distance to the surfels counts there [N]: from 0 to 1, without a kink."""
+    """Return how much the distance to the surfels counts there [N]: from 0 to 1, without a kink."""
     low, high = _FIELD_VOXELS * view.voxel_m, _SURFEL_VOXELS * view.voxel_m
     share = np.clip((distance - low) / (high - low), 0.0, 1.0)
     return np.asarray(share * share * (3.0 - 2.0 * share), np.float64)
 
 
 def _unit(vectors: Doubles, otherwise: Doubles | float = 0.0) -> Doubles:
-    """The directions [N, 3] of ``vectors`` [N, 3]; ``otherwise`` where they have no length."""
+    """Return directions [N, 3] of ``vectors`` [N, 3]; ``otherwise`` where they have no length."""
     lengths = np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
     directions: Doubles = vectors / np.maximum(lengths, NO_LENGTH_M)[:, None]
     short = lengths <= NO_LENGTH_M

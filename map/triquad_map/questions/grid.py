@@ -11,7 +11,7 @@ from triquad_map.view import MapView
 
 @dataclass(frozen=True)
 class GridShape:
-    """Where the middles of a grid's cells are."""
+    """The places of the middles of a grid's cells."""
 
     corner: Doubles  # [3] the grid's least corner, metres, map frame
     cell_m: float
@@ -19,11 +19,11 @@ class GridShape:
 
     @property
     def cells(self) -> int:
-        """How many there are."""
+        """The number of cells."""
         return self.counts[0] * self.counts[1] * self.counts[2]
 
     def middles(self) -> Doubles:
-        """The middles [cells, 3], z running fastest."""
+        """Return the middles [cells, 3], z running fastest."""
         axes = [np.arange(count) for count in self.counts]
         cells = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         return np.asarray(self.corner + (cells + 0.5) * self.cell_m, np.float64)
@@ -40,7 +40,7 @@ class Grid:
 
 
 def grid(view: MapView, shape: GridShape, max_distance_m: float) -> Grid:
-    """Distance, of at most ``max_distance_m``, and status at the middles of all cells."""
+    """Return distance, of at most ``max_distance_m``, and status at the middles of all cells."""
     answer = distances(view, shape.middles(), DistanceOptions(max_distance_m))
     return Grid(
         shape,

@@ -12,27 +12,27 @@ from triquad_map.questions.segments import STEP_VOXELS
 from triquad_map.view import MapView
 
 _TOLERANCE_VOXELS = 0.5
-"""How far above a point its ground may be, and how much above the ground need not be seen: a
+"""The most that ground may lie above its point, and that need not be seen above the ground: a
 surface may cut the corner of a voxel in which no ray happened to end."""
 
 _BESIDE = 0.5
-"""Of the normal's z, up to which a surface is a wall."""
+"""The normal's z up to which a surface is a wall."""
 
 _FACES_DOWN = -0.5
-"""Up to here a normal's z is that of a wall whose top edge was met: it leans as the field says."""
+"""The normal's z up to which a wall's top edge was met: it leans as the field says."""
 
 _LEAST_UP = 0.5
-"""Of the normal's z: what is steeper is not stepped down to as if it were a plane."""
+"""The least of the normal's z: what is steeper is not stepped down to as if it were a plane."""
 
 _LONGEST_REST_M = 0.02
-"""From where a ray met the surface to the surface."""
+"""The longest way from where a ray met the surface to the surface."""
 
 _DOWN = np.array([0.0, 0.0, -1.0])
 
 
 @dataclass(frozen=True)
 class Ground:
-    """What lies below N points, metres, map frame, of one epoch.
+    """The ground below N points, metres, map frame, of one epoch.
 
     ``SURFACE``: the first surface below the point, which is its ground. ``FREE``: none as far down
     as asked, and rays have passed through all of that: a hole or an edge. ``UNKNOWN``: some of
@@ -47,7 +47,7 @@ class Ground:
 
     @property
     def slope_deg(self) -> Floats:
-        """How steep the ground is [N], 0 to 90 degrees; 90 where there is none."""
+        """The slope of the ground [N], 0 to 90 degrees; 90 where there is none."""
         return np.degrees(np.arccos(np.clip(self.normal[:, 2], 0.0, 1.0)))
 
 
@@ -62,7 +62,7 @@ class _Columns:
 
 
 def ground(view: MapView, points: Doubles, max_drop_m: float) -> Ground:
-    """The ground at most ``max_drop_m`` below ``points`` [N, 3], metres, map frame."""
+    """Return the ground at most ``max_drop_m`` below ``points`` [N, 3], metres, map frame."""
     columns = _columns(view, points, max_drop_m)
     unseen_m = np.where(columns.hit, _TOLERANCE_VOXELS * view.voxel_m, 0.0)
     to_see_m = np.maximum(columns.depths - unseen_m, 0.0)
@@ -85,7 +85,7 @@ def _stand(view: MapView, answer: Ground, rows: Longs, places: Doubles) -> None:
     """Put the ground into ``rows`` [R] of the answer, where ``places`` [R, 3] on it bear."""
     here = distances(view, places, DistanceOptions(view.voxel_m))
     up = here.gradient[:, 2]
-    bears = (up > _FACES_DOWN) & _ended_near(view, places)  # else met from behind, or made up
+    bears = (up > _FACES_DOWN) & _ended_near(view, places)  # else met from behind, or not seen
     # The rest of the way to the surface, as if that were a plane.
     rest_m = here.distance_m / np.maximum(up, _LEAST_UP)
     heights = places[:, 2] - np.clip(rest_m, -_LONGEST_REST_M, _LONGEST_REST_M)
@@ -96,7 +96,7 @@ def _stand(view: MapView, answer: Ground, rows: Longs, places: Doubles) -> None:
 
 
 def _columns(view: MapView, points: Doubles, max_drop_m: float) -> _Columns:
-    """The columns below ``points`` [N, 3]; those of points at a surface begin a little above."""
+    """Return the columns below ``points`` [N, 3]; those at a surface begin a little above."""
     starts = points.copy()
     depths = np.full(len(points), max_drop_m)
     hit = _trace_down(view, starts, depths)
@@ -112,12 +112,12 @@ def _columns(view: MapView, points: Doubles, max_drop_m: float) -> _Columns:
 
 
 def _trace_down(view: MapView, starts: Doubles, depths: Doubles) -> Bools:
-    """Shorten ``depths`` [N] to the first surface below; whether there is one."""
+    """Shorten ``depths`` [N] to the first surface below; return whether there is one."""
     return trace(view, starts, np.broadcast_to(_DOWN, starts.shape), ranges=depths)
 
 
 def _seen_down(view: MapView, starts: Doubles, depths: Doubles) -> Doubles:
-    """How far below ``starts`` [N, 3] rays have shown all, at most ``depths`` [N].
+    """Return how far below ``starts`` [N, 3] rays have shown all, at most ``depths`` [N].
 
     Between two seen places half a voxel apart there is nothing unknown: voxels are twice as high.
     What rays have seen only just now may have gaps in what is known of it: it is not seen through.
@@ -137,7 +137,7 @@ def _seen_down(view: MapView, starts: Doubles, depths: Doubles) -> Doubles:
 
 
 def _is_new(view: MapView, places: Doubles, status: Bytes, left_m: Doubles) -> Bools:
-    """Whether rays ended in the voxels of ``places`` [N, 3] on what is new, and not on a wall.
+    """Return whether rays ended in the voxels of ``places`` [N, 3] on what is new, not on a wall.
 
     ``left_m`` [N] is how far the first known surface below is, which needs a voxel itself.
     """
@@ -150,9 +150,9 @@ def _is_new(view: MapView, places: Doubles, status: Bytes, left_m: Doubles) -> B
 
 
 def _ended_near(view: MapView, points: Doubles) -> Bools:
-    """Whether rays ended in the voxels of ``points`` [N, 3], or closely above or below.
+    """Return whether rays ended in the voxels of ``points`` [N, 3], or closely above or below.
 
-    Where none did, the field goes on from what lies beside, as if a hole were covered.
+    Where none did, the field goes on from what lies next to it, as if a hole were covered.
     """
     near_m = _TOLERANCE_VOXELS * view.voxel_m
     ended = np.zeros(len(points), np.bool_)

@@ -1,4 +1,4 @@
-"""How far rays reach: a simulated lidar, or what a localiser expects to see."""
+"""The ranges of rays: a simulated lidar, or what a localiser expects to see."""
 
 from dataclasses import dataclass
 
@@ -16,12 +16,12 @@ _TOUCH_M = 1e-5
 """A ray that comes as near to unknown space has reached it: its places are no more exact."""
 
 _LOOK_AHEAD_M = 3.0
-"""How far around a surface is searched for: farther costs more than shorter steps."""
+"""The distance of a search for surface: farther costs more than shorter steps."""
 
 
 @dataclass(frozen=True)
 class RayOptions:
-    """How far rays go and what stops them."""
+    """The options of how far rays go and what stops them."""
 
     max_range_m: float
     through_unknown: bool = False
@@ -29,7 +29,7 @@ class RayOptions:
 
 @dataclass(frozen=True)
 class RayRanges:
-    """How far N rays reach, metres, of one epoch.
+    """The ranges of N rays, metres, of one epoch.
 
     ``SURFACE``: to a seen surface. ``UNKNOWN``: to where unknown space begins. ``FREE``: to the
     largest range, through space that was seen to be free (or, where asked for, unknown).
@@ -41,7 +41,7 @@ class RayRanges:
 
 
 def rays(view: MapView, origins: Doubles, directions: Doubles, options: RayOptions) -> RayRanges:
-    """How far rays from ``origins`` [N, 3] along unit ``directions`` [N, 3] reach, map frame."""
+    """Return ranges of rays from ``origins`` [N, 3] along unit ``directions`` [N, 3], map frame."""
     status = np.full(len(origins), Status.FREE, np.uint8)
     ranges = np.full(len(origins), options.max_range_m)
     hit = trace(view, origins, directions, ranges=ranges)
@@ -52,7 +52,7 @@ def rays(view: MapView, origins: Doubles, directions: Doubles, options: RayOptio
 
 
 def trace(view: MapView, origins: Doubles, directions: Doubles, ranges: Doubles) -> Bools:
-    """Shorten ``ranges`` [N] to the first surface (Hart 1996); whether each ray meets one."""
+    """Shorten ``ranges`` [N] to the first surface (Hart 1996); return whether rays meet one."""
     hit = np.zeros(len(origins), np.bool_)
     at = np.zeros(len(origins))
     before = np.zeros(len(origins))  # distance at the last place

@@ -1,4 +1,4 @@
-"""What a ball meets that moves along straight segments."""
+"""The contacts of a ball that moves along straight segments."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ STEP_VOXELS = 0.5
 
 @dataclass(frozen=True)
 class SegmentOptions:
-    """What moves along the segments, and how far around surfaces are searched for."""
+    """The ball that moves along the segments, and how far around surfaces are searched for."""
 
     radius_m: float
     max_distance_m: float
@@ -30,7 +30,7 @@ class SegmentOptions:
 
 @dataclass(frozen=True)
 class Segments:
-    """What a ball meets on N segments, metres, of one epoch.
+    """The contacts of a ball on N segments, metres, of one epoch.
 
     Places are distances along the segment from its start. ``clearance_m`` is that of the ball's
     centre, up to where it first touches a surface; it is right within half a step of half a voxel.
@@ -46,7 +46,7 @@ class Segments:
     epoch: int
 
     def free(self, unknown: UnknownLike = Unknown.OBSTACLE) -> Bools:
-        """Whether the ball can pass each segment [N], where unknown space counts as asked.
+        """Return whether the ball can pass each segment [N], where unknown space counts as asked.
 
         Raises:
             UnknownSpaceError: it counts as an error, and is met before any contact.
@@ -60,7 +60,7 @@ class Segments:
 
 @dataclass(frozen=True)
 class _March:
-    """How far a walk along N segments went."""
+    """The progress of a walk along N segments."""
 
     blocked: Bools
     contact: Doubles
@@ -69,7 +69,7 @@ class _March:
 
 
 def segments(view: MapView, starts: Doubles, ends: Doubles, options: SegmentOptions) -> Segments:
-    """What a ball meets that moves from ``starts`` to ``ends`` [N, 3], metres, map frame."""
+    """Return what a ball meets that moves from ``starts`` to ``ends`` [N, 3], metres, map frame."""
     lengths = np.linalg.norm(ends - starts, axis=1)
     directions = (ends - starts) / np.maximum(lengths, 1e-12)[:, None]
     reach_m = max(options.max_distance_m, options.radius_m + view.voxel_m)
@@ -116,9 +116,9 @@ def _march(
 ) -> _March:
     """Walk along the segments as far as the distance allows, until the first contact.
 
-    ``gap`` gives the distances [N] at points [N, 3]. These change by no more than the way that is
-    gone: the next contact is at least ``distance - radius`` away, and a place with less clearance
-    ``distance - clearance``.
+    ``gap`` gives the distances [N] at points [N, 3]. These change by no more than the way
+    covered: the next contact is at least ``distance - radius`` away, and a place with less
+    clearance ``distance - clearance``.
     """
     count = len(starts)
     march = _March(
@@ -150,7 +150,7 @@ def _march(
 
 @dataclass(frozen=True)
 class Polyline:
-    """As :class:`Segments`, of several one after the other; places are metres from the start."""
+    """The :class:`Segments` of several one after the other; places are metres from the start."""
 
     length_m: float
     blocked: bool
@@ -162,7 +162,7 @@ class Polyline:
     epoch: int
 
     def free(self, unknown: UnknownLike = Unknown.OBSTACLE) -> bool:
-        """Whether the ball can pass, where unknown space counts as asked.
+        """Return whether the ball can pass, where unknown space counts as asked.
 
         Raises:
             UnknownSpaceError: it counts as an error, and is met before any contact.
@@ -174,7 +174,7 @@ class Polyline:
 
 
 def along_polyline(parts: Segments) -> Polyline:
-    """Consecutive segments as one way."""
+    """Return consecutive segments as one way."""
     lengths = parts.length_m.astype(np.float64)
     begins = np.cumsum(lengths) - lengths
     total = float(lengths.sum())

@@ -1,4 +1,4 @@
-"""Whether spheres are free: a robot's body, made of spheres."""
+"""The status of spheres: a robot's body, made of spheres."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ from triquad_map.view import MapView
 
 @dataclass(frozen=True)
 class Spheres:
-    """What N spheres hold, of one epoch.
+    """The content of N spheres, of one epoch.
 
     ``SURFACE``: a seen surface reaches into the sphere, or it lies behind one. ``UNKNOWN``: none
     does, but unknown space. ``FREE``: all of it was seen to be free.
@@ -28,7 +28,7 @@ class Spheres:
     epoch: int
 
     def free(self, unknown: UnknownLike = Unknown.OBSTACLE) -> Bools:
-        """Whether each sphere [N] can be entered, where unknown space counts as asked.
+        """Return whether each sphere [N] can be entered, where unknown space counts as asked.
 
         Raises:
             UnknownSpaceError: it counts as an error, and a sphere without a surface meets it.
@@ -42,7 +42,7 @@ class Spheres:
 
 
 def spheres(view: MapView, centres: Doubles, radii: Doubles) -> Spheres:
-    """What the spheres around ``centres`` [N, 3] of ``radii`` [N] hold, metres, map frame."""
+    """Return what spheres around ``centres`` [N, 3] of ``radii`` [N] contain, metres, map frame."""
     # A little beyond the largest, so that what touches it is found.
     reach_m = float(radii.max(initial=0.0)) + view.voxel_m
     answer = distances(view, centres, DistanceOptions(reach_m, unknown_distance=True))

@@ -37,7 +37,7 @@ class CodedRows:
             self._cells[cell] = codes[start:end], rows[start:end]
 
     def find(self, codes: Longs) -> FoundRows:
-        """The rows of ``codes`` [N]."""
+        """Return the rows of ``codes`` [N]."""
         found = np.repeat(self._nothing[None], len(codes), axis=0)
         there = np.zeros(len(codes), np.bool_)
         cells, owners = np.unique(codes >> self._shift, return_inverse=True)

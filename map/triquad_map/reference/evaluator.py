@@ -1,4 +1,4 @@
-"""A map as a file holds it, answered with numpy alone: slow, and what others must equal.
+"""A map as a file has it, answered with numpy alone: slow, and what others must equal.
 
 Positions are float64 in the map frame and become float32 once they are relative to a region's
 centre.
@@ -30,7 +30,7 @@ class MapEvaluator(ComposedView):
         super().__init__(record.epoch, record.settings, regions, split=in_chunks)
 
     def query(self, points: NDArray[np.floating], gradient: bool = False) -> FieldAnswer:
-        """Signed distance, status and, on request, gradient.
+        """Return signed distance, status and, on request, gradient.
 
         Args:
             points: ``[N, 3]``, metres, map frame.
@@ -57,13 +57,13 @@ def _recorded(settings: FieldSettings, region: Region) -> RecordedRegion:
 
 
 def in_chunks(count: int, work: Work, least: int = 0) -> None:  # noqa: ARG001
-    """A :class:`~triquad_map.composition.region.Split` that bounds memory."""
+    """Split work to bound memory: a :class:`~triquad_map.composition.region.Split`."""
     for first in range(0, count, CHUNK_POINTS):
         work(first, min(first + CHUNK_POINTS, count))
 
 
 def checked_points(points: NDArray[np.floating]) -> Doubles:
-    """Points [N, 3] as float64.
+    """Return points [N, 3] as float64.
 
     Raises:
         FormatError: ``points`` has another shape, or a coordinate is not finite.

@@ -24,7 +24,7 @@ class RegionField:
     def __init__(
         self, settings: FieldSettings, region: Region, shifts: Mapping[int, int] | None = None
     ) -> None:
-        """The field of a region without its vertices, which :meth:`add` brings.
+        """Make the field of a region without its vertices, which :meth:`add` brings.
 
         ``shifts`` are by level those of the cells in which they come, see :class:`CodedRows`.
         """
@@ -45,7 +45,7 @@ class RegionField:
             self._features[table.plane, table.level].add(table.codes, table.vectors())
 
     def evaluate(self, points: Floats, gradient: bool) -> FieldValues:
-        """The field at points [N, 3], metres from the region's centre."""
+        """Return the field at points [N, 3], metres from the region's centre."""
         parts: list[Floats] = []
         width = self._settings.input_size if gradient else 0
         slopes = np.zeros((3, len(points), width), np.float32)
@@ -63,11 +63,11 @@ class RegionField:
         return FieldValues(value * scale, np.einsum("anc,nc->na", slopes, sensitivity) * scale)
 
     def evaluate_in_grid(self, axes: Floats, points: Longs) -> Floats:
-        """Distances in a grid; see :class:`triquad_map.composition.region.FieldEngine`."""
+        """Return distances in a grid; see :class:`triquad_map.composition.region.FieldEngine`."""
         return self.evaluate(in_grid(axes, points), gradient=False).sdf
 
     def _interpolate(self, local: Floats, slopes: Floats | None) -> Floats:
-        """Interpolated features [N, H * d]; their d/dx goes into ``slopes`` [3, N, ...]."""
+        """Return interpolated features [N, H * d]; their d/dx goes into ``slopes`` [3, N, ...]."""
         settings = self._settings
         size = settings.feature_size
         leaf = np.float32(settings.leaf_m)
@@ -97,7 +97,7 @@ class RegionField:
         return features
 
     def _fourier(self, local: Floats, slopes: Floats | None) -> Floats:
-        """Fourier features [N, 6m]; their d/dx goes into ``slopes`` [3, N, 6m]."""
+        """Return Fourier features [N, 6m]; their d/dx goes into ``slopes`` [3, N, 6m]."""
         half = np.float32(self._settings.region_side_m / 2)
         angle = (local / half)[:, :, None] * self._turns  # [N, 3, m]
         sine, cosine = np.sin(angle), np.cos(angle)
@@ -112,7 +112,7 @@ class RegionField:
         return np.concatenate([sine.reshape(-1, width), cosine.reshape(-1, width)], axis=1)
 
     def _decode(self, x: Floats, gradient: bool) -> tuple[Floats, Floats]:
-        """Output [N] of the MLP and, on request, its derivative [N, input] by the input."""
+        """Return output [N] of the MLP and, on request, its derivative [N, input] by the input."""
         weights, biases = self._mlp.weights, self._mlp.biases
         first = np.maximum(x @ weights[0] + biases[0], 0)
         second = np.maximum(first @ weights[1] + biases[1], 0)

@@ -1,4 +1,4 @@
-"""What rays have shown of a region, found with numpy alone."""
+"""The evidence of a region, found with numpy alone."""
 
 import itertools
 from collections.abc import Iterator, Sequence
@@ -23,14 +23,14 @@ from triquad_map.surface import MARGIN_STEP
 _BLOCKS_AT_ONCE = 2048
 
 _VOXEL_BITS = 3 * (BLOCK_VOXELS.bit_length() - 1)
-"""By which the code of a voxel is longer than that of its block."""
+"""The bits that the code of a voxel is longer than that of its block."""
 
 
 class SeenBlocks:
     """The evidence of a region, in leaf coordinates."""
 
     def __init__(self, settings: FieldSettings, shift: int = ONE_CELL) -> None:
-        """``shift`` is that of the cells in which evidence is added, see :class:`CodedRows`."""
+        """Take the ``shift`` of the cells in which evidence is added, see :class:`CodedRows`."""
         self._side = 1 << settings.depth
         self._surface = CodedRows(BLOCK_BYTES, np.uint8, shift)
         self._free = CodedRows(BLOCK_BYTES, np.uint8, shift)
@@ -47,7 +47,7 @@ class SeenBlocks:
         self.newest_s = max(self.newest_s, int(evidence.seen_s.max(initial=0)))
 
     def status(self, voxels: Doubles, reach: float) -> Bytes:
-        """Status values [N]; see :class:`triquad_map.composition.region.SeenSpace`."""
+        """Return status values [N]; see :class:`triquad_map.composition.region.SeenSpace`."""
         free = self._holds(self._free, np.floor(voxels).astype(np.int64))
         status = np.where(free, Status.FREE, Status.UNKNOWN).astype(np.uint8)
         low = np.floor(voxels - reach).astype(np.int64)
@@ -58,17 +58,17 @@ class SeenBlocks:
         return status
 
     def surface_in_grid(self, axes: Sequence[Doubles], reach: float) -> Bools:
-        """Where a grid has surface; see :class:`triquad_map.composition.region.SeenSpace`."""
+        """Find surface in a grid; see :class:`triquad_map.composition.region.SeenSpace`."""
         places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
         surface = self.status(places.reshape(-1, 3), reach) == Status.SURFACE
         return np.asarray(surface.reshape(places.shape[:-1]))
 
     def ended_in(self, voxels: Longs) -> Bools:
-        """Whether rays ended in ``voxels`` [N, 3]."""
+        """Return whether rays ended in ``voxels`` [N, 3]."""
         return self._holds(self._surface, voxels)
 
     def near_ends(self, voxels: Doubles, reach: float) -> Bools:
-        """Where rays ended; see :class:`triquad_map.composition.region.SeenSpace`."""
+        """Return where rays ended; see :class:`triquad_map.composition.region.SeenSpace`."""
         near = np.zeros(len(voxels), np.bool_)
         low = np.floor(voxels - reach).astype(np.int64)
         high = np.floor(voxels + reach).astype(np.int64)
@@ -82,7 +82,7 @@ class SeenBlocks:
         return near
 
     def _margins_of(self, voxels: Longs) -> Bytes:
-        """The margins [N, 6] of voxels [N, 3]; 0 where none are known."""
+        """Return the margins [N, 6] of voxels [N, 3]; 0 where none are known."""
         blocks, inner = np.divmod(voxels, BLOCK_VOXELS)
         codes = _voxel_codes(morton.encode(blocks), inner)
         return np.asarray(self._margins.find(codes).rows, np.uint8)
@@ -135,7 +135,7 @@ class SeenBlocks:
             )
 
     def _holds(self, masks: CodedRows, voxels: Longs) -> Bools:
-        """Whether the bits of voxels [N, 3] are set."""
+        """Return whether the bits of voxels [N, 3] are set."""
         inside = np.all((voxels >= 0) & (voxels < self._side), axis=1)
         blocks, inner = np.divmod(np.where(inside[:, None], voxels, 0), BLOCK_VOXELS)
         found = masks.find(morton.encode(blocks))
@@ -166,13 +166,13 @@ def _search_inside(
 
 
 def _voxel_codes(blocks: Longs, inner: Longs) -> Longs:
-    """Codes [N] of voxels, by those of their blocks [N] and where in these they are [N, 3]."""
+    """Return codes [N] of voxels, by codes of their blocks [N] and places in these [N, 3]."""
     codes: Longs = (blocks << _VOXEL_BITS) + inner @ (BLOCK_VOXELS**2, BLOCK_VOXELS, 1)
     return codes
 
 
 def _steps(shell: int) -> Iterator[Longs]:
-    """Steps [3] to the blocks of one shell around a block."""
+    """Yield steps [3] to the blocks of one shell around a block."""
     for step in itertools.product(range(-shell, shell + 1), repeat=3):
         if max(map(abs, step)) == shell:
             yield np.array(step, np.int64)

@@ -31,7 +31,7 @@ class SurfelCloud:
     """Surfels by blocks of voxels."""
 
     def __init__(self, voxels: Longs, surfels: Surfels, confidence: Floats, seen_s: Longs) -> None:
-        """``surfels`` of ``voxels`` [S, 3], of which those of a block follow each other.
+        """Take ``surfels`` of ``voxels`` [S, 3], of which those of a block follow each other.
 
         Each has a ``confidence`` [S], and was ``seen_s`` [S] last, seconds since 1970.
         """
@@ -62,7 +62,7 @@ class SurfelCloud:
         for first in range(0, count, step):
             part = np.arange(first, min(first + step, count))
             gaps = self._block_gaps(points[part])
-            # The nearest block first: for what it holds, most others need no search.
+            # The nearest block first: for what it contains, most others need no search.
             nearest = np.zeros(gaps.shape, np.bool_)
             nearest[np.arange(len(part)), gaps.argmin(axis=1)] = True
             limits = found.distances[part, None]
@@ -93,7 +93,7 @@ class SurfelCloud:
         nearest.normal[rows] = np.where(facing, self._surfels.normals[surfels], 0.0)
 
     def _block_gaps(self, points: Doubles) -> Doubles:
-        """How far [N, B] the surfels of each block are at least from each point."""
+        """Return how far [N, B] the surfels of each block are at least from each point."""
         squares = np.zeros((len(points), len(self._corners)))
         for axis in range(3):
             low = self._corners[:, axis] - points[:, axis, None]
@@ -145,7 +145,7 @@ class SurfelCloud:
         found.rows[rows] = self._rows[surfels[winners[nearer]]]
 
     def _closest_points(self, points: Doubles, surfels: NDArray[np.intp]) -> Doubles:
-        """The nearest point [P, 3] of each surfel to each point."""
+        """Return the nearest point [P, 3] of each surfel to each point."""
         offsets = points - self._positions[surfels]
         normals = self._normals[surfels]
         heights = (offsets * normals).sum(axis=1, keepdims=True)
@@ -168,7 +168,7 @@ def _portions(sizes: Longs) -> Iterator[slice]:
 
 
 def fitted_surfels(record: Evidence, seen: SeenBlocks, field: SampleField) -> SurfelCloud:
-    """The surfels of all voxels in which rays ended; ``seen`` holds what ``record`` does."""
+    """Return the surfels of all voxels in which rays ended; ``seen`` has what ``record`` has."""
     voxels = seen_voxels(record, record.surface)
     surfels = fit_surfels(voxels, field, seen.ended_in)
     seen_s = np.repeat(record.seen_s, surface_counts(record.surface))

@@ -27,11 +27,11 @@ _MAX_ITEMS = 64
 _OBJECTS_PER_ITEM = 8  # of a manifest's longest list
 _MAX_STRING_BYTES = 4096
 _TOPIC = re.compile(rb"[\x80-\x8f]\xa5topic[\xa0-\xbf](/triquad/[a-z]+)")
-"""How a part begins: a short msgpack map, whose first key is ``topic``."""
+"""The beginning of a part: a short msgpack map, whose first key is ``topic``."""
 
 
 def unpack_body(topic: str, payload: bytes, max_items: int = _MAX_ITEMS) -> "PartBody":
-    """The body of a part, whose lists have at most ``max_items`` items.
+    """Return the body of a part, whose lists have at most ``max_items`` items.
 
     Raises:
         DamagedMapFileError: it is not a msgpack map, exceeds a limit, or is of another topic.
@@ -42,7 +42,7 @@ def unpack_body(topic: str, payload: bytes, max_items: int = _MAX_ITEMS) -> "Par
 
 
 def part_topic(payload: bytes) -> str | None:
-    """The topic that a part names first; ``None``: it is no part."""
+    """Return the topic that a part names first; ``None``: it is no part."""
     match = _TOPIC.match(payload)
     return None if match is None else match[1].decode()
 
@@ -76,7 +76,7 @@ class PartBody:
         self._body: Mapping[str, object] = body
 
     def value(self, key: str, kind: type) -> Any:
-        """The field ``key``, which must be exactly of the type ``kind``."""
+        """Return the field ``key``, which must be exactly of the type ``kind``."""
         value = self._body.get(key)
         if type(value) is not kind:
             raise DamagedMapFileError(
@@ -91,21 +91,21 @@ class PartBody:
             raise DamagedMapFileError(f"{self.topic}: {key} = {value!r}, expected {wanted!r}")
 
     def count(self, key: str) -> int:
-        """A number in ``[0, 2**63)``."""
+        """Return a number in ``[0, 2**63)``."""
         value: int = self.value(key, int)
         if not 0 <= value < 2**63:
             raise DamagedMapFileError(f"{self.topic}: {key} = {value} is not a count")
         return value
 
     def texts(self, key: str) -> list[str]:
-        """A list of strings."""
+        """Return a list of strings."""
         values: list[Any] = self.value(key, list)
         if not all(type(value) is str for value in values):
             raise DamagedMapFileError(f"{self.topic}: {key} is not a list of strings")
         return values
 
     def index(self) -> RegionIndex:
-        """The index of the region to which the part belongs."""
+        """Return the index of the region to which the part belongs."""
         value = self.value("region", list)
         if len(value) != 3 or not all(
             type(number) is int and abs(number) <= _MAX_REGION_INDEX for number in value
@@ -116,14 +116,14 @@ class PartBody:
         return (value[0], value[1], value[2])
 
     def array(self, key: str, dtype: str, shape: tuple[int | None, ...]) -> NDArray[Any]:
-        """An array of this dtype and shape; a size that is ``None`` may be any."""
+        """Return an array of this dtype and shape; a size that is ``None`` may be any."""
         name = f"{self.topic}: {key}"
         array = unpack_array(name, self._body.get(key))
         ArraySpec(dtype, shape).check(name, array)
         return array
 
     def arrays(self, key: str, count: int) -> tuple[NDArray[Any], ...]:
-        """``count`` arrays of ``<f4``, each of any shape."""
+        """Return ``count`` arrays of ``<f4``, each of any shape."""
         arrays = []
         for i, item in enumerate(self._items(key, count)):
             name = f"{self.topic}: {key}[{i}]"
@@ -133,16 +133,16 @@ class PartBody:
         return tuple(arrays)
 
     def mapping(self, key: str) -> Mapping[str, object]:
-        """A nested map."""
+        """Return a nested map."""
         value: Mapping[str, object] = self.value(key, dict)
         return value
 
     def maps(self, key: str, count: int) -> tuple["PartBody", ...]:
-        """``count`` nested maps."""
+        """Return ``count`` nested maps."""
         return tuple(PartBody(self.topic, item) for item in self._items(key, count))
 
     def codes(self, key: str, most: int) -> Longs:
-        """Morton codes [V], of which no more than ``most`` are decoded: each takes eight bytes."""
+        """Return Morton codes [V], of which at most ``most`` are decoded: each takes 8 bytes."""
         planes = self.array(key, "|u1", (None, None))
         self._limit(key, planes.shape[1], most)
         if not 1 <= len(planes) <= MAX_CODE_BYTES:
@@ -150,7 +150,7 @@ class PartBody:
         return unshuffle_codes(planes)
 
     def counts(self, key: str, count: int | None, most: int) -> Longs:
-        """Numbers that are not negative: ``count`` of them, ``None``: any up to ``most``."""
+        """Return numbers that are not negative: ``count`` of them, ``None``: any up to ``most``."""
         planes = self.array(key, "|u1", (None, count))
         self._limit(key, planes.shape[1], most)
         if not 1 <= len(planes) <= MAX_CODE_BYTES:
@@ -158,7 +158,7 @@ class PartBody:
         return unshuffle_counts(planes)
 
     def column(self, column: Column, count: int | None) -> NDArray[Any]:
-        """A shuffled column of ``count`` rows; ``None``: of any number."""
+        """Return a shuffled column of ``count`` rows; ``None``: of any number."""
         planes = self.array(column.name, "|u1", (None, count, *column.row))
         for dtype in column.dtypes:
             if np.dtype(dtype).itemsize == len(planes):
@@ -166,20 +166,20 @@ class PartBody:
         raise DamagedMapFileError(f"{self.topic}: {column.name} has {len(planes)} bytes per value")
 
     def columns(self, columns: Sequence[Column], most: int) -> tuple[NDArray[Any], ...]:
-        """Shuffled columns of equal length, which is at most ``most``."""
+        """Return shuffled columns of equal length, which is at most ``most``."""
         first = self.column(columns[0], None)
         self._limit(columns[0].name, len(first), most)
         return (first, *(self.column(column, len(first)) for column in columns[1:]))
 
     def integers(self, key: str, count: int, size: int) -> NDArray[np.int16]:
-        """Integers [count, size] of one or two bytes."""
+        """Return integers [count, size] of one or two bytes."""
         planes = self.array(key, "|i1", (None, size, count))
         if len(planes) not in (1, 2):
             raise DamagedMapFileError(f"{self.topic}: {key} has {len(planes)} bytes per value")
         return join_integers(planes)
 
     def has(self, key: str) -> bool:
-        """Whether there is a field ``key``."""
+        """Return whether there is a field ``key``."""
         return key in self._body
 
     def _items(self, key: str, count: int) -> list[Any]:

@@ -59,14 +59,14 @@ _MIN_SEAM_BYTES = 512  # a block of its own costs some bytes
 
 
 def pack_part(key: PartKey, body: Mapping[str, object]) -> Part:
-    """A part of this body: numbers, strings, lists, maps and packed arrays."""
+    """Return a part of this body: numbers, strings, lists, maps and packed arrays."""
     return Part(key, typing.cast(bytes, msgpack.packb({"topic": key.topic, **body})))
 
 
 def pack_record(
     record: MapRecord, feature_dtype: str, previews: Mapping[RegionIndex, Part]
 ) -> Iterator[Part]:
-    """The parts of all regions of a checked record, each region's preview after them.
+    """Yield the parts of all regions of a checked record, each region's preview after them.
 
     Raises:
         FormatError: features do not fit ``feature_dtype``, one of ``FLOATS``.
@@ -78,7 +78,7 @@ def pack_record(
 
 
 def pack_region(region: Region, settings: FieldSettings, feature_dtype: str) -> Iterator[Part]:
-    """The parts of a checked region, in the order of the file.
+    """Yield the parts of a checked region, in the order of the file.
 
     ``feature_dtype``, one of ``FLOATS``, is for features that are not integers.
 
@@ -93,7 +93,7 @@ def pack_region(region: Region, settings: FieldSettings, feature_dtype: str) -> 
 
 
 def _region_part(key: PartKey, fields: Mapping[str, object]) -> Part:
-    """A part of a region, with what tells its place."""
+    """Return a part of a region, with what gives its place."""
     place: dict[str, object] = {"region": list(key.region)}
     if key.topic not in (REGION, TRAINING):
         place |= {"plane": key.plane, "cell": key.cell}
@@ -127,9 +127,9 @@ def _pack_squares(
     *,
     fields_of: Callable[[int, slice], Mapping[str, object]],
 ) -> Iterator[Part]:
-    """A part for each square that holds vertices.
+    """Yield a part for each square that contains vertices.
 
-    ``fields_of`` gives what a part holds of some rows of a table, which it gets by its number.
+    ``fields_of`` gives what a part contains of some rows of a table, which it gets by its number.
     """
     for plane in range(len(AXES)):
         cells = {
@@ -201,7 +201,7 @@ def _pack_evidence(region: Region) -> Iterator[Part]:
 
 
 def _seen_fields(seen_s: Longs) -> dict[str, object]:
-    """Times of the blocks with surface, as seconds since shortly before the first of them."""
+    """Return times of the blocks with surface, in seconds since shortly before the first."""
     known = seen_s[seen_s > 0]
     start = int(known.min()) - 1 if len(known) else 0
     since = np.maximum(seen_s - start, 0)
@@ -260,7 +260,7 @@ def _pack_rays(region: Region, rays: ReplayRays) -> Iterator[Part]:
 
 
 def seams(part: Part) -> list[int]:
-    """Offsets in a valid part's payload at which byte planes of its arrays begin and end."""
+    """Return offsets in a valid part's payload at which byte planes of its arrays begin and end."""
     if not part.key.topic.startswith(PREFIX):
         return []
     binaries = list(_binaries(msgpack.unpackb(part.payload, max_ext_len=0)))
@@ -275,7 +275,7 @@ def seams(part: Part) -> list[int]:
 
 
 def _binaries(value: object) -> Iterator[tuple[int, int]]:
-    """Size and number of byte planes of each binary in a body, in the order of the payload."""
+    """Yield size and number of byte planes of each binary in a body, in the payload's order."""
     if isinstance(value, bytes):
         yield len(value), 1
     elif isinstance(value, dict) and isinstance(value.get("data"), bytes):

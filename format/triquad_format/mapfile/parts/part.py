@@ -47,7 +47,7 @@ CELL_LEAVES = 1 << _LEAVES_LOG2
 """Side of a cell in leaves: 51.2 m at the default leaf."""
 
 LEVEL_BITS = MAX_LEVEL.bit_length()
-"""Planes of bits that hold levels of evidence."""
+"""The number of bit planes for levels of evidence."""
 
 MAX_CODE_BYTES = 6
 """Bytes of the widest difference between two neighbouring Morton codes."""
@@ -55,7 +55,7 @@ MAX_CODE_BYTES = 6
 
 @dataclass(frozen=True, order=True)
 class PartKey:
-    """What a part is of; no two parts of a map have the same key."""
+    """The key of a part; no two parts of a map have the same one."""
 
     topic: str
     region: RegionIndex = NO_REGION  # also of what belongs to the whole map
@@ -72,27 +72,27 @@ class Part:
 
 
 def square_shift(settings: FieldSettings, level: int) -> int:
-    """Bits by which the code of a vertex of a level is longer than that of its square."""
+    """Return how many bits a vertex's code at a level is longer than that of its square."""
     return 2 * (_LEAVES_LOG2 - (settings.depth - level))
 
 
 def cube_shift() -> int:
-    """Bits by which the code of a block is longer than that of its cube."""
+    """Return how many bits a block's code is longer than that of its cube."""
     return 3 * (_LEAVES_LOG2 - (BLOCK_VOXELS.bit_length() - 1))
 
 
 def leaf_shift() -> int:
-    """Bits by which the code of a leaf is longer than that of its cube."""
+    """Return how many bits a leaf's code is longer than that of its cube."""
     return 3 * _LEAVES_LOG2
 
 
 def vertex_reach(settings: FieldSettings) -> int:
-    """How far a vertex of the coarsest level has an effect, leaves."""
+    """Return how far a vertex of the coarsest level has an effect, leaves."""
     return 1 << (settings.feature_levels - 1)
 
 
 def extent(settings: FieldSettings, key: PartKey) -> LeafBox:
-    """The column over a square, or the cube, that a part is of; else all of its region: leaves."""
+    """Return the column over a part's square, or its cube; else all of its region: leaves."""
     box = whole_region(settings)
     axes = {VERTICES: list(AXES[key.plane]), EVIDENCE: [0, 1, 2]}.get(key.topic, [])
     if axes:
@@ -103,12 +103,12 @@ def extent(settings: FieldSettings, key: PartKey) -> LeafBox:
 
 
 def cells_at(leaves: Longs) -> set[int]:
-    """Codes of the squares or cubes that hold places [N, 2 or 3], in leaf coordinates."""
+    """Return codes of the squares or cubes that contain places [N, 2 or 3], in leaf coordinates."""
     return set(np.unique(morton.encode(leaves >> _LEAVES_LOG2)).tolist())
 
 
 def cells_near(leaves: NDArray[np.floating], reach: float) -> set[int]:
-    """Codes of the squares or cubes within ``reach`` leaves of places [N, 2 or 3] in leaves."""
+    """Return codes of squares or cubes within ``reach`` leaves of places [N, 2 or 3] in leaves."""
     cells: set[int] = set()
     for corner in np.ndindex(*(2,) * leaves.shape[1]):
         near = np.floor(leaves + (2 * np.array(corner) - 1) * reach).astype(np.int64)
@@ -129,20 +129,20 @@ SAMPLE_COLUMNS = (Column("points", ("<f4",), (3,)), Column("labels", FLOATS))
 
 
 def feature_column(settings: FieldSettings) -> Column:
-    """Feature vectors of vertices that are not integers."""
+    """Return feature vectors of vertices that are not integers."""
     return Column("features", FLOATS, (settings.feature_size,))
 
 
 def moment_columns(settings: FieldSettings) -> tuple[Column, ...]:
-    """Adam's state of vertices: first and second moments, and steps."""
+    """Return Adam's state of vertices: first and second moments, and steps."""
     floats, row = ("<f4", "<f2"), (settings.feature_size,)
     return Column("means", floats, row), Column("variances", floats, row), Column("steps", ("<i4",))
 
 
 def shuffle(array: NDArray[np.generic]) -> Bytes:
-    """Bytes ``[B, ...]`` of an array ``[...]`` of ``B``-byte values, little endian.
+    """Return bytes ``[B, ...]`` of an array ``[...]`` of ``B``-byte values, little endian.
 
-    Row ``k`` holds byte ``k`` of every value: bytes of one significance resemble each other, so
+    Row ``k`` is byte ``k`` of every value: bytes of one significance resemble each other, so
     they compress better side by side.
     """
     little = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<"), copy=False)
@@ -152,18 +152,18 @@ def shuffle(array: NDArray[np.generic]) -> Bytes:
 
 
 def unshuffle(planes: Bytes, dtype: str) -> NDArray[np.generic]:
-    """The array ``[...]`` of this dtype; the inverse of :func:`shuffle`."""
+    """Return the array ``[...]`` of this dtype; the inverse of :func:`shuffle`."""
     values = np.ascontiguousarray(np.moveaxis(planes, 0, -1))
     return np.frombuffer(values.data, dtype).reshape(planes.shape[1:])
 
 
 def shuffle_codes(codes: Longs) -> Bytes:
-    """Shuffled differences ``[B, V]`` of increasing codes ``[V]``, in as few bytes as hold them."""
+    """Return shuffled differences ``[B, V]`` of increasing codes ``[V]``, in the fewest bytes."""
     return shuffle_counts(np.diff(codes, prepend=np.int64(0)))
 
 
 def unshuffle_codes(planes: Bytes) -> Longs:
-    """The inverse of :func:`shuffle_codes`; it takes at most ``MAX_CODE_BYTES`` rows.
+    """Invert :func:`shuffle_codes`; it takes at most ``MAX_CODE_BYTES`` rows.
 
     Differences this small cannot pass over the negative numbers, so that codes which overflow
     are seen to decrease.
@@ -172,21 +172,21 @@ def unshuffle_codes(planes: Bytes) -> Longs:
 
 
 def shuffle_counts(counts: Longs) -> Bytes:
-    """Shuffled numbers ``[B, V]`` that are not negative, in as few bytes as hold them all."""
+    """Return shuffled numbers ``[B, V]`` that are not negative, in as few bytes as they all fit."""
     width = (int(counts.max(initial=1)).bit_length() + 7) // 8
     narrow = next(size for size in (1, 2, 4, 8) if size >= width)
     return shuffle(counts.astype(f"<u{narrow}"))[:width]
 
 
 def unshuffle_counts(planes: Bytes) -> Longs:
-    """The inverse of :func:`shuffle_counts`; it takes at most seven rows."""
+    """Invert :func:`shuffle_counts`; it takes at most seven rows."""
     wide = np.zeros((8, planes.shape[1]), np.uint8)
     wide[: len(planes)] = planes
     return unshuffle(wide, "<i8").astype(np.int64)
 
 
 def split_integers(integers: NDArray[np.int16]) -> NDArray[np.int8]:
-    """Signed bytes ``[W, S, V]`` of integers ``[V, S]``, ``W`` being 1 where one byte holds all.
+    """Return signed bytes ``[W, S, V]`` of integers ``[V, S]``, ``W`` being 1 where each fits one.
 
     Row 0 is the integer's remainder in -128 to 127, row 1 the multiple of 256 without it: unlike
     the upper byte of the two's complement, it is 0 for all small integers.
@@ -198,7 +198,7 @@ def split_integers(integers: NDArray[np.int16]) -> NDArray[np.int8]:
 
 
 def join_integers(planes: NDArray[np.int8]) -> NDArray[np.int16]:
-    """Integers ``[V, S]``; the inverse of :func:`split_integers`."""
+    """Return integers ``[V, S]``; the inverse of :func:`split_integers`."""
     integers = planes[0].astype(np.int32)
     for plane in planes[1:]:
         integers += plane.astype(np.int32) << 8
@@ -206,7 +206,7 @@ def join_integers(planes: NDArray[np.int8]) -> NDArray[np.int16]:
 
 
 def split_bits(numbers: Bytes, width: int) -> Bytes:
-    """Bits [width, N] of small numbers [S], highest bits first, ``N`` being ``S / 8`` rounded up.
+    """Return bits [width, N] of small numbers [S], highest first; ``N`` is ``S / 8`` rounded up.
 
     Each plane but the first is stored as its difference (xor) from the one above. Levels of
     neighbours are alike: two that differ by one differ in one stored bit, so that the planes shrink
@@ -219,7 +219,7 @@ def split_bits(numbers: Bytes, width: int) -> Bytes:
 
 
 def join_bits(planes: Bytes, count: int) -> Bytes:
-    """``count`` numbers; the inverse of :func:`split_bits`."""
+    """Return ``count`` numbers; the inverse of :func:`split_bits`."""
     numbers = np.zeros(count, np.uint8)
     for plane in np.bitwise_xor.accumulate(planes, axis=0):
         numbers <<= 1
@@ -228,12 +228,12 @@ def join_bits(planes: Bytes, count: int) -> Bytes:
 
 
 def split_codes(codes: Bytes, widths: Sequence[int]) -> Bytes:
-    """Planes [sum of ``widths``, N] of codes [S, C], one column of so many bits after the other."""
+    """Return planes [sum of ``widths``, N] of codes [S, C], one column after the other."""
     columns = zip(codes.T, widths, strict=True)
     return np.concatenate([split_bits(column, width) for column, width in columns])
 
 
 def join_codes(planes: Bytes, widths: Sequence[int], count: int) -> Bytes:
-    """Codes [count, C]; the inverse of :func:`split_codes`."""
+    """Return codes [count, C]; the inverse of :func:`split_codes`."""
     columns = np.split(planes, np.cumsum(widths)[:-1])
     return np.stack([join_bits(column, count) for column in columns], axis=1)

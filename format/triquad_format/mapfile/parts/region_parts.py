@@ -94,7 +94,7 @@ class RegionParts:
             self._rows[key] = self._read_levels(body, key)
 
     def region(self) -> Region:
-        """The region; the caller has checked by the manifest that all parts are there.
+        """Return the region; the caller has checked by the manifest that all parts are there.
 
         Raises:
             FormatError: a field of a head is missing or malformed, or parts do not fit together.
@@ -112,7 +112,7 @@ class RegionParts:
         )
 
     def _read_levels(self, body: PartBody, key: PartKey) -> tuple[_Columns, ...]:
-        """The rows of each level in a square of vertices, or of their moments."""
+        """Return the rows of each level in a square of vertices, or of their moments."""
         settings = self._settings
         levels = []
         for level, rows in zip(
@@ -131,7 +131,7 @@ class RegionParts:
         return tuple(levels)
 
     def _tables(self, scales: Sequence[float]) -> tuple[VertexTable, ...]:
-        """The vertex tables, with their scales where there are any."""
+        """Return the vertex tables, with their scales where there are any."""
         places = [(plane, level) for plane in range(len(AXES)) for level in self._settings.levels]
         if len(scales) not in (0, len(places)):
             raise DamagedMapFileError(f"{REGION}: {len(scales)} scales for {len(places)} tables")
@@ -143,12 +143,12 @@ class RegionParts:
         ):
             scale = scales[number] if scales else None
             if scale is not None and not len(codes):
-                features = features.astype(np.int16)  # no part tells of what dtype no rows are
+                features = features.astype(np.int16)  # no part says of what dtype no rows are
             tables.append(VertexTable(plane, level, codes, features=features, scale=scale))
         return tuple(tables)
 
     def _levels(self, topic: str, empty: _Columns) -> list[_Columns]:
-        """The rows of each plane's levels, those of all squares together."""
+        """Return the rows of each plane's levels, those of all squares together."""
         planes = [self._of(topic, plane) for plane in range(len(AXES))]
         return [
             _joined(topic, [square[level] for square in squares], empty)
@@ -157,7 +157,7 @@ class RegionParts:
         ]
 
     def _of(self, topic: str, plane: int = 0) -> list[tuple[_Columns, ...]]:
-        """The rows in the parts of a topic, in the order of their cells."""
+        """Return the rows in the parts of a topic, in the order of their cells."""
         keys = sorted(key for key in self._rows if key.topic == topic and key.plane == plane)
         return [self._rows[key] for key in keys]
 
@@ -189,7 +189,7 @@ class RegionParts:
         )
 
     def _rays(self, head: PartBody) -> ReplayRays:
-        """The rays of all cubes, in the order of their leaves."""
+        """Return the rays of all cubes, in the order of their leaves."""
         count = head.count("rays")
         keys = [key for key in self._rows if key.topic == RAYS]
         keys.sort(key=lambda key: (key.cell, key.plane))
@@ -202,7 +202,7 @@ class RegionParts:
 
 
 def _read_codes(body: PartBody, key: PartKey, shift: int, most: int | None = None) -> Longs:
-    """Codes [V] within the region of those within a square or cube, ``most`` at most."""
+    """Return codes [V] within the region of those within a square or cube, ``most`` at most."""
     codes = body.codes("codes", most or 1 << shift)
     if len(codes) and not 0 <= codes.max() < 1 << shift:
         raise DamagedMapFileError(f"{key.topic}: a code lies outside of cell {key.cell}")
@@ -212,7 +212,7 @@ def _read_codes(body: PartBody, key: PartKey, shift: int, most: int | None = Non
 
 
 def _read_rays(body: PartBody, key: PartKey) -> _Columns:
-    """Ends, numbers of origins and slopes of the rays that end in a cube."""
+    """Return ends, numbers of origins and slopes of the rays that end in a cube."""
     leaves = _read_codes(body, key, leaf_shift(), most=RAYS_PER_PART)
     counts = body.counts("counts", len(leaves), RAYS_PER_PART)
     count = int(counts.sum())
@@ -231,7 +231,7 @@ def _read_rays(body: PartBody, key: PartKey) -> _Columns:
 
 
 def _read_evidence(body: PartBody, key: PartKey) -> Evidence:
-    """The evidence of a cube."""
+    """Return the evidence of a cube."""
     codes = _read_codes(body, key, cube_shift())
     surface, free = (
         body.array(name, "|u1", (len(codes), BLOCK_BYTES)) for name in ("surface", "free")
@@ -249,12 +249,12 @@ def _read_evidence(body: PartBody, key: PartKey) -> Evidence:
 
 
 def _read_codes_of_voxels(body: PartBody, key: str, widths: Sequence[int], count: int) -> Bytes:
-    """Codes [count, C] of surface voxels, one column for each of ``widths``, which are bits."""
+    """Return codes [count, C] of surface voxels, one column for each of ``widths``, in bits."""
     return join_codes(_planes(body, key, sum(widths), count), widths, count)
 
 
 def _planes(body: PartBody, key: str, planes: int, count: int) -> Bytes:
-    """So many planes of bits of ``count`` surface voxels."""
+    """Return ``planes`` planes of bits of ``count`` surface voxels."""
     return body.array(key, "|u1", (planes, (count + 7) // 8))
 
 
@@ -273,12 +273,12 @@ def _read_seen(body: PartBody, surface: Bytes) -> Longs:
 
 
 def _no_rows(columns: Sequence[Column]) -> _Columns:
-    """These columns without rows."""
+    """Return these columns without rows."""
     return tuple(np.zeros((0, *column.row), column.dtypes[0]) for column in columns)
 
 
 def _joined(topic: str, portions: Sequence[_Columns], empty: _Columns) -> _Columns:
-    """The rows of all portions, column by column."""
+    """Return the rows of all portions, column by column."""
     # A portion without rows gives dtypes where there is no other.
     kept = [portion for portion in portions if len(portion[0])] or [*portions[:1], empty][:1]
     kinds = [(column.dtype, column.shape[1:]) for column in kept[0]]
@@ -291,7 +291,7 @@ def _joined(topic: str, portions: Sequence[_Columns], empty: _Columns) -> _Colum
 
 
 def _joined_evidence(portions: Sequence[Evidence]) -> Evidence:
-    """The evidence of a region from that of its cubes, in their order."""
+    """Return the evidence of a region from that of its cubes, in their order."""
     if len(portions) == 1:
         return portions[0]
     whole = [no_evidence(), *portions]

@@ -1,4 +1,4 @@
-"""Rays that carve: the voxels that they cross are free, and surfaces that they pass are doubted.
+"""Rays that carve: the voxels that they cross are free, surfaces that they pass contradicted.
 
 Kernels stop where the index has no more room; the caller makes room and goes on.
 """
@@ -25,11 +25,11 @@ from triquad_map.compiled.voxel_index import (
 _NO_ROOM = -2
 
 _CLEAR_SHARE = 0.9
-"""Of a ray, that may show that a surface is not there: beyond it, rays graze the ground."""
+"""The share of a ray that may show that a surface is not there: beyond, rays graze the ground."""
 
 
 class Reach(NamedTuple):
-    """How far before their ends rays stop to tell of what they cross, in voxels."""
+    """The distance before their ends at which rays stop to show what they cross, in voxels."""
 
     free: float  # that a voxel is free
     clear: float = np.inf  # that a surface is not there; infinite: never
@@ -38,7 +38,7 @@ class Reach(NamedTuple):
 
 @kernel(inline="always")
 def _crossing(origin: float, direction: float) -> tuple[int, float, float]:
-    """Which way a ray steps on an axis, how far apart its crossings are, and how far the first."""
+    """Return a ray's step on an axis, how far apart its crossings are, and how far the first."""
     if direction == 0:
         return 1, np.inf, np.inf
     fraction = origin - np.floor(origin)
@@ -49,7 +49,7 @@ def _crossing(origin: float, direction: float) -> tuple[int, float, float]:
 
 @kernel(inline="always")
 def _inside(origin: float, direction: float, side: int) -> tuple[float, float]:
-    """How far along a ray it enters and leaves the region on an axis."""
+    """Return how far along a ray it enters and leaves the region on an axis."""
     if direction == 0:
         return (-np.inf, np.inf) if 0 <= origin <= side else (np.inf, -np.inf)
     a, b = -origin / direction, (side - origin) / direction
@@ -58,7 +58,7 @@ def _inside(origin: float, direction: float, side: int) -> tuple[float, float]:
 
 @kernel(inline="always")
 def part_inside(at: Vector, way: Vector, length: float, side: int) -> tuple[float, float]:
-    """Where the part of a ray begins and ends that lies in the region."""
+    """Return where the part of a ray begins and ends that lies in the region."""
     enters_x, leaves_x = _inside(at[0], way[0], side)
     enters_y, leaves_y = _inside(at[1], way[1], side)
     enters_z, leaves_z = _inside(at[2], way[2], side)
@@ -72,7 +72,7 @@ def _walk(
 ) -> tuple[int, int]:
     """Set the bits of the voxels on a way (Amanatides and Woo 1987); returns (blocks, rows) used.
 
-    The rows of voxels in which rays ended go to ``crossed``: noted here, they slow each step.
+    The rows of voxels in which rays ended go to ``crossed``: recorded here, they slow each step.
     """
     side, index, surface, masks = seen
     at, way = ray.start, ray.way

@@ -1,4 +1,4 @@
-"""When a surface that was seen is no longer there: rays pass where rays ended.
+"""The decision that a surface that was seen is no longer there: rays pass where rays ended.
 
 No other ray of such a scan may end in the voxel. Thin things, edges and far ground are hit and
 passed alternately; so rays in a row count for what they are worth by a voxel's own record: how
@@ -27,27 +27,27 @@ from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.voxel_index import SHIFT, bit_of, byte_of
 
 _PRIOR_HITS, _PRIOR_PASSES = 0.3, 0.7
-"""What is taken to have been seen of a voxel before anything was: one ray in all."""
+"""The prior of a voxel before anything was seen of it: one ray in all."""
 
 _MOST_COUNTED = 200
 _OWN_RECORD_HITS = 3
 """A voxel with fewer hits has no record of its own that could speak against its neighbours."""
 
 _LEAST_GONE = 3
-"""So many voxels around must be gone to take one along that rays need not have passed."""
+"""The least removed voxels around one to remove it where rays need not have passed it."""
 
 _SOLID_HITS = 20
-"""A surface that was hit so many times for each time it was crossed has no gaps: crossings of all
+"""A surface that was hit this often for each time it was crossed has no gaps: crossings of all
 its voxels count together."""
 
 _SCANS_AROUND = 2  # times those that a voxel's own record asks for, where rays need not cross it
 
 _GROUP_REACH = 2
-"""Voxels around one without a record of its own, that are looked at with it: few rays reach a far
+"""Voxels around one without a record of its own, that are checked with it: few rays reach a far
 thing, and leave voxels between them out."""
 
 _GROUP_GONE = 0.25
-"""The share of such a group that takes the rest of it along."""
+"""The share of such a group whose removal removes the rest of it."""
 
 _GROUP_FLAT = 0.7
 """A group that is deeper than this along the rays, voxels, rays may pass without crossing it."""
@@ -57,17 +57,17 @@ _GROUP_SPAN = 2
 
 
 class Disbelief(NamedTuple):
-    """When a surface counts as gone."""
+    """The rule for when a surface counts as removed."""
 
-    scans: int  # at least so many in a row, of which rays passed and none ended there
+    scans: int  # at least this number in a row, of which rays passed and none ended there
     own: float  # and so improbable are their crossings: logarithm of the probability
     around: float  # or so improbable what passed a voxel and those around it
-    shared: float  # or so improbable its passes alone, where half of those around it are gone
+    shared: float  # or so improbable its passes alone, where half of those around it are removed
     witnessed: float  # or so improbable its crossings, where the field shows no surface either
 
     @classmethod
     def of(cls, scans: int, doubt: float) -> "Disbelief":
-        """The rule by which own crossings in ``scans`` that are less probable than ``doubt`` count.
+        """Return the rule that counts own crossings in ``scans`` less probable than ``doubt``.
 
         The other signs are weighed by how many wrong ones each gives in a world that stands still.
         """
@@ -77,7 +77,7 @@ class Disbelief(NamedTuple):
 
 @inner_kernel()
 def _improbability(passes: int, earlier: int, hits: int) -> float:
-    """Logarithm of how probable so many passes in a row are, by what was seen earlier."""
+    """Return the logarithm of how probable the passes in a row are, by what was seen earlier."""
     a, b = hits + _PRIOR_HITS, earlier + _PRIOR_PASSES
     total = 0.0
     for i in range(min(passes, _MOST_COUNTED)):
@@ -87,7 +87,7 @@ def _improbability(passes: int, earlier: int, hits: int) -> float:
 
 @inner_kernel()
 def _own_improbability(voxel: ObservedVoxel) -> float:
-    """Logarithm of how probable the crossings of a voxel are by its own record.
+    """Return the logarithm of how probable the crossings of a voxel are by its own record.
 
     As many in a row, at any time so far: each hit gave chance another try (Bonferroni).
     """
@@ -98,10 +98,10 @@ def _own_improbability(voxel: ObservedVoxel) -> float:
 
 @inner_kernel()
 def _goes_along(voxel: ObservedVoxel, around: Around, rule: Disbelief) -> bool:
-    """Whether a surface goes since those around it are gone.
+    """Return whether a surface is removed since those around it are.
 
-    A thing goes as a whole: no ray need pass each of its voxels. What has a record of its own goes
-    only if that speaks for it, or if no ray passed and two thirds are gone.
+    A thing is removed as a whole: no ray need pass each of its voxels. One with its own record is
+    only if that speaks for it, or if no ray passed and two thirds are removed.
     """
     if around.gone == 0 or 2 * around.gone < around.known:
         return False
@@ -118,7 +118,7 @@ def _goes_along(voxel: ObservedVoxel, around: Around, rule: Disbelief) -> bool:
 
 @inner_kernel()
 def _is_doubted_around(voxel: ObservedVoxel, around: Around, rule: Disbelief) -> bool:
-    """Whether no surface around a voxel is believed, and what passed all of it is improbable."""
+    """Return whether no surface around a voxel is believed, and all passes are improbable."""
     if around.gone + around.doubted < around.known:
         return False
     is_solid = around.hits >= _SOLID_HITS * around.earlier_misses
@@ -133,7 +133,7 @@ def _is_doubted_around(voxel: ObservedVoxel, around: Around, rule: Disbelief) ->
 
 @inner_kernel()
 def _goes_with_group(row: int, seen: SeenVoxels, observed: Observed, rule: Disbelief) -> bool:
-    """Whether a surface without a record of its own goes with what was seen two voxels around.
+    """Return whether a surface without a record is removed with those two voxels around.
 
     A hit there that came later, and that no ray passed since, speaks for all of it.
     """
@@ -151,7 +151,7 @@ def _goes_with_group(row: int, seen: SeenVoxels, observed: Observed, rule: Disbe
 
 @inner_kernel()
 def _is_gone(row: int, seen: SeenVoxels, observed: Observed, rule: Disbelief) -> bool:
-    """Whether the surface of a voxel is gone, by its own record or with those around it."""
+    """Return whether a voxel's surface is removed, by its own record or with those around it."""
     voxel = observed.voxels[row]
     scans = min(voxel.pass_scans, voxel.misses)
     if scans >= rule.scans and _own_improbability(voxel) < rule.own:
@@ -159,7 +159,7 @@ def _is_gone(row: int, seen: SeenVoxels, observed: Observed, rule: Disbelief) ->
     around = seen_around(row, 1, seen, observed)
     if _goes_along(voxel, around, rule) or _is_doubted_around(voxel, around, rule):
         return True
-    if voxel.hits >= _OWN_RECORD_HITS or around.later > 0:  # which spares looking farther
+    if voxel.hits >= _OWN_RECORD_HITS or around.later > 0:  # which spares a further search
         return False
     return _goes_with_group(row, seen, observed, rule)
 
@@ -168,7 +168,7 @@ def _is_gone(row: int, seen: SeenVoxels, observed: Observed, rule: Disbelief) ->
 def _take_back(
     row: int, seen: SeenVoxels, observed: Observed, taken: list[Voxel], waiting: list[int]
 ) -> None:
-    """Clear the surface bit of a row, whose support begins anew, and add its voxel to ``taken``.
+    """Clear the surface bit of a row, whose support begins again, and add its voxel to ``taken``.
 
     Those near it that were not hit since are added to ``waiting``.
     """
@@ -187,10 +187,10 @@ def _take_back(
 def take_back(
     gone: Longs, passed: Ints, seen: SeenVoxels, observed: Observed, rule: Disbelief
 ) -> Longs:
-    """Take back the surface of voxels that are contradicted; returns them [M, 3].
+    """Remove the surface of voxels that are contradicted; returns them [M, 3].
 
-    That of the rows ``gone`` is; that of ``passed``, by rays of the newest scan, may be. With what
-    goes, those near it are asked once more.
+    That of the rows ``gone`` is; that of ``passed``, by rays of the newest scan, may be. After each
+    removal, those near it are checked once more.
     """
     taken = [voxel_of(0, seen, observed) for _ in range(0)]
     waiting = [np.int64(row) for row in passed if observed.voxels[row].pass_scans >= rule.scans]
@@ -208,7 +208,7 @@ def take_back(
 
 @kernel()
 def doubted(passed: Ints, seen: SeenVoxels, observed: Observed, rule: Disbelief) -> Longs:
-    """Those of the rows ``passed`` whose surface is gone if the field shows none there either."""
+    """Return the rows of ``passed`` whose surface is removed if the field shows none either."""
     chosen = np.empty(len(passed), np.int64)
     count = 0
     for row in passed:
@@ -223,7 +223,7 @@ def doubted(passed: Ints, seen: SeenVoxels, observed: Observed, rule: Disbelief)
 
 @kernel()
 def middles(rows: Longs, seen: SeenVoxels, observed: Observed) -> Doubles:
-    """Where the surface of ``rows`` [N] was seen [N, 3], voxels."""
+    """Return where the surface of ``rows`` [N] was seen [N, 3], voxels."""
     places = np.empty((len(rows), 3))
     for i, row in enumerate(rows):
         voxel, mean = voxel_of(row, seen, observed), observed.voxels[row].mean

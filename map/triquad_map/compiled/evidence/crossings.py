@@ -1,4 +1,4 @@
-"""Which rays pass a surface that was seen, and what they show of it.
+"""The rays that pass a surface that was seen, and what they show of it.
 
 A ray contradicts a surface only where it crosses it: a disc around the middle of the ends in a
 voxel, as wide as they spread, far enough from where the ray ends itself. Where too little is known
@@ -32,7 +32,7 @@ _LEAST_COSINE = 0.01
 _DEPTH, _GRAZING_DEPTH = 0.2, 0.5  # voxels behind the surface
 
 _KNOWN_ENDS = 8
-"""Where so many rays ended on a plane, only rays that cross it count."""
+"""The number of rays that ended on a plane from which only rays that cross it count."""
 
 
 class Passing(NamedTuple):
@@ -46,7 +46,7 @@ class Passing(NamedTuple):
 
 @kernel(inline="always")
 def _crosses(ray: Passing, corner: Voxel, voxel: ObservedVoxel) -> bool:
-    """Whether a ray crosses the disc of the surface in a voxel at its least ``corner``."""
+    """Return whether a ray crosses the disc of the surface in a voxel at its least ``corner``."""
     way, mean, normal = ray.way, voxel.mean, voxel.normal
     to_x = corner[0] + mean[0] - ray.start[0]
     to_y = corner[1] + mean[1] - ray.start[1]

@@ -1,7 +1,7 @@
-"""What the rays have shown of a region: sparse voxels in which a surface or free space was seen.
+"""The evidence of rays in a region: sparse voxels in which a surface or free space was seen.
 
 Three planes alias: where all three projections of an unobserved point are occupied, the field
-answers as if it had been seen. Only a 3-D record can tell such ghosts from surfaces.
+answers as if it had been seen. Only a 3-D record can distinguish such ghosts from surfaces.
 
 All coordinates here are voxel coordinates of the region (see :mod:`triquad_format.records.region`).
 """
@@ -43,7 +43,7 @@ _UNKNOWN = np.uint8(Status.UNKNOWN)
 
 @kernel()
 def _status(voxels: Doubles, reach: float, seen: SeenVoxels) -> Bytes:
-    """Status [N] at ``voxels`` [N, 3]; surfaces reach ``reach`` beyond theirs."""
+    """Return status [N] at ``voxels`` [N, 3]; surfaces reach ``reach`` beyond theirs."""
     status = np.empty(len(voxels), np.uint8)
     side, blocks, surface, free = seen
     for i in range(len(voxels)):
@@ -79,7 +79,7 @@ def _status(voxels: Doubles, reach: float, seen: SeenVoxels) -> Bytes:
 
 @kernel()
 def _ended_in(voxels: Longs, seen: SeenVoxels) -> Bools:
-    """Whether rays ended [N] in ``voxels`` [N, 3]."""
+    """Return whether rays ended [N] in ``voxels`` [N, 3]."""
     ended = np.empty(len(voxels), np.bool_)
     for i in range(len(voxels)):
         x, y, z = voxels[i, 0], voxels[i, 1], voxels[i, 2]
@@ -123,23 +123,23 @@ class FrozenEvidence:
 
     @property
     def newest_s(self) -> int:
-        """When a ray last ended anywhere, seconds since 1970; 0: never, or not known."""
+        """The time when a ray last ended anywhere, seconds since 1970; 0: never, or not known."""
         return int(self.seen_s.max(initial=0))
 
     def status(self, voxels: Doubles, reach: float = 0.5) -> Bytes:
-        """Status values [N]; see :class:`triquad_map.composition.region.SeenSpace`."""
+        """Return status values [N]; see :class:`triquad_map.composition.region.SeenSpace`."""
         return _status(voxels, reach, self.seen)
 
     def surface_in_grid(self, axes: Sequence[Doubles], reach: float) -> Bools:
-        """Where a grid has surface; see :class:`triquad_map.composition.region.SeenSpace`."""
+        """Find surface in a grid; see :class:`triquad_map.composition.region.SeenSpace`."""
         return surface_in_grid(axes, reach, self.seen)
 
     def near_ends(self, voxels: Doubles, reach: float) -> Bools:
-        """Where rays ended; see :class:`triquad_map.composition.region.SeenSpace`."""
+        """Return where rays ended; see :class:`triquad_map.composition.region.SeenSpace`."""
         return near_ends(voxels, reach, self.seen, self._firsts, self.margins)
 
     def ended_in(self, voxels: Longs) -> Bools:
-        """Whether rays ended in ``voxels`` [N, 3]."""
+        """Return whether rays ended in ``voxels`` [N, 3]."""
         return _ended_in(voxels, self.seen)
 
     def find_unknown(
@@ -149,11 +149,11 @@ class FrozenEvidence:
         find_unknown(voxels, self.seen, (blocks.start, blocks.stop), distances, nearest)
 
     def surface_cells(self) -> Longs:
-        """Blocks [B, 3], in units of blocks, that hold any seen surface."""
+        """Return blocks [B, 3], in units of blocks, that contain any seen surface."""
         return self.cells[self.surface.any(axis=1)]
 
     def record(self, outcomes: Bytes | None = None) -> EvidenceRecord:
-        """The evidence as the map file holds it; empty blocks are left out.
+        """Return the evidence as the map file has it; empty blocks are left out.
 
         ``outcomes`` [S, 3] are those of the voxels in ``surface``, in their order; without them
         nothing is known of any.
@@ -183,7 +183,7 @@ class FrozenEvidence:
 
     @classmethod
     def from_record(cls, side: int, record: EvidenceRecord) -> "FrozenEvidence":
-        """The evidence of a record, of a region of ``side`` voxels."""
+        """Return the evidence of a record, of a region of ``side`` voxels."""
         index = VoxelIndex.of_cells(morton.decode(record.codes, 3)).freeze()
         masks = (np.ascontiguousarray(mask) for mask in (record.surface, record.free))
         seen = SeenVoxels(side, index, *masks)

@@ -1,4 +1,4 @@
-"""How much larger evidence would become by the rays of a scan, counted before any is recorded."""
+"""The growth of evidence by the rays of a scan, counted before any is recorded."""
 
 from typing import NamedTuple
 
@@ -23,14 +23,14 @@ from triquad_map.compiled.voxel_index import (
 )
 
 _APART, _STEP = 4.0, 2.0
-"""How far apart the ends of the ways are that are looked at, and how often they are, voxels."""
+"""The distances between the ends of checked ways, and between their checked places, voxels."""
 
 _MOST_BLOCKS = 1 << 18
 """New blocks of one scan that are counted; what more there are is taken to be in proportion."""
 
 
 class EvidenceSize(NamedTuple):
-    """What evidence holds, or would hold in addition."""
+    """The size of evidence, or what would be added to it."""
 
     blocks: int  # of 8 x 8 x 8 voxels, of which anything is known
     surface_blocks: int  # those of them in which rays ended
@@ -38,7 +38,7 @@ class EvidenceSize(NamedTuple):
 
 
 class NewEnds(NamedTuple):
-    """Where rays would end for the first time."""
+    """The voxels in which rays would end for the first time."""
 
     voxels: Longs  # [N, 3] in which no surface is known
     blocks: int  # of them, in which none is
@@ -48,7 +48,7 @@ class NewEnds(NamedTuple):
 def _new_ends(
     voxels: Doubles, seen: SeenVoxels, keys: Longs, block_keys: Longs, new: Longs
 ) -> tuple[int, int]:
-    """How many voxels that hold points [N, 3] have no surface yet, in how many new blocks.
+    """Return how many voxels of points [N, 3] have no surface yet, in how many new blocks.
 
     They go to ``new`` [N, 3].
     """
@@ -73,9 +73,9 @@ def _new_ends(
 def _new_blocks(
     origin: Doubles, ends: Doubles, side: int, index: Index, keys: Longs
 ) -> tuple[int, int]:
-    """How many blocks on the ways to ``ends`` [N, 3] are not in the index; (rays done, blocks).
+    """Return (rays done, blocks): new blocks on the ways to ``ends`` [N, 3], not in the index.
 
-    It stops where ``keys``, the set of those that were found, is half full. Ways are looked at
+    It stops where ``keys``, the set of those that were found, is half full. Ways are checked
     every few voxels: of what they touch at a corner alone, some is left out.
     """
     at = (origin[0], origin[1], origin[2])
@@ -109,7 +109,7 @@ def _new_blocks(
 
 
 def new_ends(ends: Doubles, seen: SeenVoxels) -> NewEnds:
-    """The voxels of ``ends`` [N, 3], voxels, that add surface to what was ``seen``."""
+    """Return the voxels of ``ends`` [N, 3], voxels, that add surface to what was ``seen``."""
     new = np.empty((len(ends), 3), np.int64)
     sets = empty_keys(len(ends)), empty_keys(len(ends))
     voxels, blocks = _new_ends(ends, seen, *sets, new)
@@ -117,7 +117,7 @@ def new_ends(ends: Doubles, seen: SeenVoxels) -> NewEnds:
 
 
 def new_blocks(origin: Doubles, ends: Doubles, seen: SeenVoxels) -> int:
-    """About how many blocks the ways from ``origin`` [3] to ``ends`` [N, 3] add, voxels."""
+    """Return about how many blocks the ways from ``origin`` [3] to ``ends`` [N, 3] add, voxels."""
     # Rays that end near each other cross much the same blocks.
     ends = ends[thin(ends, _APART, empty_keys(len(ends)))]
     done, found = _new_blocks(origin, ends, seen.side, seen.blocks, empty_keys(_MOST_BLOCKS))

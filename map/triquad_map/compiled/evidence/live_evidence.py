@@ -1,4 +1,4 @@
-"""What rays have shown of a region, while they go on to show more."""
+"""The evidence of rays in a region, while they go on to show more."""
 
 from typing import NamedTuple
 
@@ -35,10 +35,10 @@ _LEAST_SCANS = 3  # in which new surface was seen
 
 
 class Marks(NamedTuple):
-    """Where the rays of a scan ended."""
+    """The voxels in which the rays of a scan ended."""
 
     new: Longs  # [M, 3] voxels in which there was no surface before
-    rows: Ints  # [N] of each ray's voxel, for what is told of them later
+    rows: Ints  # [N] of each ray's voxel, for what is recorded of them later
 
 
 class LiveEvidence:
@@ -48,7 +48,7 @@ class LiveEvidence:
     """
 
     def __init__(self, side: int) -> None:
-        """``side`` is that of the region, voxels."""
+        """Begin without evidence; ``side`` is that of the region, voxels."""
         self._blocks = VoxelIndex(_MIN_CAPACITY)
         masks = np.zeros((2, _MIN_CAPACITY, BLOCK_BYTES), np.uint8)
         self._seen = SeenVoxels(side, self._blocks.arrays, *masks)
@@ -57,26 +57,26 @@ class LiveEvidence:
 
     @property
     def size(self) -> EvidenceSize:
-        """How much it holds."""
+        """The size of the evidence."""
         observed = self._observations
         return EvidenceSize(self._blocks.count, observed.blocks, observed.voxels)
 
     def surface_blocks(self) -> Longs:
-        """The blocks [B, 3] in which surface is believed."""
+        """Return the blocks [B, 3] in which surface is believed."""
         return self._blocks.cells()[self._seen.surface[: self._blocks.count].any(axis=1)]
 
     def new_ends(self, ends: Doubles) -> NewEnds:
-        """What rays that end at ``ends`` [N, 3] would add; nothing is recorded."""
+        """Return what rays that end at ``ends`` [N, 3] would add; nothing is recorded."""
         return new_ends(ends, self._seen)
 
     def new_blocks(self, origin: Doubles, ends: Doubles) -> int:
-        """About how many blocks rays from ``origin`` [3] to ``ends`` [N, 3] would add."""
+        """Return about how many blocks rays from ``origin`` [3] to ``ends`` [N, 3] would add."""
         return new_blocks(origin, ends, self._seen)
 
     def mark_surface(self, voxels: Doubles, sighting: Sighting | None = None) -> Marks:
         """Record that rays ended at ``voxels`` [N, 3]; those outside the region are left out.
 
-        ``sighting`` tells from where and when; without it they support the surface no better.
+        ``sighting`` says from where and when; without it they support the surface no better.
         """
         self._frozen = None
         new = np.empty((len(voxels), 3), np.int64)
@@ -96,10 +96,10 @@ class LiveEvidence:
         self._observations.set_normals(marks.rows, normals)
 
     def new_surface(self, marks: Marks, scans: int) -> int:
-        """In how many voxels the newest scan's rays ended on surface of the last ``scans``.
+        """Return in how many voxels the newest scan's rays ended on surface of the last ``scans``.
 
         It was first seen in these, and seen in at least half of the scans since and in three:
-        single rays end beside a surface by chance.
+        single rays end next to a surface by chance.
         """
         voxels = self._observations.arrays.voxels
         rows = marks.rows[marks.rows > 0]
@@ -113,12 +113,12 @@ class LiveEvidence:
     def set_discs(self, voxels: Longs, surfels: Surfels) -> None:
         """Take from ``surfels`` [N] where the surface lies in ``voxels`` [N, 3].
 
-        For evidence that was restored: a record tells of voxels only.
+        For evidence that was restored: a record has voxels only.
         """
         self._observations.set_discs(voxels, surfels, self._seen)
 
     def ray_surfels(self, voxels: Longs, since: int) -> Surfels:
-        """What rays alone show of surface that was first seen in scan ``since`` or later.
+        """Return what rays alone show of surface that was first seen in scan ``since`` or later.
 
         See :data:`triquad_map.surface.ShownByRays`.
         """
@@ -130,7 +130,7 @@ class LiveEvidence:
         Args:
             origin: sensor position, may lie outside the region.
             ends: end points of the rays.
-            reach: how far the rays tell of what they cross.
+            reach: how far the rays show what they cross.
 
         Returns:
             Where rays passed a surface.
@@ -160,9 +160,9 @@ class LiveEvidence:
 
         Args:
             passed: where these rays passed a surface.
-            rule: when a surface is gone.
-            field: in voxels; it has learnt from all rays around. With it, surface goes that rays
-                crossed and that the field does not show either.
+            rule: when a surface is removed.
+            field: in voxels; it has learnt from all rays around. With it, surface is removed that
+                rays crossed and that the field does not show either.
 
         Returns:
             These voxels [M, 3]; they are free.
@@ -202,7 +202,7 @@ class LiveEvidence:
         self._observations.forget(np.flatnonzero(near), self._seen.surface[: self._blocks.count])
 
     def freeze(self, split: Split = in_one) -> FrozenEvidence:
-        """The evidence as it is now; the same object until anything changes."""
+        """Return the evidence as it is now; the same object until anything changes."""
         if self._frozen is None:
             side, _, *masks = self._seen
             surface, free = (mask[: self._blocks.count].copy() for mask in masks)
@@ -214,13 +214,13 @@ class LiveEvidence:
         return self._frozen
 
     def record(self) -> EvidenceRecord:
-        """The evidence as the map file holds it, with what to go on from it takes."""
+        """Return the evidence as the map file has it, with what is needed to go on from it."""
         frozen = self.freeze()
         return frozen.record(self._observations.outcomes(frozen.surface))
 
     @classmethod
     def from_record(cls, side: int, record: EvidenceRecord) -> "LiveEvidence":
-        """The evidence of a record, of a region of ``side`` voxels."""
+        """Return the evidence of a record, of a region of ``side`` voxels."""
         evidence, frozen = cls(side), FrozenEvidence.from_record(side, record)
         evidence._blocks = VoxelIndex.of_cells(frozen.cells)
         evidence._seen = frozen.seen

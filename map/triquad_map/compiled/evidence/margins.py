@@ -1,9 +1,9 @@
-"""In which part of a surface voxel rays ended: its margins, as files tell them.
+"""The part of a surface voxel in which rays ended: its margins, as files have them.
 
-A surface may end within a voxel, at the corner of a house or where nobody looked any farther. How
-many quarters of a voxel on each of its sides lie beyond all ends tells where. A margin counts only
+A surface may end within a voxel, at the corner of a house or where no sensor saw any farther. How
+many quarters of a voxel on each of its sides lie beyond all ends shows where. A margin counts only
 where the surface does not go on beyond that side: in between, few rays leave gaps. And it counts
-only where rays would have ended in it: by as many scans as hit the voxel, or one beside it.
+only where rays would have ended in it: by as many scans as hit the voxel, or one next to it.
 """
 
 import math
@@ -28,21 +28,21 @@ _CHANCE = 0.1
 """A margin counts where the chance is less that all scans missed a surface that goes on."""
 
 _BEYOND = np.array([[1 << axis, 0, 8 << axis] for axis in range(3)])
-"""The bit of the side on which a voxel lies beside another one: less, level or greater, by axis."""
+"""The bit of the side on which a voxel is next to another: less, level or greater, by axis."""
 
 _BITS_SET = np.array([byte.bit_count() for byte in range(256)], np.uint8)
 
 _LEAST_SCANS = np.array(
-    # A margin begins half a step earlier than it is told.
+    # A margin begins half a step earlier than its number says.
     [math.ceil(math.log(_CHANCE) / math.log(1 - MARGIN_STEP * (m + 0.5))) for m in range(_MARGINS)]
 )
-"""So many scans would have hit a surface that goes on, by the margin."""
+"""The number of scans that would have hit a surface that goes on, by the margin."""
 
 Scans = NDArray[np.int16]
 
 
 class SurfaceEnds(NamedTuple):
-    """Where rays ended in surface voxels [S], as kernels take it."""
+    """The ends of rays in surface voxels [S], as kernels take them."""
 
     firsts: Longs  # [B] number of the first surface voxel of each block
     scans: Bytes  # [S] of which rays ended in each voxel
@@ -70,7 +70,7 @@ def _add_block(row: int, shift: Voxel, seen: SeenVoxels, ends: SurfaceEnds, arou
 
 @inner_kernel()
 def _fill_around(row: int, seen: SeenVoxels, ends: SurfaceEnds, around: Scans) -> None:
-    """What is known of a block's voxels and those beside it: scans and 1; 0: no surface."""
+    """Fill in a block's voxels and those next to it: scans and 1; 0: no surface."""
     around[:] = 0
     x, y, z = unpack(seen.blocks.row_keys[row])
     for i in range(-1, 2):
@@ -84,9 +84,9 @@ def _fill_around(row: int, seen: SeenVoxels, ends: SurfaceEnds, around: Scans) -
 
 @inner_kernel()
 def _look_around(voxel: Voxel, around: Scans) -> tuple[int, int]:
-    """Scans that hit a voxel or one beside it, whichever was hit most, and where surface goes on.
+    """Return the most scans that hit a voxel or one next to it, and where surface goes on.
 
-    A bit for each side tells whether any of the nine voxels beyond it has surface.
+    A bit for each side says whether any of the nine voxels beyond it has surface.
     """
     most = goes_on = 0
     for i in range(3):
@@ -110,7 +110,7 @@ def _fill_margins(voxel: Voxel, beyond: Bytes, around: Scans, margins: Bytes) ->
 
 @kernel()
 def margins_that_count(seen: SeenVoxels, ends: SurfaceEnds) -> Bytes:
-    """The margins [S, 6] of all surface voxels; 0: none counts."""
+    """Return the margins [S, 6] of all surface voxels; 0: none counts."""
     margins = np.zeros((len(ends.beyond), _SIDES), np.uint8)
     side = BLOCK_VOXELS + 2
     around = np.zeros((side, side, side), np.int16)
@@ -133,7 +133,7 @@ def margins_that_count(seen: SeenVoxels, ends: SurfaceEnds) -> Bytes:
 
 @inner_kernel()
 def _number_of(row: int, voxel: Voxel, firsts: Longs, seen: SeenVoxels) -> int:
-    """The number of a surface voxel, in the block ``row``, among all."""
+    """Return the number of a surface voxel, in the block ``row``, among all."""
     last = byte_of(voxel[0], voxel[1])
     number = firsts[row]
     for byte in range(last):
@@ -144,7 +144,7 @@ def _number_of(row: int, voxel: Voxel, firsts: Longs, seen: SeenVoxels) -> int:
 
 @inner_kernel()
 def _holds(point: Doubles, voxel: Voxel, margins: Bytes) -> bool:
-    """Whether a point near a voxel lies in none of its ``margins`` [6]."""
+    """Return whether a point near a voxel lies in none of its ``margins`` [6]."""
     for side in range(_SIDES):
         inside = point[side % 3] - voxel[side % 3]
         depth = inside if side < 3 else 1 - inside
@@ -157,7 +157,7 @@ def _holds(point: Doubles, voxel: Voxel, margins: Bytes) -> bool:
 def near_ends(
     points: Doubles, reach: float, seen: SeenVoxels, firsts: Longs, margins: Bytes
 ) -> Bools:
-    """Whether ``points`` [N, 3] lie within ``reach`` of surface voxels, and not in their margins.
+    """Return whether ``points`` [N, 3] lie within ``reach`` of surface voxels, not in margins.
 
     All is in voxels. The reach is on each axis, and beyond sides without a margin. ``firsts`` [B]
     are the numbers of the first surface voxel of each block, ``margins`` [S, 6] those that count.

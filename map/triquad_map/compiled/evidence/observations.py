@@ -1,4 +1,4 @@
-"""What is known of each voxel in which rays ended: how often, from where, and what became of it."""
+"""Observations of each voxel in which rays ended: how often, from where, and what became of it."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,14 +28,14 @@ from triquad_map.surface import LEAST_STRENGTH, SurfelKind, Surfels
 _VOXELS = BLOCK_VOXELS**3
 _MIN_CAPACITY = 64
 _MIN_ROWS = 1024
-_LEAST_BLOCKS = 64  # whose support a thread of its own tells sooner
+_LEAST_BLOCKS = 64  # whose support a thread of its own finds sooner
 _DISC = int(SurfelKind.DISC)
 _DISC_ENDS, _DISC_SPREAD = 16.0, 0.15  # that a disc of the field stands for
 _FARTHEST_BESIDE = 0.75  # voxels from a voxel's middle to the disc of another one
-_OUTSIDE = 0.1  # voxels by which a disc may reach out of its own voxel
+_OUTSIDE = 0.1  # voxels that a disc may reach out of its own voxel
 
 _RECORD = ("hits", "earlier_passes", "earlier_misses")
-"""What files keep of a voxel's record."""
+"""The fields of a voxel's record that files keep."""
 
 
 @kernel()
@@ -58,7 +58,7 @@ def _set_discs(
     for i in range(len(voxels)):
         row = row_of(seen, observed, voxels[i, 0], voxels[i, 1], voxels[i, 2])
         voxel = observed.voxels[row]
-        if row == 0 or voxel.ends != 0:  # rays have told since
+        if row == 0 or voxel.ends != 0:  # rays have shown since
             continue
         is_disc = kinds[i] == _DISC
         for axis in range(3):
@@ -74,7 +74,7 @@ def _set_discs(
 
 @inner_kernel()
 def _set_disc_beside(row: int, seen: SeenVoxels, observed: Observed) -> None:
-    """Take the disc of a voxel beside it for one that has none: the nearest to its middle.
+    """Take the disc of a voxel next to it for one that has none: the nearest to its middle.
 
     The ends of noisy rays lie in voxels on both sides of a surface, and the disc in one of them.
     """
@@ -105,7 +105,7 @@ class Observations:
     """The observations of the blocks of some evidence, by their rows."""
 
     def __init__(self, blocks: int) -> None:
-        """``blocks`` is how many there is room for."""
+        """Make room for ``blocks`` blocks."""
         self._places = 1  # in use
         self._rows = 1
         self.arrays = _arrays(blocks, _MIN_CAPACITY, _MIN_ROWS)
@@ -121,7 +121,7 @@ class Observations:
         return self._rows - 1
 
     def make_room(self, blocks: int) -> None:
-        """Make room for so many blocks."""
+        """Make room for ``blocks`` blocks."""
         places = with_room(self.arrays.places, blocks)
         self.arrays = self.arrays._replace(places=places)
 
@@ -148,13 +148,13 @@ class Observations:
     def set_discs(self, voxels: Longs, surfels: Surfels, seen: SeenVoxels) -> None:
         """Take the middles and normals of ``voxels`` [N, 3] from their ``surfels``.
 
-        Where there is no disc, it is the nearest one beside, or else the next ray that ends there
-        tells where the surface is.
+        Where there is no disc, it is the nearest one next to it, or else the next ray that ends
+        there shows where the surface is.
         """
         _set_discs(voxels, surfels.offsets, surfels.normals, surfels.kinds, seen, self.arrays)
 
     def support(self, surface: Bytes, split: Split) -> Support:
-        """What is told of each voxel set in ``surface`` [blocks, BLOCK_BYTES], in their order."""
+        """Return the support of each voxel set in ``surface`` [blocks, BLOCK_BYTES], in order."""
         used = used_blocks(surface)
         surface, places = surface[used], self.arrays.places[used]
         starts = np.concatenate([[0], np.cumsum(surface_counts(surface))])
@@ -172,7 +172,7 @@ class Observations:
         return support
 
     def outcomes(self, surface: Bytes) -> Bytes:
-        """Codes [S, 3] of what became of rays at each voxel set in ``surface``, in their order."""
+        """Return codes [S, 3] of the outcomes of rays at voxels set in ``surface``, in order."""
         used = used_blocks(surface)
         ended = np.unpackbits(surface[used], axis=1, bitorder="little").astype(np.bool_)
         rows = self.arrays.rows[self.arrays.places[used]][ended]
@@ -180,7 +180,7 @@ class Observations:
         return outcome_codes(np.stack([voxels[name][rows] for name in _RECORD], axis=1))
 
     def seen_s(self, blocks: int) -> Longs:
-        """When a ray last ended in each of the first ``blocks``, seconds since 1970; 0: never."""
+        """Return when rays last ended in each of the first ``blocks``, s since 1970; 0: never."""
         return self.arrays.seen_s[self.arrays.places[:blocks]]
 
     def forget(self, blocks: NDArray[np.intp], surface: Bytes) -> None:
@@ -199,9 +199,9 @@ class Observations:
         margins: Bytes,
         outcomes: Bytes,
     ) -> "Observations":
-        """Observations of the blocks ``surface`` [blocks, BLOCK_BYTES] that give these levels.
+        """Return observations of blocks ``surface`` [blocks, BLOCK_BYTES] that give these levels.
 
-        And these ``margins`` [S, 6]. ``outcomes`` are the codes [S, 3] of what became of rays.
+        They give ``margins`` [S, 6], too. ``outcomes`` are codes [S, 3] of what became of rays.
         """
         used = used_blocks(surface)
         places = slice(1, 1 + len(used))
@@ -225,7 +225,7 @@ class Observations:
         voxels["lowest"], voxels["highest"] = eighths[:, :3], EIGHTHS - 1 - eighths[:, 3:]
         for name, counts in zip(_RECORD, outcome_counts(outcomes).T, strict=True):
             voxels[name] = counts
-        # The margins that a file tells count, however few scans its hits stand for.
+        # The margins that a file has count, however few scans its hits stand for.
         is_sure = margins.any(axis=1)
         voxels["scans"] = np.where(is_sure, MOST_SCANS, np.minimum(voxels["hits"], MOST_SCANS))
         observations = cls(len(surface))

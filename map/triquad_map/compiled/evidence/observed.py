@@ -1,4 +1,4 @@
-"""What is known of each voxel in which rays ended, as kernels take it: a record for each."""
+"""Observations of each voxel in which rays ended, as kernels take them: a record for each."""
 
 from typing import Any, NamedTuple
 
@@ -22,7 +22,7 @@ OBSERVED_VOXEL = np.dtype(
         ("spread", np.float32),  # mean squared distance of the ends from their mean, voxels
         ("ends", np.float32),  # rays that ended on the surface that is there now, up to a limit
         ("weight", np.float32),  # these rays, the near ones counting more
-        ("sectors", np.int32),  # a bit for each eighth of the horizon looked from
+        ("sectors", np.int32),  # a bit for each eighth of the horizon it was seen from
         ("hits", np.int32),  # scans of which rays ended there, whatever surface it was
         ("first_scan", np.int32),  # of which a ray ended on the surface that is there now
         ("hit_scan", np.int32),  # the last of which a ray ended there
@@ -58,7 +58,7 @@ Vector = tuple[float, float, float]
 
 @kernel(inline="always")
 def forget_ends(voxel: ObservedVoxel) -> None:
-    """From now on, no ray ended in a voxel."""
+    """Forget all rays that ended in a voxel."""
     voxel.weight = voxel.ends = voxel.scans = 0
     voxel.sectors = 0
     for axis in range(3):
@@ -67,14 +67,14 @@ def forget_ends(voxel: ObservedVoxel) -> None:
 
 @kernel(inline="always")
 def is_flat(voxel: ObservedVoxel) -> bool:
-    """Whether the normal of the surface in a voxel is known."""
+    """Return whether the normal of the surface in a voxel is known."""
     normal = voxel.normal
     return bool(normal[0] != 0 or normal[1] != 0 or normal[2] != 0)
 
 
 @kernel(inline="always")
 def row_of(seen: SeenVoxels, observed: Observed, x: int, y: int, z: int) -> int:
-    """The row of a voxel; 0 where no ray ended in it."""
+    """Return the row of a voxel; 0 where no ray ended in it."""
     block = find_block(seen.blocks, x, y, z, seen.side)
     if block < 0:
         return 0
@@ -83,7 +83,7 @@ def row_of(seen: SeenVoxels, observed: Observed, x: int, y: int, z: int) -> int:
 
 @inner_kernel()
 def voxel_of(row: int, seen: SeenVoxels, observed: Observed) -> Voxel:
-    """The voxel of a row."""
+    """Return the voxel of a row."""
     owner = observed.voxels[row].owner
     x, y, z = unpack(seen.blocks.row_keys[owner >> (3 * SHIFT)])
     return (
@@ -95,7 +95,7 @@ def voxel_of(row: int, seen: SeenVoxels, observed: Observed) -> Voxel:
 
 @kernel()
 def has_surface(row: int, seen: SeenVoxels, observed: Observed) -> bool:
-    """Whether the surface of a row is still believed."""
+    """Return whether the surface of a row is still believed."""
     owner = observed.voxels[row].owner
     block = owner >> (3 * SHIFT)
     return bool(seen.surface[block, owner >> SHIFT & (1 << (2 * SHIFT)) - 1] & bit_of(owner & LOW))
@@ -103,7 +103,7 @@ def has_surface(row: int, seen: SeenVoxels, observed: Observed) -> bool:
 
 @inner_kernel()
 def rows_around(row: int, reach: int, seen: SeenVoxels, observed: Observed) -> Ints:
-    """The rows of the voxel of a row and those up to ``reach`` around it in which rays ended."""
+    """Return the rows of a row's voxel and those up to ``reach`` around it in which rays ended."""
     middle = voxel_of(row, seen, observed)
     x, y, z = middle
     rows = np.empty((2 * reach + 1) ** 3, np.int32)

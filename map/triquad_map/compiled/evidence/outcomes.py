@@ -1,6 +1,6 @@
-"""What became of rays at a surface voxel, as files tell it: on a scale of powers of two.
+"""The outcomes of rays at a surface voxel, as files have them: on a scale of powers of two.
 
-It tells a fence, which is hit and missed by turns, from a wall. A wall has the codes 0: it was hit
+They distinguish a fence, hit and missed by turns, from a wall. A wall has the codes 0: it was hit
 often, and hardly a ray passed. So has a voxel of which nothing is known.
 """
 
@@ -9,14 +9,14 @@ from triquad_format.records.arrays import Bytes, Ints
 from triquad_format.records.region import OUTCOME_BITS
 
 _MOST_HITS = 8
-"""A longer record is restored as one of so many hits, which new rays outweigh sooner."""
+"""A longer record is restored as one of this many hits, which new rays outweigh sooner."""
 
 _LEAST_SHARE_LOG2 = -3  # of passes or misses, for each hit: of one in eight; fewer are none
 _SHARES = (1 << OUTCOME_BITS[1]) - 1
 
 
 def outcome_codes(counts: Ints) -> Bytes:
-    """Codes [N, 3] of ``counts`` [N, 3]: hits, and the passes and misses between them."""
+    """Return codes [N, 3] of ``counts`` [N, 3]: hits, and the passes and misses between them."""
     hits = counts[:, :1]
     known = np.maximum(hits, 1)
     log2_hits = np.rint(np.log2(known))
@@ -30,7 +30,7 @@ def outcome_codes(counts: Ints) -> Bytes:
 
 
 def outcome_counts(codes: Bytes) -> Ints:
-    """Counts [N, 3] of ``codes`` [N, 3]: hits, and the passes and misses between them."""
+    """Return counts [N, 3] of ``codes`` [N, 3]: hits, and the passes and misses between them."""
     of_hits, of_shares = codes[:, :1].astype(np.float64), codes[:, 1:]
     hits = np.where(of_hits > 0, np.exp2(of_hits - 1), _MOST_HITS)
     shares = np.where(of_shares > 0, np.exp2(of_shares - 1.0 + _LEAST_SHARE_LOG2), 0.0)

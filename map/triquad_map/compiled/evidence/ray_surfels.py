@@ -13,7 +13,7 @@ _RAY_DISC, _RAY_POINT = int(SurfelKind.RAY_DISC), int(SurfelKind.RAY_POINT)
 
 
 def ray_surfels(voxels: Longs, since: int, seen: SeenVoxels, observed: Observed) -> Surfels:
-    """The surfels of ``voxels`` [N, 3]; see :data:`triquad_map.surface.ShownByRays`.
+    """Return the surfels of ``voxels`` [N, 3]; see :data:`triquad_map.surface.ShownByRays`.
 
     Only where rays first ended in scan ``since`` or later: of the rest the field has learnt.
     """
@@ -26,7 +26,7 @@ def ray_surfels(voxels: Longs, since: int, seen: SeenVoxels, observed: Observed)
 def _normal_around(
     voxel: Longs, row: int, seen: SeenVoxels, observed: Observed, normal: Doubles
 ) -> bool:
-    """The normal of the ends in a voxel and those around it; False where they are not flat.
+    """Return the normal of the ends in a voxel and those around it; False where they are not flat.
 
     Only those count that rays have ended in since they did here, and not much more often: a floor
     does not, on which something was put.
@@ -70,7 +70,7 @@ def _set_normal(
 
 @inner_kernel()
 def _product(one: Floats | Doubles, other: Floats) -> float:
-    """The scalar product of two vectors [3]."""
+    """Return the scalar product of two vectors [3]."""
     product: float = one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
     return product
 

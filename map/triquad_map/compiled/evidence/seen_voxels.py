@@ -32,7 +32,7 @@ class SeenVoxels(NamedTuple):
 def mark_ends(
     voxels: Doubles, start: int, seen: SeenVoxels, count: int, new: Longs, found: int
 ) -> tuple[int, int, int]:
-    """Set the bits of the voxels holding points, and collect those that were not set before.
+    """Set the bits of the voxels with points, and collect those that were not set before.
 
     Returns (points done, blocks in use, voxels collected).
     """

@@ -1,4 +1,4 @@
-"""How a scan's rays that end are counted, each in its voxel.
+"""The counts of a scan's rays that end, each in its voxel.
 
 Kernels stop where there is no more room; the caller makes room and goes on.
 """
@@ -22,11 +22,11 @@ from triquad_map.compiled.voxel_index import LOW, SHIFT, byte_of, find_block
 from triquad_map.surface import NEAR_M
 
 _COUNTED_ENDS = 64
-"""Of a voxel; the shape that further ones give counts as that of so many."""
+"""The ends of a voxel that count; the shape that further ones give counts as that of as many."""
 
 
 class Sighting(NamedTuple):
-    """From where and when a scan looked."""
+    """The place and the time of a scan."""
 
     origin: Doubles  # [3] the sensor, voxels
     leaf_m: float
@@ -36,7 +36,7 @@ class Sighting(NamedTuple):
 
 @kernel(inline="always")
 def _sector(x: float, y: float) -> int:
-    """Which eighth of the horizon a direction lies in."""
+    """Return which eighth of the horizon a direction lies in."""
     eighth = 0 if y >= 0 else 4
     if (x >= 0) != (y >= 0):
         eighth += 2

@@ -1,4 +1,4 @@
-"""What rays tell of each surface voxel: how well it is supported, and where in it they ended."""
+"""The support of each surface voxel by rays: how strong it is, and where in it they ended."""
 
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ from triquad_map.surface import LEAST_STRENGTH, LEVELS, SECTORS_COUNTED
 
 
 class Support(NamedTuple):
-    """What rays tell of surface voxels [S], as kernels take it."""
+    """The support of surface voxels [S] by rays, as kernels take it."""
 
     levels: Bytes  # [S] how well each is supported
     scans: Bytes  # [S] of which rays ended in it, up to ``MOST_SCANS``
@@ -24,7 +24,7 @@ class Support(NamedTuple):
 
 @kernel(inline="always")
 def _level(voxel: ObservedVoxel) -> int:
-    """The level of a voxel; each scan in a row that contradicts it takes one off."""
+    """Return the level of a voxel; each scan in a row that contradicts it takes one off."""
     sectors = 0
     for sector in range(8):
         sectors += voxel.sectors >> sector & 1
@@ -37,7 +37,7 @@ def _level(voxel: ObservedVoxel) -> int:
 
 @kernel(inline="always")
 def _quarters(eighths: int) -> int:
-    """How many quarters of a voxel are told of so many eighths in which no ray ended.
+    """Return how many quarters of a voxel stand for as many eighths in which no ray ended.
 
     They are less by an eighth at least.
     """

@@ -1,4 +1,4 @@
-"""Which points of a grid lie near seen surface: told by the voxels, not point by point.
+"""The points of a grid that lie near seen surface: found by the voxels, not point by point.
 
 Mesh tiles ask this of all their cells, of which few are near any.
 """
@@ -25,7 +25,7 @@ class _Axis(NamedTuple):
 
 
 def surface_in_grid(axes: Sequence[Doubles], reach: float, seen: SeenVoxels) -> Bools:
-    """Which points [X, Y, Z] of a grid have surface voxels within ``reach`` of them on each axis.
+    """Return which points [X, Y, Z] of a grid have surface voxels within ``reach`` on each axis.
 
     ``axes`` are their leaf coordinates [X], [Y] and [Z], increasing.
     """

@@ -1,4 +1,4 @@
-"""What is known of a voxel together with those around it."""
+"""The observations of a voxel together with those around it."""
 
 from typing import NamedTuple
 
@@ -27,7 +27,7 @@ class Around(NamedTuple):
 
 @inner_kernel()
 def seen_around(row: int, reach: int, seen: SeenVoxels, observed: Observed) -> Around:
-    """What is known of the voxel of a row and those up to ``reach`` around it."""
+    """Return what is known of the voxel of a row and those up to ``reach`` around it."""
     known = gone = doubted = later = scans = 0
     first = last = observed.voxels[row].hit_scan
     misses = earlier_misses = passes = earlier_passes = hits = 0
@@ -66,7 +66,7 @@ def seen_around(row: int, reach: int, seen: SeenVoxels, observed: Observed) -> A
 
 @inner_kernel()
 def depth_around(row: int, reach: int, seen: SeenVoxels, observed: Observed) -> float:
-    """How deep what was seen up to ``reach`` around lies along the ray that hit the voxel last.
+    """Return how deep what was seen up to ``reach`` around lies along the last ray to hit it.
 
     Returns:
         A standard deviation, voxels; infinite where no such ray is known.

@@ -20,13 +20,13 @@ _SQUARE, _X, _Y, _Z = range(4)
 
 @kernel(inline="always")
 def _nearest(x: float, low: float, side: float) -> float:
-    """The place in ``[low, low + side]`` that is nearest to ``x``."""
+    """Return the place in ``[low, low + side]`` that is nearest to ``x``."""
     return min(max(x, low), low + side)
 
 
 @kernel(inline="always")
 def _square_gap(x: float, low: float, side: float) -> float:
-    """Square of how far ``x`` lies outside of ``[low, low + side]``."""
+    """Return the square of how far ``x`` lies outside of ``[low, low + side]``."""
     gap = x - _nearest(x, low, side)
     return gap * gap
 

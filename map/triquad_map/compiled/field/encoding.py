@@ -55,7 +55,7 @@ class PointBatch(NamedTuple):
 
 @kernel()
 def new_batch(levels: int, size: int, inputs: int, hidden: int) -> PointBatch:
-    """Room for a batch: ``levels`` of features of length ``size``, an MLP's inputs and width."""
+    """Return room for a batch: ``levels`` of features of length ``size``, MLP inputs and width."""
     return PointBatch(
         np.zeros((3, BATCH), np.float32),
         np.zeros(BATCH, np.int64),
@@ -100,7 +100,7 @@ class Geometry(NamedTuple):
 
 @kernel(fastmath=True)
 def locate(batch: PointBatch, geometry: Geometry, vertices: Vertices, features: Floats) -> None:
-    """The cells around the batch's points, and the rows of their vertices."""
+    """Find the cells around the batch's points, and the rows of their vertices."""
     for plane in range(3):
         _find_blocks(batch, plane, geometry, vertices)
         _find_cells(batch, plane, geometry)
@@ -155,14 +155,14 @@ def _find_cells(batch: PointBatch, plane: int, geometry: Geometry) -> None:
 
 @kernel(inline="always")
 def _corner_rows(batch: PointBatch, at: int, t: int) -> tuple[int, int, int, int]:
-    """Rows of the 4 vertices around a point, on one plane and level."""
+    """Return rows of the 4 vertices around a point, on one plane and level."""
     i = 4 * at
     return batch.rows[t, i], batch.rows[t, i + 1], batch.rows[t, i + 2], batch.rows[t, i + 3]
 
 
 @kernel(fastmath=True, inline="always")
 def _weights(batch: PointBatch, at: int, t: int) -> tuple[float, float, float, float]:
-    """Bilinear weights of the 4 vertices, in the order of their rows."""
+    """Return bilinear weights of the 4 vertices, in the order of their rows."""
     a, b = batch.across[at, t], batch.along[at, t]
     both = a * b
     return np.float32(1) - a - b + both, a - both, b - both, both
@@ -170,7 +170,7 @@ def _weights(batch: PointBatch, at: int, t: int) -> tuple[float, float, float, f
 
 @inner_kernel(fastmath=True)
 def interpolate(batch: PointBatch, levels: int, features: Floats) -> None:
-    """The first inputs of the MLP: features summed over the planes, level by level."""
+    """Compute the first inputs of the MLP: features summed over the planes, level by level."""
     size = features.shape[1]
     batch.features[:] = 0
     for t in range(BATCH):
@@ -186,7 +186,7 @@ def interpolate(batch: PointBatch, levels: int, features: Floats) -> None:
 def interpolate_plane(
     batch: PointBatch, plane: int, geometry: Geometry, vertices: Vertices, features: Floats
 ) -> None:
-    """As :func:`locate` and :func:`interpolate`, with the features of one plane alone."""
+    """Do as :func:`locate` and :func:`interpolate`, with the features of one plane alone."""
     size = features.shape[1]
     _find_blocks(batch, plane, geometry, vertices)
     _find_cells(batch, plane, geometry)
@@ -208,7 +208,7 @@ def interpolate_plane(
 
 @inner_kernel(fastmath=True)
 def _transpose_features(batch: PointBatch, count: int) -> None:
-    """The first ``count`` inputs of the MLP, from the features of each point."""
+    """Compute the first ``count`` inputs of the MLP, from the features of each point."""
     for k in range(count):
         for t in range(BATCH):
             batch.x[k, t] = batch.features[t, k]
@@ -252,7 +252,7 @@ def add_feature_slopes(batch: PointBatch, geometry: Geometry, features: Floats) 
 
 @inner_kernel()
 def _transpose_gradient(batch: PointBatch, count: int) -> None:
-    """The gradient of the first ``count`` inputs, point by point, into ``batch.features``."""
+    """Copy the gradient of the first ``count`` inputs, point by point, into ``batch.features``."""
     for k in range(count):
         for t in range(BATCH):
             batch.features[t, k] = batch.gx[k, t]
@@ -260,7 +260,7 @@ def _transpose_gradient(batch: PointBatch, count: int) -> None:
 
 @kernel(fastmath=True, inline="always")
 def _cosine(turns: float) -> float:
-    """Cosine of an angle in turns; a polynomial, which compiles to vector instructions."""
+    """Return the cosine of an angle in turns, a polynomial that compiles to vector instructions."""
     t = turns - np.floor(turns + np.float32(0.5))
     u = np.float32(0.25) - abs(t)
     v = u * u
@@ -276,7 +276,7 @@ def _cosine(turns: float) -> float:
 
 @kernel(fastmath=True)
 def wave(batch: PointBatch, first: int, turns_per_m: Floats) -> None:
-    """Fourier features, from input ``first`` on: sines of all axes, then cosines."""
+    """Compute Fourier features, from input ``first`` on: sines of all axes, then cosines."""
     m = len(turns_per_m)
     for axis in range(3):
         for i in range(m):

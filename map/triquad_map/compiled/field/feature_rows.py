@@ -56,7 +56,7 @@ def row_slopes(
     rows: tuple[int, int, int, int],
     place: tuple[float, float],
 ) -> tuple[float, float]:
-    """How ``values[point, start:start + size] @ row`` changes across and along a cell.
+    """Return how ``values[point, start:start + size] @ row`` changes across and along a cell.
 
     The row is interpolated between those of the cell's corners, in the order of
     :class:`triquad_map.compiled.field.encoding.PointBatch`, at a ``place`` in it, float32.
@@ -95,7 +95,7 @@ def move_row(
     scales: tuple[float, float],
     epsilon: float,
 ) -> None:
-    """One step of Adam, as in :mod:`triquad_server.engine.compiled_trainer`; clears the gradient.
+    """Do a step of Adam, as in :mod:`triquad_server.engine.compiled_trainer`; clears the gradient.
 
     Numbers are float32.
 

@@ -1,7 +1,7 @@
 """The field's arithmetic in compiled code: encoding, MLP, and backward through both by hand.
 
 The same field as the tensors of :mod:`triquad_server.engine.tensor_field` compute, which are its
-reference. A kernel runs on one thread and holds no Python lock; callers split the work. Arrays are
+reference. A kernel runs on one thread and without Python's lock; callers split the work. Arrays are
 float32.
 """
 
@@ -63,7 +63,7 @@ def add_product(weights: Floats, x: Floats, out: Floats) -> None:
     """``out += weights.T @ x`` for weights [K, J], x [K, T], out [J, T]."""
     inputs, outputs = weights.shape
     k = 0
-    while k + 8 <= inputs:  # so many at once that reading and writing ``out`` costs little
+    while k + 8 <= inputs:  # enough at once that reading and writing ``out`` costs little
         for j in range(outputs):
             w0, w1, w2, w3 = weights[k, j], weights[k + 1, j], weights[k + 2, j], weights[k + 3, j]
             w4, w5 = weights[k + 4, j], weights[k + 5, j]
@@ -149,14 +149,14 @@ def _layer(weights: Floats, biases: Floats, x: Floats, out: Floats) -> None:
 
 @inner_kernel(fastmath=True)
 def _decode(batch: PointBatch, mlp: Mlp) -> None:
-    """Both hidden layers and the logits of the batch's inputs."""
+    """Compute both hidden layers and the logits of the batch's inputs."""
     _layer(mlp.w1, mlp.b1, batch.x, batch.h1)
     decode_rest(batch, mlp)
 
 
 @inner_kernel(fastmath=True)
 def decode_rest(batch: PointBatch, mlp: Mlp) -> None:
-    """The second hidden layer and the logits, from the first."""
+    """Compute the second hidden layer and the logits, from the first."""
     _layer(mlp.w2, mlp.b2, batch.h1, batch.h2)
     for t in range(BATCH):
         batch.logits[t] = mlp.b3[0]
@@ -167,7 +167,7 @@ def decode_rest(batch: PointBatch, mlp: Mlp) -> None:
 
 @inner_kernel()
 def transposed(mlp: Mlp, inputs: int) -> tuple[Floats, Floats]:
-    """The first two layers' weights as :func:`backward` needs them.
+    """Return the first two layers' weights as :func:`backward` needs them.
 
     Those of the first layer reach the first ``inputs`` inputs only.
     """
@@ -176,7 +176,7 @@ def transposed(mlp: Mlp, inputs: int) -> tuple[Floats, Floats]:
 
 @kernel(fastmath=True)
 def backward(batch: PointBatch, mlp: Mlp, w1_transposed: Floats, w2_transposed: Floats) -> None:
-    """Gradients of the hidden layers and of the inputs, from ``batch.slopes``."""
+    """Compute gradients of the hidden layers and of the inputs, from ``batch.slopes``."""
     for j in range(len(mlp.w3)):
         for t in range(BATCH):
             batch.g2[j, t] = batch.slopes[t] * mlp.w3[j] if batch.h2[j, t] > 0 else _ZERO
@@ -205,14 +205,14 @@ def add_weight_gradient(batch: PointBatch, sums: Mlp) -> None:
 
 @inner_kernel()
 def batch_for(field: CompiledField) -> PointBatch:
-    """Room for a batch of points of a field."""
+    """Return room for a batch of points of a field."""
     inputs, hidden = field.mlp.w1.shape
     return new_batch(field.geometry.levels, field.features.shape[1], inputs, hidden)
 
 
 @kernel(fastmath=True)
 def forward(batch: PointBatch, field: CompiledField) -> None:
-    """The logits of a batch, and what :func:`backward` needs of the layers before."""
+    """Compute the logits of a batch, and what :func:`backward` needs of the layers before."""
     levels = field.geometry.levels
     if levels > 0:
         locate(batch, field.geometry, field.vertices, field.features)
@@ -248,7 +248,7 @@ def evaluate(points: Floats, field: CompiledField, logits: Floats, gradients: Fl
 def make_field(
     settings: FieldSettings, tree: LiveQuadtree | FrozenQuadtree, arrays: FieldArrays
 ) -> CompiledField:
-    """The form of a field that kernels take; it shares memory with the arrays and the tree."""
+    """Return the form of a field that kernels take; it shares memory with arrays and tree."""
     geometry = Geometry(
         leaf_m=np.float32(settings.leaf_m),
         half_side=np.float32(1 << (settings.depth - 1)),

@@ -21,7 +21,7 @@ class FrozenCompiledField:
         self._field = make_field(settings, tree, arrays)
 
     def evaluate(self, points: Floats, gradient: bool) -> FieldValues:
-        """The field at points [N, 3], metres from the region's centre; on the caller's thread."""
+        """Return the field at points [N, 3], metres from the centre; on the caller's thread."""
         logits = np.empty(len(points), np.float32)
         gradients = np.empty((len(points) if gradient else 0, 3), np.float32)
         evaluate(points, self._field, logits, gradients)
@@ -29,14 +29,14 @@ class FrozenCompiledField:
         return FieldValues(logits * scale, gradients * scale)
 
     def evaluate_in_grid(self, axes: Floats, points: Longs) -> Floats:
-        """Distances in a grid; see :class:`triquad_map.composition.region.FieldEngine`."""
+        """Return distances in a grid; see :class:`triquad_map.composition.region.FieldEngine`."""
         logits = np.empty(len(points), np.float32)
         evaluate_in_grid(axes, points, self._field, logits)
         return np.asarray(logits * np.float32(self.settings.logit_scale_m))
 
 
 def recorded_field(settings: FieldSettings, region: Region) -> FrozenCompiledField:
-    """The field of a region as a file holds it."""
+    """Return the field of a region as a file has it."""
     tree = LiveQuadtree(settings)
     features = [np.zeros((1, settings.feature_size), np.float32)]  # row 0: absent vertices
     for table in region.tables:

@@ -20,14 +20,14 @@ from triquad_map.compiled.kernel import inner_kernel, kernel
 _ZERO = np.float32(0)
 
 _WAVE_OF_PLANE = np.array([0, 2, 1])
-"""For each plane the axis whose Fourier features count with it; each counts once."""
+"""The axis whose Fourier features count with each plane; each counts once."""
 
 _PLANES = np.arange(3)  # as literal numbers they would be compiled for one by one
 
 
 @inner_kernel(fastmath=True)
 def _wave_terms(axes: Floats, field: CompiledField, batch: PointBatch) -> Floats:
-    """What the Fourier features of each coordinate of a grid add to the first layer: [3, S, J]."""
+    """Return what Fourier features of a grid's coordinates add to the first layer: [3, S, J]."""
     learnt = field.geometry.levels * field.features.shape[1]
     m = len(field.turns_per_m)
     terms = np.empty((3, axes.shape[1], len(field.mlp.b1)), np.float32)
@@ -49,7 +49,7 @@ def _wave_terms(axes: Floats, field: CompiledField, batch: PointBatch) -> Floats
 
 @kernel()
 def _pairs(points: Longs, u: int, v: int, side: int, numbers: Ints) -> Longs:
-    """The different pairs [P, 2] of coordinates ``u`` and ``v`` of points, and whose is which."""
+    """Return the different pairs [P, 2] of coordinates ``u`` and ``v``, and each point's pair."""
     known = np.full((side, side), -1, np.int32)
     pairs = np.empty((min(len(points), side * side), 2), np.int64)
     count = 0
@@ -73,7 +73,7 @@ def _plane_terms(
     waves: Floats,
     numbers: Ints,
 ) -> Floats:
-    """What one plane adds to the first layer at pairs [P, 2] of its coordinates: [P, J].
+    """Return what one plane adds to the first layer at pairs [P, 2] of its coordinates: [P, J].
 
     Each brings along the waves of one axis. Fills in which of them each point has.
     """
@@ -102,7 +102,7 @@ def _plane_terms(
 def evaluate_in_grid(axes: Floats, points: Longs, field: CompiledField, logits: Floats) -> None:
     """Fill ``logits`` [N] at ``points`` [N, 3], by their numbers on the ``axes`` [3, S] of a grid.
 
-    Those of a point do not hang on which others are asked for: mesh tiles meet on their faces.
+    Those of a point do not depend on which others are asked for: mesh tiles meet on their faces.
     """
     batch = batch_for(field)
     waves = _wave_terms(axes, field, batch)

@@ -2,7 +2,7 @@
 
 A vertex is keyed by plane, level and 2-D Morton code (3QFP, section III-A). One hash table per
 plane and level would cost 12 H probes a point, so vertices are kept by *block*, a node of the
-coarsest level that carries features: a block holds the rows of all vertices within it and on its
+coarsest level that carries features: a block has the rows of all vertices within it and on its
 border (4 + 9 + 25 for H = 3), and one probe per plane finds them all. A vertex on a border is in
 all blocks that it touches.
 """
@@ -61,7 +61,7 @@ class Shape(NamedTuple):
 
 @register_jitable
 def morton_code(first: CoordinateT, second: CoordinateT) -> CoordinateT:
-    """2-D Morton codes of non-negative int64 coordinates below 2**31: numbers or tensors.
+    """Return 2-D Morton codes of non-negative int64 coordinates below 2**31: numbers or tensors.
 
     Those of :mod:`triquad_format.records.morton`.
     """
@@ -78,7 +78,7 @@ def _spread(bits: Any) -> Any:
 
 @kernel(inline="always")
 def block_key(plane: int, u: int, v: int) -> int:
-    """Key of the block ``(u, v)`` on a plane."""
+    """Return the key of the block ``(u, v)`` on a plane."""
     key: int = morton_code(u, v) | (plane << PLANE_BITS)
     return key
 
@@ -129,7 +129,7 @@ def grow_vertices(
 
 @kernel()
 def count_new_vertices(shape: Shape, vertices: Vertices, leaves: Longs, keys: Longs) -> int:
-    """How many vertices ``leaves`` [N, 3] project into that are not there; ``keys`` is their set.
+    """Return how many vertices of ``leaves`` [N, 3] are not there; ``keys`` is their set.
 
     It is cut short where the set is half full.
     """
@@ -158,7 +158,7 @@ def count_new_vertices(shape: Shape, vertices: Vertices, leaves: Longs, keys: Lo
 
 @kernel()
 def mark_rows(shape: Shape, vertices: Vertices, cubes: Longs, side: int, marked: Bools) -> None:
-    """Mark the rows of the vertices on the shadows of ``cubes`` [N, 3] of so many leaves."""
+    """Mark the rows of the vertices on the shadows of ``cubes`` [N, 3] of ``side`` leaves."""
     down = shape.levels - 1
     for i in range(len(cubes)):
         for plane in range(3):
@@ -204,7 +204,7 @@ class FrozenQuadtree:
     count: int  # rows of the feature table
 
     def table(self, plane: int, h: int) -> tuple[Longs, Longs]:
-        """Sorted Morton codes [V] and rows [V] of the vertices on a plane and level ``h``."""
+        """Return sorted Morton codes [V] and rows [V] of vertices on a plane and level ``h``."""
         owner = 1 + plane * self.shape.levels + h
         rows = np.flatnonzero(self.vertices.owners[: self.count] == owner)
         codes = self.vertices.codes[rows]
@@ -235,7 +235,7 @@ class LiveQuadtree:
         self._frozen: FrozenQuadtree | None = None  # until the tree grows
 
     def freeze(self) -> FrozenQuadtree:
-        """The tree as it is now; the same object until it grows."""
+        """Return the tree as it is now; the same object until it grows."""
         if self._frozen is None:
             # Codes and owners of rows never change.
             vertices = self.vertices._replace(
@@ -245,7 +245,7 @@ class LiveQuadtree:
         return self._frozen
 
     def table(self, plane: int, h: int) -> tuple[Longs, Longs]:
-        """Sorted Morton codes [V] and rows [V] of the vertices on a plane and level ``h``."""
+        """Return sorted Morton codes [V] and rows [V] of vertices on a plane and level ``h``."""
         return self.freeze().table(plane, h)
 
     def grow(self, leaves: Longs) -> int:
@@ -260,7 +260,7 @@ class LiveQuadtree:
         return self._rows - before
 
     def rows_under(self, cubes: Longs, side: int) -> Bools:
-        """Which rows [rows] are those of vertices in or beside the shadows of cubes of leaves.
+        """Return which rows [rows] are of vertices in or next to the shadows of cubes of leaves.
 
         ``cubes`` [N, 3] are counted in cubes of ``side`` leaves.
         """
@@ -269,7 +269,7 @@ class LiveQuadtree:
         return marked
 
     def growth_by(self, leaves: Longs) -> int:
-        """How many rows :meth:`grow` would add; an estimate where they are very many."""
+        """Return how many rows :meth:`grow` would add; an estimate where they are very many."""
         keys = empty_keys(min(_MOST_COUNTED, _NEW_ROWS * (1 + len(leaves))))
         return int(count_new_vertices(self.shape, self.vertices, leaves, keys))
 

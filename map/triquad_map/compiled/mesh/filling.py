@@ -1,11 +1,11 @@
-"""Where surface goes on that no ray has met: from seen surface into unknown space, step by step.
+"""Continues surface that no ray has met: from seen surface into unknown space, step by step.
 
 The field answers everywhere, also where nobody taught it, and there most of its zeros are no
-surface. Those that are lie in line with what was seen beside them, and around them the field still
+surface. Those that are lie in line with what was seen next to them, and around them the field still
 rises as a distance does. So surface is continued from each voxel with seen surface to the voxels
 around it, from these to the next, and so on: into a voxel that is ``UNKNOWN``, never into a
 ``FREE`` one, where the field has a surface that lies in one plane with that of the voxel before.
-``docs/design.md`` tells how much of what is found so is right.
+``docs/design.md`` says how much of what is found so is right.
 
 Voxels have the side of a leaf and are named by integer coordinates in the map frame: the voxel
 ``v`` is the cube ``[v, v + 1)`` of positions in voxels.
@@ -26,14 +26,14 @@ from triquad_map.sorted_keys import rows_of
 from triquad_map.surface import FieldSample, SampleField, SurfelKind, fit_surfels
 
 _STEEPNESS = 0.7
-"""From a voxel behind a surface to a voxel before it the field rises by at least so much of the
-way."""
+"""The least share of the way from a voxel behind a surface to a voxel before it by which the field
+rises."""
 
 _COSINE = 0.9
-"""Of the angle between the normals of surface in two neighbouring voxels, at least."""
+"""The least cosine of the angle between the normals of surface in two neighbouring voxels."""
 
 _OFF_PLANE = 0.25
-"""How far the surface in each of them lies off the other's plane at most, in voxels."""
+"""The most that the surface in each of them lies off the other's plane, in voxels."""
 
 _AROUND = np.array([step for step in np.ndindex(3, 3, 3) if step != (1, 1, 1)]) - 1  # [26, 3]
 
@@ -57,12 +57,12 @@ class _Patches:
     sources: Longs  # [N, 3] as of FilledVoxels
 
     def chosen(self, rows: Bools | NDArray[np.intp]) -> "_Patches":
-        """Some of them, ``rows``."""
+        """Return some of them, ``rows``."""
         return _Patches(*(array[rows] for array in vars(self).values()))
 
 
 def filled_voxels(view: ComposedView, low: Doubles, high: Doubles, fill_m: float) -> FilledVoxels:
-    """The voxels into which surface goes on that meet a box; there may be others around it.
+    """Return the voxels into which surface goes on that meet a box; there may be others around it.
 
     Args:
         view: the map.
@@ -87,7 +87,7 @@ def filled_voxels(view: ComposedView, low: Doubles, high: Doubles, fill_m: float
 
 
 def cells_around(filled: FilledVoxels, voxel_m: float, cell_m: float, reach_m: float) -> Longs:
-    """The cells [C, 3] of a lattice that may hold faces up to ``reach_m`` from filled voxels."""
+    """Return cells [C, 3] of a lattice that may have faces up to ``reach_m`` from filled voxels."""
     middles, away_m = _middles(filled.voxels) * voxel_m, (voxel_m + cell_m) / 2 + reach_m
     first = np.ceil((middles - away_m) / cell_m - 0.5).astype(np.int64)
     last = np.floor((middles + away_m) / cell_m - 0.5).astype(np.int64)
@@ -95,7 +95,7 @@ def cells_around(filled: FilledVoxels, voxel_m: float, cell_m: float, reach_m: f
 
 
 def _seen_voxels(view: ComposedView, low: Doubles, high: Doubles, margin: int) -> Longs:
-    """The voxels [N, 3] with seen surface, up to ``margin`` voxels around a box at least."""
+    """Return the voxels [N, 3] with seen surface, up to ``margin`` voxels around a box at least."""
     first = np.floor(low / view.voxel_m).astype(np.int64) - margin
     last = np.floor(high / view.voxel_m).astype(np.int64) + margin
     middles = _middles(first[:, None] + np.arange((last - first).max() + 1)) * view.voxel_m
@@ -111,13 +111,13 @@ def _field_in_voxels(view: ComposedView) -> SampleField:
 
 
 def _seen_patches(field: SampleField, seen: Longs) -> _Patches:
-    """The surface of the voxels ``seen`` [N, 3]: in them, or just beside where the field has it."""
+    """Return the surface of voxels ``seen`` [N, 3]: in them, or just next to them in the field."""
     patches, kinds = _patches(field, seen)
     return patches.chosen((kinds == SurfelKind.DISC) | (kinds == SurfelKind.NONE))
 
 
 def _patches(field: SampleField, voxels: Longs) -> tuple[_Patches, Bytes]:
-    """The surface of ``voxels`` [N, 3], as their own sources, and the kinds [N] of its surfels."""
+    """Return the surface of ``voxels`` [N, 3], their own sources, and the kinds [N] of surfels."""
     surfels = fit_surfels(voxels, field, lambda beside: np.ones(len(beside), np.bool_))
     points = _middles(voxels) + surfels.offsets
     return _Patches(voxels, points, surfels.normals.astype(np.float64), voxels), surfels.kinds
@@ -126,7 +126,7 @@ def _patches(field: SampleField, voxels: Longs) -> tuple[_Patches, Bytes]:
 def _next_front(
     view: ComposedView, field: SampleField, front: _Patches, known: Longs, limit: float
 ) -> _Patches:
-    """The surface of ``front`` where it goes on in voxels beside it that are not ``known``."""
+    """Return the surface of ``front`` where it goes on in voxels next to it, not ``known``."""
     before = np.repeat(np.arange(len(front.voxels)), len(_AROUND))
     voxels = front.voxels[before] + np.tile(_AROUND, (len(front.voxels), 1))
     least = known.min(axis=0) - 1
@@ -147,7 +147,7 @@ def _next_front(
 
 
 def _distance_like(view: ComposedView, field: SampleField, voxels: Longs) -> _Patches:
-    """The surface in those of ``voxels`` [N, 3] that are unknown, where it is a distance's zero."""
+    """Return the surface in unknown ones of ``voxels`` [N, 3], where it is a distance's zero."""
     unknown = view.status(_middles(voxels) * view.voxel_m, 0.0) == Status.UNKNOWN
     patches, kinds = _patches(field, voxels[unknown])
     patches = patches.chosen(kinds == SurfelKind.DISC)
@@ -157,7 +157,7 @@ def _distance_like(view: ComposedView, field: SampleField, voxels: Longs) -> _Pa
 
 
 def _aligned(one: _Patches, other: _Patches) -> Bools:
-    """Whether patches [N] lie in one plane with the ``other`` ones, as far as can be asked."""
+    """Return whether patches [N] lie in one plane with ``other`` ones, as far as can be asked."""
     way = other.points - one.points
     level: Bools = (one.normals * other.normals).sum(axis=1) >= _COSINE
     for normals in (one.normals, other.normals):
@@ -166,10 +166,10 @@ def _aligned(one: _Patches, other: _Patches) -> Bools:
 
 
 def on_filled(view: ComposedView, filled: FilledVoxels, points: Doubles, reach_m: float) -> Bools:
-    """Whether points [N, 3], metres, map frame, of a surface lie where it was continued.
+    """Return whether points [N, 3], metres, map frame, of a surface lie where it was continued.
 
-    That is up to ``reach_m`` beside a voxel with seen surface, of which they are in a part that was
-    not seen; or so far beside a filled voxel on each axis, at most ``fill_m`` from the voxel with
+    That is up to ``reach_m`` from a voxel with seen surface, of which they are in a part that was
+    not seen; or so far from a filled voxel on each axis, at most ``fill_m`` from the voxel with
     seen surface at which that began, and not in a ``FREE`` voxel.
     """
     if filled.fill_m == 0:
@@ -182,7 +182,7 @@ def on_filled(view: ComposedView, filled: FilledVoxels, points: Doubles, reach_m
 
 
 def _beside_filled(filled: FilledVoxels, places: Doubles, voxel_m: float, reach_m: float) -> Bools:
-    """As :func:`on_filled`, of filled voxels alone and of ``places`` [N, 3] in voxels."""
+    """Do as :func:`on_filled`, of filled voxels alone and of ``places`` [N, 3] in voxels."""
     found = np.zeros(len(places), np.bool_)
     if not len(filled.voxels):
         return found
@@ -201,11 +201,11 @@ def _beside_filled(filled: FilledVoxels, places: Doubles, voxel_m: float, reach_
 
 
 def _middles(voxels: Longs) -> Doubles:
-    """The middles [N, 3] of voxels [N, 3], in voxels."""
+    """Return the middles [N, 3] of voxels [N, 3], in voxels."""
     return voxels.astype(np.float64) + 0.5
 
 
 def _box_distances(points: Doubles, voxels: Longs) -> Doubles:
-    """Distances [N] of points [N, 3] from voxels [N, 3], in voxels."""
+    """Return distances [N] of points [N, 3] from voxels [N, 3], in voxels."""
     outside = np.maximum(np.maximum(voxels - points, points - voxels - 1.0), 0.0)
     return np.asarray(np.linalg.norm(outside, axis=1))

@@ -7,9 +7,9 @@ six faces join into loops, and each loop is filled by a fan.
 
 Vertices lie on lattice edges, so each is named by the edge's lower lattice point and its axis.
 
-``skimage.measure.marching_cubes`` finds the same vertices (a test holds them equal); this one
+``skimage.measure.marching_cubes`` finds the same vertices (a test checks that); this one
 searches only the cells it is given, names the edges, on which neighbouring tiles meet exactly, and
-takes 4 ms for a tile of 64^3 cells, without Python's lock: the other takes 8 ms and holds it.
+takes 4 ms for a tile of 64^3 cells, without Python's lock: the other takes 8 ms and keeps it.
 """
 
 import numpy as np
@@ -25,7 +25,7 @@ _EDGES = 24
 
 
 def _face_cycles() -> list[list[int]]:
-    """The corners of each face of a cell, counter-clockwise seen from outside."""
+    """Return the corners of each face of a cell, counter-clockwise seen from outside."""
     cycles = []
     for axis, bit in enumerate(_AXIS_BIT):
         u, v = _AXIS_BIT[(axis + 1) % 3], _AXIS_BIT[(axis + 2) % 3]
@@ -35,12 +35,12 @@ def _face_cycles() -> list[list[int]]:
 
 
 def _edge(first: int, second: int) -> int:
-    """Number of the edge between two corners."""
+    """Return the number of the edge between two corners."""
     return 3 * min(first, second) + _AXIS_BIT.index(first ^ second)
 
 
 def _successors(solid: int) -> dict[int, int]:
-    """For each crossed edge the next one around its loop; ``solid`` has a bit for each corner."""
+    """Return the next edge in its loop for each crossed one; ``solid`` has a bit a corner."""
     following: dict[int, int] = {}
     for cycle in _face_cycles():
         inside = [bool(solid >> corner & 1) for corner in cycle]
@@ -55,7 +55,7 @@ def _successors(solid: int) -> dict[int, int]:
 
 
 def _triangles(solid: int) -> list[tuple[int, int, int]]:
-    """Triangles of one configuration, as edges; counter-clockwise seen from free space."""
+    """Return triangles of one configuration, as edges; counter-clockwise seen from free space."""
     following = _successors(solid)
     triangles = []
     while following:
@@ -67,7 +67,7 @@ def _triangles(solid: int) -> list[tuple[int, int, int]]:
 
 
 def _table() -> tuple[Longs, Longs]:
-    """For each of 256 configurations: how many triangles, and their edges [256, most, 3]."""
+    """Return the number of triangles of 256 configurations, and their edges [256, most, 3]."""
     cases = [_triangles(solid) for solid in range(256)]
     counts = np.array([len(case) for case in cases], np.int64)
     edges = np.zeros((256, counts.max(), 3), np.int64)
@@ -81,7 +81,7 @@ COUNTS, EDGES = _table()
 
 @kernel()
 def _configurations(cells: Longs, volume: Floats, counts: Longs) -> tuple[Bytes, int]:
-    """Which corners of each cell are solid, and the number of triangles of all.
+    """Return which corners of each cell are solid, and the number of triangles of all.
 
     A cell with a corner of unknown distance (NaN) counts as empty.
     """
@@ -143,7 +143,7 @@ def _fill(
 def _places(
     names: Longs, volume: Floats, points: NDArray[np.uint16], axes: Bytes, fractions: Doubles
 ) -> None:
-    """Where vertices of these names lie: lower lattice point, axis, and how far along it."""
+    """Find where vertices of these names lie: lower lattice point, axis, and how far along it."""
     side = volume.shape[0]
     for i in range(len(names)):
         axis = names[i] % 3
@@ -158,7 +158,7 @@ def _places(
 
 @kernel()
 def _renumbered(faces: Ints, vertices: int) -> tuple[Longs, Ints]:
-    """The vertices that faces use, in the order in which they do, and the faces with these."""
+    """Return the vertices that faces use, in the order of use, and the faces with these."""
     numbers = np.full(vertices, -1, np.int32)
     used = np.empty(vertices, np.int64)
     renumbered = np.empty(faces.shape, np.int32)
@@ -175,7 +175,7 @@ def _renumbered(faces: Ints, vertices: int) -> tuple[Longs, Ints]:
 
 
 class Crossings:
-    """Where a surface crosses the edges of a lattice, and the triangles between those places."""
+    """The places where a surface crosses the edges of a lattice, and the triangles between them."""
 
     def __init__(self, cells: Longs, volume: Floats) -> None:
         """Find the surface, where the distance is 0.
@@ -216,7 +216,7 @@ class Crossings:
 
 @kernel()
 def centroids(vertices: Doubles, faces: Ints) -> Doubles:
-    """The middles [F, 3] of triangles of ``vertices`` [V, 3]."""
+    """Return the middles [F, 3] of triangles of ``vertices`` [V, 3]."""
     centroids = np.empty((len(faces), 3))
     for i in range(len(faces)):
         a, b, c = vertices[faces[i, 0]], vertices[faces[i, 1]], vertices[faces[i, 2]]

@@ -71,7 +71,7 @@ def mesh_tile(
     around: TileBorder | None = None,
     fill_m: float = 0.0,
 ) -> TileMesh:
-    """The surface within one tile.
+    """Return the surface within one tile.
 
     Args:
         view: the map.
@@ -103,7 +103,7 @@ def mesh_tile(
 
 
 def _are_seen(view: ComposedView, middles: Doubles, lattice: TileLattice) -> Bools:
-    """Whether faces [F] with these ``middles`` [F, 3], metres, map frame, lie where rays ended."""
+    """Return whether faces [F] with ``middles`` [F, 3], metres, map frame, lie where rays ended."""
     if lattice.cell_m <= _FINE * view.voxel_m:
         return view.near_ends(middles, lattice.reach_m)
     seen: Bools = view.status(middles, lattice.reach_m) == Status.SURFACE
@@ -113,7 +113,7 @@ def _are_seen(view: ComposedView, middles: Doubles, lattice: TileLattice) -> Boo
 def _near_cells(
     view: ComposedView, filled: FilledVoxels, first: Longs, lattice: TileLattice
 ) -> Longs:
-    """Cells [C, 3] of the tile that may hold faces near enough to seen or continued surface."""
+    """Return cells [C, 3] of the tile that may have faces near seen or continued surface."""
     middles = (first[:, None] + np.arange(lattice.cells) + 0.5) * np.float64(lattice.cell_m)
     near = view.surface_in_grid(middles, lattice.cell_m / 2 + lattice.reach_m)
     if len(filled.voxels):
@@ -125,7 +125,7 @@ def _near_cells(
 
 @kernel()
 def _by_group(names: Longs, side: int, group: int) -> Longs:
-    """The cells [C, 3] of a tile with these numbers [C], increasing: group by group."""
+    """Return the cells [C, 3] of a tile with these numbers [C], increasing: group by group."""
     groups = -(-side // group)
     starts = np.zeros(groups**3 + 1, np.int64)
     homes = np.empty(len(names), np.int64)
@@ -153,7 +153,7 @@ def _enter(values: Floats, points: Longs, volume: Floats) -> None:
 
 @kernel()
 def _corners(seen: Longs, volume: Floats) -> Longs:
-    """The lattice points [P, 3] at the corners of cells [C, 3]; they become NaN in ``volume``."""
+    """Return lattice points [P, 3] at corners of cells [C, 3]; they become NaN in ``volume``."""
     points = np.empty((8 * len(seen), 3), np.int64)
     count = 0
     for cell in seen:
@@ -169,7 +169,7 @@ def _corners(seen: Longs, volume: Floats) -> Longs:
 def _lattice_values(
     view: ComposedView, seen: Longs, first: Longs, lattice: TileLattice, around: TileBorder | None
 ) -> tuple[Floats, Longs]:
-    """Distances on the tile's lattice points [cells + 1] * 3, and the points [P, 3] at seen cells.
+    """Return distances on the lattice points [cells + 1] * 3, and the points [P, 3] at seen cells.
 
     Those of other points mean nothing.
     """

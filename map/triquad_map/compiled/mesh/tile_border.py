@@ -1,4 +1,4 @@
-"""What neighbouring tiles have to agree on: distances at the lattice points of their faces."""
+"""The values that neighbouring tiles share: distances at the lattice points of their faces."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -19,12 +19,12 @@ class TileBorder:
 
     @classmethod
     def of_tile(cls, points: Longs, volume: Floats) -> "TileBorder":
-        """Those of a tile's lattice points [P, 3] that lie on its faces."""
+        """Return the lattice points [P, 3] of a tile that lie on its faces."""
         return cls(*_on_faces(points, volume))
 
     @classmethod
     def joined(cls, borders: Iterable["TileBorder"]) -> "TileBorder":
-        """All points of several borders; where one occurs twice, both say the same."""
+        """Return all points of several borders; where one occurs twice, both say the same."""
         parts = list(borders)
         return cls(
             np.concatenate([np.zeros((0, 3), np.int16), *(part.points for part in parts)]),
@@ -32,7 +32,7 @@ class TileBorder:
         )
 
     def seen_from(self, offset: tuple[int, int, int], cells: int) -> "TileBorder":
-        """The points that a neighbour shares, in its own lattice.
+        """Return the points that a neighbour shares, in its own lattice.
 
         Args:
             offset: how many tiles this one lies from the neighbour, each -1, 0 or 1.
@@ -51,7 +51,7 @@ class TileBorder:
 
 @kernel()
 def _on_faces(points: Longs, volume: Floats) -> tuple[NDArray[np.int16], Floats]:
-    """Those of a tile's lattice points [P, 3] that lie on its faces, and their values."""
+    """Return the lattice points [P, 3] of a tile that lie on its faces, and their values."""
     last = len(volume) - 1
     outer = np.empty((len(points), 3), np.int16)
     values = np.empty(len(points), np.float32)

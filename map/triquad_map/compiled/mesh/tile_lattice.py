@@ -22,7 +22,7 @@ TileIndex = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class TileLattice:
-    """Where the cells and tiles of one level of detail lie."""
+    """The places of the cells and tiles of one level of detail."""
 
     cell_m: float
     cells: int  # along the side of a tile, the same on all levels
@@ -40,7 +40,7 @@ class TileLattice:
         return self.cell_m + self.reach_m
 
     def at_level(self, level: int) -> "TileLattice":
-        """The lattice so many levels coarser: a tile covers ``2**level`` of these on each axis.
+        """Return the lattice ``level`` levels coarser: a tile has ``2**level`` of these an axis.
 
         Groups of cells keep their size, so that no level searches farther around than this one.
         """
@@ -53,12 +53,12 @@ class TileLattice:
         )
 
     def meets(self, tiles: NDArray[np.integer], low: Doubles, high: Doubles) -> Bools:
-        """Which [T] of tiles [T, 3] meet the box between two corners [3], metres, map frame."""
+        """Return which [T] of tiles [T, 3] meet the box between corners [3], metres, map frame."""
         corners = tiles * self.tile_side_m
         return np.asarray(((corners <= high) & (corners + self.tile_side_m >= low)).all(axis=1))
 
     def tiles_meeting(self, low: Doubles, high: Doubles, margin_m: float = 0.0) -> Longs:
-        """Tiles [T, 3], each once, that come within ``margin_m`` of any of N boxes.
+        """Return tiles [T, 3], each once, that come within ``margin_m`` of any of N boxes.
 
         ``low`` and ``high`` [N, 3] are the boxes' corners, metres, map frame.
         """
@@ -77,7 +77,7 @@ def check_level(level: int) -> None:
 
 
 def _each_once(rows: Longs) -> Longs:
-    """The different ones of rows [N, D], in order."""
+    """Return the different rows among [N, D], in order."""
     if len(rows) == 0:
         return rows
     columns = [np.ascontiguousarray(column) for column in rows.T]
@@ -85,7 +85,7 @@ def _each_once(rows: Longs) -> Longs:
     sizes = [int(column.max()) - low + 1 for column, low in zip(columns, lows, strict=True)]
     if math.prod(sizes) >= 2**62:
         return np.asarray(np.unique(rows, axis=0))
-    # By one number each: numpy holds Python's lock while it sorts rows.
+    # By one number each: numpy keeps Python's lock while it sorts rows.
     names = np.zeros(len(rows), np.int64)
     for column, low, size in zip(columns, lows, sizes, strict=True):
         names = names * size + (column - low)
@@ -95,7 +95,7 @@ def _each_once(rows: Longs) -> Longs:
 
 @kernel()
 def _tile_boxes(low: Doubles, high: Doubles, margin_m: float, side_m: float) -> Longs:
-    """The first and last tiles [B, 6] of boxes [N, 3]; once, where boxes in a row have the same."""
+    """Return the first and last tiles [B, 6] of boxes [N, 3]; once for equal boxes in a row."""
     boxes = np.empty((len(low), 6), np.int64)
     count = 0
     for i in range(len(low)):

@@ -1,4 +1,4 @@
-"""What the nearest surfels of a region say of points of the map frame."""
+"""The nearest surface of points of the map frame, by the surfels of a region."""
 
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ _RAY_DISC = int(SurfelKind.RAY_DISC)
 
 
 class ShownSurfels(NamedTuple):
-    """What is said of surfels that were found."""
+    """The properties of surfels that were found."""
 
     kinds: Bytes  # [S]
     normals: Floats  # [S, 3]

@@ -33,7 +33,7 @@ from triquad_map.view import NearestSurface
 _NEVER = -1
 
 _UNLEARNT_REFITTED = 4_000
-"""Of surfels that rays alone show, with each epoch: there are few."""
+"""The most surfels fitted that rays alone show, with each epoch: there are few."""
 
 _FITTED_AT_ONCE = 32_768  # each takes half a kilobyte meanwhile
 
@@ -44,7 +44,7 @@ Rows = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class SurfelPlaces:
-    """Where the surfels of the voxels in which rays ended stand."""
+    """The places of the surfels of the voxels in which rays ended."""
 
     cells: Longs  # [blocks, 3]
     surface: Bytes  # [blocks, BLOCK_BYTES] these voxels
@@ -52,13 +52,13 @@ class SurfelPlaces:
     shape: TreeShape
 
     def voxels(self) -> Longs:
-        """The voxel [S, 3] of each surfel. Nobody keeps them: they take a quarter of the memory."""
+        """Return the voxel [S, 3] of each surfel, not kept: it takes a quarter of the memory."""
         used = np.flatnonzero(np.diff(self.starts))  # most blocks are of open air
         return surfel_voxels(self.cells[used], self.surface[used], int(self.starts[-1]))
 
 
 def surfel_places(cells: Longs, surface: Bytes) -> SurfelPlaces:
-    """Places for the voxels in ``surface`` [blocks, BLOCK_BYTES] of blocks at ``cells`` [, 3]."""
+    """Return places for voxels in ``surface`` [blocks, BLOCK_BYTES] of blocks ``cells`` [, 3]."""
     counts = surface_counts(surface)
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
     return SurfelPlaces(cells, surface, starts, tree_shape(cells, surface, starts))
@@ -66,7 +66,7 @@ def surfel_places(cells: Longs, surface: Bytes) -> SurfelPlaces:
 
 @kernel()
 def surfel_voxels(cells: Longs, surface: Bytes, count: int) -> Longs:
-    """The voxels [count, 3] of surfels, given the blocks' ``cells`` [blocks, 3]."""
+    """Return the voxels [count, 3] of surfels, given the blocks' ``cells`` [blocks, 3]."""
     voxels = np.empty((count, 3), np.int64)
     at = 0
     for row in range(len(surface)):
@@ -96,7 +96,7 @@ class SurfelRows(NamedTuple):
 
 @kernel()
 def carry(before: SurfelRows, now: SurfelRows) -> Bools:
-    """Copy surfels to the same voxels of ``now``; whether each [S] of ``before`` has one there.
+    """Copy surfels to the same voxels of ``now``; return whether each [S] of ``before`` has one.
 
     Blocks of ``now`` are those of ``before`` and more.
     """
@@ -162,7 +162,7 @@ class SurfelMap:
         return len(self._fitted.epochs)
 
     def voxels(self) -> Longs:
-        """The voxel [S, 3] of each surfel."""
+        """Return the voxel [S, 3] of each surfel."""
         return self._fitted.places.voxels()
 
     @property
@@ -186,9 +186,9 @@ class SurfelMap:
         most: int | None,
         by_rays: ShownByRays = nothing_shown,
     ) -> "SurfelMap":
-        """The surfels of a later epoch: new ones are fitted, and of the others the oldest.
+        """Return the surfels of a later epoch: new ones are fitted, and of the others the oldest.
 
-        At most so many of the others are fitted; ``None``: all. Those that rays alone show are
+        At most ``most`` of the others are fitted; ``None``: all. Those that rays alone show are
         whatever ``most`` is, since further rays show them better.
         """
         places = self._fitted.places
@@ -205,7 +205,7 @@ class SurfelMap:
 def first_surfels(
     evidence: FrozenEvidence, field: SampleField, epoch: int, by_rays: ShownByRays = nothing_shown
 ) -> SurfelMap:
-    """The surfels of all seen voxels, for an epoch."""
+    """Return the surfels of all seen voxels, for an epoch."""
     fitted = _nothing_in(surfel_places(evidence.cells, evidence.surface))
     voxels, rows = fitted.places.voxels(), _outdated(fitted, None)
     return _fitted_again(evidence, fitted, voxels, rows, field=field, by_rays=by_rays, epoch=epoch)
@@ -219,7 +219,7 @@ def _nothing_in(places: SurfelPlaces) -> _Fitted:
 
 
 def _carried(before: _Fitted, places: SurfelPlaces, voxels: Longs) -> _Fitted:
-    """Copies of surfels in later ``places``, which are of ``voxels`` [S, 3]."""
+    """Return copies of surfels in later ``places``, which are of ``voxels`` [S, 3]."""
     if places is before.places:
         copies = {name: array.copy() for name, array in vars(before.surfels).items()}
         return _Fitted(places, Surfels(**copies), before.epochs.copy())
@@ -232,14 +232,14 @@ def _carried(before: _Fitted, places: SurfelPlaces, voxels: Longs) -> _Fitted:
 
 
 def _beside(surfels: Surfels, voxels: Longs, gone: Longs) -> Rows:
-    """The surfels of ``voxels`` [S, 3] whose surface may have lain in ``gone`` [N, 3] beside."""
+    """Return surfels of ``voxels`` [S, 3] whose surface may have lain in ``gone`` [N, 3] nearby."""
     rows = np.flatnonzero(surfels.kinds == SurfelKind.NONE)
     around = (gone[:, None] + _AROUND).reshape(-1, 3)
     return rows[np.isin(keys_of(voxels[rows]), keys_of(around))]
 
 
 def _outdated(fitted: _Fitted, most: int | None) -> Rows:
-    """What was never fitted, and at most so many of the rest, those longest ago.
+    """Return what was never fitted, and at most ``most`` of the rest, those longest ago.
 
     What the field has still to learn goes first: so it takes over soon after it has.
     """
@@ -253,7 +253,7 @@ def _outdated(fitted: _Fitted, most: int | None) -> Rows:
 
 
 def _oldest(fitted: _Fitted, chosen: Bools, most: int) -> Rows:
-    """Of the ``chosen`` [S] surfels at most so many, those that were fitted longest ago."""
+    """Return at most ``most`` of the ``chosen`` [S] surfels, those that were fitted longest ago."""
     rows = np.flatnonzero(chosen)
     if len(rows) <= most:
         return rows

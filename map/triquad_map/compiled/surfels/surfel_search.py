@@ -1,7 +1,7 @@
 """The search for the nearest surfel.
 
 From the root of the tree down, the nearest box first, and no box that lies farther than the
-nearest surfel so far. Boxes and surfels are looked at eight at a time. The surfel that was found
+nearest surfel so far. Boxes and surfels are checked eight at a time. The surfel that was found
 for the point before is a first bound, so points are taken in an order in which neighbours follow
 each other.
 """
@@ -44,18 +44,18 @@ from triquad_map.surface import SMOOTHING
 _FARTHEST = CELL_LIMIT / 2
 
 _ROUNDING = 2.0**-21
-"""By how much, of their coordinates, boxes and points are off at most in single precision."""
+"""The share of their coordinates by which boxes and points are off at most in single precision."""
 
 _SMOOTHING = np.float32(SMOOTHING)
 _KEPT = 128
-"""How many leaves are remembered for the direction."""
+"""The number of leaves that are remembered for the direction."""
 
 _SQUARES = 3
-"""In what is remembered of each leaf, the row after x, y and z."""
+"""The row after x, y and z in what is remembered of each leaf."""
 
 _WHOLE = np.float32(1 << 24) / _KEPT
-"""Weights and distances are counted in whole numbers up to this, of which so many have a sum that
-is exact: it does not hang on the order in which leaves are met, and so on no other point."""
+"""Weights and distances are counted in whole numbers up to this, of which ``_KEPT`` have an exact
+sum: it does not depend on the order in which leaves are met, and so on no other point."""
 
 _WAITING = 1024
 """Room for boxes that may have to be opened: seven levels of nodes with 64 below each, and more."""
@@ -63,7 +63,7 @@ _WAITING = 1024
 _NONE = -1
 _NO_LENGTH = np.float32(1e-9)
 
-_CELL_BITS = 7  # of each coordinate of the cells by which points are put in order
+_CELL_BITS = 7  # of each coordinate of the cells that put points in order
 _DIGIT_BITS = 11  # of a cell's code that are counted at a time
 _DIGIT = (1 << _DIGIT_BITS) - 1
 _DIGITS = 2
@@ -76,18 +76,18 @@ Vectors = tuple[Lanes, Lanes, Lanes]
 class Room(NamedTuple):
     """Room for what is known while the nearest surfel of a point is searched for."""
 
-    kept: Ints  # [_KEPT] leaves that may hold surfels that count in the direction
+    kept: Ints  # [_KEPT] leaves that may have surfels that count in the direction
     nearest: Floats  # [_KEPT] square of the distance to the nearest surfel of each
     offsets: Floats  # [_KEPT, 4, LANES] from all of each, x, y, z, and the squares of their lengths
-    waiting: Ints  # [_WAITING] leaves and nodes that may hold nearer surfels, the nearest last
+    waiting: Ints  # [_WAITING] leaves and nodes that may have nearer surfels, the nearest last
     away: Floats  # [_WAITING] squares of the distances to their boxes
     aside: Floats  # [LANES] room for those of a few boxes
 
 
 class Found(NamedTuple):
-    """What was found for a point."""
+    """The nearest surfel of a point."""
 
-    leaf: int  # that holds the nearest surfel, ``_NONE``: there is none
+    leaf: int  # that has the nearest surfel, ``_NONE``: there is none
     lane: int  # of this leaf
     square: float  # of the distance to it
     kept: int  # leaves
@@ -95,7 +95,7 @@ class Found(NamedTuple):
 
 @inner_kernel(fastmath=True)
 def _from_surfels(tree: SurfelTree, leaf: int, at: Place) -> Vectors:
-    """From the middles of a leaf's surfels to a place."""
+    """Return the vectors from the middles of a leaf's surfels to a place."""
     surfels = tree.surfels
     x = fill(at[0] - surfels[leaf, CORNER, 0]) - load(surfels, (leaf, X, 0))
     y = fill(at[1] - surfels[leaf, CORNER, 1]) - load(surfels, (leaf, Y, 0))
@@ -115,7 +115,7 @@ def _normals(tree: SurfelTree, leaf: int) -> Vectors:
 
 @inner_kernel(fastmath=True)
 def _closest_offset(tree: SurfelTree, leaf: int, at: Place) -> Vectors:
-    """From the points of a leaf's surfels that are nearest to a place to that place."""
+    """Return the vectors to a place from the points of a leaf's surfels that are nearest to it."""
     x, y, z = _from_surfels(tree, leaf, at)
     u, v, w = _normals(tree, leaf)
     height = x * u + y * v + z * w
@@ -128,7 +128,7 @@ def _closest_offset(tree: SurfelTree, leaf: int, at: Place) -> Vectors:
 
 @inner_kernel(fastmath=True)
 def _sifted(room: Room, limit: float) -> int:
-    """Of all kept leaves keep those of which a surfel is so near; how many they are."""
+    """Keep the leaves of which a surfel is within ``limit``; return how many they are."""
     count = 0
     for i in range(_KEPT):
         if room.nearest[i] <= limit:
@@ -141,7 +141,7 @@ def _sifted(room: Room, limit: float) -> int:
 
 @inner_kernel(fastmath=True)
 def _limit(distance: float, at: Place) -> float:
-    """Square of the distance up to which surfels may count, where one is so near."""
+    """Return the square of the distance up to which surfels may count, where one is so near."""
     farthest = max(abs(at[0]), abs(at[1]), abs(at[2])) + distance
     reach = np.float32(distance + SMOOTHING + _ROUNDING * farthest)
     limit: float = reach * reach
@@ -150,7 +150,7 @@ def _limit(distance: float, at: Place) -> float:
 
 @inner_kernel(fastmath=True)
 def _open(tree: SurfelTree, node: int, at: Place, limit: float, room: Room, count: int) -> int:
-    """Add what lies below a node to the ``count`` leaves and nodes that wait; how many they are."""
+    """Add what lies below a node to ``count`` waiting leaves and nodes; return their number."""
     boxes, waiting, away = tree.boxes, room.waiting, room.away
     zero, limits = fill(0.0), fill(limit)
     x, y, z = fill(at[0]), fill(at[1]), fill(at[2])
@@ -247,7 +247,7 @@ def _write_found(
 
 @inner_kernel(fastmath=True)
 def _first_limit(tree: SurfelTree, at: Place, distance: float, leaf: int) -> float:
-    """As :func:`_limit`, from how far is searched and a leaf that may be near."""
+    """Do as :func:`_limit`, from how far is searched and a leaf that may be near."""
     if leaf != _NONE:
         x, y, z = _from_surfels(tree, leaf, at)
         distance = min(distance, np.sqrt(least(x * x + y * y + z * z)))
@@ -256,7 +256,7 @@ def _first_limit(tree: SurfelTree, at: Place, distance: float, leaf: int) -> flo
 
 @inner_kernel(fastmath=True)
 def _spread(cell: int) -> int:
-    """A number's bits, each at three times its place."""
+    """Return a number's bits, each at three times its place."""
     code = 0
     for bit in range(_CELL_BITS):
         code |= (cell >> bit & 1) << 3 * bit
@@ -265,7 +265,7 @@ def _spread(cell: int) -> int:
 
 @inner_kernel(fastmath=True)
 def _cell_codes(points: Doubles) -> Ints:
-    """Morton codes [N] of the points' cells, of which there are so many along the longest side."""
+    """Return Morton codes [N] of the points' cells, with a given number along the longest side."""
     codes = np.zeros(len(points), np.int32)
     side = 1.0
     for axis in range(3):
@@ -281,7 +281,7 @@ def _cell_codes(points: Doubles) -> Ints:
 
 @inner_kernel(fastmath=True)
 def _ends(points: Doubles, axis: int) -> tuple[float, float]:
-    """The least and the greatest coordinate."""
+    """Return the least and the greatest coordinate."""
     low = high = points[0, axis]
     for i in range(len(points)):
         low, high = min(low, points[i, axis]), max(high, points[i, axis])
@@ -290,7 +290,7 @@ def _ends(points: Doubles, axis: int) -> tuple[float, float]:
 
 @inner_kernel(fastmath=True)
 def _spatial_order(points: Doubles) -> Ints:
-    """The numbers of points [N, 3] in an order in which neighbours mostly follow each other."""
+    """Return numbers of points [N, 3] in an order in which neighbours mostly follow each other."""
     codes = _cell_codes(points)
     order, before = np.empty(len(points), np.int32), np.empty(len(points), np.int32)
     for i in range(len(points)):

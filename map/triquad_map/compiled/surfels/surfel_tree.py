@@ -1,9 +1,9 @@
 """The surfels of a region as a tree of boxes, in which the nearest are searched for.
 
-A leaf holds up to eight surfels that are neighbours in a block. Above are blocks, then cubes of
+A leaf has up to eight surfels that are neighbours in a block. Above are blocks, then cubes of
 4 x 4 x 4 blocks, then of as many of these, up to one root over all. Which surfels stand where
 depends on the voxels in which rays ended alone; their places and the boxes around them are filled
-in anew with each epoch.
+in again with each epoch.
 """
 
 from typing import NamedTuple
@@ -21,13 +21,13 @@ from triquad_map.compiled.voxel_index import LOW, SHIFT
 from triquad_map.surface import DISC_RADIUS, SurfelKind, Surfels
 
 _CUBE_BITS = 6
-"""Of Morton codes: a node has those below it in a cube of 4 x 4 x 4."""
+"""The bits of Morton codes within a node, which has those below it in a cube of 4 x 4 x 4."""
 
 _FAR = np.float32(1e6)
-"""Where lanes without a surfel have it, in voxels from their block's corner."""
+"""The place of lanes without a surfel, in voxels from their block's corner."""
 
 _NOWHERE = np.float32(1e15)
-"""Half the side of a box that holds nothing, turned inside out."""
+"""Half the side of an empty box, turned inside out."""
 
 Rows = NDArray[np.intp]
 
@@ -44,13 +44,13 @@ _RAY_DISC = int(SurfelKind.RAY_DISC)
 _RADIUS = np.float32(DISC_RADIUS)
 
 X, Y, Z, NORMAL_X, NORMAL_Y, NORMAL_Z, RADIUS, CORNER = range(8)
-"""What the rows of a leaf hold; in the last are the three coordinates of its block's corner."""
+"""The rows of a leaf; in the last are the three coordinates of its block's corner."""
 
 ROWS = 8
 
 
 class TreeShape(NamedTuple):
-    """Which surfels are in which leaves, and which leaves and nodes below which nodes.
+    """The structure of a tree: the surfels in each leaf, and the leaves and nodes below each node.
 
     Leaves come first, then blocks, and so on up to the root, the last; children of a node follow
     each other.
@@ -76,7 +76,7 @@ class SurfelTree(NamedTuple):
 
 
 def tree_shape(cells: Longs, surface: Bytes, starts: Ints) -> TreeShape:
-    """The tree of the surfels in the voxels in ``surface`` [blocks, BLOCK_BYTES].
+    """Return the tree of the surfels in the voxels in ``surface`` [blocks, BLOCK_BYTES].
 
     Blocks are at ``cells`` [blocks, 3]; ``starts`` [blocks + 1] are the first surfels of each.
     """
@@ -99,7 +99,7 @@ def tree_shape(cells: Longs, surface: Bytes, starts: Ints) -> TreeShape:
 
 @kernel()
 def _leaves(surface: Bytes, starts: Ints, blocks: Rows) -> tuple[Ints, Ints, Ints]:
-    """The order of surfels, the first of each leaf, and the first leaf of each of the ``blocks``.
+    """Return the order of surfels, the first of each leaf, and each of ``blocks``' first leaf.
 
     A leaf is the largest cube, or half or quarter of one, that has no more surfels than lanes.
     """
@@ -130,7 +130,7 @@ def _leaves(surface: Bytes, starts: Ints, blocks: Rows) -> tuple[Ints, Ints, Int
 
 @kernel(inline="always")
 def _order_block(mask: Bytes, surfel: int, codes: Ints, rows: Ints, order: Ints) -> int:
-    """Write Morton codes and numbers of a block's surfels, in this order; how many they are.
+    """Write Morton codes and numbers of a block's surfels, in this order; return their number.
 
     The first of them is ``surfel``; ``rows`` is room for the number of each voxel's.
     """
@@ -155,7 +155,7 @@ def _order_block(mask: Bytes, surfel: int, codes: Ints, rows: Ints, order: Ints)
 
 
 def surfel_tree(shape: TreeShape, voxels: Longs, surfels: Surfels) -> SurfelTree:
-    """The tree of the ``surfels`` [S] of ``voxels`` [S, 3]."""
+    """Return the tree of the ``surfels`` [S] of ``voxels`` [S, 3]."""
     leaves, nodes = len(shape.leaves) - 1, len(shape.children) - 1
     tree = SurfelTree(
         shape.order,
