@@ -1,6 +1,6 @@
 """The triquad map server.
 
-``triquad-server`` is a process of its own; a script or a notebook may have one within itself:
+``triquad-server`` is a process of its own; a script or a notebook may run a server within itself:
 
 import triquad_server
 

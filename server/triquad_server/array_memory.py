@@ -1,4 +1,4 @@
-"""How much memory the arrays of a part of the server take."""
+"""Measures how much memory the arrays of a part of the server take."""
 
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 
 Buffers = Mapping[int, int]
-"""Bytes of pieces of memory, by where they begin: arrays that share one count once."""
+"""The bytes of pieces of memory, by start address: arrays that share one count once."""
 
 NO_BUFFERS: Buffers = MappingProxyType({})
 
 
 def buffers_of(part: object, without: Buffers = NO_BUFFERS) -> dict[int, int]:
-    """The memory of all arrays and tensors that a part of the program leads to.
+    """Return the memory of all arrays and tensors that a part of the program leads to.
 
     Args:
         part: an object, or containers of some, which must not change meanwhile; only those of
@@ -40,7 +40,7 @@ def buffers_of(part: object, without: Buffers = NO_BUFFERS) -> dict[int, int]:
 
 
 def bytes_by_part(parts: Mapping[str, object], without: Buffers = NO_BUFFERS) -> dict[str, int]:
-    """Bytes of each part; what several share counts for the first of them.
+    """Return the bytes of each part; what several share counts for the first of them.
 
     ``without`` is memory that belongs to others.
     """

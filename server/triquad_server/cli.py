@@ -43,7 +43,7 @@ _log = logging.getLogger("triquad_server")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the server until SIGINT or SIGTERM; returns the exit code."""
+    """Run the server until SIGINT or SIGTERM, and return the exit code."""
     _on_signals(_leave)
     log_options = _log_options()
     start_log(log_options.parse_known_args(argv)[0].log_format)
@@ -58,7 +58,7 @@ def _on_signals(handler: Callable[..., None]) -> None:
 
 
 def _leave(*_: object) -> None:
-    """Stop before anything is open: an exception could get lost in what is being imported."""
+    """Stop before anything is open: an exception could get lost during an import."""
     _log.info("stopped")
     os._exit(OK)
 
@@ -124,12 +124,12 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _implied(options: argparse.Namespace) -> list[str]:
-    """The settings that flags stand for."""
+    """Return the settings that flags stand for."""
     return [] if options.metrics_port is None else [f"metrics.port={options.metrics_port}"]
 
 
 def _log_options() -> argparse.ArgumentParser:
-    """What has to be known of the log before anything can be wrong."""
+    """Return the parser of the options of the log, which are needed before anything can fail."""
     parser = argparse.ArgumentParser(prog=_PROGRAM, add_help=False)
     parser.add_argument(
         "--log-format",

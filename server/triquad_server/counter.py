@@ -1,10 +1,10 @@
-"""Counts by reason, added to by any thread."""
+"""Counts events by reason; safe for any thread."""
 
 import threading
 
 
 class Counter:
-    """How often each thing happened."""
+    """Counts how often each thing happened."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -16,6 +16,6 @@ class Counter:
             self._counts[reason] = self._counts.get(reason, 0) + count
 
     def counts(self) -> dict[str, int]:
-        """The counts so far."""
+        """Return the counts so far."""
         with self._lock:
             return dict(self._counts)

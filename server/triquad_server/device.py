@@ -1,4 +1,4 @@
-"""The device on which a server computes."""
+"""Chooses the device on which a server computes."""
 
 import ctypes
 import importlib.util
@@ -10,7 +10,7 @@ _DRIVERS = {"linux": "libcuda.so.1", "win32": "nvcuda.dll"}
 
 
 def choose_device(wanted: str) -> str:
-    """The device to compute on: ``wanted``, or for "auto" a GPU where there is one.
+    """Return the device to compute on: ``wanted``, or for "auto" a GPU where there is one.
 
     Raises:
         ServerError: there is no GPU or no torch, but one is wanted; or it is no device.
@@ -30,7 +30,7 @@ def choose_device(wanted: str) -> str:
 
 
 def _has_driver() -> bool:
-    """Whether there may be a GPU, found out without torch, which takes 200 MB and a second."""
+    """Return whether there may be a GPU, without torch, whose import takes 200 MB and a second."""
     driver = _DRIVERS.get(sys.platform)
     if driver is None:
         return False

@@ -1,4 +1,4 @@
-"""A server within a program: in a script, a notebook or a test, on threads of its own."""
+"""Runs a server within a program: in a script, a notebook or a test, on threads of its own."""
 
 import logging
 import queue
@@ -32,7 +32,7 @@ _WAKE_S = 0.2  # for when two threads wait for the end
 
 
 class _Run(Phases):
-    """A server on a thread of its own, where no Ctrl-C cuts short an import or a checkpoint.
+    """Runs a server on a thread of its own, where no Ctrl-C interrupts an import or a checkpoint.
 
     Other threads wait for it by what C code alone locks: the locks of Python's own conditions and
     futures may be in disorder after a ``KeyboardInterrupt``.
@@ -49,7 +49,7 @@ class _Run(Phases):
         self._running.acquire()
 
     def serve(self, options: "LaunchOptions") -> None:
-        """Serve until asked to stop; for the thread."""
+        """Serve until asked to stop; runs on the thread."""
         try:
             from triquad_server.launch import serve_until_stopped  # takes seconds
 
@@ -64,18 +64,18 @@ class _Run(Phases):
             self._running.release()
 
     def serving(self, health: "Health", question: "SelfQuestion") -> None:  # noqa: ARG002
-        """The server has started."""
+        """Report that the server has started."""
         self._is_started = True
         self._started.put(None)
 
     def wait_for_start(self) -> None:
-        """Wait until it serves; raises what keeps it from that."""
+        """Wait until it serves; raises the error that keeps it from serving."""
         error = self._started.get()
         if error is not None:
             raise error
 
     def wait_for_end(self) -> Stop:
-        """Why it has stopped, once it has, however often Ctrl-C is pressed meanwhile.
+        """Wait for the end, however often Ctrl-C is pressed meanwhile; return why it has stopped.
 
         Raises:
             KeyboardInterrupt: it was pressed; the server has ended.
@@ -103,7 +103,7 @@ class Server:
     """
 
     def __init__(self, options: "LaunchOptions") -> None:
-        """Use :func:`serve`. Returns once the server has started."""
+        """Start a server, and return once it has started; use :func:`serve` instead."""
         (self.endpoint,) = options.network.listen
         self.map_name = options.map_name
         self._clients: weakref.WeakSet[Client] = weakref.WeakSet()
@@ -112,7 +112,7 @@ class Server:
         threading.Thread(target=self._run.serve, args=(options,), name="triquad-server").start()
         try:
             self._run.wait_for_start()
-        except BaseException:  # Ctrl-C too, which the thread hears of from us alone
+        except BaseException:  # Ctrl-C too, which only this thread passes on
             self._ask_to_stop()
             raise
 
@@ -123,15 +123,15 @@ class Server:
         self.close()
 
     def client(self, timeout_s: float = 10.0) -> "Client":
-        """A new client of this server, which is closed with it at the latest.
+        """Return a new client of this server, which is closed with it at the latest.
 
         Args:
-            timeout_s: for each request, as of ``triquad_client.connect``.
+            timeout_s: the time limit of each request, as of ``triquad_client.connect``.
 
         Raises:
             ServerError: the server has stopped.
         """
-        # The one door from the server to the client, of which the server itself needs nothing.
+        # The only import of the client by the server, which itself needs nothing of it.
         from triquad_client import connect
 
         if self._run.has_ended:
@@ -141,7 +141,7 @@ class Server:
         return client
 
     def close(self) -> None:
-        """Stop the server, with a last checkpoint if it has a store; twice does no harm.
+        """Stop the server, with a last checkpoint if it has a store; closing twice does no harm.
 
         Ctrl-C meanwhile raises ``KeyboardInterrupt`` once all is written.
 
@@ -226,7 +226,7 @@ def _loaded(settings: "Settings | str | Path | None") -> "Settings":
 
 @contextmanager
 def _free_endpoint() -> Iterator[str]:
-    """An endpoint on a port of the loopback that nobody else is given while the context is open."""
+    """Yield an endpoint on a loopback port that no one else is given while the context is open."""
     with closing(socket.socket()) as reserved:
         # Without this, Zenoh could not listen there as well.
         reserved.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

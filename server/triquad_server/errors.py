@@ -4,11 +4,11 @@ from triquad_format.errors import TriquadError
 
 
 class ServerError(TriquadError):
-    """What keeps the server from starting or from doing its work."""
+    """An error that keeps the server from starting or from doing its work."""
 
 
 class ListenError(ServerError):
-    """The server cannot listen where it was told to."""
+    """The server cannot listen at the given endpoint."""
 
 
 class StoreError(ServerError):
@@ -16,7 +16,7 @@ class StoreError(ServerError):
 
 
 class StoreBaseError(StoreError):
-    """Files that hold parts of the newest checkpoint are damaged: a complete one is due."""
+    """Files with parts of the newest checkpoint are damaged: a complete one must be written."""
 
 
 class LastCheckpointError(StoreError):

@@ -1,4 +1,4 @@
-"""A bounded queue of what many owners send, who are served in turn."""
+"""A bounded queue of items of many owners, who are served in turn."""
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
@@ -8,14 +8,14 @@ ItemT = TypeVar("ItemT")
 
 
 class Owner(NamedTuple):
-    """Whose turn it is: that of a group, and of one name in it."""
+    """The owner of an item: a group, and one name in it."""
 
     group: str
     name: str = ""
 
 
 def first_to_go(items: Sequence[tuple[Owner, int]]) -> int:
-    """Which of items with their sizes, oldest first, is removed where they are too many.
+    """Return which of the items with their sizes, oldest first, is removed if they are too many.
 
     It is the newest of the owner who has most.
     """
@@ -33,15 +33,15 @@ def first_to_go(items: Sequence[tuple[Owner, int]]) -> int:
 
 
 class FairQueue(Generic[ItemT]):
-    """Groups take turns, and so do the names within each, however much any of them sends.
+    """Serves groups in turn, and the names within each, however much any of them sends.
 
     Where it is full, the group that has most of it loses an item. Not safe for several threads.
     """
 
     def __init__(self, limit: int, limit_bytes: int, limit_each: int, *, newest_go: bool) -> None:
-        """At most ``limit`` items wait, ``limit_each`` of each group, and ``limit_bytes`` in all.
+        """Let ``limit`` items wait at most, ``limit_each`` of each group, ``limit_bytes`` in all.
 
-        A single item may be larger. Where there are too many, the newest go, or the oldest.
+        A single item may be larger. If there are too many, the newest are removed, or the oldest.
         """
         self.limit = limit
         self.limit_bytes = limit_bytes
@@ -56,15 +56,15 @@ class FairQueue(Generic[ItemT]):
         return self._count
 
     def count(self, group: str) -> int:
-        """Items of a group that wait."""
+        """Return how many items of a group wait."""
         return sum(map(len, self._groups.get(group, {}).values()))
 
     def most(self) -> int:
-        """Items that wait of the group that has most."""
+        """Return how many items wait of the group that has most."""
         return max(map(self.count, self._groups), default=0)
 
     def put(self, owner: Owner, item: ItemT, nbytes: int) -> list[ItemT]:
-        """Add an item; returns those that are removed for it, of which it may be one."""
+        """Add an item; return those that are removed for it, of which it may be one."""
         names = self._groups.setdefault(owner.group, {})
         names.setdefault(owner.name, deque()).append((item, nbytes))
         self._count += 1
@@ -79,9 +79,9 @@ class FairQueue(Generic[ItemT]):
         return removed
 
     def take(self, may: Callable[[ItemT], bool] = lambda _: True) -> ItemT | None:
-        """The oldest item of the owner whose turn it is; it then comes last.
+        """Return the oldest item of the owner whose turn it is; the owner then comes last.
 
-        Owners of whose oldest item ``may`` says no are passed over.
+        Owners whose oldest item ``may`` rejects are passed over.
         """
         for owner in self._in_turn():
             names = self._groups[owner.group]

@@ -1,4 +1,4 @@
-"""How the server is doing: its status, published once a second, and whether it is well."""
+"""Reports the server's status, published once a second, and whether it works."""
 
 import logging
 import threading
@@ -30,7 +30,7 @@ _BEATS_PER_LOG_LINE = 5
 
 @dataclass(frozen=True)
 class Health:
-    """Collects from its parts how the server is doing."""
+    """Collects the status of the server from its parts."""
 
     map_name: str
     server: str  # a name of this process
@@ -41,7 +41,7 @@ class Health:
     mapper: MapperThread
     epochs: EpochHistory
     checkpoints: CheckpointThread
-    map_max_bytes: int  # beyond which the map does not grow
+    map_max_bytes: int  # memory limit of the map
     started_s: float = field(default_factory=time.monotonic)  # monotonic
 
     def status(self) -> ServerStatus:
@@ -85,10 +85,10 @@ class Health:
         )
 
     def mapping_problem(self, stuck_s: float = STUCK_S) -> str | None:
-        """Return why nothing is mapped any more until a restart, ``None`` where all is well.
+        """Return why nothing is mapped any more until a restart; ``None`` if mapping works.
 
-        A thread that computes is alive, for :data:`ENDLESS_S` at most; one that waits is alive if
-        it hears the :class:`Heartbeat`, which wakes it.
+        A thread that computes counts as alive, for :data:`ENDLESS_S` at most; one that waits does
+        if the :class:`Heartbeat`, which wakes it, reaches it.
         """
         if self.mapper.ended is not None:
             return self.mapper.ended
@@ -99,7 +99,7 @@ class Health:
         return f"mapping makes no progress: it is at {at} since {for_s:.0f} s"
 
     def problem(self) -> str | None:
-        """Return why the server does not do all that it should, ``None`` where it does.
+        """Return why the server does not do all that it should; ``None`` if it does.
 
         That is :meth:`mapping_problem`, or a store that cannot be written.
         """
@@ -109,7 +109,7 @@ class Health:
         return f"what is mapped is not kept: {self.checkpoints.error}"
 
     def summary(self) -> str:
-        """Return in a line what the server does, and what keeps it from that."""
+        """Return a line on what the server does, and what keeps it from that."""
         doing = (
             f"serving map '{self.map_name}': epoch {self.epochs.newest.number}, "
             f"{self.mapper.progress.map.scans_taken} scans taken"
@@ -119,7 +119,7 @@ class Health:
 
 
 class Heartbeat:
-    """Tells the network and the log how the server is doing."""
+    """Publishes the server's status on the network, and logs it."""
 
     def __init__(self, session: zenoh.Session, health: Health) -> None:
         self._health = health
@@ -131,7 +131,7 @@ class Heartbeat:
             congestion_control=zenoh.CongestionControl.DROP,
             priority=zenoh.Priority.INTERACTIVE_LOW,
         )
-        self._logged: tuple[object, ...] = ()  # what the last line told
+        self._logged: tuple[object, ...] = ()  # what the last line reported
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="heartbeat")
         self._thread.start()
@@ -147,7 +147,7 @@ class Heartbeat:
         while not self._stopping.wait(STATUS_PERIOD_S):
             beat += 1
             try:
-                self._health.mapper.wake()  # for a sign of life, even where nothing is to do
+                self._health.mapper.wake()  # as a sign of life, even where there is nothing to do
                 self._health.warnings.check()
                 status = self._health.status()
                 self._publisher.put(codec.encode(status))
@@ -158,7 +158,7 @@ class Heartbeat:
                 self._log_progress(status)
 
     def _log_progress(self, status: ServerStatus) -> None:
-        """Log a line, where anything happened since the last one."""
+        """Log a line, if anything happened since the last one."""
         dropped, lost = sum(status.scans_dropped.values()), sum(status.scans_lost.values())
         now = (status.epoch, status.scans_taken, dropped, lost)
         if now != self._logged:

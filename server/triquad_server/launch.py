@@ -1,4 +1,4 @@
-"""Starting and stopping a server: one that is a process, or one within a program."""
+"""Starts and stops a server, as a process or within a program."""
 
 import logging
 import sys
@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger("triquad_server")
 
 _SWITCH_INTERVAL_S = 0.0005
-"""How long a thread may keep the interpreter while another waits: a query is to be answered in a
-few milliseconds, which is Python's default for a single turn."""
+"""The time for which a thread may keep the interpreter while another waits: a query is to be
+answered in a few milliseconds, which is Python's default for a single turn."""
 
 
 class _StoppedEarlyError(Exception):
@@ -48,7 +48,7 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
     """Serve until something is put into ``stops``, and return it: this process does nothing else.
 
     Raises:
-        ServerError: the server cannot start; subclasses tell what is in the way.
+        ServerError: the server cannot start; its subclasses name the cause.
     """
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     give_back_early()
@@ -61,7 +61,7 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
 
 
 def _stop_where_a_thread_ends(stops: Stops) -> None:
-    """Ask to stop where an exception ends a thread: without any of them this serves but in part."""
+    """Ask to stop if an exception ends a thread: without any of them, the server works in part."""
     tell = threading.excepthook
 
     def tell_and_stop(args: threading.ExceptHookArgs) -> None:
@@ -79,10 +79,10 @@ def serve_until_stopped(options: LaunchOptions, stops: Stops, phases: Phases) ->
     Args:
         options: what the server is started with.
         stops: where it is asked to stop; before it has started, too.
-        phases: hears how it goes.
+        phases: receives the steps of the run.
 
     Raises:
-        ServerError: the server cannot start; subclasses tell what is in the way.
+        ServerError: the server cannot start; its subclasses name the cause.
     """
     try:
         with ExitStack() as stack:
@@ -137,7 +137,7 @@ def _open(options: LaunchOptions, stops: Stops, phases: Phases, stack: ExitStack
 
 
 def _open_monitoring(settings: Settings, stack: ExitStack) -> "MonitoringServer | None":
-    """The port for metrics, where one is wanted: it listens before all else takes its time."""
+    """Open the port for metrics, if one is configured, before all that takes time."""
     if settings.metrics.port == 0:
         return None
     # Only where it is wanted, since Python's HTTP server takes a while to import.
@@ -159,7 +159,7 @@ def _open_store(options: LaunchOptions, phases: Phases, stack: ExitStack) -> Sto
 
 
 def _restored(store: Store, options: LaunchOptions, phases: Phases) -> ValidCheckpoint | None:
-    """The checkpoint from which the map goes on, if there is one."""
+    """Return the checkpoint from which the map goes on, if there is one."""
     phases.starting("restoring the newest checkpoint")
     restored = store.newest()
     if restored is None:
@@ -172,10 +172,10 @@ def _restored(store: Store, options: LaunchOptions, phases: Phases) -> ValidChec
 
 
 def _settings_of(record: MapRecord, settings: Settings) -> Settings:
-    """The settings for a restored map, which keeps its own field.
+    """Return the settings for a restored map, which keeps its own field.
 
     Raises:
-        SettingsError: lengths that are given do not go with it.
+        SettingsError: lengths that are given do not agree with it.
     """
     if record.settings == settings.field:
         return settings
@@ -205,7 +205,7 @@ def _before_each_step(stops: Stops, phases: Phases) -> Callable[[str], None]:
 
 
 def _log_who_gets_in(network: Configuration) -> None:
-    """Say whom the network lets in, and what they may do."""
+    """Log whom the network lets in, and what they may do."""
     if not network.own_access_control:
         _log.info("access: as the Zenoh configuration says")
     elif network.listens_beyond or network.connect:

@@ -1,4 +1,4 @@
-"""What a server is started with; quick to import."""
+"""The options that a server is started with; quick to import."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,17 +10,17 @@ from triquad_server.settings import Settings
 
 @dataclass(frozen=True)
 class LaunchOptions:
-    """What a server is started with."""
+    """The options that a server is started with."""
 
     map_name: str
     network: NetworkOptions
     settings: Settings
     store: Path | None
     device: str  # "cpu", "cuda" or "auto"
-    restore: int | None = None  # the epoch that the map is taken back to; None: the newest
+    restore: int | None = None  # the epoch that the map is restored to; None: the newest
 
     def __post_init__(self) -> None:
-        """Refuse to restore from nowhere.
+        """Refuse to restore without a store.
 
         Raises:
             ServerError: there is no store.

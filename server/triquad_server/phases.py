@@ -1,4 +1,4 @@
-"""The phases of a server's run, and what is done about them; quick to import."""
+"""The phases of a server's run, and the hooks called for them; quick to import."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ if TYPE_CHECKING:
 
 
 class Phases:
-    """Hears how a server starts, serves and stops; this one does nothing about it."""
+    """Receives the phases of a server's run; this one does nothing about them."""
 
     def starting(self, stage: str) -> None:
-        """The start comes to another stage; called before each."""
+        """Report the next stage of the start; called before each."""
 
     def serving(self, health: Health, question: SelfQuestion) -> None:
-        """The server serves, until :meth:`stopping`; both arguments tell how it does."""
+        """Report that the server serves, until :meth:`stopping`; both arguments give its state."""
 
     def stopping(self) -> None:
-        """The server was asked to stop, and what is left to do begins."""
+        """Report that the server was asked to stop, and finishes its work."""

@@ -1,4 +1,4 @@
-"""A question about the map that the server asks itself, to know whether it still answers."""
+"""A query that the server sends to itself, to check that it still answers."""
 
 import numpy as np
 import zenoh
@@ -9,10 +9,10 @@ from triquad_format.wire.origin import RequestOrigin
 
 
 class SelfQuestion:
-    """Asks for the field at one point, which goes the way of the questions of others."""
+    """Queries the field at one point, in the same way as clients do."""
 
     def __init__(self, session: zenoh.Session, map_name: str, own_name: str) -> None:
-        """``own_name`` has turns of its own, as any client: no other comes before."""
+        """Make the query; ``own_name`` has its own turns, as any client: none comes before."""
         self._session = session
         self._key = keys.operation_key(map_name, keys.SDF)
         request = SdfRequest(np.zeros(3), np.zeros((1, 3), np.float32), gradient=False, epoch=0)
@@ -20,7 +20,7 @@ class SelfQuestion:
         self._own_name = own_name
 
     def problem(self, timeout_s: float) -> str | None:
-        """That no answer came in time; ``None`` where one came.
+        """Return an error if no answer came in time; ``None`` if one came.
 
         A refusal, where too many requests wait, is an answer.
         """
@@ -37,7 +37,7 @@ class SelfQuestion:
 
 
 def _is_ours(error: zenoh.ReplyError) -> bool:
-    """Whether an error comes from the server, not from Zenoh, which has waited for long enough."""
+    """Return whether an error comes from the server, not from Zenoh, whose wait has ended."""
     try:
         codec.decode(ErrorReply, error.payload.to_bytes())
     except WireError:

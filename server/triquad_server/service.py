@@ -1,4 +1,4 @@
-"""The map server: its parts, wired to a Zenoh session."""
+"""The map server: its parts, connected to a Zenoh session."""
 
 import secrets
 from collections.abc import Callable
@@ -82,14 +82,14 @@ class ServedMap:
 
     name: str
     mapper: Mapper
-    device: str  # where the mapper computes
-    store: Store | None = None  # where its checkpoints go
-    restored: CheckpointInfo | None = None  # the checkpoint it was restored from
-    teams: Teams = field(default_factory=Teams)  # whose threads make mesh tiles
+    device: str  # device of the mapper
+    store: Store | None = None  # store of its checkpoints
+    restored: CheckpointInfo | None = None  # checkpoint that it was restored from
+    teams: Teams = field(default_factory=Teams)  # teams that make mesh tiles
 
 
 class Service:
-    """Serves one map until it is closed. Session and store are closed by the caller, after."""
+    """Serves one map until it is closed; the caller closes session and store after it."""
 
     def __init__(
         self,
@@ -98,7 +98,7 @@ class Service:
         settings: Settings,
         failed: Callable[[], None] = lambda: None,
     ) -> None:
-        """Begin to serve; ``failed`` is called where mapping stops by an internal error."""
+        """Begin to serve; ``failed`` is called if mapping stops by an internal error."""
         self._session = session
         self._served = served
         self._settings = settings
@@ -122,16 +122,16 @@ class Service:
 
     @property
     def epoch(self) -> int:
-        """Number of the newest epoch."""
+        """The number of the newest epoch."""
         return self._epochs.newest.number
 
     @property
     def own_name(self) -> str:
-        """By which the server names itself in requests to itself."""
+        """The name of the server in requests to itself."""
         return self._operations.own_name
 
     def close(self) -> None:
-        """Refuse what still waits, stop mapping, and write a last checkpoint.
+        """Refuse pending requests, stop mapping, and write a last checkpoint.
 
         Raises:
             StoreError: the checkpoint cannot be written; all else is closed.
@@ -191,7 +191,7 @@ class Service:
             keys.CHECKPOINT, answering(CheckpointRequest, checkpoints.answer), Lane.SLOW
         )
         self._operations.serve(keys.RESET, answering(ResetRequest, resets.answer), Lane.SLOW)
-        # Closed before the last checkpoint is written: it shows every reset that was answered.
+        # Closed before the last checkpoint is written: it contains every reset that was answered.
         self._parts.callback(self._operations.close)
         self._parts.callback(self._mapper.pause)
         self._open_intake()
@@ -243,7 +243,7 @@ class Service:
         self._operations.serve(keys.SOURCES, answering(SourcesRequest, queries.sources))
 
     def _serve_mesh(self, server: str) -> TileCache:
-        """Queries of mesh tiles, and following them; all tiles."""
+        """Serve queries of mesh tiles, and requests that follow them; return the cache."""
         cache = TileCache(self._settings.mesh, self._served.teams.meshing)
         feed = TileFeed(
             cache,
@@ -263,7 +263,7 @@ class Service:
         return cache
 
     def _serve_status(self) -> None:
-        """How the server is doing, and whether scans are in the map."""
+        """Publish the server's status, and answer whether scans are in the map."""
         flush = FlushHandler(
             self._scans.ledger,
             self._mapper.publish_soon,

@@ -1,4 +1,4 @@
-"""How the service manager hears of a server: that it starts, that it serves, that it still does."""
+"""Reports to the service manager that a server starts, that it serves, and that it still works."""
 
 import logging
 import threading
@@ -10,16 +10,16 @@ from triquad_server.self_question import SelfQuestion
 
 _log = logging.getLogger(__name__)
 
-_STATUS_PERIOD_S = 10.0  # where the manager does not say how often it wants to hear anything
-_SOONER = 10  # times sooner, a server is checked again that was not well
+_STATUS_PERIOD_S = 10.0  # where the manager does not set how often to report
+_SOONER = 10  # factor by which a server that was not well is checked again sooner
 
 
 class Supervision(Phases):
-    """Tells the service manager of a server that is a process of its own.
+    """Notifies the service manager of a server that is a process of its own.
 
-    It hears that the server is alive as long as maps are learnt and questions are answered: once
+    It reports that the server is alive as long as maps are learnt and queries are answered: once
     they are not, nothing but a restart helps. From the moment that the server is asked to stop it
-    is believed; how long a last checkpoint may take is the manager's to say.
+    counts as alive; the manager decides how long a last checkpoint may take.
     """
 
     def __init__(self, manager: ServiceManager) -> None:
@@ -30,11 +30,11 @@ class Supervision(Phases):
         self._thread: threading.Thread | None = None
 
     def starting(self, stage: str) -> None:
-        """Tell which stage of the start begins."""
+        """Report which stage of the start begins."""
         self._manager.starting(stage)
 
     def serving(self, health: Health, question: SelfQuestion) -> None:
-        """Tell that the server serves, and from now on how it does."""
+        """Report that the server serves, and from now on its state."""
         self._manager.tell("READY=1", status=health.summary())
         if self._manager.listens:
             self._thread = threading.Thread(
@@ -43,14 +43,14 @@ class Supervision(Phases):
             self._thread.start()
 
     def stopping(self) -> None:
-        """Tell that the server stops."""
+        """Report that the server stops."""
         self._stopping.set()
         self._manager.tell(
             "STOPPING=1", status="what waits is answered, and the last checkpoint is written"
         )
 
     def close(self) -> None:
-        """Say nothing more."""
+        """Report nothing more."""
         self._closing.set()
         if self._thread is not None:
             self._thread.join()
@@ -67,7 +67,7 @@ class Supervision(Phases):
                 self._manager.tell(status=health.summary())
 
     def _tell(self, problem: str | None) -> None:
-        """Tell that the server is alive, or the log why that is not told."""
+        """Report that the server is alive, or log why not."""
         if problem is None and self._manager.watchdog_s is not None:
             self._manager.tell("WATCHDOG=1")
         elif problem is not None and self._was_well:
@@ -76,6 +76,6 @@ class Supervision(Phases):
 
 
 def _problem(health: Health, question: SelfQuestion, watchdog_s: float) -> str | None:
-    """Why the server does not map, or does not answer, any more; ``None`` where it does both."""
+    """Return why the server does not map, or does not answer; ``None`` if it does both."""
     mapping = health.mapping_problem(min(STUCK_S, watchdog_s))
     return mapping or question.problem(timeout_s=watchdog_s / 2)

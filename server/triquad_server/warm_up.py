@@ -1,4 +1,4 @@
-"""Compiles all kernels of a server before it is ready, by a small synthetic map.
+"""Compiles all kernels of a server before it is ready, using a small synthetic map.
 
 That takes half a minute or more, once per machine and release; from then on the compiled code is
 found on disk. ``python -m triquad_server.warm_up`` does it without starting a server.
@@ -23,7 +23,7 @@ from triquad_server.process.threads import Teams
 from triquad_server.settings import MemorySettings, Settings
 
 _COMPILING = "compiling, step %d of %d: %s; half a minute or more, once per machine and release"
-_REMOVING_SCANS = 6  # of rays that pass the synthetic sphere, until it is removed
+_REMOVING_SCANS = 6  # scans of rays that pass the synthetic sphere, until it is removed
 _DIRECTIONS = 400  # of the rays of a synthetic scan
 _RADIUS_M = 3.0  # of the sphere that it sees
 
@@ -78,10 +78,10 @@ def go_through(step: Callable[[], None]) -> None:
 
 
 class _SyntheticMap:
-    """A sphere that is mapped, asked about, meshed and removed: each step uses some kernels."""
+    """Maps a sphere, queries it, meshes it and removes it: each step uses some kernels."""
 
     def __init__(self, settings: Settings, device: str, teams: Teams) -> None:
-        # With room for it, whatever the memory of the map itself is.
+        # With room for it, whatever the memory limit of the map itself.
         self._settings = settings.model_copy(update={"memory": MemorySettings()})
         self._teams = teams
         scan = settings.scan
@@ -107,7 +107,7 @@ class _SyntheticMap:
         self._mapper.publish()
 
     def questions(self) -> None:
-        """Ask the map, as it is restored, for distances."""
+        """Query the restored map for distances."""
         epoch = self._restored.publish()
         points = self._directions * self._radius_m
         epoch.query(points, gradient=True)
@@ -122,7 +122,7 @@ class _SyntheticMap:
         cache.make(0, (x, y, z))
 
     def restored_training(self) -> None:
-        """Train it further in part, as what is restored and then seen again."""
+        """Train the map further in part, as one that is restored and then seen again."""
         (region, *_) = self._restored.regions
         pool = region.training.rays.pool
         blocks = region.evidence.live.surface_blocks()

@@ -1,1 +1,1 @@
-"""The field that is trained: on tensors and compiled, with its optimiser."""
+"""The field that is trained, on tensors or compiled, with its optimiser."""

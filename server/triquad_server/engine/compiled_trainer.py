@@ -1,4 +1,4 @@
-"""Training a field in compiled code, on the CPU, by Adam (Kingma and Ba 2015, algorithm 1).
+"""Trains a field in compiled code, on the CPU, by Adam (Kingma and Ba 2015, algorithm 1).
 
 A step touches some rows of a parameter. With its gradient ``g``, a row that takes its ``t``-th step
 changes by::
@@ -40,7 +40,7 @@ EPSILON = 1e-10
 
 _NEGLIGIBLE = 1e-8
 _MAX_CORRECTED = 1 << 20
-_AHEAD = 12  # rows that are brought into the cache before their turn
+_AHEAD = 12  # rows that are fetched into the cache in advance
 _NONE_HELD = np.zeros(0, np.bool_)
 
 
@@ -54,19 +54,19 @@ class ParameterRows(NamedTuple):
 
 
 class CompiledRates(NamedTuple):
-    """Rates with their corrections by age, as kernels take them."""
+    """Rates with their corrections by age, in the form that kernels take."""
 
     mean_decay: float
     variance_decay: float
     mean_scales: Floats
-    """[n] Correction of the mean after 1, 2, ... steps, times the learning rate; the last for
-    more."""
+    """[n] The correction of the mean after 1, 2, ... steps, times the learning rate; the last one
+    applies to more steps."""
 
-    variance_scales: Floats  # [n] and of the variance
+    variance_scales: Floats  # [n] the same of the variance
 
     @classmethod
     def of(cls, rates: Rates) -> "CompiledRates":
-        """These rates at all ages."""
+        """Return these rates at all ages."""
         mean_decay, variance_decay = rates.mean_decay, rates.variance_decay
         ages, mean_scales, variance_scales = _corrections(mean_decay, variance_decay)
         learning_rates = rates.by_age(ages).astype(np.float32)
@@ -74,7 +74,7 @@ class CompiledRates(NamedTuple):
 
 
 def _parameter_rows(parameter: Parameter) -> ParameterRows:
-    """A parameter's own memory, each row flattened."""
+    """Return a parameter's own memory, each row flattened."""
     count = len(parameter)
     return ParameterRows(
         values=parameter.values.reshape(count, -1),
@@ -86,7 +86,7 @@ def _parameter_rows(parameter: Parameter) -> ParameterRows:
 
 @lru_cache(maxsize=4)
 def _corrections(mean_decay: float, variance_decay: float) -> tuple[Doubles, Floats, Floats]:
-    """Ages, and scales of mean and variance at each, until nothing changes any more."""
+    """Return the ages, and the scales of mean and variance at each, until they no longer change."""
     slowest = max(mean_decay, variance_decay)
     count = min(_MAX_CORRECTED, 1 + int(np.log(_NEGLIGIBLE) / np.log(slowest)))
     ages = np.arange(1.0, max(count, LAST_AGE) + 1)
@@ -99,7 +99,7 @@ def _corrections(mean_decay: float, variance_decay: float) -> tuple[Doubles, Flo
 
 @kernel(fastmath=True, inline="always")
 def _step_row(row: int, gradients: Floats, parameter: ParameterRows, rates: CompiledRates) -> None:
-    """One step of a row along its gradient, which is cleared."""
+    """Take one step of a row along its gradient, and clear the gradient."""
     parameter.steps[row] += 1
     age = min(parameter.steps[row], len(rates.mean_scales)) - 1
     move_row(
@@ -125,9 +125,9 @@ def _step_touched(
     held: Bools,
     rates: CompiledRates,
 ) -> None:
-    """Adam on the ``count`` rows that the thread ``part`` touched; clears their sums.
+    """Apply Adam to the ``count`` rows that the thread ``part`` touched, and clear their sums.
 
-    A row that several threads touched is left to the first of them. Those that are ``held`` [N]
+    A row that several threads touched is updated by the first of them. Rows that are ``held`` [N]
     take no step.
     """
     rows = touched[part].rows
@@ -156,11 +156,11 @@ def _step_touched(
 
 @inner_kernel(fastmath=True)
 def _record_touched(batch: PointBatch, count: int, touched: Touched, step: int, known: int) -> int:
-    """Add the rows of the first ``count`` points to the ``known`` ones; returns how many now."""
+    """Add the rows of the first ``count`` points to the ``known`` ones; return the new number."""
     for t in range(count):
         for i in range(batch.rows.shape[1]):
             row = batch.rows[t, i]
-            if touched.stamps[row] != step and row != 0:  # absent vertices learn nothing
+            if touched.stamps[row] != step and row != 0:  # absent vertices are not trained
                 touched.stamps[row] = step
                 touched.rows[known] = row
                 known += 1
@@ -169,14 +169,14 @@ def _record_touched(batch: PointBatch, count: int, touched: Touched, step: int, 
 
 @inner_kernel(fastmath=True)
 def _squashed(logit: float, tail: float) -> float:
-    """A logit as a number in [0, 1]; its ``tail`` is ``exp(-abs(logit))``, which is never large."""
+    """Return a logit as a number in [0, 1]; its ``tail`` is ``exp(-abs(logit))``, never large."""
     squashed: float = (np.float32(1) if logit >= 0 else tail) / (np.float32(1) + tail)
     return squashed
 
 
 @inner_kernel(fastmath=True)
 def _cross_entropy(batch: PointBatch, wanted: Floats, share: float) -> float:
-    """Set the slopes of the batch's logits; returns the sum of the losses."""
+    """Set the slopes of the batch's logits, and return the sum of the losses."""
     loss = 0.0
     batch.slopes[:] = 0
     for t in range(len(wanted)):
@@ -233,7 +233,7 @@ def _add_loss_gradient(
 
 
 class CompiledTrainer:
-    """Trains a field in compiled code, in its own memory, which is arrays."""
+    """Trains a field in compiled code, in the arrays that hold it."""
 
     def __init__(self, field: LiveField, sums: GradientSums, team: Team) -> None:
         self._field = field
@@ -241,7 +241,7 @@ class CompiledTrainer:
         self._team = team
 
     def train(self, batch: Batch, rates: Rates) -> float:
-        """One optimiser step; returns the loss before it."""
+        """Take one optimiser step; return the loss before it."""
         points = batch.points
         wanted = batch.labels / np.float32(self._field.settings.logit_scale_m)
         self._field.thaw()
@@ -270,7 +270,7 @@ class CompiledTrainer:
         return sum(losses)
 
     def _step(self, counts: list[int], mlp_sums: list[Mlp], rates: Rates) -> None:
-        """Adam on the MLP and on the rows that were touched, so many by each thread."""
+        """Apply Adam to the MLP and to the touched rows, ``counts`` of them by each thread."""
         compiled = CompiledRates.of(rates)
         if self._field.held is None:
             self._step_mlp(mlp_sums, compiled)
@@ -283,7 +283,7 @@ class CompiledTrainer:
         )
 
     def _step_mlp(self, sums: list[Mlp], rates: CompiledRates) -> None:
-        """Adam on the MLP, by the gradients of each thread."""
+        """Apply Adam to the MLP, by the gradients of each thread."""
         share = np.float32(self._field.next_mlp_share())
         of_mlp = rates._replace(mean_scales=share * rates.mean_scales)
         for part, parameter in enumerate(self._field.mlp):

@@ -1,4 +1,4 @@
-"""A field as the plain arrays of a region's record, and back."""
+"""Converts a field to the plain arrays of a region's record, and back."""
 
 import numpy as np
 from triquad_format.records.arrays import Floats
@@ -19,7 +19,7 @@ def region_record(
     evidence: FrozenEvidence | LiveEvidence,
     training: TrainingState | None,
 ) -> Region:
-    """A region as plain arrays that share nothing with ``field`` and ``evidence``."""
+    """Return a region as plain arrays that share nothing with ``field`` and ``evidence``."""
     arrays = field.arrays
     tables = []
     for plane in range(len(AXES)):
@@ -38,7 +38,7 @@ def region_record(
 
 
 def training_state(field: LiveField, budget_samples: int) -> TrainingState:
-    """What training needs beyond the field, but for rays and samples, sharing nothing with it.
+    """Return what training needs beyond the field, rays and samples, as copies.
 
     Of the vertices' moments the means are left out, which forget in some ten steps, and the
     variances are rounded: that changes steps by at most 3 %, and takes a seventh of the bytes.
@@ -71,13 +71,13 @@ def training_state(field: LiveField, budget_samples: int) -> TrainingState:
 def field_from_record(
     record: Region, settings: FieldSettings, memory: Memory, seed: int
 ) -> LiveField:
-    """A field that answers as the recorded one and goes on training where it stopped."""
+    """Return a field that answers as the recorded one and goes on training where it stopped."""
     layers = zip(record.mlp.weights, record.mlp.biases, strict=True)
     field = LiveField(
         settings,
         record.frequencies,
         [array for layer in layers for array in layer],
-        # Without training state nothing tells how much it learnt.
+        # Without training state, it is unknown how much it learnt.
         mlp_steps=0 if record.training is None else record.training.mlp_steps,
         generator=np.random.default_rng(seed),
         memory=memory,
@@ -104,7 +104,7 @@ def _restore_optimiser(field: LiveField, state: TrainingState) -> None:
 
 
 def _rounded(values: Floats) -> Floats:
-    """Positive ``values`` to four significant bits; the other bits are 0, and take no room."""
+    """Return positive ``values`` to four significant bits; other bits are 0, and take no room."""
     dropped = 23 - _VARIANCE_BITS
     bits = values.view(np.int32) + (1 << dropped - 1)
     rounded: Floats = (bits >> dropped << dropped).view(np.float32)

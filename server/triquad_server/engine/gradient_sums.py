@@ -1,4 +1,4 @@
-"""Gradients of the features of fields, summed by each thread that trains."""
+"""Sums the gradients of the features of fields, by each thread that trains."""
 
 from typing import NamedTuple
 
@@ -10,14 +10,14 @@ _LAST_STEP = 2**31 - 1
 
 
 class Touched(NamedTuple):
-    """Which feature rows a thread has added a gradient to."""
+    """The feature rows that a thread has added a gradient to."""
 
     stamps: Ints  # [rows] the step in which each row was touched last
-    rows: Ints  # [rows] those touched in this step, in the order in which they were
+    rows: Ints  # [rows] those touched in this step, in order
 
 
 class GradientSums:
-    """Room for the gradients of the feature rows, for each thread; all but row 0 are zero between
+    """Buffers for the gradients of feature rows, for each thread; all but row 0 are zero between
     steps.
 
     Trainers that do not train at the same time share it.
@@ -41,5 +41,5 @@ class GradientSums:
             self.features = tuple(np.zeros((room, size), np.float32) for _ in range(THREADS))
 
     def clear(self) -> None:
-        """Free the room."""
+        """Free the buffers."""
         self.features, self.touched, self.step = (), (), 1

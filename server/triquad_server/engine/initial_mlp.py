@@ -1,8 +1,8 @@
-"""The MLP that a region begins with: one that has learnt simulated streets, where its shape allows.
+"""The MLP that a region begins with: pretrained on simulated streets, where its shape allows.
 
-What it knows is how features become distances, in leaves, which is much alike everywhere: at leaves
+It maps features to distances, in leaves, a relation that is much alike everywhere: at leaves
 of up to 0.2 m features find their values in fewer steps, and where little is trained the map is
-better. Of where things are, it knows nothing: that is in the features, and in the weights of the
+better. It holds no positions of surfaces: those are in the features, and in the weights of the
 Fourier features, which start at zero.
 """
 
@@ -16,23 +16,23 @@ from triquad_format.records.arrays import Floats
 from triquad_format.records.field_settings import FieldSettings
 
 PRETRAINED = Path(__file__).with_name("pretrained_mlp.npz")
-"""Arrays, as :func:`initial_mlp` reads them; `make pretrained` writes them."""
+"""The file with the arrays that :func:`initial_mlp` reads; `make pretrained` writes it."""
 
 _STEPS = 1000
-"""That a pretrained MLP counts as having taken, so that it moves less than a young one."""
+"""The steps that a pretrained MLP counts as having taken; a young one moves more."""
 
 
 class InitialMlp(NamedTuple):
-    """What a region begins with."""
+    """The MLP that a region begins with."""
 
     parts: list[Floats]  # weights [in, out] and bias [out] of each layer in turn
-    steps: int  # it counts as having taken
+    steps: int  # steps that it counts as having taken
 
 
 def initial_mlp(settings: FieldSettings, generator: np.random.Generator) -> InitialMlp:
-    """What is not pretrained, ``generator`` draws.
+    """Return the MLP; what is not pretrained is drawn by ``generator``.
 
-    Pretrained it is where features, their deviation and the hidden layers are as by default.
+    It is pretrained where features, their deviation and the hidden layers are as by default.
     """
     random = random_mlp(settings, generator)
     if settings.encoding == "fourier":
@@ -51,7 +51,7 @@ def initial_mlp(settings: FieldSettings, generator: np.random.Generator) -> Init
 
 
 def random_mlp(settings: FieldSettings, generator: np.random.Generator) -> list[Floats]:
-    """Weights [in, out] and bias [out] of each layer in turn, as those of torch.nn.Linear."""
+    """Return weights [in, out] and bias [out] of each layer in turn, as in torch.nn.Linear."""
     hidden = settings.hidden
     mlp = []
     for inputs, outputs in ((settings.input_size, hidden), (hidden, hidden), (hidden, 1)):
@@ -63,8 +63,8 @@ def random_mlp(settings: FieldSettings, generator: np.random.Generator) -> list[
 
 @cache
 def _read_pretrained() -> dict[str, Floats]:
-    """Weights and bias of each layer: the first [levels, features, hidden], without those of the
-    Fourier features; distances in leaves come out of the last.
+    """Return the weights and bias of each layer: the first [levels, features, hidden], without
+    those of the Fourier features; the last one's output is distances in leaves.
     """
     with np.load(PRETRAINED) as stored:
         return dict(stored)

@@ -13,7 +13,7 @@ from triquad_map.compiled.field.quadtree import LiveQuadtree
 from triquad_server.engine.initial_mlp import initial_mlp
 from triquad_server.engine.memory import FieldNumbers, FrozenField, Memory, Rows
 
-_SPARE = 4  # a row more for every so many, when rows are copied to where there is more room
+_SPARE = 4  # one spare row for each N rows, when rows are copied to larger arrays
 
 
 class Parameter:
@@ -24,11 +24,11 @@ class Parameter:
     """
 
     def __init__(self, values: Floats, memory: Memory) -> None:
-        """Begin with ``values`` [rows, ...], which are copied, and no steps taken."""
+        """Copy ``values`` [rows, ...]; no steps are taken yet."""
         self._memory = memory
         self.values: Rows = memory.put(values)
-        self.means: Rows = memory.put(np.zeros_like(values))  # running, of the gradients
-        self.variances: Rows = memory.put(np.zeros_like(values))  # of the squared gradients
+        self.means: Rows = memory.put(np.zeros_like(values))  # running means of the gradients
+        self.variances: Rows = memory.put(np.zeros_like(values))  # and of the squared gradients
         self.steps: Rows = memory.put(np.zeros(len(values), np.int32))  # [rows]
         self._room: tuple[Rows, ...] = (self.values, self.means, self.variances, self.steps)
         self._is_frozen = False
@@ -50,12 +50,12 @@ class Parameter:
         self.values, self.means, self.variances, self.steps = (rows[:count] for rows in room)
 
     def freeze(self) -> Rows:
-        """The values as they are now, which stay so: they are copied before they change."""
+        """Return the values as they are now; they are copied before they change."""
         self._is_frozen = True
         return self.values
 
     def thaw(self) -> None:
-        """Have values that may be changed in place: a copy of those that are frozen."""
+        """Make the values changeable in place, as a copy of those that are frozen."""
         if self._is_frozen:
             values = self._with_room(self.values, len(self))
             self._room = (values, *self._room[1:])
@@ -69,9 +69,9 @@ class Parameter:
         self.steps[:] = self._memory.put(steps)
 
     def _with_room(self, rows: Rows, count: int) -> Rows:
-        """A copy of those of ``rows`` that are in use, with room for ``count`` and some more.
+        """Return a copy of the ``rows`` in use, with room for ``count`` and some more.
 
-        It is little, since each epoch that was trained has its own, and on a device takes it.
+        It is small, since each epoch that was trained has its own, and on a device takes it.
         """
         roomy = self._memory.room(count + count // _SPARE, rows)
         roomy[: len(self)] = rows[: len(self)]
@@ -96,24 +96,25 @@ class Rates(NamedTuple):
     variance_decay: float = 0.99  # beta2
 
     def by_age(self, ages: Rows) -> Rows:
-        """The learning rates, shaped as ``ages``, of rows that took so many steps: one at least."""
+        """Return the learning rates, shaped as ``ages``, of rows that took that many steps, >= 1.
+        """
         shares = (_SOFT_STEPS / ages).clip(_HARDEST, 1)
         young = (_YOUNG_STEPS / ages).clip(0, 1) ** 2
         return self.learning_rate * shares + (self.young_rate - self.learning_rate) * young
 
 
 _SOFT_STEPS, _HARDEST = 800, 0.1
-"""For so many steps a row of features learns at the full rate; after n times as many at an n-th of
-it, and at this share at least. What is learnt hardens, and moves little where others are."""
+"""The steps for which a row of features learns at the full rate (after n times as many, at an n-th
+of it), and the least share of the rate. So learnt values move little where others are trained."""
 
 LAST_AGE = int(_SOFT_STEPS / _HARDEST)  # from here on, no rate falls any more
 
 _YOUNG_STEPS = 200
-"""For so many steps a row learns at the rate of young ones; after n times as many, what is above
+"""The steps for which a row learns at the rate of young ones; after n times as many, what is above
 the others' rate is down to ``1 / n**2`` of it."""
 
 _MLP_SOFT_STEPS, _MLP_HARDEST = 300, 0.02
-"""The MLP does so, and in addition so: all places of a region share it."""
+"""The same of the MLP, which applies in addition to the above: all places of a region share it."""
 
 
 class LiveField:
@@ -132,14 +133,14 @@ class LiveField:
         generator: np.random.Generator,
         memory: Memory,
     ) -> None:
-        """A field without vertices.
+        """Make a field without vertices.
 
         Args:
             settings: its shape.
             frequencies: [m] of Fourier features, on coordinates normalised to [-1, 1].
             mlp: weights [in, out] and bias [out] of each layer in turn.
-            mlp_steps: that the MLP counts as having taken; with moments of zero, the first few of
-                an old one are up to twice as large.
+            mlp_steps: steps that the MLP has taken already; with moments of zero, the first few
+                of an old one are up to twice as large.
             generator: draws the feature vectors of new vertices.
             memory: where all numbers are copied to.
         """
@@ -151,9 +152,9 @@ class LiveField:
         self.mlp = [Parameter(part[None], memory) for part in mlp]
         for part in self.mlp:
             part.steps[:] = mlp_steps
-        self.mlp_steps = mlp_steps  # to read its own from a GPU would take a wait
+        self.mlp_steps = mlp_steps  # to read its own from a GPU would have to wait for it
         self.held: Rows | None = None
-        """Which of the first rows of features [N] stay as they are, as does the MLP; None: none."""
+        """Which of the first rows of features [N] do not change, nor does the MLP; None: none."""
 
         self.version = 0  # rises with each step of training
         self._frequencies = memory.put(frequencies)
@@ -162,17 +163,17 @@ class LiveField:
 
     @property
     def vertices(self) -> int:
-        """Vertices on all planes and levels."""
+        """The number of vertices on all planes and levels."""
         return len(self.features) - 1
 
     @property
     def vertices_that_learn(self) -> int:
-        """All but those that are held."""
+        """The number of vertices but for those that are held."""
         return self.vertices - self._vertices_held
 
     @property
     def parameters(self) -> int:
-        """Learnable numbers."""
+        """The number of learnable numbers."""
         features = self.vertices * self.settings.feature_size
         return int(features + sum(math.prod(part.values.shape) for part in self.mlp))
 
@@ -202,7 +203,7 @@ class LiveField:
         self.features.append(new)
 
     def growth_by(self, leaves: Longs) -> int:
-        """How many vertices :meth:`grow` would add."""
+        """Return how many vertices :meth:`grow` would add."""
         return 0 if self.settings.encoding == "fourier" else self.tree.growth_by(leaves)
 
     def restore(self, plane: int, h: int, codes: Longs, features: Floats) -> None:
@@ -211,37 +212,37 @@ class LiveField:
         self.features.append(features)
 
     def next_mlp_share(self) -> float:
-        """Count a step of the MLP; the share of the rates in it: it hardens more than features."""
+        """Count a step of the MLP; return its share of the rates, falling faster than features'."""
         self.mlp_steps += 1
         return min(1.0, max(_MLP_HARDEST, _MLP_SOFT_STEPS / self.mlp_steps))
 
     def live_view(self) -> FrozenField:
-        """The field in its own memory: for its thread alone, and of use until it changes."""
+        """Return the field in its own memory: for its thread alone, and valid until it changes."""
         return self.memory.field(self.settings, self.tree.freeze(), self.numbers)
 
     def hold(self, rows: Bools | None) -> None:
-        """From now on, the feature ``rows`` [N] and the MLP stay as they are; None: all learns.
+        """From now on, keep the feature ``rows`` [N] and the MLP unchanged; None: train all.
 
-        Rows that are added later learn.
+        Rows that are added later are trained.
         """
         self.held = None if rows is None else self.memory.put(rows)
         self._vertices_held = 0 if rows is None else int(rows[1:].sum())
 
     def freeze(self) -> FrozenField:
-        """The field as it is now; it shares its numbers with this one, until these change."""
+        """Return the field as it is now; both share their numbers until this one changes."""
         mlp = tuple(part.freeze()[0] for part in self.mlp)
         frozen = FieldNumbers(self.features.freeze(), mlp, self._frequencies)
         return self.memory.field(self.settings, self.tree.freeze(), frozen)
 
     def thaw(self) -> None:
-        """Before a step: have numbers of its own, which may be changed in place."""
+        """Before a step, make numbers of its own, which may be changed in place."""
         self.version += 1
         for parameter in (self.features, *self.mlp):
             parameter.thaw()
 
 
 def initial_field(settings: FieldSettings, memory: Memory, seed: int) -> LiveField:
-    """A field of which nothing is learnt yet: random, but for its MLP (:func:`initial_mlp`)."""
+    """Return an untrained field: random, but for its MLP (:func:`initial_mlp`)."""
     generator = np.random.default_rng(seed)
     frequencies = generator.standard_normal(settings.frequencies, np.float32)
     frequencies *= np.float32(math.sqrt(settings.frequency_variance))

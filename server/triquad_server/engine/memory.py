@@ -1,4 +1,4 @@
-"""Where the numbers of a field are: in arrays of this process, or in tensors on a device."""
+"""The memory of the numbers of a field: arrays of this process, or tensors on a device."""
 
 from typing import Any, NamedTuple, Protocol
 
@@ -16,8 +16,8 @@ Rows = Any
 """Numbers as a memory holds them: an array, or a tensor, which has the same arithmetic."""
 
 _LINE_BYTES = 64
-"""A row of eight numbers is half a line of the processor's cache, and lies in one where arrays
-begin with a line; numpy's own begin 16 bytes after one."""
+"""The line size of the processor's cache. A row of eight numbers is half a line, and lies in one
+if arrays begin with a line; numpy's own begin 16 bytes after one."""
 
 
 class FieldNumbers(NamedTuple):
@@ -29,19 +29,19 @@ class FieldNumbers(NamedTuple):
 
 
 class FrozenField(FieldEngine, Protocol):
-    """A field that does not change any more. Safe for any thread."""
+    """A field that does not change any more; safe for any thread."""
 
     @property
     def settings(self) -> FieldSettings:
-        """Its shape."""
+        """The shape of the field."""
 
     @property
     def tree(self) -> LiveQuadtree | FrozenQuadtree:
-        """Its vertices."""
+        """The vertices of the field."""
 
     @property
     def arrays(self) -> FieldArrays:
-        """Its numbers; they are not to be changed."""
+        """The numbers of the field, which must not be changed."""
 
 
 class Memory(Protocol):
@@ -49,62 +49,62 @@ class Memory(Protocol):
 
     @property
     def device(self) -> str:
-        """Where it is: ``cpu``, or another device of torch."""
+        """The device of the memory: ``cpu``, or another device of torch."""
 
     def put(self, array: Array) -> Rows:
-        """A copy of an array."""
+        """Return a copy of an array."""
 
     def room(self, count: int, like: Rows) -> Rows:
-        """So many rows as those of ``like``, in which nothing is written yet."""
+        """Return ``count`` rows shaped as those of ``like``, not initialised."""
 
     def array(self, rows: Rows) -> Array:
-        """Rows as an array, which may share memory with them."""
+        """Return rows as an array, which may share memory with them."""
 
     def field(
         self, settings: FieldSettings, tree: FrozenQuadtree, numbers: FieldNumbers
     ) -> FrozenField:
-        """What answers from a field's numbers, with which it shares memory."""
+        """Return a field that answers from these numbers, with which it shares memory."""
 
 
 class ArrayMemory:
-    """Arrays, which compiled code trains and answers from."""
+    """Keeps numbers in arrays, which compiled code trains and answers from."""
 
     device = "cpu"
 
     def put(self, array: Array) -> Array:
-        """A copy of an array."""
+        """Return a copy of an array."""
         copied = _empty(array.shape, array.dtype)
         copied[...] = array
         return copied
 
     def room(self, count: int, like: Array) -> Array:
-        """So many rows as those of ``like``, in which nothing is written yet."""
+        """Return ``count`` rows shaped as those of ``like``, not initialised."""
         return _empty((count, *like.shape[1:]), like.dtype)
 
     def array(self, rows: Array) -> Array:
-        """The rows themselves."""
+        """Return the rows themselves."""
         return rows
 
     def field(
         self, settings: FieldSettings, tree: FrozenQuadtree, numbers: FieldNumbers
     ) -> FrozenField:
-        """The compiled field."""
+        """Return the compiled field."""
         return FrozenCompiledField(settings, tree, FieldArrays(*numbers))
 
 
 def memory_on(device: str) -> Memory:
-    """The memory of the fields that are trained on a device, ``cpu`` or another of torch's."""
+    """Return the memory of the fields that are trained on a device, ``cpu`` or another of torch."""
     if device == "cpu":
         return ArrayMemory()
-    from triquad_server.engine.tensor_memory import TensorMemory  # 200 MB, for who needs it
+    from triquad_server.engine.tensor_memory import TensorMemory  # its import takes 200 MB
 
     return TensorMemory(device)
 
 
 def _empty(shape: tuple[int, ...], dtype: DTypeLike) -> Array:
-    """An array in which nothing is written yet; it begins with a line of the cache."""
+    """Return an array that is not initialised; it begins with a line of the cache."""
     size = int(np.prod(shape)) * np.dtype(dtype).itemsize
-    # Memory that nothing has been written to is not taken from the system.
+    # The system reserves no memory before it is written to.
     memory = np.empty(size + _LINE_BYTES, np.uint8)
     start = -memory.ctypes.data % _LINE_BYTES
     return memory[start : start + size].view(dtype).reshape(shape)

@@ -41,14 +41,14 @@ class FieldTensors:
 
     @classmethod
     def of(cls, field: LiveField) -> "FieldTensors":
-        """The numbers of a field as they are now, those that are in arrays as well; see there."""
+        """Return the numbers of a field as they are now; those in arrays as tensors, too."""
         features, mlp, frequencies = field.numbers
         tensor = torch.as_tensor
         return cls(tensor(features), tuple(map(tensor, mlp)), tensor(frequencies))
 
     @property
     def arrays(self) -> FieldArrays:
-        """The numbers as arrays, which share memory with tensors on the CPU."""
+        """Return the numbers as arrays, which share memory with tensors on the CPU."""
         mlp = tuple(part.cpu().numpy() for part in self.mlp)
         return FieldArrays(self.features.cpu().numpy(), mlp, self.frequencies.cpu().numpy())
 
@@ -62,7 +62,7 @@ class Corners:
 
 
 class CornerIndex:
-    """A tree's blocks as tensors on a device; they do not grow when the tree does."""
+    """Finds a tree's blocks in tensors on a device; they do not grow when the tree does."""
 
     def __init__(
         self, tree: LiveQuadtree | FrozenQuadtree, settings: FieldSettings, device: torch.device
@@ -78,7 +78,7 @@ class CornerIndex:
         self._offsets = torch.tensor([[0, side, 1, side + 1] for side in sides], device=device)
 
     def around(self, points: Tensor) -> Corners:
-        """Vertices around ``points`` [N, 3] (metres from the centre) and their weights."""
+        """Return vertices around ``points`` [N, 3] (metres from the centre) and their weights."""
         levels = self._settings.feature_levels
         leaf = points / self._settings.leaf_m + (1 << (self._settings.depth - 1))
         blocks = leaf / (1 << (levels - 1))
@@ -100,7 +100,7 @@ class CornerIndex:
         return Corners(self._by_level(rows), self._by_level(weights))
 
     def _find(self, plane: int, block: Tensor) -> Tensor:
-        """Numbers of blocks [N, 2]; 0 where there is none."""
+        """Return the numbers of blocks [N, 2]; 0 where there is none."""
         side = 1 << self._settings.levels[0]
         inside = ((block >= 0) & (block < side)).all(dim=1)
         block = block.clamp(0, side - 1)
@@ -114,20 +114,20 @@ class CornerIndex:
         return numbers * inside
 
     def _by_level(self, parts: list[Tensor]) -> Tensor:
-        """Parts [N, 4], plane by plane, as [N, H, 12]."""
+        """Return parts [N, 4], plane by plane, as [N, H, 12]."""
         levels = self._settings.feature_levels
         stacked = torch.stack(parts, 1).view(-1, len(AXES), levels, 4)
         return stacked.transpose(1, 2).reshape(-1, levels, 12)
 
 
 def _bilinear(t: Tensor) -> Tensor:
-    """Weights [N, 4] of the vertices (0, 0), (1, 0), (0, 1), (1, 1) at fractions ``t`` [N, 2]."""
+    """Return weights [N, 4] of corners (0, 0), (1, 0), (0, 1), (1, 1) at fractions ``t`` [N, 2]."""
     a, b = t[:, 0], t[:, 1]
     return torch.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b], 1)
 
 
 class TensorField:
-    """The field as it is while its tree does not grow; it follows changes of its tensors.
+    """Evaluates the field as it is while its tree does not grow; it follows changes of its tensors.
 
     Points are float32 [N, 3], metres from the region's centre.
     """
@@ -149,7 +149,7 @@ class TensorField:
         return self.tensors.arrays
 
     def evaluate(self, points: Floats, gradient: bool) -> FieldValues:
-        """The field at points [N, 3]."""
+        """Evaluate the field at points [N, 3]."""
         parts = [
             self._evaluate(points[start : start + _CHUNK], gradient)
             for start in range(0, max(1, len(points)), _CHUNK)
@@ -160,17 +160,17 @@ class TensorField:
         )
 
     def evaluate_in_grid(self, axes: Floats, points: Longs) -> Floats:
-        """Distances in a grid; see :class:`triquad_map.composition.region.FieldEngine`."""
+        """Evaluate distances in a grid; see :class:`triquad_map.composition.region.FieldEngine`."""
         return self.evaluate(in_grid(axes, points), gradient=False).sdf
 
     def sdf(self, points: Tensor) -> Tensor:
-        """Signed distance [N] in metres; differentiable in the points."""
+        """Return the signed distance [N] in metres; differentiable in the points."""
         corners = self.around(points)
         encoded = None if corners is None else self.gather(corners)
         return self.logits(points, encoded, self.tensors.mlp) * self.settings.logit_scale_m
 
     def sdf_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance [N] and its gradient [N, 3]."""
+        """Return the signed distance [N] and its gradient [N, 3]."""
         points = points.detach().requires_grad_()
         with torch.enable_grad():
             sdf = self.sdf(points)
@@ -178,11 +178,11 @@ class TensorField:
         return sdf.detach(), gradient
 
     def around(self, points: Tensor) -> Corners | None:
-        """The vertices around points; ``None`` where the field has no features."""
+        """Return the vertices around points; ``None`` where the field has no features."""
         return None if self._corners is None else self._corners.around(points)
 
     def gather(self, corners: Corners) -> Tensor:
-        """Interpolated features [N, H * d], summed over the planes."""
+        """Return the interpolated features [N, H * d], summed over the planes."""
         count, levels, around = corners.rows.shape
         features = self.tensors.features
         summed = F.embedding_bag(
@@ -194,7 +194,7 @@ class TensorField:
         return summed.view(count, levels * features.shape[1])
 
     def logits(self, points: Tensor, encoded: Tensor | None, mlp: tuple[Tensor, ...]) -> Tensor:
-        """What ``mlp`` makes [N] of points and their interpolated features."""
+        """Return the output [N] of ``mlp`` for points and their interpolated features."""
         parts = [] if encoded is None else [encoded]
         if self.settings.encoding != "features":
             parts.append(self._fourier(points))
@@ -204,7 +204,7 @@ class TensorField:
         return torch.addmm(b3, hidden, w3)[:, 0]
 
     def _fourier(self, points: Tensor) -> Tensor:
-        """Fourier features [N, 6m] of coordinates normalised to [-1, 1] over the cube."""
+        """Return Fourier features [N, 6m] of coordinates normalised to [-1, 1] over the cube."""
         normalised = points / (self.settings.region_side_m / 2)
         angles = 2 * math.pi * normalised[:, :, None] * self.tensors.frequencies
         angles = angles.reshape(len(points), 3 * len(self.tensors.frequencies))

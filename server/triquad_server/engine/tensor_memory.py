@@ -1,4 +1,4 @@
-"""Fields in tensors, on any device: the memory of the reference engine."""
+"""Keeps fields in tensors, on any device: the memory of the reference engine."""
 
 import torch
 from torch import Tensor
@@ -10,26 +10,26 @@ from triquad_server.engine.tensor_field import FieldTensors, TensorField
 
 
 class TensorMemory:
-    """Tensors on one device."""
+    """Keeps numbers in tensors on one device."""
 
     def __init__(self, device: str) -> None:
         self.device = device
 
     def put(self, array: Array) -> Tensor:
-        """A copy of an array."""
+        """Return a copy of an array."""
         return torch.tensor(array, device=self.device)
 
     def room(self, count: int, like: Tensor) -> Tensor:
-        """So many rows as those of ``like``, in which nothing is written yet."""
+        """Return ``count`` rows shaped as those of ``like``, not initialised."""
         return like.new_empty((count, *like.shape[1:]))
 
     def array(self, rows: Tensor) -> Array:
-        """Rows as an array; from another device, it is a copy, for which all work there ends."""
+        """Return rows as an array; from another device, a copy, for which all work there ends."""
         array: Array = rows.cpu().numpy()
         return array
 
     def field(
         self, settings: FieldSettings, tree: FrozenQuadtree, numbers: FieldNumbers
     ) -> TensorField:
-        """The field in tensors."""
+        """Return the field in tensors."""
         return TensorField(settings, tree, FieldTensors(*numbers))

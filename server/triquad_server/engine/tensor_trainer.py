@@ -1,4 +1,4 @@
-"""Training a field on tensors, by automatic differentiation: any device, and the reference."""
+"""Trains a field on tensors, by automatic differentiation: any device, and the reference."""
 
 from typing import NamedTuple
 
@@ -15,26 +15,26 @@ class ParameterTensors(NamedTuple):
     """The memory of a parameter."""
 
     values: Tensor  # [rows, ...]
-    means: Tensor  # likewise
-    variances: Tensor  # likewise
+    means: Tensor  # [rows, ...]
+    variances: Tensor  # [rows, ...]
     steps: Tensor  # [rows]
 
     @classmethod
     def of(cls, parameter: Parameter) -> "ParameterTensors":
-        """A parameter's own memory, be it tensors or arrays."""
+        """Return a parameter's own memory, be it tensors or arrays."""
         parts = (parameter.values, parameter.means, parameter.variances, parameter.steps)
         return cls(*map(torch.as_tensor, parts))
 
 
 class TensorTrainer:
-    """Trains a field by automatic differentiation, where it is: on a device, or in arrays."""
+    """Trains a field by automatic differentiation, in its own memory: on a device, or in arrays."""
 
     def __init__(self, field: LiveField) -> None:
         self._field = field
         self._tensor_field = TensorField(field.settings, field.tree, FieldTensors.of(field))
 
     def train(self, batch: Batch, rates: Rates) -> Tensor:
-        """One optimiser step; returns the loss before it.
+        """Take one optimiser step; return the loss before it.
 
         The loss is the cross entropy between the two distances squashed by a sigmoid
         (3QFP, equation 5).
@@ -58,7 +58,7 @@ class TensorTrainer:
         return loss.detach()
 
     def _up_to_date(self) -> TensorField:
-        """The field with all vertices that it has now, and in the memory that they are in now."""
+        """Return the field with all its present vertices, in their present memory."""
         field = self._field
         field.thaw()
         tensors = FieldTensors.of(field)
@@ -99,7 +99,7 @@ class TensorTrainer:
 
 
 def step_rows(parameter: ParameterTensors, rows: Tensor, gradient: Tensor, rates: Rates) -> None:
-    """One step of ``rows`` [T], all different, along their ``gradient`` [T, ...]."""
+    """Take one step of ``rows`` [T], all different, along their ``gradient`` [T, ...]."""
     parameter.steps[rows] += 1
     means = parameter.means[rows].lerp_(gradient, 1 - rates.mean_decay)
     variances = parameter.variances[rows].lerp_(gradient.square(), 1 - rates.variance_decay)
@@ -109,10 +109,9 @@ def step_rows(parameter: ParameterTensors, rows: Tensor, gradient: Tensor, rates
 
 
 def step_where(parameter: ParameterTensors, mask: Tensor, gradient: Tensor, rates: Rates) -> None:
-    """As :func:`step_rows` for the rows where ``mask`` [rows] is set; ``gradient`` [rows, ...].
+    """Do as :func:`step_rows` for the rows where ``mask`` [rows] is set; ``gradient`` [rows, ...].
 
-    It goes over all rows, but need not know how many are set, for which a GPU would have to be
-    waited for.
+    It processes all rows, but need not know how many are set, which would mean waiting for a GPU.
     """
     parameter.steps.add_(mask)
     mask = mask.reshape(-1, *[1] * (gradient.dim() - 1))
@@ -124,7 +123,7 @@ def step_where(parameter: ParameterTensors, mask: Tensor, gradient: Tensor, rate
 
 
 def _change(means: Tensor, variances: Tensor, steps: Tensor, rates: Rates) -> Tensor:
-    """What rows [R, ...] lose that took ``steps`` [R], this one included."""
+    """Return the decrease of rows [R, ...] that took ``steps`` [R], this one included."""
     age = steps.to(means.dtype).reshape(-1, *[1] * (means.dim() - 1))
     mean = means / (1 - rates.mean_decay**age)
     deviation = (variances / (1 - rates.variance_decay**age)).sqrt_()

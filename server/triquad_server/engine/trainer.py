@@ -1,4 +1,4 @@
-"""What trains a field: compiled code where it is in arrays, automatic differentiation elsewhere."""
+"""Trains a field: compiled code where it is in arrays, automatic differentiation elsewhere."""
 
 from typing import Any, Protocol
 
@@ -11,7 +11,7 @@ from triquad_server.engine.memory import ArrayMemory
 
 
 class Loss(Protocol):
-    """A number that a GPU may still be working at; to read it waits for that."""
+    """A number that a GPU may still be computing; reading it waits for that."""
 
     def __float__(self) -> float: ...
     def __add__(self, other: Any) -> Any: ...
@@ -22,11 +22,11 @@ class Trainer(Protocol):
     """Trains a field."""
 
     def train(self, batch: Batch, rates: Rates) -> Loss:
-        """One optimiser step; returns the loss before it."""
+        """Take one optimiser step; return the loss before it."""
 
 
 def trainer_of(field: LiveField, sums: GradientSums, team: Team) -> Trainer:
-    """The trainer of a field; ``sums`` and ``team`` are for compiled code."""
+    """Return the trainer of a field; ``sums`` and ``team`` are for compiled code."""
     if isinstance(field.memory, ArrayMemory):
         return CompiledTrainer(field, sums, team)
     from triquad_server.engine.tensor_trainer import TensorTrainer

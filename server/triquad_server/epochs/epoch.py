@@ -31,11 +31,11 @@ class FrozenRegion:
     vertices: int
     parameters: int
     changed: int  # epoch of its last change
-    live_bytes: Mapping[str, int]  # what the live region took beside this one, by part
+    live_bytes: Mapping[str, int]  # by part, memory of the live region in addition to this one
     buffers: Buffers  # memory of this one; other epochs may share it
 
     def record(self) -> Region:
-        """The region as a map file holds it, without training state."""
+        """Return the region as a map file holds it, without training state."""
         return region_record(self.index, self.engine, self.evidence, training=None)
 
 
@@ -51,7 +51,7 @@ class Epoch(ComposedView):
         split: Split,
         progress: MapProgress | None = None,
     ) -> None:
-        """The map called ``name``; ``split`` runs the work of its answers.
+        """Make an epoch of the map called ``name``; ``split`` runs the work of its answers.
 
         ``progress`` is how far the map had come; ``None``: it was just begun.
         """
@@ -63,34 +63,34 @@ class Epoch(ComposedView):
         self._name = name
 
     def asked_with(self, split: Split = in_one) -> ComposedView:
-        """The same map for questions at which ``split`` works: who asks alone, by default.
+        """Return the same map, whose answers ``split`` runs: by default, the caller's thread alone.
 
-        For those who give way to queries: these have threads of their own.
+        For those who give way to queries, which have threads of their own.
         """
         return ComposedView(self.number, self.field_settings, self.frozen_regions, split=split)
 
     @property
     def regions(self) -> int:
-        """Regions of the map."""
+        """The number of regions of the map."""
         return len(self.frozen_regions)
 
     @property
     def vertices(self) -> int:
-        """Quadtree vertices of all regions."""
+        """The number of quadtree vertices of all regions."""
         return sum(region.vertices for region in self.frozen_regions)
 
     @property
     def parameters(self) -> int:
-        """Learnable numbers of all regions."""
+        """The number of learnable numbers of all regions."""
         return sum(region.parameters for region in self.frozen_regions)
 
     @property
     def buffers(self) -> Buffers:
-        """Its memory; epochs share that of what did not change between them."""
+        """The memory of the epoch; epochs share that of what did not change between them."""
         return ChainMap(*(dict(region.buffers) for region in self.frozen_regions))
 
     def record(self) -> MapRecord:
-        """The epoch as a map file holds it, without training state."""
+        """Return the epoch as a map file holds it, without training state."""
         regions = tuple(region.record() for region in self.frozen_regions)
         return MapRecord(
             self._name, self.number, self.field_settings, regions, progress=self.progress

@@ -1,4 +1,4 @@
-"""The published states of the map that can be asked for."""
+"""Keeps the published states of the map that can be queried."""
 
 import threading
 import time
@@ -13,21 +13,21 @@ from triquad_server.epochs.epoch import Epoch
 from triquad_server.settings import MemorySettings, ServiceSettings
 
 _RECENT_PERIODS = 10
-"""After this many of the periods in which epochs follow each other the newest alone stays."""
+"""After this many of the periods in which epochs follow each other, only the newest is kept."""
 
 
 class KeptEpochs(NamedTuple):
-    """The epochs that can be asked for."""
+    """The epochs that can be queried."""
 
     epochs: tuple[Epoch, ...]  # the newest last
-    pinned: int  # of them, which stay because they were asked for by number
+    pinned: int  # epochs of them that stay because they were requested by number
     newest_age_s: float
 
 
 class EpochHistory:
-    """The newest epochs, and older ones for a while after they were asked for by number.
+    """Keeps the newest epochs, and older ones for a while after they were requested by number.
 
-    Older ones stay while they fit in their memory: first those that were asked for last.
+    Older ones stay while they fit in their memory: those that were requested last come first.
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class EpochHistory:
             first: the newest, for now.
             settings: which epochs stay.
             clock: seconds that never run backwards.
-            older_bytes: that older epochs may take, beyond what they share with newer ones.
+            older_bytes: memory of older epochs, beyond what they share with newer ones.
         """
         self.newest = first  # the epoch published last
         self._lock = threading.Condition()
@@ -53,8 +53,8 @@ class EpochHistory:
         self._published_s = clock()  # when the newest was
         self._recent_s = _RECENT_PERIODS * settings.publish_period_s
         self._epochs = {first.number: first}  # oldest first
-        self._pins: dict[int, float] = {}  # when an epoch was last asked for, in that order
-        self._viewed: Counter[int] = Counter()  # requests that are at work on an epoch, by number
+        self._pins: dict[int, float] = {}  # when an epoch was last requested, in that order
+        self._viewed: Counter[int] = Counter()  # requests that are handled with an epoch, by number
         self._listeners: list[Callable[[], None]] = []
 
     def listen(self, listener: Callable[[], None]) -> None:
@@ -75,7 +75,7 @@ class EpochHistory:
             listener()
 
     def let_go(self) -> None:
-        """Remove those whose time is over.
+        """Remove the epochs that have expired.
 
         To be called from time to time: requests for the newest leave older ones as they are.
         """
@@ -84,20 +84,20 @@ class EpochHistory:
 
     @property
     def is_recent(self) -> bool:
-        """Whether the newest was published a short time ago."""
+        """Return whether the newest was published a short time ago."""
         return self._clock() - self._published_s <= self._recent_s
 
     def kept(self) -> KeptEpochs:
-        """What is kept now."""
+        """Return the epochs that are kept now."""
         with self._lock:
             epochs = tuple(self._epochs.values())
             age_s = self._clock() - self._published_s
         return KeptEpochs(epochs, max(0, len(epochs) - self._settings.epochs_kept), age_s)
 
     def get(self, number: int) -> Epoch:
-        """The epoch of that number, or the newest for 0.
+        """Return the epoch of that number, or the newest for 0.
 
-        Asking for an epoch by number pins it: a long request in many parts, or many requests that
+        Requesting an epoch by number pins it: a long request in many parts, or many requests that
         belong together, do not lose their epoch while they go on.
 
         Raises:
@@ -111,10 +111,10 @@ class EpochHistory:
 
     @contextmanager
     def view(self, number: int) -> Iterator[Epoch]:
-        """As :meth:`get`; training gives way while the epoch is asked.
+        """Yield the epoch as :meth:`get` does; training gives way while the context is open.
 
-        An epoch that grows old meanwhile is pinned: the request may be the first of many parts, of
-        which the next asks for it by number.
+        An epoch that becomes old meanwhile is pinned: the request may be the first of many, of
+        which the next requests it by number.
         """
         with self._lock:
             epoch = self._get(number)
@@ -132,7 +132,7 @@ class EpochHistory:
                     self._lock.notify_all()
 
     def give_way(self, limit_s: float) -> None:
-        """Return once no epoch is asked, or after ``limit_s``: training never starves."""
+        """Return once no epoch is queried, or after ``limit_s``: so training never starves."""
         with self._lock:
             self._lock.wait_for(lambda: not self._viewed, limit_s)
 
@@ -151,18 +151,18 @@ class EpochHistory:
         return epoch
 
     def _pin(self, number: int) -> None:
-        """Count an epoch as asked for now."""
+        """Record that an epoch was requested now."""
         self._pins.pop(number, None)
         self._pins[number] = self._clock()
 
     def _tidy(self) -> None:
-        """Remove older epochs whose time is over, or that exceed a limit."""
+        """Remove older epochs that have expired, or that exceed a limit."""
         since = self._clock() - self._settings.pin_s
         kept = self._settings.epochs_kept if self.is_recent else 1
         recent = list(self._epochs)[-kept:]
         pinned = [number for number, asked_s in self._pins.items() if asked_s >= since]
         stay = {self.newest.number, *self._viewed}
-        older = 0  # that stay because they were asked for
+        older = 0  # epochs that stay because they were requested
         counted = set(self.newest.buffers)  # memory of those that stay
         used = 0
         for number in (*reversed(pinned), *reversed(recent)):

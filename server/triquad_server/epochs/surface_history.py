@@ -1,4 +1,4 @@
-"""Where surface appeared and vanished, epoch by epoch, as far back as there is room for."""
+"""Records where surface appeared and vanished, epoch by epoch, as far back as there is room."""
 
 import threading
 from collections import deque
@@ -20,20 +20,20 @@ from triquad_server.epochs.epoch import Epoch, FrozenRegion
 
 @dataclass(frozen=True)
 class VoxelChanges:
-    """Voxels in which surface appeared or vanished."""
+    """The voxels in which surface appeared or vanished."""
 
     voxels: Longs  # [N, 3] of the map's lattice: a voxel ``v`` reaches from v to v + 1 leaves
     appeared: Bools  # [N] else it vanished
     epochs: Longs  # [N] of the newest change of each
 
     def part(self, chosen: Bools) -> "VoxelChanges":
-        """Those of ``chosen`` [N]."""
+        """Return the voxels that are ``chosen`` [N]."""
         return VoxelChanges(self.voxels[chosen], self.appeared[chosen], self.epochs[chosen])
 
 
 @dataclass(frozen=True)
 class _EpochChanges:
-    """What one epoch shows that the one before did not."""
+    """The changes of one epoch from the one before."""
 
     epoch: int
     voxels: Ints  # [N, 3]
@@ -41,14 +41,14 @@ class _EpochChanges:
 
 
 class _Surface(NamedTuple):
-    """The surface that rays have shown of a region."""
+    """The surface of a region as rays have shown it."""
 
     keys: Longs  # [B] of the blocks
     masks: Bytes  # [B, BLOCK_BYTES]
 
 
 class _Flips(NamedTuple):
-    """How the surface of a region differs from what it was."""
+    """The differences between the surface of a region and an earlier one."""
 
     keys: Longs  # [B] of blocks
     appeared: Bytes  # [B, BLOCK_BYTES]
@@ -57,15 +57,15 @@ class _Flips(NamedTuple):
 
 _NO_SURFACE = _Surface(np.zeros(0, np.int64), np.zeros((0, BLOCK_BYTES), np.uint8))
 CHANGES_KEPT = 1_000_000
-"""Voxels whose surface appeared or vanished that are remembered, each change of each, for clients
-that ask what changed: 13 bytes each."""
+"""The number of changes of voxels' surface that are kept, for clients that request them: 13 bytes
+each."""
 
 _VOXEL_BYTES = 13  # three numbers of 32 bits, and whether it appeared
 _NO_VOXELS = np.zeros((0, 3), np.int32)
 
 
 class SurfaceHistory:
-    """What became of the surface from epoch to epoch. One thread adds, any may ask.
+    """Keeps the changes of the surface from epoch to epoch; one thread adds, any may query.
 
     The newest changes are kept, ``limit`` voxels at most: older epochs are forgotten as a whole.
     """
@@ -75,12 +75,12 @@ class SurfaceHistory:
         self._newest = first
         self._limit = limit
         self._lock = threading.Lock()
-        self._oldest = first.number  # what changed after it is known
+        self._oldest = first.number  # changes after it are known
         self._changes: deque[_EpochChanges] = deque()  # oldest first, none of them empty
         self._voxels = 0  # of all changes
 
     def add(self, epoch: Epoch) -> None:
-        """Record what ``epoch`` changes; to be called before others can see it."""
+        """Record what ``epoch`` changes; call this before others can see it."""
         changes = _changes(self._newest, epoch)
         with self._lock:
             self._newest = epoch
@@ -94,13 +94,13 @@ class SurfaceHistory:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the changes that are kept."""
+        """The bytes of the changes that are kept."""
         return self._voxels * _VOXEL_BYTES
 
     def between(self, since: int, until: int) -> VoxelChanges:
-        """What is different in epoch ``until`` from epoch ``since``.
+        """Return what differs between the epochs ``since`` and ``until``.
 
-        What appeared and vanished again in between is not among it.
+        A surface that appeared and vanished again in between is not included.
 
         Raises:
             RefusedError: ``epoch_gone``: changes are not known from ``since`` on.
@@ -119,7 +119,7 @@ class SurfaceHistory:
 
 
 def _net(changes: list[_EpochChanges]) -> VoxelChanges:
-    """What is left of changes, the newest first: those of a voxel take turns, so pairs cancel."""
+    """Return the net changes, given the newest first: a voxel's alternate, so pairs cancel."""
     voxels = np.concatenate([_NO_VOXELS, *(one.voxels for one in changes)]).astype(np.int64)
     appeared = np.concatenate([np.zeros(0, np.bool_), *(one.appeared for one in changes)])
     numbers = np.array([one.epoch for one in changes], np.int64)
@@ -131,7 +131,7 @@ def _net(changes: list[_EpochChanges]) -> VoxelChanges:
 
 
 def _changes(before: Epoch, now: Epoch) -> _EpochChanges:
-    """What ``now`` shows that ``before`` did not."""
+    """Return how ``now`` differs from ``before``."""
     old = {region.index: region for region in before.frozen_regions}
     new = {region.index: region for region in now.frozen_regions}
     voxels, appeared = [_NO_VOXELS], [np.zeros(0, np.bool_)]
@@ -156,10 +156,10 @@ def _surface_of(region: FrozenRegion | None) -> _Surface:
 
 
 def _flips(old: _Surface, new: _Surface) -> _Flips:
-    """What differs. As a rule the blocks of ``new`` are those of ``old`` and more."""
+    """Return the differences. As a rule the blocks of ``new`` are those of ``old`` and more."""
     shared = min(len(old.keys), len(new.keys))
     if not np.array_equal(old.keys[:shared], new.keys[:shared]):
-        shared = 0  # the region was forgotten and made anew: all vanished, and all appeared
+        shared = 0  # the region was forgotten and learnt again: all vanished, and all appeared
     rows = _differing_rows(old.masks[:shared], new.masks[:shared])
     gone, added = old.masks[shared:], new.masks[shared:]
     before = np.concatenate([old.masks[rows], gone, np.zeros_like(added)])
@@ -169,15 +169,15 @@ def _flips(old: _Surface, new: _Surface) -> _Flips:
 
 
 def _differing_rows(one: Bytes, other: Bytes) -> NDArray[np.intp]:
-    """The blocks whose masks [B, BLOCK_BYTES] are not the same; most are."""
+    """Return the blocks whose masks [B, BLOCK_BYTES] differ; few do."""
     words = np.flatnonzero(one.reshape(-1).view(np.uint64) != other.reshape(-1).view(np.uint64))
     return np.unique(words // (BLOCK_BYTES // np.dtype(np.uint64).itemsize))
 
 
 def _map_voxels(index: RegionIndex, keys: Longs, masks: Bytes, settings: FieldSettings) -> Ints:
-    """The voxels [N, 3] of the map's lattice set in ``masks``, but for those that neighbours own.
+    """Return the voxels [N, 3] of the map's lattice set in ``masks``, without those of neighbours.
 
-    Neighbouring regions overlap, and know the same of where they do.
+    Neighbouring regions overlap, and agree there.
     """
     used = np.flatnonzero(masks.any(axis=1))
     cells, mine = cells_of(keys[used]), settings.owned_blocks

@@ -1,1 +1,1 @@
-"""Scans, from the wire to rays."""
+"""The intake of scans, from the network to rays."""

@@ -1,4 +1,4 @@
-"""Flush requests: pending, without holding up any worker, until their scans show in the map."""
+"""Flush requests: pending, without occupying any worker, until their scans show in the map."""
 
 import threading
 import time
@@ -18,21 +18,21 @@ from triquad_server.process.threads import submit
 from triquad_server.serving.request import Request
 
 ARRIVAL_GRACE_S = 2.0
-"""A scan that has not arrived so long after the flush request, which travels the same way behind
-it, is lost."""
+"""The seconds after which a scan is lost that has not arrived, since the flush request, which
+travels the same way behind it."""
 
 _SENDERS = 16
-"""Replies on their way at a time: clients that do not read them hold up no others."""
+"""The number of replies sent at a time: clients that do not read them delay no others."""
 
 _STOPPING = "the server is stopping"
 
 Outcome = FlushReply | RefusedError
-"""What a request is answered with: a reply, or why there is none."""
+"""The answer to a request: a reply, or an error."""
 
 
 @dataclass(frozen=True)
 class _Pending:
-    """A flush request that waits."""
+    """A pending flush request."""
 
     request: Request
     asks: FlushRequest
@@ -41,11 +41,11 @@ class _Pending:
 
     @property
     def scan(self) -> tuple[str, int, int]:
-        """Source, session and sequence of the scan."""
+        """The source, session and sequence of the scan."""
         return self.asks.source, self.asks.session, self.asks.sequence
 
     def send(self, outcome: Outcome, warnings: Callable[[str], str | None]) -> None:
-        """Answer the request; an internal error ends this one only, not the thread of all."""
+        """Answer the request; an internal error ends this request only, not the thread."""
         try:
             if isinstance(outcome, RefusedError):
                 self.request.refuse(outcome.code, str(outcome))
@@ -69,10 +69,10 @@ class FlushHandler:
         limit: int,
         warnings: Callable[[str], str | None] = lambda _: None,
     ) -> None:
-        """Begin to answer; ``publish_soon`` asks the mapper for an epoch.
+        """Begin to answer; ``publish_soon`` requests an epoch from the mapper.
 
         At most ``limit`` requests are pending; of more, the newest of the client that has most of
-        them is refused. ``warnings`` are those about a source.
+        them is refused. ``warnings`` returns those about a source.
         """
         self._ledger = ledger
         self._publish_soon = publish_soon
@@ -88,11 +88,11 @@ class FlushHandler:
 
     @property
     def queue(self) -> QueueMetrics:
-        """What is pending."""
+        """Return the state of the queue of pending requests."""
         return QueueMetrics(len(self._pending) + self._sending, self._limit)
 
     def close(self) -> None:
-        """Refuse what is pending, and end."""
+        """Refuse all pending requests, and end."""
         with self._ledger.changed:
             self._stopping = True
             self._ledger.changed.notify_all()
@@ -157,7 +157,8 @@ class FlushHandler:
                 self._sending -= 1
 
     def _decided(self) -> list[tuple[_Pending, Outcome]]:
-        """The requests that can be answered now, and how; they are no longer pending."""
+        """Return the requests that can be answered now, with answers; they are no longer pending.
+        """
         now = time.monotonic()
         busy = RefusedError("busy", f"{self._limit} flush requests are pending already; try later")
         refused: list[tuple[_Pending, Outcome]] = [(entry, busy) for entry in self._excess]
@@ -169,7 +170,7 @@ class FlushHandler:
         return refused + [(entry, outcome) for entry, outcome in outcomes if outcome is not None]
 
     def _outcome(self, entry: _Pending, now: float) -> Outcome | None:
-        """What a request is answered with; ``None`` where it stays pending."""
+        """Return the answer to a request; ``None`` if it stays pending."""
         if now >= entry.give_up_at and not self._ledger.arrived(*entry.scan):
             reply = self._ledger.give_up(*entry.scan)
         else:
@@ -183,7 +184,7 @@ class FlushHandler:
         )
 
     def _time_left_s(self) -> float | None:
-        """How long until time alone decides on a request; ``None``: it never does."""
+        """Return how long until time alone decides on a request; ``None``: it never does."""
         times = [entry.deadline for entry in self._pending]
         times += [
             entry.give_up_at for entry in self._pending if not self._ledger.arrived(*entry.scan)

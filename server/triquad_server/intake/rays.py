@@ -1,4 +1,4 @@
-"""From a scan to the rays that are used: checked, told apart by range, thinned, turned."""
+"""Turns a scan into the rays that are used: checked, sorted by range, thinned, transformed."""
 
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -16,10 +16,10 @@ WORLD_LIMIT_M = 100_000.0
 """A sensor farther than this from the map's origin is refused."""
 
 _SHELL = 0.18
-"""The logarithm of how many times farther the outer side of a shell is than its inner one."""
+"""The logarithm of the ratio of a shell's outer to its inner radius."""
 
 _NOWHERE = (np.inf, np.inf, np.inf), (-np.inf, -np.inf, -np.inf)
-"""Corners of a box that holds nothing."""
+"""The corners of an empty box."""
 
 
 @dataclass(frozen=True)
@@ -32,13 +32,13 @@ class RobotBox:
 
     @property
     def corners(self) -> Doubles:
-        """Its corners [8, 3], map frame."""
+        """The corners [8, 3] of the box, map frame."""
         corners = np.stack(np.meshgrid(*zip(self.low, self.high, strict=True)), -1).reshape(-1, 3)
         world: Doubles = corners @ self.world_from_sensor[:3, :3].T + self.world_from_sensor[:3, 3]
         return world
 
     def voxel_centres(self, leaf_m: float) -> Doubles:
-        """The centres [N, 3], map frame, of the map's voxels that lie in it."""
+        """Return the centres [N, 3], map frame, of the map's voxels that lie in it."""
         rotation, origin = self.world_from_sensor[:3, :3], self.world_from_sensor[:3, 3]
         corners = self.corners
         first = np.floor(corners.min(axis=0) / leaf_m).astype(np.int64)
@@ -59,13 +59,13 @@ class ScanRays:
     points_dropped: dict[str, int]  # points and rays of the scan that are not used, by reason
     # [K, 3] the sensor's range on rays that met something beyond it
     far_ends: Doubles = field(default_factory=lambda: np.empty((0, 3)))
-    # [M, 3] and on rays that met nothing
+    # [M, 3] the range on rays that met nothing
     open_ends: Doubles = field(default_factory=lambda: np.empty((0, 3)))
     robot: RobotBox | None = None
 
     @property
     def free_corners(self) -> Doubles:
-        """Points [K, 3] around all that is free without a ray's end that tells it."""
+        """Points [K, 3] that bound the free space that no ray's end shows."""
         corners = [] if self.robot is None else [self.robot.corners]
         return np.concatenate([self.far_ends, self.open_ends, *corners])
 
@@ -116,7 +116,7 @@ def check_count(points: Floats, no_return: Floats | None, max_points: int) -> No
 
 
 def _unit_vectors(no_return: Floats) -> Doubles:
-    """Unit vectors [M, 3] along the rays without a return; what is no direction is refused."""
+    """Return unit vectors [M, 3] along the rays without a return; refuse what is no direction."""
     vectors = no_return.astype(np.float64)
     lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
     good = np.isfinite(lengths[:, 0]) & (lengths[:, 0] > 0)
@@ -132,7 +132,7 @@ def _unit_vectors(no_return: Floats) -> Doubles:
 
 
 class _Limits(NamedTuple):
-    """Which points are used, as the kernel takes it."""
+    """The limits that decide which points are used, in the form that the kernel takes."""
 
     range_min_m: float
     range_max_m: float
@@ -143,7 +143,7 @@ class _Limits(NamedTuple):
 
 
 class _Selection(NamedTuple):
-    """Points that are used, and by reason how many are not."""
+    """The points that are used, and by reason the number of others."""
 
     kept: Doubles  # [N, 3]
     beyond: Doubles  # [M, 3] where the rays to points that are too far leave the sensor's range
@@ -155,7 +155,7 @@ class _Selection(NamedTuple):
 
     @property
     def dropped(self) -> dict[str, int]:
-        """How many points are not used, by reason."""
+        """Return how many points are not used, by reason."""
         counts = self._asdict()
         reasons = ("not_finite", "no_range", "on_robot", "too_near", "too_far")
         return {reason: counts[reason] for reason in reasons if counts[reason]}
@@ -163,16 +163,16 @@ class _Selection(NamedTuple):
 
 @kernel(inline="always")
 def _is_within(x: float, y: float, z: float, low: Doubles, high: Doubles) -> bool:
-    """Whether a point lies between two corners."""
+    """Return whether a point lies between two corners."""
     within: bool = low[0] <= x <= high[0] and low[1] <= y <= high[1] and low[2] <= z <= high[2]
     return within
 
 
 @kernel(inline="always")
 def _is_first(keys: Longs, x: float, y: float, z: float, distance: float, limits: _Limits) -> bool:
-    """Whether no point before lies in the same voxel or, so chosen, in the same direction.
+    """Return whether no point before lies in the same voxel or, if so set, in the same direction.
 
-    There, points are put onto the inner sphere of a shell around the sensor, and thinned on it.
+    For directions, points are put onto the inner sphere of a shell around the sensor and thinned.
     """
     scale = 1.0
     if limits.by_direction:
@@ -182,7 +182,7 @@ def _is_first(keys: Longs, x: float, y: float, z: float, distance: float, limits
 
 @kernel()
 def _select(points: Floats, limits: _Limits, keys: Longs) -> _Selection:
-    """Tell the points that are used from the others."""
+    """Select the points that are used."""
     kept, beyond = np.empty((len(points), 3)), np.empty((len(points), 3))
     count = not_finite = no_range = on_robot = too_near = too_far = 0
     for i in range(len(points)):
@@ -212,7 +212,7 @@ def _select(points: Floats, limits: _Limits, keys: Longs) -> _Selection:
 def _why_empty(
     points: int, disbelieved: int, settings: ScanSettings, *, source: SourceSettings
 ) -> str:
-    """Why nothing is left of a scan of so many points, and what decides that."""
+    """Return why nothing is left of a scan of ``points`` points, and which setting decides that."""
     box = " and outside of robot_box_m" if source.robot_box_m else ""
     rays = "there is no ray without a return"
     if disbelieved:
@@ -234,7 +234,7 @@ def usable_rays(
     source: SourceSettings = ANY_SOURCE,
     no_return: Floats | None = None,
 ) -> ScanRays:
-    """The rays of a scan that are finite, in range and thinned, and those that met nothing.
+    """Return the rays of a scan that are finite, in range and thinned, and those that met nothing.
 
     Args:
         points: end points [N, 3], metres, sensor frame.
@@ -262,7 +262,7 @@ def usable_rays(
         robot_high=high,
     )
     given = np.ascontiguousarray(points).view()
-    given.flags.writeable = False  # as those of the wire, for which nothing is compiled anew
+    given.flags.writeable = False  # as those of the network, so nothing is compiled again
     found = _select(given, limits, empty_keys(len(points)))
     if len(found.kept) + len(found.beyond) + len(directions) == 0:
         raise ScanRefusedError(

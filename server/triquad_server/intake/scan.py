@@ -1,4 +1,4 @@
-"""Scans from the network: received, decoded, and put into the queue where they may be there."""
+"""Receives scans from the network, decodes them, and queues them if they are accepted."""
 
 import logging
 import threading
@@ -19,7 +19,7 @@ from triquad_server.intake.scan_queue import ScanQueue
 _log = logging.getLogger(__name__)
 
 _INBOX = 1024
-"""Messages of scans that wait to be decoded."""
+"""The number of scan messages that wait to be decoded."""
 
 
 class ScanIntake:
@@ -41,7 +41,7 @@ class ScanIntake:
         self._max_points = max_points
         self._queue = queue
         self._arrived = arrived
-        # Scans as they came, by key: to decode them, too, takes time that a source may take up.
+        # Scans as received, by key: decoding takes time, too, which one source may use up.
         self._inbox: FairQueue[zenoh.Sample] = FairQueue(
             _INBOX, queue.limit_bytes, _INBOX, newest_go=False
         )
@@ -65,7 +65,7 @@ class ScanIntake:
                 self._empty_ring()
 
     def _empty_ring(self) -> None:
-        """Keep what has come meanwhile: in a full ring, one source pushes out what is others'."""
+        """Queue what has come meanwhile: in a full ring, one source pushes out others' scans."""
         with suppress(zenoh.ZError):  # it is closing
             for _ in range(_INBOX):
                 sample = self._subscriber.try_recv()
@@ -79,7 +79,7 @@ class ScanIntake:
         self._inbox.put(Owner(str(sample.key_expr)), sample, len(sample.payload))
 
     def _receive_safely(self, sample: zenoh.Sample) -> None:
-        """As :meth:`_receive`; an internal error must not stop the intake of other scans."""
+        """Do as :meth:`_receive`; an internal error must not stop the intake of other scans."""
         try:
             self._receive(str(sample.key_expr), sample.payload)
         except Exception:
@@ -102,7 +102,7 @@ class ScanIntake:
             self._enter(key, scan)
 
     def _enter(self, key: str, scan: Scan) -> None:
-        """Put a decoded scan into the queue, where it may be there."""
+        """Put a decoded scan into the queue, if it is accepted."""
         if key.rpartition("/")[2] != scan.source:
             self._drop("key_source_mismatch", key, f"its source is {scan.source!r:.80}")
             return

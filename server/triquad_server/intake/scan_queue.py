@@ -1,4 +1,4 @@
-"""The queue of scans that wait for the map."""
+"""The queue of scans that wait for the mapper."""
 
 import threading
 from collections.abc import Collection
@@ -11,30 +11,30 @@ from triquad_server.intake.rays import ScanRays
 from triquad_server.intake.source_ledger import SourceLedger
 
 MAX_SOURCES_WAITING = 64
-"""Sources that may each have as many scans wait as one may; more share that."""
+"""The number of sources that may each have the full number of scans wait; more share that."""
 
 _BEHIND = 0.25
-"""A source falls behind of whose scans more than this share of its limit wait."""
+"""A source falls behind if more than this share of its limit waits."""
 
 _PRESSED = 0.5
-"""Requests give way to scans once more than this share of the limit of a source wait."""
+"""Requests give way to scans once more than this share of a source's limit waits."""
 
 _GIVE_WAY_S = 0.05
-"""Requests wait for so long at most, before each of them: they are late then, but scans that do
-not fit in the queue are lost."""
+"""Each request waits this many seconds at most: it is late then, but scans that do not fit in the
+queue are lost."""
 
-_SCAN_BYTES = 2_000  # that a scan takes beside its points
+_SCAN_BYTES = 2_000  # memory of a scan in addition to its points
 
 
 class ScanQueue:
-    """The newest scans of each source that wait; sources take turns.
+    """Keeps the newest scans of each source that wait; sources take turns.
 
     Where there are too many, the oldest is pushed out and counted: of a source that has too many,
     or of the one that has most.
     """
 
     def __init__(self, limit: int, limit_bytes: int = 2**40) -> None:
-        """At most ``limit`` scans of each source wait, and ``limit_bytes`` of all together."""
+        """Let at most ``limit`` scans of each source wait, and ``limit_bytes`` of all together."""
         self.limit = limit
         self.limit_bytes = limit_bytes
         self.ledger = SourceLedger()
@@ -52,7 +52,7 @@ class ScanQueue:
 
     @property
     def bytes_waiting(self) -> int:
-        """Bytes of the scans that wait."""
+        """Return the bytes of the scans that wait."""
         return self._scans.nbytes
 
     def put(self, scan: Scan) -> None:
@@ -66,7 +66,7 @@ class ScanQueue:
                 self.ledger.push_out(pushed_out)
 
     def refuse(self, scan: Scan, reason: str, text: str) -> None:
-        """Account for a scan that arrived but is not let in."""
+        """Record that a scan that arrived is not queued."""
         with self._taken:
             backwards = self.ledger.arrive(scan)
             if backwards is None:
@@ -74,10 +74,10 @@ class ScanQueue:
             self.dropped.add(backwards or reason)
 
     def take(self, passed_over: Collection[str] = ()) -> Scan | None:
-        """The oldest scan of the next source, not of one that is ``passed_over``.
+        """Return the oldest scan of the next source, not of one that is ``passed_over``.
 
-        Of a source that falls behind it may be, nevertheless. It counts as waiting until another
-        is asked for.
+        Sources that fall behind are not passed over. The scan counts as waiting until the next
+        one is requested.
         """
         with self._taken:
             scan = self._scans.take(
@@ -88,13 +88,13 @@ class ScanQueue:
             return scan
 
     def taken(self, scan: Scan, rays: ScanRays) -> None:
-        """Account for a scan that is in the map; ``rays`` are what of it is used."""
+        """Record that a scan is in the map; ``rays`` are what of it is used."""
         for reason, count in rays.points_dropped.items():
             self.points_dropped.add(reason, count)
         self.ledger.take(scan)
 
     def reject(self, scan: Scan, reason: str, text: str) -> None:
-        """Account for a scan that was taken, and that the map refused."""
+        """Record that the map refused a scan that was taken."""
         self.dropped.add(reason)
         self.ledger.refuse(scan, text)
 

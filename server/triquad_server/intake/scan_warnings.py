@@ -16,20 +16,20 @@ from triquad_server.settings import ANY_SOURCE, Settings
 _log = logging.getLogger(__name__)
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 30.0, 3600.0
-"""Between two warnings of one cause and source; each time twice as long."""
+"""The first and the longest pause between two warnings of one cause and source; it doubles."""
 
-_STANDS_S = 60.0  # for so long after its cause was last met, clients are told a warning
-_SCANS = 10  # of a source that are judged together
+_STANDS_S = 60.0  # how long clients are shown a warning after its cause was last met
+_SCANS = 10  # scans of a source that are judged together
 _TOO_NEAR_SHARE, _TOO_FAR_SHARE = 0.1, 0.5
-"""Of the points, above which their loss is told. What is too far still shows free space."""
-_MAX_SOURCES = 256  # that are remembered; the one heard of longest ago goes
-_MAX_WARNINGS = 1024  # that are remembered, the same way
+"""The shares of points above which their loss is reported. Points too far still show free space."""
+_MAX_SOURCES = 256  # sources that are kept; the one heard of longest ago is removed
+_MAX_WARNINGS = 1024  # warnings that are kept, the same way
 _MAX_TOLD = 50  # warnings for a client at once
 _RANGES = 1000  # of a scan, at most, of which the median is taken
 
 _NEAR_LEAVES, _GOOD_LEAVES = 18.0, 40.0
-"""Median ranges that are too near for the leaf, and that suit it: lidars in streets have 28 to 55
-leaves with the presets for them, sensors in rooms 15 with the leaf of streets."""
+"""The median ranges that are too near for the leaf, and that suit it: lidars in streets have 28 to
+55 leaves with the presets for them, sensors in rooms 15 with the leaf of streets."""
 
 _TABLETOP_LEAF_M = 0.035  # finer leaves than this are those of the preset tabletop
 
@@ -46,18 +46,18 @@ class _Points:
 
 @dataclass
 class _Warning:
-    """A warning as it was last told."""
+    """A warning as it was last reported."""
 
     text: str
-    told: int  # scans of which was told so far, where it is of scans
-    seen: int  # of which was known so far
+    told: int  # scans reported so far, where it is about scans
+    seen: int  # scans known so far
     due_s: float  # monotonic: not again before
     pause_s: float
     met_s: float  # when its cause was last met
 
 
 class ScanWarnings:
-    """Logs and keeps warnings, each cause of each source once in a while; safe for any thread."""
+    """Logs and keeps warnings, each cause of each source with pauses; safe for any thread."""
 
     def __init__(
         self, scans: ScanQueue, settings: Settings, now: Callable[[], float] = time.monotonic
@@ -72,7 +72,7 @@ class ScanWarnings:
         self._warnings: OrderedDict[tuple[str, str], _Warning] = OrderedDict()
 
     def add(self, source: str, sent: int, rays: ScanRays) -> None:
-        """A scan of ``sent`` points was taken in, and ``rays`` are what of it is used."""
+        """Record that a scan of ``sent`` points was taken in; ``rays`` are what of it is used."""
         with self._lock:
             points = self._points.setdefault(source, _Points())
             self._points.move_to_end(source)
@@ -87,7 +87,7 @@ class ScanWarnings:
                 points.ranges_m.append(float(np.median(np.linalg.norm(some - rays.origin, axis=1))))
 
     def check(self) -> None:
-        """Log what there is to warn of and was not told lately."""
+        """Log the warnings that are due and were not logged lately."""
         with self._lock:
             self._check_scans()
             for source, points in self._points.items():
@@ -97,12 +97,12 @@ class ScanWarnings:
                     self._points[source] = _Points()
 
     def of(self, source: str) -> str | None:
-        """The warnings that stand about a source, a line each."""
+        """Return the current warnings about a source, a line each."""
         self.check()
         return self._lines(lambda of_source: of_source == source)
 
     def all(self) -> str | None:
-        """All warnings that stand, a line each."""
+        """Return all current warnings, a line each."""
         return self._lines(lambda _: True)
 
     def _lines(self, wanted: Callable[[str], bool]) -> str | None:
@@ -139,7 +139,7 @@ class ScanWarnings:
             self._count(source, "refused", refusal.scans, text)
 
     def _count(self, source: str, cause: str, count: int, text: str) -> None:
-        """Warn of scans of which there are ``count`` by now, if they became more."""
+        """Warn of ``count`` scans so far, if they became more."""
         before = self._warnings.get((source, cause))
         told, seen = (before.told, before.seen) if before else (0, 0)
         if count > told:
@@ -154,7 +154,7 @@ class ScanWarnings:
             ("too_far", "range_max_m", "more", _TOO_FAR_SHARE),
         ):
             share = points.dropped[reason] / max(1, points.sent)
-            # What is given for the source is meant, and so is a background that is cut off.
+            # What is set for the source is intended, and so is a background that is cut off.
             meant = getattr(own, key) is not None or (
                 reason == "too_far" and key in self._settings.scan.model_fields_set
             )
@@ -187,7 +187,7 @@ class ScanWarnings:
     def _warn(
         self, source: str, cause: str, text: str, *, scans: int = 0, met_s: float | None = None
     ) -> None:
-        """Tell a warning, unless its last telling was not long ago.
+        """Report a warning, unless it was reported not long ago.
 
         Its cause was met at ``met_s``, or just now.
         """

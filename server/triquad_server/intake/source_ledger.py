@@ -1,4 +1,4 @@
-"""What became of each scan, by source: taken, refused or lost."""
+"""Records what became of each scan, by source: taken, refused or lost."""
 
 import threading
 import time
@@ -10,7 +10,7 @@ from triquad_format.wire.messages import FlushReply, Scan
 from triquad_format.wire.metrics_messages import SourceMetrics
 
 MAX_SESSIONS = 1024
-"""Sessions of publishers that are remembered; the one heard of longest ago is forgotten."""
+"""The number of publishers' sessions that are kept; the one heard of longest ago is removed."""
 
 MAX_SOURCES_LISTED = 64
 
@@ -18,32 +18,32 @@ MAX_SEQUENCE = 2**48
 
 _AHEAD_AT_ONCE = 1000
 _AHEAD_PER_S = 1000
-"""How far sequences may leap: as many scans as may get lost at once, and in each second in which
-nothing was heard of the session. Whoever leaps farther does not count on from where it was."""
+"""How far sequences may leap ahead: as many scans as may get lost at once, and in each second in
+which the session was silent. A source that leaps farther does not count on from its last one."""
 
 FORGOTTEN = "*"
-"""Stands for all forgotten sources where losses are listed."""
+"""The name that stands for all forgotten sources where losses are listed."""
 
 _MAX_COUNT = 2**63 - 1
 
 
 class Refusals(NamedTuple):
-    """Refused scans of one source."""
+    """The refused scans of one source."""
 
     scans: int
-    last: str  # why the last of them was
+    last: str  # why the last of them was refused
 
 
 class Losses(NamedTuple):
-    """Lost scans of one source."""
+    """The lost scans of one source."""
 
-    pushed_out: int  # of the full queue
+    pushed_out: int  # pushed out of the full queue
     never_arrived: int
 
 
 @dataclass
 class _Track:
-    """Counts of one session of one source. Scans of one session stay in order all the way."""
+    """Counters of one session of one source; scans of one session stay in order all the way."""
 
     arrived: int = -1  # highest sequence that arrived or was given up
     done: int = -1  # highest sequence that came out of the queue
@@ -52,23 +52,23 @@ class _Track:
     stamp_ns: int = -(2**63)
     taken: int = 0
     refused: int = 0
-    pushed_out: int = 0  # of the full queue
+    pushed_out: int = 0  # pushed out of the full queue
     never_arrived: int = 0
     last_refusal: str | None = None
-    heard_s: float = field(default_factory=time.monotonic)  # of it last, monotonic
+    heard_s: float = field(default_factory=time.monotonic)  # when it was last heard of, monotonic
 
     @property
     def lost(self) -> int:
-        """Scans lost, one way or the other."""
+        """The number of lost scans, of either kind."""
         return self.pushed_out + self.never_arrived
 
     def lose_up_to(self, sequence: int) -> None:
-        """Count what did not arrive, up to and with ``sequence``, as lost."""
+        """Count scans up to and with ``sequence`` that did not arrive as lost."""
         self.never_arrived += max(0, sequence - self.arrived)
         self.arrived = max(self.arrived, sequence)
 
     def is_ahead(self, sequence: int) -> bool:
-        """Whether a sequence lies farther ahead than scans can have got lost since the last."""
+        """Return whether a sequence lies farther ahead than scans can have got lost since."""
         if self.arrived < 0:
             return False  # it may have begun long before this process
         silent_s = time.monotonic() - self.heard_s
@@ -80,7 +80,7 @@ class _Track:
         self.last_refusal = text
 
     def settled(self, sequence: int) -> bool:
-        """Whether a scan was taken, refused or lost."""
+        """Return whether a scan was taken, refused or lost."""
         return sequence <= (self.done if self.waiting else self.arrived)
 
 
@@ -96,7 +96,7 @@ class SourceLedger:
         self._forgotten = Losses(0, 0)
 
     def arrive(self, scan: Scan) -> str | None:
-        """Record a scan's arrival; the reason where its sequence or stamp refuses it."""
+        """Record a scan's arrival; return the reason if its sequence or stamp refuses it."""
         with self.changed:
             if not 0 <= scan.sequence < MAX_SEQUENCE:
                 return "bad_sequence"
@@ -134,9 +134,9 @@ class SourceLedger:
             self._leave_queue(scan).refuse(f"scan {scan.sequence}: {text}")
 
     def turn_away(self, scan: Scan, text: str) -> None:
-        """Record that a scan that just arrived is not let into the queue.
+        """Record that a scan that just arrived is not queued.
 
-        Earlier ones may still wait there, so it says nothing of them.
+        Earlier ones may still wait there, so this settles none of them.
         """
         with self.changed:
             track = self._track(scan.source, scan.session)
@@ -159,10 +159,10 @@ class SourceLedger:
                 self.changed.notify_all()
 
     def give_up(self, source: str, session: int, sequence: int) -> FlushReply | None:
-        """Count what has not arrived up to ``sequence`` as lost; the outcome, as :meth:`outcome`.
+        """Count scans up to ``sequence`` that did not arrive as lost; return as :meth:`outcome`.
 
-        What cannot have been sent is answered but not remembered, be it of a session that was never
-        heard of or far ahead in one: questions must not push out, nor hold up, who sends scans.
+        Sequences that cannot have been sent are answered but not recorded, be it of a session that
+        is unknown or far ahead in one: requests must not push out, nor delay, sources of scans.
         """
         with self.changed:
             track = self._tracks.get((source, session))
@@ -183,19 +183,19 @@ class SourceLedger:
             return self.outcome(source, session, sequence)
 
     def arrived(self, source: str, session: int, sequence: int) -> bool:
-        """Whether a scan, or a later one of its session, arrived."""
+        """Return whether a scan, or a later one of its session, arrived."""
         with self.changed:
             track = self._tracks.get((source, session))
             return track is not None and sequence <= track.arrived
 
     def settled(self, source: str, session: int, sequence: int) -> bool:
-        """Whether a scan was taken, refused or lost."""
+        """Return whether a scan was taken, refused or lost."""
         with self.changed:
             track = self._tracks.get((source, session))
             return track is not None and track.settled(sequence)
 
     def outcome(self, source: str, session: int, sequence: int) -> FlushReply | None:
-        """The counts of a session, once the scan is settled and an epoch shows it if taken."""
+        """Return a session's counts, once the scan is settled and an epoch shows it if taken."""
         with self.changed:
             track = self._tracks.get((source, session))
             if track is None or not track.settled(sequence):
@@ -205,11 +205,11 @@ class SourceLedger:
             return FlushReply(track.taken, track.refused, track.lost, track.last_refusal)
 
     def lost(self) -> dict[str, int]:
-        """Scans lost, by source."""
+        """Return the number of lost scans, by source."""
         return {source: min(_MAX_COUNT, sum(lost)) for source, lost in self.losses().items()}
 
     def losses(self) -> dict[str, Losses]:
-        """Scans lost, by source and by how."""
+        """Return the lost scans, by source and by cause."""
         with self.changed:
             found = {FORGOTTEN: self._forgotten} if any(self._forgotten) else {}
             for (source, _), track in self._tracks.items():
@@ -218,7 +218,7 @@ class SourceLedger:
             return found
 
     def sources(self) -> dict[str, SourceMetrics]:
-        """The scans of each source; those heard of longest ago are put together where many are."""
+        """Return the scans of each source; of many, those heard of longest ago are merged."""
         now = time.monotonic()
         found: dict[str, SourceMetrics] = {}
         with self.changed:
@@ -228,7 +228,7 @@ class SourceLedger:
         return found
 
     def refused(self) -> dict[str, Refusals]:
-        """Scans refused, by source."""
+        """Return the refused scans, by source."""
         with self.changed:
             found: dict[str, Refusals] = {}
             for (source, _), track in self._tracks.items():
@@ -245,7 +245,7 @@ class SourceLedger:
         return track
 
     def _track(self, source: str, session: int) -> _Track:
-        """The track of a session, now the one heard of last."""
+        """Return the track of a session, now the most recent one."""
         track = self._tracks.setdefault((source, session), _Track())
         self._tracks.move_to_end((source, session))
         if len(self._tracks) > MAX_SESSIONS:
@@ -255,7 +255,7 @@ class SourceLedger:
 
 
 def _with_losses(before: Losses, track: _Track) -> Losses:
-    """The losses of a source, with those of one more session."""
+    """Return the losses of a source, with those of one more session."""
     return Losses(
         pushed_out=min(_MAX_COUNT, before.pushed_out + track.pushed_out),
         never_arrived=min(_MAX_COUNT, before.never_arrived + track.never_arrived),
@@ -263,7 +263,7 @@ def _with_losses(before: Losses, track: _Track) -> Losses:
 
 
 def _with_track(before: SourceMetrics | None, track: _Track, age_s: float) -> SourceMetrics:
-    """The scans of a source, with those of one more of its sessions."""
+    """Return the scans of a source, with those of one more of its sessions."""
     if before is None:
         return SourceMetrics(1, track.taken, track.refused, track.lost, age_s)
     return SourceMetrics(

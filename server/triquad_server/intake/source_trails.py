@@ -1,4 +1,4 @@
-"""Where each source of scans has been, and its newest scan: for those who watch."""
+"""Records where each source of scans has been, and its newest scan, for viewers."""
 
 import threading
 from collections import OrderedDict
@@ -13,20 +13,20 @@ from triquad_map.compiled.voxel_index import with_room
 from triquad_server.intake.rays import ScanRays
 
 MAX_SOURCES = 256
-"""Sources that are remembered; the one heard of longest ago is forgotten."""
+"""The number of sources that are kept; the one heard of longest ago is removed."""
 
 MAX_POSITIONS = 8192
-"""Of a trail. Once it has so many, every second one is dropped, and from then on they are twice as
-far apart: all of the way remains visible."""
+"""The positions of a trail at most. Once it has that many, every second one is dropped, and from
+then on they are twice as far apart: all of the way remains visible."""
 
-_LEAST_ROOM = 16  # positions: whoever invents sources gets no more of each
+_LEAST_ROOM = 16  # positions: a client that invents sources gets no more of each
 
 _JUMP_LEAVES = 250.0
 """A sensor that is farther away than this from one scan to the next has not moved there: 50 m with
 the leaf of streets, where a car does 14 m a second and some of its scans may be lost."""
 
 _DRAWS = np.random.default_rng(0).random(MAX_SAMPLE_POINTS)
-"""Which point of each run is taken, always the same: to draw them anew takes longer."""
+"""Which point of each run is taken, always the same: drawing them each time takes longer."""
 
 
 @dataclass(frozen=True)
@@ -41,19 +41,19 @@ class TakenScan:
 
     @property
     def position(self) -> Doubles:
-        """Where the sensor was: [3] metres, map frame."""
+        """Return where the sensor was: [3] metres, map frame."""
         return self.world_from_sensor[:3, 3]
 
 
 @dataclass(frozen=True)
 class SourceDelta:
-    """What is new of a source since a revision."""
+    """The changes of a source since a revision."""
 
     scans: int
-    whole: bool  # what was told before is void
+    whole: bool  # what was sent before is void
     trail: Doubles  # [N, 3] metres, map frame
     pieces: Longs  # [N] rise where the sensor jumped
-    newest: TakenScan | None  # where it is new
+    newest: TakenScan | None  # where the new positions begin
 
 
 @dataclass
@@ -84,14 +84,14 @@ class _Trail:
             column[: self.count] = column[:before][kept]
 
     def after(self, revision: int) -> slice:
-        """The positions that were added after a revision."""
+        """Return the positions that were added after a revision."""
         first = np.searchsorted(self.revisions[: self.count], revision, side="right")
         return slice(int(first), self.count)
 
 
 @dataclass
 class _Source:
-    """What is known of one source."""
+    """The trail and the newest scan of one source."""
 
     rewritten: int  # revision since which the trail was only added to
     spacing_m: float  # of the trail's positions
@@ -100,7 +100,7 @@ class _Source:
     trail: _Trail = field(default_factory=_Trail)
 
     def add(self, taken: TakenScan, jump_m: float) -> None:
-        """Add its newest scan."""
+        """Add the source's newest scan."""
         jumped = self.newest is None or _apart(taken.position, self.newest.position) > jump_m
         self.scans += 1
         self.newest = taken
@@ -116,7 +116,7 @@ class _Source:
         trail.add(taken.position, piece, taken.revision)
 
     def forget(self, minimum: Doubles, maximum: Doubles, revision: int) -> None:
-        """Forget where it has been within a box; the trail is interrupted there.
+        """Forget where the source has been within a box; the trail is interrupted there.
 
         Its newest scan is forgotten where it, or the last of the trail, lies in the box.
         """
@@ -133,7 +133,7 @@ class _Source:
             self.rewritten = revision
 
     def delta(self, revision: int) -> SourceDelta:
-        """What is new since a revision."""
+        """Return the changes since a revision."""
         whole = self.rewritten > revision
         chosen = slice(0, self.trail.count) if whole else self.trail.after(revision)
         newest = self.newest
@@ -149,10 +149,10 @@ class _Source:
 
 
 class SourceTrails:
-    """Where each source has been, and its newest scan. One thread adds, any may ask."""
+    """Keeps where each source has been, and its newest scan; one thread adds, any may query."""
 
     def __init__(self, leaf_m: float) -> None:
-        """Positions of a trail are a leaf apart, at first."""
+        """Begin with positions of a trail a leaf apart."""
         self._spacing_m = leaf_m
         self._jump_m = _JUMP_LEAVES * leaf_m
         self._lock = threading.Lock()
@@ -160,7 +160,7 @@ class SourceTrails:
         self._sources: OrderedDict[str, _Source] = OrderedDict()  # the one heard of last is last
 
     def add(self, scan: Scan, rays: ScanRays) -> None:
-        """A scan was taken into the map, and ``rays`` are what of it is used."""
+        """Record that a scan was taken into the map; ``rays`` are what of it is used."""
         points = evenly(rays.ends, MAX_SAMPLE_POINTS)
         with self._lock:
             self._revision += 1
@@ -189,14 +189,14 @@ class SourceTrails:
                     del self._sources[name]
 
     def since(self, revision: int) -> tuple[int, dict[str, SourceDelta]]:
-        """The revision now, and what is new of every source since an earlier one."""
+        """Return the revision now, and the changes of every source since an earlier one."""
         with self._lock:
             deltas = {name: source.delta(revision) for name, source in self._sources.items()}
             return self._revision, deltas
 
 
 def evenly(points: Doubles, count: int) -> Doubles:
-    """At most ``count`` of the points [N, 3]: one of each of as many runs of them.
+    """Return at most ``count`` of the points [N, 3]: one of each of as many runs of them.
 
     Which one of a run is drawn: every tenth, say, may be of one laser of a lidar.
     """
@@ -208,7 +208,7 @@ def evenly(points: Doubles, count: int) -> Doubles:
 
 
 def _within(positions: Doubles, minimum: Doubles, maximum: Doubles) -> Bools:
-    """Whether each of the positions [N, 3] lies between two corners [3]."""
+    """Return whether each of the positions [N, 3] lies between two corners [3]."""
     return np.asarray(((positions >= minimum) & (positions <= maximum)).all(axis=1))
 
 

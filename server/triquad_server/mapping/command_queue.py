@@ -15,25 +15,25 @@ ResultT = TypeVar("ResultT")
 
 @dataclass(frozen=True)
 class Command:
-    """What is to be run, and who waits for it."""
+    """A command to be run, and the future that its caller waits for."""
 
     run: Callable[[Mapper], Any]
     result: Future[Any]
 
 
 class CommandQueue:
-    """Commands in the order in which they came, until there are no more."""
+    """Queues commands in the order in which they came, until it is closed."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._commands: deque[Command] = deque()
-        self.ended: str | None = None  # why there are no more
+        self.ended: str | None = None  # why no more are taken
 
     def add(self, run: Callable[[Mapper], ResultT]) -> Future[ResultT]:
         """Add a command; what it returns, or raises, is the future's result.
 
         Raises:
-            MapperStoppedError: there are no more.
+            MapperStoppedError: no more are taken.
         """
         result: Future[ResultT] = Future()
         with self._lock:
@@ -43,7 +43,7 @@ class CommandQueue:
         return result
 
     def take(self) -> Command | None:
-        """The oldest command, which is no longer in the queue; None where there is none."""
+        """Remove and return the oldest command; None where there is none."""
         with self._lock:
             return self._commands.popleft() if self._commands else None
 

@@ -1,4 +1,4 @@
-"""Who is told of what becomes of a map."""
+"""The functions that are called when a map changes."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -40,11 +40,11 @@ class LiveRegion:
         self.training = training
         self._setup = setup
         self._published: FrozenRegion | None = None
-        self.is_changed = True  # since it was published
+        self.is_changed = True  # changed since it was published
 
     @classmethod
     def unseen(cls, index: RegionIndex, setup: RegionSetup) -> "LiveRegion":
-        """A region of which nothing is known yet."""
+        """Make a region of which nothing is known yet."""
         centre, (field_seed, seed) = setup.field.region_centre(index), setup.seeds(index)
         field = initial_field(setup.field, setup.memory, field_seed)
         evidence = RegionEvidence(LiveEvidence(1 << setup.field.depth), setup, centre, seed)
@@ -53,7 +53,7 @@ class LiveRegion:
 
     @classmethod
     def restored(cls, record: Region, setup: RegionSetup) -> "LiveRegion":
-        """A region from its record; without training state there is nothing to train on."""
+        """Make a region from its record; without training state there is nothing to train on."""
         index = record.index
         centre, (field_seed, seed) = setup.field.region_centre(index), setup.seeds(index)
         field = field_from_record(record, setup.field, setup.memory, seed=field_seed)
@@ -68,15 +68,15 @@ class LiveRegion:
 
     @property
     def size(self) -> RegionSize:
-        """How much it holds."""
+        """Return the size of the region."""
         return RegionSize(self.evidence.size, self.field.vertices)
 
     def new_voxels(self, rays: ScanRays) -> int:
-        """In how many voxels rays would end for the first time."""
+        """Return in how many voxels rays would end for the first time."""
         return len(self.evidence.live.new_ends(self.evidence.voxels(rays.ends)).voxels)
 
     def growth_by(self, rays: ScanRays) -> RegionSize:
-        """What the rays would add to it; of the space that they cross, an estimate."""
+        """Return what the rays would add to it; of the space that they cross, an estimate."""
         voxels, live = self.evidence.voxels, self.evidence.live
         new = live.new_ends(voxels(rays.ends))
         ways = voxels(np.concatenate([rays.ends, rays.free_corners]))
@@ -93,7 +93,7 @@ class LiveRegion:
         return seen
 
     def scan_taken(self, rays: ScanRays, normals: Doubles, seen: SeenSurface) -> None:
-        """Keep what the rays of a scan teach, after :meth:`scan_seen`.
+        """Keep the rays of a scan for training, after :meth:`scan_seen`.
 
         ``normals`` [N, 3] are those of the surface at the rays' ends, NaN where unknown.
         """
@@ -101,7 +101,7 @@ class LiveRegion:
         self.evidence.live.set_normals(seen.marks, normals)
 
     def take_step(self) -> tuple[Loss, int]:
-        """One optimiser step; returns its loss and samples. On a GPU, to read the loss waits."""
+        """Take one optimiser step; return loss and samples. On a GPU, reading the loss waits."""
         taken = self.training.take_step()
         self.evidence.step_taken()
         self.is_changed = True
@@ -114,7 +114,7 @@ class LiveRegion:
         self.is_changed = True
 
     def publish(self, epoch: int) -> FrozenRegion:
-        """The region as it is now, for ``epoch``; the same as before where nothing changed."""
+        """Return the region as it is now, for ``epoch``; the last one again if nothing changed."""
         if self._published is not None and not self.is_changed:
             return self._published
         field = self.field.freeze()
@@ -146,7 +146,7 @@ class LiveRegion:
         return self._published
 
     def snapshot(self) -> RegionSnapshot:
-        """The region as it is now, sharing nothing with this one."""
+        """Return a copy of the region as it is now."""
         live = self.evidence.live
         return RegionSnapshot(
             region=region_record(self.index, self.field, live, training=None),

@@ -17,10 +17,10 @@ from triquad_server.mapping.training.fair_share import FairShare
 
 
 class LiveRegions:
-    """All regions of a map; only the thread that owns the map may use them."""
+    """Holds all regions of a map; only the thread that owns the map may use them."""
 
     def __init__(self, setup: RegionSetup, max_bytes: int) -> None:
-        """There are none yet; they may take ``max_bytes``, with the newest epoch of them."""
+        """Begin without regions; they may take ``max_bytes``, with the newest epoch of them."""
         self._setup = setup
         self._budget = MemoryBudget(max_bytes, setup.field)
         self._regions: dict[RegionIndex, LiveRegion] = {}
@@ -34,32 +34,32 @@ class LiveRegions:
 
     @property
     def bytes_used(self) -> int:
-        """Memory of the regions with the newest epoch, without rays; an estimate."""
+        """Return the memory of the regions with the newest epoch, without rays; an estimate."""
         return self._budget.bytes_of(region.size for region in self)
 
     @property
     def samples_left(self) -> int:
-        """Training samples that are still to be trained on."""
+        """The number of training samples that are still to be trained on."""
         return sum(region.training.budget.samples for region in self)
 
     @property
     def rays_share(self) -> float:
-        """Of the rays that each place is to keep, the share that memory has room for."""
+        """The share of the rays that each place is to keep that memory has room for."""
         return self._share.rays_share
 
     @property
     def next_to_learn(self) -> LiveRegion | None:
-        """The region with most to learn for what is there; None: all have settled."""
+        """Return the region with most samples per vertex to train on; None: all have settled."""
         region = max(self, key=lambda r: r.training.samples_per_vertex, default=None)
         return None if region is None or region.training.is_settled else region
 
     def restore(self, records: Iterable[Region]) -> None:
-        """Have the regions of a record; what they may keep is told by :meth:`share_out`."""
+        """Add the regions of a record; :meth:`share_out` sets what they may keep."""
         for record in records:
             self._regions[record.index] = LiveRegion.restored(record, self._setup)
 
     def reached_by(self, rays: ScanRays) -> list[LiveRegion]:
-        """The regions that a scan enters; those that are new belong to the map from now on.
+        """Return the regions that a scan enters; new ones belong to the map from now on.
 
         Raises:
             ScanRefusedError: the map would have too many regions, or take too much memory.

@@ -1,4 +1,4 @@
-"""How well the whole map fits its held-out rays, as the status tells it."""
+"""Measures how well the whole map fits its held-out rays, for the status."""
 
 from collections.abc import Iterable
 
@@ -10,7 +10,7 @@ from triquad_server.mapping.live_region import LiveRegion
 
 
 def map_fit(regions: Iterable[LiveRegion]) -> FieldFit | None:
-    """How regions fit, as they were judged last; ``None`` where none was."""
+    """Return how well regions fit, as they were judged last; ``None`` where none was."""
     judgements = [(region.centre, region.training.judgement) for region in regions]
     judged = [(centre, judgement.fit) for centre, judgement in judgements if judgement.fit]
     fit = field_fit.map_fit(judged)

@@ -1,4 +1,4 @@
-"""The map as it was at a moment, of which any thread makes the records while mapping goes on."""
+"""The map as it was at a moment, from which any thread makes the records while mapping goes on."""
 
 from dataclasses import dataclass, replace
 
@@ -14,21 +14,21 @@ from triquad_server.mapping.replay.replay_record import recorded_rays
 
 @dataclass(frozen=True)
 class RegionSnapshot:
-    """What a record takes, sharing nothing with the region.
+    """A copy of what a record needs of a region.
 
-    To find the rays that a file holds, and their order, takes ten times as long as to copy them.
+    Finding the rays that a file holds, and their order, takes ten times as long as copying them.
     """
 
     region: Region  # without a training state
     training: TrainingState  # without rays and samples
-    table: RayTable  # all that are kept: those to train on, then those that are held out
+    table: RayTable  # all kept rays: those to train on, then those that are held out
     trained: int  # how many are to train on
-    placement: Placement  # of samples on what is no ray that ends in the cube
+    placement: Placement  # of samples in place of what is no ray that ends in the cube
     settings: FieldSettings
     team: Team
 
     def record(self) -> Region:
-        """The region with all of its training state as plain arrays."""
+        """Return the region with all of its training state as plain arrays."""
         rays, others = recorded_rays(self.table, self.settings)
         others = others[others < self.trained]  # samples are for training
         rng = np.random.default_rng(len(others))
@@ -44,25 +44,25 @@ class RegionSnapshot:
 
 @dataclass(frozen=True)
 class MapChanges:
-    """What a checkpoint needs that follows another."""
+    """The changes that a checkpoint that follows another needs."""
 
     record: MapRecord  # of the regions that changed, with training state
-    regions: tuple[RegionIndex, ...]  # all that there are
-    epoch: Epoch  # the same state, for questions
+    regions: tuple[RegionIndex, ...]  # all regions of the map
+    epoch: Epoch  # the same state, for queries
 
 
 @dataclass(frozen=True)
 class MapSnapshot:
-    """What changed, as it was at a moment."""
+    """The changes of the map, as it was at a moment."""
 
     name: str
     settings: FieldSettings
     changed: tuple[RegionSnapshot, ...]
-    regions: tuple[RegionIndex, ...]  # all that there are
+    regions: tuple[RegionIndex, ...]  # all regions of the map
     epoch: Epoch  # the same state
 
     def changes(self) -> MapChanges:
-        """The records of it, which take a second for 100 m of a street."""
+        """Return the records of the changes, which takes a second for 100 m of a street."""
         regions = tuple(region.record() for region in self.changed)
         epoch = self.epoch
         record = MapRecord(self.name, epoch.number, self.settings, regions, progress=epoch.progress)

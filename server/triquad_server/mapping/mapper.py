@@ -1,4 +1,4 @@
-"""The live map: takes in scans, trains, publishes epochs. Owned by one thread."""
+"""The live map, owned by one thread: it takes in scans, trains, and publishes epochs."""
 
 import logging
 import math
@@ -28,7 +28,7 @@ _LOSS_MEMORY = 0.95
 
 
 class Mapper:
-    """A map that grows and learns. It knows no files and no clocks."""
+    """Builds and trains a map, without files and clocks."""
 
     def __init__(
         self,
@@ -38,7 +38,7 @@ class Mapper:
         record: MapRecord | None = None,
         teams: Teams | None = None,
     ) -> None:
-        """A map that goes on from its ``record``; without ``teams`` it has threads of its own."""
+        """Make a map that goes on from ``record``; without ``teams`` it has threads of its own."""
         self._name = name
         self._teams = teams or Teams()
         self._settings = settings
@@ -69,35 +69,35 @@ class Mapper:
 
     @property
     def settled(self) -> bool:
-        """Whether nothing is left to learn from the scans so far."""
+        """Return whether nothing is left to learn from the scans so far."""
         return self.samples_left == 0
 
     @property
     def samples_left(self) -> int:
-        """Training samples that are still to be trained on, of all regions."""
+        """The number of training samples that are still to be trained on, of all regions."""
         return self.regions.samples_left
 
     @property
     def rays_kept(self) -> int:
-        """Rays that are kept to train on; one that crosses regions counts in each."""
+        """The number of rays that are kept to train on; one that crosses regions counts in each."""
         return sum(len(region.training.rays.pool) for region in self.regions)
 
     @property
     def loss(self) -> float:
-        """The loss of the last steps; on a GPU, to read it waits for all of them."""
+        """The loss of the last steps; on a GPU, reading it waits for all of them."""
         return 0.0 if self._loss is None else float(self._loss)
 
     @property
     def progress(self) -> MapProgress:
-        """How far the map has come; to read it on a GPU waits for the last steps."""
+        """Return how far the map has come; on a GPU, this waits for the last steps."""
         loss = self.loss
-        # A loss that is no number must not keep a map from being written.
+        # A loss that is not a number must not keep a map from being written.
         return MapProgress(
             self.scans_taken, self.samples_trained, loss if math.isfinite(loss) else 0.0
         )
 
     def figures(self) -> MapFigures:
-        """The figures of the map as it is now."""
+        """Return the figures of the map as it is now."""
         training = [region.training for region in self.regions]
         return MapFigures(
             scans_taken=self.scans_taken,
@@ -126,7 +126,7 @@ class Mapper:
             points: [N, 3] metres, sensor frame.
             world_from_sensor: pose [4, 4].
             stamp_s: when it was taken, seconds since 1970.
-            source: whose settings count; empty: those of no particular source.
+            source: its settings apply; empty: those of no particular source.
             no_return: directions [M, 3], sensor frame, of rays that met nothing.
 
         Returns:
@@ -146,7 +146,7 @@ class Mapper:
     def _usable_rays(
         self, points: Floats, world_from_sensor: Doubles, source: str, no_return: Floats | None
     ) -> ScanRays:
-        """What of a scan is used. A defect that its numbers lead to must not stop the mapping."""
+        """Return a scan's usable rays. A defect due to its numbers must not stop the mapping."""
         of_source = self._settings.sources.get(source, ANY_SOURCE)
         settings = self._settings.scan_of(of_source)
         try:
@@ -161,17 +161,17 @@ class Mapper:
             raise ScanRefusedError("internal", text) from error
 
     def _take_in(self, rays: ScanRays, regions: list[LiveRegion], stamp_s: int) -> None:
-        """Have regions take in a scan; normals are found while they record what it shows."""
+        """Have regions take in a scan; normals are computed while they record what it shows."""
         seen, normals = self._teams.mapping.both(
             lambda: [region.scan_seen(rays, stamp_s) for region in regions],
             lambda: self._normals.add(rays.ends, rays.origin),
         )
-        self.regions.share_out()  # by the voxels that are seen by now
+        self.regions.share_out()  # by the voxels that are seen so far
         for region, surface in zip(regions, seen, strict=True):
             region.scan_taken(rays, normals, surface)
 
     def train(self) -> None:
-        """One optimiser step where most is to be learnt; nothing once all is settled."""
+        """Take one optimiser step where most is to be learnt; do nothing once all is settled."""
         region = self.regions.next_to_learn
         if region is None:
             return
@@ -181,7 +181,7 @@ class Mapper:
         self.samples_trained += samples
 
     def publish(self) -> Epoch:
-        """The newest epoch: a new one where the map changed since the last."""
+        """Return the newest epoch: a new one if the map changed since the last."""
         changed = self._structure_changed or any(region.is_changed for region in self.regions)
         if self._epoch is not None and not changed:
             return self._epoch
@@ -199,7 +199,7 @@ class Mapper:
         return self._epoch
 
     def release(self) -> None:
-        """Free what training alone needs, until there is something to learn again."""
+        """Free what only training needs, until there is something to learn again."""
         self._setup.sums.clear()
 
     def reset(self, minimum: Doubles, maximum: Doubles) -> None:
@@ -214,14 +214,14 @@ class Mapper:
         self._structure_changed = True
 
     def changes_since(self, epoch: int | None) -> MapChanges:
-        """The newest epoch, with training state, of the regions that changed after ``epoch``.
+        """Return the newest epoch, with training state, of the regions changed after ``epoch``.
 
-        ``None``: of all regions.
+        ``None`` returns all regions.
         """
         return self.snapshot_since(epoch).changes()
 
     def snapshot_since(self, epoch: int | None) -> MapSnapshot:
-        """As :meth:`changes_since`, of which other threads make the records."""
+        """Return as :meth:`changes_since` a snapshot, from which other threads make the records."""
         newest = self.publish()
         changed = {
             frozen.index

@@ -1,4 +1,4 @@
-"""The thread that owns the live map: takes scans, trains in slices, publishes epochs."""
+"""The thread that owns the live map: it takes scans, trains in slices, and publishes epochs."""
 
 import logging
 import threading
@@ -25,13 +25,13 @@ from triquad_server.process.threads import NICENESS
 
 _log = logging.getLogger(__name__)
 
-_GIVE_WAY_S = 0.1  # training waits for queries at most so long before each step
+_GIVE_WAY_S = 0.1  # seconds that training waits for queries before each step, at most
 
 _SCANS_S = 0.05
-"""Scans are taken in for so long before training goes on, at least."""
+"""The seconds for which scans are taken in before training goes on, at least."""
 
 _SCANS_SHARE = 2.0
-"""How many times as long as all else took, where scans wait for so long."""
+"""The same time, where many scans wait, as a multiple of the time that all else took."""
 
 ResultT = TypeVar("ResultT")
 
@@ -48,7 +48,7 @@ class MapperThread:
         failed: Callable[[], None],
         listeners: MapListeners | None = None,
     ) -> None:
-        """Begin with :meth:`start`.
+        """Make the thread, which begins with :meth:`start`.
 
         Args:
             mapper: what owns the map; its newest epoch is in ``epochs``.
@@ -56,7 +56,7 @@ class MapperThread:
             epochs: where epochs are published.
             period_s: between two epochs while the map changes.
             failed: called where an internal error ends the thread.
-            listeners: who is told of scans and epochs.
+            listeners: functions that are called with scans and epochs.
         """
         self._mapper = mapper
         self._scans = scans
@@ -69,18 +69,18 @@ class MapperThread:
         self._paused = threading.Event()
         self._stopping = threading.Event()
         self._schedule = PublishSchedule(period_s)
-        self._step_s = _GIVE_WAY_S  # what the last step of training took
+        self._step_s = _GIVE_WAY_S  # seconds that the last step of training took
         self.progress = Progress(loss=mapper.loss, fit=map_fit(mapper.regions))
         self._record_progress()
         self._thread = threading.Thread(target=self._run, name="mapper")
 
     @property
     def ended(self) -> str | None:
-        """Why the thread takes no more commands, once it does not."""
+        """Return why the thread takes no more commands; ``None`` while it does."""
         return self._commands.ended
 
     def start(self) -> None:
-        """Begin to map."""
+        """Start the thread."""
         self._thread.start()
 
     def pause(self) -> None:
@@ -98,7 +98,7 @@ class MapperThread:
             self._thread.join()
 
     def wake(self) -> None:
-        """Have the thread see whether scans are waiting."""
+        """Make the thread check whether scans are waiting."""
         self._wake.set()
 
     def publish_soon(self) -> None:
@@ -107,7 +107,7 @@ class MapperThread:
         self._wake.set()
 
     def call(self, command: Callable[[Mapper], ResultT]) -> ResultT:
-        """What ``command`` returns when run on the mapper thread, between slices.
+        """Run ``command`` on the mapper thread, between slices, and return its result.
 
         Once it returns, an epoch shows what it did to the map.
 
@@ -139,9 +139,9 @@ class MapperThread:
             self._commands.end(ended)
 
     def _turn(self, else_s: float) -> float:
-        """One round: commands, scans, a slice of training, an epoch where one is due.
+        """Run one round: commands, scans, a slice of training, an epoch if one is due.
 
-        ``else_s`` is what all but scans took in the last round; returns the same of this one.
+        ``else_s`` is the time of all but scans in the last round; return the same of this one.
         """
         self._wake.clear()
         self._epochs.let_go()
@@ -166,7 +166,7 @@ class MapperThread:
         return else_s
 
     def _train(self) -> None:
-        """One step of training, which gives way to queries for a third of its time at most."""
+        """Take one step of training, which gives way to queries for a third of its time at most."""
         self.time.begin(Activity.GIVING_WAY)
         self._epochs.give_way(min(_GIVE_WAY_S, self._step_s / 2))
         self.time.begin(Activity.TRAINING)
@@ -192,13 +192,13 @@ class MapperThread:
 
     def _run_command(self, command: Command) -> None:
         result = command.run(self._mapper)
-        self._publish()  # first: who gets the result may ask for its epoch
+        self._publish()  # first: the caller may request its epoch
         command.result.set_result(result)
 
     def _ingest_scans(self, for_s: float) -> bool:
-        """Take in the oldest scan of each source, for a moment; False where none waits.
+        """Take in the oldest scan of each source, for a moment; return False where none waits.
 
-        More are taken of sources of which so many wait that scans may soon be lost.
+        More are taken of sources of which many wait, so that scans may soon be lost.
         """
         ends_s = time.monotonic() + for_s
         sources: set[str] = set()

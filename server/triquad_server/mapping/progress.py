@@ -1,4 +1,4 @@
-"""How far a map has come, in figures."""
+"""The progress of a map, in figures."""
 
 from dataclasses import dataclass
 
@@ -10,19 +10,19 @@ class MapFigures:
     """The figures of a live map."""
 
     scans_taken: int = 0  # also those before a restart
-    samples_trained: int = 0  # likewise
+    samples_trained: int = 0  # also those before a restart
     samples_left: int = 0
-    samples_discarded: int = 0  # so far, which were more than may be left
+    samples_discarded: int = 0  # so far, beyond the limit of what may be left
     rays_kept: int = 0  # to train on; one that crosses regions counts in each
-    rays_discarded: int = 0  # so far, that gave way to others, or were too many
-    replay_share: float = 1.0  # of the rays that each place is to keep
-    map_bytes: int = 0  # that the map and its newest epoch take, without rays; an estimate
-    normals_bytes: int = 0  # that moments of points take, for normals of coming scans
+    rays_discarded: int = 0  # so far, that were replaced by others, or were too many
+    replay_share: float = 1.0  # kept, of the rays that each place is to keep
+    map_bytes: int = 0  # bytes of the map and its newest epoch, without rays; an estimate
+    normals_bytes: int = 0  # bytes of the moments of points, for normals of coming scans
 
 
 @dataclass(frozen=True)
 class Progress:
-    """What the mapper's thread has done, as of its last slice."""
+    """The work of the mapper's thread, as of its last slice."""
 
     settled: bool = True  # nothing is left to learn, and the newest epoch shows all
     own_samples_trained: int = 0  # by this process

@@ -1,4 +1,4 @@
-"""What rays have shown of one region of the live map: voxels, surfels, and surface that went."""
+"""The evidence of rays in one region of the live map: voxels, surfels, and removed surface."""
 
 import math
 from functools import partial
@@ -19,25 +19,26 @@ from triquad_map.surface import SampleField, ShownByRays, nothing_shown
 from triquad_server.intake.rays import ScanRays
 from triquad_server.mapping.replay.region_setup import RegionSetup
 
-_CARVE_SHORT = 0.5  # voxels before its end, up to where a ray shows free space
-_CLEAR_SHORT = 2.5  # voxels before its end, up to where a ray shows that a surface is not there
+_CARVE_SHORT = 0.5  # voxels before its end up to which a ray shows free space
+_CLEAR_SHORT = 2.5  # voxels before its end up to which a ray shows that a surface is not there
 _FAR_THINNED_AT, _OPEN_THINNED_AT = 0.5, 0.25  # shares of the rays' length
 
 _NEW_SCANS = 10
-"""Scans after a surface was first seen, in which the field has had time to learn it."""
+"""The scans after a surface was first seen in which the field has had time to learn it."""
 
 _FEW_NEW = 2
-"""New surface in more voxels than these makes the region learn again what it had learnt."""
+"""New surface in more voxels than these makes the region learn all of its surface again."""
 
 _SURFELS_REFITTED = 8_000
-"""Surfels that are fitted again with each epoch while the field is trained: some 10 ms."""
+"""The number of surfels that are fitted again with each epoch while the field is trained: some
+10 ms."""
 
 
 class SeenSurface(NamedTuple):
-    """Where the rays of a scan ended in a region."""
+    """What the rays of a scan show of surface in a region."""
 
     marks: Marks
-    is_new: bool  # on surface that the field has had no time to learn
+    is_new: bool  # they ended on surface that the field has had no time to learn
 
 
 class PublishedEvidence(NamedTuple):
@@ -45,33 +46,33 @@ class PublishedEvidence(NamedTuple):
 
     evidence: FrozenEvidence
     surfels: SurfelMap
-    removed: Longs  # [M, 3] voxels whose surface went since the epoch before
+    removed: Longs  # [M, 3] voxels whose surface was removed since the epoch before
 
 
 class RegionEvidence:
     """The evidence of one region, and how it was published last."""
 
     def __init__(self, live: LiveEvidence, setup: RegionSetup, centre: Doubles, seed: int) -> None:
-        """``centre`` [3] is that of the region, map frame."""
+        """Make the evidence; ``centre`` [3] is that of the region, map frame."""
         self.live = live
         self._setup = setup
         self._centre = centre
         self._random = np.random.default_rng(seed)
-        self._scans = 0  # in which the region was seen
+        self._scans = 0  # scans in which the region was seen
         self._scans_learnt = 0  # of these, those before the field was trained last
         self._passed: list[Ints] = []  # where rays passed a surface since the last epoch
-        self._removed: list[Longs] = []  # voxels whose surface went since the last epoch
+        self._removed: list[Longs] = []  # voxels whose surface was removed since the last epoch
         self._surfels: SurfelMap | None = None  # of the last epoch
         self._fitted_to: int | None = None
-        """Version of the field to which all surfels are fitted; None: some to earlier ones."""
+        """The version of the field to which all surfels are fitted; None: some to earlier ones."""
 
-        self._is_restored = False  # and not yet published: the field alone tells where surface lies
+        self._is_restored = False  # and not yet published: only the field shows where surface lies
 
     @classmethod
     def restored(
         cls, record: Evidence, setup: RegionSetup, centre: Doubles, seed: int
     ) -> "RegionEvidence":
-        """The evidence of a record."""
+        """Make the evidence of a record."""
         live = LiveEvidence.from_record(1 << setup.field.depth, record)
         evidence = cls(live, setup, centre, seed)
         evidence._is_restored = True
@@ -79,11 +80,11 @@ class RegionEvidence:
 
     @property
     def size(self) -> EvidenceSize:
-        """How much it holds."""
+        """Return the size of the evidence."""
         return self.live.size
 
     def voxels(self, points: Doubles) -> Doubles:
-        """Voxel coordinates [N, 3] of points [N, 3], map frame."""
+        """Return the voxel coordinates [N, 3] of points [N, 3], map frame."""
         return self._setup.field.leaf_coordinates(points - self._centre)
 
     def scan_taken(self, rays: ScanRays, stamp_s: int) -> SeenSurface:
@@ -114,13 +115,13 @@ class RegionEvidence:
         return SeenSurface(marks, is_new)
 
     def step_taken(self) -> None:
-        """The field was trained on what was seen so far."""
+        """Record that the field was trained on what was seen so far."""
         self._scans_learnt = self._scans
 
     def published(
         self, samples: SampleField, version: int, epoch: int, *, is_settled: bool
     ) -> PublishedEvidence:
-        """The evidence as it is now, to be published with ``epoch``.
+        """Return the evidence as it is now, to be published with ``epoch``.
 
         Args:
             samples: the field, in voxels.
@@ -152,7 +153,7 @@ class RegionEvidence:
         self.live.clear(self.voxels(low[None])[0], self.voxels(high[None])[0])
 
     def _thinned(self, origin: Doubles, ends: Doubles, share: float) -> Doubles:
-        """Some of the rays to ``ends`` [N, 3]: one per voxel at a share of their length.
+        """Return some of the rays to ``ends`` [N, 3]: one per voxel at a share of their length.
 
         Nearer, they leave no gaps. The voxels are shifted from scan to scan, so that a robot at
         rest uses other rays each time.
@@ -170,12 +171,12 @@ class RegionEvidence:
         *,
         is_settled: bool,
     ) -> SurfelMap:
-        """The surfels of an epoch; once the region has settled, all are fitted to its field."""
+        """Return the surfels of an epoch; once the region has settled, all fitted to its field."""
         most: int | None = None
         shown: ShownByRays = nothing_shown
         if not is_settled or self._fitted_to == version:
             most = 0 if is_settled else _SURFELS_REFITTED
-            since = max(1, self._scans_learnt - _NEW_SCANS)  # and not of before a restart
+            since = max(1, self._scans_learnt - _NEW_SCANS)  # and not from before a restart
             shown = partial(self.live.ray_surfels, since=since)
         if self._surfels is None:
             return first_surfels(evidence, samples, epoch, shown)

@@ -1,4 +1,4 @@
-"""Which regions a scan reaches."""
+"""Finds which regions a scan reaches."""
 
 import itertools
 import math
@@ -14,9 +14,9 @@ from triquad_server.intake.rays import ScanRays
 def regions_around(
     rays: ScanRays, there: Collection[RegionIndex], field: FieldSettings
 ) -> list[RegionIndex]:
-    """Regions whose cubes hold an end point or the sensor, and those in between that are there.
+    """Return regions whose cubes hold an end point or the sensor, and existing ones in between.
 
-    Rays that met nothing, and the robot, make no region: they are recorded in those there are.
+    Rays that met nothing, and the robot, make no region: they are recorded in existing ones.
     """
     half = field.region_side_m / 2
     pitch = field.region_pitch_m

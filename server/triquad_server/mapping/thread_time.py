@@ -1,4 +1,4 @@
-"""What a thread spends its time on."""
+"""Measures how a thread spends its time."""
 
 import threading
 import time
@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 
 class Activity(Enum):
-    """What the mapper's thread does."""
+    """An activity of the mapper's thread."""
 
     SCANS = "scans"  # taking them in
     TRAINING = "training"
@@ -19,7 +19,7 @@ class Activity(Enum):
 
 
 class Current(NamedTuple):
-    """What a thread does now."""
+    """The present activity of a thread."""
 
     activity: Activity
     for_s: float
@@ -27,19 +27,19 @@ class Current(NamedTuple):
 
 
 class ThreadTime:
-    """How a thread spends its time: that thread tells, any may ask."""
+    """Measures how a thread spends its time; that thread reports, any may query."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        """Idle at first; ``clock`` gives seconds that never run backwards."""
+        """Begin idle; ``clock`` gives seconds that never run backwards."""
         self._clock = clock
         self._lock = threading.Lock()
         self._spent_s = dict.fromkeys(Activity, 0.0)
         self._activity, self._since_s = Activity.IDLE, clock()
-        self._cpu_clock: int | None = None  # that of the thread, once it has told anything
-        self._computed_s = 0.0  # by the thread, until its activity began
+        self._cpu_clock: int | None = None  # that of the thread, once it has reported anything
+        self._computed_s = 0.0  # CPU time of the thread until its activity began
 
     def begin(self, activity: Activity) -> None:
-        """The thread turns to another activity, or begins the same again."""
+        """Record that the thread begins another activity, or the same again."""
         now, computed_s = self._clock(), time.thread_time()
         with self._lock:
             if self._cpu_clock is None:
@@ -48,21 +48,21 @@ class ThreadTime:
             self._activity, self._since_s, self._computed_s = activity, now, computed_s
 
     def current(self) -> Current:
-        """What the thread does now, and for how long it has."""
+        """Return what the thread does now, and for how long it has."""
         with self._lock:
             for_s = self._clock() - self._since_s
             waited_s = max(0.0, for_s - self._computed_since_s())
             return Current(self._activity, for_s, waited_s)
 
     def spent_s(self) -> dict[str, float]:
-        """Seconds so far, by activity, with what goes on now."""
+        """Return the seconds so far, by activity, with the present one."""
         with self._lock:
             spent_s = dict(self._spent_s)
             spent_s[self._activity] += self._clock() - self._since_s
         return {activity.value: seconds for activity, seconds in spent_s.items()}
 
     def _computed_since_s(self) -> float:
-        """For how long the thread has computed since its activity began."""
+        """Return for how long the thread has computed since its activity began."""
         if self._cpu_clock is None:
             return 0.0
         try:

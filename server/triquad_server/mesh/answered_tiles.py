@@ -1,4 +1,4 @@
-"""Tiles as they were answered with, for whoever asks for the same epoch next."""
+"""Keeps tiles that were sent in replies, for the next client that requests the same epoch."""
 
 import threading
 from dataclasses import dataclass
@@ -10,30 +10,30 @@ from triquad_map.compiled.mesh.tile_lattice import TileIndex
 
 @dataclass(frozen=True)
 class AskedTile:
-    """What is asked of a tile."""
+    """The parameters of a requested tile."""
 
-    level: int  # of detail
+    level: int  # level of detail
     index: TileIndex
-    fill_m: float  # how far holes are filled in it
+    fill_m: float  # length up to which holes are filled in it
 
 
 class AnsweredTile(NamedTuple):
-    """A tile as it travels."""
+    """A tile in its transmitted form."""
 
-    data: bytes  # of triquad_format.wire.tile_codec
+    data: bytes  # encoded by triquad_format.wire.tile_codec
     filled: Bytes | None  # [F] 1 where a face fills a hole; None: none was to be filled
 
     @property
     def nbytes(self) -> int:
-        """Bytes of memory that it takes."""
+        """The bytes of memory that the tile takes."""
         return len(self.data) + (0 if self.filled is None else self.filled.nbytes)
 
 
 class AnsweredTiles:
-    """Tiles of one epoch, the newest of which any was asked for; safe for any thread.
+    """Keeps tiles of one epoch, the newest of which any was requested; safe for any thread.
 
-    Those that come first stay. Others would push out each other where all do not fit, since who
-    asks for a mesh asks for all tiles in their order.
+    Those that come first stay. Otherwise they would push out each other where all do not fit, since
+    a client that requests a mesh requests all tiles in their order.
     """
 
     def __init__(self, limit: int) -> None:
@@ -45,7 +45,7 @@ class AnsweredTiles:
         self.nbytes = 0
 
     def get(self, epoch: int, asked: AskedTile) -> AnsweredTile | None:
-        """The tile of an epoch as it was put; None where it was not, or is gone."""
+        """Return the tile of an epoch as it was put; None if it is not there."""
         with self._lock:
             return self._tiles.get(asked) if epoch == self._epoch else None
 

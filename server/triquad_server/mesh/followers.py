@@ -19,41 +19,41 @@ from triquad_server.fair_queue import Owner, first_to_go
 from triquad_server.mesh.tile_level import CachedTile
 
 BURST_S = 1.0
-"""A client that asked for nothing for so long may be sent as many seconds' worth at once."""
+"""The seconds of silence after which a client may be sent as many seconds' worth at once."""
 
 MAX_HELD_BYTES = 64_000_000
-"""Of all requests that are held together; more are refused, of the client that has most."""
+"""The memory of all pending requests; more are refused, of the client that has most."""
 
 _REFRESH_GRACE_S = 10.0
-"""So long after its deadline, a request may wait for the epoch that was the newest when it came to
-be refreshed from; that takes a fraction of this."""
+"""The seconds after its deadline that a request may wait for the cache to be refreshed from the
+epoch that was the newest when it came; a refresh takes a fraction of this."""
 
 _FOLLOWER_BYTES, _KNOWN_BYTES = 4096, 300
-"""Of one that is held, and of each tile that it names as known."""
+"""The memory of a pending request, and of each tile that it names as known."""
 
 
 class PendingRequest(Protocol):
-    """A request for updates, which gets one answer: of the network, or of this process."""
+    """A request for updates, which gets one answer, from the network or from this process."""
 
     @property
     def size(self) -> int:
-        """Bytes that it takes while it is held."""
+        """The bytes that it takes while it is pending."""
 
     @property
     def owner(self) -> Owner:
-        """Whose it is."""
+        """The owner of the request."""
 
     def read(self, kind: type[TileUpdatesRequest]) -> TileUpdatesRequest:
-        """What is asked for."""
+        """Return the decoded message of the request."""
 
     def answer(self, message: TileUpdates) -> None:
-        """Give the answer."""
+        """Send the answer."""
 
     def refuse(self, code: str, text: str) -> None:
-        """Say why there is none."""
+        """Answer with an error."""
 
     def fail(self, error: Exception) -> None:
-        """Say that an internal error, which is being handled, is why there is none."""
+        """Answer that an internal error occurred, which is being handled."""
 
 
 @dataclass(eq=False)
@@ -67,20 +67,20 @@ class Follower:
     bytes_per_s: float
     restart: bool  # it knows tiles of another server: they are void
     known_to: int  # it knows everything up to this revision
-    known: dict[TileIndex, int]  # versions of tiles that it has whatever the revision
+    known: dict[TileIndex, int]  # versions of tiles that it has, whatever the revision
     nothing_at: tuple[int, int] | None = None  # state of the cache that had nothing for it
 
     def is_current(self, epoch: int) -> bool:
-        """Whether ``epoch`` is no older than the newest when the request came."""
+        """Return whether ``epoch`` is no older than the newest when the request came."""
         return epoch >= self.needs_epoch
 
     def late_s(self, epoch: int) -> float:
-        """When it has to be answered, with tiles or without, by a cache that knows ``epoch``."""
+        """Return when it must be answered, with tiles or not, by a cache that knows ``epoch``."""
         return self.deadline_s + (0.0 if self.is_current(epoch) else _REFRESH_GRACE_S)
 
     @property
     def nbytes(self) -> int:
-        """Memory that it takes while it is held, about."""
+        """The approximate memory that it takes while it is pending."""
         return _FOLLOWER_BYTES + 2 * self.request.size + len(self.known) * _KNOWN_BYTES
 
 
@@ -91,7 +91,7 @@ def new_follower(
     server: str,
     epoch: int,
 ) -> Follower:
-    """A request that begins to wait; it has passed its checks.
+    """Return a pending request; it has passed its checks.
 
     ``server`` is the name that replies carry, ``epoch`` the newest.
     """
@@ -145,9 +145,9 @@ def check_updates(asks: TileUpdatesRequest, server: str, revision: int) -> None:
 
 
 def one_too_many(pending: Sequence[Follower], sending: int, limit: int) -> tuple[int, str] | None:
-    """Which of the followers is to be refused, and why: the newest of the client that has most.
+    """Return which follower is to be refused, and why: the newest of the client with most.
 
-    None: with the replies that are being sent they are no more than the ``limit``, and they do not
+    It is None if, with the replies being sent, they are no more than the ``limit``, and do not
     take too much memory.
     """
     held = sum(follower.nbytes for follower in pending)
@@ -175,16 +175,16 @@ def _check_held(asks: TileUpdatesRequest) -> None:
 
 @dataclass
 class TileReply:
-    """Tiles on their way to one follower."""
+    """Collects tiles for a reply to one follower."""
 
-    complete: bool  # nothing more waits
-    revision: int  # up to which the follower knows everything once it has the reply
+    complete: bool  # nothing more is pending
+    revision: int  # revision up to which the follower knows everything once it has the reply
     removed: list[TileIndex] = field(default_factory=list)
     tiles: list[CachedTile] = field(default_factory=list)
-    data: list[bytes] = field(default_factory=list)  # of each tile
+    data: list[bytes] = field(default_factory=list)  # epoch of each tile
 
     def fits(self, data: bytes, limit: float) -> bool:
-        """Whether a tile may be added: the first always may."""
+        """Return whether a tile may be added: the first always may."""
         return not data or not self.data or sum(map(len, self.data)) + len(data) <= limit
 
     def add(self, tile: CachedTile, data: bytes) -> None:
@@ -199,7 +199,7 @@ class TileReply:
     def message(
         self, *, server: str, epoch: int, restart: bool, lattice: TileLattice
     ) -> TileUpdates:
-        """The reply as it travels."""
+        """Return the message of the reply."""
         return TileUpdates(
             server=server,
             revision=self.revision,

@@ -1,4 +1,4 @@
-"""Where the surface of a map changed: what mesh tiles have to follow."""
+"""Finds where the surface of a map changed, so that mesh tiles can be updated."""
 
 from dataclasses import dataclass, replace
 
@@ -13,22 +13,22 @@ from triquad_map.compiled.team import Team
 from triquad_server.engine.memory import FrozenField
 from triquad_server.epochs.epoch import FrozenRegion
 
-_KEY_BITS = 20  # of each coordinate of a voxel, or of a group, in its region
+_KEY_BITS = 20  # bits of each coordinate of a voxel, or of a group, in its region
 
 _LEFT_SHARE = 0.02
 _LEFT_VOXELS = 4
-"""Where the surface left so many voxels of a group, and that share of them, something is gone; of
-fewer, training is the cause, which never leaves all voxels alone."""
+"""Something was removed if the surface left this many voxels of a group, and that share of them; if
+fewer, the cause is training, during which some always change."""
 
 _FARTHER = 2
-"""Quarters of a voxel by which what was seen of it must grow to be told."""
+"""The quarters of a voxel by which what was seen of it must grow to be reported."""
 
 
 @dataclass(frozen=True)
 class Changes:
-    """Where the surface changed. Positions are metres in the map frame."""
+    """The changes of the surface; positions are metres in the map frame."""
 
-    places: Doubles  # [N, 3] centres of voxels whose surface is new or gone
+    places: Doubles  # [N, 3] centres of voxels whose surface is new or removed
     drifted: Doubles  # [G, 3] centres of groups whose surface moved as a whole
 
 
@@ -36,10 +36,10 @@ class Changes:
 class _Voxels:
     """The voxels of a region with seen surface: a map has hundreds of thousands of them."""
 
-    keys: Longs  # [V] increasing; they tell where each is
+    keys: Longs  # [V] increasing; they encode the positions
     margins: NDArray[np.int8]  # [V, 6] quarters of a voxel beyond all ends
     groups: Doubles  # [G, 3] centres of the groups
-    group: Ints  # [V] of each voxel
+    group: Ints  # [V] group of each voxel
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class _Recorded:
     evidence: FrozenEvidence
     voxels: _Voxels
     offsets: Floats | None
-    """[V] metres from each voxel's centre to the surface; None: what the engine tells."""
+    """[V] metres from each voxel's centre to the surface; None: to be computed by the engine."""
 
     margins: NDArray[np.int8]  # [V, 6] of the voxels
 
@@ -78,7 +78,7 @@ class SurfaceChanges:
         self._recorded: dict[RegionIndex, _Recorded] = {}
 
     def since_last(self, regions: tuple[FrozenRegion, ...]) -> Changes:
-        """What changed since the last call."""
+        """Return what changed since the last call."""
         before, self._recorded = self._recorded, {}
         nothing = np.zeros((0, 3))
         found = [Changes(nothing, nothing)]
@@ -103,7 +103,7 @@ class SurfaceChanges:
         )
 
     def _compare(self, old: _Recorded, new: _Recorded) -> tuple[_Recorded, Changes]:
-        """What is to be recorded, and what changed."""
+        """Return what is to be recorded, and what changed."""
         voxels = new.voxels
         now, told = self._offsets(new), self._offsets(old)
         before, margins = told, old.margins
@@ -138,7 +138,7 @@ class SurfaceChanges:
         )
 
     def _seen(self, region: FrozenRegion, old: _Recorded | None) -> _Recorded:
-        """A region without offsets: whoever asks for the first list of tiles needs none."""
+        """Return a region without offsets, which the first list of tiles does not need."""
         if old is not None and old.evidence is region.evidence:
             voxels = old.voxels
         else:
@@ -166,12 +166,12 @@ class SurfaceChanges:
         return _Voxels(keys, margins, groups, group.ravel().astype(np.int32))
 
     def _centres(self, centre: Doubles, keys: Longs) -> Doubles:
-        """The centres [N, 3] of voxels of the region around ``centre``, metres, map frame."""
+        """Return the centres [N, 3] of voxels of the region at ``centre``, metres, map frame."""
         corner = centre - self._settings.region_side_m / 2
         return corner + (_cells(keys) + 0.5) * self._settings.leaf_m
 
     def _offsets(self, recorded: _Recorded) -> Floats:
-        """How far [V] the surface is from voxels' centres; at most a voxel: beyond are others."""
+        """Return the distance [V] of the surface from voxels' centres; at most a voxel."""
         if recorded.offsets is not None:
             return recorded.offsets
         centres = self._centres(recorded.centre, recorded.voxels.keys)
@@ -190,11 +190,11 @@ class SurfaceChanges:
 
 
 def _key(cells: Longs) -> Longs:
-    """One number for each of cells [N, 3], none of them negative."""
+    """Return one number for each of cells [N, 3], none of them negative."""
     return (cells[:, 0] << 2 * _KEY_BITS) | (cells[:, 1] << _KEY_BITS) | cells[:, 2]
 
 
 def _cells(keys: Longs) -> Longs:
-    """The inverse of :func:`_key`."""
+    """Return the inverse of :func:`_key`."""
     x, y, z = keys >> 2 * _KEY_BITS, keys >> _KEY_BITS, keys
     return np.stack([x, y, z], axis=1) & ((1 << _KEY_BITS) - 1)

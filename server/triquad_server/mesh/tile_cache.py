@@ -1,4 +1,4 @@
-"""The mesh tiles of a map as they travel: made once, and the same bytes for everybody."""
+"""Caches the mesh tiles of a map in transmitted form: made once, and the same for all clients."""
 
 import hashlib
 import threading
@@ -22,11 +22,11 @@ from triquad_server.mesh.tile_level import CachedTile, TileBytes, TileDelta, Til
 from triquad_server.settings import MeshSettings
 
 _ANSWERED_BYTES = 8_000_000
-"""Of tiles of one epoch that somebody asked for by name: some 230 m of street."""
+"""The memory of tiles of one epoch that were requested by name: some 230 m of street."""
 
 
 def tile_lattice(settings: MeshSettings, level: int) -> TileLattice:
-    """The lattice of a level of detail, ``0 <= level < LEVELS``."""
+    """Return the lattice of a level of detail, ``0 <= level < LEVELS``."""
     finest = TileLattice(settings.cell_m, settings.tile_cells, settings.reach_m)
     return finest.at_level(level)
 
@@ -36,45 +36,45 @@ def _touch(first: TileIndex, second: TileIndex) -> bool:
 
 
 class TileCache:
-    """Makes tiles when they are asked for, and keeps them until their surface changes.
+    """Makes tiles when they are requested, and keeps them until their surface changes.
 
-    One thread has tiles made and asks for what is new; any thread may ask what changed.
+    One thread has tiles made and requests what is new; any thread may ask what changed.
     """
 
     def __init__(self, settings: MeshSettings, team: Team) -> None:
-        """``team`` shares the work of making tiles."""
+        """Begin with no tiles; ``team`` shares the work of making tiles."""
         self._lock = threading.Lock()
         self._team = team
         self._settings = settings
         self._levels = [TileLevel(tile_lattice(settings, level)) for level in range(LEVELS)]
         self._changes: SurfaceChanges | None = None
-        self.epoch = -1  # number of that of the last refresh
-        self._view: ComposedView | None = None  # of which tiles are made
-        self.revision = 0  # how often bytes of any tile came to differ
+        self.epoch = -1  # number of the epoch of the last refresh
+        self._view: ComposedView | None = None  # epoch from which tiles are made
+        self.revision = 0  # number of times that bytes of any tile came to differ
         self.tiles_made = 0  # so far
         self._bytes = TileBytes(settings.cache_bytes)
-        # Those that are asked for by name.
+        # Those that are requested by name.
         self.answered = AnsweredTiles(min(_ANSWERED_BYTES, settings.cache_bytes))
 
     @property
     def made_from(self) -> int:
-        """Number of the epoch from which tiles are made; -1: of none, after :meth:`let_go`."""
+        """Return the number of the epoch from which tiles are made; -1 after :meth:`let_go`."""
         view = self._view
         return -1 if view is None else view.epoch
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the encoded tiles that are kept."""
+        """Return the bytes of the encoded tiles that are kept."""
         return self._bytes.size + self.answered.nbytes
 
     def lattice(self, level: int) -> TileLattice:
-        """Where the tiles of a level lie."""
+        """Return where the tiles of a level lie."""
         return self._levels[level].lattice
 
     def refresh(self, epoch: Epoch, *, to_make: bool = True) -> None:
-        """Find out what changed until ``epoch``; one older than the last changes nothing.
+        """Find what changed until ``epoch``; one older than the last changes nothing.
 
-        Tiles are made from it from now on, but for where none are made and none are to be
+        Tiles are made from it from now on, unless none are made and none are to be
         (``to_make``).
         """
         with self._lock:
@@ -84,12 +84,12 @@ class TileCache:
                 self._view = epoch.asked_with()
 
     def let_go(self) -> None:
-        """Hold no epoch for tiles to be made from, until the next refresh: it takes memory."""
+        """Keep no epoch for making tiles until the next refresh, since it takes memory."""
         with self._lock:
             self._view = None
 
     def changed(self, level: int, indices: NDArray[np.integer]) -> Longs:
-        """Epochs [T] in which the surface of tiles [T, 3] last changed; 0 where none was seen."""
+        """Return the epochs [T] when the surface of tiles [T, 3] last changed; 0: none was seen."""
         with self._lock:
             tiles = self._levels[level]
             epochs = [tiles.changed.get((x, y, z), 0) for x, y, z in indices.tolist()]
@@ -98,7 +98,7 @@ class TileCache:
     def delta(
         self, level: int, low: Doubles, high: Doubles, known_to: int, known: Mapping[TileIndex, int]
     ) -> TileDelta:
-        """What is new in a box to somebody who knows everything up to the revision ``known_to``.
+        """Return what is new in a box to a client that knows all up to revision ``known_to``.
 
         The box has the corners ``low`` and ``high`` [3], metres, map frame; ``known`` are versions
         of tiles that are known whatever the revision.
@@ -109,7 +109,7 @@ class TileCache:
             )
 
     def make_some(self, level: int, indices: Iterable[TileIndex]) -> list[TileIndex]:
-        """Make some tiles at the same time, one on each core, the first of ``indices`` among them.
+        """Make some tiles in parallel, one on each core, including the first of ``indices``.
 
         No two of them touch, so that none has to fit another that is not made yet.
         """
@@ -160,7 +160,7 @@ class TileCache:
         return tile
 
     def data(self, level: int, tile: CachedTile) -> bytes | None:
-        """The bytes of a tile, None where they are gone; it has to be made anew then."""
+        """Return the bytes of a tile; None if they were dropped, and it has to be made again."""
         with self._lock:
             return self._bytes.get((level, tile.index))
 
@@ -184,10 +184,10 @@ class TileCache:
         borders: Mapping[TileIndex, TileBorder],
         view: ComposedView,
     ) -> Iterator[TileBorder]:
-        """The borders to be taken over; tiles of others will have to be made again.
+        """Yield the borders to be taken over; tiles of others will have to be made again.
 
-        Those are others whose surface is no longer where it was: else two tiles in turns could
-        hold on to what neither has any more.
+        Those are others whose surface has moved: else two tiles in turns could
+        keep what neither has any more.
         """
         lattice = tiles.lattice
         corner = np.asarray(index) * lattice.cells

@@ -1,4 +1,4 @@
-"""The feed of mesh tiles: requests are pending, and hold up no worker, until there are tiles."""
+"""The feed of mesh tiles: requests are pending, and occupy no worker, until there are tiles."""
 
 import logging
 import math
@@ -30,15 +30,15 @@ from triquad_server.settings import MeshSettings
 _log = logging.getLogger(__name__)
 
 _STOPPING = "the server is stopping"
-_REPLY_BYTES = 1_000_000  # of the tiles of one reply; a single tile may be larger
+_REPLY_BYTES = 1_000_000  # bytes of the tiles of one reply; a single tile may be larger
 _HOLDS_S = 5.0
-"""For so long after the last follower an epoch is held, of which tiles may be made."""
+"""The seconds for which an epoch is kept for making tiles after the last follower."""
 
 _NOW_S = 0.0  # there may be something to do at once
-_SLICE_S = 0.2  # tiles are made so long for one follower, then for the next
+_SLICE_S = 0.2  # time for which tiles are made for one follower, then for the next
 _GIVE_WAY_S = 0.1
 _MAX_REFRESH_SHARE = 4
-"""Refreshing the cache takes at most one part in so many of the thread's time."""
+"""Refreshing the cache takes at most one part in this many of the thread's time."""
 
 
 class TileFeed:
@@ -75,18 +75,18 @@ class TileFeed:
 
     @property
     def queue(self) -> QueueMetrics:
-        """Followers that wait for tiles, or that tiles are being sent to."""
+        """Return the state of the queue of followers, including those being sent to."""
         with self._changed:
             return QueueMetrics(len(self._pending) + self._senders.sending, self._limit)
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the followers that wait."""
+        """Return the bytes of the followers that wait."""
         with self._changed:
             return sum(follower.nbytes for follower in self._pending)
 
     def close(self) -> None:
-        """Refuse what is pending, and end."""
+        """Refuse all pending requests, and end."""
         with self._changed:
             self._stopping = True
             self._changed.notify_all()
@@ -147,9 +147,9 @@ class TileFeed:
         return bool(self._pending) or self._stopping
 
     def _refresh(self) -> float:
-        """Find out what changed, where there may be something and it is time.
+        """Find what changed, if there may be something and a refresh is due.
 
-        Returns when to do so again, monotonic seconds; infinity: after the next epoch.
+        Return when to do so again, monotonic seconds; infinity: after the next epoch.
         """
         started = time.monotonic()
         newest = self._epochs.newest
@@ -169,7 +169,7 @@ class TileFeed:
         return math.inf if is_current else self._next_refresh_s
 
     def _serve_safely(self, follower: Follower) -> float:
-        """As :meth:`_serve`; an internal error ends this request only."""
+        """Do as :meth:`_serve`; an internal error ends this request only."""
         try:
             return self._serve(follower)
         except Exception as error:
@@ -183,7 +183,7 @@ class TileFeed:
     def _serve(self, follower: Follower) -> float:
         """Answer a follower, or make tiles for it, if that can be done now.
 
-        Returns when there may be more to do for it, monotonic seconds, unless something wakes the
+        Return when there may be more to do for it, monotonic seconds, unless something wakes the
         feed before: a new epoch, or a reply that was sent.
         """
         if self._senders.is_sending_to(follower):
@@ -211,7 +211,7 @@ class TileFeed:
         return _NOW_S
 
     def _answer_if_late(self, follower: Follower, *, knows_all: bool) -> float:
-        """Answer a follower without tiles, if its time is over; returns when it is."""
+        """Answer a follower without tiles, if its time is over; return when it is."""
         late_s = follower.late_s(self._cache.epoch)
         if time.monotonic() >= late_s:
             complete = knows_all and follower.is_current(self._cache.epoch)
@@ -230,7 +230,7 @@ class TileFeed:
                 del left[index]
 
     def _filled(self, follower: Follower, delta: TileDelta) -> TileReply:
-        """As many of the tiles as a reply may have, at least one."""
+        """Return a reply with as many of the tiles as it may have, at least one."""
         limit = min(
             follower.asks.max_bytes,
             _REPLY_BYTES,
@@ -241,7 +241,7 @@ class TileFeed:
         )
         for tile in delta.ready:
             data = b"" if tile.empty else self._encoded(follower.asks.level, tile)
-            if data is None:  # its bytes are others now: a later delta has it
+            if data is None:  # its bytes differ now: a later delta has it
                 reply.complete = False
             elif not reply.fits(data, limit):
                 reply.complete = False
@@ -254,7 +254,7 @@ class TileFeed:
         return reply
 
     def _encoded(self, level: int, tile: CachedTile) -> bytes | None:
-        """The bytes of a tile; None where they were gone and the tile has others now."""
+        """Return the bytes of a tile; None if they were dropped and the tile has others now."""
         data = self._cache.data(level, tile)
         if data is not None:
             return data

@@ -1,4 +1,4 @@
-"""The tiles of one level of detail as they were made, and which of them are out of date."""
+"""Keeps the tiles of one level of detail as they were made, and which of them are out of date."""
 
 from collections import OrderedDict
 from collections.abc import Mapping
@@ -16,11 +16,11 @@ _AROUND = [
 ]
 
 TileKey = tuple[int, TileIndex]
-"""Level of detail and index of a tile."""
+"""The level of detail and the index of a tile."""
 
 
 class TileBytes:
-    """Encoded tiles in memory; those unused for longest are dropped where there are too many."""
+    """Keeps encoded tiles in memory; those unused for longest are dropped if there are too many."""
 
     def __init__(self, limit: int) -> None:
         """Keep at most ``limit`` bytes, or a single tile that is larger."""
@@ -29,7 +29,7 @@ class TileBytes:
         self._data: OrderedDict[TileKey, bytes] = OrderedDict()  # longest unused first
 
     def get(self, key: TileKey) -> bytes | None:
-        """The bytes of a tile, None where they are gone."""
+        """Return the bytes of a tile; None if they were dropped."""
         data = self._data.get(key)
         if data is not None:
             self._data.move_to_end(key)
@@ -46,7 +46,7 @@ class TileBytes:
 
 @dataclass(frozen=True)
 class CachedTile:
-    """A tile that was made. Its bytes may be gone; what neighbours need of it never is."""
+    """A tile that was made; its bytes may be dropped, what neighbours need of it never is."""
 
     index: TileIndex
     version: int  # epoch of which its bytes are
@@ -59,22 +59,22 @@ class CachedTile:
 
 @dataclass(frozen=True)
 class TileDelta:
-    """What somebody does not know of the tiles of a box."""
+    """The changes of the tiles of a box for one client."""
 
     ready: list[CachedTile]  # by increasing revision; empty ones are to be removed
-    removed: list[TileIndex]  # that the other side has, and that were never here
+    removed: list[TileIndex]  # known to the client, and never in this cache
     missing: list[TileIndex]  # that were never made
-    outdated: list[TileIndex]  # that have to be made anew, those made longest ago first
-    revision: int  # who knows all of this knows everything up to here
+    outdated: list[TileIndex]  # to be made again, those made longest ago first
+    revision: int  # a client with all of this knows everything up to here
 
     @property
     def to_make(self) -> list[TileIndex]:
-        """All that have to be made, the most needed first."""
+        """The tiles that have to be made, the most needed first."""
         return self.missing + self.outdated
 
 
 class TileLevel:
-    """The tiles of one level of detail: which there are, and which of them are out of date."""
+    """Keeps the tiles of one level of detail, and which of them are out of date."""
 
     def __init__(self, lattice: TileLattice) -> None:
         self.lattice = lattice
@@ -83,7 +83,7 @@ class TileLevel:
         self._indices = np.zeros((0, 3), np.int64)  # of ``changed``
 
     def clean(self, index: TileIndex) -> CachedTile | None:
-        """The tile where it shows what the map has; None where it has to be made."""
+        """Return the tile if it shows the current surface; None if it has to be made."""
         tile = self.tiles.get(index)
         return tile if tile is not None and self.changed.get(index, 0) <= tile.made else None
 
@@ -108,7 +108,7 @@ class TileLevel:
         known: Mapping[TileIndex, int],
         revision: int,
     ) -> TileDelta:
-        """As :meth:`TileCache.delta`; ``revision`` is that of the newest tile of any level."""
+        """Return :meth:`TileCache.delta`; ``revision`` is that of the newest tile of any level."""
         ready: list[CachedTile] = []
         missing: list[TileIndex] = []
         outdated: list[TileIndex] = []
@@ -128,10 +128,10 @@ class TileLevel:
         return TileDelta(ready, removed, sorted(missing), outdated=outdated, revision=revision)
 
     def borders_around(self, index: TileIndex) -> dict[TileIndex, TileBorder]:
-        """What a tile has to agree with, by the tiles whose it is, in its own lattice.
+        """Return the borders with which a tile has to agree, by their tiles, in its own lattice.
 
-        That is its own border where only its bytes are gone, and those of all neighbours that show
-        what the map has: these agree with each other. The others will be made to fit it.
+        That is its own border if only its bytes were dropped, and those of all neighbours that show
+        the current surface: these agree with each other. The others will be made to fit it.
         """
         found: dict[TileIndex, TileBorder] = {}
         own = self.clean(index)

@@ -1,4 +1,4 @@
-"""Answers to queries of mesh tiles, and of which there are."""
+"""Answers queries of mesh tiles, and of their list."""
 
 import numpy as np
 from triquad_format.errors import RefusedError
@@ -18,19 +18,19 @@ from triquad_server.mesh.answered_tiles import AnsweredTile, AskedTile
 from triquad_server.mesh.tile_cache import TileCache
 
 MAX_TILES = 1_000_000
-"""Tiles of one list."""
+"""The most tiles of one list."""
 
 
 class TileQueries:
     """Answers mesh queries."""
 
     def __init__(self, epochs: EpochHistory, cache: TileCache) -> None:
-        """``cache`` knows when tiles changed."""
+        """Make the handler; ``cache`` knows when tiles changed."""
         self._epochs = epochs
         self._cache = cache
 
     def tiles(self, request: TileListRequest) -> TileList:
-        """The tiles that meet the request's box.
+        """Return the tiles that meet the request's box.
 
         Raises:
             RefusedError: a field is out of range, the epoch is gone, or the tiles are too many.
@@ -54,7 +54,7 @@ class TileQueries:
         )
 
     def mesh(self, request: MeshRequest) -> MeshReply:
-        """The meshes of some tiles.
+        """Return the meshes of some tiles.
 
         Raises:
             RefusedError: a field is out of range, or the epoch is gone.
@@ -63,7 +63,7 @@ class TileQueries:
         check_level(request.level)
         _check_fill(request.fill_m)
         epoch = self._epochs.get(request.epoch)
-        # On the thread that answers alone: of a box full of tiles, others make more of them.
+        # In the answering thread alone: for a box full of tiles, other threads make more of them.
         view, lattice = epoch.asked_with(), self._cache.lattice(request.level)
         tiles = []
         for x, y, z in request.tiles.tolist():
@@ -80,7 +80,7 @@ class TileQueries:
         )
 
     def _tile(self, view: ComposedView, asked: AskedTile, lattice: TileLattice) -> AnsweredTile:
-        """The mesh of one tile, as it was answered before or made anew."""
+        """Return the mesh of one tile, as it was sent before or made now."""
         kept = self._cache.answered.get(view.epoch, asked)
         if kept is not None:
             return kept
@@ -121,9 +121,9 @@ def _check_fill(fill_m: float) -> None:
 
 
 def surface_tiles(epoch: Epoch, lattice: TileLattice, fill_m: float = 0.0) -> Ints:
-    """Tiles [T, 3], sorted, that meet a block with seen surface, or what is meshed around it.
+    """Return the tiles [T, 3], sorted, that meet a block with seen surface, or the mesh around it.
 
-    That is more where the surface is continued up to ``fill_m``.
+    There are more if the surface is continued up to ``fill_m``.
     """
     settings = epoch.field_settings
     side_m = BLOCK_VOXELS * settings.leaf_m

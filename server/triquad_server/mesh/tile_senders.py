@@ -1,4 +1,4 @@
-"""Sending replies to clients that follow the mesh. One that does not read holds up no other."""
+"""Sends replies to clients that follow the mesh; one that does not read delays no other."""
 
 import logging
 import math
@@ -19,22 +19,22 @@ from triquad_server.process.threads import NICENESS, submit
 _log = logging.getLogger(__name__)
 
 _SENDERS = 16
-"""Replies on their way at a time: clients that do not read them hold up no others."""
+"""The number of replies sent at a time: clients that do not read them delay no others."""
 
 MAX_CLIENTS = 1024
-"""Of more, those heard of longest ago are forgotten."""
+"""The number of clients that are kept; the one heard of longest ago is removed."""
 
 
 @dataclass
 class _Bucket:
-    """What a client may be sent; less than nothing where it was sent more."""
+    """The bytes that a client may be sent; negative if it was sent more."""
 
     tokens: float  # bytes
     at_s: float
 
 
 class Bandwidth:
-    """How many bytes a second each client is sent: a token bucket for each, by its name.
+    """Limits the bytes per second to each client: a token bucket for each, by its name.
 
     Times are monotonic seconds. A rate of infinity sets no limit.
     """
@@ -43,11 +43,11 @@ class Bandwidth:
         self._buckets: OrderedDict[str, _Bucket] = OrderedDict()
 
     def may_send(self, client: str, bytes_per_s: float, now_s: float) -> bool:
-        """Whether it is time to send to a client again."""
+        """Return whether a client may be sent to again."""
         return math.isinf(bytes_per_s) or self._filled(client, bytes_per_s, now_s).tokens > 0
 
     def ready_s(self, client: str, bytes_per_s: float, now_s: float) -> float:
-        """When it will be time to send to a client again, monotonic seconds."""
+        """Return when a client may be sent to again, monotonic seconds."""
         if self.may_send(client, bytes_per_s, now_s):
             return now_s
         return now_s + (1.0 - self._buckets[client].tokens) / bytes_per_s
@@ -69,10 +69,10 @@ class Bandwidth:
 
 
 class TileSenders:
-    """Sends replies, on threads of its own, to each client as fast as it may be sent to."""
+    """Sends replies, on threads of its own, to each client at its permitted rate."""
 
     def __init__(self, on_sent: Callable[[], None]) -> None:
-        """``on_sent`` is called after each reply, in the thread that sent it."""
+        """Make the senders; ``on_sent`` is called after each reply, in the thread that sent it."""
         self._on_sent = on_sent
         self._bandwidth = Bandwidth()
         self._lock = threading.Lock()
@@ -83,24 +83,24 @@ class TileSenders:
 
     @property
     def sending(self) -> int:
-        """Replies that are not sent yet."""
+        """Return the number of replies that are not sent yet."""
         with self._lock:
             return self._sending.total()
 
     def is_sending_to(self, follower: Follower) -> bool:
-        """Whether a reply to the same client is on its way: the next waits until it has arrived."""
+        """Return whether a reply to the same client is being sent: the next waits for it."""
         with self._lock:
             return self._sending[follower.request.owner] > 0
 
     def ready_s(self, follower: Follower) -> float:
-        """When a follower's client may be sent something again, monotonic seconds: now, if it may.
+        """Return when a follower's client may be sent to again, monotonic seconds: now, if it may.
 
         For one thread.
         """
         return self._bandwidth.ready_s(follower.asks.client, follower.bytes_per_s, time.monotonic())
 
     def send(self, follower: Follower, reply: TileUpdates) -> None:
-        """Send a reply, in the background. For the thread that asks :meth:`ready_s`."""
+        """Send a reply, in the background; for the thread that calls :meth:`ready_s`."""
         self._bandwidth.spend(
             follower.asks.client, len(reply.data), follower.bytes_per_s, now_s=time.monotonic()
         )

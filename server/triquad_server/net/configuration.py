@@ -1,4 +1,4 @@
-"""The Zenoh configuration of a server: its options, above a file, above what is safe."""
+"""The Zenoh configuration of a server: options first, then a file, then safe defaults."""
 
 import json
 from collections.abc import Mapping
@@ -16,20 +16,20 @@ from triquad_server.errors import ServerError
 _CONNECT_MS = 5000  # a router that was started together with the server may need a moment
 
 _LINKS: Mapping[str, Any] = {
-    # A link that is opened and then says nothing holds a place among those that are pending.
+    # A link that is opened and then sends nothing takes up one of the pending places.
     "transport/unicast/accept_timeout": 5000,
     "transport/unicast/accept_pending": 1000,
     "transport/unicast/max_sessions": 500,
 }
 
 _NO_SCOUTING = {"scouting/delay": 1}
-"""For how long a router waits for others as it starts [ms], 500 by default. Where it looks
-for nobody, nobody comes."""
+"""How long a router waits for others as it starts [ms], 500 by default; without scouting, none
+come."""
 
 
 @dataclass(frozen=True)
 class NetworkOptions:
-    """Options that are given to the Zenoh session; what is left out is as the file has it."""
+    """Options of the Zenoh session; those that are left out are as the file has them."""
 
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
@@ -40,7 +40,7 @@ class NetworkOptions:
 
 @dataclass(frozen=True)
 class NetworkDefaults:
-    """What a server lets in, where a file does not say otherwise."""
+    """The network defaults of a server, where a file does not set others."""
 
     grants: tuple[Grant, ...]  # who may do what
     max_message_bytes: int
@@ -55,7 +55,7 @@ class Configuration:
 
     @property
     def mode(self) -> str:
-        """``router``, ``peer`` or ``client``."""
+        """The mode of the session: ``router``, ``peer`` or ``client``."""
         return str(json.loads(self.zenoh.get_json("mode")))
 
     @property
@@ -70,11 +70,11 @@ class Configuration:
 
     @property
     def listens_beyond(self) -> bool:
-        """Whether others than programs of this machine can connect."""
+        """Return whether others than programs of this machine can connect."""
         return not all(map(is_of_this_machine, self.listen))
 
     def _endpoints(self, path: str) -> tuple[str, ...]:
-        """A list of endpoints, which Zenoh lets differ by mode."""
+        """Return a list of endpoints, which Zenoh lets differ by mode."""
         endpoints = json.loads(self.zenoh.get_json(path))
         if isinstance(endpoints, dict):
             endpoints = endpoints.get(self.mode) or []
@@ -82,9 +82,9 @@ class Configuration:
 
 
 def configuration(options: NetworkOptions, defaults: NetworkDefaults) -> Configuration:
-    """The configuration of a server.
+    """Return the configuration of a server.
 
-    What the options leave out is as the file has it; and what both leave out, as is safe: a router
+    What the options leave out is as the file has it; what both leave out is safe: a router
     that only this machine reaches, that neither looks for others nor is found, and that takes no
     more than it needs.
 
@@ -125,7 +125,7 @@ def _of_options(options: NetworkOptions) -> dict[str, Any]:
         given["listen/exit_on_failure"] = True
     if options.connect:
         given["connect/endpoints"] = options.connect
-        # By default a router goes on without, and says nothing.
+        # By default a router continues without, and reports nothing.
         given["connect/timeout_ms"] = _CONNECT_MS
         given["connect/exit_on_failure"] = True
     return given
@@ -141,5 +141,5 @@ def _safe(defaults: NetworkDefaults) -> dict[str, Any]:
 
 
 def first_line(error: Exception) -> str:
-    """The text of an error without Zenoh's source locations."""
+    """Return the text of an error without Zenoh's source locations."""
     return " ".join(str(error).split(" at /", 1)[0].split())

@@ -8,17 +8,18 @@ from triquad_server.errors import ListenError
 from triquad_server.net.configuration import Configuration, first_line
 
 _ZENOH_THREADS = "(rx: (worker_threads: 4), tx: (worker_threads: 8))"
-"""Of Zenoh's threads, as its environment variable ``ZENOH_RUNTIME`` has them.
+"""The number of Zenoh's threads, in the form of its environment variable ``ZENOH_RUNTIME``.
 
 Zenoh gives up a client that takes nothing after five seconds, and the thread that sends to it then
-waits for whoever else has something for it. By default all clients share one such thread: replies
-to others were late as well, and their links were closed in turn. Those that receive are more than
-the usual two for the same reason: many megabytes of one client must not come before all others.
+waits for any others that have something for it. By default all clients share one such thread:
+replies to others were late as well, and their links were closed in turn. Those that receive are
+more than the usual two for the same reason: many megabytes of one client must not come before all
+others.
 """
 
 
 def open_session(config: Configuration) -> zenoh.Session:
-    """An open Zenoh session.
+    """Open a Zenoh session.
 
     Raises:
         ListenError: an endpoint cannot be listened on, or none to connect to answers.

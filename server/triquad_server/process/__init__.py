@@ -1,1 +1,1 @@
-"""The server as a process: its log, who started it and asks it to stop, memory, threads, files."""
+"""The server as a process: log, service manager, stop, memory, threads, and files."""

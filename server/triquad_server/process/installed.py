@@ -1,4 +1,4 @@
-"""What the server needs in addition to the base installation."""
+"""Checks for the libraries that the server needs in addition to the base installation."""
 
 import importlib.util
 
@@ -8,7 +8,7 @@ _NEEDED = ("numba", "pydantic_settings")
 
 
 def require_libraries() -> None:
-    """Tell what to install, before anything is imported that needs it.
+    """Report what to install, before anything is imported that needs it.
 
     Raises:
         ServerError: a library is missing.

@@ -1,4 +1,4 @@
-"""How much memory this process uses, and that it gives back what it has freed."""
+"""Measures this process's memory, and lets freed memory be returned to the system."""
 
 import contextlib
 import ctypes
@@ -16,7 +16,7 @@ _STATM = Path("/proc/self/statm")
 
 
 def resident_bytes() -> int:
-    """Resident memory; where the system does not tell, the largest it has been."""
+    """Return the resident memory, or where the system does not report it, the largest so far."""
     try:
         return int(_STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, ValueError, IndexError):
@@ -25,7 +25,7 @@ def resident_bytes() -> int:
 
 
 def give_back_early() -> None:
-    """Have memory that is free go back to the system, where its C library is glibc.
+    """Let free memory be returned to the system, where its C library is glibc.
 
     By default it keeps arrays of up to 32 MB for later, for each of some 30 threads apart: with
     100 m of street, at rest after its mesh was fetched, a server took 628 instead of 437 MB.

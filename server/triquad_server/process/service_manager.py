@@ -1,4 +1,4 @@
-"""What systemd, or a manager with the same protocol, is told: datagrams of sd_notify(3)."""
+"""Notifies systemd, or a manager with the same protocol, by datagrams of sd_notify(3)."""
 
 import logging
 import os
@@ -12,10 +12,10 @@ _STAGE_S = 300  # the longest that one stage of the start may take
 
 
 class ServiceManager:
-    """Tells the service manager how the server does; sends nothing where there is none."""
+    """Notifies the service manager of the server's state; sends nothing where there is none."""
 
     def __init__(self) -> None:
-        name = os.environ.get("NOTIFY_SOCKET", "")  # of an abstract socket, where it begins with @
+        name = os.environ.get("NOTIFY_SOCKET", "")  # of an abstract socket if it begins with @
         self._address = "\0" + name[1:] if name.startswith("@") else name
         self.listens = bool(name)
         period_us = os.environ.get("WATCHDOG_USEC", "0")
@@ -23,7 +23,7 @@ class ServiceManager:
         self.watchdog_s = int(period_us) / 1e6 or None if self.listens and ours else None
 
     def starting(self, stage: str) -> None:
-        """Tell that the server comes to the next stage of its start, which may take a while."""
+        """Report that the server begins the next stage of its start, which may take a while."""
         self.tell(f"EXTEND_TIMEOUT_USEC={_STAGE_S * 1_000_000}", status=stage)
 
     def tell(self, *lines: str, status: str = "") -> None:

@@ -1,4 +1,4 @@
-"""Why a server stops; quick to import, so that signals are heeded from the start."""
+"""The reasons for which a server stops; quick to import, so that signals are handled early."""
 
 import queue
 import threading
@@ -7,14 +7,14 @@ from enum import Enum
 
 
 class Stop(Enum):
-    """Why a server stops."""
+    """The reason for which a server stops."""
 
     ASKED = "asked to"
     INTERNAL_ERROR = "by an internal error"
 
 
 Stops = queue.SimpleQueue[Stop]
-"""Where signals and internal errors ask the server to stop; may be put to from a signal handler."""
+"""A queue that signal handlers and internal errors use to ask the server to stop."""
 
 _WAKE_S = 0.5
 

@@ -1,4 +1,4 @@
-"""The teams of threads between which the server's work is split, and pools of others."""
+"""The teams of threads that share the server's work, and thread pools."""
 
 import logging
 from collections.abc import Callable
@@ -13,17 +13,17 @@ _log = logging.getLogger(__name__)
 Arguments = ParamSpec("Arguments")
 
 NICENESS = 5
-"""How much later than queries, for which somebody waits, the system schedules all other work."""
+"""The niceness of all work but queries, for which somebody waits."""
 
 
 @dataclass(frozen=True)
 class Teams:
-    """Teams for the work of one map; their threads are started when they are first needed."""
+    """The teams for the work of one map; their threads are started when they are first needed."""
 
-    answers: Team = field(default_factory=lambda: Team("triquad-answers"))  # to queries
+    answers: Team = field(default_factory=lambda: Team("triquad-answers"))  # for queries
     # Taking in scans and training; the mapper's own thread has the same niceness.
     mapping: Team = field(default_factory=lambda: Team("triquad-mapping", NICENESS))
-    # Tiles that nobody waits for at the moment.
+    # For tiles that nobody waits for at the moment.
     meshing: Team = field(default_factory=lambda: Team("triquad-meshing", NICENESS))
 
     def close(self) -> None:
@@ -38,9 +38,9 @@ def submit(
     *args: Arguments.args,
     **kwargs: Arguments.kwargs,
 ) -> None:
-    """Have a thread of a pool do some work; while none can be started, it waits for one."""
+    """Run some work in a thread of a pool; while none can be started, it waits for one."""
     try:
         pool.submit(work, *args, **kwargs)
     except RuntimeError as error:
-        # The pool has put it among what waits before it started a thread.
+        # The pool queued the work before it tried to start a thread.
         _log.warning("%s: work in the background waits for one that ends", error)

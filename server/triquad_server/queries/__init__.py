@@ -1,1 +1,1 @@
-"""What clients ask of the map: which operations there are, and what answers them."""
+"""The queries of clients: which operations there are, and their request handlers."""

@@ -1,4 +1,4 @@
-"""Answers to the question of where surface appeared and vanished."""
+"""Answers queries of where surface appeared and vanished."""
 
 from dataclasses import dataclass
 
@@ -14,10 +14,10 @@ from triquad_server.epochs.history import EpochHistory
 from triquad_server.epochs.surface_history import SurfaceHistory, VoxelChanges
 
 MAX_BOXES = 256
-"""Boxes of one reply. Where there would be more, voxels twice as far apart share one, and boxes may
-be twice as long, and so on."""
+"""The most boxes of one reply. Where there would be more, voxels twice as far apart share one, and
+boxes may be twice as long, and so on."""
 
-_DECIMALS = 6  # of metres: the last digits of a product mean nothing
+_DECIMALS = 6  # of metres: further digits of a product mean nothing
 _LONGEST_VOXELS = 32  # 6.4 m with the default leaf
 
 
@@ -25,13 +25,13 @@ class ChangeQueries:
     """Answers what changed since an epoch."""
 
     def __init__(self, epochs: EpochHistory, history: SurfaceHistory, server: str) -> None:
-        """``server`` is the name that replies carry."""
+        """Make the handler; ``server`` is the name that replies carry."""
         self._epochs = epochs
         self._history = history
         self._server = server
 
     def changes(self, request: ChangesRequest) -> ChangesReply:
-        """What changed in the request's box.
+        """Return what changed in the request's box.
 
         Raises:
             RefusedError: a field is out of range, or it is not known what changed since then.
@@ -71,33 +71,33 @@ class ChangeQueries:
 
 @dataclass(frozen=True)
 class _Boxed:
-    """Voxels that all appeared, or all vanished, and the boxes around them."""
+    """The voxels that all appeared, or all vanished, and the boxes around them."""
 
     voxels: VoxelChanges
     boxes: Boxes
 
     @property
     def appeared(self) -> Bytes:
-        """1 where surface appeared, 0 where it vanished, for each box."""
+        """Return 1 where surface appeared, 0 where it vanished, for each box."""
         appeared = np.zeros(len(self.boxes.low), np.uint8)
         appeared[self.boxes.box] = self.voxels.appeared
         return appeared
 
     @property
     def epochs(self) -> Longs:
-        """Of the newest change in each box."""
+        """Return the epoch of the newest change in each box."""
         epochs = np.zeros(len(self.boxes.low), np.int64)
         np.maximum.at(epochs, self.boxes.box, self.voxels.epochs)
         return epochs
 
     @property
     def counts(self) -> Longs:
-        """Voxels in each box."""
+        """Return the number of voxels in each box."""
         return np.bincount(self.boxes.box, minlength=len(self.boxes.low)).astype(np.int64)
 
 
 def _boxed(changes: VoxelChanges) -> list[_Boxed]:
-    """Few enough boxes around the voxels that appeared, and around those that vanished."""
+    """Return boxes, few enough, around voxels that appeared, and around those that vanished."""
     kinds = [changes.part(changes.appeared), changes.part(~changes.appeared)]
     scale = 1
     while True:
@@ -110,7 +110,7 @@ def _boxed(changes: VoxelChanges) -> list[_Boxed]:
 
 
 def _inside(changes: VoxelChanges, request: ChangesRequest, newest: Epoch) -> Bools:
-    """Whether the middle of each voxel [N] lies in the request's box."""
+    """Return whether the middle of each voxel [N] lies in the request's box."""
     middles = (changes.voxels + 0.5) * newest.field_settings.leaf_m
     inside = (middles >= request.minimum) & (middles <= request.maximum)
     return np.asarray(inside.all(axis=1))

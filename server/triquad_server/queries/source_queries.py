@@ -1,4 +1,4 @@
-"""Answers to the question of where the sources of scans have been, and what they see."""
+"""Answers queries of where the sources of scans have been, and what they see."""
 
 import numpy as np
 from triquad_format.errors import RefusedError
@@ -13,19 +13,19 @@ from triquad_format.wire.source_messages import (
 from triquad_server.intake.source_trails import SourceDelta, SourceTrails, TakenScan, evenly
 
 MOST_POINTS = 100_000
-"""Of the newest scans of all sources together, in one reply."""
+"""The points of the newest scans of all sources together, at most, in one reply."""
 
 
 class SourceQueries:
-    """Answers what is new of the sources of scans."""
+    """Answers queries of what is new of the sources of scans."""
 
     def __init__(self, trails: SourceTrails, server: str) -> None:
-        """``server`` is the name that replies carry."""
+        """Make the handler; ``server`` is the name that replies carry."""
         self._trails = trails
         self._server = server
 
     def sources(self, request: SourcesRequest) -> SourcesReply:
-        """All sources, with what is new of them since the request's revision.
+        """Return all sources, with what is new of them since the request's revision.
 
         Raises:
             RefusedError: a field is out of range.
@@ -34,7 +34,7 @@ class SourceQueries:
             raise RefusedError(
                 "bad_request", f"max_points = {request.max_points}: use 0 to {MAX_SAMPLE_POINTS}"
             )
-        # What another run of the server told is known no more than nothing.
+        # The revision of another run of the server is ignored.
         known = request.revision if request.server == self._server else 0
         revision, deltas = self._trails.since(known)
         if request.revision < 0 or known > revision:

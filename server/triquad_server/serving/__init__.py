@@ -1,1 +1,1 @@
-"""Requests: whose turn it is, who works at them, and what became of them."""
+"""Requests: their order, their workers, and their results."""

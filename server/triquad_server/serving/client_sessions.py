@@ -1,4 +1,4 @@
-"""The client sessions that are linked to the server, and of which of them a request is."""
+"""The client sessions that are linked to the server, and the session of each request."""
 
 import secrets
 import threading
@@ -15,28 +15,28 @@ _UNLINKED = ""
 """The group of all clients that are not linked to the server itself: they take one turn together,
 since any name can be invented."""
 
-_GRACE_S = 0.5  # that a request is worked at for longer: its client's own time-out comes first
+_GRACE_S = 0.5  # a request is handled for this much longer: its client's own time-out comes first
 _REMEMBERED = 1024  # sessions that have left
 
 
 @dataclass(frozen=True)
 class Source:
-    """Whose request it is, and until when its answer is waited for."""
+    """The owner of a request, and the time until which its answer is waited for."""
 
     owner: Owner
     deadline_s: float  # monotonic
 
 
 class ClientSessions:
-    """Tells of which session a request is; safe for any thread.
+    """Finds the session of a request; safe for any thread.
 
-    A client that is linked and says who it is has turns of its own. One that comes through a
-    router, or says nothing, shares those of all such: Zenoh does not tell from which link a request
+    A client that is linked and names itself has turns of its own. Those that come through a
+    router, or give no name, share turns: Zenoh does not show from which link a request
     came, but invented names are no links.
     """
 
     def __init__(self, session: zenoh.Session) -> None:
-        """Begin to watch who is linked to ``session``."""
+        """Begin to watch the links of ``session``."""
         self._info = session.info
         self.own_name = secrets.token_hex(16)  # in requests of the server to itself; known to none
         self._lock = threading.Lock()
@@ -47,11 +47,11 @@ class ClientSessions:
         )
 
     def close(self) -> None:
-        """Watch no more."""
+        """End watching."""
         self._listener.undeclare()
 
     def source(self, query: zenoh.Query, longest_s: float) -> Source:
-        """Whose request it is; no client is believed to wait for more than ``longest_s``."""
+        """Return the owner of a request; no client waits for more than ``longest_s``."""
         attachment = query.attachment
         origin = None if attachment is None else read_origin(attachment.to_bytes())
         now = time.monotonic()
@@ -62,15 +62,15 @@ class ClientSessions:
         return Source(self._owner(origin), now + wait_s + _GRACE_S)
 
     def have_left(self, owner: Owner) -> bool:
-        """Whether the link to the client that a request is of is closed.
+        """Return whether the link to the client that sent a request is closed.
 
-        A request may arrive before its link is known: a link that never was counts for nothing.
+        A request may arrive before its link is known: a link that never was does not count.
         """
         return owner.name in self._left
 
     def _owner(self, origin: RequestOrigin) -> Owner:
         name = origin.client
-        # One that is new may ask before its link is known here: Zenoh knows.
+        # A new client may send requests before its link is known here: Zenoh knows it.
         is_known = (
             name == self.own_name
             or name in self._links

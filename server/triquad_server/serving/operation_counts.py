@@ -1,4 +1,4 @@
-"""What became of the requests of each operation, and how long it took."""
+"""Counts the results of each operation's requests, and their times."""
 
 import threading
 import time
@@ -10,23 +10,23 @@ from triquad_format.wire.metrics_messages import OperationMetrics, TimeHistogram
 BOUNDS_S = tuple(
     round(step * 10.0**power, 6) for power in range(-4, 2) for step in (1, 1.8, 3.2, 5.6)
 )
-"""Upper bounds of the buckets: four a decade, 0.1 ms to 56 s."""
+"""The upper bounds of the buckets: four a decade, 0.1 ms to 56 s."""
 
 
 class Times:
-    """A histogram of times. Not safe for several threads at once."""
+    """A histogram of times; not safe for several threads at once."""
 
     def __init__(self) -> None:
         self._counts = [0] * (len(BOUNDS_S) + 1)
         self._sum_s = 0.0
 
     def add(self, time_s: float) -> None:
-        """Count something that took so long."""
+        """Count something that took ``time_s`` seconds."""
         self._counts[bisect_left(BOUNDS_S, time_s)] += 1
         self._sum_s += time_s
 
     def histogram(self) -> TimeHistogram:
-        """The counts so far."""
+        """Return the counts so far."""
         return TimeHistogram(np.array(self._counts, np.int64), self._sum_s)
 
 
@@ -41,20 +41,20 @@ class OperationCounts:
         self._received_bytes = self._sent_bytes = 0
 
     def arrive(self, size: int) -> float:
-        """A request of ``size`` bytes is there; the time, monotonic seconds."""
+        """Record a request of ``size`` bytes that arrived; return the time, monotonic seconds."""
         with self._lock:
             self._pending += 1
             self._received_bytes += size
         return time.monotonic()
 
     def begin(self, arrived_s: float) -> None:
-        """A worker begins with a request."""
+        """Record that a worker begins with a request."""
         waited_s = time.monotonic() - arrived_s
         with self._lock:
             self._waits.add(waited_s)
 
     def answer(self, arrived_s: float, size: int) -> None:
-        """A request was answered with ``size`` bytes."""
+        """Record that a request was answered with ``size`` bytes."""
         took_s = time.monotonic() - arrived_s
         with self._lock:
             self._pending -= 1
@@ -62,18 +62,18 @@ class OperationCounts:
             self._answers.add(took_s)
 
     def refuse(self, code: str) -> None:
-        """A request was refused; ``code`` is one of ``ERROR_CODES``."""
+        """Record that a request was refused; ``code`` is one of ``ERROR_CODES``."""
         with self._lock:
             self._pending -= 1
             self._refused[code] = self._refused.get(code, 0) + 1
 
     def refused(self) -> dict[str, int]:
-        """Refused requests, by error code."""
+        """Return the number of refused requests, by error code."""
         with self._lock:
             return dict(self._refused)
 
     def metrics(self) -> OperationMetrics:
-        """The counts so far."""
+        """Return the counts so far."""
         with self._lock:
             return OperationMetrics(
                 answers=self._answers.histogram(),

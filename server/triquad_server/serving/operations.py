@@ -28,12 +28,12 @@ from triquad_server.settings import ServiceSettings
 
 _log = logging.getLogger(__name__)
 
-_WORKERS = max(2, THREADS)  # for questions: one per core
+_WORKERS = max(2, THREADS)  # for queries: one per core
 _ADMINISTRATION_WORKERS = 2
 _QUEUE_BYTES = 64_000_000  # of the requests of all clients that wait
 _PLAIN_BYTES = 16_384  # of a request that holds neither points nor tiles
 _SLOW = "slow"
-"""The group of all requests that may take seconds: one of all clients is worked at."""
+"""The group of all requests that may take seconds: one of all clients is handled at a time."""
 
 _STOPPING = "the server is stopping"
 
@@ -41,18 +41,18 @@ Handler = Callable[[Request], None]
 """Reads the request and answers it, or raises :class:`RefusedError`."""
 
 ReadQueue = Callable[[], QueueMetrics]
-"""What waits in a queue now."""
+"""Returns the state of a queue now."""
 
 
 class Lane(Enum):
-    """Which queue the requests of an operation wait in."""
+    """The queue in which the requests of an operation wait."""
 
     QUESTIONS = "questions"
     ADMINISTRATION = "administration"
-    """What takes no time: it is answered however many questions wait."""
+    """The lane of what takes no time: it is answered however many queries wait."""
 
     SLOW = "slow"
-    """Administration that may take seconds, one after the other."""
+    """The lane of administration that may take seconds, one after the other."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class _Operation:
 
 
 def answering(kind: type[RequestT], answer: Callable[[RequestT], Message]) -> Handler:
-    """A handler that decodes a ``kind`` and replies with what ``answer`` makes of it."""
+    """Return a handler that decodes a ``kind`` and replies with the result of ``answer``."""
 
     def handle(request: Request) -> None:
         request.answer(answer(request.read(kind)))
@@ -74,7 +74,7 @@ def answering(kind: type[RequestT], answer: Callable[[RequestT], Message]) -> Ha
 
 
 class Operations:
-    """Receives the requests of one map, and has them worked at: each is answered exactly once."""
+    """Receives the requests of one map, and has them handled: each is answered exactly once."""
 
     def __init__(
         self,
@@ -83,7 +83,7 @@ class Operations:
         settings: ServiceSettings,
         give_way: Callable[[], None] = lambda: None,
     ) -> None:
-        """``give_way`` returns when a question may begin, as far as other work goes."""
+        """Begin; ``give_way`` returns when a query may begin, as far as other work is concerned."""
         self._session = session
         self._map_name = map_name
         self._give_way = give_way
@@ -104,7 +104,7 @@ class Operations:
 
     @property
     def own_name(self) -> str:
-        """By which the server names itself in a request, to have turns of its own."""
+        """The name of the server in a request to itself, to have turns of its own."""
         return self._sessions.own_name
 
     def serve(
@@ -114,24 +114,24 @@ class Operations:
         lane: Lane = Lane.QUESTIONS,
         max_bytes: int = _PLAIN_BYTES,
     ) -> None:
-        """Answer an operation from now on; larger requests than ``max_bytes`` are refused."""
+        """Answer an operation from now on; requests larger than ``max_bytes`` are refused."""
         key = keys.operation_key(self._map_name, name)
         counts = self.counts[name] = OperationCounts()
         queue = self._questions if lane is Lane.QUESTIONS else self._administration
         self._operations[key] = _Operation(handle, counts, lane, queue, max_bytes)
-        # In the network's own threads, which only put requests into the queue.
+        # This runs in the network's own threads, so it only queues requests.
         receive = zenoh.handlers.Callback(partial(self._receive, key), indirect=False)
         self._queryables.append(self._session.declare_queryable(key, receive, complete=True))
 
     def stop(self) -> None:
-        """Refuse what waits and what comes."""
+        """Refuse all waiting and new requests."""
         self._stopping = True
         for queue in (self._questions, self._administration):
             for request in queue.clear():
                 self._refusals.add(request, "busy", _STOPPING)
 
     def close(self) -> None:
-        """As :meth:`stop`; returns once all that was worked at is answered. Twice does no harm."""
+        """Do as :meth:`stop`; return once all work is answered. Closing twice does no harm."""
         if self._closed:
             return
         self._closed = True
@@ -145,7 +145,7 @@ class Operations:
         self._sessions.close()
 
     def _queue(self, name: str, workers: int, limits: QueueLimits) -> RequestQueue[Request]:
-        """A queue with workers, whose threads are started when they are needed."""
+        """Return a queue with workers, whose threads are started when they are needed."""
         pool = ThreadPoolExecutor(workers + MOST_SENDING, name)
         self._pools.append(pool)
         return RequestQueue(
@@ -154,7 +154,7 @@ class Operations:
 
     def _receive(self, key: str, query: zenoh.Query) -> None:
         if str(query.key_expr) != key:
-            query.drop()  # unanswered: who means it names it
+            query.drop()  # unanswered: a client that means it names it
             return
         try:
             self._take(key, query)
@@ -162,7 +162,7 @@ class Operations:
             _log.exception("a request on %s could not be received", key)
 
     def _take(self, key: str, query: zenoh.Query) -> None:
-        """Have a request wait."""
+        """Queue a request, or refuse it."""
         operation = self._operations[key]
         source = self._sessions.source(query, MAX_WAIT_S)
         owner = source.owner
@@ -197,7 +197,7 @@ class Operations:
             operation.queue.finish(request)
 
     def _check(self, request: Request) -> None:
-        """Refuse a request that nobody waits for any more."""
+        """Refuse a request whose client no longer waits."""
         if self._stopping:
             raise RefusedError("busy", _STOPPING)
         if self._sessions.have_left(request.owner):

@@ -1,4 +1,4 @@
-"""Requests that are refused before any worker begins with them."""
+"""Refuses requests before any worker begins with them."""
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -9,14 +9,14 @@ from triquad_server.serving.request import Request
 _THREADS = 2
 
 _MOST_BYTES = 4_000_000
-"""Of requests that wait for these threads: beyond, large ones are refused by the network's thread,
-so that their sender waits for it and they take no memory."""
+"""The memory of requests that wait for these threads: beyond, large ones are refused by the
+network's thread, so that their sender waits for it and they take no memory."""
 
 _LARGE_BYTES = 65_536
 
 
 class Refusals:
-    """Refuses requests in threads of its own: a client may not take the reply for seconds."""
+    """Refuses requests in threads of its own: a client may delay the reply for seconds."""
 
     def __init__(self) -> None:
         self._threads = ThreadPoolExecutor(_THREADS, "refusals")

@@ -1,4 +1,4 @@
-"""A request on its way to its answer."""
+"""A request until it is answered."""
 
 import logging
 from collections.abc import Callable
@@ -30,11 +30,11 @@ class Request:
         deadline_s: float,
         sends: Callable[["Request", int], bool],
     ) -> None:
-        """``key`` is that of the operation, whose ``counts`` tell what becomes of the request.
+        """Make a request; ``key`` is that of the operation, whose ``counts`` record the result.
 
         ``owner`` is the client session, which waits until ``deadline_s``, monotonic. ``sends`` is
-        called before a reply of a number of bytes is sent, which takes as long as the client likes;
-        a reply for which it says no is not sent.
+        called before a reply of N bytes is sent, which takes as long as the client likes;
+        a reply that it rejects is not sent.
         """
         self.key = key
         self.owner = owner
@@ -46,7 +46,7 @@ class Request:
 
     @property
     def size(self) -> int:
-        """Bytes of the payload."""
+        """The number of bytes of the payload."""
         payload = self._query.payload
         return 0 if payload is None else len(payload)
 
@@ -55,7 +55,7 @@ class Request:
         self._counts.begin(self._arrived_s)
 
     def read(self, kind: type[RequestT]) -> RequestT:
-        """The request's message.
+        """Return the request's message.
 
         Raises:
             RefusedError: there is none, or it cannot be decoded.
@@ -71,7 +71,7 @@ class Request:
             raise RefusedError("bad_request", str(error)) from error
 
     def answer(self, message: Message) -> None:
-        """Reply with ``message``; refuse to, where large replies to others take the memory."""
+        """Reply with ``message``; refuse to, if large replies to others take the memory."""
         payload = codec.encode(message)
         if not self._sends(self, len(payload)):
             self.refuse("busy", "too many large replies are on their way; ask for less, or later")
@@ -95,7 +95,7 @@ class Request:
         self.refuse("internal", f"{type(error).__name__}: {error}")
 
     def _finish(self, reply: Callable[[], None]) -> None:
-        """Send the reply and end the query, also where its client is gone."""
+        """Send the reply and end the query, even if its client has left."""
         try:
             with self._query:
                 reply()

@@ -10,24 +10,24 @@ from triquad_format.wire.metrics_messages import QueueMetrics
 from triquad_server.fair_queue import FairQueue, Owner
 
 MOST_SENDING = 32
-"""Replies on their way to clients, which may not read them, each in a thread. Zenoh gives up a
+"""The replies being sent at a time, which clients may not read, each in a thread. Zenoh gives up a
 client that has taken nothing for five seconds."""
 
 _SENDING_EACH = 2
-"""Replies on their way to one client: no more of its requests are worked at until it takes one."""
+"""The replies that are sent to one client at a time: no more of its requests are handled before."""
 
 _SESSIONS_WAITING = 8
-"""Client sessions of which as many requests may wait as may of each; more share that."""
+"""The number of sessions that may each have the full number of requests wait; more share that."""
 
 _REPLY_BYTES = 32_000_000
-"""Of all replies on their way; a large one beyond is refused."""
+"""The bytes of all replies that are sent at a time; a large one beyond is refused."""
 
 _SMALL_REPLY_BYTES = 262_144
-"""A reply of no more, such as a planner's, never is."""
+"""The bytes of a reply, such as a planner's, that is never refused."""
 
 
 class Owned(Protocol):
-    """What waits in the queue."""
+    """An item in the queue."""
 
     owner: Owner
 
@@ -37,23 +37,23 @@ RequestT = TypeVar("RequestT", bound=Owned)
 
 @dataclass(frozen=True)
 class QueueLimits:
-    """Bounds of what waits."""
+    """The limits of what waits."""
 
-    requests_each: int  # of one client session
+    requests_each: int  # requests of one client session
     nbytes: int  # of the payloads of all
 
 
 class RequestQueue(Generic[RequestT]):
-    """A bounded queue of requests, of which one is worked at by each worker; safe for any thread.
+    """A bounded queue of requests, each handled by one of some workers; safe for any thread.
 
-    A session has at most half of the workers, so that one is left for the next. A request is
-    worked at until its reply is made: while that is on its way, another may begin.
+    A session has at most half of the workers, so that one is left for the next. A request occupies
+    its worker until its reply is made: while that is sent, another may begin.
     """
 
     def __init__(
         self, begin: Callable[[RequestT], None], *, workers: int, limits: QueueLimits
     ) -> None:
-        """``begin`` has a thread work at a request, and returns at once."""
+        """Begin with no requests; ``begin`` has a thread handle a request, and returns at once."""
         self._begin = begin
         self._workers = workers
         self._most_each = max(1, workers // 2)
@@ -69,12 +69,12 @@ class RequestQueue(Generic[RequestT]):
 
     @property
     def metrics(self) -> QueueMetrics:
-        """What waits for a worker."""
+        """Return the state of the requests that wait for a worker."""
         with self._lock:
             return QueueMetrics(len(self._waiting), self._waiting.limit)
 
     def put(self, request: RequestT, nbytes: int) -> list[RequestT]:
-        """Have a request wait for a worker; returns those that are too many now."""
+        """Queue a request for a worker; return those that are too many now."""
         with self._lock:
             excess = self._waiting.put(request.owner, request, nbytes)
             self._fill()
@@ -83,8 +83,8 @@ class RequestQueue(Generic[RequestT]):
     def send(self, request: RequestT, nbytes: int) -> bool:
         """Free the worker of a request whose reply is made and about to be sent.
 
-        Returns whether it may be: a large one may not while others take the memory. Of requests
-        that are not worked at any more, every reply may.
+        Return whether it may be: a large one may not while others take the memory. Of requests
+        that are not handled any more, every reply may.
         """
         with self._lock:
             if request not in self._working:
@@ -114,7 +114,7 @@ class RequestQueue(Generic[RequestT]):
             return self._waiting.clear()
 
     def _fill(self) -> None:
-        """Have requests worked at while there are workers and replies can be sent."""
+        """Start requests while there are workers and replies can be sent."""
         while len(self._working) < self._workers and len(self._sending) < MOST_SENDING:
             request = self._waiting.take(self._may_begin)
             if request is None:

@@ -1,4 +1,4 @@
-"""When checkpoints are written: now and then, on request, and at the end."""
+"""Writes checkpoints from time to time, on request, and at the end."""
 
 import logging
 import queue
@@ -34,7 +34,7 @@ ResultT = TypeVar("ResultT")
 
 @dataclass(frozen=True)
 class _Job:
-    """What is to be run on the thread, and who waits for it."""
+    """A job to run on the thread, and the future that its caller waits for."""
 
     run: Callable[[], Any]
     result: Future[Any]
@@ -42,16 +42,16 @@ class _Job:
 
 @dataclass(frozen=True)
 class _Counts:
-    """Checkpoints so far."""
+    """Counters of checkpoints so far."""
 
     written: int = 0
     failed: int = 0
-    duration_s: float | None = None  # of writing the last
+    duration_s: float | None = None  # seconds of writing the last
     ended_s: float | None = None  # when the last was written, monotonic
 
 
 class CheckpointThread:
-    """Writes the map to its store, on a thread of its own that gives way to those that answer.
+    """Writes the map to its store, on a thread of its own that gives way to queries.
 
     A store that fails never stops the mapping.
     """
@@ -63,7 +63,7 @@ class CheckpointThread:
         period_s: float,
         last: CheckpointInfo | None,
     ) -> None:
-        """``last`` is the checkpoint that the map was restored from."""
+        """Make the thread; ``last`` is the checkpoint that the map was restored from."""
         self._mapper = mapper
         self._store = store
         self._period_s = period_s
@@ -77,7 +77,7 @@ class CheckpointThread:
 
     @property
     def has_store(self) -> bool:
-        """Whether there is anywhere to write checkpoints to."""
+        """Return whether there is a store to write checkpoints to."""
         return self._store is not None
 
     def start(self) -> None:
@@ -86,7 +86,7 @@ class CheckpointThread:
             self._thread.start()
 
     def metrics(self) -> CheckpointMetrics:
-        """How many checkpoints were written, and how long the last took."""
+        """Return how many checkpoints were written, and how long the last took."""
         counts = self._counts
         age_s = None if counts.ended_s is None else time.monotonic() - counts.ended_s
         return CheckpointMetrics(counts.written, counts.failed, counts.duration_s, age_s)
@@ -113,7 +113,7 @@ class CheckpointThread:
         _log.info("the map is in %s, as of epoch %d", info.path, info.epoch)
 
     def answer(self, _request: CheckpointRequest) -> CheckpointInfo:
-        """A checkpoint of the map as it is now; the last one where nothing changed.
+        """Return a checkpoint of the map as it is now; the last one if nothing changed.
 
         Raises:
             RefusedError: there is no store, or it cannot be written.
@@ -124,7 +124,7 @@ class CheckpointThread:
             raise RefusedError("store", str(error)) from error
 
     def call(self, job: Callable[[], ResultT]) -> ResultT:
-        """What ``job`` returns when run on this thread: nothing else is written meanwhile.
+        """Run ``job`` on this thread and return its result: nothing else is written meanwhile.
 
         Raises:
             StoreError: there is no store.
@@ -137,7 +137,7 @@ class CheckpointThread:
         return result.result()
 
     def found_damaged(self, name: str) -> None:
-        """Have all of the map written anew, if the newest checkpoint needs the file ``name``."""
+        """Have all of the map written again, if the newest checkpoint needs the file ``name``."""
         self._asked.put(_Job(lambda: self._write_anew(name), Future()))
         self._wake.set()
 
@@ -149,7 +149,7 @@ class CheckpointThread:
             self._write_if_changed()
 
     def _run(self) -> None:
-        lower_priority(2 * NICENESS)  # mapping comes first, too
+        lower_priority(2 * NICENESS)  # mapping has priority, too
         due = time.monotonic() + self._period_s
         while not self._stopping.is_set():
             self._wake.wait(due - time.monotonic() if self._period_s > 0 else None)
@@ -172,13 +172,13 @@ class CheckpointThread:
         try:
             self.write()
         except StoreError:
-            return  # the status and the log have it
+            return  # the status and the log report it
         except Exception:
             self.error = "an internal error of the server; its log has the details"
             _log.exception("a checkpoint met an internal error")
 
     def write(self) -> CheckpointInfo:
-        """Write what changed; only for what runs on this thread. As :meth:`answer`.
+        """Write what changed; only for jobs on this thread. As :meth:`answer`.
 
         Raises:
             StoreError: it cannot be written.
@@ -188,7 +188,7 @@ class CheckpointThread:
         return self.write_changes(self._snapshot_since(base))
 
     def write_changes(self, snapshot: MapSnapshot) -> CheckpointInfo:
-        """Write what changed since the last checkpoint; only for what runs on this thread.
+        """Write what changed since the last checkpoint; only for jobs on this thread.
 
         Raises:
             StoreError: it cannot be written.
@@ -221,7 +221,7 @@ class CheckpointThread:
         return info
 
     def _write_changes(self, store: Store, changes: MapChanges) -> CheckpointInfo:
-        """Write the changes; all of the map where the checkpoints before were damaged since."""
+        """Write the changes, or all of the map if earlier checkpoints were damaged since."""
         try:
             return store.write(changes)
         except StoreBaseError as error:
@@ -229,11 +229,11 @@ class CheckpointThread:
             return store.write(self._snapshot_since(None).changes())
 
     def _snapshot_since(self, base: int | None) -> MapSnapshot:
-        """What a checkpoint needs that follows the epoch ``base``."""
+        """Return what a checkpoint that follows the epoch ``base`` needs."""
         return self._mapper.call(lambda mapper: mapper.snapshot_since(base))
 
     def _fold(self) -> None:
-        """Put old checkpoints together, where there are many."""
+        """Fold old checkpoints together, if there are many."""
         assert self._store is not None
         try:
             info = self._store.fold(self._interrupted)
@@ -259,5 +259,5 @@ class CheckpointThread:
         return "the server started" if self.last is None else f"epoch {self.last.epoch}"
 
     def _interrupted(self) -> bool:
-        """Whether something is more urgent than folding, which can be begun again."""
+        """Return whether something is more urgent than folding, which can be begun again."""
         return self._stopping.is_set() or not self._asked.empty()

@@ -1,4 +1,4 @@
-"""Map files that clients fetch in chunks."""
+"""Serves map files that clients fetch in chunks."""
 
 import io
 import threading
@@ -28,10 +28,10 @@ class _MapBytes:
 
 
 class MapDownloads:
-    """Serialises epochs on request; the files asked for last are kept."""
+    """Serialises epochs on request; the files requested last are kept."""
 
     def __init__(self, mapper: MapperThread, epochs: EpochHistory, server: str = "") -> None:
-        """``server`` is a name of this process."""
+        """Make the handler; ``server`` is a name of this process."""
         self._epochs = epochs
         self._server = server
         self._mapper = mapper
@@ -40,12 +40,12 @@ class MapDownloads:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the files that are kept."""
+        """Return the bytes of the files that are kept."""
         with self._lock:
             return sum(len(file.data) for file in self._files.values())
 
     def info(self, request: MapInfoRequest) -> MapInfo:
-        """Size and digest of the newest epoch's file, which is made unless it is there."""
+        """Return size and digest of the newest epoch's file, which is made unless it is there."""
         newest = self._epochs.newest
         with self._lock:
             for file in self._files.values():
@@ -74,7 +74,7 @@ class MapDownloads:
         return info
 
     def chunk(self, request: MapChunkRequest) -> MapChunk:
-        """Bytes of a file, at most ``CHUNK_BYTES``.
+        """Return bytes of a file, at most ``CHUNK_BYTES``.
 
         Raises:
             RefusedError: the file is not kept, or the bytes do not lie in it.

@@ -1,5 +1,4 @@
-"""The checkpoints of a map in their folder: which are kept, whether they are as they were written,
-and who may write them."""
+"""The checkpoints of a map in their folder, checked for changes and locked for writing."""
 
 import contextlib
 import fcntl
@@ -29,55 +28,55 @@ _log = logging.getLogger(__name__)
 
 _LOCK = "lock"
 _UNFINISHED = (".epoch-*.tmp", f".{PROTECTIONS_NAME}.*.tmp")
-"""Left by a server that was killed while it wrote."""
+"""The files left by a server that was killed while it wrote."""
 _MAX_PROTECTED = 1000
 
 
 @dataclass(frozen=True)
 class _FileIdentity:
-    """What tells a file from one that was put in its place, or changed."""
+    """The properties that change if another file replaces a file, or if it changes."""
 
     device: int
     inode: int
     size: int  # bytes
     modified_ns: int  # when its contents changed, nanoseconds since 1970
-    changed_ns: int  # when anything about it changed: nobody can set this back
+    changed_ns: int  # when anything about it changed: this cannot be set back
 
 
 class KeptCheckpoints:
-    """The folder in which the checkpoints of one map lie; one process at a time may write to it.
+    """Manages the folder with the checkpoints of one map; one process at a time may write to it.
 
-    A locked file in it sees to that; the system lets go of it however the process ends.
+    A locked file in it ensures this; the system releases the lock however the process ends.
     """
 
     def __init__(self, path: Path, retention: StoreSettings) -> None:
-        """Take the folder, which is made if need be; delete what is unfinished in it.
+        """Lock the folder, which is made if need be; delete unfinished files in it.
 
         Raises:
-            StoreError: another process holds it.
+            StoreError: another process has it locked.
             OSError: it cannot be written to.
         """
         path.mkdir(parents=True, exist_ok=True)
         self.path = path
         self._lock = _locked(path / _LOCK)
         self._retention = retention
-        self._needed: dict[Path, frozenset[str]] = {}  # names of files, by checkpoint
+        self._needed: dict[Path, frozenset[str]] = {}  # names of each checkpoint's files
         self._identities: dict[str, _FileIdentity | None] = {}  # of files that were valid
         self._protected = ProtectedCheckpoints(path, retention.protect_h)
         for unfinished in _UNFINISHED:
             _delete(path.glob(unfinished))
 
     def close(self) -> None:
-        """Let others have the folder."""
+        """Release the folder."""
         self._lock.close()
 
     def renew_lock(self) -> None:
-        """Take the folder again where the locked file is no longer the one that others see.
+        """Lock the folder again if the locked file is no longer the one that others see.
 
-        Whoever deletes it, alone or with the folder, would let another process in.
+        Deleting it, alone or with the folder, would let another process in.
 
         Raises:
-            StoreError: another process has come first.
+            StoreError: another process has locked it first.
             OSError: the file cannot be made.
         """
         path = self.path / _LOCK
@@ -97,7 +96,7 @@ class KeptCheckpoints:
         self.record([path.name])
 
     def unchanged(self, names: Iterable[str]) -> bool:
-        """Whether files are there, and as they were when they were recorded."""
+        """Return whether files exist, and are as they were when they were recorded."""
         for name in names:
             identity = _file_identity(self.path / name)
             if identity is None or identity != self._identities.get(name):
@@ -105,10 +104,10 @@ class KeptCheckpoints:
         return True
 
     def delete_old(self, newest: int) -> None:
-        """Delete the files that no checkpoint needs which is to stay.
+        """Delete the files that are needed by none of the checkpoints that stay.
 
-        Only those up to the epoch ``newest`` are counted and deleted: what bears a higher number is
-        damaged, or not this server's, and must not push out a valid checkpoint.
+        Only those up to the epoch ``newest`` are counted and deleted: a file with a higher number
+        is damaged, or not this server's, and must not push out a valid checkpoint.
         """
         try:
             files = [file for file in checkpoint_files(self.path) if file.epoch <= newest]
@@ -133,14 +132,14 @@ class KeptCheckpoints:
 
     @property
     def restored(self) -> Restored | None:
-        """The last time that the map was taken back."""
+        """The last time that the map was restored."""
         return self._protected.restored
 
     def protect(self, epoch: int, why: str, instead_of: int | None = None) -> None:
         """Have a checkpoint stay for ``protect_h``, whatever else retention says.
 
-        The time of one that is protected already begins anew. ``instead_of`` is one that may go
-        for it.
+        The time of one that is protected already begins again. ``instead_of`` is one that may be
+        deleted for it.
 
         Raises:
             StoreError: too much is protected already.
@@ -154,7 +153,7 @@ class KeptCheckpoints:
             self._protected.remove(instead_of)
 
     def protect_restored(self, restored: Restored, why: str) -> None:
-        """Record that the map was taken back to an older checkpoint; the copy stays, too.
+        """Record that the map was restored to an older checkpoint; the copy stays, too.
 
         Raises:
             OSError: this cannot be recorded.
@@ -162,7 +161,7 @@ class KeptCheckpoints:
         self._protected.set_restored(restored, why)
 
     def _check_protected(self, epoch: int, others: frozenset[int]) -> None:
-        """Raise unless there is room for another protected checkpoint; the first always has."""
+        """Raise an error unless there is room for one more to protect; the first always has."""
         limit = self._retention.protect_bytes
         files = [f for f in checkpoint_files(self.path) if f.epoch == epoch or f.epoch in others]
         names = frozenset().union(*(self._needed_by(file) for file in newest_of_each(files)))
@@ -182,10 +181,10 @@ class KeptCheckpoints:
         return KeptCheckpoint(file.epoch, stamp_ns, files=self._needed_by(file))
 
     def _needed_by(self, file: CheckpointFile) -> frozenset[str]:
-        """Names of the files that a checkpoint consists of."""
+        """Return the names of the files that a checkpoint consists of."""
         if file.path not in self._needed:
             names = {file.path.name}
-            # One that does not open needs nothing any more.
+            # One that cannot be opened needs nothing any more.
             with contextlib.suppress(MapFileError):
                 names |= set(open_manifest(file).files)
             self._needed[file.path] = frozenset(names)
@@ -193,7 +192,7 @@ class KeptCheckpoints:
 
 
 def _file_identity(path: Path) -> _FileIdentity | None:
-    """The file as it is now; ``None`` where there is none to be seen."""
+    """Return the file as it is now; ``None`` if none can be seen."""
     try:
         status = path.stat()
     except OSError:

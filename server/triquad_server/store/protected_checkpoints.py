@@ -1,4 +1,4 @@
-"""Checkpoints that must stay for a while, and for how long that has been so."""
+"""Checkpoints that must stay for a while, and how long they have been protected."""
 
 import logging
 import time
@@ -25,22 +25,22 @@ _HOUR_S = 3600.0
 
 @dataclass(frozen=True)
 class Clocks:
-    """The two clocks that tell how long something has been protected."""
+    """The two clocks that measure how long something has been protected."""
 
     monotonic_s: Callable[[], float] = time.monotonic
     wall_ns: Callable[[], int] = time.time_ns  # since 1970; may be set to anything at any time
 
 
 class ProtectedCheckpoints:
-    """The protected checkpoints of a folder, in memory and in a file that outlives the server.
+    """Keeps the protected checkpoints of a folder, in memory and in a file that stays on disk.
 
-    While the server runs, the monotonic clock alone tells how old a protection is: no jump of the
+    While the server runs, only the monotonic clock measures a protection's age: no jump of the
     time of day ends it. The time of day counts for the time between two servers only, and never
     backwards.
     """
 
     def __init__(self, folder: Path, protect_h: float, clocks: Clocks | None = None) -> None:
-        """Take up what is listed in the folder. Where the list is damaged, all is protected.
+        """Read the list in the folder. Where it is damaged, all is protected.
 
         Raises:
             OSError: the folder cannot be read.
@@ -49,7 +49,7 @@ class ProtectedCheckpoints:
         self._protect_s = protect_h * _HOUR_S
         self._clocks = clocks or Clocks()
         listed = self._read()
-        self.restored = listed.restored  # the last time that the map was taken back
+        self.restored = listed.restored  # the last time that the map was restored
         away_s = 0.0
         if listed.listed_ns > 0:
             away_s = max(0.0, (self._clocks.wall_ns() - listed.listed_ns) / 1e9)
@@ -67,7 +67,7 @@ class ProtectedCheckpoints:
 
     @property
     def first_ends_h(self) -> float:
-        """Hours until the first protection ends; 0 where there is none."""
+        """The hours until the first protection ends; 0 where there is none."""
         return max(0.0, min(map(self._lasts_s, self._entries.values()), default=0.0)) / _HOUR_S
 
     def add(self, epoch: int, why: str) -> None:
@@ -80,7 +80,7 @@ class ProtectedCheckpoints:
         self._write({**self._entries, epoch: Protection(epoch, age_s, why)}, self.restored)
 
     def remove(self, epoch: int) -> None:
-        """Protect a checkpoint no more.
+        """End the protection of a checkpoint.
 
         Raises:
             OSError: the list cannot be written; nothing has changed.
@@ -88,7 +88,7 @@ class ProtectedCheckpoints:
         self._write({e: one for e, one in self._entries.items() if e != epoch}, self.restored)
 
     def set_restored(self, restored: Restored, why: str) -> None:
-        """Record that the map was taken back, and protect the checkpoint that it went on from.
+        """Record that the map was restored, and protect the checkpoint that it went on from.
 
         Raises:
             OSError: the list cannot be written; nothing has changed.
@@ -98,7 +98,7 @@ class ProtectedCheckpoints:
         self._write({**self._entries, restored.as_epoch: protection}, restored)
 
     def renew(self, there: Iterable[int]) -> None:
-        """List the ages as they are now, and no more what has ended or is not ``there``.
+        """Update the listed ages, and remove what has ended or is not ``there``.
 
         So the time of day, should it be wrong, counts from this moment on at most.
         """

@@ -1,4 +1,4 @@
-"""Resets: what the map was before stays on disk, so that nothing is lost by mistake."""
+"""Resets the map: its earlier state stays on disk, so that nothing is lost by mistake."""
 
 import logging
 
@@ -20,7 +20,7 @@ _WHY = "before a reset"
 
 
 class Resets:
-    """Answers resets: each first has a checkpoint written that retention must keep."""
+    """Answers reset requests: each first has a checkpoint written that retention must keep."""
 
     def __init__(
         self,
@@ -30,9 +30,9 @@ class Resets:
         protect_h: float,
         trails: SourceTrails,
     ) -> None:
-        """Without a ``store``, or with ``protect_h`` = 0, nothing is kept.
+        """Make the handler; without a ``store``, or with ``protect_h`` = 0, nothing is kept.
 
-        Where sources have been in the box, ``trails`` forget.
+        Where sources have been in the box is removed from ``trails``.
         """
         self._mapper = mapper
         self._trails = trails
@@ -41,7 +41,7 @@ class Resets:
         self._protect_h = protect_h
 
     def answer(self, request: ResetRequest) -> ResetReply:
-        """Forget what lies in the request's box; answered once an epoch shows it.
+        """Forget what lies in the request's box, and reply once an epoch shows it.
 
         Raises:
             RefusedError: it is not a box; or the map as it is could not be kept, and was not reset.
@@ -68,7 +68,7 @@ class Resets:
         return ResetReply(epoch, undo=undo)
 
     def _forget(self, mapper: Mapper, request: ResetRequest) -> int:
-        """Forget what lies in the box; the epoch that shows it. For the mapper's thread."""
+        """Forget what lies in the box; return the epoch that shows it. For the mapper's thread."""
         mapper.reset(request.minimum, request.maximum)
         self._trails.forget(request.minimum, request.maximum)
         return mapper.publish().number
@@ -81,7 +81,7 @@ class Resets:
         base = store.base_epoch
 
         def forget(mapper: Mapper) -> tuple[MapSnapshot, int]:
-            """The map as it was just before: no scan comes in between."""
+            """Forget it, and return the map just before: no scan comes in between."""
             return mapper.snapshot_since(base), self._forget(mapper, request)
 
         before, epoch = self._mapper.call(forget)
@@ -95,12 +95,12 @@ class Resets:
         return ResetReply(epoch, kept, undo)
 
     def _keep_the_rest(self, store: Store, before: MapSnapshot, kept: int | None) -> int | None:
-        """Keep what was learnt while the checkpoint was written, too; returns the epoch kept."""
+        """Keep what was learnt while the checkpoint was written, too; return the epoch kept."""
         if not before.regions or before.epoch.number == kept:
             return kept
         try:
             written = self._checkpoints.write_changes(before).epoch
-            if written != before.epoch.number:  # all was needed, and is no longer there
+            if written != before.epoch.number:  # all of it was needed, and is no longer there
                 return kept
             store.protect(written, _WHY, instead_of=kept)
             return written

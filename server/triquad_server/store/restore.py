@@ -1,4 +1,4 @@
-"""Reading the newest valid checkpoint of a folder."""
+"""Reads the newest valid checkpoint of a folder."""
 
 import hashlib
 import itertools
@@ -25,8 +25,8 @@ _log = logging.getLogger(__name__)
 _READ_BYTES = 2**20
 
 MAX_EPOCH = 2**52
-"""A map goes on from epochs below this: at a million a second, that is enough for 140 years. What
-is above was not counted by any server, and would end where no client takes numbers any more."""
+"""A map goes on from epochs below this: at a million a second, that is enough for 140 years. Those
+above were not counted by any server, and would end where no client takes numbers any more."""
 
 
 @dataclass(frozen=True)
@@ -39,12 +39,12 @@ class ValidCheckpoint:
 
     @property
     def record(self) -> MapRecord:
-        """The map in it."""
+        """Return the map in it."""
         return self.file.record
 
 
 def newest_valid(folder: Path) -> ValidCheckpoint | None:
-    """The newest valid checkpoint, or ``None`` where there are no checkpoints at all.
+    """Return the newest valid checkpoint, or ``None`` if there are no checkpoints at all.
 
     Damaged ones are renamed, so that they are kept but never count as checkpoints again.
 
@@ -76,7 +76,7 @@ def newest_valid(folder: Path) -> ValidCheckpoint | None:
 
 
 def valid_checkpoint(checkpoint: CheckpointFile) -> ValidCheckpoint:
-    """A checkpoint that is chosen.
+    """Read a chosen checkpoint.
 
     Raises:
         StoreError: it is damaged, or cannot be read.
@@ -101,7 +101,7 @@ def check_countable(path: Path, epoch: int) -> None:
 
 
 def _read(checkpoint: CheckpointFile) -> MapFile | None:
-    """A checkpoint, or ``None`` where it is damaged or not what its name says.
+    """Read a checkpoint; return ``None`` if it is damaged or not what its name says.
 
     Raises:
         StoreError: it cannot be read now, though it may well be valid; or a map cannot go on from

@@ -1,4 +1,4 @@
-"""Which checkpoints stay: a choice without files or clocks."""
+"""Chooses the checkpoints that stay, without access to files or clocks."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -6,16 +6,16 @@ from dataclasses import dataclass
 from triquad_server.settings import StoreSettings
 
 _MIN_KEPT = 2
-"""The newest checkpoints that always stay: should one be damaged, there is another."""
+"""The number of newest checkpoints that always stay: should one be damaged, there is another."""
 
 
 @dataclass(frozen=True)
 class KeptCheckpoint:
-    """What decides whether a checkpoint stays."""
+    """The properties of a checkpoint that decide whether it stays."""
 
     epoch: int
     stamp_ns: int  # when it was written, nanoseconds since 1970
-    files: frozenset[str]  # that it consists of
+    files: frozenset[str]  # names of its files
 
 
 def needed_files(
@@ -26,13 +26,13 @@ def needed_files(
     protected: Collection[int],
     now_ns: int,
 ) -> frozenset[str]:
-    """Names of the files that the checkpoints need which stay.
+    """Return the names of the files that are needed by checkpoints that stay.
 
     Args:
         checkpoints: all there are, the newest first.
         sizes: bytes of each file; a file that several checkpoints need counts once.
         settings: how many stay, of what age, and of how many bytes.
-        protected: epochs that stay beside all these.
+        protected: epochs that stay in addition to all these.
         now_ns: the time, nanoseconds since 1970.
     """
     needed: set[str] = set()
@@ -51,5 +51,5 @@ def needed_files(
 
 
 def bytes_of(files: Collection[str], sizes: Mapping[str, int]) -> int:
-    """What files take on disk; those that are gone take nothing."""
+    """Return the bytes that files take on disk; deleted ones take nothing."""
     return sum(sizes.get(name, 0) for name in files)

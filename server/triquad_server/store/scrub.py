@@ -1,4 +1,4 @@
-"""A slow check of all that lies in a store: what rots there is found while the map is in memory."""
+"""Slowly checks all files of a store: corruption is found while the map is in memory."""
 
 import logging
 import threading
@@ -18,7 +18,7 @@ _log = logging.getLogger(__name__)
 
 _HOUR_S = 3600.0
 _BYTES_PER_S = 8e6
-"""So slowly a store is read: a disk does a hundred times as much."""
+"""The rate at which a store is read: a disk does a hundred times as much."""
 
 
 class Scrubber:

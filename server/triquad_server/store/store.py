@@ -1,7 +1,7 @@
 """Checkpoints on disk: one folder per map.
 
 A checkpoint holds what changed since the one before and refers to older files for the rest; now
-and then all is folded into one file. How far back they reach, the settings decide.
+and then all is folded into one file. The settings decide how far back they reach.
 """
 
 import dataclasses
@@ -45,17 +45,17 @@ from triquad_server.store.restore import (
 _log = logging.getLogger(__name__)
 
 _FEATURE_DTYPE = "<f2"
-_MAPS_NAMED = 8  # of a store, where an epoch is looked for in vain
+_MAPS_NAMED = 8  # checkpoints of a store, where an epoch is not found
 
 
 class Store:
-    """The checkpoints of one map, for one thread. One server at a time holds the folder."""
+    """Manages the checkpoints of one map, for one thread; one server at a time locks the folder."""
 
     def __init__(self, root: Path, map_name: str, settings: StoreSettings) -> None:
-        """Take possession of ``root/map_name``, which is made if need be.
+        """Lock ``root/map_name``, which is made if need be.
 
         Raises:
-            StoreError: the folder cannot be written to, or another server holds it.
+            StoreError: the folder cannot be written to, or another server has locked it.
         """
         self.folder = root / map_name
         self._known: KnownParts | None = None
@@ -68,7 +68,7 @@ class Store:
             ) from error
 
     def close(self) -> None:
-        """Let go of the folder."""
+        """Release the folder."""
         self._files.close()
 
     @property
@@ -80,7 +80,7 @@ class Store:
         return known.facts.epoch
 
     def newest(self) -> ValidCheckpoint | None:
-        """The newest valid checkpoint, from which the map goes on; ``None``: there is none at all.
+        """Return the newest valid checkpoint, from which the map goes on; ``None``: there is none.
 
         Raises:
             StoreError: see :func:`triquad_server.store.restore.newest_valid`.
@@ -126,9 +126,9 @@ class Store:
         return True
 
     def fold(self, stopping: Callable[[], bool]) -> CheckpointInfo | None:
-        """Put the newest checkpoint into one file, where that pays; the answer tells of it.
+        """Fold the newest checkpoint into one file if that pays; return what was written.
 
-        It is left undone as soon as ``stopping()`` says so.
+        It is aborted as soon as ``stopping()`` returns true.
 
         Raises:
             StoreBaseError: a file that holds parts cannot be read; all of the map is needed.
@@ -156,14 +156,14 @@ class Store:
             raise StoreError(f"epoch {epoch} in {self.folder} cannot be kept: {error}") from error
 
     def restore(self, epoch: int) -> None:
-        """Take the map back to an older checkpoint, which is written anew as the newest.
+        """Restore the map to an older checkpoint, which is written again as the newest.
 
         What was the newest so far stays for ``protect_h``, as does the one that is written. A
         server that is started again with the same ``epoch`` does not lose what was learnt since:
-        to take the map back there once more changes nothing.
+        to restore it there once more changes nothing.
 
         Raises:
-            StoreError: there is no such checkpoint, it is not valid, or it cannot be written anew.
+            StoreError: there is no such checkpoint, it is not valid, or it cannot be written again.
         """
         done = self._files.restored
         if done is not None and done.epoch == epoch:
@@ -196,7 +196,7 @@ class Store:
         )
 
     def _maps_beside(self) -> str:
-        """Where this map has no checkpoints, which others of the store have some."""
+        """Return which other maps of the store have checkpoints, where this one has none."""
         try:
             if checkpoint_files(self.folder):
                 return ""
@@ -213,7 +213,7 @@ class Store:
         """Write known parts into one file, as the newest checkpoint.
 
         Raises:
-            _StoppedError: ``stopping()`` said so.
+            _StoppedError: ``stopping()`` returned true.
             StoreError: as of :meth:`fold`.
         """
         path = self.folder / checkpoint_name(known.facts.epoch, complete=True)
@@ -233,7 +233,7 @@ class Store:
 
     @contextmanager
     def _writing(self, failure: str) -> Iterator[OtherFiles]:
-        """The older files, while a new one is written; errors begin with ``failure``."""
+        """Yield the older files, while a new one is written; errors begin with ``failure``."""
         try:
             self._files.renew_lock()
             with closing(OtherFiles(files_in(self.folder))) as others:
@@ -256,7 +256,7 @@ class Store:
         return KnownParts.after(manifest, checkpoint.path.name, stored)
 
     def _stored_bytes(self, name: str) -> int:
-        """Bytes of the parts in a file, needed or not."""
+        """Return the bytes of the parts in a file, needed or not."""
         checkpoint = checkpoint_file(self.folder / name)
         return 0 if checkpoint is None else own_bytes(open_manifest(checkpoint))
 
@@ -273,18 +273,18 @@ def _info(path: Path, written: WrittenMap) -> CheckpointInfo:
 
 
 def stamp_now_ns() -> int:
-    """Nanoseconds since 1970; within what a file can hold, whatever the clock says."""
+    """Return nanoseconds since 1970, within what a file can hold, whatever the clock says."""
     return min(max(time.time_ns(), 0), 2**63 - 1)
 
 
 class _StoppedError(Exception):
-    """Something is more urgent: what is left of the parts is not asked for."""
+    """An error that ends the writing of parts, since something is more urgent."""
 
 
 def _changed_parts(
     changes: MapChanges, known: KnownParts | None, others: OtherFiles | None, *, stamp_ns: int
 ) -> Iterator[Part | Entry]:
-    """The parts of a checkpoint; those that did not change are copied from ``others``, if given."""
+    """Yield the parts of a checkpoint; unchanged ones are copied from ``others``, if given."""
     changed = {region.index: region for region in changes.record.regions}
     settings = changes.record.settings
     for index in changes.regions:
@@ -298,7 +298,7 @@ def _changed_parts(
 
 
 def _copied_parts(entries: Iterable[Entry], others: OtherFiles) -> Iterator[Part]:
-    """Parts that other files hold, read and checked; the map's own part is made anew.
+    """Yield parts that other files hold, read and checked; the map's own part is made again.
 
     Raises:
         MapFileError: one of the files cannot be read, or is damaged.
@@ -308,16 +308,16 @@ def _copied_parts(entries: Iterable[Entry], others: OtherFiles) -> Iterator[Part
             continue
         try:
             payload = others.payload(entry)
-        except OSError as error:  # of reading: the file that is written is another
+        except OSError as error:  # error of reading: the file that is written is another
             raise MapFileError(f"a file that holds parts cannot be read: {error}") from error
         yield Part(entry.key, payload)
 
 
 def _abortable(stopping: Callable[[], bool], parts: Iterator[Part]) -> Iterator[Part]:
-    """The parts, until ``stopping()``.
+    """Yield the parts, until ``stopping()``.
 
     Raises:
-        _StoppedError: it says so.
+        _StoppedError: it returned true.
     """
     for part in parts:
         if stopping():

@@ -1,1 +1,1 @@
-"""Rays that are kept, the distances that they teach, and samples drawn on them."""
+"""Replay: rays that are kept, the distances that they teach, and samples drawn on them."""

@@ -1,4 +1,4 @@
-"""Rays that a region is never trained on: they tell how good its field is."""
+"""Rays that a region is never trained on, used to judge its field."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from triquad_server.mapping.replay.ray_table import END
 
 
 def ends_in_steps(rows: Floats, settings: FieldSettings) -> NDArray[np.int64]:
-    """Where the rays end [N, 3], given by the ``rows`` [N, COLUMNS] of their table, as in
+    """Return where the rays end [N, 3], given by the ``rows`` [N, COLUMNS] of their table, as in
     :class:`triquad_format.records.replay_rays.ReplayRays`.
     """
     leaves = rows[:, END : END + 3].astype(np.float64) / settings.leaf_m + (1 << settings.depth)
@@ -19,13 +19,13 @@ def ends_in_steps(rows: Floats, settings: FieldSettings) -> NDArray[np.int64]:
 
 
 def ray_keys(rows: Floats, settings: FieldSettings) -> Longs:
-    """A number for each ray: where it ends."""
+    """Return a number for each ray that identifies where it ends."""
     return replay_rays.ray_keys(ends_in_steps(rows, settings))
 
 
 @kernel(inline="always")
 def end_in_steps(row: Floats, leaf_m: float, corner: float) -> tuple[int, int, int]:
-    """As :func:`ends_in_steps`, of one ray; the cube's ``corner`` is so many leaves away."""
+    """Return :func:`ends_in_steps` of one ray; the cube's ``corner`` is that many leaves away."""
     return (
         np.int64(np.floor((np.float64(row[END]) / leaf_m + corner) * replay_rays.STEPS)),
         np.int64(np.floor((np.float64(row[END + 1]) / leaf_m + corner) * replay_rays.STEPS)),
@@ -35,7 +35,7 @@ def end_in_steps(row: Floats, leaf_m: float, corner: float) -> tuple[int, int, i
 
 @inner_kernel()
 def is_held_out(x: int, y: int, z: int) -> bool:
-    """As :func:`triquad_format.records.replay_rays.are_held_out`, of one ray."""
+    """Return :func:`triquad_format.records.replay_rays.are_held_out` of one ray."""
     key = np.uint64(0)
     for step in (x, y, z):
         key = key << np.uint64(replay_rays.AXIS_BITS) | np.uint64(step & replay_rays.AXIS_MASK)
@@ -53,5 +53,5 @@ def _held_out(rows: Floats, leaf_m: float, corner: float) -> Bools:
 
 
 def are_held_out(rows: Floats, settings: FieldSettings) -> Bools:
-    """Which rays are held out."""
+    """Return which rays are held out."""
     return _held_out(rows, settings.leaf_m, float(1 << settings.depth))

@@ -1,4 +1,4 @@
-"""Bounded memory of rays, spread over the map.
+"""A bounded memory of rays, spread over the map.
 
 While there is room, all rays stay. Then each new one replaces that of two candidates whose bin of
 space holds more, so that places seen long ago keep theirs and places seen for long do not take
@@ -27,19 +27,19 @@ _NO_LIMIT = 1 << 62
 _ROOM = 1.1  # at most, of the capacity: it grows with the map
 
 RAY_BYTES = math.ceil(_ROOM * 4 * (COLUMNS + 1))
-"""Bytes of a ray, with where its origin is, and with the spare room of the arrays."""
+"""The bytes of a ray, with the row of its origin, and with the spare room of the arrays."""
 
 
 class KeptRays:
-    """Rays of one region, at most as many as its capacity."""
+    """Keeps rays of one region, at most as many as its capacity."""
 
     def __init__(self, settings: FieldSettings, rng: np.random.Generator) -> None:
-        """There are no rays, and no limit yet; ``rng`` chooses which rays stay."""
+        """Begin without rays and limit; ``rng`` chooses which rays stay."""
         self._settings = settings
         self._rng = rng
         self._capacity = _NO_LIMIT
         self._size = 0
-        self.discarded = 0  # rays so far, that gave way to others or were too many
+        self.discarded = 0  # rays so far that were replaced by others or were too many
         self._rows = np.zeros((0, COLUMNS), np.float32)
         self._origin_of = np.zeros(0, np.int32)
         self._origins = np.zeros((0, 3), np.float32)
@@ -51,12 +51,12 @@ class KeptRays:
 
     @property
     def table(self) -> RayTable:
-        """All that is kept; it changes as rays come and go."""
+        """Return all that is kept; it changes as rays come and go."""
         used = slice(self._size)
         return RayTable(self._rows[used], self._origin_of[used], self._origins)
 
     def add(self, new: RayTable) -> Longs:
-        """Take in rays; returns their places [N] in the table, of as many as are taken in."""
+        """Take in rays; return their places [N] in the table, of as many as are taken in."""
         used = self._size
         room = min(len(new), self._capacity - used)
         places = np.arange(used, used + room)
@@ -83,7 +83,7 @@ class KeptRays:
         return places
 
     def limit(self, capacity: int) -> None:
-        """Change the capacity; what is too much goes at random."""
+        """Change the capacity; surplus rays are removed at random."""
         self._capacity = capacity
         if self._size > capacity:
             self.discarded += self._size - capacity
@@ -125,9 +125,9 @@ class KeptRays:
         self._size = size
 
     def _make_room(self, name: str, rows: int) -> None:
-        """Let an array have so many rows, in place.
+        """Let an array have ``rows`` rows, in place.
 
-        To copy it every few scans of new surface would take as long as all else here.
+        Copying it every few scans of new surface would take as long as all else here.
         """
         array = vars(self).pop(name)  # numpy resizes an array in place if nothing else refers to it
         try:
@@ -138,7 +138,7 @@ class KeptRays:
             setattr(self, name, array)
 
     def _add_origins(self, new: Floats) -> int:
-        """Add origins [K, 3], in place of those of no ray any more; returns the first one's row."""
+        """Add origins [K, 3], in place of unused ones; return the first one's row."""
         if self._origin_count + len(new) > len(self._origins):
             rays = self._origin_of[: self._size]
             known = rays >= 0
@@ -165,7 +165,7 @@ class KeptRays:
 
 
 def _coprime(size: int) -> int:
-    """A stride of about a golden section of ``size`` that visits every place once."""
+    """Return a stride of about a golden section of ``size`` that reaches every place once."""
     stride = max(1, round(0.618 * size))
     while math.gcd(stride, size) != 1:
         stride += 1

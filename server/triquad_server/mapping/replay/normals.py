@@ -1,7 +1,7 @@
 """Surface normals from the scans so far: moments of the end points in two sparse grids.
 
-Points in one cell share a normal, that of all points in the 27 cells around. A scan alone cannot
-tell the normal of far ground, where it is a few lines of points; the moments of many scans can. The
+Points in one cell share a normal, that of all points in the 27 cells around. A single scan does
+not determine the normal of far ground, where it is a few lines of points; many scans do. The
 fine grid serves where it has a plane, the coarse one where it has not.
 """
 
@@ -21,7 +21,7 @@ from triquad_map.compiled.voxel_index import (
 )
 
 _FINE_LEAVES, _COARSE_LEAVES = 0.75, 2.5  # sides of the cells
-_FULL = 65_536  # points of a cell, above which older ones count for less
+_FULL = 65_536  # points of a cell, above which older ones count less
 _RENEWAL = 2.0  # factor by which a cell's points become more until its normal is estimated again
 
 
@@ -84,9 +84,9 @@ def _gather(row: int, cell_m: float, index: Index, moments: Floats) -> tuple[flo
 
 @kernel()
 def _outdated(rows: Ints, normals: Doubles, moments: Floats, basis: Floats) -> Ints:
-    """Cells of points without a normal whose own is of far fewer points than there are.
+    """Return the cells of points without a normal that have far more points than at their last fit.
 
-    Their ``basis`` is brought up to date.
+    Their ``basis`` is updated.
     """
     outdated = np.empty(len(rows), np.int32)
     count = 0
@@ -111,7 +111,7 @@ def _estimate(rows: Ints, cell_m: float, index: Index, moments: Floats, normals:
 
 @kernel()
 def _adopt(rows: Ints, of_cells: Floats, normals: Doubles) -> None:
-    """Replace those of ``normals`` that are NaN by those of their cells."""
+    """Replace the ``normals`` that are NaN by those of their cells."""
     for i in range(len(rows)):
         if np.isnan(normals[i, 0]):
             for axis in range(3):
@@ -119,7 +119,7 @@ def _adopt(rows: Ints, of_cells: Floats, normals: Doubles) -> None:
 
 
 class MomentGrid:
-    """Moments of points in the cells of a sparse lattice."""
+    """Keeps moments of points in the cells of a sparse lattice."""
 
     def __init__(self, cell_m: float, team: Team) -> None:
         self._team = team
@@ -131,7 +131,7 @@ class MomentGrid:
         self._basis = np.zeros(1024, np.float32)
 
     def add(self, points: Doubles) -> Ints:
-        """Add points [N, 3], metres, map frame; returns the row of each one's cell."""
+        """Add points [N, 3], metres, map frame; return the row of each one's cell."""
         rows = np.empty(len(points), np.int32)
         done = 0
         while done < len(points):
@@ -145,7 +145,7 @@ class MomentGrid:
         return rows
 
     def fill(self, normals: Doubles, rows: Ints) -> None:
-        """Replace those of ``normals`` [N, 3] that are NaN by those of the cells ``rows`` [N]."""
+        """Replace the ``normals`` [N, 3] that are NaN by those of the cells ``rows`` [N]."""
         outdated = _outdated(rows, normals, self._moments, self._basis)
 
         def work(first: int, last: int) -> None:
@@ -167,12 +167,12 @@ class MomentGrid:
 
     @property
     def cells(self) -> int:
-        """Cells in use."""
+        """The number of cells in use."""
         return self._cells.count
 
     @property
     def nbytes(self) -> int:
-        """Memory of the cells, with the room that they have to grow."""
+        """The memory of the cells, with their spare room."""
         arrays = (*self._cells.arrays, self._moments, self._normals, self._basis)
         return sum(array.nbytes for array in arrays)
 
@@ -192,10 +192,10 @@ class MomentGrid:
 
 
 class SurfaceNormals:
-    """Normals of the surfaces around the sensor; those farthest from it go first."""
+    """Estimates normals of the surfaces around the sensor; the farthest cells are removed first."""
 
     def __init__(self, leaf_m: float, team: Team, max_cells: int = 150_000) -> None:
-        """Each grid has ``max_cells`` cells, at some 100 bytes."""
+        """Make grids of ``max_cells`` cells each, at some 100 bytes."""
         sides_m = (_FINE_LEAVES * leaf_m, _COARSE_LEAVES * leaf_m)
         self._grids = tuple(MomentGrid(side_m, team) for side_m in sides_m)
         self._max_cells = max_cells
@@ -214,7 +214,7 @@ class SurfaceNormals:
         return normals
 
     def restore(self, points: Doubles) -> None:
-        """Go on from end points [N, 3] of earlier scans, the newest last, if any."""
+        """Continue from end points [N, 3] of earlier scans, the newest last, if any."""
         for grid in self._grids:
             grid.add(points)
             if grid.cells > self._max_cells:
@@ -222,7 +222,7 @@ class SurfaceNormals:
 
     @property
     def nbytes(self) -> int:
-        """Memory of both grids."""
+        """The memory of both grids."""
         return sum(grid.nbytes for grid in self._grids)
 
     def forget(self, low: Doubles, high: Doubles) -> None:

@@ -1,4 +1,4 @@
-"""Bins of space in which rays end, by which those to push out are chosen and those to forget found.
+"""Bins of space in which rays end, for choosing rays to push out and finding those to forget.
 
 A bin is a cube of four leaves; cubes that lie far apart may share one. Rays are rows of a
 :class:`RayTable`.
@@ -14,7 +14,7 @@ from triquad_server.mapping.replay.ray_table import COLUMNS, END, RayTable
 
 BIN_LEAVES = 4.0
 BINS = 1 << 18
-_AHEAD = 16  # places that are brought into the cache before their turn
+_AHEAD = 16  # places that are fetched into the cache in advance
 
 
 @inner_kernel()
@@ -27,7 +27,7 @@ def _bin(row: Floats, bin_m: float) -> int:
 
 @kernel()
 def count_in_bins(rows: Floats, bin_m: float) -> Ints:
-    """How many rays [N] end in each bin."""
+    """Count the rays [N] that end in each bin."""
     occupancy = np.zeros(BINS, np.int32)
     for i in range(len(rows)):
         occupancy[_bin(rows[i], bin_m)] += 1
@@ -45,7 +45,7 @@ def best_to_push_out(
     bin_m: float,
     occupancy: Ints,
 ) -> Longs:
-    """Different places whose rays are the best to push out, ``count <= size // 2`` of them.
+    """Return ``count <= size // 2`` different places whose rays are the best to push out.
 
     The pool is paired up, each place once, and of a pair the one goes whose bin holds more.
     """
@@ -85,7 +85,7 @@ def put_rays(
 
 @kernel(inline="always")
 def _voxel(row: Floats, leaf_m: float, middle: float) -> tuple[int, int, int]:
-    """The voxel in which a ray ends."""
+    """Return the voxel in which a ray ends."""
     return (
         int(np.floor(row[END] / leaf_m + middle)),
         int(np.floor(row[END + 1] / leaf_m + middle)),
@@ -95,7 +95,7 @@ def _voxel(row: Floats, leaf_m: float, middle: float) -> tuple[int, int, int]:
 
 @kernel()
 def rays_ending_in(blocks: Index, leaf_m: float, middle: float, rows: Floats) -> Longs:
-    """Which rays [N] end in blocks of voxels."""
+    """Return which rays [N] end in blocks of voxels."""
     chosen = np.empty(len(rows), np.int64)
     count = 0
     for i in range(len(rows)):
@@ -109,7 +109,7 @@ def rays_ending_in(blocks: Index, leaf_m: float, middle: float, rows: Floats) ->
 
 @kernel()
 def bins_of(voxels: Longs, leaf_m: float, middle: float) -> Bools:
-    """Which bins hold any part of ``voxels`` [N, 3]."""
+    """Return which bins hold any part of ``voxels`` [N, 3]."""
     chosen = np.zeros(BINS, np.bool_)
     corner = np.zeros(COLUMNS, np.float32)
     for voxel in voxels:
@@ -132,7 +132,7 @@ def remove_ending_in(
     origin_of: Ints,
     occupancy: Ints,
 ) -> int:
-    """Remove the rays that end in voxels, and put the last ones there; returns the size."""
+    """Remove the rays that end in voxels, and put the last ones there; return the size."""
     i = 0
     while i < size:
         own_bin = _bin(rows[i], BIN_LEAVES * leaf_m)

@@ -1,10 +1,10 @@
-"""Rays that are kept, what they teach of the signed distance, and samples drawn along them.
+"""Kept rays, what they teach of the signed distance, and samples drawn along them.
 
-A ray tells the signed distance all along itself: nothing at its end point, more before it, less
+A ray gives the signed distance all along itself: zero at its end point, more before it, less
 behind it. The published label is the distance to the end point along the ray, which is too large
 where the ray meets the surface at an angle. Where the surface's normal is known, the label here is
 the distance to its plane, so it changes by the cosine of the angle of incidence for each metre.
-Near edges and on small things the points around tell no normal: there the label is the distance
+Near edges and on small things the points around give no normal: there the label is the distance
 along the ray at first, and by the gradient of the field itself once that knows the surface.
 
 All is in metres, relative to the region's centre. Every draw (3QFP, section III-C) makes new
@@ -35,17 +35,17 @@ AnyFloats = NDArray[np.floating]
 LEAST_SLOPE = 0.05
 
 _CELLS = 128
-"""Cells from the centre of the cube to its face, by which samples are put in order."""
+"""The number of cells from the centre of the cube to its face, used to sort samples."""
 
-_AHEAD = 16  # rays that are brought into the cache before their turn
+_AHEAD = 16  # rays that are fetched into the cache in advance
 
 
 class RayTable(NamedTuple):
-    """Rays, and single samples, which have no origin."""
+    """A table of rays, and of single samples, which have no origin."""
 
     rows: Floats
     """[N, COLUMNS] The end point, and by how much the signed distance falls for each metre of the
-    ray, negated where no normal told it; of a sample, the point and its signed distance."""
+    ray, negated where no normal gave it; of a sample, the point and its signed distance."""
 
     origin_of: Ints  # [N] row of a ray's origin; NO_ORIGIN of a sample
     origins: Floats  # [K, 3] where the sensor was
@@ -54,24 +54,24 @@ class RayTable(NamedTuple):
         return len(self.rows)
 
     def of(self, chosen: Bools) -> "RayTable":
-        """The ``chosen`` [N] rays, with all origins."""
+        """Return the ``chosen`` [N] rays, with all origins."""
         return RayTable(self.rows[chosen], self.origin_of[chosen], self.origins)
 
 
 class Placement(NamedTuple):
-    """Where on their rays samples lie."""
+    """The placement of samples on their rays."""
 
-    surface_share: float  # of the samples that lie around the end points
+    surface_share: float  # share of the samples that lie around the end points
     spread_m: float  # standard deviation of those
-    truncation_m: float  # and how far off they lie at most
+    truncation_m: float  # and their largest distance
     free_from: float  # the others lie from this share of the ray
-    behind_m: float  # to so far behind its end
+    behind_m: float  # to this distance behind its end
     half_side_m: float  # of the region's cube: samples lie inside
 
 
 @inner_kernel()
 def _set_direction(direction: Doubles, origin: AnyFloats, end: AnyFloats) -> float:
-    """Set the unit vector [3] from ``origin`` to ``end``; returns how far it is."""
+    """Set the unit vector [3] from ``origin`` to ``end``; return their distance."""
     squared = 0.0
     for axis in range(3):
         direction[axis] = end[axis] - origin[axis]
@@ -87,7 +87,7 @@ def _set_direction(direction: Doubles, origin: AnyFloats, end: AnyFloats) -> flo
 def _clipped(
     end: AnyFloats, direction: Doubles, half_side_m: float, first: float, last: float
 ) -> tuple[float, float]:
-    """The part of an interval of a ray that lies in the cube; none where it begins after its end.
+    """Return a ray's part of an interval in the cube; if there is none, it ends before it begins.
 
     It is in metres behind the end point [3]. The cube is centred at the origin.
     """
@@ -105,8 +105,8 @@ def _clipped(
 def _free_part(
     end: AnyFloats, direction: Doubles, reach_m: float, placement: Placement
 ) -> tuple[float, float, float]:
-    """Where the free space of a ray in the cube begins and ends, metres behind the end point [3],
-    and its share of that of the whole ray."""
+    """Return where the free space of a ray in the cube begins and ends, metres behind the end point
+    [3], and its share of that of the whole ray."""
     first, last = (placement.free_from - 1) * reach_m, placement.behind_m
     whole = last - first
     leaves_cube = False
@@ -128,7 +128,7 @@ def _fill(
     chances: Doubles,
     rows: Floats,
 ) -> int:
-    """Fill the rows with rays that pass the cube; returns how many."""
+    """Fill the rows with rays that pass the cube; return how many."""
     count = 0
     direction = np.empty(3)
     for i in range(len(ends)):
@@ -159,9 +159,9 @@ def rays_through(
     placement: Placement,
     rng: np.random.Generator,
 ) -> RayTable:
-    """The rays in a region's cube; of those that are partly there, as many as is their part.
+    """Return the rays in a region's cube; of those partly there, a share as large as their part.
 
-    So what regions draw from their rays is, of all together, what one would draw.
+    So all regions together draw from their rays what a single one would draw.
 
     Args:
         rays: N rays, map frame.
@@ -178,7 +178,7 @@ def rays_through(
 
 
 def samples_alone(points: Floats, labels: NDArray[np.floating]) -> RayTable:
-    """Samples that teach the signed distances ``labels`` [N] at points [N, 3]."""
+    """Return samples that teach the signed distances ``labels`` [N] at points [N, 3]."""
     rows = np.column_stack([points, labels]).astype(np.float32)
     no_origins = np.zeros((0, 3), np.float32)
     return RayTable(rows, np.full(len(rows), NO_ORIGIN, np.int32), no_origins)
@@ -212,7 +212,7 @@ def _draw(
                 outside = outside or abs(place) >= placement.half_side_m
             if outside or kinds[i] >= placement.surface_share:
                 first, last, free = _free_part(row, direction, reach_m, placement)
-                # Of a ray that leaves the cube, free space is as much less.
+                # The samples on free space of a ray that leaves the cube are fewer in proportion.
                 share = placement.surface_share + (1 - placement.surface_share) * free
                 if outside or kinds[i] * share >= placement.surface_share:
                     offset = first + places[i] * (last - first)
@@ -226,7 +226,7 @@ def _draw(
 
 @kernel()
 def _in_order(samples: Floats, cells: Longs) -> tuple[Floats, Floats]:
-    """Points [B, 3] and labels [B] in the order of their cells (a counting sort)."""
+    """Return points [B, 3] and labels [B] in the order of their cells (a counting sort)."""
     starts = np.zeros((2 * _CELLS) ** 2 + 1, np.int32)
     for cell in cells:
         starts[cell + 1] += 1
@@ -245,7 +245,7 @@ def _in_order(samples: Floats, cells: Longs) -> tuple[Floats, Floats]:
 def draw_ordered_samples(
     table: RayTable, chosen: Longs, placement: Placement, rng: np.random.Generator, team: Team
 ) -> Batch:
-    """One sample on each of the rays ``chosen`` [B].
+    """Draw one sample on each of the rays ``chosen`` [B].
 
     Neighbours in space follow each other, and find in the cache what the last one fetched.
     """

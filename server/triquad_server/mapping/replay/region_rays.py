@@ -1,4 +1,4 @@
-"""The rays that are kept of a region: those to train on, and those by which its field is judged."""
+"""The kept rays of a region: those to train on, and those to judge its field with."""
 
 import numpy as np
 from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
@@ -15,17 +15,17 @@ from triquad_server.mapping.replay.replay_record import restored_rays
 
 
 class RegionRays:
-    """Some rays are held out from training; which, tells the place where they end."""
+    """Keeps rays, some of them held out from training, which is decided by where they end."""
 
     def __init__(self, setup: RegionSetup, seed: int) -> None:
-        """None are kept yet, and there is no limit."""
+        """Begin without rays and limit."""
         self._settings = setup.field
         self.pool = ReplayPool(setup.placement, setup.field, seed, setup.team)
         self.held_out = KeptRays(setup.field, np.random.default_rng(seed))
 
     @classmethod
     def restored(cls, state: TrainingState, setup: RegionSetup, seed: int) -> "RegionRays":
-        """The rays of a record."""
+        """Make the rays of a record."""
         rays = cls(setup, seed)
         rays.keep(restored_rays(state.rays, setup.field, setup.team))
         rays.pool.add(samples_alone(state.sample_points, state.sample_labels))
@@ -33,7 +33,7 @@ class RegionRays:
 
     @property
     def table(self) -> RayTable:
-        """A copy of all rays: those of the pool, then those that are held out."""
+        """Return a copy of all rays: those of the pool, then those that are held out."""
         trained, held = self.pool.table, self.held_out.table
         moved = np.where(held.origin_of >= 0, held.origin_of + len(trained.origins), held.origin_of)
         return RayTable(
@@ -44,27 +44,27 @@ class RegionRays:
 
     @property
     def judging(self) -> Floats:
-        """The rows [N, COLUMNS] of the rays that are held out and end in the region's cube."""
+        """Return the rows [N, COLUMNS] of held-out rays that end in the region's cube."""
         rows = self.held_out.table.rows
         return rows[in_cube(rows[:, END : END + 3], self._settings)]
 
     @property
     def ends(self) -> Floats:
-        """Where the rays of the pool end [N, 3], metres from the region's centre, newest last."""
+        """Return where the pool's rays end [N, 3], metres from the region's centre, newest last."""
         table = self.pool.table
         order = np.argsort(table.origin_of, kind="stable")[(table.origin_of < 0).sum() :]
         ends: Floats = table.rows[order, END : END + 3]
         return ends
 
     def keep(self, rays: RayTable) -> Bools:
-        """Keep rays [N]; returns which of them are held out."""
+        """Keep rays [N]; return which of them are held out."""
         held = are_held_out(rays.rows, self._settings)
         self.held_out.add(rays.of(held))
         self.pool.add(rays.of(~held))
         return held
 
     def limit(self, rays: int) -> None:
-        """Keep at most so many rays to train on, and as many to judge by as is their part."""
+        """Keep at most ``rays`` rays to train on, and a proportional number to judge by."""
         self.pool.limit(rays)
         self.held_out.limit(max(1, rays // HELD_OUT))
 

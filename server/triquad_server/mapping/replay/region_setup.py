@@ -1,4 +1,4 @@
-"""What the regions of a map have in common."""
+"""The setup that the regions of a map share."""
 
 from dataclasses import dataclass
 
@@ -13,12 +13,12 @@ from triquad_server.mapping.replay.ray_table import Placement
 from triquad_server.settings import ChangeSettings, ScanSettings, TrainingSettings
 
 FREE_FROM = 0.3
-"""Share of the range from which on samples of free space are drawn."""
+"""The share of the range from which on samples of free space are drawn."""
 
 
 @dataclass(frozen=True)
 class RegionSetup:
-    """What the regions of a map have in common."""
+    """The setup that the regions of a map share."""
 
     field: FieldSettings
     scan: ScanSettings
@@ -30,7 +30,7 @@ class RegionSetup:
 
     @property
     def placement(self) -> Placement:
-        """Where on their rays samples lie."""
+        """Return where on their rays samples lie."""
         return Placement(
             surface_share=self.scan.surface_share,
             spread_m=self.scan.spread_m,
@@ -42,11 +42,11 @@ class RegionSetup:
 
     @property
     def disbelief(self) -> Disbelief:
-        """When rays contradict a surface."""
+        """Return when rays contradict a surface."""
         return Disbelief.of(self.change.scans, self.change.doubt)
 
     def seeds(self, index: RegionIndex) -> tuple[int, int]:
-        """Seeds of a region's field and of its replay pool; no two regions share one."""
+        """Return seeds of a region's field and of its replay pool; no two regions share one."""
         natural = tuple(2 * i if i >= 0 else -2 * i - 1 for i in index)
         sequence = np.random.SeedSequence(self.training.seed, spawn_key=natural)
         field, pool = sequence.generate_state(2, np.uint64).tolist()

@@ -1,4 +1,4 @@
-"""Samples drawn on the rays that a region keeps to be trained on."""
+"""Draws samples on the rays that a region keeps to train on."""
 
 import numpy as np
 from triquad_format.records.arrays import Doubles, Longs
@@ -22,12 +22,12 @@ _NONE = np.zeros(0, np.int64)
 
 
 class ReplayPool:
-    """Rays of one region; some can be drawn on more often than others."""
+    """Keeps rays of one region, some of which can be oversampled."""
 
     def __init__(
         self, placement: Placement, settings: FieldSettings, seed: int, team: Team
     ) -> None:
-        """There are no rays, and no limit yet; ``team`` draws samples on them."""
+        """Begin without rays and limit; ``team`` draws samples on them."""
         self._settings = settings
         self._team = team
         self.placement = placement
@@ -43,7 +43,7 @@ class ReplayPool:
 
     @property
     def table(self) -> RayTable:
-        """All that is kept; it changes with the pool."""
+        """Return all that is kept; it changes with the pool."""
         return self.kept.table
 
     def add(self, new: RayTable, fresh: bool = True) -> None:
@@ -66,12 +66,12 @@ class ReplayPool:
 
     @property
     def rays_drawn_on(self) -> int:
-        """How many rays are drawn on at random."""
+        """Return how many rays are drawn on at random."""
         in_focus = self._in_focus()
         return len(self) if in_focus is None else len(in_focus)
 
     def oversample(self, places: Longs) -> int:
-        """From now on, some samples are drawn in ``places`` [P] on request; returns their rays."""
+        """From now on, draw some samples in ``places`` [P] on request; return their rays."""
         self._oversampled = _NONE
         if len(places):
             ends = self.table.rows[:, END : END + 3]
@@ -79,7 +79,7 @@ class ReplayPool:
         return len(self._oversampled)
 
     def draw(self, count: int, fresh: int, oversampled: int = 0) -> Batch:
-        """``count`` samples on rays at random.
+        """Draw ``count`` samples on rays at random.
 
         ``fresh`` of them are on the newest, ``oversampled`` in the places that are oversampled.
         """
@@ -90,13 +90,13 @@ class ReplayPool:
         return self.draw_on(places)
 
     def draw_on(self, places: Longs) -> Batch:
-        """A sample on each of the rays of :attr:`table` at ``places`` [N]."""
+        """Draw a sample on each of the rays of :attr:`table` at ``places`` [N]."""
         return draw_ordered_samples(
             self.table, places, self.placement, rng=self._rng, team=self._team
         )
 
     def unsure(self, count: int, fresh: int) -> Longs:
-        """The places of rays whose slope no normal told, among ``count`` that are drawn on.
+        """Return the places of rays whose slope no normal gave, among ``count`` that are drawn on.
 
         They end in the cube: elsewhere a field knows no surface.
         """
@@ -108,11 +108,11 @@ class ReplayPool:
         return unsure
 
     def set_slopes(self, places: Longs, slopes: Doubles) -> None:
-        """The rays at ``places`` [N] have these ``slopes`` [N], which no normal told."""
+        """Set the ``slopes`` [N] of the rays at ``places`` [N], which no normal gave."""
         self.table.rows[places, VALUE] = -slopes
 
     def limit(self, capacity: int) -> None:
-        """Change the capacity; what is too much goes at random."""
+        """Change the capacity; surplus rays are removed at random."""
         is_too_much = len(self) > capacity
         self.kept.limit(capacity)
         if is_too_much:
@@ -131,7 +131,7 @@ class ReplayPool:
         self._focused = None
 
     def _at_random(self, count: int, fresh: int) -> Longs:
-        """Places [count] at random, ``fresh`` of them of the newest."""
+        """Draw places [count] at random, ``fresh`` of them of the newest."""
         in_focus = self._in_focus()
         places: Longs = self._rng.integers(self.rays_drawn_on, size=count)
         if in_focus is not None:
@@ -141,7 +141,7 @@ class ReplayPool:
         return places
 
     def _in_focus(self) -> Longs | None:
-        """The places of the rays that are drawn on at random; None: all of them."""
+        """Return the places of the rays that are drawn on at random; None: all of them."""
         if self._blocks is None:
             return None
         if self._focused is None:
@@ -149,13 +149,13 @@ class ReplayPool:
         return self._focused if len(self._focused) else None
 
     def _ending_in_blocks(self, places: Longs) -> Longs:
-        """Those of the rays at ``places`` [N] that end in the blocks in focus."""
+        """Return which rays at ``places`` [N] end in the blocks in focus."""
         assert self._blocks is not None
         middle = float(1 << (self._settings.depth - 1))  # of the region, voxels
         rows = self.table.rows[places]
         return places[rays_ending_in(self._blocks, self._settings.leaf_m, middle, rows)]
 
     def _select_none(self) -> None:
-        """Rays have other places now."""
+        """Forget the selected places, since rays have others now."""
         self._fresh = self._oversampled = _NONE
         self._focused = None

@@ -1,7 +1,7 @@
-"""The rays of a replay pool as a record holds them, and back.
+"""Converts the rays of a replay pool to their form in a record, and back.
 
-The file tells where rays end more finely than any sensor does, and at which angle they met the
-surface. Rounded ends take less room there, and angles that the ends around tell again take none: so
+The file holds ends of rays more finely than any sensor measures, and the angle of incidence at
+the surface. Rounded ends take less room there, and angles implied by the ends around take none: so
 there is room for more rays.
 """
 
@@ -17,12 +17,13 @@ from triquad_server.mapping.replay.held_out import end_in_steps, is_held_out
 from triquad_server.mapping.replay.normals import SurfaceNormals
 from triquad_server.mapping.replay.ray_table import LEAST_SLOPE, VALUE, RayTable
 
-_MOST_RAYS = 6_000_000  # so many fit into the parts of a single cube
+_MOST_RAYS = 6_000_000  # this many fit into the parts of a single cube
 
-_ORIGIN_BITS = 15  # beside 48 of a leaf's code
+_ORIGIN_BITS = 15  # in addition to 48 of a leaf's code
 
 _ROUNDED_STEPS = 3
-"""To the middle of so many steps: 5 mm at the default leaf, which adds 1.4 mm of noise."""
+"""Ends are rounded to the middle of this many steps: 5 mm at the default leaf, which adds 1.4 mm
+of noise."""
 
 _ROUNDED_SLOPES = 8  # of SLOPE_SCALE
 
@@ -31,7 +32,7 @@ _FAR = -1  # the code of what is no ray that ends in the cube
 
 @inner_kernel()
 def _leaf_code(x: int, y: int, z: int) -> int:
-    """As :func:`triquad_format.records.morton.encode`, of one leaf."""
+    """Return :func:`triquad_format.records.morton.encode` of one leaf."""
     code: int = np.int64(0)
     for axis, number in enumerate((x, y, z)):
         bits = np.int64(number)
@@ -43,9 +44,9 @@ def _leaf_code(x: int, y: int, z: int) -> int:
 
 @kernel()
 def _codes(table: RayTable, leaf_m: float, side: int, coarser: int) -> Longs:
-    """By what the rays [N] of a table are put in order: by origin within a leaf, nearly.
+    """Return codes that sort a table's rays [N]: by origin within a leaf, nearly.
 
-    Neighbours that are alike take less room.
+    Similar neighbours take less room.
     """
     codes = np.empty(len(table.rows), np.int64)
     most = 2 * side * STEPS
@@ -68,7 +69,7 @@ def _record(
         row = rows[places[i]]
         x, y, z = end_in_steps(row, leaf_m, corner)
         near_x, near_y, near_z = _rounded(x), _rounded(y), _rounded(z)
-        # Rays that are held out stay what they are, and no others become it.
+        # Rays that are held out remain so, and no others become held out.
         if not is_held_out(x, y, z) and not is_held_out(near_x, near_y, near_z):
             x, y, z = near_x, near_y, near_z
         ends[i, 0], ends[i, 1], ends[i, 2] = x, y, z
@@ -77,7 +78,7 @@ def _record(
 
 @inner_kernel()
 def _rounded(step: int) -> int:
-    """The middle of a few steps of the same leaf."""
+    """Return the middle of a few steps of the same leaf."""
     leaf = step // STEPS * STEPS
     first = (step - leaf) // _ROUNDED_STEPS * _ROUNDED_STEPS
     after = min(first + _ROUNDED_STEPS, STEPS)
@@ -86,9 +87,9 @@ def _rounded(step: int) -> int:
 
 @inner_kernel()
 def _told_slope(value: float) -> int:
-    """The slope of a ray with this ``value`` in its table, if the field told it.
+    """Return the slope of a ray with this ``value`` in its table, if the field gave it.
 
-    SLOPE_SCALE where a normal did, and where nothing did.
+    It is SLOPE_SCALE where a normal gave it, or nothing did.
     """
     if value >= 0 or value <= -1:
         return SLOPE_SCALE
@@ -96,15 +97,15 @@ def _told_slope(value: float) -> int:
 
 
 def recorded_rays(table: RayTable, settings: FieldSettings) -> tuple[ReplayRays, Longs]:
-    """The rays of a table, as many as a file holds, and the places of all else in it: samples, and
-    what ends far away.
+    """Return the rays of a table, as many as a file holds, and the places of all else in it:
+    samples, and what ends far away.
     """
     side = 1 << settings.depth
     coarser = max(0, len(table.origins).bit_length() - _ORIGIN_BITS)
     codes = _codes(table, settings.leaf_m, side, coarser)
     places = np.argsort(codes)
     far = int((codes == _FAR).sum())
-    del codes  # a big map's rays are what memory is shortest for
+    del codes  # for a big map's rays, memory is shortest
     others, places = np.sort(places[:far]), places[far:]
     if len(places) > _MOST_RAYS:
         rng = np.random.default_rng(len(places))
@@ -116,7 +117,7 @@ def recorded_rays(table: RayTable, settings: FieldSettings) -> tuple[ReplayRays,
 
 
 def restored_rays(rays: ReplayRays, settings: FieldSettings, team: Team) -> RayTable:
-    """The rays of a record; their slopes are told by the ends around, where these have a normal."""
+    """Return the rays of a record; their slopes follow from normals of the ends around, if any."""
     ends = rays.ends_m(settings)
     normals = SurfaceNormals(settings.leaf_m, team, max_cells=len(ends)).add(ends, np.zeros(3))
     ways = ends - rays.origins[rays.origin_of]

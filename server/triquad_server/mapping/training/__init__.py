@@ -1,1 +1,1 @@
-"""What regions have still to learn, where, and at which rates."""
+"""Training: what regions still have to learn, where, and at which rates."""

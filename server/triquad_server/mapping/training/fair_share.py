@@ -1,4 +1,4 @@
-"""What each voxel with surface has of the rays that are kept and of the training that is left."""
+"""Each voxel's share of the rays that are kept and of the training that is left."""
 
 import math
 from dataclasses import dataclass
@@ -7,20 +7,21 @@ from triquad_server.mapping.replay.kept_rays import RAY_BYTES
 from triquad_server.settings import TrainingSettings
 
 _STEP = 1.1
-"""By which the rays of a voxel become fewer: it is expensive, and so it is done seldom."""
+"""The factor between the possible numbers of rays per voxel: changing it is expensive, so it is
+done seldom."""
 
 
 @dataclass(frozen=True)
 class FairShare:
-    """What a voxel with surface has, wherever it is, so that all places are learnt alike."""
+    """The share of a voxel with surface, the same everywhere: all places are learnt alike."""
 
-    rays: float  # that are kept
-    samples: float  # that may be left to train on
-    rays_share: float  # of `training.rays_per_voxel`, that memory has room for
+    rays: float  # rays that are kept
+    samples: float  # samples that may be left to train on
+    rays_share: float  # share of `training.rays_per_voxel` that memory has room for
 
     @classmethod
     def of(cls, voxels: int, training: TrainingSettings) -> "FairShare":
-        """The share in a map of so many ``voxels`` with surface."""
+        """Return the share in a map of ``voxels`` voxels with surface."""
         count = max(1, voxels)
         wanted = max(training.pool_rays / count, training.rays_per_voxel)
         kept = min(wanted, training.pool_bytes / RAY_BYTES / count)

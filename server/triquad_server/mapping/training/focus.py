@@ -1,4 +1,4 @@
-"""Where a region learns: everywhere, or only where it was seen since all of it had settled."""
+"""Decides where a region learns: everywhere, or only where it was seen since all had settled."""
 
 import numpy as np
 from triquad_format.records.arrays import Doubles, Longs
@@ -10,25 +10,25 @@ from triquad_server.engine.live_field import LiveField
 from triquad_server.mapping.replay.replay_pool import ReplayPool
 
 _GROWTH = 1.1
-"""Factor by which blocks become more until new ones are taken into account: to find their rays and
-rows is expensive."""
+"""The growth of blocks until new ones are taken into account: finding their rays and rows is
+expensive."""
 
 _LATEST_SAMPLES = 1 << 19
-"""Samples that are trained on without new blocks, at most."""
+"""The most samples that are trained on before new blocks are taken into account."""
 
 _MOST_SHARE = 0.25
-"""Where more of the blocks with surface were seen since, all of the region learns."""
+"""If a larger share of the blocks with surface was seen since, all of the region learns."""
 
 _LEAST_FREE = 0.25
-"""Or where, of the rows under what was seen since, fewer are under nothing else: in a small place,
-nearly all rows are shared, and so they are under a small thing."""
+"""It does also if a smaller share of the rows under what was seen since is under nothing else: in a
+small place, nearly all rows are shared, and so are those under a small thing."""
 
 _LEARNT_STEPS = 300
-"""An MLP that took fewer has not learnt enough to stay as it is; a pretrained one has."""
+"""An MLP that took fewer steps has not learnt enough to stay fixed; a pretrained one has."""
 
 
 class Focus:
-    """The blocks of a region in which anything was seen since all of it had settled.
+    """Limits training to the blocks of a region that were seen since all of it had settled.
 
     The region learns there alone: on rays that end there, in rows of features that no surface
     elsewhere uses, and with the MLP that it has. Everything else stays as it is, to the bit. Once
@@ -37,16 +37,16 @@ class Focus:
     """
 
     def __init__(self, field: LiveField, evidence: LiveEvidence, pool: ReplayPool) -> None:
-        """All of the region learns."""
+        """Begin with all of the region learning."""
         self._field = field
         self._evidence = evidence
         self._pool = pool
         self._seen_since: Longs | None = None  # keys [B] of blocks; None: all learns
-        self._blocks_applied = 0  # of them, those that the field and the pool know of
-        self._samples_since = 0  # that were trained on since
+        self._blocks_applied = 0  # blocks that the field and the pool know of
+        self._samples_since = 0  # samples that were trained on since
 
     def narrow(self) -> None:
-        """There is nothing left to learn: from now on, only what is seen later learns."""
+        """From now on, train only what is seen later, since nothing is left to learn."""
         has_features = self._field.settings.encoding != "fourier"
         has_learnt = self._field.mlp_steps >= _LEARNT_STEPS
         if self._seen_since is None and has_features and has_learnt:
@@ -54,7 +54,7 @@ class Focus:
         self._blocks_applied = 0
 
     def widen_to(self, positions: Doubles | Longs) -> None:
-        """Something is seen at ``positions`` [N, 3], in voxels; outside it does not count."""
+        """Add blocks seen at ``positions`` [N, 3], in voxels; those outside do not count."""
         if self._seen_since is not None:
             side = 1 << self._field.settings.depth
             is_inside = ((positions >= 0) & (positions < side)).all(axis=1)
@@ -62,13 +62,13 @@ class Focus:
             self._seen_since = np.union1d(self._seen_since, keys_of(blocks))
 
     def release(self) -> None:
-        """All of the region learns."""
+        """Let all of the region learn."""
         self._seen_since = None
         self._field.hold(None)
         self._pool.focus(None)
 
     def apply(self, samples: int) -> None:
-        """Before ``samples`` are trained on: the field and the pool keep to what was seen since."""
+        """Restrict the field and the pool to what was seen since, for the next ``samples``."""
         if self._seen_since is None:
             return
         self._samples_since += samples

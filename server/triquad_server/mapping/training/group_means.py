@@ -1,4 +1,4 @@
-"""Means of values in groups."""
+"""Computes means of values in groups."""
 
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ class GroupMeans(NamedTuple):
 
     @classmethod
     def of(cls, values: Doubles, group_of: Longs, groups: int) -> "GroupMeans":
-        """Of ``values`` [N], each in the group ``group_of`` [N]."""
+        """Return the means of ``values`` [N], each in the group ``group_of`` [N]."""
         counts = np.bincount(group_of, minlength=groups)
         least = np.maximum(counts, 1)
         means = np.bincount(group_of, values, groups) / least

@@ -1,8 +1,8 @@
-"""The places of a region that are learnt: training on more of their rays makes them no better.
+"""The learnt places of a region: training on more of their rays makes them no better.
 
-A robot at rest sends the same surfaces again and again. They are taken in, since they tell what is
+A robot at rest sends the same surfaces again and again. They are taken in, since they show what is
 still there, but once the error of a place falls no more, its rays need no training: so the map
-settles while scans come. When anything changes in sight, all is learnt again as if it were new.
+settles while scans come. When anything changes in view, all is learnt again as if it were new.
 """
 
 from collections.abc import Callable
@@ -19,70 +19,70 @@ from triquad_server.mapping.training.group_means import GroupMeans
 AtEnds = Callable[[Floats], NDArray[np.floating]]
 
 VISITS = 5
-"""To each ray on average, between two comparisons: so many samples make a difference where there is
-one to be made."""
+"""The samples per ray, on average, between two comparisons: enough to make a difference where one
+is possible."""
 
-_COMPARISONS = 2  # in a row, in which the error of a place that is learnt did not fall
+_COMPARISONS = 2  # comparisons in a row in which a learnt place's error did not fall
 
 _LEAST_FALL = 0.2
-"""Share of the mean square error, with the noise of the rays, by which it falls where it does."""
+"""The least fall that counts, as a share of the mean square error, including the rays' noise."""
 
 _SURE = 5.0
-"""By so many standard errors of the mean a place must fit worse than when it had settled."""
+"""A settled place fits worse if it does so by this many standard errors of the mean."""
 
 _LEAST_RISE = 0.5
-"""And by this share of its mean square error."""
+"""The error must also rise by this share of its mean square error."""
 
 _LEAST_RAYS = 24
-"""Of a place by itself: those that have fewer are compared as one."""
+"""The least rays of a place by itself: places that have fewer are compared as one."""
 
 _FEW_NEEDING = 0.01
-"""Where a smaller share of a scan's rays end in places that are not learnt, these need none
+"""If a smaller share of a scan's rays end in places that are not learnt, these need no training
 either: in a place of few rays, chance alone makes the error fall now and then."""
 
-_NOISE = 0.1  # of rays, in leaves: where errors are less, few rays tell of it alone
+_NOISE = 0.1  # of rays, in leaves: below such errors, few rays show whether they fall
 
 _TURNS = 4
-"""One in so many of a scan's rays is taken into account, and another the next time."""
+"""One in this many of a scan's rays is taken into account, and another the next time."""
 
 _FEW_REMOVED = 2
-"""Where at once surface goes from more voxels of a place, all is learnt again: single ones hold the
-noise of rays."""
+"""If surface is removed from more voxels of a place at once, all is learnt again: for single ones,
+the rays' noise may be the cause."""
 
 _FOLLOWED = np.dtype(
     [
         ("key", np.int64),
         ("error", np.float64),  # mean square error, as a multiple of the first that was compared
         ("least", np.float64),  # the last of these that had fallen
-        ("comparisons", np.int64),  # since
+        ("comparisons", np.int64),  # comparisons since
         ("settled", np.float64),  # mean square error once it was learnt and had settled, or NaN
     ]
 )
 
 
 class LearntPlaces:
-    """Follows the error of a region's places at the ends of rays that are held out."""
+    """Tracks the error of a region's places at the ends of rays that are held out."""
 
     def __init__(self, settings: FieldSettings) -> None:
-        """None is learnt."""
+        """Begin with no place learnt."""
         self._settings = settings
         self._turn = 0
-        self._visits = 0.0  # to each ray on average, since errors were compared
-        self._ends = np.zeros((0, 3), np.float32)  # of the rays for the next comparison
-        self._squares = np.zeros(0)  # of what the field said there
+        self._visits = 0.0  # samples per ray on average since errors were compared
+        self._ends = np.zeros((0, 3), np.float32)  # ends of the rays for the next comparison
+        self._squares = np.zeros(0)  # the field's values there
         self.learn_all_again()
 
     def __len__(self) -> int:
         return len(self._learnt)
 
     def learn_all_again(self) -> None:
-        """From now on, no place is learnt."""
+        """From now on, treat no place as learnt."""
         self._followed = np.zeros(0, _FOLLOWED)  # increasing keys
-        self._learnt = np.zeros(0, np.int64)  # keys of those that are
+        self._learnt = np.zeros(0, np.int64)  # keys of the learnt ones
         self._seen = np.zeros(0, np.int64)  # keys of places in which rays ended since the last time
 
     def see(self, ends: Doubles) -> None:
-        """Rays end at ``ends`` [N, 3], metres from the region's centre."""
+        """Record that rays end at ``ends`` [N, 3], metres from the region's centre."""
         self._turn = (self._turn + 1) % _TURNS
         keys = place_keys(ends[self._turn :: _TURNS], self._settings)
         new = rows_of(self._seen, keys) < 0
@@ -90,7 +90,7 @@ class LearntPlaces:
             self._seen = np.union1d(self._seen, keys[new])
 
     def need_training(self, ends: Doubles | Floats) -> Bools:
-        """Which rays [N] of a scan need training, that end at ``ends`` [N, 3]."""
+        """Return which rays [N] of a scan, ending at ``ends`` [N, 3], need training."""
         if len(self._learnt) == 0:
             return np.ones(len(ends), np.bool_)
         needing = rows_of(self._learnt, place_keys(ends, self._settings)) < 0
@@ -99,24 +99,24 @@ class LearntPlaces:
         return needing
 
     def surface_removed(self, points: Doubles) -> None:
-        """Surface went from ``points`` [N, 3], one in each voxel."""
+        """Record that surface was removed from ``points`` [N, 3], one in each voxel."""
         _, counts = np.unique(place_keys(points, self._settings), return_counts=True)
         if (counts > _FEW_REMOVED).any():
             self.learn_all_again()
 
     def trained(self, visits: float) -> None:
-        """Samples were drawn on each ray, so many on average, and trained on."""
+        """Record that ``visits`` samples per ray, on average, were drawn and trained on."""
         self._visits += visits
 
     def judge(
         self, ends: Floats, sdf: NDArray[np.floating], field: AtEnds, *, settled: bool
     ) -> bool:
-        """Find out where the error falls no more; returns whether it rose, and all is learnt again.
+        """Find where the error no longer falls; return whether it rose, so all is learnt again.
 
         Args:
             ends: [N, 3] of the rays that are held out now, metres from the region's centre.
-            sdf: [N] what the field says there, metres.
-            field: tells what the field says elsewhere.
+            sdf: [N] the field's values there, metres.
+            field: gives the field's values elsewhere.
             settled: nothing is trained any more. Before, errors rise and fall by chance.
         """
         squares = sdf.astype(np.float64) ** 2
@@ -131,7 +131,7 @@ class LearntPlaces:
         return rose
 
     def _compare(self, field: AtEnds) -> None:
-        """The errors at the rays of the last time, in places that were seen since."""
+        """Compare the errors at the rays of the last time, in places that were seen since."""
         keys = self._seen
         rows = rows_of(keys, place_keys(self._ends, self._settings))
         is_seen = rows >= 0
@@ -147,7 +147,7 @@ class LearntPlaces:
         self._follow(keys[told], times[told])
 
     def _times_of_few(self, before: Doubles, after: Doubles, rays: Longs) -> float:
-        """How many times its mean square error before that after is, in places of few ``rays`` [P].
+        """Return the ratio of mean square errors after and before, in places of few ``rays`` [P].
 
         The logarithms are averaged: one place in which nothing can be learnt does not decide for
         all.
@@ -157,7 +157,7 @@ class LearntPlaces:
         return float(np.exp((logs * rays).sum() / rays.sum()))
 
     def _follow(self, keys: Longs, times: Doubles) -> None:
-        """The errors of places became so many ``times`` what they were."""
+        """Record that the errors of places are ``times`` what they were."""
         self._begin_to_follow(keys)
         rows = rows_of(self._followed["key"], keys)
         places = self._followed[rows]
@@ -178,7 +178,7 @@ class LearntPlaces:
         self._followed = np.sort(np.concatenate([self._followed, new]), order="key")
 
     def _rose(self, ends: Floats, squares: Doubles) -> bool:
-        """Whether the field fits the rays of now anywhere worse than those when it had settled.
+        """Return whether the field fits the present rays anywhere worse than when it had settled.
 
         A place that has settled now is compared from now on.
         """

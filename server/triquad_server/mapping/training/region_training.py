@@ -1,4 +1,4 @@
-"""What one region of the live map has still to learn, and where it has forgotten."""
+"""Training of one region of the live map: what it still has to learn, and has forgotten."""
 
 import logging
 from dataclasses import replace
@@ -27,28 +27,28 @@ from triquad_server.mapping.training.training_budget import TrainingBudget
 
 _log = logging.getLogger(__name__)
 
-_SAMPLES_PER_VOXEL = 16  # that teach the free space of a surface that is gone
-_VISITS = 4  # to each of them
+_SAMPLES_PER_VOXEL = 16  # samples that teach the free space of a removed surface
+_VISITS = 4  # times that each of them is trained on
 
 _VERTICES_PER_SAMPLE = 14
-"""Of a region, for each sample of a step: each vertex takes about as many steps wherever it is."""
+"""The vertices for each sample of a step: each vertex takes about as many steps in any region."""
 
-_LEAST_BATCH = 4096  # what a step costs however few its samples are matters below
+_LEAST_BATCH = 4096  # below, the fixed cost of a step matters
 
 _JUDGED_AFTER_SAMPLES = 8_000_000
-"""A field that is being trained is judged after so many samples: a few seconds. Where few rays are
-kept, it is as soon as each was visited as often as makes a difference."""
+"""A field that is being trained is judged after this many samples: a few seconds. If few rays are
+kept, it is as soon as each was sampled often enough to make a difference."""
 
 _JUDGED_AFTER_SHARE = 0.5
 """A field that has settled is judged once this share of the rays that are held out is new."""
 
 _FEW_REMOVED = 32
-"""Where the surface of more voxels is gone, all of the region learns: rows that others use as well
+"""If the surface of more voxels is removed, all of the region learns: rows that others use as well
 have to forget it."""
 
 
 class RegionTraining:
-    """The training of one region's field: it is told of scans, and has to be told of epochs."""
+    """Trains one region's field; it is notified of scans, and must be notified of epochs."""
 
     def __init__(
         self,
@@ -59,7 +59,7 @@ class RegionTraining:
         seed: int,
         rays: RegionRays | None = None,
     ) -> None:
-        """There is nothing to learn yet.
+        """Begin with nothing to learn.
 
         Args:
             field: what is trained.
@@ -80,8 +80,8 @@ class RegionTraining:
         self._focus = Focus(field, evidence, self.rays.pool)
         self._slopes = Slopes(field, self.rays.pool)
         self._trainer = trainer_of(field, setup.sums, setup.team)
-        self._unjudged_samples = 0  # that were trained since it was judged
-        self._unjudged_rays = 0  # that were held out since
+        self._unjudged_samples = 0  # samples that were trained since it was judged
+        self._unjudged_rays = 0  # rays that were held out since
 
     @classmethod
     def restored(
@@ -93,7 +93,7 @@ class RegionTraining:
         centre: Doubles,
         seed: int,
     ) -> "RegionTraining":
-        """Training goes on as recorded; what is forgotten is judged by what the field says now."""
+        """Continue as recorded; what the field forgets is judged by its values now."""
         rays = RegionRays.restored(state, setup, seed)
         training = cls(field, evidence, setup, centre, seed, rays)
         training.budget.restore(state.budget_samples, len(rays.pool))
@@ -105,19 +105,19 @@ class RegionTraining:
 
     @property
     def is_settled(self) -> bool:
-        """Whether there is nothing left to train on."""
+        """Return whether there is nothing left to train on."""
         return self.budget.samples == 0
 
     @property
     def samples_per_vertex(self) -> float:
-        """Samples that are still to be trained on for each vertex."""
+        """The number of samples that are still to be trained on for each vertex."""
         return self.budget.samples / max(1, self._field.vertices)
 
     @property
     def batch(self) -> int:
-        """Samples of a step: fewer where little learns, or it would take too few steps.
+        """The samples of a step: fewer where little learns, or it would take too few steps.
 
-        And half while scans stream in: of as many samples, more and smaller steps learn sooner.
+        They are halved while scans stream in: smaller steps learn sooner from as many samples.
         """
         most = self._setup.training.batch
         wanted = min(most, self._field.vertices_that_learn // _VERTICES_PER_SAMPLE)
@@ -126,7 +126,7 @@ class RegionTraining:
         return min(most, max(_LEAST_BATCH, wanted))
 
     def limit(self, share: FairShare, voxels: int) -> None:
-        """Keep as many rays and samples as is the share of so many ``voxels`` with surface."""
+        """Keep as many rays and samples as is the share of ``voxels`` voxels with surface."""
         self.rays.limit(max(1, int(share.rays * voxels)))
         self.budget.limit(int(share.samples * voxels))
 
@@ -156,7 +156,7 @@ class RegionTraining:
         self.budget.add(int((needing & ~held).sum()))
 
     def take_step(self) -> tuple[Loss, int]:
-        """One optimiser step; returns its loss and samples. On a GPU, to read the loss waits."""
+        """Take one optimiser step; return loss and samples. On a GPU, reading the loss waits."""
         self._focus.apply(self.batch)
         pool = self.rays.pool
         step = self.budget.next_step(self.batch, pool.rays_drawn_on)
@@ -168,9 +168,9 @@ class RegionTraining:
         return loss, step.samples
 
     def published(self, field: FrozenField, surfels: SurfelMap, removed: Longs) -> None:
-        """An epoch shows the ``field`` and the ``surfels``, and no surface in ``removed`` [M, 3].
+        """Use a published epoch: its ``field``, its ``surfels``, and voxels ``removed`` [M, 3].
 
-        These are voxels in which the epoch before showed some. The field is judged from time to
+        These had surface in the epoch before, and have none now. The field is judged from time to
         time, and learns again what it has forgotten.
         """
         if len(removed):
@@ -187,7 +187,7 @@ class RegionTraining:
             self.budget.clear()
 
     def state(self) -> TrainingState:
-        """What training needs beyond the field, but for rays and samples, sharing nothing."""
+        """Return what training needs beyond the field, rays and samples, as copies."""
         return replace(
             training_state(self._field, self.budget.samples),
             places_repaired=self.judgement.repairs.done,
@@ -221,7 +221,7 @@ class RegionTraining:
         return self._unjudged_samples > 0 or new
 
     def _judge(self, field: FrozenField) -> None:
-        """Find out where the field has forgotten what it knew, and have it learnt again."""
+        """Find where the field has forgotten what it knew, and have it learnt again."""
         self._unjudged_samples = self._unjudged_rays = 0
         rows = self.rays.judging
         if len(rows) == 0:
@@ -246,5 +246,5 @@ class RegionTraining:
 
 
 def _sdf(field: FrozenField, points: Floats) -> Floats:
-    """What a field says at ``points`` [N, 3], metres from the region's centre."""
+    """Return a field's values at ``points`` [N, 3], metres from the region's centre."""
     return field.evaluate(np.ascontiguousarray(points), gradient=False).sdf

@@ -1,6 +1,6 @@
 """Slopes of the rays whose surface has no normal: by the gradient of the field that learns them.
 
-On edges and on small things the points around tell no normal. With distances along the ray as its
+On edges and on small things the points around give no normal. With distances along the ray as its
 labels, a ray teaches there a field that is too steep; but the direction of its gradient is right.
 """
 
@@ -12,23 +12,23 @@ from triquad_server.mapping.replay.ray_table import END, LEAST_SLOPE, RayTable
 from triquad_server.mapping.replay.replay_pool import ReplayPool
 from triquad_server.mapping.training.training_budget import Step
 
-_EVERY_SAMPLES = 1 << 15  # the field is asked
-_SHARE = 0.25  # of the samples, as many rays are looked at: each of them a few times
-_LEARNT_WITHIN = 0.25  # leaves: so near to a ray's end is the surface of a field that knows it
+_EVERY_SAMPLES = 1 << 15  # samples after which the field is queried
+_SHARE = 0.25  # share of the samples; as many rays are updated, each of them a few times
+_LEARNT_WITHIN = 0.25  # leaves: the surface of a field that knows it is this near to a ray's end
 _LEARNT_SLOPE = 0.5  # and its gradient is longer than this
 
 
 class Slopes:
-    """Keeps the slopes of a pool's rays up to date while a field learns from them."""
+    """Updates the slopes of a pool's rays while a field learns from them."""
 
     def __init__(self, field: LiveField, pool: ReplayPool) -> None:
-        """Of the rays of ``pool``, from which ``field`` learns."""
+        """Update the rays of ``pool``, from which ``field`` learns."""
         self._field = field
         self._pool = pool
-        self._samples_since = 0  # that were trained on since the field was asked
+        self._samples_since = 0  # samples that were trained on since the field was queried
 
     def after(self, step: Step) -> None:
-        """A step was taken: from time to time, ask the field about some of the rays drawn on."""
+        """Query the field, from time to time after a step, about some of the rays drawn on."""
         self._samples_since += step.samples
         if self._samples_since < _EVERY_SAMPLES:
             return
@@ -47,7 +47,7 @@ class Slopes:
 
 
 def _slopes(table: RayTable, rays: Longs, gradients: Floats) -> Doubles:
-    """Slopes [N] of ``rays`` [N] where the field has these ``gradients`` [N, 3] at their ends."""
+    """Return slopes [N] of ``rays`` [N] where the field has ``gradients`` [N, 3] at their ends."""
     ways = table.rows[rays, END : END + 3] - table.origins[table.origin_of[rays]]
     lengths = np.linalg.norm(ways, axis=1) * np.linalg.norm(gradients, axis=1)
     slopes: Doubles = np.abs((ways * gradients).sum(axis=1)) / np.maximum(lengths, 1e-9)

@@ -1,4 +1,4 @@
-"""What a region still has to learn: how many samples, on which rays, and at which rates."""
+"""A region's budget of training: how many samples, on which rays, and at which rates."""
 
 from typing import NamedTuple
 
@@ -6,47 +6,47 @@ from triquad_server.engine.live_field import Rates
 from triquad_server.settings import TrainingSettings
 
 _LEAST_RATE = 0.02  # share of the learning rate with which the last samples are trained
-_REPAIR_SHARE = 0.5  # of a batch, that is drawn where the field has forgotten
-_REPAIR_VISITS = 16  # to each ray there
+_REPAIR_SHARE = 0.5  # share of a batch that is drawn where the field has forgotten
+_REPAIR_VISITS = 16  # samples on each ray there
 _REPAIR_ROUNDS = 3
-"""So often in a row what was forgotten is learnt again; then there must be new rays first. Else two
+"""How often in a row what was forgotten is learnt again before new rays must arrive. Else two
 places that make each other forget would do so for ever."""
 
 
 class Step(NamedTuple):
-    """How the next step of the optimiser is to be."""
+    """The next step of the optimiser."""
 
     samples: int
     fresh: int  # of them, on rays of the newest scan
-    repair: int  # and in places that have forgotten
+    repair: int  # of them, in places that have forgotten
     rates: Rates
 
 
 class TrainingBudget:
-    """Samples that are still to be trained on. New rays add to it, and each step takes from it."""
+    """Counts samples that are still to be trained on; new rays add to it, each step spends some."""
 
     def __init__(self, settings: TrainingSettings) -> None:
         self._settings = settings
         self.samples = 0
-        self.discarded = 0  # samples so far, that were more than may be left
-        self._most = 0  # that may be left
+        self.discarded = 0  # samples so far beyond the limit of what may be left
+        self._most = 0  # limit of what may be left
         self._fresh = 0  # of the samples, those that are to be on rays of the newest scan
-        self._repair = 0  # and those in places that have forgotten
-        self._rounds = 0  # of repair, since there were new rays
+        self._repair = 0  # of the samples, those in places that have forgotten
+        self._rounds = 0  # rounds of repair since there were new rays
         self._new_rays = 0  # since nothing was left
 
     @property
     def learns_newest(self) -> bool:
-        """Whether rays of the newest scan have yet to be learnt from."""
+        """Return whether rays of the newest scan have yet to be learnt from."""
         return self._fresh > 0
 
     @property
     def may_repair(self) -> bool:
-        """Whether what was forgotten may be learnt again."""
+        """Return whether what was forgotten may be learnt again."""
         return self._rounds < _REPAIR_ROUNDS
 
     def add(self, rays: int) -> None:
-        """There are new rays to learn from."""
+        """Add new rays to learn from."""
         if rays:
             self._rounds = 0
         if self.samples == 0:
@@ -58,12 +58,12 @@ class TrainingBudget:
         self.limit(self._most)
 
     def add_samples(self, samples: int) -> None:
-        """There is more to learn from what is known; not once nothing is left."""
+        """Add samples on what is known; without effect once nothing is left."""
         if self.samples:
             self.samples += samples
 
     def restore(self, samples: int, rays: int) -> None:
-        """Go on with ``samples`` from a record, on so many rays."""
+        """Go on with ``samples`` from a record, on ``rays`` rays."""
         self.samples = samples if rays else 0
         self._new_rays = rays
 
@@ -75,7 +75,7 @@ class TrainingBudget:
         self.discarded += too_many
 
     def repair(self, rays: int) -> None:
-        """So many rays are in places that have forgotten: learn these again, and nothing else."""
+        """Learn again the ``rays`` rays in places that have forgotten, and nothing else."""
         if rays:
             self._rounds += 1
         self._repair = _REPAIR_VISITS * rays
@@ -83,11 +83,11 @@ class TrainingBudget:
         self.samples = max(self.samples, min(needed, self._most))
 
     def clear(self) -> None:
-        """There is nothing left to learn."""
+        """Leave nothing to learn."""
         self.samples = 0
 
     def next_step(self, count: int, kept_rays: int) -> Step:
-        """A step of ``count`` samples, where so many rays are kept."""
+        """Return a step of ``count`` samples, where ``kept_rays`` rays are kept."""
         settings = self._settings
         rates = Rates(
             settings.learning_rate * self._cooling(kept_rays),
@@ -101,14 +101,14 @@ class TrainingBudget:
         )
 
     def spend(self, step: Step) -> None:
-        """A step was taken."""
+        """Record that a step was taken."""
         self._repair -= step.repair
         self.samples = max(0, self.samples - step.samples)
-        # Of a tiny share no batch has a whole sample: the rest ends with the budget.
+        # A tiny share gives no batch a whole sample: the rest ends with the budget.
         self._fresh = self._fresh - step.fresh if self.samples else 0
 
     def _cooling(self, rays: int) -> float:
-        """Share of the learning rate: falls as the budget is used up, so that the field settles.
+        """Return the share of the learning rate, which falls as the budget is used up, to settle.
 
         It falls the later, the fewer the ``rays`` are from which there is something to learn: so
         what is new learns quickly where much has settled.
