@@ -182,7 +182,7 @@ def serve(
         listen: where other processes reach it, ``HOST:PORT`` or an endpoint of Zenoh; ``None``: a
             free port of the loopback.
         device: what it computes on; ``"auto"``: a GPU where there is one.
-        restore: the epoch of an older checkpoint of the store, to which the map is taken back,
+        restore: the epoch of an older checkpoint of the store, to which the map is restored,
             such as ``client.reset().kept_epoch``; ``None``: the newest.
 
     Raises:

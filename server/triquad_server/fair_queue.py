@@ -35,7 +35,7 @@ def first_to_go(items: Sequence[tuple[Owner, int]]) -> int:
 class FairQueue(Generic[ItemT]):
     """Serves groups in turn, and the names within each, however much any of them sends.
 
-    Where it is full, the group that has most of it loses an item. Not safe for several threads.
+    When it is full, an item of the group that has most is removed. Not safe for several threads.
     """
 
     def __init__(self, limit: int, limit_bytes: int, limit_each: int, *, newest_go: bool) -> None:

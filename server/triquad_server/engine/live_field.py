@@ -87,7 +87,7 @@ class Batch:
 
 
 class Rates(NamedTuple):
-    """How fast values and moments follow the gradients."""
+    """The rates at which values and moments follow the gradients."""
 
     learning_rate: float
     young_rate: float
@@ -96,7 +96,8 @@ class Rates(NamedTuple):
     variance_decay: float = 0.99  # beta2
 
     def by_age(self, ages: Rows) -> Rows:
-        """Return the learning rates, shaped as ``ages``, of rows that took that many steps, >= 1.
+        """Return learning rates, shaped as ``ages``, of rows that took that many steps: one at
+        least.
         """
         shares = (_SOFT_STEPS / ages).clip(_HARDEST, 1)
         young = (_YOUNG_STEPS / ages).clip(0, 1) ** 2
@@ -154,7 +155,7 @@ class LiveField:
             part.steps[:] = mlp_steps
         self.mlp_steps = mlp_steps  # to read its own from a GPU would have to wait for it
         self.held: Rows | None = None
-        """Which of the first rows of features [N] do not change, nor does the MLP; None: none."""
+        """The mask of the first rows [N] that stay fixed, as does the MLP; None: no rows."""
 
         self.version = 0  # rises with each step of training
         self._frequencies = memory.put(frequencies)
@@ -168,7 +169,7 @@ class LiveField:
 
     @property
     def vertices_that_learn(self) -> int:
-        """The number of vertices but for those that are held."""
+        """The number of vertices that are not held."""
         return self.vertices - self._vertices_held
 
     @property

@@ -65,7 +65,7 @@ class Epoch(ComposedView):
     def asked_with(self, split: Split = in_one) -> ComposedView:
         """Return the same map, whose answers ``split`` runs: by default, the caller's thread alone.
 
-        For those who give way to queries, which have threads of their own.
+        It is for callers that give way to queries, which have threads of their own.
         """
         return ComposedView(self.number, self.field_settings, self.frozen_regions, split=split)
 

@@ -60,7 +60,7 @@ class EpochHistory:
     def listen(self, listener: Callable[[], None]) -> None:
         """Call ``listener``, which must be quick, after each new epoch, in the mapper's thread.
 
-        To be called before any epoch but the first is added.
+        Call this before any epoch but the first is added.
         """
         self._listeners.append(listener)
 
@@ -77,7 +77,7 @@ class EpochHistory:
     def let_go(self) -> None:
         """Remove the epochs that have expired.
 
-        To be called from time to time: requests for the newest leave older ones as they are.
+        Call this from time to time: requests for the newest leave older ones as they are.
         """
         with self._lock:
             self._tidy()
@@ -98,7 +98,7 @@ class EpochHistory:
         """Return the epoch of that number, or the newest for 0.
 
         Requesting an epoch by number pins it: a long request in many parts, or many requests that
-        belong together, do not lose their epoch while they go on.
+        belong together, keep their epoch while they go on.
 
         Raises:
             RefusedError: ``epoch_gone``.

@@ -18,8 +18,8 @@ from triquad_server.process.threads import submit
 from triquad_server.serving.request import Request
 
 ARRIVAL_GRACE_S = 2.0
-"""The seconds after which a scan is lost that has not arrived, since the flush request, which
-travels the same way behind it."""
+"""A scan that has not arrived this many seconds after the flush request, which travels the same way
+behind it, is lost."""
 
 _SENDERS = 16
 """The number of replies sent at a time: clients that do not read them delay no others."""
@@ -157,8 +157,7 @@ class FlushHandler:
                 self._sending -= 1
 
     def _decided(self) -> list[tuple[_Pending, Outcome]]:
-        """Return the requests that can be answered now, with answers; they are no longer pending.
-        """
+        """Return the requests that can be answered now, and how; they are no longer pending."""
         now = time.monotonic()
         busy = RefusedError("busy", f"{self._limit} flush requests are pending already; try later")
         refused: list[tuple[_Pending, Outcome]] = [(entry, busy) for entry in self._excess]

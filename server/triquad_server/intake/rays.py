@@ -1,4 +1,4 @@
-"""Turns a scan into the rays that are used: checked, sorted by range, thinned, transformed."""
+"""Turns a scan into the rays that are used: checked, classified by range, thinned, transformed."""
 
 from dataclasses import dataclass, field
 from typing import NamedTuple

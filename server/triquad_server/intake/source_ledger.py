@@ -18,7 +18,7 @@ MAX_SEQUENCE = 2**48
 
 _AHEAD_AT_ONCE = 1000
 _AHEAD_PER_S = 1000
-"""How far sequences may leap ahead: as many scans as may get lost at once, and in each second in
+"""The largest leap of sequences: as many scans as may get lost at once, and in each second in
 which the session was silent. A source that leaps farther does not count on from its last one."""
 
 FORGOTTEN = "*"

@@ -26,7 +26,7 @@ _JUMP_LEAVES = 250.0
 the leaf of streets, where a car does 14 m a second and some of its scans may be lost."""
 
 _DRAWS = np.random.default_rng(0).random(MAX_SAMPLE_POINTS)
-"""Which point of each run is taken, always the same: drawing them each time takes longer."""
+"""The point of each run that is taken, always the same: drawing it each time takes longer."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class SourceDelta:
 
 @dataclass
 class _Trail:
-    """Where a sensor has been: a bounded number of positions, oldest first."""
+    """The positions of a sensor: a bounded number, oldest first."""
 
     count: int = 0
     positions: Doubles = field(default_factory=lambda: np.empty((0, 3)))

@@ -53,7 +53,7 @@ class LiveRegion:
 
     @classmethod
     def restored(cls, record: Region, setup: RegionSetup) -> "LiveRegion":
-        """Make a region from its record; without training state there is nothing to train on."""
+        """Restore a region from its record; without training state there is nothing to train on."""
         index = record.index
         centre, (field_seed, seed) = setup.field.region_centre(index), setup.seeds(index)
         field = field_from_record(record, setup.field, setup.memory, seed=field_seed)

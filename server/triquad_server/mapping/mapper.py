@@ -221,7 +221,7 @@ class Mapper:
         return self.snapshot_since(epoch).changes()
 
     def snapshot_since(self, epoch: int | None) -> MapSnapshot:
-        """Return as :meth:`changes_since` a snapshot, from which other threads make the records."""
+        """Return a snapshot for :meth:`changes_since`, whose records other threads make."""
         newest = self.publish()
         changed = {
             frozen.index

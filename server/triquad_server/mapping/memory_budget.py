@@ -13,7 +13,7 @@ from triquad_server.errors import ScanRefusedError
 from triquad_server.intake.rays import ScanRays
 
 _ROOM = 1.15
-"""Memory of the system per memory used: spare room to grow, and gaps between arrays."""
+"""The ratio of allocated to used memory: spare room to grow, and pieces between arrays."""
 
 _REGION_BYTES = 600_000  # of a region in which nothing is known yet
 _SLOT_BYTES = 3 * 12  # of an index, for each cell: two to four slots of a key and a row

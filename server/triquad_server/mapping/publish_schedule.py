@@ -7,8 +7,8 @@ _MIN_PUBLISH_SHARE = 5
 """Publishing takes at most one part in this many of the thread's time."""
 
 _SOONEST_PUBLISH_S = 0.1
-"""The least seconds between epochs that a flush waits for: however much is flushed, an epoch that
-was just queried stays for a moment."""
+"""The least time between epochs that a flush waits for, seconds: however much is flushed, an epoch
+that was just queried stays for a moment."""
 
 
 class PublishSchedule:

@@ -24,10 +24,10 @@ _CLEAR_SHORT = 2.5  # voxels before its end up to which a ray shows that a surfa
 _FAR_THINNED_AT, _OPEN_THINNED_AT = 0.5, 0.25  # shares of the rays' length
 
 _NEW_SCANS = 10
-"""The scans after a surface was first seen in which the field has had time to learn it."""
+"""The number of scans, after a surface is first seen, that give the field time to learn it."""
 
 _FEW_NEW = 2
-"""New surface in more voxels than these makes the region learn all of its surface again."""
+"""New surface in more voxels than these makes the region learn again what it had learnt."""
 
 _SURFELS_REFITTED = 8_000
 """The number of surfels that are fitted again with each epoch while the field is trained: some
@@ -35,7 +35,7 @@ _SURFELS_REFITTED = 8_000
 
 
 class SeenSurface(NamedTuple):
-    """What the rays of a scan show of surface in a region."""
+    """The surface that the rays of a scan show in a region."""
 
     marks: Marks
     is_new: bool  # they ended on surface that the field has had no time to learn
@@ -72,7 +72,7 @@ class RegionEvidence:
     def restored(
         cls, record: Evidence, setup: RegionSetup, centre: Doubles, seed: int
     ) -> "RegionEvidence":
-        """Make the evidence of a record."""
+        """Restore the evidence of a record."""
         live = LiveEvidence.from_record(1 << setup.field.depth, record)
         evidence = cls(live, setup, centre, seed)
         evidence._is_restored = True

@@ -171,7 +171,10 @@ class SurfaceChanges:
         return corner + (_cells(keys) + 0.5) * self._settings.leaf_m
 
     def _offsets(self, recorded: _Recorded) -> Floats:
-        """Return the distance [V] of the surface from voxels' centres; at most a voxel."""
+        """Return the distance [V] from voxel centres to the surface, a voxel at most.
+
+        Farther surfaces are in other voxels.
+        """
         if recorded.offsets is not None:
             return recorded.offsets
         centres = self._centres(recorded.centre, recorded.voxels.keys)

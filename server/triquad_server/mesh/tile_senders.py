@@ -95,7 +95,7 @@ class TileSenders:
     def ready_s(self, follower: Follower) -> float:
         """Return when a follower's client may be sent to again, monotonic seconds: now, if it may.
 
-        For one thread.
+        It is for one thread.
         """
         return self._bandwidth.ready_s(follower.asks.client, follower.bytes_per_s, time.monotonic())
 

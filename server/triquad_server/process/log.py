@@ -16,7 +16,7 @@ LOG_FORMATS = TEXT, JSON = "text", "json"
 
 
 class TextLines(logging.Formatter):
-    """Time, level and message in a line; the lines of an exception follow, each indented.
+    """Formats time, level and message in a line; an exception's lines follow, each indented.
 
     Control characters are escaped: names from the network must not forge lines of the log.
     """

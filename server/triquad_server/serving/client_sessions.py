@@ -51,7 +51,7 @@ class ClientSessions:
         self._listener.undeclare()
 
     def source(self, query: zenoh.Query, longest_s: float) -> Source:
-        """Return the owner of a request; no client waits for more than ``longest_s``."""
+        """Return a request's owner and deadline; no longer wait than ``longest_s`` is believed."""
         attachment = query.attachment
         origin = None if attachment is None else read_origin(attachment.to_bytes())
         now = time.monotonic()

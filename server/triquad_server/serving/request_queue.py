@@ -14,16 +14,16 @@ MOST_SENDING = 32
 client that has taken nothing for five seconds."""
 
 _SENDING_EACH = 2
-"""The replies that are sent to one client at a time: no more of its requests are handled before."""
+"""The replies being sent to one client: no more of its requests are handled until it takes one."""
 
 _SESSIONS_WAITING = 8
 """The number of sessions that may each have the full number of requests wait; more share that."""
 
 _REPLY_BYTES = 32_000_000
-"""The bytes of all replies that are sent at a time; a large one beyond is refused."""
+"""The bytes of all replies being sent; a large one beyond is refused."""
 
 _SMALL_REPLY_BYTES = 262_144
-"""The bytes of a reply, such as a planner's, that is never refused."""
+"""The most bytes of a reply, such as a planner's, that is never refused."""
 
 
 class Owned(Protocol):

@@ -113,7 +113,7 @@ class CheckpointThread:
         _log.info("the map is in %s, as of epoch %d", info.path, info.epoch)
 
     def answer(self, _request: CheckpointRequest) -> CheckpointInfo:
-        """Return a checkpoint of the map as it is now; the last one if nothing changed.
+        """Write a checkpoint of the map as it is now; return the last one if nothing changed.
 
         Raises:
             RefusedError: there is no store, or it cannot be written.
@@ -178,7 +178,7 @@ class CheckpointThread:
             _log.exception("a checkpoint met an internal error")
 
     def write(self) -> CheckpointInfo:
-        """Write what changed; only for jobs on this thread. As :meth:`answer`.
+        """Write what changed, as :meth:`answer` does; only for jobs on this thread.
 
         Raises:
             StoreError: it cannot be written.

@@ -34,7 +34,7 @@ _MAX_PROTECTED = 1000
 
 @dataclass(frozen=True)
 class _FileIdentity:
-    """The properties that change if another file replaces a file, or if it changes."""
+    """The properties of a file that differ if it is replaced or changed."""
 
     device: int
     inode: int

@@ -10,7 +10,7 @@ from triquad_format.mapfile.parts.part import MAP, PartKey
 from triquad_format.records.field_settings import RegionIndex
 
 _MAX_FILES = 8
-_MAX_STORED_RATIO = 1.5  # share of the bytes that are needed
+_MAX_STORED_RATIO = 1.5  # of stored bytes to those that are needed
 _LARGE_SHARE = 0.5
 
 

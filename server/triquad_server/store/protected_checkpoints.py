@@ -32,7 +32,7 @@ class Clocks:
 
 
 class ProtectedCheckpoints:
-    """Keeps the protected checkpoints of a folder, in memory and in a file that stays on disk.
+    """Keeps a folder's protected checkpoints, in memory and in a file that outlives the server.
 
     While the server runs, only the monotonic clock measures a protection's age: no jump of the
     time of day ends it. The time of day counts for the time between two servers only, and never

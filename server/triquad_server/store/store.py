@@ -45,7 +45,7 @@ from triquad_server.store.restore import (
 _log = logging.getLogger(__name__)
 
 _FEATURE_DTYPE = "<f2"
-_MAPS_NAMED = 8  # checkpoints of a store, where an epoch is not found
+_MAPS_NAMED = 8  # maps of a store that are named where an epoch is not found
 
 
 class Store:
@@ -159,7 +159,7 @@ class Store:
         """Restore the map to an older checkpoint, which is written again as the newest.
 
         What was the newest so far stays for ``protect_h``, as does the one that is written. A
-        server that is started again with the same ``epoch`` does not lose what was learnt since:
+        server that is started again with the same ``epoch`` keeps what was learnt since:
         to restore it there once more changes nothing.
 
         Raises:

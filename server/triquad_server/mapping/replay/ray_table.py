@@ -87,7 +87,7 @@ def _set_direction(direction: Doubles, origin: AnyFloats, end: AnyFloats) -> flo
 def _clipped(
     end: AnyFloats, direction: Doubles, half_side_m: float, first: float, last: float
 ) -> tuple[float, float]:
-    """Return a ray's part of an interval in the cube; if there is none, it ends before it begins.
+    """Return the part of a ray's interval in the cube; if there is none, it begins after its end.
 
     It is in metres behind the end point [3]. The cube is centred at the origin.
     """

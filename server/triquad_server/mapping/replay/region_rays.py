@@ -25,7 +25,7 @@ class RegionRays:
 
     @classmethod
     def restored(cls, state: TrainingState, setup: RegionSetup, seed: int) -> "RegionRays":
-        """Make the rays of a record."""
+        """Restore the rays of a record."""
         rays = cls(setup, seed)
         rays.keep(restored_rays(state.rays, setup.field, setup.team))
         rays.pool.add(samples_alone(state.sample_points, state.sample_labels))
@@ -64,7 +64,7 @@ class RegionRays:
         return held
 
     def limit(self, rays: int) -> None:
-        """Keep at most ``rays`` rays to train on, and a proportional number to judge by."""
+        """Keep at most ``rays`` rays to train on, and a proportional number to judge with."""
         self.pool.limit(rays)
         self.held_out.limit(max(1, rays // HELD_OUT))
 

@@ -20,8 +20,8 @@ _MOST_SHARE = 0.25
 """If a larger share of the blocks with surface was seen since, all of the region learns."""
 
 _LEAST_FREE = 0.25
-"""It does also if a smaller share of the rows under what was seen since is under nothing else: in a
-small place, nearly all rows are shared, and so are those under a small thing."""
+"""All of the region also learns if a smaller share of the rows under what was seen since is under
+nothing else: in a small place, nearly all rows are shared, and so are those under a small thing."""
 
 _LEARNT_STEPS = 300
 """An MLP that took fewer steps has not learnt enough to stay fixed; a pretrained one has."""

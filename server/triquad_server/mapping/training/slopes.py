@@ -1,4 +1,4 @@
-"""Slopes of the rays whose surface has no normal: by the gradient of the field that learns them.
+"""Finds slopes of rays whose surface has no normal, by the gradient of the field that learns them.
 
 On edges and on small things the points around give no normal. With distances along the ray as its
 labels, a ray teaches there a field that is too steep; but the direction of its gradient is right.

@@ -108,7 +108,7 @@ class TrainingBudget:
         self._fresh = self._fresh - step.fresh if self.samples else 0
 
     def _cooling(self, rays: int) -> float:
-        """Return the share of the learning rate, which falls as the budget is used up, to settle.
+        """Return the share of the learning rate: it falls with the budget, so the field settles.
 
         It falls the later, the fewer the ``rays`` are from which there is something to learn: so
         what is new learns quickly where much has settled.
