@@ -1,1 +1,1 @@
-"""Benchmarks, campaigns and studies: what measures triquad, and is not installed."""
+"""Benchmarks, campaigns and studies: they measure triquad, and are not installed."""

@@ -1,6 +1,6 @@
 """``make bench``: how fast and how good triquad is on this machine, part by part.
 
-Each part guards a promise of the README. Its figures are kept in ``bench/results``, and
+Each part checks a promise of the README. Its figures are kept in ``bench/results``, and
 ``docs/benchmarks.md`` is made of all that lie there.
 """
 
@@ -30,7 +30,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _bench(options: argparse.Namespace) -> int:
-    """Measure part after part; the figures of one are kept before the next begins."""
+    """Measure the parts in turn; the figures of each are saved before the next begins."""
     _compile()
     for part in options.parts or PARTS:
         figures = PARTS[part](options)

@@ -1,4 +1,4 @@
-"""What benchmarks report: figures, what they should be, and how two ways are timed in turns."""
+"""Figures that benchmarks report, their bounds, and timing of two ways in turns."""
 
 import statistics
 import time
@@ -25,7 +25,7 @@ class Figure:
 
     @property
     def kept(self) -> bool:
-        """Whether it is within its bounds; NaN never is."""
+        """Whether the value is within its bounds; NaN never is."""
         low_enough = self.at_most is None or self.value <= self.at_most
         high_enough = self.at_least is None or self.value >= self.at_least
         return low_enough and high_enough
@@ -44,14 +44,14 @@ class Figure:
 
 
 def seconds(work: Callable[[], object]) -> float:
-    """How long ``work()`` takes."""
+    """Return how long ``work()`` takes."""
     started = time.perf_counter()
     work()
     return time.perf_counter() - started
 
 
 def typical(scans_s: list[float]) -> float:
-    """What a scan takes [seconds] after the first, which meet nothing but new surface."""
+    """Return the typical seconds of a scan after the first, which meet only new surface."""
     return statistics.median(scans_s[_FIRST_SCANS:])
 
 

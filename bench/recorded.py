@@ -14,14 +14,14 @@ _RANGE_MIN_M = 2.0  # nearer is the vehicle's own body
 
 @dataclass(frozen=True)
 class RecordedScans:
-    """Scans of a recorded drive: those to map, and those that the map is not to see."""
+    """Scans of a recorded drive: those to map, and those to withhold."""
 
     mapped: tuple[PosedScan, ...]
     withheld: tuple[PosedScan, ...]
 
 
 def check_recorded(part: str, folder: Path | None) -> None:
-    """Try a folder before all else, which takes minutes; tell where a part has none.
+    """Check a folder before all else, which takes minutes; report a part that has none.
 
     Raises:
         ToolError: it cannot be read.
@@ -33,7 +33,7 @@ def check_recorded(part: str, folder: Path | None) -> None:
 
 
 def recorded_scans(path: Path, scans: int | None = None) -> RecordedScans:
-    """The scans of a folder (the first ``scans`` of them), every 7th apart.
+    """Return the scans of a folder (the first ``scans`` of them), every 7th apart.
 
     Raises:
         ToolError: the folder cannot be read.

@@ -20,14 +20,14 @@ PAGE = _HERE.parent / "docs" / "benchmarks.md"
 
 @dataclass(frozen=True)
 class Result:
-    """What one part measured at one time."""
+    """The measurement of one part at one time."""
 
     part: str
     date: str  # ISO 8601
     machine: str  # in words
     street: int  # seed of streets, rooms and tables
     figures: list[Figure]
-    remark: str = ""  # what is missed, and why: written by hand, kept when it is measured again
+    remark: str = ""  # what is missed, and why: written by hand, kept in later measurements
 
     @property
     def title(self) -> str:
@@ -36,7 +36,7 @@ class Result:
 
     @classmethod
     def read(cls, folder: Path, part: str) -> "Result | None":
-        """The newest result of a part; ``None``: it was never measured."""
+        """Return the newest result of a part; ``None``: it was never measured."""
         path = folder / f"{part}.json"
         if not path.exists():
             return None
@@ -45,7 +45,7 @@ class Result:
         return cls(figures=figures, **fields)
 
     def write(self, folder: Path) -> None:
-        """Keep this as the newest result of its part."""
+        """Save this as the newest result of its part."""
         folder.mkdir(parents=True, exist_ok=True)
         text = json_text(asdict(self)) + "\n"
         (folder / f"{self.part}.json").write_text(text, encoding="utf-8")
@@ -57,7 +57,7 @@ def _figure(saved: dict[str, Any]) -> Figure:
 
 
 def machine() -> str:
-    """The machine in words."""
+    """Return the machine in words."""
     cpuinfo = Path("/proc/cpuinfo")
     found = re.search(r"model name\s*: (.*)", cpuinfo.read_text()) if cpuinfo.exists() else None
     name = found[1] if found else platform.processor() or platform.machine()
@@ -65,7 +65,7 @@ def machine() -> str:
 
 
 def page(folder: Path) -> str:
-    """The page of all results in a folder: a table of what is bounded, the rest in a line."""
+    """Return the page of all results in a folder: a table of bounded ones, the rest in a line."""
     found = (Result.read(folder, path.stem) for path in sorted(folder.glob("*.json")))
     sections = (_section(result) for result in found if result is not None)
     text = (RESULTS / "page.md").read_text(encoding="utf-8")

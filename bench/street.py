@@ -33,7 +33,7 @@ SCANS = 100
 LENGTH_M = 110.0  # so that the map has some 2 million parameters
 _COLUMNS = 1024  # some 60,000 points a scan
 _STEPS = 14  # of training between two scans that a map streams in
-_PUBLISHED = 5  # one such scan in so many
+_PUBLISHED = 5  # one such scan in N
 
 
 @dataclass(frozen=True)
@@ -44,13 +44,13 @@ class BenchStreet(DrivenStreet):
     samples_max: int = STREET_SAMPLES_MAX  # of a mesh, to score it
 
     def mesh_scores(self, mesh: Mesh) -> MeshScores:
-        """Scores of a mesh within the scene's bounds."""
+        """Return scores of a mesh within the scene's bounds."""
         settings = ScoreSettings(samples_max=self.samples_max)
         return score_against_scene(mesh, self.drive.scene, self.visible, settings=settings)
 
 
 def bench_street(seed: int) -> BenchStreet:
-    """100 scans along the exact street ``seed``."""
+    """Return 100 scans along the exact street ``seed``."""
     scene = street(seed, LENGTH_M)
     poses = drive(scene, SCANS, LENGTH_M / SCANS)
     driven = driven_street(SimulatedDrive(scene, Lidar(columns=_COLUMNS), poses, seed=seed))
@@ -63,7 +63,7 @@ def bench_street(seed: int) -> BenchStreet:
 def settled_mapper(
     name: str, scans: Sequence[PosedScan], settings: Settings | None = None
 ) -> Mapper:
-    """A mapper that has learnt all it can of some scans; ``name`` is told while one waits."""
+    """Return a mapper that has learnt all it can of some scans; ``name`` is shown meanwhile."""
     settings = settings or Settings()
     mapper = Mapper("bench", settings, "cpu")
     with progress(f"mapping {name}", len(scans) + 1) as report:
@@ -82,14 +82,14 @@ def learn_all(mapper: Mapper) -> None:
 
 
 def learn_again(mapper: Mapper) -> None:
-    """As :func:`learn_all`, with what was forgotten meanwhile: that is found as it is published."""
+    """Train as :func:`learn_all`, with what was removed meanwhile, found as it is published."""
     while not mapper.settled:
         learn_all(mapper)
         mapper.publish()
 
 
 def sdf_error_cm(epoch: Epoch, probes: StreetProbes) -> float:
-    """The mean error of the signed distance at points near the surface."""
+    """Return the mean error of the signed distance at points near the surface."""
     return 100 * score_street(epoch.query, probes).sdf_error_m
 
 
@@ -102,7 +102,7 @@ class StreamedMap:
         self.ingest_s: list[float] = []  # of each scan
 
     def take_in(self, scan: PosedScan) -> None:
-        """Take in a scan, and train."""
+        """Integrate a scan, and train."""
         ingest = partial(self.mapper.ingest, scan.points, scan.world_from_sensor)
         self.ingest_s.append(seconds(ingest))
         for _ in range(_STEPS):

@@ -57,7 +57,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _one_turn(options: argparse.Namespace) -> int:
-    """Run a turn in this process, and tell what it did."""
+    """Run a turn in this process, and report what it did."""
     part = BY_NAME[options.part[0]]
     folder = options.out / f"{part.name}-{options.seed}"
     shutil.rmtree(folder, ignore_errors=True)
@@ -80,7 +80,7 @@ def _one_turn(options: argparse.Namespace) -> int:
 
 
 def _run(part: Part, turn: Turn) -> float:
-    """Run the turn; the seconds that it took. Whatever is raised broke a promise."""
+    """Run the turn, and return its seconds. Any exception broke a promise."""
     started = time.monotonic()
     try:
         part.run(turn)

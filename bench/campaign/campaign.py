@@ -26,7 +26,7 @@ _ROOT = Path(__file__).parents[2]
 
 
 class Campaign:
-    """What was done so far, in a folder, and how to go on."""
+    """A campaign in a folder: what was done so far, and how to go on."""
 
     def __init__(self, folder: Path, parts: Sequence[Part]) -> None:
         """Go on with the campaign in ``folder``, or begin one."""
@@ -43,11 +43,11 @@ class Campaign:
 
     @property
     def broken(self) -> int:
-        """How many promises were not kept."""
+        """The number of promises that were not kept."""
         return sum(len(done.broken) for done in self._record.parts.values())
 
     def table(self) -> str:
-        """What was done and what broke, in Markdown."""
+        """Return what was done and what broke, in Markdown."""
         return markdown([*self._parts], self._record, self._missing)
 
     def run(self, seconds: float, lanes: int) -> None:
@@ -100,7 +100,7 @@ class Campaign:
             return part
 
     def _turn(self, part: Part, seed: int, seconds: float) -> TurnResult:
-        """One turn in a process group of its own, which is killed where it hangs."""
+        """Run a turn in a process group of its own, which is killed if it hangs."""
         told = self._folder / f"{part.name}-{seed}.json"
         told.unlink(missing_ok=True)
         command = [sys.executable, "-m", "bench.campaign", "--part", part.name, "--seed", str(seed)]

@@ -1,4 +1,4 @@
-"""A proxy of TCP connections that can be cut, held up, and healed."""
+"""A TCP proxy whose connections can be cut, stalled and restored."""
 
 import contextlib
 import select
@@ -7,7 +7,7 @@ import threading
 
 
 class CuttingProxy:
-    """Passes on what arrives at its own port of the loopback, until it is told otherwise."""
+    """Forwards what arrives at its own port of the loopback, until it is cut or stalled."""
 
     def __init__(self, endpoint: str) -> None:
         """Begin to accept; ``endpoint`` is the server's, such as ``tcp/127.0.0.1:7447``."""
@@ -24,7 +24,7 @@ class CuttingProxy:
         self._threads[0].start()
 
     def cut(self) -> int:
-        """End all connections at once, wherever in a message they are; how many there were."""
+        """End all connections at once, also amid a message; return how many there were."""
         with self._lock:
             pairs, self._pairs = self._pairs, []
         for pair in pairs:
@@ -34,11 +34,11 @@ class CuttingProxy:
         return len(pairs)
 
     def hold(self) -> None:
-        """Pass on nothing, but keep the connections."""
+        """Forward nothing, but keep the connections."""
         self._flowing.clear()
 
     def heal(self) -> None:
-        """Pass on again."""
+        """Forward again."""
         self._flowing.set()
 
     def close(self) -> None:

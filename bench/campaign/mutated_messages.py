@@ -1,4 +1,4 @@
-"""Good messages on every key, and what becomes of them where a few things in them change."""
+"""Valid messages on every key, and mutants in which a few things are changed."""
 
 import copy
 import math
@@ -51,7 +51,7 @@ _BOX = (np.full(3, -6.0), np.full(3, 6.0))
 
 
 def good_requests() -> dict[str, list[Message]]:
-    """A few requests that are answered, for each operation that is known here."""
+    """Return a few requests that are answered, for each operation that is known here."""
     some = servers.sphere(20)
     way = some / np.linalg.norm(some, axis=1, keepdims=True)
     tiles = np.array([[-1, 0, 0], [0, 0, 0]], np.int32)
@@ -81,7 +81,7 @@ def good_requests() -> dict[str, list[Message]]:
 
 
 class MutatedMessages:
-    """Draws mutants of good messages, and the keys that they are sent to."""
+    """Draws mutants of valid messages, and the keys that they are sent to."""
 
     def __init__(self, chance: random.Random) -> None:
         self._chance = chance
@@ -91,7 +91,7 @@ class MutatedMessages:
         self._all = [payload for good in self._requests.values() for payload in good]
 
     def scan(self) -> bytes | None:
-        """A mutated scan of the source ``lidar``; ``None`` where a request is due."""
+        """Return a mutated scan of the source ``lidar``; ``None`` where a request is due."""
         if self._chance.random() > _SHARE_OF_SCANS:
             return None
         self._sequence += 1
@@ -101,7 +101,7 @@ class MutatedMessages:
         return self._mutated(codec.encode(good))
 
     def request(self) -> tuple[str, bytes]:
-        """An operation, and a request that may be meant for it."""
+        """Return an operation, and a request that may be meant for it."""
         operation = self._chance.choice(OPERATIONS)
         own = self._requests.get(operation, self._all)
         return operation, self._mutated(
@@ -171,7 +171,7 @@ class MutatedMessages:
                 }
 
     def _other_numbers(self, data: bytes) -> bytes:
-        """Some of the numbers of an array are others."""
+        """Return an array in which some of the numbers are changed."""
         size = 8 if len(data) % 8 == 0 else 4 if len(data) % 4 == 0 else 1
         numbers = np.frombuffer(data, {8: "<f8", 4: "<f4", 1: "|u1"}[size]).copy()
         places = [self._chance.randrange(len(numbers)) for _ in range(self._chance.choice((1, 9)))]

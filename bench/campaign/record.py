@@ -1,4 +1,4 @@
-"""What a campaign did so far: a file that is replaced after each turn."""
+"""The progress of a campaign: a file that is replaced after each turn."""
 
 import json
 import os
@@ -9,7 +9,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class TurnResult:
-    """What a turn did, as its process told."""
+    """The results of a turn, as its process reported."""
 
     counts: dict[str, int]
     most_seen: dict[str, float]
@@ -29,7 +29,7 @@ class PartRecord:
 
     @property
     def done(self) -> int:
-        """How many of the things that the part counts."""
+        """The number of things that the part counts."""
         return self.counts["done"]
 
     def add(self, seed: int, result: TurnResult) -> None:
@@ -52,7 +52,7 @@ class Record:
 
     @classmethod
     def read(cls, path: Path) -> "Record":
-        """The record in a file, or a new one where there is none."""
+        """Return the record in a file, or a new one where there is none."""
         if not path.exists():
             return cls(path)
         told = json.loads(path.read_text())
@@ -63,7 +63,7 @@ class Record:
         return cls(path, told["seconds"], parts)
 
     def of(self, part: str) -> PartRecord:
-        """What was done of a part."""
+        """Return the record of a part."""
         return self.parts.setdefault(part, PartRecord())
 
     def write(self) -> None:

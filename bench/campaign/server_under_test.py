@@ -23,7 +23,7 @@ _INTERNAL = ("Traceback", "internal error")
 def server_under_test(
     turn: Turn, environment: Mapping[str, str] | None = None, stop_status: int | None = 0
 ) -> Iterator[servers.ServerProcess]:
-    """A server on a store of the turn's folder, that is stopped at the end unless it was killed.
+    """Yield a server on a store of the turn's folder; it is stopped at the end unless killed.
 
     ``stop_status`` is the exit status that is then expected; ``None``: it is not stopped but
     killed. Internal errors in the log break a promise.
@@ -54,14 +54,14 @@ def expect(kept: bool, promise: str) -> None:
 
 
 def sphere_at(x_m: float, points: int = 500) -> tuple[np.ndarray, np.ndarray]:
-    """Points of a scan in the sensor frame, and its pose on the x axis."""
+    """Return points of a scan in the sensor frame, and its pose on the x axis."""
     pose = np.eye(4)
     pose[0, 3] = x_m
     return servers.sphere(points), pose
 
 
 def expect_known(client: triquad_client.Client, x_m: float) -> None:
-    """The surface of the sphere at ``x_m`` must be in the map."""
+    """Expect the surface of the sphere at ``x_m`` to be in the map."""
     points, pose = sphere_at(x_m, 200)
     statuses = client.query_sdf(points + pose[:3, 3]).status
     known = float((statuses == Status.SURFACE).mean())
@@ -69,7 +69,7 @@ def expect_known(client: triquad_client.Client, x_m: float) -> None:
 
 
 def expect_honest_service(endpoint: str, x_m: float = 0.0) -> None:
-    """A new client publishes a scan, sees it in the map, and is answered in time."""
+    """Expect a new client to publish a scan, see it in the map, and be answered in time."""
     started = time.monotonic()
     with triquad_client.connect(endpoint) as client:
         for _ in range(2):
@@ -85,12 +85,12 @@ def expect_honest_service(endpoint: str, x_m: float = 0.0) -> None:
 
 
 def resident_bytes(pid: int) -> int:
-    """Memory that a process has of its own in RAM."""
+    """Return the memory that a process has of its own in RAM."""
     pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGESIZE")
 
 
 def virtual_bytes(pid: int) -> int:
-    """Address space that a process takes."""
+    """Return the address space that a process takes."""
     pages = int(Path(f"/proc/{pid}/statm").read_text().split()[0])
     return pages * os.sysconf("SC_PAGESIZE")

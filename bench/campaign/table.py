@@ -7,7 +7,7 @@ from bench.campaign.turn import Part
 
 
 def markdown(parts: Sequence[Part], record: Record, missing: Mapping[str, str]) -> str:
-    """A row for each part: what was done, what became of it, and how many promises broke."""
+    """Return a row for each part: what was done, what became of it, and how many promises broke."""
     lines = [
         "| part | done | of which | most seen | minutes | broken |",
         "|---|---|---|---|---|---|",

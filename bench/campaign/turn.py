@@ -18,7 +18,7 @@ class Turn:
 
     seed: int
     folder: Path  # its own; it stays where something broke
-    most: int  # so many things are done, at most
+    most: int  # how many things are done, at most
     seconds: float  # nothing new is begun after them
     counts: Counter[str] = field(default_factory=Counter)
     most_seen: dict[str, float] = field(default_factory=dict)  # the largest of each measurement
@@ -53,9 +53,9 @@ class Part:
 
     name: str
     unit: str  # of what it counts
-    goal: int  # so many in a whole campaign
+    goal: int  # how many in a whole campaign
     per_turn: int
     run: Callable[[Turn], None]
-    promise: str  # what has to hold all the while
+    promise: str  # what has to be true all the while
     missing: Callable[[], str | None] = lambda: None
-    """Why the part cannot run on this machine, if it cannot."""
+    """The reason why the part cannot run on this machine, if it cannot."""

@@ -1,4 +1,4 @@
-"""A real browser without a screen: Chromium, as the system has it, and what its pages show."""
+"""A headless browser: Chromium, as the system has it, and what its pages show."""
 
 import io
 import shutil
@@ -25,7 +25,7 @@ _SOFTWARE_RENDERING = (
 
 
 def installed() -> str:
-    """Where Chromium is.
+    """Return where Chromium is.
 
     Raises:
         ToolError: it is not installed.
@@ -38,7 +38,7 @@ def installed() -> str:
 
 @contextmanager
 def running_browser() -> Iterator[Browser]:
-    """Chromium, which draws in software.
+    """Yield Chromium, which draws in software.
 
     Raises:
         ToolError: it is not installed.
@@ -54,7 +54,7 @@ def running_browser() -> Iterator[Browser]:
 
 @contextmanager
 def opened_page(browser: Browser, url: str) -> Iterator[Page]:
-    """A page in a window of its own."""
+    """Yield a page in a window of its own."""
     context = browser.new_context(viewport={"width": WIDTH, "height": HEIGHT})
     page = context.new_page()
     page.goto(url)
@@ -66,12 +66,12 @@ def opened_page(browser: Browser, url: str) -> Iterator[Page]:
 
 
 def picture(page: Page) -> Bytes:
-    """What the page shows now, [height, width, 3]."""
+    """Return what the page shows now, [height, width, 3]."""
     return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))
 
 
 def drawn_share(page: Page) -> float:
-    """Share of the pixels beside the panel in which something is drawn."""
+    """Return the share of the pixels next to the panel in which something is drawn."""
     scene = picture(page)[HEIGHT // 3 :, :-_PANEL_PIXELS]  # what it notifies of stands above
     return float((scene.min(axis=-1) < _BRIGHT).mean())
 
@@ -86,7 +86,7 @@ def wait_until_drawn(page: Page) -> None:
 
 
 def wait_until(page: Page, holds: Callable[[], bool], what: str, timeout_s: float = 60.0) -> None:
-    """Wait until something holds of what a page shows; ``what`` says it in words.
+    """Wait until a condition on what a page shows is true; ``what`` says it in words.
 
     Raises:
         ToolError: it does not.

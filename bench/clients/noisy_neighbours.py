@@ -32,7 +32,7 @@ _TIMEOUT_S = 60.0
 
 @contextmanager
 def neighbour(kind: str, endpoint: str, map_name: str) -> Iterator["subprocess.Popen[str]"]:
-    """A process of a ``kind`` of ``KINDS``, once it has begun; killed in the end."""
+    """Yield a process of a ``kind`` of ``KINDS``, once it has begun; it is killed in the end."""
     command = [sys.executable, "-m", __name__, kind, endpoint, map_name]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -45,7 +45,7 @@ def neighbour(kind: str, endpoint: str, map_name: str) -> Iterator["subprocess.P
 
 @contextmanager
 def frozen_neighbours(endpoint: str, map_name: str) -> Iterator[None]:
-    """One process after the other that asks for much and is frozen before it has read any of it."""
+    """Run process after process that asks for much and is frozen before it has read any of it."""
     stop = threading.Event()
 
     def freeze_again_and_again() -> None:
@@ -64,7 +64,7 @@ def frozen_neighbours(endpoint: str, map_name: str) -> Iterator[None]:
 
 
 def be_greedy(session: zenoh.Session, map_name: str) -> None:
-    """Ask for 20,000 distances 300 times every few seconds, as somebody else each time."""
+    """Ask for 20,000 distances 300 times every few seconds, as a new client session each time."""
     request = codec.encode(_distances())
     _say_begun()
     while True:
@@ -134,7 +134,7 @@ def _distances() -> DistanceRequest:
 def _ask(
     session: zenoh.Session, map_name: str, operation: str, payload: bytes, name: str | None = None
 ) -> Iterable[zenoh.Reply]:
-    """Ask in the name of a session, its own unless another is given; where replies come."""
+    """Ask in the name of a session, its own by default; return where replies come."""
     origin = RequestOrigin(name or str(session.info.zid()), _TIMEOUT_S)
     replies: Iterable[zenoh.Reply] = session.get(
         keys.operation_key(map_name, operation),

@@ -37,27 +37,27 @@ class Served:
     client: Client
 
     def another_client(self) -> Client:
-        """A client of its own, for a ``with`` statement."""
+        """Return a client of its own, for a ``with`` statement."""
         return connect(self.endpoint, MAP, timeout_s=_TIMEOUT_S)
 
     def planner(self, points: Doubles, question: str) -> Probe:
-        """A process that asks a question at points [N, 3], for a ``with`` statement."""
+        """Return a process that asks a question at points [N, 3], for a ``with`` statement."""
         return Probe(self.endpoint, MAP, points, question=question)
 
 
 def around(place: Doubles, count: int, rng: np.random.Generator) -> Doubles:
-    """So many points [N, 3] around a place [3] of a drive, as a planner asks for."""
+    """Return N points [N, 3] around a place [3] of a drive, as a planner asks for."""
     return place + rng.uniform((-8, -8, -1.5), (8, 8, 2.0), (count, 3))
 
 
 def near_surface(made: BenchStreet) -> Doubles:
-    """1,000 points [N, 3] near the street's surface."""
+    """Return 1,000 points [N, 3] near the street's surface."""
     return np.random.default_rng(0).permutation(made.probes.near)[:_ASKED]
 
 
 @contextmanager
 def served(record: MapRecord | None = None, arguments: Sequence[str] = ()) -> Iterator[Served]:
-    """A server with an empty map, or with that of a record, in a folder that goes in the end.
+    """Yield a server with an empty map or that of a record, in a folder that is deleted at last.
 
     ``arguments`` are further ones of its command line.
     """
@@ -80,7 +80,7 @@ def stream(
     title: str = "streaming at 10 Hz",
     published: Callable[[int], None] = lambda _: None,
 ) -> None:
-    """Publish scans as a lidar does; ``published`` is told the number of each."""
+    """Publish scans as a lidar does; ``published`` is called with the number of each."""
     started, stamp_s = time.monotonic(), time.time()
     with progress(title, len(scans)) as report:
         for number, scan in enumerate(scans):
@@ -94,7 +94,7 @@ def stream(
 def stream_beside_planner(
     server: Served, made: BenchStreet, published: Callable[[int], None] = lambda _: None
 ) -> ProbeReport:
-    """Stream the street while a planner asks for 1,000 gradients, and say what it met."""
+    """Stream the street while a planner asks for 1,000 gradients, and report what it met."""
     with server.planner(near_surface(made), "gradient") as probe:
         stream(server.client, made.scans, published=published)
         return probe.finish()
@@ -103,7 +103,7 @@ def stream_beside_planner(
 def latency_figures(
     name: str, met: ProbeReport, *, median_ms: float | None = None, tail_ms: float | None = None
 ) -> list[Figure]:
-    """How soon a planner's queries were answered, and what the median and 99 % should be."""
+    """Return how soon a planner was answered, and what the median and 99 % should be."""
     return [
         Figure(f"{name}, median", met.latency_p50_ms, "ms", at_most=median_ms),
         Figure(f"{name}, 99 %", met.latency_p99_ms, "ms", at_most=tail_ms),

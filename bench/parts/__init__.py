@@ -1,1 +1,1 @@
-"""The benchmarks: each part guards a promise of the README."""
+"""The benchmarks: each part checks a promise of the README."""

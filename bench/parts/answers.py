@@ -47,7 +47,7 @@ with triquad_client.connect(sys.argv[1], sys.argv[2], timeout_s=60.0) as client:
 
 
 def measure_planners(made: BenchStreet) -> list[Figure]:
-    """Figures of answers, and of how soon they come."""
+    """Return figures of answers, and of how soon they come."""
     with served() as server:
         points = _planner_points(made, _ASKED)
         figures = _one(server, made, points[0])
@@ -63,7 +63,7 @@ def measure_planners(made: BenchStreet) -> list[Figure]:
 
 
 def _in_process(made: BenchStreet, view: MapView) -> list[Figure]:
-    """How soon distances are known, without a network and while nothing else is done."""
+    """Return how soon distances are known, without a network and while nothing else is done."""
     options = DistanceOptions(REACH_M)
 
     def typical_s(asked: Sequence[Points]) -> float:
@@ -84,14 +84,14 @@ def _in_process(made: BenchStreet, view: MapView) -> list[Figure]:
 
 
 def _planner_points(made: BenchStreet, count: int) -> list[Points]:
-    """What each planner asks: ``count`` points around one place of the drive."""
+    """Return what each planner asks: ``count`` points around one place of the drive."""
     rng = np.random.default_rng(0)
     poses = made.drive.poses[np.arange(_CLIENTS) * len(made.drive.poses) // _CLIENTS]
     return [around(pose[:3, 3], count, rng) for pose in poses]
 
 
 def _trained_per_s(server: Served, made: BenchStreet, title: str) -> float:
-    """Stream all scans; returns how many samples were trained each second meanwhile."""
+    """Stream all scans; return how many samples were trained each second meanwhile."""
     before = server.client.status().samples_trained
     started = time.monotonic()
     stream(server.client, made.scans, title)
@@ -141,7 +141,7 @@ def _met_together(name: str, met: Sequence[ProbeReport]) -> list[Figure]:
 
 
 def _beside_frozen(server: Served, points: Points) -> list[Figure]:
-    """What a client that freezes in the middle of a mesh does to the others."""
+    """Return figures of other clients while one freezes in the middle of a mesh."""
     wait_until_settled(server.client, _SETTLE_LIMIT_S)
 
     def ask() -> tuple[ProbeReport, int]:
@@ -166,7 +166,7 @@ def _beside_frozen(server: Served, points: Points) -> list[Figure]:
 
 @contextmanager
 def _mesh_reader(endpoint: str) -> Iterator["subprocess.Popen[str]"]:
-    """A process that fetches meshes all the time."""
+    """Yield a process that fetches meshes all the time."""
     command = [sys.executable, "-c", _FROZEN, endpoint, MAP]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -180,7 +180,7 @@ def _mesh_reader(endpoint: str) -> Iterator["subprocess.Popen[str]"]:
 
 @contextmanager
 def _samples(endpoint: str) -> Iterator[Callable[[], int]]:
-    """Counts the status samples that come."""
+    """Yield a counter of the status samples that arrive."""
     config = zenoh.Config()
     put(config, {**QUIET, "mode": "client", "connect/endpoints": [endpoint]})
     received: list[zenoh.Sample] = []

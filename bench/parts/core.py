@@ -1,4 +1,4 @@
-"""The map's core in this process: taking in scans, training, queries, publishing.
+"""The map's core in this process: integrating scans, training, queries, publishing.
 
 The baseline is the engine of tensors with automatic differentiation, on all cores.
 """
@@ -31,7 +31,7 @@ _RATE = 1e-4  # of learning: so slow that the baseline leaves the field as it is
 
 
 def measure_core(made: BenchStreet) -> list[Figure]:
-    """Figures of the map's core."""
+    """Return figures of the map's core."""
     settings = Settings()
     mapper = Mapper("bench", settings, "cpu")
     with progress("core", 4) as report:
@@ -63,7 +63,7 @@ def measure_core(made: BenchStreet) -> list[Figure]:
 
 
 def seen_points(epoch: Epoch, made: BenchStreet, rng: np.random.Generator) -> Doubles:
-    """Random points [N, 3] of what rays have shown of the street, free or surface."""
+    """Return random points [N, 3] of what rays have shown of the street, free or surface."""
     low, high = made.drive.scene.bounds
     found: list[Doubles] = []
     while sum(map(len, found)) < _QUERY_POINTS:

@@ -1,4 +1,4 @@
-"""Voxels in which rays ended, and how many of them a map takes for surface."""
+"""Voxels in which rays ended, and how many of them a map takes to be surface."""
 
 from dataclasses import dataclass, field
 
@@ -10,7 +10,7 @@ from triquad_server.intake.rays import usable_rays
 from triquad_server.settings import Settings
 from triquad_tools.sensors.sweep import PosedScan, moved
 
-_KEY_SIDE = 1 << 20  # voxels along an axis that keys can tell apart
+_KEY_SIDE = 1 << 20  # voxels along an axis that keys can distinguish
 _NONE = -1  # no voxel's key
 
 
@@ -21,20 +21,20 @@ class EndedVoxels:
     _scans: list[Longs] = field(default_factory=list)  # the keys of each
 
     def add(self, keys: Longs) -> None:
-        """Enter the voxels of a scan, of some or all of its :func:`end_keys`."""
+        """Add the voxels of a scan: some or all of its :func:`end_keys`."""
         keys = np.unique(keys)
         self._scans.append(keys[keys != _NONE])
 
     def keys(self, scans: int = 1) -> Longs:
-        """The keys [N] of those in which rays of at least so many scans ended."""
+        """Return the keys [N] of those in which rays of as many scans or more ended."""
         keys, counts = np.unique(np.concatenate(self._scans), return_counts=True)
         return np.asarray(keys[counts >= scans])
 
 
 def end_keys(scan: PosedScan, settings: Settings) -> Longs:
-    """The keys [N] of the voxels in which the points of a scan lie.
+    """Return the keys [N] of the voxels in which the points of a scan lie.
 
-    A point has none where its voxel holds no end of a ray that a map with such settings uses.
+    A point has none if its voxel contains no end of a ray that a map with such settings uses.
     """
     pose, leaf_m = scan.world_from_sensor, settings.field.leaf_m
     points = moved(scan.points, pose)
@@ -44,17 +44,17 @@ def end_keys(scan: PosedScan, settings: Settings) -> Longs:
 
 
 def voxel_keys(points: Doubles, voxel_m: float) -> Longs:
-    """One number [N] for the voxel of each point [N, 3]."""
+    """Return one number [N] for the voxel of each point [N, 3]."""
     cells = np.floor(points / voxel_m).astype(np.int64) + _KEY_SIDE // 2
     return np.asarray(cells @ np.array([_KEY_SIDE**2, _KEY_SIDE, 1]))
 
 
 def voxel_centres(keys: Longs, voxel_m: float) -> Doubles:
-    """The middles [N, 3] of the voxels of keys [N]."""
+    """Return the centres [N, 3] of the voxels of keys [N]."""
     cells = np.stack([keys // _KEY_SIDE**2, keys // _KEY_SIDE % _KEY_SIDE, keys % _KEY_SIDE], 1)
     return np.asarray((cells - _KEY_SIDE // 2 + 0.5) * voxel_m)
 
 
 def surface_share(view: MapView, centres: Doubles) -> float:
-    """The share of voxels with such ``centres`` [N, 3] that a map takes for surface."""
+    """Return the share of voxels with ``centres`` [N, 3] that a map takes to be surface."""
     return float((view.status(centres, reach_m=0.0) == Status.SURFACE).mean())

@@ -37,7 +37,7 @@ print(time.perf_counter() - started)
 
 
 def measure_file(made: BenchStreet) -> list[Figure]:
-    """Figures of the street's map as a file."""
+    """Return figures of the street's map as a file."""
     epoch = settled_mapper("the street", made.scans).publish()
     record = epoch.record()
     with tempfile.TemporaryDirectory(prefix="triquad-bench-") as name:
@@ -83,7 +83,7 @@ def _f_score(record: MapRecord, made: BenchStreet) -> float:
 
 
 def _opening(record: MapRecord, folder: Path) -> list[Figure]:
-    """The street's region, side by side until the file is large."""
+    """Return figures of opening a large file: copies of the street's region, side by side."""
     path = folder / "large.triquad"
     first = record.regions[0]
     bytes_each = write_map(record, folder / "one.triquad").bytes

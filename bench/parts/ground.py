@@ -25,7 +25,7 @@ _STEPS = 200
 
 
 def measure_ground(made: BenchStreet, view: MapView) -> list[Figure]:
-    """Figures of a map of the street, asked in this process."""
+    """Return figures of a map of the street, asked in this process."""
     points = ground_points(made)
     truth_m = _true_heights(made.drive.scene, points)
     answer = ground(view, points, MAX_DROP_M)
@@ -49,14 +49,14 @@ def measure_ground(made: BenchStreet, view: MapView) -> list[Figure]:
 
 
 def ground_latency(server: Served, points: Doubles) -> list[Figure]:
-    """How soon a settled server answers another process."""
+    """Return how soon a settled server answers another process."""
     with server.planner(points[:_ASKED], "ground") as probe:
         time.sleep(_PROBED_S)
         return latency_figures(f"ground below {_ASKED} points, through the network", probe.finish())
 
 
 def ground_points(made: BenchStreet) -> Doubles:
-    """Places [N, 3] in free space over what a robot could walk on, beside the sensor's way."""
+    """Return places [N, 3] in free space over walkable ground, next to the sensor's way."""
     rng = np.random.default_rng(0)
     way = made.drive.poses[rng.integers(len(made.drive.poses), size=_PLACES), :3, 3]
     points = way + rng.uniform(-_BESIDE_M, _BESIDE_M, way.shape)
@@ -65,7 +65,7 @@ def ground_points(made: BenchStreet) -> Doubles:
 
 
 def _true_heights(scene: Scene, points: Doubles) -> Doubles:
-    """How high [N] the ground below is: as far down as the distance allows, step by step."""
+    """Return the height [N] of the ground below, found by steps as long as the distance allows."""
     places = points.copy()
     for _ in range(_STEPS):
         places[:, 2] -= scene.sdf(places)

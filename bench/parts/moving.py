@@ -1,4 +1,4 @@
-"""A world that moves: what a map forgets of it, and what it keeps.
+"""A world with moving things: what a map forgets of it, and what it keeps.
 
 On a simulated street things move among others that stand, some of them thin, and then are gone.
 """
@@ -43,20 +43,20 @@ from bench.street import StreamedMap
 
 BUSY_SCANS = 60
 LOOKS = (0, 10, 30, 100, 300)  # scans of the empty street
-_LEFT_AT_MOST = {10: 2.0, 30: 0.5}  # per cent of the trail, after so many of them
+_LEFT_AT_MOST = {10: 2.0, 30: 0.5}  # per cent of the trail, after N of them
 _KEPT = (100, 300)  # scans of it after which what stands is to be there
-_AFTER = 30  # scans of it after which the rest is told
+_AFTER = 30  # scans of it after which the rest is measured
 _TRAIL_CLEAR_M = 0.35  # from anything static: no voxel of the trail touches it
 _GHOST_CLEAR_M = 0.2
 _AIR_M = 0.05
-_THIN_X_M, _THIN_Y_M = 6.0, -2.5  # beside the lane
+_THIN_X_M, _THIN_Y_M = 6.0, -2.5  # next to the lane
 _ROBOT = SegmentOptions(radius_m=0.4, max_distance_m=1.0)
 _ROBOT_Z_M = 0.6
 _WAY_M = 25  # of the lane, in which the car drove
 
 
 def measure_moving(seed: int, folder: Path | None) -> list[Figure]:
-    """Figures of street ``seed`` with things that move, and, if given, of a recorded folder.
+    """Return figures of street ``seed`` with things that move, and, if given, of a recorded folder.
 
     Raises:
         ToolError: the folder cannot be read.
@@ -103,27 +103,27 @@ class Look:
 
     @property
     def trail_left(self) -> float:
-        """The share of the trail that is taken for surface."""
+        """The share of the trail that is taken to be surface."""
         return surface_share(self.epoch, self.trail)
 
     @property
     def static_kept(self) -> float:
-        """The share of static voxels that are taken for surface."""
+        """The share of static voxels that are taken to be surface."""
         return surface_share(self.epoch, self.static)
 
     @property
     def thin_kept(self) -> float:
-        """The share of the voxels of thin things alone that are taken for surface."""
+        """The share of the voxels of thin things alone that are taken to be surface."""
         return surface_share(self.epoch, self.thin)
 
     @property
     def air_in_trail(self) -> float:
-        """The share of the trail where the field knows that it is in the air."""
+        """The share of the trail that the field knows to be free."""
         return float((self.epoch.query(self.trail).sdf > _AIR_M).mean())
 
     @property
     def lane_blocked_m(self) -> int:
-        """How many metres of the lane a robot cannot pass for what it takes for surface."""
+        """Metres of the lane that a robot cannot pass because of what it takes to be surface."""
         starts = np.array([(x, LANE_M, _ROBOT_Z_M) for x in range(_WAY_M)])
         return int(segments(self.epoch, starts, starts + (1.0, 0, 0), _ROBOT).blocked.sum())
 
@@ -142,7 +142,7 @@ class Look:
         return area_m2
 
     def _ghosts(self, middles: Doubles) -> Bools:
-        """Which of faces with such middles [F, 3] lie in the trail."""
+        """Return which of the faces with these centres [F, 3] lie in the trail."""
         voxel_m = self.epoch.voxel_m
         inside = np.isin(voxel_keys(middles, voxel_m), voxel_keys(self.trail, voxel_m))
         return np.asarray(inside & (self.scene.sdf(middles) > _GHOST_CLEAR_M))
@@ -150,16 +150,16 @@ class Look:
 
 @dataclass(frozen=True)
 class Followed:
-    """What became of a map on a street on which things move."""
+    """The results of a map of a street on which things move."""
 
     looks: dict[int, Look]  # by the scans of the empty street until then
     ingest_s: list[float]  # [n] of each scan
 
 
 def follow(traffic: Traffic, thin: tuple[Solid, ...], looks: Sequence[int]) -> Followed:
-    """Map a street, and look at the map after some numbers of scans of the empty street.
+    """Map a street, and measure the map after some numbers of scans of the empty street.
 
-    ``thin`` are those of the things that stand there whose voxels are told apart.
+    ``thin`` are those of the standing things whose voxels are counted separately.
     """
     streamed = StreamedMap(Settings())
     seen = _Seen(traffic.standing.scene, Scene(thin, traffic.standing.scene.bounds))
@@ -176,7 +176,7 @@ def follow(traffic: Traffic, thin: tuple[Solid, ...], looks: Sequence[int]) -> F
 
 
 class _Seen:
-    """Where rays ended on a street so far, by what they ended on."""
+    """The voxels of a street in which rays ended so far, by what they ended on."""
 
     def __init__(self, scene: Scene, thin: Scene) -> None:
         """``scene`` is that of all that stands, ``thin`` of some of it."""
@@ -190,7 +190,7 @@ class _Seen:
         self._on_others.add(keys[~scan.moving & ~thin])
 
     def look(self, epoch: Epoch) -> Look:
-        """A map, and the truth so far."""
+        """Return a map, and the truth so far."""
         moving, thin, others = self._on_moving, self._on_thin, self._on_others
         static = np.union1d(thin.keys(), others.keys())
         trail = voxel_centres(np.setdiff1d(moving.keys(), static), epoch.voxel_m)

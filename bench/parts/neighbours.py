@@ -1,4 +1,4 @@
-"""What clients that want too much take from a planner and a lidar."""
+"""The effect of clients that want too much on a planner and a lidar."""
 
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -20,7 +20,7 @@ _SETTLE_S = 600.0
 
 
 def measure_neighbours(made: BenchStreet) -> list[Figure]:
-    """Figures of a planner at 20 Hz and a lidar at 10 Hz, alone and beside noisy neighbours."""
+    """Return figures of a planner at 20 Hz and a lidar at 10 Hz, alone and with neighbours."""
     place = made.drive.poses[len(made.drive.poses) // 2][:3, 3]
     points = around(place, _ASKED, np.random.default_rng(0))
     with served() as server:
@@ -33,7 +33,7 @@ def measure_neighbours(made: BenchStreet) -> list[Figure]:
 def _measure(
     server: Served, made: BenchStreet, points: Doubles, kinds: Sequence[str]
 ) -> tuple[ProbeReport, int, int]:
-    """What a planner met while a lidar streams; its scans, and how many of them were lost."""
+    """Return a planner's figures while a lidar streams, the scans, and how many were lost."""
     with ExitStack() as stack:
         for kind in kinds:
             if kind == "unread":

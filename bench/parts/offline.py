@@ -1,4 +1,4 @@
-"""Maps opened offline: how true and how fast their answers are beside the server's epoch."""
+"""Maps opened offline: how true and fast their answers are compared to the server's epoch."""
 
 import tempfile
 from collections.abc import Callable
@@ -23,7 +23,7 @@ _ROUNDS = 7
 
 
 def measure_offline(made: BenchStreet) -> list[Figure]:
-    """Figures of the street's map, opened offline, against the settled server's epoch."""
+    """Return figures of the street's map, opened offline, against the settled server's epoch."""
     epoch = settled_mapper("the street", made.scans).publish()
     points = seen_points(epoch, made, np.random.default_rng(_OFFLINE_SEED))
     with tempfile.TemporaryDirectory(prefix="triquad-bench-") as name:
@@ -61,7 +61,7 @@ def _differences(offline: OfflineMap, epoch: Epoch, points: Doubles) -> list[Fig
 
 
 def _ratios(offline: OfflineMap, epoch: Epoch, points: Doubles) -> list[Figure]:
-    """How many times as long as the server's epoch the file takes."""
+    """Return how many times as long as the server's epoch the file takes."""
     figures = []
     for count in (1_000, 100_000):
         some = points[:count]

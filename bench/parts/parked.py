@@ -1,4 +1,4 @@
-"""A robot at rest: after how much training its map settles while scans come.
+"""A robot at rest: after how much training its map settles while scans arrive.
 
 It drives into a street, stands there, and a box is put down before it. Training is counted in
 samples; between two scans there is time for as many steps as in all benchmarks that stream.
@@ -29,7 +29,7 @@ _AHEAD_M, _HALF_M = 5.0, np.array([0.6, 0.9, 0.45])  # where the box is put, and
 
 
 def measure_parked(seed: int) -> list[Figure]:
-    """What a robot at rest trains, and how good its map is before, meanwhile and afterwards."""
+    """Return what a robot at rest trains, and how good its map is before, during and after."""
     scene = street(seed, _LENGTH_M)
     way = drive(scene, _DRIVEN, _STEP_M)
     driven = driven_street(SimulatedDrive(scene, Lidar(columns=_COLUMNS), way, seed=seed))
@@ -59,7 +59,7 @@ def measure_parked(seed: int) -> list[Figure]:
 
 
 def _rest(robot: StreamedMap, scans: Iterable[PosedScan]) -> list[int]:
-    """The samples that are trained on after each scan, until these are few."""
+    """Return the samples that are trained on after each scan, until these are few."""
     trained: list[int] = []
     with progress("at rest", _MOST) as report:
         for number, scan in enumerate(scans):
@@ -71,7 +71,7 @@ def _rest(robot: StreamedMap, scans: Iterable[PosedScan]) -> list[int]:
 
 
 def _trained(robot: StreamedMap, scan: PosedScan) -> int:
-    """Take in a scan; returns on how many samples the map was trained after it."""
+    """Integrate a scan; return on how many samples the map was trained after it."""
     before = robot.mapper.samples_trained
     robot.take_in(scan)
     return robot.mapper.samples_trained - before
@@ -82,7 +82,7 @@ def _at_rest(scene: Scene, pose: Doubles, count: int, seed: int) -> Iterable[Pos
 
 
 def _front(centre: Doubles, seen_from: Doubles) -> Doubles:
-    """Points [N, 3] on that face of the box which looks along the street to the robot."""
+    """Return points [N, 3] on that face of the box which looks along the street to the robot."""
     side = np.sign(seen_from[0] - centre[0])
     y, z = np.meshgrid(np.linspace(-0.8, 0.8, 17), np.linspace(-0.2, 0.4, 7))
     x = np.full(y.size, side * _HALF_M[0])

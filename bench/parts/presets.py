@@ -1,4 +1,4 @@
-"""Presets: places and sensors that each is for, streamed at 10 Hz."""
+"""Presets: the places and sensors that each is for, streamed at 10 Hz."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -34,7 +34,7 @@ _LONG_SCANS, _LONG_M = 150, 300.0
 
 @dataclass(frozen=True)
 class Place:
-    """What a preset is for: a place, a sensor, and how right its map should be."""
+    """The purpose of a preset: a place, a sensor, and how right its map should be."""
 
     name: str
     preset: str
@@ -51,7 +51,7 @@ def _street_by(lidar: Lidar, seed: int) -> SimulatedDrive:
 
 
 def _long_street(seed: int) -> SimulatedDrive:
-    """A lidar of 128 beams with a range of 120 m, at 72 km/h."""
+    """Return a lidar of 128 beams with a range of 120 m, at 72 km/h."""
     lidar = Lidar(beams=128, columns=1024, range_max_m=120.0, noise_m=0.02)
     scene = street(seed, _LONG_M)
     return SimulatedDrive(scene, lidar, drive(scene, _LONG_SCANS, _LONG_M / _LONG_SCANS), seed)
@@ -79,7 +79,7 @@ PLACES = (
 
 
 def measure_presets(seed: int) -> list[Figure]:
-    """Figures of all places, each with a server of its preset."""
+    """Return figures of all places, each with a server of its preset."""
     return [figure for place in PLACES for figure in _place_figures(place, seed)]
 
 

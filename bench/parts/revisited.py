@@ -1,4 +1,4 @@
-"""A recorded drive that is mapped over and over: what of it the map keeps.
+"""A recorded drive that is mapped repeatedly: what the map keeps of it.
 
 Things move there, and nobody knows which. What several scans saw should stay; what a single one
 saw, and later ones passed, may well have moved.
@@ -28,15 +28,15 @@ _ROUNDS = 2
 
 @dataclass(frozen=True)
 class Revisited:
-    """What a settled map keeps of where rays ended, and how right it is elsewhere."""
+    """The share of voxels where rays ended that a settled map keeps, and its errors elsewhere."""
 
-    kept: float  # the share of voxels in which rays ended that are taken for surface
+    kept: float  # the share of voxels in which rays ended that are taken to be surface
     kept_of_several: float  # of those in which rays of at least two scans of one round ended
     error_m: float  # median distance from the surface of the points of withheld scans
 
 
 def revisited_figures(path: Path) -> list[Figure]:
-    """Figures of a recorded folder, with things taken back and without."""
+    """Return figures of a recorded folder, with contradicted surface removed and without."""
     scans, usual = recorded_scans(path), Settings()
     still = usual.model_copy(update={"change": usual.change.model_copy(update={"static": True})})
     found = revisit(scans, usual, path.name)
@@ -52,7 +52,7 @@ def revisited_figures(path: Path) -> list[Figure]:
 
 
 def revisit(scans: RecordedScans, settings: Settings, name: str) -> Revisited:
-    """Map a recorded drive over and over, and compare the map with where rays ended."""
+    """Map a recorded drive repeatedly, and compare the map with where rays ended."""
     streamed, ended = StreamedMap(settings), EndedVoxels()
     rounds = _ROUNDS * scans.mapped
     with progress(f"mapping {name}", len(rounds) + 1) as report:
@@ -74,6 +74,6 @@ def revisit(scans: RecordedScans, settings: Settings, name: str) -> Revisited:
 
 
 def _unseen_points(scans: RecordedScans, settings: Settings) -> Doubles:
-    """The points [N, 3] of withheld scans that a map would use, map frame."""
+    """Return the points [N, 3] of withheld scans that a map would use, map frame."""
     rays = (usable_rays(s.points, s.world_from_sensor, settings.scan) for s in scans.withheld)
     return np.concatenate([of_scan.ends for of_scan in rays])

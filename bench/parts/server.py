@@ -1,4 +1,4 @@
-"""Through the network: a server process, a lidar at 10 Hz and a planner."""
+"""A whole server through the network: a server process, a lidar at 10 Hz and a planner."""
 
 import statistics
 import time
@@ -27,8 +27,8 @@ from bench.street import BenchStreet
 
 _SOON_S = 2.0  # after the last scan
 _SETTLE_LIMIT_S = 300.0
-_REST_S = 12.0  # in which a server gives back what it has no use for
-_RESTED = 11  # seconds after that in which its memory is looked at
+_REST_S = 12.0  # in which a server frees what it does not need
+_RESTED = 11  # seconds after that in which its memory is measured
 _MESH_SAMPLES = 6_000_000
 _REPEATS = 15
 _ASKED = 1_000
@@ -36,7 +36,7 @@ _QUESTIONS, _FIRST = 320, 20  # the first are not counted
 
 
 def measure_server(made: BenchStreet) -> list[Figure]:
-    """Figures of a whole server: what a robot would meet."""
+    """Return figures of a whole server: what a robot would meet."""
     made = replace(made, samples_max=_MESH_SAMPLES)
     with served() as server:
         client = server.client
@@ -62,7 +62,7 @@ def _resident_mb(client: Client) -> float:
 
 
 def _resident_at_rest_mb(client: Client) -> float:
-    """Memory once nobody asks, whether or not a checkpoint is being written just then."""
+    """Return the memory at rest, whether or not a checkpoint is being written just then."""
     time.sleep(_REST_S)
     samples = []
     for _ in range(_RESTED):
@@ -72,7 +72,7 @@ def _resident_at_rest_mb(client: Client) -> float:
 
 
 def _early(client: Client, made: BenchStreet) -> list[Figure]:
-    """The map soon after the last scan: all of it is taken from the epoch of that moment."""
+    """Return figures of the map soon after the last scan, all from the epoch of that moment."""
     trained = client.status().samples_trained / 1e6
     mesh = client.mesh(made.drive.scene.box)
     lost = client.flush(FLUSH_TIMEOUT_S)
@@ -86,7 +86,7 @@ def _early(client: Client, made: BenchStreet) -> list[Figure]:
 
 
 def _idle(client: Client, made: BenchStreet) -> list[Figure]:
-    """How soon an idle server answers one question after the other."""
+    """Return how soon an idle server answers one question after the other."""
     place = made.drive.poses[len(made.drive.poses) // 2][:3, 3]
     points, near = around(place, _ASKED, np.random.default_rng(0)), near_surface(made)
 
@@ -128,7 +128,7 @@ def _converged(client: Client, made: BenchStreet) -> list[Figure]:
 
 
 def _network(client: Client, made: BenchStreet, folder: Path) -> list[Figure]:
-    """Queries of 100,000 points through the network, against the same map in this process."""
+    """Compare queries of 100,000 points through the network with the same map in this process."""
     client.download_map(folder / "map.triquad")
     epoch = Mapper("bench", Settings(), "cpu", record=read_map(folder / "map.triquad")).publish()
     points = seen_points(epoch, made, np.random.default_rng(0))

@@ -1,4 +1,4 @@
-"""A server's start: where nothing was ever compiled, and later."""
+"""A server's start: with nothing compiled, and later."""
 
 import os
 import statistics
@@ -19,7 +19,7 @@ _TIMEOUT_S = 300.0
 
 
 def measure_start() -> list[Figure]:
-    """How soon a server answers, and takes a scan in, and what it takes of memory by then."""
+    """Return how soon a server answers and integrates a scan, and its memory by then."""
     with tempfile.TemporaryDirectory(prefix="triquad-bench-") as name:
         first = _Start(Path(name))
         later = [_Start(Path(name)) for _ in range(_STARTS)]
@@ -37,7 +37,7 @@ class _Start:
     """A start of a server with an empty map, which ends again."""
 
     def __init__(self, folder: Path) -> None:
-        """Compiled code is kept in a folder."""
+        """Start a server whose compiled code is kept in a folder."""
         variables = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "kernels")}
         started = time.monotonic()
         with tempfile.TemporaryDirectory(dir=folder) as name:
@@ -51,7 +51,7 @@ class _Start:
 
 
 def _sphere() -> Floats:
-    """Points [N, 3] around a sensor, metres."""
+    """Return points [N, 3] around a sensor, metres."""
     directions = np.random.default_rng(0).normal(size=(1000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     return (3 * directions).astype(np.float32)

@@ -26,13 +26,13 @@ _EVERY_SCANS = 15
 
 
 def measure_store(made: BenchStreet) -> list[Figure]:
-    """Figures of checkpoints."""
+    """Return figures of checkpoints."""
     record = _row(made)
     return _costs(record, made) + _latencies(record, made)
 
 
 def _row(made: BenchStreet) -> MapRecord:
-    """A street's region, settled, 16 times in a row."""
+    """Return a street's region, settled, 16 times in a row."""
     settings = Settings()
     mapper = Mapper(MAP, settings, "cpu")
     for scan in made.scans[:_SCANS]:
@@ -53,7 +53,7 @@ def _row(made: BenchStreet) -> MapRecord:
 
 
 def _costs(record: MapRecord, made: BenchStreet) -> list[Figure]:
-    """Bytes and time of a complete checkpoint, and of those after driving on in one region."""
+    """Return bytes and time of a complete checkpoint, and of those after driving in one region."""
     mapper = Mapper(MAP, Settings(), "cpu", record=record)
     with (
         tempfile.TemporaryDirectory(prefix="triquad-bench-") as root,
@@ -81,7 +81,7 @@ def _costs(record: MapRecord, made: BenchStreet) -> list[Figure]:
 
 @dataclass(frozen=True)
 class _Cost:
-    """What a checkpoint cost."""
+    """The cost of a checkpoint."""
 
     bytes: int
     seconds: float
@@ -94,7 +94,7 @@ def _checkpoint(mapper: Mapper, store: Store) -> _Cost:
 
 
 def _latencies(record: MapRecord, made: BenchStreet) -> list[Figure]:
-    """Replies while the robot drives on in one region, without and with checkpoints."""
+    """Return latencies while the robot drives on in one region, without and with checkpoints."""
     with served(record) as server, ThreadPoolExecutor(1) as beside:
 
         def published(number: int) -> None:

@@ -1,4 +1,4 @@
-"""Answers: how true they are, and how well what is unknown is told apart."""
+"""Answers: how true they are, and how well unknown space is recognised."""
 
 from dataclasses import dataclass
 
@@ -44,7 +44,7 @@ class AnswerProbes:
 
 
 def measure_answers(street: DrivenStreet, record: MapRecord, view: MapView) -> list[Figure]:
-    """Figures of a map of ``street``, its ``record`` and what answers from it."""
+    """Return figures of a map of ``street``, its ``record`` and what answers from it."""
     rng = np.random.default_rng(0)
     probes = AnswerProbes(
         seen_free=_along_rays(street, rng),
@@ -69,7 +69,7 @@ def _distances(
     slopes = scene.gradient(points)
     answer = distances(view, points, DistanceOptions(REACH_M, unknown_distance=True))
     feet_seen = view.status(points - truth[:, None] * slopes) == Status.SURFACE
-    # What a planner can tell from the answer itself.
+    # What a planner can see from the answer itself.
     known = answer.unknown_distance_m >= answer.distance_m
     figures = [Figure("points to which a surface is nearer than unknown space",
                       100 * known.mean(), "%")]  # fmt: skip
@@ -109,7 +109,7 @@ def _errors(
 
 
 def _calibration(answer: Distances, truth: Doubles, chosen: Bools) -> list[Figure]:
-    """Whether errors fall as the stated confidence rises."""
+    """Return figures of whether errors fall as the stated confidence rises."""
     chosen = chosen & answer.found
     error = np.abs(answer.distance_m - truth)[chosen]
     levels = level_confidence()
@@ -141,7 +141,7 @@ def _unknown(probes: AnswerProbes, view: MapView) -> list[Figure]:
 
 
 def _corridor(probes: AnswerProbes, view: MapView) -> list[Figure]:
-    """Obstacles around the way of the sensor, where there are none."""
+    """Return figures of obstacles around the way of the sensor, where there are none."""
     balls = spheres(view, probes.corridor, np.full(len(probes.corridor), _BALL_M))
     answer = distances(view, probes.corridor, DistanceOptions(REACH_M))
     false = (balls.status == Status.SURFACE) | (answer.distance_m <= 0)
@@ -188,7 +188,7 @@ def _never_seen(street: DrivenStreet, rng: np.random.Generator) -> Doubles:
 
 
 def _ghosts(street: DrivenStreet, record: MapRecord, rng: np.random.Generator) -> Doubles:
-    """Places that three planes of features cannot tell from seen surface."""
+    """Return places that three planes of features cannot tell from seen surface."""
     voxels = surface_voxels(record)
     leaf_m = record.settings.leaf_m
     cells = np.floor(voxels / leaf_m).astype(np.int64)

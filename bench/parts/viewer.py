@@ -1,4 +1,4 @@
-"""What the viewer shows how soon, and how smoothly."""
+"""How soon and how smoothly the viewer shows a map."""
 
 import statistics
 import time
@@ -45,7 +45,7 @@ seconds => new Promise(done => {
 
 
 def measure_viewer(made: BenchStreet) -> list[Figure]:
-    """Figures of the viewer, in a browser that draws in software on the same two cores."""
+    """Return figures of the viewer, in a browser that draws in software on the same two cores."""
     with served() as server:
         stream(server.client, made.scans)
         wait_until_settled(server.client, _SETTLE_LIMIT_S)
@@ -53,7 +53,7 @@ def measure_viewer(made: BenchStreet) -> list[Figure]:
 
 
 def _first_mesh(client: Client) -> list[Figure]:
-    """How soon a page shows the mesh of a street that is learnt to the end."""
+    """Return how soon a page shows the mesh of a street that is learnt completely."""
     times: list[float] = []
     with (
         closing(Viewer(LiveSource(client, ""), "127.0.0.1", 0)) as viewer,
@@ -68,7 +68,7 @@ def _first_mesh(client: Client) -> list[Figure]:
 
 
 def _long_street(client: Client) -> list[Figure]:
-    """How many frames a second there are of 2 km of streets, while the camera turns."""
+    """Return the frames per second of 2 km of streets, while the camera turns."""
     source = RepeatedSource.of_street(client)
     with (
         closing(Viewer(source, "127.0.0.1", 0)) as viewer,
@@ -105,20 +105,20 @@ def _frames_per_second(page: Page) -> float:
 
 @dataclass(frozen=True)
 class RepeatedFollower:
-    """Tiles of one street, again and again along x, all there at once."""
+    """The tiles of one street, repeated along x, all there at once."""
 
     tiles: Mapping[TileIndex, MeshTile]
     complete: bool = True
 
     def refresh(self) -> None:
-        """Nothing changes."""
+        """Do nothing: no tile changes."""
 
     def moved(self, bounds: Bounds) -> "RepeatedFollower":  # noqa: ARG002
-        """More than is asked for does no harm."""
+        """Do nothing: more tiles than requested do no harm."""
         return self
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: there is nothing to release."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ class RepeatedSource:
 
     @classmethod
     def of_street(cls, client: Client) -> "RepeatedSource":
-        """The street that a server has."""
+        """Return the street that a server has."""
         live = LiveSource(client, "")
         followers = {}
         for level in range(COARSEST + 1):
@@ -145,18 +145,18 @@ class RepeatedSource:
         return cls(client, live.sizes, followers)
 
     def state(self) -> MapState:
-        """Of no map that there is."""
+        """Return the state of a synthetic map."""
         return MapState(self.title, 0, "")
 
     def follow(self, level: int, bounds: Bounds | None = None) -> RepeatedFollower:  # noqa: ARG002
-        """All tiles of a level."""
+        """Return all tiles of a level."""
         return self.followers[level]
 
 
 def _repeated(
     tiles: Mapping[TileIndex, MeshTile], level: int, side_m: float
 ) -> dict[TileIndex, MeshTile]:
-    """Those tiles of a level that lie in the piece that is copied, with their copies."""
+    """Return the tiles of a level that lie in the piece that is copied, with their copies."""
     count = _COPIED_TILES << (COARSEST - level)
     step_m = np.array([count * side_m, 0.0, 0.0])
     return {

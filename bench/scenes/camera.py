@@ -38,7 +38,7 @@ class DepthCamera:
     def scan(
         self, scene: Scene, world_from_sensor: Doubles, rng: np.random.Generator
     ) -> SimulatedScan:
-        """One image of ``scene`` from a pose ``[4, 4]`` in its free space, as points."""
+        """Return one image of ``scene`` from a pose ``[4, 4]`` in its free space, as points."""
         rotation, origin = world_from_sensor[:3, :3], world_from_sensor[:3, 3]
         lengths = np.linalg.norm(self.directions, axis=1)
         rays = self.directions @ rotation.T / lengths[:, None]
@@ -56,7 +56,7 @@ class DepthCamera:
 
 
 def looking_at(eyes: Doubles, targets: Doubles) -> Doubles:
-    """Poses ``[n, 4, 4]`` of a camera at ``eyes [n, 3]`` that looks at ``targets [n, 3]``, upright.
+    """Return upright poses ``[n, 4, 4]`` of a camera, from ``eyes [n, 3]`` to ``targets [n, 3]``.
 
     The map's z axis points up; no camera may look straight up or down.
     """

@@ -12,7 +12,7 @@ from bench.scenes.camera import DepthCamera, looking_at
 
 _WALL_M = 0.3  # thickness of walls and ceiling
 _AROUND_M = 0.1  # of the bounds, beyond the inner faces of the walls
-_FREE_M = 0.75  # furniture at the walls keeps within so much of them
+_FREE_M = 0.75  # furniture at the walls keeps within this distance of them
 _SPACING_M = 0.25  # between two pieces of furniture
 
 _SCAN_PERIOD_S = 0.1
@@ -21,7 +21,7 @@ _TURNS = 2.0  # of a camera about the vertical, in each lap
 
 
 def room(seed: int) -> Scene:
-    """A room about the origin, its floor at ``z = 0``; the same seed gives the same room.
+    """Return a room about the origin, its floor at ``z = 0``; the same seed gives the same room.
 
     There is a table with chairs in the middle, and furniture along the walls.
     """
@@ -38,7 +38,7 @@ def room(seed: int) -> Scene:
 
 
 def room_by_camera(seed: int, scans: int) -> SimulatedDrive:
-    """A depth camera that is carried around the table of room ``seed``, 10 scans a second."""
+    """Return a drive of a depth camera around the table of room ``seed``, 10 scans a second."""
     scene = room(seed)
     lap = _laps(scans)
     eyes = _way(scene, lap, height_m=1.2)
@@ -49,7 +49,7 @@ def room_by_camera(seed: int, scans: int) -> SimulatedDrive:
 
 
 def room_by_lidar(seed: int, scans: int) -> SimulatedDrive:
-    """A lidar of 64 beams that is driven around the table of room ``seed``, 10 scans a second."""
+    """Return a drive of a lidar of 64 beams around the table of room ``seed``, 10 scans/s."""
     scene = room(seed)
     lap = _laps(scans)
     poses = np.tile(np.eye(4), (scans, 1, 1))
@@ -62,12 +62,12 @@ def room_by_lidar(seed: int, scans: int) -> SimulatedDrive:
 
 
 def _laps(scans: int) -> Doubles:
-    """Laps [scans] that were made at each scan."""
+    """Return laps [scans] that were made at each scan."""
     return np.arange(scans, dtype=np.float64) * (_SCAN_PERIOD_S / _LAP_S)
 
 
 def _way(scene: Scene, lap: Doubles, height_m: float) -> Doubles:
-    """Positions [n, 3] on an ellipse between the table and the furniture at the walls."""
+    """Return positions [n, 3] on an ellipse between the table and the furniture at the walls."""
     half = 0.5 * (scene.bounds[1] - scene.bounds[0])[:2] - _AROUND_M - _FREE_M - 0.4
     angle = 2.0 * math.pi * lap
     rise = 0.15 * np.sin(2.0 * math.pi * 3.0 * lap)
@@ -75,7 +75,7 @@ def _way(scene: Scene, lap: Doubles, height_m: float) -> Doubles:
 
 
 def _shell(half_x: float, half_y: float, height: float) -> list[Solid]:
-    """Four walls and a ceiling around the inside; what overlaps lies behind their faces."""
+    """Return four walls and a ceiling around the inside; what overlaps lies behind their faces."""
     half_wall = 0.5 * _WALL_M
     middle_z, half_z = 0.5 * height, 0.5 * height + _WALL_M
     walls = [
@@ -91,13 +91,13 @@ def _shell(half_x: float, half_y: float, height: float) -> list[Solid]:
 
 
 class _Place:
-    """Where a piece of furniture stands: it is built about its own foot, its back to -y."""
+    """The place of a piece of furniture: it is built about its own base, its back to -y."""
 
     def __init__(self, x: float, y: float, yaw: float) -> None:
         self._x, self._y, self._yaw = x, y, yaw
 
     def at(self, along: float, across: float, z: float) -> Vector:
-        """A point of the piece in the room."""
+        """Return a point of the piece in the room."""
         cos, sin = math.cos(self._yaw), math.sin(self._yaw)
         return (
             self._x + cos * along - sin * across,
@@ -106,11 +106,11 @@ class _Place:
         )
 
     def box(self, middle: Vector, half: Vector, radius: float = 0.0) -> Solid:
-        """A box of the piece."""
+        """Return a box of the piece."""
         return box(self.at(*middle), half, self._yaw, radius)
 
     def post(self, along: float, across: float, radius: float, top: float) -> Solid:
-        """An upright post from the floor, into which it reaches."""
+        """Return an upright post from the floor, into which it reaches."""
         half = 0.5 * (top + 0.1)
         return cylinder(self.at(along, across, top - half), radius, half)
 
@@ -134,7 +134,7 @@ def _table_and_chairs(rng: np.random.Generator) -> list[Solid]:
 
 
 def _chair(place: _Place) -> list[Solid]:
-    """A seat, a back and four legs."""
+    """Return a seat, a back and four legs."""
     parts = [
         place.box((0.0, 0.0, 0.45), (0.2, 0.2, 0.02)),
         place.box((0.0, -0.2, 0.72), (0.2, 0.015, 0.2)),
@@ -146,7 +146,7 @@ def _chair(place: _Place) -> list[Solid]:
 
 
 def _thing(rng: np.random.Generator, foot: Vector) -> list[Solid]:
-    """A cup, a box or a ball that stands on something."""
+    """Return a cup, a box or a ball that stands on something."""
     x, y, z = foot
     size = rng.uniform(0.04, 0.09)
     choice = rng.integers(3)
@@ -161,7 +161,7 @@ def _thing(rng: np.random.Generator, foot: Vector) -> list[Solid]:
 def _row(
     rng: np.random.Generator, side: float, reach: float, wall: float, *, turned: bool
 ) -> list[Solid]:
-    """Furniture along a wall, as far to both sides of its middle as ``reach`` says."""
+    """Return furniture along a wall, up to ``reach`` from its middle on both sides."""
     yaw = (0.0 if side < 0.0 else math.pi) + (0.5 * math.pi if turned else 0.0)
     # A quarter turn takes the back of a piece, at -y, to +x.
     away = -side if turned else side
@@ -179,7 +179,7 @@ def _row(
 
 
 def _shelf(rng: np.random.Generator, place: _Place, half: float) -> list[Solid]:
-    """Boards between two sides and a back, with books on them."""
+    """Return boards between two sides and a back, with books on them."""
     depth, height = rng.uniform(0.28, 0.36), rng.uniform(1.4, 2.0)
     middle = 0.5 * depth
     parts = [place.box((0.0, 0.005, 0.5 * height), (half, 0.015, 0.5 * height + 0.01))]
@@ -203,7 +203,7 @@ def _shelf(rng: np.random.Generator, place: _Place, half: float) -> list[Solid]:
 
 
 def _sofa(rng: np.random.Generator, place: _Place, half: float) -> list[Solid]:
-    """A seat, a back, two arms and a cushion, all of them rounded."""
+    """Return a seat, a back, two arms and a cushion, all of them rounded."""
     depth = rng.uniform(0.6, 0.7)
     middle = 0.5 * depth
     return [
@@ -216,7 +216,7 @@ def _sofa(rng: np.random.Generator, place: _Place, half: float) -> list[Solid]:
 
 
 def _cupboard(rng: np.random.Generator, place: _Place, half: float) -> list[Solid]:
-    """A body with two handles, and things on it."""
+    """Return a body with two handles, and things on it."""
     depth, height = rng.uniform(0.4, 0.6), rng.uniform(0.7, 1.1)
     parts = [place.box((0.0, 0.5 * depth, 0.5 * height), (half, 0.5 * depth, 0.5 * height + 0.01))]
     for x in (-0.06, 0.06):
@@ -228,7 +228,7 @@ def _cupboard(rng: np.random.Generator, place: _Place, half: float) -> list[Soli
 
 
 def _lamp(rng: np.random.Generator, place: _Place, half: float) -> list[Solid]:
-    """A lamp on a thin post, and a plant in a pot beside it."""
+    """Return a lamp on a thin post, and a plant in a pot next to it."""
     x, height = -0.4 * half, rng.uniform(1.4, 1.7)
     plant, size = (0.5 * half, 0.3), rng.uniform(0.13, 0.18)
     parts = [
@@ -245,6 +245,6 @@ def _lamp(rng: np.random.Generator, place: _Place, half: float) -> list[Solid]:
 
 
 def _picture(rng: np.random.Generator, place: _Place, half: float) -> list[Solid]:
-    """A picture on the wall, or a screen."""
+    """Return a picture on the wall, or a screen."""
     size = (0.7 * half, rng.uniform(0.015, 0.03), rng.uniform(0.2, 0.4))
     return [place.box((0.0, size[1] - 0.005, rng.uniform(1.3, 1.6)), size)]

@@ -18,20 +18,20 @@ _POSE_PERIOD_S = 0.01
 
 @dataclass(frozen=True)
 class SteadyMotion:
-    """Straight on along x at a constant speed, while the sensor turns about the vertical."""
+    """Motion along x at a constant speed, while the sensor turns about the vertical."""
 
     start_m: tuple[float, float, float]
     speed_m_s: float
     yaw_rate_rad_s: float
 
     def pose(self, time_s: float) -> Pose:
-        """Where the sensor is."""
+        """Return where the sensor is."""
         half = 0.5 * self.yaw_rate_rad_s * time_s
         x, y, z = self.start_m
         return Pose((x + self.speed_m_s * time_s, y, z), (0, 0, math.sin(half), math.cos(half)))
 
     def frames(self, end_s: float) -> FrameTree:
-        """The motion up to a time as a robot reports it, a hundred times a second."""
+        """Return the motion up to a time as a robot reports it, a hundred times a second."""
         frames = FrameTree()
         for number in range(-1, round((end_s + SWEEP_S) / _POSE_PERIOD_S) + 2):
             time_s = number * _POSE_PERIOD_S
@@ -40,14 +40,14 @@ class SteadyMotion:
 
 
 def nanoseconds(time_s: float) -> int:
-    """A time as a stamp."""
+    """Return a time as a stamp."""
     return round(time_s * 1e9)
 
 
 def sweep(
     scene: Scene, lidar: Lidar, motion: SteadyMotion, *, start_s: float, rng: np.random.Generator
 ) -> Sweep:
-    """One turn of a lidar that begins at a time; each point has its own."""
+    """Return one turn of a lidar that begins at a time; each point has its own."""
     columns = lidar.directions.reshape(lidar.columns, lidar.beams, 3)
     parts: list[Doubles] = []
     offsets: list[Doubles] = []

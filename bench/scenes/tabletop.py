@@ -20,7 +20,7 @@ _LAP_S = 20.0
 
 
 def tabletop(seed: int) -> Scene:
-    """A table with its top at ``z = 0`` and things of 3 to 25 cm on it, about the origin.
+    """Return a table with its top at ``z = 0`` and things of 3 to 25 cm on it, about the origin.
 
     The same seed gives the same things.
     """
@@ -42,7 +42,7 @@ def tabletop(seed: int) -> Scene:
 
 
 def tabletop_by_camera(seed: int, scans: int) -> SimulatedDrive:
-    """A depth camera that is led around the table ``seed``, 10 scans a second.
+    """Return a depth camera that is led around the table ``seed``, 10 scans a second.
 
     It is 0.3 to 1 m from what it looks at.
     """
@@ -58,7 +58,7 @@ def tabletop_by_camera(seed: int, scans: int) -> SimulatedDrive:
 
 
 def _thing(rng: np.random.Generator, x: float, y: float) -> list[Solid]:
-    """A box, a ball, a cup, a bottle or a stack; it reaches a little into the table."""
+    """Return a box, a ball, a cup, a bottle or a stack; it reaches a little into the table."""
     size, yaw = rng.uniform(0.015, 0.05), rng.uniform(0.0, math.pi)
     choice = rng.integers(5)
     if choice == 0:

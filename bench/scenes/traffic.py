@@ -17,7 +17,7 @@ _ON_SURFACE_M = 1e-6
 LANE_M = 1.6  # where cars drive, to the left of the middle of the road
 
 Movers = Callable[[float], list[Solid]]
-"""The things that move, at a time in seconds from the start; none where all are gone."""
+"""The things that move, at a time in seconds from the start; none after all have left."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Traffic:
 
     standing: SimulatedDrive  # without them
     movers: Movers
-    busy_scans: int  # so many at first; then all that moves is gone
+    busy_scans: int  # how many at first; then all that moves has left
 
     def __len__(self) -> int:
         return len(self.standing)
@@ -42,7 +42,7 @@ class Traffic:
         return (self.scan(index) for index in range(len(self)))
 
     def scan(self, index: int) -> TrafficScan:
-        """Scan ``index`` of the drive, always the same."""
+        """Return scan ``index`` of the drive, always the same."""
         standing = self.standing
         moving = tuple(self.movers(index * _PERIOD_S))
         scene = Scene((*standing.scene.solids, *moving), standing.scene.bounds)
@@ -54,21 +54,21 @@ class Traffic:
         return TrafficScan(**vars(made), moving=on_moving)
 
     def among(self, solids: Iterable[Solid]) -> "Traffic":
-        """The same drive with more things that stand on the street."""
+        """Return the same drive with more things that stand on the street."""
         scene = self.standing.scene
         scene = replace(scene, solids=(*scene.solids, *solids))
         return replace(self, standing=replace(self.standing, scene=scene))
 
 
 def lies_on(scene: Scene, points: Doubles) -> Bools:
-    """Which [N] of exact points ``[N, 3]``, world frame, lie on the surface of a scene."""
+    """Return which [N] of exact points ``[N, 3]``, world frame, lie on a scene's surface."""
     return np.asarray(np.abs(scene.sdf(points)) < _ON_SURFACE_M)
 
 
 def street_traffic(seed: int, busy_scans: int, scans: int, lidar: Lidar | None = None) -> Traffic:
-    """Street ``seed`` with a car that drives by, two people, a parked car that leaves and a door.
+    """Return street ``seed`` with a car driving by, two people, a parked car that leaves, a door.
 
-    After ``busy_scans`` of the ``scans`` all of them are gone, the door, too. A scan is taken
+    After ``busy_scans`` of the ``scans`` all of them have left, the door, too. A scan is taken
     every 0.1 s and 0.15 m; without a ``lidar``, of some 60,000 points.
     """
     scene = street(seed)
@@ -99,7 +99,7 @@ def street_traffic(seed: int, busy_scans: int, scans: int, lidar: Lidar | None =
 
 
 def thin_things(x: float, y: float, length_m: float = 12.0) -> list[Solid]:
-    """Posts of 2 cm, two wires of 4 cm and a fence of bars of 16 mm.
+    """Return posts of 2 cm, two wires of 4 cm and a fence of bars of 16 mm.
 
     They stand along x for ``length_m`` from ``x`` on, within 1.2 m of ``y``, metres.
     """
@@ -120,7 +120,7 @@ def _car(x: float, y: float) -> list[Solid]:
 
 
 def _door(x: float, angle: float) -> Solid:
-    """A door in the street's side, as far open as ``angle`` says; it turns about its hinge."""
+    """Return a door in the street's side, opened by ``angle``; it turns about its hinge."""
     half = 0.45
     y = -(ROAD_HALF_WIDTH_M + 1.2)
     centre = (x + half * math.cos(angle), y + half * math.sin(angle), 1.15)

@@ -26,7 +26,7 @@ from bench.street import settled_mapper
 
 
 def measure_ablation(seed: int, scans: int, step_m: float) -> list[Figure]:
-    """Figures of all encodings on a drive of some scans along street ``seed``."""
+    """Return figures of all encodings on a drive of some scans along street ``seed``."""
     drive = street_drive(seed, scans, step_m)
     return [figure for encoding in ENCODINGS for figure in _variant(encoding, drive)]
 

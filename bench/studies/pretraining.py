@@ -33,7 +33,7 @@ def main() -> None:
 
 
 def _learnt_on(street: int, mlp: Sequence[Floats]) -> Sequence[Floats]:
-    """What becomes of an ``mlp`` that learns a street as if it were young."""
+    """Return an ``mlp`` after learning a street as if it were new."""
     settings = Settings()
     warm_up(settings, "cpu")
     mapper = Mapper("pretraining", settings, "cpu")
@@ -46,7 +46,7 @@ def _learnt_on(street: int, mlp: Sequence[Floats]) -> Sequence[Floats]:
 
 
 def _begin_with(mlp: Sequence[Floats], field: LiveField) -> None:
-    """Of the weights of Fourier features, which know a place, nothing is taken over."""
+    """Begin with an MLP, but without its weights of Fourier features, which know a place."""
     field.mlp_steps = 0
     for part, values in zip(field.mlp, mlp, strict=True):
         part.values[0] = values
@@ -75,7 +75,7 @@ def _write(mlp: Sequence[Floats], field: FieldSettings) -> None:
 
 
 def _features(field: FieldSettings) -> int:
-    """Inputs of the MLP that are features."""
+    """Return how many inputs of the MLP are features."""
     return field.feature_levels * field.feature_size
 
 

@@ -1,7 +1,7 @@
-"""``python -m bench.studies.tradeoffs OUT.png``: how good a map is by its time, bytes and scans.
+"""``python -m bench.studies.tradeoffs OUT.png``: how good a map is for its time, bytes and scans.
 
-All of it is one drive along an exact street; every mesh is scored against all that the lidar hit
-in the whole of it. On street 1 it is drawn with VDBFusion 0.1.6, measured on the same scans.
+The map is of one drive along an exact street; every mesh is scored against all lidar hits
+of the whole drive. On street 1 it is drawn with VDBFusion 0.1.6, measured on the same scans.
 """
 
 import argparse
@@ -38,7 +38,7 @@ TIME, BYTES, SPACING = "processor seconds", "file, MB", "one scan in"
 
 @dataclass(frozen=True)
 class Scored:
-    """How good a map is at one point of a curve."""
+    """The scores of a map at one point of a curve."""
 
     curve: str
     cost: float
@@ -59,7 +59,7 @@ NEIGHBOUR = (
 
 
 def measure_tradeoffs(made: BenchStreet) -> list[Scored]:
-    """Scores along three curves."""
+    """Return scores along three curves."""
     scores, settled = _by_time(made)
     scores += _by_bytes(settled, made)
     for every in _EVERY:
@@ -95,7 +95,7 @@ def draw(scores: Sequence[Scored], path: Path, *, title: str, neighbour: bool) -
 
 
 def _by_time(made: BenchStreet) -> tuple[list[Scored], Epoch]:
-    """Scores after some seconds of taking scans in and training, of all cores together.
+    """Return scores after some seconds of taking scans in and training, of all cores together.
 
     The epoch is that of the settled map, of all scans.
     """
@@ -122,7 +122,7 @@ def _by_time(made: BenchStreet) -> tuple[list[Scored], Epoch]:
 
 
 def _by_bytes(epoch: Epoch, made: BenchStreet) -> list[Scored]:
-    """Scores of a map's file, as it is and packed within errors."""
+    """Return scores of a map's file, as it is and packed within errors."""
     plain = io.BytesIO()
     size = _written(epoch.record(), epoch, plain)
     plain.seek(0)
@@ -138,7 +138,7 @@ def _by_bytes(epoch: Epoch, made: BenchStreet) -> list[Scored]:
 
 
 def _written(record: MapRecord, epoch: Epoch, file: io.BytesIO) -> int:
-    """Write a map as a server does, with its previews; returns its size in bytes."""
+    """Write a map as a server does, with its previews; return its size in bytes."""
     return write_map(record, file, previews=previews_of(record, epoch)).bytes
 
 

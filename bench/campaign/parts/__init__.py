@@ -1,1 +1,1 @@
-"""What a campaign does to a server, one part a file."""
+"""The parts of a campaign against a server, one a file."""

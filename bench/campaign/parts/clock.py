@@ -15,12 +15,12 @@ _JUMPS_S = (1, 60, 3_600, _DAY_S, 365 * _DAY_S, 30 * 365 * _DAY_S)
 
 
 def missing() -> str | None:
-    """Why no clock can be made to jump here, if none can."""
+    """Return why no clock can be made to jump here, if none can."""
     return None if _library() else "libfaketime is not installed (apt-get install faketime)"
 
 
 def run(turn: Turn) -> None:
-    """Let the server's clock jump, and see that it maps, answers and keeps checkpoints."""
+    """Let the server's clock jump, and check that it maps, answers and keeps checkpoints."""
     shift = turn.folder / "shift"
     shift.write_text("+0")
     environment = {

@@ -50,14 +50,14 @@ def _use_honestly(endpoint: str) -> None:
 
 
 def _beside_the_map(endpoint: str) -> int:
-    """Memory of the server without that of the map, which the crowd's scans make larger."""
+    """Return the memory of the server without the map, which the crowd's scans enlarge."""
     with triquad_client.connect(endpoint) as client:
         metrics = client.metrics()
     return metrics.resident_bytes - sum(metrics.memory_bytes.values())
 
 
 def _round(turn: Turn, endpoint: str, kinds: Sequence[str]) -> None:
-    """Neighbours of these kinds at once, and scans of sources that were never heard of."""
+    """Run neighbours of these kinds in parallel, and publish scans of new sources."""
     with ExitStack() as stack, servers.raw_session(connect=endpoint) as session:
         for kind in kinds:
             stack.enter_context(neighbour(kind, endpoint, servers.MAP))

@@ -1,4 +1,4 @@
-"""A network that drops connections amid messages, and holds them up."""
+"""A network that drops connections amid messages, and stalls them."""
 
 import contextlib
 import threading
@@ -67,7 +67,7 @@ def _cut_amid_load(turn: Turn, proxy: CuttingProxy) -> None:
 def _load(
     client: triquad_client.Client, place: float, stopping: threading.Event, failures: list[str]
 ) -> None:
-    """Publish and ask, with whatever errors of triquad that brings, but no others."""
+    """Publish and ask; errors of triquad are allowed, but no others."""
     queries = servers.sphere(20_000)
     while not stopping.is_set():
         try:
@@ -81,7 +81,7 @@ def _load(
 
 
 def _expect_served_again(client: triquad_client.Client, place: float) -> None:
-    """The same client has its connection again, in time, and what it flushes is in the map."""
+    """Expect the same client to reconnect in time, and what it flushes to be in the map."""
     by = time.monotonic() + WITHIN_S
     while time.monotonic() < by:
         with contextlib.suppress(TriquadError):

@@ -38,7 +38,7 @@ def run(turn: Turn) -> None:
 def _fill(
     turn: Turn, client: triquad_client.Client, pid: int, kept: triquad_client.CheckpointInfo
 ) -> triquad_client.CheckpointInfo:
-    """One size at which files end; the checkpoint that is valid afterwards."""
+    """Limit files to one size; return the checkpoint that is valid afterwards."""
     points, pose = sphere_at(turn.random.randrange(_PLACES) * _SPACING_M)
     client.publish_scan(points, pose)
     client.flush(servers.WAIT_S)
@@ -68,7 +68,7 @@ def _learn_and_keep(client: triquad_client.Client, place: int) -> triquad_client
 
 @contextmanager
 def _files_of_at_most(pid: int, size: int) -> Iterator[None]:
-    """Every file that the process writes ends after so many bytes, as on a disk that is full."""
+    """Let every file that the process writes end after N bytes, as on a disk that is full."""
     _, hard = resource.prlimit(pid, resource.RLIMIT_FSIZE)
     resource.prlimit(pid, resource.RLIMIT_FSIZE, (size, hard))
     try:

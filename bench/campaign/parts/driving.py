@@ -49,7 +49,7 @@ def run(turn: Turn) -> None:
 
 
 def _lap(seed: int) -> list[SimulatedScan]:
-    """Scans up a street and back."""
+    """Return scans up a street and back."""
     scene = street(seed)
     rng = np.random.default_rng(seed)
     lidar = Lidar(beams=16, columns=120, range_max_m=25.0)

@@ -31,11 +31,11 @@ _START_S = 120.0
 """Time for a child to import all that reads files, and to make valid ones."""
 _HANG_S = 20.0
 _LIMIT_BYTES = 64 * 2**20
-"""Memory that a reader may take beside the size of the file."""
+"""Memory that a reader may take in addition to the size of the file."""
 
 _MUTATIONS = (*DAMAGE * 3, *FORGERY * 3, add_bombs, forge_bombs)
 _READ, _ENDED = "read", "ended"
-_CHUNK = 50  # mutants between two looks at the time
+_CHUNK = 50  # mutants between two checks of the time
 
 
 def run(turn: Turn) -> None:
@@ -47,7 +47,7 @@ def run(turn: Turn) -> None:
 
 
 def _run_child(turn: Turn, part: int) -> None:
-    """One child's files, until it has ended in whatever way."""
+    """Run one child on its files, until it has ended in any way."""
     # A forked child would wait for ever for the threads that compute in this process.
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
@@ -76,7 +76,7 @@ def _run_child(turn: Turn, part: int) -> None:
 
 
 def _read_mutants(turn: Turn, part: int, tell: Connection) -> None:
-    """All of a child: it draws mutants and tells what becomes of each."""
+    """Run a child: draw mutants, and report the outcome of each."""
     folder = turn.folder / f"files-{part}"
     folder.mkdir()
     maps = valid_maps(folder)
@@ -91,7 +91,7 @@ def _read_mutants(turn: Turn, part: int, tell: Connection) -> None:
 def _read_chunk(
     turn: Turn, maps: list[ValidMap], seeds: tuple[int, int, int], tell: Connection
 ) -> None:
-    """Some mutants, which follow from the seeds alone."""
+    """Read some mutants, which follow from the seeds alone."""
 
     @seed(repr(seeds))
     @settings(
@@ -111,7 +111,7 @@ def _read_chunk(
 
 
 def _outcome(maps: list[ValidMap], mutation: Mutation, data: st.DataObject) -> tuple[str, str]:
-    """What became of a mutant, and what broke, if anything did."""
+    """Return the outcome of a mutant, and what broke, if anything did."""
     valid = data.draw(st.sampled_from(maps))
     name = data.draw(st.sampled_from(sorted(valid.files)))
     mutant = mutation(data.draw, valid.files[name])
@@ -133,7 +133,7 @@ def _outcome(maps: list[ValidMap], mutation: Mutation, data: st.DataObject) -> t
 
 
 def _read_all(valid: ValidMap, *, forged: bool) -> str:
-    """Read a mutant in every way; the sum of what came of it.
+    """Read a mutant in every way; return the sum of the results.
 
     Raises:
         AssertionError: it passed for what it is not, or took too much memory.

@@ -18,14 +18,14 @@ _LATEST_KILL_S = 1.5
 
 @dataclass
 class _Acknowledged:
-    """What the server has promised to keep."""
+    """The state that the server has promised to keep."""
 
     epoch: int = 0
     places: set[int] = field(default_factory=set)  # where spheres are in the map
 
 
 def run(turn: Turn) -> None:
-    """Start, see that all is there that was acknowledged, load, kill; and again."""
+    """Start, check that all is there that was acknowledged, load, kill; and again."""
     acknowledged = _Acknowledged()
     while not turn.over:
         _live_and_die(turn, acknowledged)

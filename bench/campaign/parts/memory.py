@@ -29,7 +29,7 @@ _OUT_OF_MEMORY = "the system gives no more memory"  # what a server logs that en
 
 @dataclass
 class _Kept:
-    """What has to be there after a restart."""
+    """The state that has to be there after a restart."""
 
     epoch: int = 0
     place: int = 0
@@ -45,7 +45,7 @@ def run(turn: Turn) -> None:
 
 
 def _serve_with_limits(turn: Turn, kept: _Kept) -> None:
-    """One server, until it ended or the turn is over."""
+    """Run one server, until it has ended or the turn is over."""
     with server_under_test(turn, stop_status=None) as server:
         pid = server.process.pid
         with triquad_client.connect(server.endpoint, timeout_s=10.0) as client:
@@ -75,7 +75,7 @@ def _keep(turn: Turn, client: triquad_client.Client, kept: _Kept) -> None:
 
 
 def _load(turn: Turn, client: triquad_client.Client) -> None:
-    """Whatever takes memory, with whatever errors of triquad that brings."""
+    """Ask for what takes memory; errors of triquad are allowed."""
     until = time.monotonic() + turn.random.uniform(0.2, _SQUEEZE_S)
     points = np.tile(servers.sphere(20_000), (turn.random.choice((1, 10)), 1))
     while time.monotonic() < until:
@@ -87,7 +87,7 @@ def _load(turn: Turn, client: triquad_client.Client) -> None:
 
 
 def _expect_alive(client: triquad_client.Client, kept: _Kept) -> None:
-    """With memory again, the server maps and answers as before."""
+    """Expect the server to map and answer as before, with memory again."""
     for _ in range(2):
         client.publish_scan(*sphere_at(kept.place * _SPACING_M), source="honest")
     client.flush(servers.WAIT_S)
@@ -96,7 +96,7 @@ def _expect_alive(client: triquad_client.Client, kept: _Kept) -> None:
 
 @contextlib.contextmanager
 def _address_space(pid: int, size: int) -> Iterator[None]:
-    """Another process may not take more address space than this, for a while."""
+    """Limit the address space of another process for a while."""
     try:
         _, hard = resource.prlimit(pid, resource.RLIMIT_AS)
         resource.prlimit(pid, resource.RLIMIT_AS, (size, hard))

@@ -23,13 +23,13 @@ from bench.campaign.turn import Turn
 
 _SENDERS = 8
 _REPLY_S = 30.0
-_WARM_SHARE = 5  # memory is compared with that after one part in so many
+_WARM_SHARE = 5  # memory is compared with that after one part in N
 _MAY_WAIT = (keys.FLUSH, keys.TILE_UPDATES)  # as long as their mutants ask for
 _WAIT_S = 1.3  # so long such a request is waited for: many ask for a second
 
 
 def run(turn: Turn) -> None:
-    """Send mutants from several threads, look at every reply, then ask as an honest client."""
+    """Send mutants from several threads, check every reply, then ask as an honest client."""
     with server_under_test(turn) as server, servers.raw_session(connect=server.endpoint) as session:
         with triquad_client.connect(server.endpoint) as client:
             servers.learn(client)
@@ -42,7 +42,7 @@ def run(turn: Turn) -> None:
 
 
 def _send(turn: Turn, senders: "list[_Sender]", most: int, server: servers.ServerProcess) -> int:
-    """Send until so many are sent; the memory that the server then takes."""
+    """Send the given number; return the memory that the server then takes."""
     with ThreadPoolExecutor(len(senders)) as pool:
         for sent in [pool.submit(sender.send_until, most) for sender in senders]:
             sent.result()

@@ -22,7 +22,7 @@ from bench.campaign.server_under_test import (
 from bench.campaign.turn import Turn
 
 _LONGEST_S = 2.0
-_MOST_WAIT_S = 10.0  # of an honest client, beside one that is stopped
+_MOST_WAIT_S = 10.0  # of an honest client, next to one that is stopped
 _GREEDY = """
 import sys
 import numpy as np
@@ -56,7 +56,7 @@ def run(turn: Turn) -> None:
 
 
 def _stop_server(server: servers.ServerProcess, stopped_s: float) -> None:
-    """Requests while it is stopped end with errors of triquad; then it serves again."""
+    """Expect requests to a stopped server to end with errors of triquad; then it serves again."""
     with triquad_client.connect(server.endpoint, timeout_s=0.5) as client:
         server.process.send_signal(signal.SIGSTOP)
         try:
@@ -71,7 +71,7 @@ def _stop_server(server: servers.ServerProcess, stopped_s: float) -> None:
 
 
 def _stop_client(turn: Turn, endpoint: str, stopped_s: float) -> None:
-    """While a greedy client is stopped amid its replies, another is served."""
+    """Expect service while a greedy client is stopped amid its replies."""
     with _greedy_client(endpoint) as greedy:
         time.sleep(turn.random.uniform(0, 0.2))
         greedy.send_signal(signal.SIGSTOP)
@@ -89,7 +89,7 @@ def _stop_client(turn: Turn, endpoint: str, stopped_s: float) -> None:
 
 @contextlib.contextmanager
 def _greedy_client(endpoint: str) -> Iterator["subprocess.Popen[str]"]:
-    """A client in a process of its own that asks without pause."""
+    """Run a client in a process of its own that asks without pause."""
     command = [sys.executable, "-c", _GREEDY, endpoint]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:

@@ -74,12 +74,12 @@ def _report(out: Path, results: DemoResults) -> int:
 
 
 def _beside_python(command: str) -> str:
-    """A command as it has to be typed: with its folder, where that is not on the path."""
+    """Return a command as it has to be typed: with its folder, if that is not on the path."""
     return command if shutil.which(command) else str(Path(sys.executable).parent / command)
 
 
 def _show(opened: ExitStack, port: int, endpoint: str) -> None:
-    """Serve a page that shows the server's map, and wait until somebody looks at it."""
+    """Serve a page that shows the server's map, and wait until a browser opens it."""
     client = opened.enter_context(connect(endpoint, steps.MAP))
     viewer = Viewer(LiveSource(client, endpoint), "127.0.0.1", port)
     opened.callback(viewer.close)
@@ -99,7 +99,7 @@ def run_demo(
     """
     laps = _Laps()
     out.mkdir(parents=True, exist_ok=True)
-    # What an earlier demonstration left in its store and log is forgotten.
+    # What an earlier demonstration left in its store and log is removed.
     shutil.rmtree(out / "store" / steps.MAP, ignore_errors=True)
     (out / "server.log").unlink(missing_ok=True)
     street = driven_street(street_drive(street_seed, scans))
@@ -137,7 +137,7 @@ def run_demo(
 
 
 class _Laps:
-    """How long each phase took."""
+    """The duration of each phase."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}

@@ -34,7 +34,7 @@ def _run(command: str, module: str, *, extra: str = "tools", needs: tuple[str, .
 
 @contextmanager
 def _leaving_on_interrupt(command: str) -> Iterator[None]:
-    """Ctrl-C ends the process at once: an exception could get lost in what is being imported."""
+    """Let Ctrl-C end the process at once: an exception could be lost in an import."""
 
     def leave(*_: object) -> None:
         os.write(2, f"{command}: interrupted\n".encode())

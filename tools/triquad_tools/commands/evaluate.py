@@ -75,7 +75,7 @@ def _evaluate(options: argparse.Namespace) -> int:
 
 
 def evaluate_mesh(options: argparse.Namespace) -> Results:
-    """Scores of a mesh file against a cloud, a folder of scans or a simulated street."""
+    """Return scores of a mesh file against a cloud, a folder of scans or a simulated street."""
     mesh = read_mesh(options.mesh)
     if not len(mesh.faces):
         raise ToolError(f"{options.mesh}: has no faces; a cloud can only be a --reference")
@@ -95,7 +95,7 @@ def evaluate_mesh(options: argparse.Namespace) -> Results:
 
 
 def evaluate_map(options: argparse.Namespace) -> Results:
-    """Scores of a map against a simulated street, or at scans that were withheld from it."""
+    """Return scores of a map against a simulated street, or at scans that were withheld from it."""
     return _at_withheld(options) if options.street is None else _on_street(options)
 
 
@@ -116,7 +116,7 @@ def _on_street(options: argparse.Namespace) -> Results:
 def _compared(
     options: argparse.Namespace, name: str, mesh: Mesh, *, truth: Truth, settings: ScoreSettings
 ) -> MeshScores:
-    """Scores of a mesh, which ``--plot`` draws."""
+    """Return scores of a mesh, which ``--plot`` draws."""
     comparison = compare_mesh(mesh, truth, settings)
     if options.plot is not None:
         from triquad_tools.plots.error_picture import draw_mesh_errors  # slow to import
@@ -159,7 +159,7 @@ def _at_withheld(options: argparse.Namespace) -> Results:
 
 
 def _drawn(options: argparse.Namespace, name: str, answers: list[WithheldAnswer]) -> WithheldScores:
-    """Scores at withheld scans, drawn into ``--plot``."""
+    """Return scores at withheld scans, drawn into ``--plot``."""
     from triquad_tools.plots.error_picture import draw_withheld  # slow to import
 
     scores = score_withheld(answers)
@@ -171,7 +171,7 @@ def _drawn(options: argparse.Namespace, name: str, answers: list[WithheldAnswer]
 
 
 def _reference(path: Path, voxel_m: float, range_min_m: float) -> Doubles:
-    """The points ``[N, 3]`` of a cloud, or of all scans of a folder in the world frame."""
+    """Return the points ``[N, 3]`` of a cloud, or of all scans of a folder in the world frame."""
     if path.is_dir():
         folder = read_kitti_folder(path)
         clouds = (world_points(scan, range_min_m) for scan in folder.read(range(len(folder))))

@@ -152,7 +152,7 @@ def _access(options: argparse.Namespace) -> Access:
 
 
 def _show(options: argparse.Namespace) -> int:
-    """One map."""
+    """Print one map."""
     target = str(options.files[0])
     with map_file(target, _access(options), options.at) as path:
         name = target if is_endpoint(target) else str(path)
@@ -172,7 +172,7 @@ def _show(options: argparse.Namespace) -> int:
 
 
 def _slice(options: argparse.Namespace) -> int:
-    """One layer of a map, of a file or of a server."""
+    """Print one layer of a map, of a file or of a server."""
     from triquad_tools.plots.slice_plan import SliceOptions, draw_slice  # slow to import
 
     wanted = SliceOptions(options.slice, options.box, options.cell or _CELL_M)
@@ -184,7 +184,7 @@ def _slice(options: argparse.Namespace) -> int:
 
 
 def _log(options: argparse.Namespace) -> int:
-    """The checkpoints of a folder."""
+    """Print the checkpoints of a folder."""
     path = options.files[0]
     if path.is_file():
         raise ToolError(f"{path} is a file: --log lists the checkpoints in a folder")
@@ -200,7 +200,7 @@ def _log(options: argparse.Namespace) -> int:
 
 
 def _diff(options: argparse.Namespace) -> int:
-    """Two map files."""
+    """Compare two map files."""
     from triquad_client import OfflineMap  # slow to import
 
     files, titles = [], []

@@ -92,7 +92,7 @@ def _prepare(settings: Settings, device: str, teams: Teams, *, stop: Callable[[]
 
 
 def _check_result(mapper: Mapper, mapping: MappingRun, selection: Selection) -> None:
-    """Tell of refused scans.
+    """Report refused scans.
 
     Raises:
         ToolError: all were.

@@ -32,7 +32,7 @@ from triquad_tools.mapfiles.source import (
 _COMMAND = "triquad-pack"
 _DAMAGE = (DamagedMapFileError, NothingLeftError)
 _MAP, _MESHES, _GRID, _PICTURE = ".triquad", (".ply", ".glb", ".obj", ".stl"), ".npz", ".png"
-_MARKED = (".ply", ".glb", ".obj")  # meshes that can tell which faces fill holes
+_MARKED = (".ply", ".glb", ".obj")  # meshes that can show which faces fill holes
 _SUFFIXES = (_MAP, *_MESHES, _GRID, _PICTURE)
 _PLANES = ("XY", "XZ", "YZ")
 _GRID_CELL_M = 0.2
@@ -130,7 +130,7 @@ def _pack(options: argparse.Namespace) -> int:
 
 
 def _tell_set_aside(path: Path) -> None:
-    """Name the newer checkpoints beside the newest valid one, which were damaged."""
+    """Name the checkpoints newer than the newest valid one, which were damaged."""
     for newer in (aside for aside in set_aside(path.parent) if aside.name > path.name):
         print_line(
             f"{_COMMAND}: {newer} is newer, but damaged: --recover saves what is intact of it"
@@ -220,7 +220,7 @@ def _box(corners: list[float] | None) -> Box | None:
 def _source(
     options: argparse.Namespace, path: Path, box: Box | None, training: bool
 ) -> tuple[SourceMap, bool]:
-    """The map, and whether nothing of it is lost."""
+    """Return the map, and whether nothing of it is lost."""
     if not options.recover:
         return read_source(path, box, training), True
     recovery = recover(path)

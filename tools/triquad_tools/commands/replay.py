@@ -32,7 +32,7 @@ _LOOK_PERIOD_S = 1.0  # between questions how many scans were lost
 
 @dataclass(frozen=True)
 class Pace:
-    """When scans are sent; by default as soon as the server has taken in those before."""
+    """The times of sending; by default as soon as the server has integrated the scans before."""
 
     rate_hz: float | None = None
     speed: float | None = None  # times the pace at which they were taken
@@ -43,7 +43,7 @@ class Pace:
         return self.rate_hz is None and self.speed is None
 
     def due_s(self, stamps_ns: Sequence[int]) -> list[float]:
-        """When each scan is to be sent, seconds after the first."""
+        """Return when each scan is to be sent, seconds after the first."""
         if self.speed is not None:
             return [(stamp - stamps_ns[0]) / 1e9 / self.speed for stamp in stamps_ns]
         period_s = 0.0 if self.rate_hz is None else 1.0 / self.rate_hz
@@ -52,13 +52,13 @@ class Pace:
 
 @dataclass(frozen=True)
 class ReplayReport:
-    """What became of the scans."""
+    """The outcome of a replay."""
 
     published: int
     skipped: int  # not sent: no point was left of them
     flush: FlushReport
     refusals: dict[str, int]  # on the server meanwhile, by reason
-    seconds: float  # until the server had taken in all
+    seconds: float  # until the server had integrated all
 
     @property
     def complete(self) -> bool:
@@ -106,7 +106,7 @@ def _publish_all(client: Client, selection: Selection, options: argparse.Namespa
 
 
 class _Publisher:
-    """Sends scans at a pace, and tells how it goes."""
+    """Sends scans at a pace, and shows progress."""
 
     def __init__(self, client: Client, pace: Pace, source: str | None) -> None:
         self._client = client
@@ -120,7 +120,7 @@ class _Publisher:
 
     @property
     def seconds(self) -> float:
-        """Since the first scan was sent."""
+        """The seconds since the first scan was sent."""
         return time.monotonic() - self._started
 
     def play(self, selection: Selection, number: int) -> None:
@@ -160,7 +160,7 @@ class _Publisher:
 
 
 def _lost(client: Client) -> int:
-    """Scans that the server has lost so far, of all sources."""
+    """Return how many scans the server has lost so far, of all sources."""
     return sum(client.status().scans_lost.values())
 
 

@@ -52,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def parsed(argv: Sequence[str]) -> argparse.Namespace:
-    """The options of a command line, over those of the file of settings that it names.
+    """Return the options of a command line, over those of the file of settings that it names.
 
     Raises:
         ToolError: the file is no TOML, or a name in it is not that of an option.
@@ -103,7 +103,7 @@ def _bridge(
 
 
 def _connected(options: argparse.Namespace, server: ServerProcess | None) -> Client | None:
-    """A client of the map server, once it serves; None where it ended before."""
+    """Return a client of the map server, once it serves; None where it ended before."""
     if server is None:
         return connect(options.connect, options.map or DEFAULT_MAP, config=options.config)
     endpoint, tell_s = options.connect, time.monotonic() + _TELL_S
@@ -126,7 +126,7 @@ def _log_counts(bridge: Bridge) -> None:
 
 
 def bridge_options(options: argparse.Namespace) -> BridgeOptions:
-    """What the arguments ask of the bridge.
+    """Return what the arguments ask of the bridge.
 
     Raises:
         ToolError: the grid would have too many cells.
@@ -158,7 +158,7 @@ def bridge_options(options: argparse.Namespace) -> BridgeOptions:
 
 
 def _of_file(path: Path, known: argparse.Namespace) -> Iterator[str]:
-    """The settings of a file, as arguments."""
+    """Yield the settings of a file, as arguments."""
     try:
         settings = tomllib.loads(path.read_text())
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""``triquad-top``: how a map server is doing, as it goes."""
+"""``triquad-top``: how a map server is doing, live."""
 
 import argparse
 import itertools
@@ -94,7 +94,7 @@ def _sleep(seconds: float) -> bool:
 
 @contextmanager
 def _keyboard() -> Iterator[Callable[[float], bool]]:
-    """Yield what waits for some seconds, and tells whether ``q`` was typed meanwhile."""
+    """Yield what waits for some seconds, and returns whether ``q`` was typed meanwhile."""
 
     def q_within(seconds: float) -> bool:
         end_s = time.monotonic() + seconds

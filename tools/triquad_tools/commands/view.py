@@ -65,7 +65,7 @@ def _shown(options: argparse.Namespace) -> Iterator[MapSource | History]:
 
 
 def _store(path: Path) -> History:
-    """The checkpoints of a store, of which the newest that can be shown is opened."""
+    """Return the checkpoints of a store, of which the newest that can be shown is opened."""
     history = History(path)
     with progress(f"opening {path}") as report:
         report(1, _name(history.newest()))

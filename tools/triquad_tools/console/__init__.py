@@ -1,1 +1,1 @@
-"""What every command shares: arguments, progress, tables, errors."""
+"""The common parts of all commands: arguments, progress, tables, errors."""

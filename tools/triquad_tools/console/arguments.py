@@ -1,4 +1,4 @@
-"""Kinds of command-line arguments; what cannot be used is refused with the value and a remedy."""
+"""Types of command-line arguments; errors name the value and a remedy."""
 
 import argparse
 import math
@@ -13,13 +13,13 @@ _LAST_PORT = 65_535
 
 
 def add_version(parser: argparse.ArgumentParser) -> None:
-    """Let a command tell its version."""
+    """Let a command print its version."""
     version = f"triquad {triquad_format.__version__}"
     parser.add_argument("--version", action="version", version=version)
 
 
 def positive(text: str) -> float:
-    """A number above 0."""
+    """Return a number above 0."""
     value = not_negative(text)
     if value == 0.0:
         raise argparse.ArgumentTypeError("0 is not allowed: use a positive number")
@@ -27,7 +27,7 @@ def positive(text: str) -> float:
 
 
 def not_negative(text: str) -> float:
-    """A finite number of at least 0."""
+    """Return a finite number of at least 0."""
     try:
         value = float(text)
     except ValueError:
@@ -38,7 +38,7 @@ def not_negative(text: str) -> float:
 
 
 def picture(text: str) -> Path:
-    """The name of a picture to be written, in a folder that exists."""
+    """Return the name of a picture to be written, in a folder that exists."""
     path = Path(text)
     if path.suffix != ".png":
         raise argparse.ArgumentTypeError(f"{text}: its name must end in .png")
@@ -49,7 +49,7 @@ def picture(text: str) -> Path:
 
 
 def error_limit(text: str) -> float:
-    """A length with its unit, such as ``2mm``, in metres: 0.01 mm to 10 cm."""
+    """Return a length with its unit, such as ``2mm``, in metres: 0.01 mm to 10 cm."""
     match = re.fullmatch(r"([0-9]*\.?[0-9]+)(mm|cm|m)", text)
     if match is None:
         raise argparse.ArgumentTypeError(
@@ -62,21 +62,21 @@ def error_limit(text: str) -> float:
 
 
 def count(text: str) -> int:
-    """A whole number of at least 1."""
+    """Return a whole number of at least 1."""
     if not text.isascii() or not text.isdigit() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text!r} is not a count: use 1, 2, ...")
     return int(text)
 
 
 def seed(text: str) -> int:
-    """A whole number of at least 0."""
+    """Return a whole number of at least 0."""
     if not text.isascii() or not text.isdigit():
         raise argparse.ArgumentTypeError(f"{text!r} is not a seed: use 0, 1, ...")
     return int(text)
 
 
 def port(text: str) -> int:
-    """A port to listen on; 0: any that is free."""
+    """Return a port to listen on; 0: any that is free."""
     if not text.isascii() or not text.isdigit() or int(text) > _LAST_PORT:
         raise argparse.ArgumentTypeError(f"{text!r} is not a port: use 0 to {_LAST_PORT}")
     return int(text)

@@ -1,4 +1,4 @@
-"""How every command ends: with an exit status, and one line for what went wrong."""
+"""The end of every command: an exit status, and one line for what went wrong."""
 
 import os
 import sys
@@ -11,15 +11,15 @@ from triquad_tools.console.lines import print_remark
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
 INTERRUPTED, NOBODY_READS = 130, 141
-"""As shells have it: 128 and the number of SIGINT, or of SIGPIPE."""
+"""The statuses of shells: 128 and the number of SIGINT, or of SIGPIPE."""
 
 
 _kept: list[KeyboardInterrupt] = []
-"""With what was being done when they came: what a compiler has half done may not be cleaned up."""
+"""The interrupts, with their frames: what a compiler has half done may not be cleaned up."""
 
 
 class ToolError(TriquadError):
-    """What the tools refuse, or what failed in them: names the file, the place and the value."""
+    """An error of the tools, or of their use: it names the file, the place and the value."""
 
 
 def run(
@@ -29,7 +29,7 @@ def run(
     failures: tuple[type[Exception], ...] = (),
     interrupted: str = "interrupted",
 ) -> int:
-    """The exit status of ``work``; what it raises becomes a status and one line.
+    """Return the exit status of ``work``; what it raises becomes a status and one line.
 
     Args:
         command: its name, with which the line begins.
@@ -43,7 +43,7 @@ def run(
         sys.stdout.flush()
         return status
     except BrokenPipeError:
-        # As in `... | head`. Python would complain when it writes out the rest at its end.
+        # As in `... | head`. Python would complain when it flushes the rest at its end.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return NOBODY_READS
     except failures as error:
@@ -61,14 +61,14 @@ def run(
 
 
 def _in_words(error: OSError) -> str:
-    """An error of the system without its number, such as ``map.triquad: no such file``."""
+    """Return a system error's text without its number, such as ``map.triquad: no such file``."""
     if error.filename is None or error.strerror is None:
         return str(error)
     return f"{error.filename}: {error.strerror[:1].lower()}{error.strerror[1:]}"
 
 
 def complain(command: str, message: object, status: int) -> int:
-    """Print a line on standard error, or several of which it begins one; returns ``status``."""
+    """Print a line on standard error, or several of which it begins one; return ``status``."""
     # Indented: a name with a line break in it cannot look like another message.
     print_remark(f"{command}: {message}".replace("\n", "\n  "))
     return status

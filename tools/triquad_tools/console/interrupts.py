@@ -1,4 +1,4 @@
-"""Ctrl-C, so that it ends a command wherever it is."""
+"""Handling of Ctrl-C, so that it ends a command wherever it is."""
 
 import re
 import signal
@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from types import FrameType
 
 _SWALLOW = re.compile(r"<frozen importlib|llvmlite.binding.executionengine\.py$")
-"""Files whose code an exception does not get out of, or not as what it is."""
+"""Files whose code swallows exceptions or changes them."""
 
 _AGAIN_S = 0.1
 
@@ -18,7 +18,7 @@ _raised = threading.Event()
 
 @contextmanager
 def no_interrupt_lost() -> Iterator[None]:
-    """SIGINT raises ``KeyboardInterrupt`` as ever, but where somebody would swallow it: then later.
+    """Let SIGINT raise ``KeyboardInterrupt`` later where it would be swallowed, else at once.
 
     Importing a library may turn it into an ``ImportError``, and with that into a library that
     seems not to be there; a callback of the compiler drops it, and fails then for a reason of its
@@ -55,7 +55,7 @@ def no_interrupt_lost() -> Iterator[None]:
 
 @contextmanager
 def sigterm_interrupts() -> Iterator[None]:
-    """SIGTERM raises KeyboardInterrupt, as SIGINT does: then servers are stopped, too."""
+    """Let SIGTERM raise KeyboardInterrupt, as SIGINT does: then servers are stopped, too."""
     before = signal.signal(signal.SIGTERM, _interrupt)
     try:
         yield

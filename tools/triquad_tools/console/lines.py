@@ -1,4 +1,4 @@
-"""Lines for people: all that the tools print goes through here."""
+"""Lines for people: the tools print everything through these functions."""
 
 import sys
 from typing import TextIO

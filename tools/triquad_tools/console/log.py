@@ -6,7 +6,7 @@ from triquad_format.printable import printable
 
 
 def start_log(name: str) -> None:
-    """Log what is worth knowing, each line with the ``name`` of the part that says it."""
+    """Log messages, each line with the ``name`` of the part that logs it."""
     handler = logging.StreamHandler()
     handler.setFormatter(_Lines(f"%(asctime)s %(levelname)s {name}: %(message)s"))
     logging.basicConfig(level=logging.INFO, handlers=[handler])
@@ -16,6 +16,6 @@ class _Lines(logging.Formatter):
     """Lines in which names from the network cannot look like other lines."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802
-        """The line of a message."""
+        """Return the line of a message."""
         record.message = printable(record.message)
         return super().formatMessage(record)

@@ -1,4 +1,4 @@
-"""Progress for the person who waits: bars on a terminal, plain lines elsewhere."""
+"""Progress for the user: bars on a terminal, plain lines elsewhere."""
 
 import sys
 import time
@@ -11,7 +11,7 @@ from triquad_format.printable import printable
 from triquad_tools.console.lines import print_remark
 
 Report = Callable[[float, str], None]
-"""Takes how much is done, in the units of the total, and a note."""
+"""Takes how much is done, in the units of the total, and a remark."""
 
 
 _LINE_PERIOD_S = 10.0
@@ -19,14 +19,14 @@ _LINE_PERIOD_S = 10.0
 
 @dataclass(frozen=True)
 class Speed:
-    """How quickly work goes, and for how long it will."""
+    """The speed of work, and its remaining time."""
 
     per_s: float
     left_s: float
 
     @classmethod
     def of(cls, done: float, left: float, seconds: float) -> "Speed":
-        """That of work of which so much was done in ``seconds``."""
+        """Return the speed of work of which the given amount was done in ``seconds``."""
         per_s = done / max(seconds, 1e-9)
         return cls(per_s, left / max(per_s, 1e-9))
 

@@ -18,7 +18,7 @@ from triquad_tools.console.lines import print_line
 
 _GAP = 2  # spaces before each column
 _PIPE_WIDTH = 10_000  # characters: nothing is broken where a program reads
-_CELL_WIDTH = 2_000  # of a text that somebody else chose
+_CELL_WIDTH = 2_000  # of a text from the network
 
 
 @dataclass(frozen=True)
@@ -65,17 +65,17 @@ def print_columns(
 
 
 def _cells(texts: Sequence[str]) -> list[str]:
-    """Texts that each stay in their cell, whatever is in them."""
+    """Return texts that each stay in their cell, whatever is in them."""
     return [printable(text, _CELL_WIDTH) for text in texts]
 
 
 def _table(show_header: bool = False) -> Table:
-    """A table without rules or colours: each line can be searched for and cut up."""
+    """Return a table without rules or colours: each line can be searched for and cut up."""
     return Table(box=None, show_header=show_header, header_style="", padding=(0, 0, 0, _GAP))
 
 
 def _console() -> Console:
-    """As wide as the terminal; elsewhere so wide that lines are whole."""
+    """Return a console as wide as the terminal; elsewhere so wide that lines are whole."""
     width = None if sys.stdout.isatty() else _PIPE_WIDTH
     return Console(markup=False, highlight=False, width=width)
 
@@ -92,7 +92,7 @@ def _print(table: Table) -> None:
 
 
 def json_text(value: object, indent: int | None = 2) -> str:
-    """Records, lists, arrays and numbers as JSON; what is not finite becomes null.
+    """Return records, lists, arrays and numbers as JSON; what is not finite becomes null.
 
     Without an ``indent`` it is one line.
     """
@@ -100,12 +100,12 @@ def json_text(value: object, indent: int | None = 2) -> str:
 
 
 def centimetres(metres: float) -> str:
-    """A length in centimetres, to a tenth of a millimetre."""
+    """Return a length in centimetres, to a tenth of a millimetre."""
     return f"{100.0 * metres:.2f} cm"
 
 
 def percent(share: float) -> str:
-    """A share in percent."""
+    """Return a share in percent."""
     return f"{100.0 * share:.2f} %"
 
 

@@ -9,7 +9,7 @@ DEFAULT_MAP = "default"
 
 
 def add_server(parser: argparse.ArgumentParser) -> None:
-    """Which map of which server; a command that can do without one gets ``None`` for each."""
+    """Add the map and the server; a command that can do without one gets ``None`` for each."""
     add = parser.add_argument
     add(
         "--connect",
@@ -22,7 +22,7 @@ def add_server(parser: argparse.ArgumentParser) -> None:
 
 
 def add_config(parser: argparse.ArgumentParser) -> None:
-    """With which credentials a server is asked."""
+    """Add the option for the credentials of a server."""
     parser.add_argument(
         "--config",
         type=Path,
@@ -32,5 +32,5 @@ def add_config(parser: argparse.ArgumentParser) -> None:
 
 
 def server_name(options: argparse.Namespace) -> str:
-    """The server that the arguments name, for people."""
+    """Return the server that the arguments name, for people."""
     return str(options.connect or options.config or DEFAULT_ENDPOINT)

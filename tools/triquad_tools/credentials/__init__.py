@@ -1,1 +1,1 @@
-"""Who may do what on a server: a certificate authority, and configurations of Zenoh for roles."""
+"""Permissions on a server: a certificate authority, and configurations of Zenoh for roles."""

@@ -1,4 +1,4 @@
-"""A small certificate authority, by whose certificates servers and clients know each other."""
+"""A small certificate authority, whose certificates identify servers and clients."""
 
 import datetime
 import ipaddress
@@ -34,7 +34,7 @@ class Certificate:
 
     @property
     def expires(self) -> datetime.datetime:
-        """Until when it is valid, UTC."""
+        """The end of its validity, UTC."""
         return self.parsed.not_valid_after_utc
 
 
@@ -55,7 +55,7 @@ class Authority:
         return _signed(common_name, days, self.own, [usage])
 
     def server(self, common_name: str, hosts: Sequence[str], days: float) -> Certificate:
-        """Issue a certificate for who listens on ``hosts``, names or addresses, and connects."""
+        """Issue a certificate to listen on ``hosts``, names or addresses, and to connect."""
         usages = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
         names = [_general_name(host) for host in dict.fromkeys((*LOCAL_HOSTS, *hosts))]
         extensions = [x509.ExtendedKeyUsage(usages), x509.SubjectAlternativeName(names)]

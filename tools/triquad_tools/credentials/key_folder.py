@@ -27,7 +27,7 @@ from triquad_tools.credentials import configurations
 from triquad_tools.credentials.certificates import LOCAL_HOSTS, Authority, Certificate
 
 LISTENING = (SERVER, ROUTER)
-"""Those that listen; each has a file of its own, whose name no client can have."""
+"""The roles that listen; each has a file of its own, whose name no client can have."""
 
 _HOST = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9.-]*[A-Za-z0-9])?|[0-9A-Fa-f:]*:[0-9A-Fa-f:.]*")
 _NAME_LENGTH = 48  # with role and issue it has to fit into the 64 characters of a common name
@@ -96,7 +96,7 @@ class KeyFolder:
         return created
 
     def add(self, holder: Holder, days: float) -> Path:
-        """Give a role; returns the file with which its holder connects.
+        """Give a role; return the file with which its holder connects.
 
         Raises:
             ToolError: another client has the name or a source, or the name cannot be one.
@@ -119,7 +119,7 @@ class KeyFolder:
         return self._issue(replace(holder, issue=secrets.token_hex(4)), days)
 
     def renew(self, name: str, days: float) -> Path:
-        """Issue a new certificate; returns the file that takes the place of the old one.
+        """Issue a new certificate; return the file that replaces the old one.
 
         Raises:
             ToolError: there is no such client, server or router.
@@ -132,7 +132,7 @@ class KeyFolder:
         return self._file(name)
 
     def remove(self, name: str) -> None:
-        """Take a role away: servers that are started again let its holder do nothing any more.
+        """Remove a role: servers that are started again let its holder do nothing any more.
 
         Raises:
             ToolError: there is no such client.
@@ -144,7 +144,7 @@ class KeyFolder:
 
     @property
     def holders(self) -> tuple[Holder, ...]:
-        """All clients."""
+        """The entries of all clients."""
         return tuple(entry.holder for entry in self.entries.values())
 
     def holder(self, name: str) -> Holder:
@@ -159,7 +159,7 @@ class KeyFolder:
         return self.entries[name].holder
 
     def certificate(self, name: str) -> Certificate:
-        """Return that of the server, the router or the authority."""
+        """Return the certificate of the server, the router or the authority."""
         stem = self.path / _AUTHORITY / name
         return Certificate(Path(f"{stem}.pem").read_bytes(), Path(f"{stem}-key.pem").read_bytes())
 

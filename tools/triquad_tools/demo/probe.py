@@ -1,4 +1,4 @@
-"""A robot's planner in the demonstration: a process that asks for distances all the time.
+"""A robot's planner in the demonstration: a process that asks for distances repeatedly.
 
 It asks for the same points some 20 times a second, until its standard input ends; then it prints
 what it met, as JSON.
@@ -32,12 +32,12 @@ QUESTIONS: dict[str, Callable[[Client, Doubles], int]] = {
     "distance": lambda client, points: client.query_distance(points).epoch,
     "ground": lambda client, points: client.query_ground(points).epoch,
 }
-"""What the planner may ask; each returns the epoch that answered."""
+"""The questions of the planner; each returns the epoch that answered."""
 
 
 @dataclass(frozen=True)
 class ProbeReport:
-    """What the planner met; latencies are NaN where no query was answered."""
+    """The results of the planner; latencies are NaN if no query was answered."""
 
     queries: int
     errors: int
@@ -74,7 +74,7 @@ class Probe:
         self._process.__exit__(None, None, None)
 
     def finish(self) -> ProbeReport:
-        """End the queries and say what they met.
+        """End the queries and return what they met.
 
         Raises:
             ToolError: the process failed.

@@ -1,4 +1,4 @@
-"""What the demonstration measured, as a table, and what of it was promised."""
+"""The measurements of the demonstration, as a table, and the promises about them."""
 
 from dataclasses import dataclass
 
@@ -10,32 +10,32 @@ from triquad_tools.evaluation.metrics import MeshScores
 
 @dataclass(frozen=True)
 class Intake:
-    """How scans were taken in and learnt."""
+    """The figures of integrating and learning scans."""
 
     scans: int
     taken: int
     refused: int
     lost: int
     points: int
-    seconds: float  # from the first scan until all were taken in
+    seconds: float  # from the first scan until all were integrated
     learning_s: float  # from the first scan until nothing was left to learn, or the limit
     settled: bool  # False: the limit came first
     samples_trained: int
 
     @property
     def scans_per_s(self) -> float:
-        """Scans taken in a second."""
+        """Scans integrated per second."""
         return self.taken / max(self.seconds, 1e-9)
 
     @property
     def samples_per_s(self) -> float:
-        """Training samples a second, while scans were taken in and after."""
+        """Training samples per second, while scans were integrated and after."""
         return self.samples_trained / max(self.learning_s, 1e-9)
 
 
 @dataclass(frozen=True)
 class Restart:
-    """How the answers differ after the server was stopped and started again."""
+    """The difference of answers after the server was stopped and started again."""
 
     points: int
     sdf_difference_max_m: float
@@ -53,7 +53,7 @@ class MapSize:
 
 @dataclass(frozen=True)
 class DemoResults:
-    """All that the demonstration measured."""
+    """All measurements of the demonstration."""
 
     seed: int
     cpus: int
@@ -67,12 +67,12 @@ class DemoResults:
 
     @property
     def seconds(self) -> float:
-        """Duration of all phases."""
+        """The duration of all phases."""
         return sum(self.phases_s.values())
 
 
 def broken_promises(results: DemoResults) -> list[str]:
-    """One line for each promise of the README that was not kept, with its value and limit."""
+    """Return a line for each promise of the README that was not kept, with value and limit."""
     street, restart = results.street, results.restart
     at_least = {
         "mesh F-score": (results.mesh.f_score, 0.95),
@@ -97,7 +97,7 @@ def broken_promises(results: DemoResults) -> list[str]:
 
 
 def table_rows(results: DemoResults) -> list[Row]:
-    """The results as lines of a table."""
+    """Return the results as lines of a table."""
     return [
         *_speed_rows(results.intake, results.queries),
         *_quality_rows(results.street, results.mesh),

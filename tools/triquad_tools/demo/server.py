@@ -16,7 +16,7 @@ _STOP_TIMEOUT_S = 60.0
 
 
 def free_port() -> int:
-    """A port of the loopback that nothing uses."""
+    """Return a port of the loopback that nothing uses."""
     with closing(socket.socket()) as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
@@ -24,7 +24,7 @@ def free_port() -> int:
 
 
 def free_endpoint() -> str:
-    """An endpoint on such a port."""
+    """Return an endpoint on such a port."""
     return f"tcp/127.0.0.1:{free_port()}"
 
 
@@ -108,7 +108,7 @@ class DemoServer:
         self._started.set()
 
     def _end(self) -> None:
-        """Stop the process, the hard way where it does not listen."""
+        """Stop the process, by force where it does not react."""
         if self._process.poll() is None:
             self._process.terminate()
             try:

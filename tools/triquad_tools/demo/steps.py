@@ -37,7 +37,7 @@ _RESTART_POINTS = 50_000
 
 @dataclass(frozen=True)
 class Learnt:
-    """How the server took in a street while it was asked."""
+    """The results of a server that integrated a street while it was queried."""
 
     intake: Intake
     queries: ProbeReport
@@ -45,7 +45,7 @@ class Learnt:
 
 @dataclass(frozen=True)
 class Scored:
-    """How good the map is, and what the server said before it was stopped."""
+    """The scores of the map, and what the server said before it was stopped."""
 
     street: StreetScores
     mesh: MeshScores

@@ -32,7 +32,7 @@ MapQuery = Callable[..., SdfResult | FieldAnswer]
 
 @dataclass(frozen=True)
 class StreetProbes:
-    """Where a map of a street is asked, and the truth there."""
+    """The points at which a map of a street is asked, and the truth there."""
 
     near: Doubles  # [N, 3] within NEAR_M of surface that the lidar truly hit
     exact_sdf: Doubles  # [N] metres
@@ -51,7 +51,7 @@ class DrivenStreet:
 
 @dataclass(frozen=True)
 class StreetScores:
-    """How well a map agrees with an exact street; NaN where there was nothing to score."""
+    """The agreement of a map with an exact street; NaN where there was nothing to score."""
 
     sdf_error_m: float  # mean absolute error near the surface
     sdf_error_median_m: float
@@ -65,7 +65,7 @@ class StreetScores:
 
 @dataclass(frozen=True)
 class WithheldScores:
-    """What a map says where scans that it never saw hit something; NaN without points."""
+    """The scores of a map where withheld scans hit something; NaN without points."""
 
     points: int
     surface_ratio: float  # share with status SURFACE
@@ -77,7 +77,7 @@ class WithheldScores:
 
 
 def street_probes(drive: SimulatedDrive, rng: np.random.Generator) -> StreetProbes:
-    """Points at which a map of ``drive`` is scored."""
+    """Return points at which a map of ``drive`` is scored."""
     hits = drive.true_hits(PROBE_SPACING_M)
     normals = drive.scene.gradient(hits)
     near = hits + rng.uniform(-NEAR_M, NEAR_M, (len(hits), 1)) * normals
@@ -101,7 +101,7 @@ def driven_street(drive: SimulatedDrive) -> DrivenStreet:
 
 
 def score_street(query: MapQuery, probes: StreetProbes) -> StreetScores:
-    """Scores of a map at ``probes``."""
+    """Return scores of a map at ``probes``."""
     answer = query(probes.near, gradient=True)
     known = np.isfinite(answer.sdf)
     errors = np.abs(answer.sdf.astype(np.float64) - probes.exact_sdf)[known]
@@ -120,7 +120,7 @@ def score_street(query: MapQuery, probes: StreetProbes) -> StreetScores:
 
 @dataclass(frozen=True)
 class WithheldAnswer:
-    """What a map says at points of a scan that it never saw."""
+    """The answer of a map at points of a scan that it never saw."""
 
     points: Doubles  # [N, 3] map frame
     distance_m: Floats  # [N] magnitude; infinite where no region is around
@@ -136,7 +136,7 @@ def ask_withheld(query: MapQuery, clouds: Iterable[Doubles]) -> Iterator[Withhel
 
 
 def score_withheld(answers: Iterable[WithheldAnswer]) -> WithheldScores:
-    """Scores of a map by what it says of scans that it never saw."""
+    """Return scores of a map by what it says of scans that it never saw."""
     distances = [np.empty(0, np.float32)]
     statuses = [np.empty(0, np.uint8)]
     for answer in answers:
@@ -156,7 +156,7 @@ def score_withheld(answers: Iterable[WithheldAnswer]) -> WithheldScores:
 
 
 def _points_in_houses(scene: Scene, positions: Doubles, rng: np.random.Generator) -> Doubles:
-    """Uniform points ``[M, 3]`` above the ground in houses beside the sensor's ``positions``."""
+    """Return uniform points ``[M, 3]`` above ground in houses near the sensor's ``positions``."""
     low = np.maximum(scene.bounds[0], positions.min(axis=0) - _HOUSE_REACH_M)
     high = np.minimum(scene.bounds[1], positions.max(axis=0) + _HOUSE_REACH_M)
     low[2] = max(low[2], 0.0)

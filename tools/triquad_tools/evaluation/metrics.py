@@ -1,7 +1,7 @@
 """Scores of a mesh, as the literature on neural mapping defines them.
 
 Accuracy goes from the mesh to the truth, completion from the truth to the mesh. The mesh is
-sampled densely; samples and truth are thinned to one point per voxel. Samples beside the truth's
+sampled densely; samples and truth are thinned to one point per voxel. Samples outside the truth's
 bounding box are left out, and so are those farther from the truth than the accuracy's cut: they
 count in ``outlier_ratio`` alone.
 """
@@ -20,10 +20,10 @@ from triquad_tools.simulation.lidar import SimulatedDrive
 from triquad_tools.simulation.scene import Scene
 
 STREET_VOXEL_M = 0.05
-"""Between the points of a simulated street that completion asks for."""
+"""The spacing of the points of a simulated street that completion asks for."""
 
 STREET_SAMPLES_MAX = 3_000_000
-"""Of its mesh: more change the scores by little."""
+"""The samples of its mesh: more change the scores by little."""
 
 Distances = Callable[[Doubles], Doubles]
 """Distances ``[N]`` of places ``[N, 3]`` to a surface, metres; infinite beyond a limit, perhaps."""
@@ -31,7 +31,7 @@ Distances = Callable[[Doubles], Doubles]
 
 @dataclass(frozen=True)
 class ScoreSettings:
-    """What the scores depend on; the defaults are those used on MaiCity."""
+    """The settings of the scores; the defaults are those used on MaiCity."""
 
     threshold_m: float = 0.1  # nearer than this counts as right, in both ratios
     accuracy_cut_m: float = 0.2  # samples farther than this are left out
@@ -42,12 +42,12 @@ class ScoreSettings:
 
 
 STREET_SETTINGS = ScoreSettings(samples_max=STREET_SAMPLES_MAX)
-"""For meshes of a simulated street."""
+"""The settings for meshes of a simulated street."""
 
 
 @dataclass(frozen=True)
 class MeshScores:
-    """How well a mesh agrees with the truth; NaN where the mesh has no samples to score."""
+    """The agreement of a mesh with the truth; NaN if the mesh has no samples to score."""
 
     accuracy_m: float  # mean distance, samples to truth
     accuracy_median_m: float
@@ -62,7 +62,7 @@ class MeshScores:
 
 @dataclass(frozen=True)
 class Truth:
-    """What a mesh should be."""
+    """The truth that a mesh should match."""
 
     points: Doubles  # [M, 3] of surface that it should have, one per voxel
     distances: Distances
@@ -70,7 +70,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A mesh beside the truth."""
+    """A mesh compared with the truth."""
 
     mesh: Mesh
     truth: Truth
@@ -80,7 +80,7 @@ class Comparison:
 
 
 def cloud_truth(reference: Doubles, settings: ScoreSettings) -> Truth:
-    """A cloud ``[M, 3]`` of true surface points, metres.
+    """Return a cloud ``[M, 3]`` of true surface points, metres.
 
     The spacing of the cloud bounds the accuracy from below: a cloud of 3 cm spacing shows no
     mesh as better than about 1.5 cm.
@@ -96,7 +96,7 @@ def cloud_truth(reference: Doubles, settings: ScoreSettings) -> Truth:
 
 
 def scene_truth(scene: Scene, visible: Doubles, settings: ScoreSettings) -> Truth:
-    """An exact scene, of which completion asks for points that a sensor has seen.
+    """Return the truth of an exact scene; completion asks for points that a sensor has seen.
 
     Args:
         scene: gives the exact distance of each sample, without the floor that a cloud has.
@@ -109,12 +109,12 @@ def scene_truth(scene: Scene, visible: Doubles, settings: ScoreSettings) -> Trut
 
 
 def drive_truth(drive: SimulatedDrive, settings: ScoreSettings) -> Truth:
-    """All that the lidar of a simulated drive hit, 5 cm apart."""
+    """Return all that the lidar of a simulated drive hit, 5 cm apart."""
     return scene_truth(drive.scene, drive.true_hits(STREET_VOXEL_M), settings)
 
 
 def compare_mesh(mesh: Mesh, truth: Truth, settings: ScoreSettings) -> Comparison:
-    """A mesh beside the truth, in the same frame."""
+    """Compare a mesh with the truth, in the same frame."""
     samples = _samples(mesh, truth.points, settings)
     missing_m = np.full(len(truth.points), settings.completion_cut_m)
     if len(samples):
@@ -128,24 +128,24 @@ def compare_mesh(mesh: Mesh, truth: Truth, settings: ScoreSettings) -> Compariso
 
 
 def score_against_cloud(mesh: Mesh, reference: Doubles, settings: ScoreSettings) -> MeshScores:
-    """Scores of a mesh against a cloud; see :func:`cloud_truth`."""
+    """Return scores of a mesh against a cloud; see :func:`cloud_truth`."""
     return compare_mesh(mesh, cloud_truth(reference, settings), settings).scores
 
 
 def score_against_scene(
     mesh: Mesh, scene: Scene, visible: Doubles, settings: ScoreSettings
 ) -> MeshScores:
-    """Scores of a mesh against an exact scene; see :func:`scene_truth`."""
+    """Return scores of a mesh against an exact scene; see :func:`scene_truth`."""
     return compare_mesh(mesh, scene_truth(scene, visible, settings), settings).scores
 
 
 def score_against_drive(mesh: Mesh, drive: SimulatedDrive) -> MeshScores:
-    """Scores of a mesh against all that the lidar of a simulated drive hit."""
+    """Return scores of a mesh against all that the lidar of a simulated drive hit."""
     return compare_mesh(mesh, drive_truth(drive, STREET_SETTINGS), STREET_SETTINGS).scores
 
 
 def median_angle_deg(one: NDArray[np.floating], other: NDArray[np.floating]) -> float:
-    """Median of the angles between vectors ``[N, 3]``; NaN where there are none."""
+    """Return median of the angles between vectors ``[N, 3]``; NaN where there are none."""
     lengths = np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
     cosines = np.einsum("ni,ni->n", one, other) / np.maximum(lengths, 1e-12)
     angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
@@ -153,7 +153,7 @@ def median_angle_deg(one: NDArray[np.floating], other: NDArray[np.floating]) -> 
 
 
 def sample_mesh(mesh: Mesh, count: int, rng: np.random.Generator) -> Doubles:
-    """Random points ``[count, 3]`` on a mesh, of uniform density over its area."""
+    """Return random points ``[count, 3]`` on a mesh, of uniform density over its area."""
     corners = np.asarray(mesh.vertices, np.float64)[mesh.faces]  # [F, 3, 3]
     sides = corners[:, 1:] - corners[:, :1]
     ends = np.cumsum(np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1))
@@ -168,7 +168,7 @@ def sample_mesh(mesh: Mesh, count: int, rng: np.random.Generator) -> Doubles:
 
 
 def mesh_area_m2(mesh: Mesh) -> float:
-    """Area of all faces."""
+    """Return area of all faces."""
     corners = np.asarray(mesh.vertices, np.float64)[mesh.faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return 0.5 * float(np.linalg.norm(cross, axis=1).sum())
@@ -181,7 +181,7 @@ def _thinned_reference(reference: Doubles, settings: ScoreSettings) -> Doubles:
 
 
 def _samples(mesh: Mesh, reference: Doubles, settings: ScoreSettings) -> Doubles:
-    """Thinned samples of the mesh where it is scored."""
+    """Return thinned samples of the mesh where it is scored."""
     # More than four samples per voxel's face would only be thinned away again.
     wanted = int(mesh_area_m2(mesh) / (0.5 * settings.voxel_m) ** 2)
     count = min(wanted, settings.samples_max)
@@ -192,14 +192,14 @@ def _samples(mesh: Mesh, reference: Doubles, settings: ScoreSettings) -> Doubles
 
 
 def is_scored(places: Doubles, reference: Doubles, settings: ScoreSettings) -> Bools:
-    """Whether places ``[N, 3]`` lie where a mesh is scored."""
+    """Return whether places ``[N, 3]`` lie where a mesh is scored."""
     low, high = np.array(scored_box(reference, settings))
     inside: Bools = ((places >= low) & (places <= high)).all(axis=1)
     return inside
 
 
 def scored_box(reference: Doubles, settings: ScoreSettings) -> tuple[list[float], list[float]]:
-    """The truth's bounding box, in which a mesh is scored, metres: its lower and upper corner.
+    """Return the lower and upper corner of the truth's box, in which a mesh is scored, metres.
 
     It is grown by the accuracy's cut: a level road is the very bottom of its box, and samples just
     below it are errors to be counted.
@@ -214,7 +214,7 @@ def _tree(points: Doubles) -> cKDTree:
 
 
 def _scores(distances: Doubles, missing_m: Doubles, settings: ScoreSettings) -> MeshScores:
-    """Scores from the distances of samples to the truth, and of the truth to the samples."""
+    """Return scores from the distances of samples to the truth, and of the truth to the samples."""
     kept = distances[distances < settings.accuracy_cut_m]
     accuracy_ratio = mean_or_nan(kept < settings.threshold_m)
     completion_ratio = mean_or_nan(missing_m < settings.threshold_m)
@@ -233,5 +233,5 @@ def _scores(distances: Doubles, missing_m: Doubles, settings: ScoreSettings) -> 
 
 
 def mean_or_nan(values: NDArray[np.floating | np.bool_]) -> float:
-    """The mean of values [N], or the share of those that are true; NaN where there are none."""
+    """Return the mean of values [N], or the share of true ones; NaN if there are none."""
     return float(np.mean(values)) if len(values) else float("nan")

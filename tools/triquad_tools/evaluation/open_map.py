@@ -1,4 +1,4 @@
-"""A map to ask, whether it is a file or a server has it."""
+"""Opens a map for queries, from a file or a server."""
 
 import triquad_client
 from triquad_client import Client, OfflineMap
@@ -7,7 +7,7 @@ from triquad_tools.mapfiles.source import Access, is_endpoint
 
 
 def newest_epoch(opened: Client | OfflineMap) -> int:
-    """The number of the epoch that a map answers from.
+    """Return the number of the epoch that a map answers from.
 
     Raises:
         TriquadError: the server does not answer.
@@ -16,7 +16,7 @@ def newest_epoch(opened: Client | OfflineMap) -> int:
 
 
 def open_map(target: str, access: Access) -> Client | OfflineMap:
-    """The map in the file ``target``, or that of the server at the endpoint ``target``.
+    """Return the map in the file ``target``, or that of the server at the endpoint ``target``.
 
     Raises:
         TriquadError: no server there has the map.

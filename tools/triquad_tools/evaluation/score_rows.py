@@ -5,11 +5,11 @@ from triquad_tools.evaluation.map_scores import StreetScores, WithheldScores
 from triquad_tools.evaluation.metrics import MeshScores
 
 TRUSTED = "SURFACE points"
-"""Of which points some figures are: those that a user would trust."""
+"""The points of some figures: those that a user would trust."""
 
 
 def mesh_rows(scores: MeshScores) -> list[Row]:
-    """The scores of a mesh as lines of a table."""
+    """Return the scores of a mesh as lines of a table."""
     return [
         Row("accuracy", centimetres(scores.accuracy_m), "mean, mesh to truth, outliers left out"),
         Row("accuracy, median", centimetres(scores.accuracy_median_m)),
@@ -24,7 +24,7 @@ def mesh_rows(scores: MeshScores) -> list[Row]:
 
 
 def street_rows(scores: StreetScores) -> list[Row]:
-    """The scores of a map of a street as lines of a table."""
+    """Return the scores of a map of a street as lines of a table."""
     return [
         Row("SDF error", centimetres(scores.sdf_error_m), "mean, within 10 cm of the surface"),
         Row("SDF error, median", centimetres(scores.sdf_error_median_m)),
@@ -38,7 +38,7 @@ def street_rows(scores: StreetScores) -> list[Row]:
 
 
 def withheld_rows(scores: WithheldScores) -> list[Row]:
-    """The scores of a map at withheld scans as lines of a table."""
+    """Return the scores of a map at withheld scans as lines of a table."""
     return [
         Row("SURFACE", percent(scores.surface_ratio), "of all points"),
         Row("UNKNOWN", percent(scores.unknown_ratio), "of all points"),

@@ -1,1 +1,1 @@
-"""What can be done with map files: summaries, differences, packing, export."""
+"""Operations on map files: summaries, differences, packing, export."""

@@ -23,7 +23,7 @@ class FailedCheckError(ToolError):
 
 
 def verify(file: MapFile) -> tuple[str, ...]:
-    """What was checked of a file that has been read as ``file``.
+    """Return what was checked of a file that has been read as ``file``.
 
     Raises:
         FailedCheckError: a check fails.
@@ -36,7 +36,7 @@ def verify(file: MapFile) -> tuple[str, ...]:
 
 
 def _field(record: MapRecord) -> str:
-    """The field is finite at block centres of the evidence."""
+    """Check that the field is finite at block centres of the evidence."""
     centres = []
     for region in record.regions:
         codes = region.evidence.codes[:: len(region.evidence.codes) // _PROBES + 1]

@@ -1,4 +1,4 @@
-"""Where and by how much two maps differ; ``docs/tools.md`` defines every figure."""
+"""The places and sizes of differences of two maps; ``docs/tools.md`` defines every figure."""
 
 import math
 from collections.abc import Iterator
@@ -21,10 +21,10 @@ NEAR_ENOUGH_M = 1e-4
 """A point this near to the zero of the field is on the surface."""
 
 STILL_M = 1e-3
-"""What moved by less has not moved: several times the error of a surface point."""
+"""The least movement that counts: several times the error of a surface point."""
 
 NOISE_M = 0.02
-"""Two maps that learnt the same differ by up to this; it does not make a change great."""
+"""The most by which two maps that learnt the same differ; it does not make a change great."""
 
 _STEPS = 8
 _LEAST_SLOPE = 0.1  # a flatter field says nothing of where its zero is
@@ -40,11 +40,11 @@ class Sighting:
     leaf_m: float  # of the map whose surface it is
 
     def part(self, rows: NDArray[np.intp]) -> "Sighting":
-        """Some of the points."""
+        """Return some of the points."""
         return Sighting(self.points[rows], self.sdf[rows], self.status[rows], leaf_m=self.leaf_m)
 
     def having(self, status: Status) -> Doubles:
-        """The points of which the other map says ``status``."""
+        """Return the points of which the other map says ``status``."""
         return np.asarray(self.points[self.status == status])
 
 
@@ -58,7 +58,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Change:
-    """How the surface in some volume differs between two maps A and B; counts are of points."""
+    """The difference of the surface in some volume between maps A and B; counts are of points."""
 
     points_a: int
     points_b: int
@@ -72,19 +72,19 @@ class Change:
 
     @property
     def differs(self) -> bool:
-        """Whether there is anything to tell."""
+        """Whether there is any difference to report."""
         only_in_one = self.appeared or self.vanished or self.newly_seen or self.no_longer_known
         return bool(only_in_one) or self.moved_p95_m >= STILL_M
 
     @property
     def size(self) -> tuple[float, float]:
-        """What orders changes: the volume, then how far the surface moved."""
+        """The sort key of changes: the volume, then how far the surface moved."""
         return self.changed_m3, 0.0 if np.isnan(self.moved_p95_m) else self.moved_p95_m
 
 
 @dataclass(frozen=True)
 class TileChange:
-    """How two maps differ in one tile."""
+    """The difference of two maps in one tile."""
 
     low_m: tuple[float, ...]  # [3] corner, map frame
     high_m: tuple[float, ...]  # [3] opposite corner
@@ -93,7 +93,7 @@ class TileChange:
 
 @dataclass(frozen=True)
 class MapDiff:
-    """How two maps differ."""
+    """The difference of two maps."""
 
     tile_m: float
     total: Change
@@ -101,23 +101,23 @@ class MapDiff:
 
 
 def compare(a: "OfflineMap", b: "OfflineMap") -> Comparison:
-    """The surface of each of two maps, asked in the other."""
+    """Return the surface of each of two maps, asked in the other."""
     return Comparison(_sighting(a, b), _sighting(b, a))
 
 
 def difference(comparison: Comparison, tile_m: float) -> MapDiff:
-    """The figures of a comparison, in all and per cube of side ``tile_m``."""
+    """Return the figures of a comparison, in all and per cube of side ``tile_m``."""
     tiles = [tile for tile in _tiles(comparison, tile_m) if tile.change.differs]
     tiles.sort(key=lambda tile: tile.change.size, reverse=True)
     return MapDiff(tile_m, _change(comparison.old, comparison.new), tuple(tiles))
 
 
 def surface_points(opened: "OfflineMap") -> Doubles:
-    """Points ``[N, 3]`` where the field is zero, at most one for each voxel where rays ended.
+    """Return points ``[N, 3]`` where the field is zero, at most one per voxel where rays ended.
 
     The middles of these voxels are moved along the gradient by Newton's method. Those that have
     not come to a zero within a voxel's diagonal, and to one where the mesh may have faces, are left
-    out: beside where rays ended the field may cross zero anywhere.
+    out: away from where rays ended the field may cross zero anywhere.
     """
     leaf_m = opened.leaf_m
     middles = opened.surface_voxels()

@@ -1,4 +1,4 @@
-"""By how much the distances of two maps differ, measured at random points where rays have been."""
+"""Differences of the distances of two maps, measured at random points where rays have been."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -50,7 +50,7 @@ class Probes:
         return np.concatenate([self.surface, self.near, self.free])
 
     def change(self, differences: NDArray[np.floating]) -> FieldChange:
-        """What differences [N] at :attr:`points` amount to."""
+        """Return the quantiles of differences [N] at :attr:`points`."""
         moved = np.abs(differences)
         ends = np.cumsum([len(self.surface), len(self.near)])
         surface, near, free = (_quantile(part) for part in np.split(moved, ends))
@@ -60,7 +60,7 @@ class Probes:
 def draw_probes(
     settings: FieldSettings, region: Region, rng: np.random.Generator, count: int = PROBES
 ) -> Probes:
-    """``count`` points of each kind; none of a kind of which the evidence knows no voxel."""
+    """Return ``count`` points of each kind; none of a kind of which the evidence knows no voxel."""
     surface = seen_voxels(region.evidence, region.evidence.surface)
     free = seen_voxels(region.evidence, region.evidence.free)
     chosen = [(surface, _SURFACE_LEAVES), (surface, _NEAR_LEAVES), (free, _FREE_LEAVES)]
@@ -74,7 +74,7 @@ def draw_probes(
 
 
 def field_change(before: MapRecord, after: MapRecord, seed: int) -> FieldChange:
-    """How far distances moved from one map to another that has the same regions and evidence."""
+    """Return how far distances moved between two maps that have the same regions and evidence."""
     rng = np.random.default_rng(seed)
     count = max(PROBES // max(len(before.regions), 1), _LEAST_PROBES)
     kinds: list[list[Doubles]] = [[np.zeros((0, 3))] for _ in range(3)]
@@ -85,7 +85,7 @@ def field_change(before: MapRecord, after: MapRecord, seed: int) -> FieldChange:
             kind.append(getattr(probes, field.name) + centre)
     everywhere = Probes(*(np.concatenate(kind) for kind in kinds))
     old, new = (MapEvaluator(record).query(everywhere.points).sdf for record in (before, after))
-    # Beside the cube of a region at the map's border there is no distance.
+    # Outside the cube of a region at the map's border there is no distance.
     return everywhere.change(np.nan_to_num(new - old))
 
 

@@ -1,7 +1,7 @@
 """Signed distances on a lattice, for programs that want an array: dense, or where surface is.
 
 Lattice points are the multiples of the cell side, as those of the server's meshes. What the field
-says is given wherever a region is, trusted or not; the status tells. Elsewhere the distance is NaN
+says is given wherever a region is, trusted or not; see the status. Elsewhere the distance is NaN
 and the status ``UNKNOWN``. ``docs/tools.md`` defines the arrays.
 """
 
@@ -29,7 +29,7 @@ BLOCK_CELLS = 8
 """Lattice points along the side of a block."""
 
 BAND_CELLS = 3
-"""How far around seen surface a sparse grid reaches at least, on each axis."""
+"""The least reach of a sparse grid around seen surface, on each axis."""
 
 _POINTS_AT_ONCE = 1 << 20
 _ROUNDING = 1e-9
@@ -42,7 +42,7 @@ Positions = Callable[[Longs], Doubles]
 
 
 def export_grid(record: MapRecord, box: Box | None, cell_m: float, sparse: bool, path: Path) -> str:
-    """Write distances on a lattice as a numpy archive; returns what was written.
+    """Write distances on a lattice as a numpy archive; return what was written.
 
     Raises:
         ToolError: the grid is too large, there is nothing to fill, or regions are too far away.
@@ -61,10 +61,10 @@ def export_grid(record: MapRecord, box: Box | None, cell_m: float, sparse: bool,
 
 
 def _dense(view: MapView, box: Box, cell_m: float) -> Arrays:
-    """All lattice points within a box."""
+    """Return all lattice points within a box."""
     corners = list(zip(box[0].tolist(), box[1].tolist(), strict=True))
     sides = [(high - low) / cell_m for low, high in corners]
-    if math.prod(side + 1 for side in sides) > MAX_CELLS:  # so many points at most
+    if math.prod(side + 1 for side in sides) > MAX_CELLS:  # at most N points
         sizes = " x ".join(f"{side:.6g}" for side in sides)
         raise _too_many(sizes, math.prod(sides), "--crop, --sparse")
     low = [math.ceil(low / cell_m - _ROUNDING) for low, _ in corners]
@@ -80,7 +80,7 @@ def _dense(view: MapView, box: Box, cell_m: float) -> Arrays:
 
 
 def _sparse(view: MapView, record: MapRecord, box: Box | None, cell_m: float) -> Arrays:
-    """The blocks with a lattice point within 3 cells of a voxel in which a ray ended."""
+    """Return the blocks with a lattice point within 3 cells of a voxel in which a ray ended."""
     indices = _blocks_near_surface(record, box, cell_m)
     count = len(indices) * BLOCK_CELLS**3
     if count > MAX_CELLS:
@@ -98,7 +98,7 @@ def _sparse(view: MapView, record: MapRecord, box: Box | None, cell_m: float) ->
 
 
 def _filled(view: MapView, shape: tuple[int, ...], positions: Positions) -> Arrays:
-    """Distances and statuses of lattice points, numbered in the order of an array of a shape."""
+    """Return distances and statuses of lattice points, numbered in an array's order."""
     count = math.prod(shape)
     sdf, status = np.empty(count, np.float32), np.empty(count, np.uint8)
     with progress("evaluating", 1.0) as report:
@@ -111,7 +111,7 @@ def _filled(view: MapView, shape: tuple[int, ...], positions: Positions) -> Arra
 
 
 def _blocks_near_surface(record: MapRecord, box: Box | None, cell_m: float) -> Longs:
-    """Indices [B, 3], in order, each once."""
+    """Return indices [B, 3], in order, each once."""
     middles = surface_voxels(record)
     if box is not None:
         middles = middles[((middles >= box[0]) & (middles <= box[1])).all(axis=1)]

@@ -19,7 +19,7 @@ _GLTF_FROM_MAP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 def read_mesh(path: Path) -> Mesh:
-    """The mesh of a file, vertices as float64 in a frame with z up.
+    """Return the mesh of a file, vertices as float64 in a frame with z up.
 
     A PLY file without faces gives a mesh without faces: a reference cloud.
 
@@ -38,7 +38,7 @@ def read_mesh(path: Path) -> Mesh:
         geometry: Any = loaded.to_geometry() if isinstance(loaded, trimesh.Scene) else loaded
         vertices = np.array(geometry.vertices, np.float64).reshape(-1, 3)
         faces = np.array(getattr(geometry, "faces", ()), np.int32).reshape(-1, 3)
-    except Exception as error:  # trimesh raises whatever its parsers stumble on
+    except Exception as error:  # trimesh raises any error of its parsers
         raise ToolError(f"{path}: cannot be read as a mesh: {error}") from error
     if path.suffix == ".glb":
         vertices = vertices @ _GLTF_FROM_MAP
@@ -48,7 +48,7 @@ def read_mesh(path: Path) -> Mesh:
 def export_mesh(
     record: MapRecord, box: Box | None, cell_m: float | None, path: Path, fill_m: float = 0.0
 ) -> str:
-    """Write the mesh of a map; returns what was written.
+    """Write the mesh of a map; return what was written.
 
     Its cells have the side ``cell_m``, half a leaf where that is not given. Given a box, it has
     the faces whose centroids lie in it. Surface is continued up to ``fill_m`` into unknown space.

@@ -1,4 +1,4 @@
-"""What appeared, vanished or moved as a whole between two maps; ``docs/tools.md`` has the rules."""
+"""Objects that appeared, vanished or moved between two maps; ``docs/tools.md`` has the rules."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,14 +14,14 @@ from triquad_tools.console.report import print_columns
 from triquad_tools.mapfiles.diff import Comparison, Sighting
 
 LEAST_POINTS = 20
-"""Clusters of fewer surface points are counted, but not listed: noise makes them, too. So many
+"""Clusters of fewer surface points are counted, but not listed: noise makes them, too. These
 are 0.8 square metres of surface in leaves of 0.2 m."""
 
 FARTHEST_M = 5.0
-"""What lies farther from where something vanished is something else."""
+"""Anything that lies farther from where something vanished is something else."""
 
 LEAST_SIZE_SHARE, LEAST_POINTS_SHARE = 0.7, 0.5
-"""Of what is the same, the smaller size along each axis is such a share of the larger, and so is
+"""If two are the same, the smaller size along each axis is such a share of the larger, and so is
 the smaller number of points, which depends on where it was seen from."""
 
 Corner = tuple[float, ...]
@@ -57,7 +57,7 @@ class Move:
 
 @dataclass(frozen=True)
 class SmallClusters:
-    """How many clusters have too few points to be listed."""
+    """The number of clusters that have too few points to be listed."""
 
     vanished: int
     appeared: int
@@ -67,7 +67,7 @@ class SmallClusters:
 
 @dataclass(frozen=True)
 class ObjectChanges:
-    """What is in only one of two maps A and B, those of most points first."""
+    """The objects in only one of two maps A and B, those of most points first."""
 
     moved: tuple[Move, ...]
     vanished: tuple[Cluster, ...]  # only in A: B has seen free space there
@@ -78,7 +78,7 @@ class ObjectChanges:
 
 
 def object_changes(comparison: Comparison) -> ObjectChanges:
-    """What appeared, vanished and moved from one map to the other."""
+    """Return what appeared, vanished and moved from one map to the other."""
     old, new = comparison.old, comparison.new
     vanished, appeared = _clusters(old, Status.FREE), _clusters(new, Status.FREE)
     newly_seen, unknown = _clusters(new, Status.UNKNOWN), _clusters(old, Status.UNKNOWN)
@@ -101,7 +101,7 @@ def object_changes(comparison: Comparison) -> ObjectChanges:
 def moves(
     vanished: tuple[Cluster, ...], appeared: tuple[Cluster, ...], leaf_m: float
 ) -> tuple[Move, ...]:
-    """What vanished and appeared again, those of most points first; the nearest pairs go first."""
+    """Return moves, those of most points first; the nearest pairs are matched first."""
     alike = [pair for pair in _near_pairs(vanished, appeared) if _alike(pair, leaf_m)]
     chosen: list[Move] = []
     for pair in sorted(alike, key=lambda pair: pair.distance_m):
@@ -130,7 +130,7 @@ def print_objects(changes: ObjectChanges, limit: int) -> None:
 
 
 def _clusters(sighting: Sighting, status: Status) -> list[Cluster]:
-    """Clusters of the points of which the other map says ``status``, those of most points first."""
+    """Return clusters of points whose other status is ``status``, those of most points first."""
     points = sighting.having(status)
     voxels = np.floor(points / sighting.leaf_m).astype(np.int64)
     members = (points[rows] for _, rows in rows_by_cell(clusters(voxels)[:, None]))
@@ -165,7 +165,7 @@ def _near_pairs(vanished: tuple[Cluster, ...], appeared: tuple[Cluster, ...]) ->
 
 
 def _alike(pair: Move, leaf_m: float) -> bool:
-    """Whether both may be the same: by their points, and by their size, which is off by a leaf."""
+    """Return whether both may be the same: by points, and by size, which is off by a leaf."""
     fewer, more = sorted([pair.before.points, pair.after.points])
     smaller = np.minimum(pair.before.size_m, pair.after.size_m)
     larger = np.maximum(pair.before.size_m, pair.after.size_m)

@@ -1,4 +1,4 @@
-"""A map as a smaller map file."""
+"""Writing a map as a smaller map file."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,21 +20,21 @@ INTEGER_ERROR_M = 0.0015
 
 @dataclass(frozen=True)
 class Precision:
-    """How features are stored: as floats of ``dtype``, or as integers within an error."""
+    """The storage of features: as floats of ``dtype``, or as integers within an error."""
 
     dtype: str | None = None  # None: as they are
     max_error_m: float | None = None  # None: no new integers
 
 
 def chosen_precision(name: str | None, max_error_m: float | None) -> Precision:
-    """What ``--precision`` and ``--max-error`` ask for."""
+    """Return what ``--precision`` and ``--max-error`` ask for."""
     if max_error_m is None and name == INTEGERS:
         max_error_m = INTEGER_ERROR_M
     return Precision(DTYPES.get(name or ""), max_error_m)
 
 
 def pack_map(source: SourceMap, precision: Precision, path: Path, bytes_before: int) -> str:
-    """Write a map file; returns its size, and how far distances moved.
+    """Write a map file; return its size, and how far distances moved.
 
     Raises:
         FormatError: integers change distances by more than the limit, or features do not fit the
@@ -67,7 +67,7 @@ def pack_map(source: SourceMap, precision: Precision, path: Path, bytes_before: 
 
 
 def _previews(record: MapRecord, stamp_ns: int | None) -> Previews | None:
-    """What MCAP viewers show; nothing where the libraries for it are not installed."""
+    """Return what MCAP viewers show; nothing if the libraries for it are not installed."""
     try:
         from triquad_map.preview import previews_of
     except ModuleNotFoundError as error:
@@ -87,7 +87,7 @@ def _warn_of_integers(record: MapRecord) -> None:
 
 
 def _dtype(record: MapRecord) -> str:
-    """The dtype that keeps all float features as they are."""
+    """Return the dtype that keeps all float features as they are."""
     tables = [table for region in record.regions for table in region.tables if len(table.codes)]
     wide = any(table.features.dtype.str == DTYPES["fp32"] for table in tables)
     return DTYPES["fp32" if wide else "fp16"]

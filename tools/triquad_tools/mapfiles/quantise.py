@@ -42,7 +42,7 @@ class QuantisedMap:
 
 
 def quantise(record: MapRecord, max_error_m: float) -> QuantisedMap:
-    """The coarsest integer features of which 99 of 100 distances are off by ``max_error_m``.
+    """Return the coarsest integer features of which 99 of 100 distances are off by ``max_error_m``.
 
     The limit holds in each region for each kind of points of :class:`FieldChange`.
 
@@ -61,7 +61,7 @@ def quantise(record: MapRecord, max_error_m: float) -> QuantisedMap:
 
 
 def dequantised(record: MapRecord) -> MapRecord:
-    """The map with float32 features where it has integers; it answers as before."""
+    """Return the map with float32 features where it has integers; it answers as before."""
     regions = tuple(
         dataclasses.replace(region, tables=tuple(map(_floats, region.tables)))
         for region in record.regions
@@ -103,7 +103,7 @@ def _quantise_region(settings: FieldSettings, region: Region, max_error_m: float
 
 
 def _rounded(table: VertexTable, scale: float) -> VertexTable:
-    """The nearest integers; the scale grows where the largest feature needs it."""
+    """Return the nearest integers; the scale grows where the largest feature needs it."""
     vectors = table.vectors()
     least = float(np.abs(vectors).max(initial=0.0)) / MAX_INTEGER
     used = np.float32(max(scale, least * (1 + 1e-6), float(np.finfo(np.float32).tiny)))
@@ -124,11 +124,11 @@ class _RegionProbes:
         self._before = self._distances(region.tables)
 
     def moves(self, tables: tuple[VertexTable, ...]) -> Floats:
-        """How far distances move [P], metres, where the region has these tables."""
+        """Return how far distances move [P], metres, where the region has these tables."""
         return self._distances(tables) - self._before
 
     def _distances(self, tables: tuple[VertexTable, ...]) -> Floats:
-        """Signed distances [P], metres; 0 beside the region's cube."""
+        """Return signed distances [P], metres; 0 outside the region's cube."""
         region = dataclasses.replace(self._record.regions[0], tables=tables)
         opened = open_view(dataclasses.replace(self._record, regions=(region,)))
         try:
@@ -140,7 +140,7 @@ class _RegionProbes:
 def _relative_scales(
     settings: FieldSettings, tables: tuple[VertexTable, ...], probes: _RegionProbes
 ) -> list[float]:
-    """``sqrt(V) / g`` of each table; ``g`` from what noise in the features of a level does."""
+    """Return ``sqrt(V) / g`` of each table; ``g`` from the effect of noise in its level."""
     rng = np.random.default_rng(_SEARCH_SEED)
     rms = {}
     for level in settings.levels:

@@ -1,4 +1,4 @@
-"""How well a recorded map fits the rays that it was not trained on, as a server judges it."""
+"""The fit of a recorded map to rays that it was not trained on, as a server computes it."""
 
 import numpy as np
 from triquad_format.records.arrays import Floats
@@ -12,7 +12,7 @@ from triquad_map.reference.region_field import RegionField
 
 
 def recorded_fit(record: MapRecord) -> MapFit | None:
-    """How well a map fits; ``None``: it holds no rays to judge by, which are training state."""
+    """Return how well a map fits; ``None`` if it has no held-out rays, which are training state."""
     settings = record.settings
     fits = []
     for region in record.regions:
@@ -28,7 +28,7 @@ def recorded_fit(record: MapRecord) -> MapFit | None:
 
 
 def _field(region: Region, settings: FieldSettings, points: Floats) -> Floats:
-    """What the field of a region says at points [N, 3], metres from its centre."""
+    """Return the field of a region at points [N, 3], metres from its centre."""
     field = RegionField(settings, region)
     field.add(region.tables)
     sdf = np.empty(len(points), np.float32)
@@ -36,6 +36,6 @@ def _field(region: Region, settings: FieldSettings, points: Floats) -> Floats:
     def work(first: int, last: int) -> None:
         sdf[first:last] = field.evaluate(points[first:last], gradient=False).sdf
 
-    with np.errstate(all="ignore"):  # a field that overflows fits badly, and that is told
+    with np.errstate(all="ignore"):  # a field that overflows fits badly, and that is reported
         in_chunks(len(points), work)
     return sdf

@@ -1,4 +1,4 @@
-"""Where a map is read from: a file with those it needs, a folder of checkpoints, a server."""
+"""Sources of maps: a file with those it needs, a folder of checkpoints, a server."""
 
 import re
 import tempfile
@@ -28,7 +28,7 @@ _ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws|unixsock-stream)/")
 
 @dataclass(frozen=True)
 class Access:
-    """What is asked for, and with what, where a target is a server."""
+    """The map and the credentials, where a target is a server."""
 
     map_name: str
     config: Path | None = None  # of Zenoh, with credentials
@@ -51,7 +51,7 @@ class SourceMap:
 
 
 def chosen_file(path: Path, when: str | None) -> Path:
-    """The file itself or, in a folder of checkpoints or a store of one, the checkpoint ``when``.
+    """Return the file itself or, for a folder of checkpoints or a store, the checkpoint ``when``.
 
     ``when`` is the number of an epoch, or a time; not given, the newest checkpoint is meant.
 
@@ -69,13 +69,13 @@ def chosen_file(path: Path, when: str | None) -> Path:
 
 
 def is_endpoint(target: str) -> bool:
-    """Whether ``target`` is a Zenoh endpoint, and not the name of a file."""
+    """Return whether ``target`` is a Zenoh endpoint, and not the name of a file."""
     return _ENDPOINT.match(target) is not None
 
 
 @contextmanager
 def map_file(target: str, access: Access, when: str | None = None) -> Iterator[Path]:
-    """A map as a file: ``target`` itself, a checkpoint of that folder, or a server's newest epoch.
+    """Yield a map's file: ``target`` itself, a checkpoint of it, or a server's newest epoch.
 
     What a server has is downloaded, with its training state, and deleted afterwards. ``when`` says
     which checkpoint of a folder; see :func:`chosen_file`.
@@ -102,7 +102,7 @@ def map_file(target: str, access: Access, when: str | None = None) -> Iterator[P
 
 
 def read_whole(path: Path) -> MapFile:
-    """The map in a file, checked.
+    """Return the map in a file, checked.
 
     Raises:
         MissingFilesError: it needs other files that are not in its folder; the text names them.
@@ -121,7 +121,7 @@ def read_whole(path: Path) -> MapFile:
 
 
 def read_source(path: Path, box: Box | None, training: bool) -> SourceMap:
-    """The map in a file, cropped to a box, with training state if that is kept.
+    """Return the map in a file, cropped to a box, with training state if that is kept.
 
     Only the parts that the box needs are read, unless there is training state and that is kept.
 
@@ -139,7 +139,7 @@ def read_source(path: Path, box: Box | None, training: bool) -> SourceMap:
 
 
 def cropped(source: SourceMap, box: Box | None, training: bool) -> SourceMap:
-    """The map within a box, with or without training state; errors as :func:`read_source`."""
+    """Return the map in a box, with or without training state; raises as :func:`read_source`."""
     record = source.record
     if box is not None:
         record = crop_record(record, box[0], box[1])
@@ -149,7 +149,7 @@ def cropped(source: SourceMap, box: Box | None, training: bool) -> SourceMap:
 
 
 def _box(path: Path, box: Box, training: bool) -> SourceMap | None:
-    """What answers in a box; ``None`` where the file has to be read whole."""
+    """Return what answers in a box; ``None`` if the whole file has to be read."""
     with StoredMap.open(path) as stored:
         topics = {entry.key.topic for entry in stored.manifest.entries}
         if training and topics & set(TRAINING_TOPICS):

@@ -1,4 +1,4 @@
-"""The history of a map: the checkpoints of a folder, as their manifests tell of them."""
+"""The history of a map: the checkpoints of a folder, from their manifests."""
 
 import dataclasses
 from contextlib import closing
@@ -25,7 +25,7 @@ from triquad_tools.console.report import print_columns
 
 @dataclass(frozen=True)
 class LoggedParts:
-    """What a manifest tells."""
+    """The content of a manifest."""
 
     time: str | None  # of the epoch, UTC as in RFC 3339
     stored: int  # parts in the file
@@ -58,12 +58,12 @@ class StoreLog:
 
     @property
     def damaged(self) -> int:
-        """How many do not open."""
+        """The number of checkpoints that do not open."""
         return sum(checkpoint.problem is not None for checkpoint in self.checkpoints)
 
 
 def read_log(store: Path) -> StoreLog:
-    """The checkpoints of a folder, or of the only map in a server's store.
+    """Return the checkpoints of a folder, or of the only map in a server's store.
 
     Parts are not read: only indices and manifests are, of the checkpoints and of what they need.
 
@@ -136,7 +136,7 @@ class _Indices:
         self._read: dict[str, MapIndex] = {}
 
     def parts(self, name: str) -> LoggedParts:
-        """What the manifest of a file tells, where all of its parts are to be found."""
+        """Return the content of a file's manifest, if all of its parts are to be found."""
         manifest = self._index(name).manifest
         for file in manifest.files:
             self._check_base(manifest, file)
@@ -151,7 +151,7 @@ class _Indices:
         )
 
     def _check_base(self, manifest: Manifest, file: str) -> None:
-        """Raise unless the file of this name has the parts that it is to hold, where they are."""
+        """Raise unless the file of this name has the parts that it should have, where they are."""
         try:
             index = self._index(file)
         except FileNotFoundError as error:

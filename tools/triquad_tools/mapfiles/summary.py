@@ -1,4 +1,4 @@
-"""What a map file holds, in figures."""
+"""The content of a map file, in figures."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -74,7 +74,7 @@ class MapSummary:
 
 
 def summarise(file: MapFile) -> MapSummary:
-    """The figures of a map file."""
+    """Return the figures of a map file."""
     record = file.record
     regions = tuple(_summarise_region(record, region) for region in record.regions)
     parts = _summarise_parts(file)
@@ -139,7 +139,7 @@ def _facts(summary: MapSummary) -> Iterator[Row]:
 
 
 def _fit_facts(summary: MapSummary) -> Iterator[Row]:
-    """How well the map fits rays that it was not trained on."""
+    """Yield how well the map fits rays that it was not trained on."""
     fit = summary.fit
     if fit is None:
         missing = "rays among it" if summary.training else "training state"
@@ -208,12 +208,12 @@ def _bits(masks: Bytes) -> int:
 
 
 def _rounded(place: Doubles) -> tuple[float, ...]:
-    """Coordinates without the noise of their last bits."""
+    """Return coordinates without the noise of their last bits."""
     return tuple(place.round(6).tolist())
 
 
 def _summarise_parts(file: MapFile) -> dict[str, TopicSummary]:
-    """The parts by topic, those in other files included."""
+    """Return the parts by topic, those in other files included."""
     sizes: dict[str, list[int]] = {}
     stored: dict[str, list[int]] = {}
     for entry in file.manifest.entries:

@@ -23,7 +23,7 @@ _SAVE_PERIOD_S = 60.0
 
 @contextmanager
 def stop_requests() -> Iterator[threading.Event]:
-    """Ctrl-C and SIGTERM only set an event, so that no step is cut off in the middle.
+    """Let Ctrl-C and SIGTERM only set an event, so that no step is interrupted.
 
     A second Ctrl-C raises KeyboardInterrupt.
     """
@@ -44,7 +44,7 @@ def stop_requests() -> Iterator[threading.Event]:
 def resumed_mapper(
     record: MapRecord | None, settings: Settings, device: str, *, teams: Teams
 ) -> Mapper:
-    """A mapper that goes on with a map; ``None``: with an empty one."""
+    """Return a mapper that goes on with a map; ``None``: with an empty one."""
     mapper = Mapper(MAP_NAME, settings, device, record=record, teams=teams)
     # What comes from now on is of a later epoch than the checkpoint.
     mapper.publish()
@@ -52,7 +52,7 @@ def resumed_mapper(
 
 
 class MappingRun:
-    """Takes in the scans of a recording and trains until nothing is left to learn."""
+    """Integrates the scans of a recording and trains until nothing is left to learn."""
 
     def __init__(
         self,
@@ -61,7 +61,7 @@ class MappingRun:
         warnings: ScanWarnings,
         stop: Callable[[], bool],
     ) -> None:
-        """``warnings`` are told what is used of each scan; ``stop()`` is asked between steps."""
+        """``warnings`` gets what is used of each scan; ``stop()`` is called between steps."""
         self._mapper = mapper
         self._unfinished = unfinished
         self._warnings = warnings
@@ -72,7 +72,7 @@ class MappingRun:
         self.last_refusal = ""
 
     def take(self, selection: Selection, start: int) -> None:
-        """Take in the scans from number ``start`` on, and train between them.
+        """Integrate the scans from number ``start`` on, and train between them.
 
         Raises:
             KeyboardInterrupt: the user wants to stop; all that was done is saved.

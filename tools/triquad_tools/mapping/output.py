@@ -17,7 +17,7 @@ SUFFIXES = (MAP_SUFFIX, *MESH_SUFFIXES, PICTURE_SUFFIX)
 
 
 def write_output(record: MapRecord, path: Path, *, cell_m: float, training: bool) -> str:
-    """Write a map file, a mesh with cells of side ``cell_m`` or a picture; says what it is.
+    """Write a map file, a mesh with cells of side ``cell_m`` or a picture; return what it is.
 
     A map file has the state that further training needs only with ``training``.
 

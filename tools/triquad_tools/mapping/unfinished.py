@@ -24,14 +24,14 @@ _KEEP = StoreSettings(period_s=0.0, keep=2)
 
 @dataclass(frozen=True)
 class Position:
-    """Where to go on."""
+    """The position at which to go on."""
 
     record: MapRecord | None  # None: with an empty map
     scans_taken: int
 
 
 def mapping_key(selection: Selection, settings: Settings) -> str:
-    """What tells whether an unfinished map is of the same scans, poses and settings."""
+    """Return a key that identifies the scans, poses and settings of an unfinished map."""
     digest = hashlib.sha256(settings.model_dump_json(include=_SECTIONS).encode())
     digest.update(selection.way.encode())
     for entry in selection.entries:
@@ -40,10 +40,10 @@ def mapping_key(selection: Selection, settings: Settings) -> str:
 
 
 class UnfinishedMap:
-    """The folder beside the output in which a map lies while it is made. Close it."""
+    """The folder next to the output that holds a map while it is made. Close it."""
 
     def __init__(self, output: Path, key: str) -> None:
-        """Take possession of the folder, which is made if need be.
+        """Lock the folder, which is made if need be.
 
         Raises:
             ToolError: it holds a map of another recording or other settings, or is not ours.
@@ -65,7 +65,7 @@ class UnfinishedMap:
             raise
 
     def close(self) -> None:
-        """Let go of the folder; what is in it stays, unless nothing was saved yet."""
+        """Unlock the folder; what is in it stays, unless nothing was saved yet."""
         self._store.close()
         if not self._scans_taken:
             self.remove()
@@ -74,11 +74,11 @@ class UnfinishedMap:
         """Delete the folder, once it is closed: the map is finished."""
         shutil.rmtree(self.folder / MAP_NAME)
         self._positions.unlink()
-        with suppress(OSError):  # whoever put something else there keeps it
+        with suppress(OSError):  # other files in the folder are kept
             self.folder.rmdir()
 
     def position(self) -> Position:
-        """Where to go on.
+        """Return the position at which to go on.
 
         Raises:
             StoreError: there are checkpoints, but none can be read.
@@ -109,7 +109,7 @@ class UnfinishedMap:
             self._store.write(changes)
 
     def _check_ours(self) -> None:
-        """Refuse to write to, and later to delete, what somebody else put there."""
+        """Refuse to write to, and later to delete, files that are not ours."""
         if self.folder.is_symlink():
             raise ToolError(f"{self.folder} is a link; remove it, or give OUT another name")
         if self.folder.is_dir() and any(self.folder.iterdir()) and not self._positions.is_file():

@@ -22,14 +22,14 @@ from triquad_tools.plots.plan import (
     save_sheet,
 )
 
-# Of Okabe and Ito's colours, which all can tell apart.
+# From Okabe and Ito's colours, which all can distinguish.
 APPEARED, VANISHED, NEWLY_SEEN, NO_LONGER_KNOWN = "#0072b2", "#d55e00", "#56b4e9", "#f0e442"
 MOVED = "#000000"
 _LEAST_RANGE_CM = 5.0
 _LINE_PT = 1.5
 _ARROWHEAD_PT = 8
 _LABEL_PT = (8, 8)  # from the arrow's head
-_BESIDE_M = 0.1  # outlines lie so far outside of what they surround
+_BESIDE_M = 0.1  # outlines lie this far outside of what they surround
 _NOTE = "outlined: what appeared or vanished as a whole; arrows: what moved"
 
 
@@ -92,7 +92,7 @@ def _draw_box(axes: Axes, cluster: Cluster, colour: str) -> None:
 
 
 def _draw_arrow(axes: Axes, move: Move) -> None:
-    """From where a cluster was to where it is, and how far that is."""
+    """Draw from where a cluster was to where it is, and how far that is."""
     start, end = ((place[0], place[1]) for place in (move.before.middle_m, move.after.middle_m))
     arrow = FancyArrowPatch(
         start, end, color=MOVED, linewidth=_LINE_PT, arrowstyle="->",

@@ -109,5 +109,5 @@ def draw_withheld(
 
 
 def error_colours(distances_m: NDArray[np.floating], high_m: float) -> Doubles:
-    """Colours ``[N, 3]``, sRGB in [0, 1], of distances ``[N]``, the greatest ``high_m``."""
+    """Return colours ``[N, 3]``, sRGB in [0, 1], of distances ``[N]``, the greatest ``high_m``."""
     return np.asarray(_COLOURS(np.asarray(distances_m, np.float64) / high_m)[:, :3], np.float64)

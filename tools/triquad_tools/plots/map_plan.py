@@ -56,7 +56,7 @@ class Columns:
 
 
 def seen_columns(record: MapRecord, surface_only: bool = False) -> Columns:
-    """The columns in which rays ended or, unless ``surface_only``, through which they passed."""
+    """Return the columns where rays ended or, unless ``surface_only``, which they passed."""
     settings, parts = record.settings, [np.empty((0, 3))]
     for region in record.regions:
         evidence = owned_evidence(settings, region)
@@ -87,9 +87,9 @@ class SampleErrors:
 
 
 def sample_errors(record: MapRecord) -> SampleErrors:
-    """Errors where rays end, and at samples within half a leaf of the surface.
+    """Return errors where rays end, and at samples within half a leaf of the surface.
 
-    Or at an even share of them.
+    If there are many, an even share of them is used.
     """
     points, labels = [np.empty((0, 3))], [np.empty(0)]
     for region in record.regions:
@@ -107,7 +107,7 @@ def sample_errors(record: MapRecord) -> SampleErrors:
 
 
 def _errors_plan(grid: PlanGrid, found: SampleErrors, settings: FieldSettings) -> Plan:
-    """A plan of the mean error in each column."""
+    """Return a plan of the mean error in each column."""
     cells = grid.statistic(found.points, 100 * found.errors_m, "mean")
     high = max(float(np.ceil(np.nanquantile(cells, 0.99))), _LEAST_RANGE_CM)
     scale = Scale("mean |signed distance - label| in cm", ERRORS, low=0.0, high=high)

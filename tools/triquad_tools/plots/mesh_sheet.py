@@ -1,4 +1,4 @@
-"""A sheet with the picture of a mesh: title, scales, notes."""
+"""A sheet with the picture of a mesh: title, scales, remarks."""
 
 import math
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ _DIRECTIONS = ("+x", "+x +y", "+y", "-x +y", "-x", "-x -y", "-y", "+x -y")
 
 @dataclass(frozen=True)
 class Legend:
-    """What a sheet says about its picture."""
+    """The texts of a sheet about its picture."""
 
     title: str  # one line or two
     scale: Scale

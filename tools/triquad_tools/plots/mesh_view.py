@@ -13,12 +13,12 @@ from triquad_map.compiled.kernel import kernel
 from triquad_map.height_scale import GAMMA
 
 WIDTH, HEIGHT = 1340, 740
-"""Of a picture, pixels."""
+"""The size of a picture, pixels."""
 
 BACKGROUND: Doubles = np.array([0.93, 0.94, 0.95])
-"""sRGB of where nothing is."""
+"""The sRGB colour of the background."""
 
-_DOWN_DEG, _ASIDE_DEG = 42.0, 18.0  # how far a view looks down, and past the map's longer side
+_DOWN_DEG, _ASIDE_DEG = 42.0, 18.0  # how far a view is turned down, and past the map's longer side
 _MOST = (0.01, 0.99)  # of the surface, along each axis of the picture: these are shown in any case
 _ROOM, _MARGIN = 0.25, 1.04  # beyond them, of their extent, as far as there is anything; an edge
 _LEAST_HEIGHT_M = 0.01
@@ -31,25 +31,25 @@ _POINT_PIXELS, _LEAST_POINT_M = 2.5, 0.02  # side of a point: the greater of bot
 
 @dataclass(frozen=True)
 class View:
-    """From where a picture is taken, from infinitely far away; its top is towards +z."""
+    """The viewpoint of a picture, infinitely far away; the picture's top is towards +z."""
 
     axes: Doubles  # [3, 3] unit vectors to the right, down and forward, map frame
     target: Doubles  # [3] metres, in the middle of the picture
     height_m: float  # of what the picture shows, across the view
 
     def project(self, points: NDArray[np.floating], height: int = HEIGHT) -> Doubles:
-        """Column, row and metres nearer than the target [N, 3], of a picture of so many rows."""
+        """Return column, row and metres nearer than the target [N, 3], in a picture so high."""
         seen = (points - self.target) @ self.axes.T
         middle, per_m = np.array([WIDTH, HEIGHT]) * height / HEIGHT / 2, height / self.height_m
         return np.column_stack([middle + per_m * seen[:, :2], -seen[:, 2]])
 
     def facing(self, corners: NDArray[np.floating]) -> Bools:
-        """Whether faces with corners [F, 3, 3] show their outer side."""
+        """Return whether faces with corners [F, 3, 3] show their outer side."""
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         return np.asarray(normals @ self.axes[2] < 0.0)
 
     def outside(self, points: NDArray[np.floating]) -> str:
-        """What is told of points [N, 3], one at least, beyond the picture's edges, if any are."""
+        """Return a remark on those of points [N, 3], one at least, beyond the picture's edges."""
         right, down, _ = ((points - self.target) @ self.axes.T).T
         beyond = np.abs(down) > self.height_m / 2
         beyond |= np.abs(right) > WIDTH / HEIGHT * self.height_m / 2
@@ -60,7 +60,7 @@ class View:
 
 
 def vertex_normals(vertices: Doubles, faces: Ints) -> Doubles:
-    """Unit normals [V, 3]: those of the faces around a vertex, weighted by their area."""
+    """Return unit normals [V, 3]: those of the faces around a vertex, weighted by their area."""
     corners = vertices[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     shares = [np.bincount(faces.ravel(), part, len(vertices)) for part in across.repeat(3, 0).T]
@@ -70,7 +70,7 @@ def vertex_normals(vertices: Doubles, faces: Ints) -> Doubles:
 
 
 def view_axes(forward: Doubles) -> Doubles:
-    """Unit vectors [3, 3] to the right, down and forward of a view in a direction [3]."""
+    """Return unit vectors [3, 3] to the right, down and forward of a view in a direction [3]."""
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -78,7 +78,7 @@ def view_axes(forward: Doubles) -> Doubles:
 
 
 def view_along(points: Doubles, corners: Doubles) -> View:
-    """The view of points [N, 3] aslant from above, of whose two sides that shows more faces.
+    """Return the view of points [N, 3] aslant from above, of whose two sides that shows more faces.
 
     The longer side lies along the picture. What lies far away from all else does not make the rest
     small: it stays outside.
@@ -97,7 +97,7 @@ def view_along(points: Doubles, corners: Doubles) -> View:
 
 
 def _view_to(some: Doubles, points: Doubles, turn: float) -> View:
-    """The view in a direction of the map, whose picture holds most of some points [N, 3]."""
+    """Return the view in a direction of the map, whose picture holds most of some points [N, 3]."""
     down = math.radians(_DOWN_DEG)
     level = math.cos(down) * np.array([math.cos(turn), math.sin(turn)])
     axes = view_axes(np.append(level, -math.sin(down)))
@@ -153,7 +153,7 @@ class Picture:
             self._light[rows[free], columns[free]] = seen[free, 3:]
 
     def pixels(self) -> Bytes:
-        """The picture [HEIGHT, WIDTH, 3]."""
+        """Return the picture [HEIGHT, WIDTH, 3]."""
         fine = self._light.reshape(HEIGHT, _FINER, WIDTH, _FINER, 3).mean(axis=(1, 3))
         return np.asarray(np.round(255.0 * np.clip(fine, 0.0, 1.0) ** (1.0 / GAMMA)), np.uint8)
 

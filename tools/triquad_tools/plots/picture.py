@@ -15,7 +15,7 @@ from triquad_tools.plots.plan import HEIGHTS, Scale
 
 
 def export_picture(source: SourceMap, box: Box | None, cell_m: float | None, path: Path) -> str:
-    """Save a picture of a map, or of what of it lies in a box; returns what it shows.
+    """Save a picture of a map, or of its part in a box; return what it shows.
 
     Raises:
         InvalidInputError: the mesh is too large, or a library is missing.

@@ -33,7 +33,7 @@ _LEAST_CELLS = 40  # along each side
 _LEAST_SIDE = 0.25  # the shorter side's share of the longer one
 _WIDE = 2.0  # the plans of a map that is wider stand below each other
 _LONGEST_IN, _LONGEST_ASIDE_IN = 11.0, 6.5  # longer side of a plan
-_ROOM_IN = (2.3, 1.7)  # beside a plan for its scale, below it for its legend
+_ROOM_IN = (2.3, 1.7)  # next to a plan for its scale, below it for its legend
 _LETTERS_PT = 13  # can be read in half the size, too
 
 Values = Doubles
@@ -51,7 +51,7 @@ class PlanGrid:
 
     @classmethod
     def around(cls, points: NDArray[np.floating], leaf_m: float) -> "PlanGrid":
-        """The grid that holds points ``[N, 2]``, of cells of one leaf or 2, 4, 8, ..."""
+        """Return the grid that holds points ``[N, 2]``, of cells of one leaf or 2, 4, 8, ..."""
         points = points if len(points) else np.zeros((1, 2))
         low, high = points.min(axis=0), points.max(axis=0)
         longest = math.ceil(float((high - low).max()) / leaf_m) + 1
@@ -69,7 +69,7 @@ class PlanGrid:
         return corner
 
     def marked(self, points: NDArray[np.floating]) -> Bools:
-        """``[rows, columns]``: whether a cell holds any of the points ``[N, 2 or 3]``."""
+        """Return ``[rows, columns]``: whether a cell holds any of the points ``[N, 2 or 3]``."""
         return self.statistic(points, np.zeros(len(points)), "count") > 0
 
     def statistic(
@@ -78,7 +78,7 @@ class PlanGrid:
         values: NDArray[np.floating],
         kind: Literal["count", "max", "mean"],
     ) -> Values:
-        """What the values ``[N]`` at points ``[N, 2 or 3]`` amount to in each cell."""
+        """Return a statistic of the values ``[N]`` at points ``[N, 2 or 3]`` in each cell."""
         if not len(points):
             return np.full((self.rows, self.columns), 0.0 if kind == "count" else np.nan)
         x, y = points[:, 0], points[:, 1]
@@ -156,7 +156,7 @@ def _align(figure: Figure, drawn: Sequence[Axes]) -> None:
 
 
 def extend(below: bool, above: bool) -> Literal["neither", "min", "max", "both"]:
-    """The ends of a scale that have an arrow, since there are values beyond."""
+    """Return the ends of a scale that have an arrow, since there are values beyond."""
     return (("neither", "max"), ("min", "both"))[below][above]
 
 

@@ -29,12 +29,12 @@ _MAX_DISTANCE_M = 3.0
 SURFACE = "#a3341f"
 BEHIND = "#d55e00"
 DISTANCE_COLOURS = colormaps["viridis"].with_extremes(under=BEHIND)
-"""Of distances from 0 up; those behind a surface stand out."""
+"""The colours of distances from 0 up; those behind a surface stand out."""
 
 
 @dataclass(frozen=True)
 class SliceOptions:
-    """Which slice of a map."""
+    """The choice of a slice of a map."""
 
     height_m: float
     box_m: Sequence[float] | None  # west, south, east, north; None: all that a file has seen
@@ -67,7 +67,7 @@ def draw_slice(target: str, access: Access, options: SliceOptions, path: Path) -
 
 
 def _seen_box(target: str) -> list[float]:
-    """West, south, east and north of what a file has seen."""
+    """Return west, south, east and north of what a file has seen."""
     if is_endpoint(target):
         raise ToolError("--slice of a server's map needs --box WEST SOUTH EAST NORTH")
     box = evidence_bounds(read_whole(Path(target)).record)
@@ -77,7 +77,7 @@ def _seen_box(target: str) -> list[float]:
 
 
 def _draw_distance(answer: Grid, axes: Axes) -> None:
-    """Where nothing was seen, no distance either: there it only says how far the last wall is."""
+    """Draw distances where something was seen: elsewhere they only say how far the last wall is."""
     label = (
         f"m to the nearest surface, {_MAX_DISTANCE_M:g} or more\norange: behind it; grey: not seen"
     )

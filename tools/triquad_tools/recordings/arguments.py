@@ -126,7 +126,7 @@ def _intrinsics(text: str) -> Intrinsics:
 
 
 def options_of(options: argparse.Namespace) -> RecordingOptions:
-    """How the arguments want a recording to be read.
+    """Return how the arguments want a recording to be read.
 
     Raises:
         ToolError: one of them cannot be used.
@@ -151,7 +151,7 @@ def options_of(options: argparse.Namespace) -> RecordingOptions:
 
 
 def flags_of(options: argparse.Namespace) -> list[str]:
-    """The flags among the arguments that say how a recording is read."""
+    """Return the flags among the arguments that say how a recording is read."""
     flags: list[str] = []
     for name in _VALUES:
         if (value := getattr(options, name)) is not None:

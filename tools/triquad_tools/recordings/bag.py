@@ -39,13 +39,13 @@ class OpenBag:
 
     @property
     def connections(self) -> list[Connection]:
-        """What was recorded: several may be of one topic."""
+        """The recorded connections: several may be of one topic."""
         return self._reader.connections
 
     def messages(
         self, connections: Collection[Connection], start_ns: int | None = None
     ) -> Iterator[Message]:
-        """The messages of some connections in the order in which they were recorded.
+        """Yield the messages of some connections in the order in which they were recorded.
 
         Raises:
             ToolError: the bag is damaged.
@@ -63,7 +63,7 @@ class OpenBag:
             yield Message(*message)
 
     def decode(self, message: Message) -> Any:
-        """The message as an object with the fields that its type has.
+        """Return the message as an object with the fields that its type has.
 
         Raises:
             ToolError: its bytes are no such message.
@@ -80,14 +80,14 @@ class OpenBag:
 
 @dataclass(frozen=True)
 class Bag:
-    """Where a bag is, which may be cut into several files."""
+    """The path of a bag, which may be cut into several files."""
 
     path: Path
     files: tuple[Path, ...]
 
     @contextmanager
     def open(self) -> Iterator[OpenBag]:
-        """The bag, open for reading.
+        """Yield the bag, open for reading.
 
         Raises:
             ToolError: it cannot be read, or is not whole.
@@ -103,7 +103,7 @@ class Bag:
             reader.close()
 
     def damaged(self, error: Exception) -> ToolError:
-        """What to say where reading the bag fails."""
+        """Return the error for a bag that cannot be read."""
         suffixes = {file.suffix for file in _bag_files(self.path)} or {self.path.suffix}
         repair = " or ".join(f"'{_REPAIR[suffix]}'" for suffix in sorted(suffixes & {*_REPAIR}))
         words = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
@@ -112,7 +112,7 @@ class Bag:
 
 
 def find_bag(path: Path) -> Bag | None:
-    """The bag at a path: a file, a folder that ROS 2 wrote, or one of parts of a bag."""
+    """Return the bag at a path: a file, a folder that ROS 2 wrote, or one of parts of a bag."""
     if path.is_file():
         return Bag(path, (path,)) if path.suffix in _SUFFIXES else None
     if (path / "metadata.yaml").is_file():

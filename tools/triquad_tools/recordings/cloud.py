@@ -12,14 +12,14 @@ _MERGED_POINTS = 2_000_000  # fewer are not worth a merge
 
 
 def is_withheld(index: int, every: int) -> bool:
-    """Whether scan ``index`` is kept back for testing: the last of each ``every`` scans."""
+    """Return whether scan ``index`` is kept back for testing: the last of each ``every`` scans."""
     return every > 0 and index % every == every - 1
 
 
 def points_in_range(
     points: NDArray[np.floating], range_min_m: float, range_max_m: float = np.inf
 ) -> NDArray[np.floating]:
-    """The points ``[N, 3]``, sensor frame, whose ranges lie within both limits.
+    """Return the points ``[N, 3]``, sensor frame, whose ranges lie within both limits.
 
     Points that are not finite are left out as soon as a limit is given.
     """
@@ -31,14 +31,14 @@ def points_in_range(
 
 
 def world_points(scan: PosedScan, range_min_m: float = 0.0, range_max_m: float = np.inf) -> Doubles:
-    """The finite points ``[N, 3]`` of a scan within limits of the range, world frame."""
+    """Return the finite points ``[N, 3]`` of a scan within limits of the range, world frame."""
     points = points_in_range(scan.points, range_min_m, range_max_m)
     points = points[np.isfinite(points).all(axis=1)]
     return moved(points, scan.world_from_sensor)
 
 
 def thin(points: Doubles, voxel_m: float) -> Doubles:
-    """The first of the points ``[N, 3]`` in each voxel of side ``voxel_m``, in their order."""
+    """Return the first of points ``[N, 3]`` in each voxel of side ``voxel_m``, in their order."""
     if len(points) == 0:
         return points
     cells = np.floor(points / voxel_m).astype(np.int64)
@@ -49,7 +49,7 @@ def thin(points: Doubles, voxel_m: float) -> Doubles:
 
 
 def merged(clouds: Iterable[Doubles], voxel_m: float) -> Doubles:
-    """All clouds as one ``[N, 3]``, one point per voxel of side ``voxel_m``."""
+    """Return all clouds as one ``[N, 3]``, one point per voxel of side ``voxel_m``."""
     kept = [np.empty((0, 3))]  # the first is what is merged so far
     for cloud in clouds:
         kept.append(thin(cloud, voxel_m))

@@ -1,4 +1,4 @@
-"""What a recording holds, told to a person."""
+"""Printing what a recording holds."""
 
 import shlex
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Telling what kind of recording a path is."""
+"""Finding out what kind of recording a path is."""
 
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -26,7 +26,7 @@ _FLAGS = {"transforms": "transform", "deskew": "no-deskew", "depth_stride": "str
 
 @dataclass(frozen=True)
 class RecordingOptions:
-    """How a recording is read, whichever kind it turns out to be."""
+    """Options for reading a recording of any kind."""
 
     ros: RosOptions = RosOptions()
     clouds: CloudOptions = CloudOptions()
@@ -34,7 +34,7 @@ class RecordingOptions:
 
 
 def open_recording(path: Path, options: RecordingOptions) -> Recording:
-    """A recording, after all of it was looked through.
+    """Return a recording, after all of it was checked.
 
     Raises:
         ToolError: there is none, it is damaged, or does not hold what ``options`` ask for.

@@ -1,4 +1,4 @@
-"""Which of the poses that were recorded tell where the sensors were."""
+"""The choice of the recorded poses that give the poses of the sensors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ class PoseSource:
     assumed: bool = False  # nothing says that they are its poses
 
     def find(self, cloud: SeenCloud) -> NoTransformError | None:
-        """Why it is not known where a cloud was; None where it is."""
+        """Return why the pose of a cloud is not known; None if it is."""
         times = np.array([cloud.first_ns, cloud.last_ns], np.int64)
         try:
             self.frames.poses(self.target, cloud.frame, times)
@@ -36,14 +36,14 @@ class PoseSource:
 
     @property
     def moves(self) -> bool:
-        """Whether they are poses at all: transforms that always hold are none."""
+        """Return whether they are poses at all: transforms that always hold are none."""
         return self.frames.moves(self.target, self.body)
 
 
 def choose_poses(
     found: Survey, clouds: Sequence[SeenCloud], options: RosOptions
 ) -> PoseSource | None:
-    """The source by which the most clouds can be placed; None where there is no pose at all.
+    """Return the source that places the most clouds; None if there is no pose at all.
 
     Raises:
         ToolError: the source that was asked for does not exist.
@@ -68,7 +68,7 @@ def _merit(source: PoseSource, clouds: Sequence[SeenCloud]) -> tuple[int, bool]:
 
 
 def _of_tf(found: Survey, frame: str, options: RosOptions) -> PoseSource:
-    """All transforms. Where they do not reach the sensor, finding a cloud says so."""
+    """Return all transforms. If they do not reach the sensor, finding a cloud says so."""
     frames, body = found.frames, frame
     if not frames.moves(frames.root(frame), frame):
         body = next(iter(frames.moving), frame)
@@ -76,7 +76,7 @@ def _of_tf(found: Survey, frame: str, options: RosOptions) -> PoseSource:
 
 
 def _of_topic(found: Survey, topic: str, frame: str, options: RosOptions) -> PoseSource:
-    """Poses of a topic, in the tree of all transforms but those that tell the same."""
+    """Return the poses of a topic, in the tree of all transforms but those that say the same."""
     poses = found.poses[topic]
     # Where a topic does not name the body, it is what the sensor is fixed to.
     body = options.body_frame or poses.child or found.frames.root(frame)

@@ -1,4 +1,4 @@
-"""Publishing scans no faster than a server takes them in, and waiting until they are learnt."""
+"""Publishing scans no faster than a server integrates them, and waiting until they are learnt."""
 
 import time
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ _PENDING = 4
 
 
 def keep_few_pending(client: Client, published: int) -> None:
-    """Call after each scan: lets 4 to 8 scans be under way, far fewer than a server queues.
+    """Let 4 to 8 scans be pending, far fewer than a server queues. Call after each scan.
 
     Not after every scan, for the server publishes an epoch before it answers.
     """
@@ -25,7 +25,7 @@ def keep_few_pending(client: Client, published: int) -> None:
 
 
 def publish_all(client: Client, scans: Sequence[PosedScan]) -> FlushReport:
-    """Publish scans, and wait until the server has taken in all of them."""
+    """Publish scans, and wait until the server has integrated all of them."""
     with progress("publishing scans", len(scans)) as report:
         for number, scan in enumerate(scans, start=1):
             client.publish_scan(scan.points, scan.world_from_sensor)
@@ -35,7 +35,7 @@ def publish_all(client: Client, scans: Sequence[PosedScan]) -> FlushReport:
 
 
 def wait_until_settled(client: Client, limit_s: float | None = None) -> ServerStatus:
-    """The server's status once nothing is left to learn, or after ``limit_s`` seconds."""
+    """Return the server's status once nothing is left to learn, or after ``limit_s`` seconds."""
     started = time.monotonic()
     first = client.status()
     with progress("training", first.samples_left) as report:

@@ -7,7 +7,7 @@ from typing import Protocol
 from triquad_tools.sensors.sweep import PosedScan
 
 DEFAULT_SOURCE = "default"
-"""Of recordings that name no sensor: the source that the client takes by default, too."""
+"""The source of recordings that name no sensor: the client's default, too."""
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class ScanEntry:
 
 @dataclass(frozen=True)
 class Stream:
-    """What of one kind a recording holds, as ``triquad-replay --list`` shows it."""
+    """One stream of a recording, as ``triquad-replay --list`` shows it."""
 
     name: str  # of the topic, or of the files
     kind: str  # type of the messages, or of the files
@@ -30,7 +30,7 @@ class Stream:
 
 
 class Recording(Protocol):
-    """A recording that was looked through as a whole, so that what is wrong with it is known."""
+    """A recording that was checked as a whole, so that its errors are known."""
 
     @property
     def entries(self) -> Sequence[ScanEntry]:
@@ -38,14 +38,14 @@ class Recording(Protocol):
 
     @property
     def streams(self) -> Sequence[Stream]:
-        """All that it holds."""
+        """The streams that it holds."""
 
     @property
     def remarks(self) -> Sequence[str]:
-        """What is left out and why, and what to do about it: a line each."""
+        """The problems: what is left out and why, and what to do about it, a line each."""
 
     def read(self, indices: Sequence[int]) -> Iterator[PosedScan]:
-        """The scans of these numbers, which increase, one after the other.
+        """Return the scans of these numbers, which increase, one after the other.
 
         Raises:
             ToolError: a scan cannot be read.

@@ -1,4 +1,4 @@
-"""How a recording of ROS is to be read, where what it holds leaves a choice."""
+"""Options for reading a recording of ROS, where its content leaves a choice."""
 
 from dataclasses import dataclass
 
@@ -11,19 +11,19 @@ from triquad_tools.sensors.ros.header import frame_name
 
 @dataclass(frozen=True)
 class RosOptions:
-    """What a person said about a recording; what is left out is found out."""
+    """A user's choices for a recording; those left out are determined."""
 
     topics: tuple[str, ...] = ()  # of clouds or depth images
     poses: str | None = None  # topic of odometry or poses, or "tf"
     map_frame: str | None = None
     body_frame: str | None = None  # whose poses those of the topic are
-    depth_stride: int = 1  # take every so many-th row and column of depth images
+    depth_stride: int = 1  # take every N-th row and column of depth images
     recorder_clock: bool = False  # stamps are when a message was recorded
     transforms: tuple[Transform, ...] = ()  # that the recording lacks
 
 
 def parse_transform(text: str) -> Transform:
-    """A transform such as ``base_link lidar 0 0 1.5 0 0 0 1``: position and quaternion.
+    """Return a transform such as ``base_link lidar 0 0 1.5 0 0 0 1``: position and quaternion.
 
     Raises:
         ToolError: it is none.

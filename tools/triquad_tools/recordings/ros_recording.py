@@ -56,7 +56,7 @@ class RosRecording:
     """A bag or an MCAP file with clouds or depth images, and poses."""
 
     def __init__(self, bag: Bag, options: RosOptions) -> None:
-        """Look through all of it.
+        """Check all of it.
 
         Raises:
             ToolError: it is damaged, or does not hold what ``options`` ask for.
@@ -81,7 +81,7 @@ class RosRecording:
 
     @property
     def remarks(self) -> Sequence[str]:
-        """What is left out and why, and what to do about it: a line each."""
+        """The problems: what is left out and why, and what to do about it, a line each."""
         lines: list[str] = []
         if self._survey.missing > 0:
             lines.append(_MISSING.format(count=self._survey.missing))
@@ -103,10 +103,10 @@ class RosRecording:
         return lines
 
     def read(self, indices: Sequence[int]) -> Iterator[PosedScan]:
-        """The scans of these numbers, which increase, one after the other.
+        """Yield the scans of these numbers, which increase, one after the other.
 
         Raises:
-            ToolError: the recording is no longer what it was when it was looked through.
+            ToolError: the recording is no longer what it was when it was checked.
         """
         wanted = {(self._placed[i].topic, self._placed[i].number) for i in indices}
         if not wanted:
@@ -149,7 +149,7 @@ class RosRecording:
         return sweep
 
     def _place_clouds(self) -> list[_PlacedCloud]:
-        """Choose the poses, and sort out which clouds they place."""
+        """Choose the poses, and find out which clouds they place."""
         clouds = [cloud for cloud in self._survey.clouds if cloud.topic in self._topics]
         good = [cloud for cloud in clouds if cloud.problem is None]
         if good:
@@ -201,7 +201,7 @@ class RosRecording:
         )
 
     def _use(self, topic: str, has_clouds: bool) -> str:
-        """What is made of a topic."""
+        """Return what a topic is used for."""
         placed = sum(each.topic == topic for each in self._placed)
         if placed:
             return f"{placed} scans, source {source_of_topic(topic)}"
@@ -221,7 +221,7 @@ class RosRecording:
 
 
 def _chosen_topics(found: Survey, options: RosOptions) -> set[str]:
-    """The topics to map: those asked for, or all clouds, or where there are none all depth images.
+    """Return the topics to map: those asked for, else all clouds, or if none, all depth images.
 
     Raises:
         ToolError: a topic that was asked for has nothing to map.
@@ -235,7 +235,7 @@ def _chosen_topics(found: Survey, options: RosOptions) -> set[str]:
             raise ToolError(f"--topics {topic}: the topic {what}; to map there is {known}")
     if options.topics:
         return set(options.topics)
-    # A cloud in a frame that stands still is no scan, but a map that somebody made of scans.
+    # A cloud in a frame that stands still is no scan, but a map made of scans.
     scans = {cloud.topic for cloud in found.clouds if cloud.frame not in ROOT_NAMES} or there
     clouds = {topic for topic in scans if found.kinds[topic] == type_store.POINT_CLOUD}
     return clouds or scans

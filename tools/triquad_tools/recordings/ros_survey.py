@@ -1,4 +1,4 @@
-"""All that a recording of ROS holds, found by one pass over it."""
+"""The content of a recording of ROS, found in one pass over it."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -31,7 +31,7 @@ _READ_KINDS = (type_store.POINT_CLOUD, type_store.IMAGE, type_store.CAMERA_INFO)
 
 @dataclass(frozen=True)
 class SeenCloud:
-    """A cloud or depth image of which the points were looked at and forgotten."""
+    """A cloud or depth image whose points were checked, but not kept."""
 
     topic: str
     number: int  # of the messages on its topic
@@ -54,7 +54,7 @@ class PoseTopic:
 
 @dataclass
 class Survey:
-    """What a recording holds."""
+    """The content of a recording."""
 
     kinds: dict[str, str]  # type of the messages by topic
     counts: Counter[str] = field(default_factory=Counter)
@@ -67,7 +67,7 @@ class Survey:
 
 
 def survey(bag: Bag, *, recorder_clock: bool) -> Survey:
-    """Look through all of a bag.
+    """Check all of a bag.
 
     Raises:
         ToolError: it is damaged.
@@ -94,7 +94,7 @@ def survey(bag: Bag, *, recorder_clock: bool) -> Survey:
 
 
 def sweep_of_image(image: Any, topic: str, cameras: Mapping[str, Any], stride: int = 1) -> Sweep:
-    """What a depth image shows that was recorded on ``topic``.
+    """Return the sweep of a depth image that was recorded on ``topic``.
 
     Raises:
         NoScanError: it is none, or what is known of its camera was not recorded.
@@ -110,7 +110,7 @@ def sweep_of_image(image: Any, topic: str, cameras: Mapping[str, Any], stride: i
 
 
 class _Reader:
-    """Takes in messages by their types."""
+    """Reads messages by their types."""
 
     def __init__(self, found: Survey, recorder_clock: bool) -> None:
         self._found = found

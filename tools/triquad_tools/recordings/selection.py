@@ -1,4 +1,4 @@
-"""What of a recording is to be mapped."""
+"""The part of a recording that is to be mapped."""
 
 import argparse
 from collections.abc import Iterator, Sequence
@@ -29,19 +29,19 @@ class Selection:
 
     @property
     def entries(self) -> list[ScanEntry]:
-        """When each was taken, and by which sensor."""
+        """The time and sensor of each scan."""
         entries = self.recording.entries
         return [entries[index] for index in self.indices]
 
     def scans(self, start: int = 0) -> Iterator[PosedScan]:
-        """The scans from number ``start`` on, one after the other."""
+        """Yield the scans from number ``start`` on, one after the other."""
         for scan in self.recording.read(self.indices[start:]):
             points = points_in_range(np.asarray(scan.points, np.float32), self.range_min_m)
             yield PosedScan(points, scan.world_from_sensor)
 
 
 def open_selected(options: argparse.Namespace) -> Selection:
-    """The recording of the arguments and the scans they choose; its remarks are told.
+    """Return the recording of the arguments and the scans they choose; its remarks are printed.
 
     Raises:
         ToolError: it cannot be read, or no scan is left to map.
@@ -63,7 +63,7 @@ def open_selected(options: argparse.Namespace) -> Selection:
 
 
 def _chosen(entries: Sequence[ScanEntry], options: argparse.Namespace) -> list[int]:
-    """The numbers of the scans within the times, every Nth of each sensor, and not withheld."""
+    """Return the numbers of scans within the times, every Nth of each sensor, not withheld."""
     first_ns = min(entry.stamp_ns for entry in entries)
     end_s = float("inf") if options.end is None else options.end
     numbers: dict[str, int] = {}

@@ -1,4 +1,4 @@
-"""Text files of numbers, line by line: what is wrong with one is told with its place."""
+"""Text files of numbers, line by line: errors name their place."""
 
 import math
 from collections.abc import Sequence
@@ -14,19 +14,19 @@ from triquad_tools.console.command import ToolError
 
 
 class Line(NamedTuple):
-    """A line that says something."""
+    """A line that is neither blank nor a comment."""
 
     place: str  # file and number of the line, for messages
     text: str
 
     @property
     def words(self) -> list[str]:
-        """What stands between blanks or commas."""
+        """The words between blanks or commas."""
         return self.text.replace(",", " ").split()
 
 
 def read_lines(path: Path) -> list[Line]:
-    """The lines of a file that are neither blank nor comments, which begin with ``#``."""
+    """Return the lines of a file that are neither blank nor comments, which begin with ``#``."""
     lines = path.read_text(errors="replace").splitlines()
     return [
         Line(f"{path}:{number}", line.strip())
@@ -36,7 +36,7 @@ def read_lines(path: Path) -> list[Line]:
 
 
 def parse_numbers(place: str, words: Sequence[str]) -> list[float]:
-    """The finite numbers that the words are.
+    """Return the finite numbers that the words are.
 
     Raises:
         ToolError: a word is none.
@@ -55,7 +55,7 @@ def _parse_number(place: str, word: str) -> float:
 
 
 def parse_stamp(place: str, word: str, earliest_ns: int) -> int:
-    """Nanoseconds of seconds; decimal, for a float of seconds since 1970 is off by 100 ns.
+    """Convert decimal seconds to nanoseconds: a float of seconds since 1970 is off by 100 ns.
 
     Raises:
         ToolError: the word is no number of seconds, or before ``earliest_ns``, the time of the
@@ -73,7 +73,7 @@ def parse_stamp(place: str, word: str, earliest_ns: int) -> int:
 
 
 def parse_rigid(place: str, words: Sequence[str]) -> Doubles:
-    """The pose ``[4, 4]`` of 12 numbers, row-major 3 x 4, its rotation made orthonormal.
+    """Return the pose ``[4, 4]`` of 12 numbers, row-major 3 x 4, its rotation made orthonormal.
 
     Raises:
         ToolError: they are no rotation and translation.

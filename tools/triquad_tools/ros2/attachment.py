@@ -1,4 +1,4 @@
-"""What rmw_zenoh attaches to messages, and how many never arrived, as their numbers tell."""
+"""The attachments of rmw_zenoh to messages, whose numbers show how many never arrived."""
 
 import struct
 from collections import OrderedDict
@@ -11,15 +11,15 @@ _MAX_MISSED = 2**20  # a larger step is of a publisher that was started again, o
 
 
 class SequenceGaps:
-    """The last number of each publisher; those heard of longest ago are forgotten."""
+    """The last number of each publisher; the oldest are removed."""
 
     def __init__(self) -> None:
         self._last: OrderedDict[bytes, int] = OrderedDict()
 
     def missed(self, attachment: bytes) -> int:
-        """How many messages of its publisher are missing before one with this attachment.
+        """Return how many messages of its publisher are missing before one with this attachment.
 
-        What is attached in another form, as by old releases, tells nothing, and neither does a
+        An attachment in another form, as by old releases, is ignored, and so is a
         number below 0 or one that is too far ahead.
         """
         if len(attachment) != ATTACHMENT.size:

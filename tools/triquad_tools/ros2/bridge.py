@@ -26,7 +26,7 @@ class Bridge:
     """Takes part in ROS 2 for a map server, until it is closed; session and client stay open."""
 
     def __init__(self, session: zenoh.Session, client: Client, options: BridgeOptions) -> None:
-        """Begin: ``session`` reaches the nodes of ROS, ``client`` the server."""
+        """Start the bridge: ``session`` reaches the nodes of ROS, ``client`` the server."""
         topics = options.topics
         below = f" below {topics.prefix}" if topics.prefix else ""
         _log.info("listening in domain %d%s", topics.domain, below)
@@ -53,14 +53,14 @@ class Bridge:
 
     @property
     def published(self) -> int:
-        """Scans that were published to the server."""
+        """The number of scans that were published to the server."""
         return self._intake.scans.count
 
     @property
     def dropped(self) -> dict[str, int]:
-        """Messages of which no scan could be published, by reason."""
+        """The messages of which no scan could be published, by reason."""
         return self._intake.drops.counts()
 
     def close(self) -> None:
-        """Take in and publish no more."""
+        """Receive and publish no more."""
         self._parts.close()

@@ -18,7 +18,7 @@ NODE_NAME = "triquad"
 
 
 class Node:
-    """Announces what the bridge publishes and subscribes to, for as long as it is not closed."""
+    """Announces what the bridge publishes and subscribes to, until it is closed."""
 
     def __init__(self, session: zenoh.Session, domain: int) -> None:
         self._session = session

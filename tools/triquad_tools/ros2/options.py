@@ -1,4 +1,4 @@
-"""What the bridge is asked to do."""
+"""Options of the bridge."""
 
 from dataclasses import dataclass, field
 
@@ -13,7 +13,7 @@ MAX_GRID_CELLS = 250_000
 
 @dataclass(frozen=True)
 class ScanOptions:
-    """How messages become scans."""
+    """Options for turning messages into scans."""
 
     depth_stride: int = 2  # every how many rows and columns of a depth image one is taken
     body_frame: str = "base_link"  # whose pose a topic of PoseStamped gives
@@ -24,7 +24,7 @@ class ScanOptions:
 
 @dataclass(frozen=True)
 class MeshOptions:
-    """How the mesh is published."""
+    """Options for publishing the mesh."""
 
     level: int = 1  # of detail: cells are twice as large at each
     bytes_per_s: int = 5_000_000  # of markers, at most
@@ -32,7 +32,7 @@ class MeshOptions:
 
 @dataclass(frozen=True)
 class SliceShape:
-    """Which slice of the map is published as an occupancy grid."""
+    """The slice of the map that is published as an occupancy grid."""
 
     height_m: float = 0.5  # in the map frame
     side_m: float = 40.0
@@ -40,11 +40,11 @@ class SliceShape:
 
     @property
     def cells(self) -> int:
-        """Cells along each side."""
+        """The cells along each side."""
         return max(1, round(self.side_m / self.cell_m))
 
     def around(self, position_m: Doubles) -> Bounds:
-        """The corners of a flat box around a position [3], on a lattice that stays."""
+        """Return the corners of a flat box around a position [3], on a lattice that stays."""
         first = np.round(position_m[:2] / self.cell_m) - self.cells // 2
         low, high = first * self.cell_m, (first + self.cells) * self.cell_m
         return [*low.tolist(), self.height_m], [*high.tolist(), self.height_m]
@@ -52,7 +52,7 @@ class SliceShape:
 
 @dataclass(frozen=True)
 class BridgeOptions:
-    """All that the bridge is asked to do."""
+    """All options of the bridge."""
 
     topics: TopicChoice = field(default_factory=TopicChoice)
     scans: ScanOptions = field(default_factory=ScanOptions)

@@ -47,7 +47,7 @@ class ServerProcess:
             file = Path(self._folder.name) / "zenoh.json5"
             file.write_text(_network(given.map, topics))
             command += ["--config", str(file)]
-        # A service manager may watch this process; it is the server that tells how it is.
+        # A service manager may watch this process; it is the server that reports its state.
         environment = {key: value for key, value in os.environ.items() if key != "WATCHDOG_PID"}
         self._process = subprocess.Popen(command, env=environment, preexec_fn=_end_with_parent)
 
@@ -73,12 +73,12 @@ class ServerProcess:
 
 
 def _end_with_parent() -> None:
-    """Let the system stop the server where the bridge is killed: it would hold the port."""
+    """Let the system stop the server if the bridge is killed: it would occupy the port."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def _parsed(arguments: Sequence[str]) -> argparse.Namespace:
-    """What the bridge has to know of the server's arguments."""
+    """Return what the bridge has to know of the server's arguments."""
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--map", default=DEFAULT_MAP)
     parser.add_argument("-l", "--listen", action="append")
@@ -87,7 +87,7 @@ def _parsed(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def _reached(endpoint: str) -> str:
-    """Where a program of this machine reaches what listens at an endpoint."""
+    """Return where a program of this machine reaches what listens at an endpoint."""
     protocol, host, port = Locator.of(endpoint)
     return f"{protocol}/{_ANYWHERE[host]}:{port}" if host in _ANYWHERE and port else endpoint
 

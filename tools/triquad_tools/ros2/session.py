@@ -18,7 +18,7 @@ _SETTINGS = {
 
 
 def open_session(router: str | None, file: Path | None) -> zenoh.Session:
-    """A client of the router that the nodes use, to be closed by the caller.
+    """Return a client of the router that the nodes use; the caller closes it.
 
     Args:
         router: its endpoint; ``None``: that of the file, or else port 7447 of this machine.

@@ -1,4 +1,4 @@
-"""Watching liveliness tokens: who publishes on topics, and who subscribes to them."""
+"""Watching liveliness tokens of publishers and subscribers."""
 
 import logging
 from collections.abc import Callable
@@ -11,7 +11,7 @@ _log = logging.getLogger("triquad_ros2")
 
 
 class TokenWatch:
-    """Tells of everybody else who has one end of a topic, those that are there already first."""
+    """Reports all others that have one end of a topic, existing ones first."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Which topics are taken in, what for, and the keys of Zenoh on which their messages come."""
+"""The topics that are received, their roles, and the keys of Zenoh for their messages."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,11 +16,11 @@ from triquad_tools.sensors.ros.type_store import (
 )
 
 TF_POSES = "tf"
-"""Stands for transforms where a topic of poses could be named."""
+"""Stands for transforms in place of a topic of poses."""
 
 
 class Role(Enum):
-    """What messages are for."""
+    """The role of messages."""
 
     CLOUD = "cloud"
     DEPTH = "depth image"
@@ -69,7 +69,7 @@ class TopicChoice:
     def named(
         cls, domain: int, namespace: str, *, clouds: list[str], depth: list[str], poses: str
     ) -> "TopicChoice":
-        """The choice of names below a namespace, all with or without leading slashes."""
+        """Return the choice of names below a namespace, all with or without leading slashes."""
         prefix = full_name("", namespace).rstrip("/")
         return cls(
             domain,
@@ -95,10 +95,10 @@ class TopicChoice:
         return full_name(self.prefix, "triquad/grid")
 
     def feeds(self) -> Iterator[Feed]:
-        """What to subscribe to from the start.
+        """Return what to subscribe to from the start.
 
         Where clouds are not chosen, those of zenoh-bridge-ros2dds are found by their tokens, since
-        their keys do not tell types.
+        their keys do not give types.
         """
         for role, names in self._names().items():
             for name in names:
@@ -110,7 +110,7 @@ class TopicChoice:
             yield Feed(Role.CLOUD, rmw_key(self.domain, anywhere), None)
 
     def wants(self, topic: Topic) -> Role | None:
-        """What a topic that was found is wanted for."""
+        """Return the role of a topic that was found."""
         for role, names in self._names().items():
             if topic.name in names and topic.type_name in TYPES[role]:
                 return role
@@ -118,7 +118,7 @@ class TopicChoice:
         return Role.CLOUD if is_cloud and self.takes_any_cloud else None
 
     def _names(self) -> dict[Role, tuple[str, ...]]:
-        """The topics whose names are known."""
+        """Return the topics whose names are known."""
         infos = tuple(camera_topic(name) for name in self.depth)
         names = {
             Role.CLOUD: self.clouds,
@@ -132,5 +132,5 @@ class TopicChoice:
 
 
 def full_name(prefix: str, name: str) -> str:
-    """A topic's name with a leading slash, behind ``prefix``."""
+    """Return a topic's name with a leading slash, behind ``prefix``."""
     return f"{prefix}/{name.strip('/')}"

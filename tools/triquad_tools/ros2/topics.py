@@ -11,7 +11,7 @@ from triquad_tools.sensors.ros.type_store import type_store
 
 ANY_HASH = "*"
 NO_HASH = "TypeHashNotSupported"
-"""What ROS 2 Humble, which knows no hashes of types, writes in their place."""
+"""The text that ROS 2 Humble, which knows no hashes of types, writes in their place."""
 
 
 class End(Enum):
@@ -31,7 +31,7 @@ class Topic:
 
 @dataclass(frozen=True)
 class Announcement:
-    """What a token says: that somebody publishes on a topic, or subscribes to it."""
+    """The content of a token: there is a publisher or a subscriber of a topic."""
 
     end: End
     topic: Topic
@@ -39,27 +39,27 @@ class Announcement:
 
 
 def type_hash(type_name: str) -> str:
-    """The hash of a type, RIHS01 (REP 2016)."""
+    """Return the hash of a type, RIHS01 (REP 2016)."""
     return str(type_store().hash_rihs01(type_name))
 
 
 def rmw_key(domain: int, topic: Topic, type_hash: str = ANY_HASH) -> str:
-    """The key of a topic in rmw_zenoh; the name may be ``/**``."""
+    """Return the key of a topic in rmw_zenoh; the name may be ``/**``."""
     return f"{domain}{topic.name}/{_dds_type(topic.type_name)}/{type_hash}"
 
 
 def rmw_topic_name(key: str) -> str:
-    """The name of the topic that has a key of rmw_zenoh."""
+    """Return the name of the topic that has a key of rmw_zenoh."""
     return "/" + "/".join(key.split("/")[1:-2])
 
 
 def bridge_key(topic_name: str) -> str:
-    """The key of a topic at a bridge, which has no type."""
+    """Return the key of a topic at a bridge, which has no type."""
     return topic_name.lstrip("/")
 
 
 def old_bridge_cache(topic_name: str) -> str:
-    """Where bridges up to 1.5 answer with what they published last on a latched topic.
+    """Return where bridges up to 1.5 answer with their last messages on a latched topic.
 
     Later ones, as rmw_zenoh, do so in the way of Zenoh's advanced publishers.
     """
@@ -67,17 +67,17 @@ def old_bridge_cache(topic_name: str) -> str:
 
 
 def rmw_tokens(domain: int, end: End) -> str:
-    """Key expression of all tokens of rmw_zenoh for one end of topics."""
+    """Return key expression of all tokens of rmw_zenoh for one end of topics."""
     return f"@ros2_lv/{domain}/*/*/*/{end.value}/**"
 
 
 def bridge_tokens(end: End) -> str:
-    """Key expression of all tokens of bridges for one end of topics."""
+    """Return key expression of all tokens of bridges for one end of topics."""
     return f"@/*/@ros2_lv/{end.value}/**"
 
 
 def read_token(key: str) -> Announcement | None:
-    """What a token of either way says; None where it says nothing about a topic."""
+    """Return the content of either kind of token; None if it says nothing about a topic."""
     parts = key.split("/")
     try:
         if parts[0] == "@ros2_lv" and len(parts) == 13:
@@ -93,7 +93,7 @@ def read_token(key: str) -> Announcement | None:
 
 @dataclass(frozen=True)
 class Delivery:
-    """How messages are delivered, as tokens have it: quality of service."""
+    """The quality of service of messages, as in tokens."""
 
     reliable: bool = True
     latched: bool = False  # later subscribers get the last ones too: TRANSIENT_LOCAL
@@ -101,35 +101,35 @@ class Delivery:
 
     @property
     def of_rmw(self) -> str:
-        """As rmw_zenoh writes it, which leaves out what is as usual there."""
+        """Return the text of rmw_zenoh, which leaves out its defaults."""
         return f"{'' if self.reliable else 2}:{1 if self.latched else ''}:,{self.depth}:,:,:,,"
 
     def of_bridge(self, type_hash: str) -> str:
-        """As a bridge writes it, with the user data that DDS nodes expect since Iron."""
+        """Return the text of a bridge, with the user data that DDS nodes expect since Iron."""
         kinds = f":{int(self.reliable)}:{int(self.latched)}:0,{self.depth}"
         return f"{kinds}:typehash={type_hash};"
 
 
 @dataclass(frozen=True)
 class Entity:
-    """Who has one end of a topic, in the graph that nodes of rmw_zenoh put together."""
+    """The owner of one end of a topic, in the graph that nodes of rmw_zenoh build."""
 
     session_id: str
     node: str
     number: int  # 0 is the node itself
 
     def rmw_prefix(self, domain: int, kind: str) -> str:
-        """What all its tokens begin with; it has no enclave and no namespace."""
+        """Return the prefix of all its tokens; it has no enclave and no namespace."""
         return f"@ros2_lv/{domain}/{self.session_id}/0/{self.number}/{kind}/%/%/{self.node}"
 
 
 def rmw_node_token(domain: int, entity: Entity) -> str:
-    """The token that says that there is a node."""
+    """Return the token that says that there is a node."""
     return entity.rmw_prefix(domain, "NN")
 
 
 def rmw_token(domain: int, entity: Entity, what: Announcement, delivery: Delivery) -> str:
-    """The token that says to nodes of rmw_zenoh what :func:`read_token` reads."""
+    """Return the token that says to nodes of rmw_zenoh what :func:`read_token` reads."""
     name = what.topic.name.replace("/", "%")
     type_key = f"{_dds_type(what.topic.type_name)}/{what.type_hash}"
     prefix = entity.rmw_prefix(domain, what.end.value)
@@ -137,7 +137,7 @@ def rmw_token(domain: int, entity: Entity, what: Announcement, delivery: Deliver
 
 
 def bridge_token(session_id: str, what: Announcement, delivery: Delivery) -> str:
-    """The token that says to bridges what :func:`read_token` reads."""
+    """Return the token that says to bridges what :func:`read_token` reads."""
     key = bridge_key(what.topic.name).replace("/", "§")
     type_key = what.topic.type_name.replace("/", "§")
     qos = delivery.of_bridge(what.type_hash)

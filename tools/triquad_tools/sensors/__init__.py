@@ -1,1 +1,1 @@
-"""From what robots and sensors say to points with a pose: numpy, and rosbags for ROS."""
+"""Turning data of robots and sensors into points with a pose: numpy, and rosbags for ROS."""

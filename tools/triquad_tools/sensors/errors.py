@@ -1,10 +1,10 @@
-"""Why no scan can be made of what a sensor said. Each text says what to do about it."""
+"""Errors in data of sensors. Each text says what to do about it."""
 
 from triquad_format.errors import TriquadError
 
 
 class NoScanError(TriquadError):
-    """No scan can be made of what a sensor said; ``reason`` is the short key to count it under."""
+    """No scan can be made of a sensor's data; ``reason`` is the short key to count it under."""
 
     def __init__(self, reason: str, text: str) -> None:
         super().__init__(text)
@@ -12,7 +12,7 @@ class NoScanError(TriquadError):
 
 
 class NoTransformError(NoScanError):
-    """Where a sensor was is not known: ``late`` where transforms that still come may tell."""
+    """The pose of a sensor is not known; ``late`` if transforms that still come may give it."""
 
     def __init__(self, reason: str, text: str, *, late: bool = False) -> None:
         super().__init__(reason, text)

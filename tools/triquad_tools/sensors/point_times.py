@@ -10,13 +10,13 @@ TIME_FIELDS = ("t", "time", "timestamp", "offset_time", "time_offset", "time_sta
 """Names under which drivers write it: Ouster; Velodyne; Hesai and RoboSense; Livox; others."""
 
 _UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
-_ENOUGH = 4096  # points, to tell the unit
+_ENOUGH = 4096  # points, to determine the unit
 _MIN_SWEEP_S, _MAX_SWEEP_S = 3e-3, 2.0
-"""What a sweep may take. They are less than a factor of 1000 apart, so one unit at most fits."""
+"""The limits of a sweep's duration. Less than a factor of 1000 apart, they fit one unit at most."""
 
 
 def offsets_s(values: NDArray[Any], stamp_ns: int) -> Doubles | None:
-    """Seconds [N] after the stamp of the cloud; None where there is no sense in the values.
+    """Return seconds [N] after the stamp of the cloud; None where there is no sense in the values.
 
     Drivers write seconds, milliseconds, microseconds or nanoseconds, since the stamp, since the
     first point, or since 1970; which it is follows from how long a sweep can take and from
@@ -46,7 +46,7 @@ def offsets_s(values: NDArray[Any], stamp_ns: int) -> Doubles | None:
 
 
 def _unit_s(spread: Doubles) -> float | None:
-    """The unit in which most points lie within one sweep."""
+    """Return the unit in which most points lie within one sweep."""
     low, high = np.quantile(spread, (0.02, 0.98))
     length = high - low
     fitting = [unit for unit in _UNITS_S if _MIN_SWEEP_S <= length * unit <= _MAX_SWEEP_S]

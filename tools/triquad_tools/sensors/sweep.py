@@ -1,4 +1,4 @@
-"""What a sensor measured in one go, before and after it is known where the sensor was."""
+"""One sweep of a sensor, before and after its pose is known."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ class Sweep:
 
     @property
     def memory_bytes(self) -> int:
-        """What its arrays take."""
+        """The bytes of its arrays."""
         return self.points.nbytes + (0 if self.offsets_s is None else self.offsets_s.nbytes)
 
 
@@ -31,6 +31,6 @@ class PosedScan:
 
 
 def moved(points: NDArray[np.floating], pose: NDArray[np.floating]) -> Doubles:
-    """Points [N, 3] by a pose [4, 4], in double precision: they may lie far from the origin."""
+    """Move points [N, 3] by a pose [4, 4], in double precision: they may be far from the origin."""
     result: Doubles = points.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
     return result

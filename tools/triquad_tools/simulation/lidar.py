@@ -22,7 +22,7 @@ _TILT_RAD = math.radians(1.0)  # of the gentle roll and pitch
 
 @dataclass(frozen=True)
 class SimulatedScan(PosedScan):
-    """What the sensor measured: returns with range noise, and the truth behind each."""
+    """The sensor's measurements: returns with range noise, and the truth behind each."""
 
     true_hits: Doubles  # [N, 3] metres, world frame, exactly on the surface
     no_return: Floats  # [M, 3] unit vectors, sensor frame, of the rays that met nothing
@@ -57,7 +57,7 @@ class Lidar:
     def scan(
         self, scene: Scene, world_from_sensor: Doubles, rng: np.random.Generator
     ) -> SimulatedScan:
-        """One scan of ``scene`` from a pose ``[4, 4]`` in its free space."""
+        """Return one scan of ``scene`` from a pose ``[4, 4]`` in its free space."""
         rotation, origin = world_from_sensor[:3, :3], world_from_sensor[:3, 3]
         rays = self.directions @ rotation.T
         ranges = scene.cast(origin, rays, self.range_max_m)
@@ -79,7 +79,7 @@ class Sensor(Protocol):
     def scan(
         self, scene: Scene, world_from_sensor: Doubles, rng: np.random.Generator
     ) -> SimulatedScan:
-        """One scan of ``scene`` from a pose ``[4, 4]`` in its free space."""
+        """Return one scan of ``scene`` from a pose ``[4, 4]`` in its free space."""
 
 
 @dataclass(frozen=True)
@@ -98,12 +98,12 @@ class SimulatedDrive:
         return (self.scan(index) for index in range(len(self)))
 
     def scan(self, index: int) -> SimulatedScan:
-        """Scan ``index`` of the drive."""
+        """Return scan ``index`` of the drive."""
         rng = np.random.default_rng([self.seed, index])
         return self.sensor.scan(self.scene, self.poses[index], rng)
 
     def true_hits(self, voxel_m: float = 0.02) -> Doubles:
-        """What the sensor could have seen: exact surface points ``[N, 3]``, world frame.
+        """Return what the sensor could have seen: exact surface points ``[N, 3]``, world frame.
 
         The noise-free hits of all scans, one per voxel of side ``voxel_m``.
         """
@@ -111,7 +111,7 @@ class SimulatedDrive:
 
 
 def drive(scene: Scene, n_scans: int, step_m: float) -> Doubles:
-    """Poses ``world_from_sensor [n_scans, 4, 4]`` of a drive along a street.
+    """Return poses ``world_from_sensor [n_scans, 4, 4]`` of a drive along a street.
 
     The sensor starts at ``x = 0``, 1.8 m above the road, in the lane at ``y < 0``, weaving gently
     and rolling and pitching by about a degree. At the end of the road it turns and comes back in
@@ -132,7 +132,7 @@ def drive(scene: Scene, n_scans: int, step_m: float) -> Doubles:
 
 
 def _positions(travelled: Doubles, length_m: float) -> Doubles:
-    """Positions ``[n, 3]`` on a stadium of two lanes joined by half circles."""
+    """Return positions ``[n, 3]`` on a stadium of two lanes joined by half circles."""
     turn = math.pi * _LANE_M
     lap = travelled % (2.0 * (length_m + turn))
     back = lap >= length_m + turn

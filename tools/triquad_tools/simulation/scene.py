@@ -23,7 +23,7 @@ class Scene:
     """A union of solids in a world frame, right-handed, z up, metres.
 
     The signed distance is positive in free space and negative inside solids. Outside it is exact
-    everywhere. Inside it is exact wherever :meth:`is_exact` says so: everywhere but beside seams,
+    everywhere. Inside it is exact wherever :meth:`is_exact` says so: everywhere but near seams,
     where the nearest surface of one solid lies hidden inside another one. There its magnitude is
     a lower bound of the depth.
     """
@@ -40,29 +40,29 @@ class Scene:
         return low, high
 
     def sdf(self, points: Doubles) -> Doubles:
-        """Signed distances ``[N]`` in metres at points ``[N, 3]`` of the world."""
+        """Return signed distances ``[N]`` in metres at points ``[N, 3]`` of the world."""
         return self._nearest(points)[0]
 
     def gradient(self, points: Doubles) -> Doubles:
-        """Unit gradients ``[N, 3]`` of the signed distance at points ``[N, 3]`` of the world."""
+        """Return unit gradients ``[N, 3]`` of the signed distance at world points ``[N, 3]``."""
         return self._nearest(points)[1]
 
     def is_exact(self, points: Doubles) -> Bools:
-        """Whether the signed distance is exact, ``[N]``, at points ``[N, 3]`` of the world.
+        """Return whether the signed distance is exact, ``[N]``, at points ``[N, 3]`` of the world.
 
         No part of the surface is nearer than the distance says; it is exact where the closest
-        point that it tells of really lies on the surface.
+        point that it gives really lies on the surface.
         """
         distances, gradients = self._nearest(points)
         closest = points - distances[:, None] * gradients
         return (distances >= 0.0) | (np.abs(self.sdf(closest)) < _ON_SURFACE_M)
 
     def is_inside_house(self, points: Doubles, margin_m: float = 0.5) -> Bools:
-        """Whether points ``[N, 3]`` lie deeper than ``margin_m`` in a house: space never seen."""
+        """Return whether points ``[N, 3]`` lie over ``margin_m`` deep in a house: never seen."""
         return self._houses.sdf(points) < -margin_m
 
     def cast(self, origin: Doubles, directions: Doubles, range_max_m: float) -> Doubles:
-        """Ranges ``[N]`` in metres at which rays first hit a solid; infinite where none does.
+        """Return ranges ``[N]``, metres, at which rays first hit a solid; infinite if none.
 
         Args:
             origin: ``[3]`` metres, world frame, in free space.
@@ -91,12 +91,12 @@ class Scene:
         return Scene(self.houses, self.bounds)
 
     def _nearest(self, points: Doubles) -> tuple[Doubles, Doubles]:
-        """Distances [N] to the nearest solids, and their gradients [N, 3]."""
+        """Return distances [N] to the nearest solids, and their gradients [N, 3]."""
         return _nearest(self._table, *self._grid, _rows(points))
 
 
 def _rows(points: Doubles) -> Doubles:
-    """``points`` as the contiguous ``[N, 3]`` float64 that the kernels are compiled for."""
+    """Return ``points`` as the contiguous ``[N, 3]`` float64 that the kernels are compiled for."""
     rows = np.ascontiguousarray(points, np.float64)
     if rows.ndim != 2 or rows.shape[1] != 3:
         raise ValueError(f"expected points [N, 3], got an array {list(rows.shape)}")
@@ -104,9 +104,9 @@ def _rows(points: Doubles) -> Doubles:
 
 
 class _CandidateGrid(NamedTuple):
-    """Per cube of a grid, the solids that are nearest to some point of that cube.
+    """The solids that are nearest to some point of each cube of a grid.
 
-    The last list, for points beside the grid, names all solids.
+    The last list, for points outside the grid, names all solids.
     """
 
     origin: Doubles  # [3] metres, lower corner
@@ -116,7 +116,7 @@ class _CandidateGrid(NamedTuple):
 
 
 def _candidate_grid(solids: Doubles, bounds: Doubles) -> _CandidateGrid:
-    """The grid over ``bounds [2, 3]`` for a table of solids ``[S, 11]``."""
+    """Return the grid over ``bounds [2, 3]`` for a table of solids ``[S, 11]``."""
     shape = np.ceil((bounds[1] - bounds[0]) / CELL_M).astype(np.int64)
     cells = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1)
     centres = bounds[0] + (cells.reshape(-1, 3) + 0.5) * CELL_M
@@ -144,7 +144,7 @@ def _all_distances(solids: Doubles, points: Doubles) -> Doubles:
 
 @inner_kernel()
 def _cell(origin: Doubles, shape: Longs, point: Doubles) -> int:
-    """The flat index of a point's cell; one past the last for a point beside the grid."""
+    """Return the flat index of a point's cell; one past the last for a point outside the grid."""
     flat = np.int64(0)
     for axis in range(3):
         cell = np.floor((point[axis] - origin[axis]) / CELL_M)
@@ -210,7 +210,7 @@ def _cast(
 
 @inner_kernel()
 def _hit(row: Doubles, origin: Doubles, direction: Doubles, start: float, limit: float) -> float:
-    """Range from ``start`` on at which a ray hits one solid; ``limit`` if that is nearer."""
+    """Return the range from ``start`` on at which a ray hits one solid; ``limit`` if nearer."""
     dx, dy, dz = direction[0], direction[1], direction[2]
     t = start
     for _ in range(_NEWTON_STEPS):

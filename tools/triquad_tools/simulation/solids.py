@@ -36,12 +36,12 @@ class Solid:
 
 
 def half_space(height_m: float) -> Solid:
-    """All that lies below ``z = height_m``."""
+    """Return all that lies below ``z = height_m``."""
     return Solid(HALF_SPACE, (0.0, 0.0, height_m), 0.0, (0.0,) * 4, math.inf)
 
 
 def box(centre: Vector, half: Vector, yaw: float = 0.0, radius: float = 0.0) -> Solid:
-    """A box with half sides ``half``, its edges rounded with ``radius`` within these sides."""
+    """Return a box with half sides ``half``, its edges rounded with ``radius`` within them."""
     if not 0.0 <= radius <= min(half):
         raise ValueError(f"radius {radius!r} does not fit a box of half sides {half!r}")
     core = (half[0] - radius, half[1] - radius, half[2] - radius)
@@ -49,18 +49,18 @@ def box(centre: Vector, half: Vector, yaw: float = 0.0, radius: float = 0.0) -> 
 
 
 def sphere(centre: Vector, radius: float) -> Solid:
-    """A ball: a box that is nothing but rounding."""
+    """Return a ball: a box that is nothing but rounding."""
     return box(centre, (radius, radius, radius), 0.0, radius)
 
 
 def cylinder(centre: Vector, radius: float, half_height: float) -> Solid:
-    """A vertical cylinder with flat caps."""
+    """Return a vertical cylinder with flat caps."""
     size = (radius, half_height, 0.0, 0.0)
     return Solid(CYLINDER, centre, 0.0, size, math.hypot(radius, half_height))
 
 
 def gable(centre: Vector, half: Vector, eave: float, yaw: float = 0.0) -> Solid:
-    """A house with a pitched roof: a box of half sides ``half`` cut by two slopes.
+    """Return a house with a pitched roof: a box of half sides ``half`` cut by two slopes.
 
     The ridge runs along the local x axis at the top of the box; the slopes begin at height
     ``eave`` above its bottom.
@@ -71,7 +71,7 @@ def gable(centre: Vector, half: Vector, eave: float, yaw: float = 0.0) -> Solid:
 
 
 def solid_table(solids: tuple[Solid, ...]) -> Doubles:
-    """The table ``[S, 11]`` of solids that the kernels read."""
+    """Return the table ``[S, 11]`` of solids that the kernels read."""
     return np.array([solid.row for solid in solids], np.float64).reshape(-1, _COLUMNS)
 
 
@@ -95,7 +95,7 @@ def _box_distance(row: Doubles, x: float, y: float, z: float) -> Distance:
 
 @inner_kernel()
 def _extrude(profile: float, along: float) -> tuple[float, float, float]:
-    """Distance to a profile extruded along an axis, and its derivatives by both arguments."""
+    """Return the distance to a profile extruded along an axis, and its partial derivatives."""
     if profile <= 0.0 and along <= 0.0:
         return (profile, 1.0, 0.0) if profile >= along else (along, 0.0, 1.0)
     mp, ma = max(profile, 0.0), max(along, 0.0)
@@ -113,7 +113,7 @@ def _cylinder_distance(row: Doubles, x: float, y: float, z: float) -> Distance:
 
 @inner_kernel()
 def _gable_profile(row: Doubles, y: float, z: float) -> tuple[float, float, float]:
-    """Distance to the right half of a gable's outline (``y >= 0``, ``z`` from the bottom)."""
+    """Return distance to the right half of a gable's outline (``y >= 0``, ``z`` from below)."""
     width, ridge, eave = row[_B], 2.0 * row[_C], row[_D]
     slope = math.sqrt(width * width + (ridge - eave) * (ridge - eave))
     ny, nz = (ridge - eave) / slope, width / slope  # normal of the roof
@@ -145,7 +145,7 @@ def _gable_distance(row: Doubles, x: float, y: float, z: float) -> Distance:
 
 @inner_kernel()
 def distance_to(row: Doubles, x: float, y: float, z: float) -> Distance:
-    """Signed distance of a world point to the solid of a row, and its gradient, world frame."""
+    """Return a world point's signed distance to a row's solid, and its gradient, world frame."""
     kind = row[_KIND]
     if kind == HALF_SPACE:
         return z - row[Z], 0.0, 0.0, 1.0

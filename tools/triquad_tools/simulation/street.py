@@ -17,7 +17,7 @@ _MARGIN_M = 12.0  # of street before the start and after the end of the drive
 
 
 def street(seed: int, length_m: float = 100.0) -> Scene:
-    """A street along the x axis from ``x = 0`` to ``length_m``, its road surface at ``z = 0``.
+    """Return a street along x from ``x = 0`` to ``length_m``, its road surface at ``z = 0``.
 
     The same seed gives the same street. Bounds reach ``12`` m beyond both ends.
     """
@@ -36,13 +36,13 @@ def street(seed: int, length_m: float = 100.0) -> Scene:
 
 
 def street_drive(seed: int, scans: int, step_m: float = 1.0) -> SimulatedDrive:
-    """A drive along street ``seed``, scans ``step_m`` apart; always the same scans."""
+    """Return a drive along street ``seed``, scans ``step_m`` apart; always the same scans."""
     scene = street(seed)
     return SimulatedDrive(scene, Lidar(), drive(scene, scans, step_m), seed=seed)
 
 
 def _standing(foot: Vector, half_x: float, half_y: float, height: float, yaw: float = 0.0) -> Solid:
-    """A box that stands at ``foot`` and is buried below it."""
+    """Return a box that stands at ``foot`` and is buried below it."""
     half_z = 0.5 * (height + _BURIED_M)
     centre = (foot[0], foot[1], foot[2] + height - half_z)
     return box(centre, (half_x, half_y, half_z), yaw)
@@ -71,7 +71,7 @@ def _houses(rng: np.random.Generator, side: float, length_m: float) -> list[Soli
 def _flat_house(
     rng: np.random.Generator, foot: Vector, half_x: float, half_y: float
 ) -> list[Solid]:
-    """A block with a ledge around its top and a smaller block on its roof."""
+    """Return a block with a ledge around its top and a smaller block on its roof."""
     height = rng.uniform(5.0, 10.0)
     yaw = rng.normal(0.0, 0.015)
     ledge_z, over = height - rng.uniform(0.4, 0.8), rng.uniform(0.25, 0.5)
@@ -90,7 +90,7 @@ def _flat_house(
 def _gabled_house(
     rng: np.random.Generator, foot: Vector, half_x: float, half_y: float
 ) -> list[Solid]:
-    """A house with a pitched roof, its ridge along or across the street, and a chimney."""
+    """Return a house with a pitched roof, its ridge along or across the street, and a chimney."""
     eave, rise = rng.uniform(3.5, 6.5), rng.uniform(1.8, 3.5)
     along = rng.uniform() < 0.6
     yaw = rng.normal(0.0, 0.015) + (0.0 if along else 0.5 * math.pi)
@@ -112,7 +112,7 @@ def _gabled_house(
 def _front(
     rng: np.random.Generator, side: float, foot: Vector, half_x: float, front: float
 ) -> list[Solid]:
-    """What a house has towards the street: a doorstep and perhaps a bay window or a balcony."""
+    """Return the front of a house: a doorstep and perhaps a bay window or a balcony."""
     door = foot[0] + rng.uniform(-0.7, 0.7) * half_x
     step = _standing((door, side * front, 0.0), 0.8, 0.55, rng.uniform(0.3, 0.5))
     x = foot[0] + rng.uniform(-0.5, 0.5) * half_x
@@ -138,7 +138,7 @@ def _cars(rng: np.random.Generator, side: float, length_m: float) -> list[Solid]
 
 
 def _car(rng: np.random.Generator, x: float, y: float) -> list[Solid]:
-    """A body, a cabin and four wheels on the road."""
+    """Return a body, a cabin and four wheels on the road."""
     half_x, half_y = rng.uniform(1.9, 2.3), rng.uniform(0.83, 0.92)
     yaw = rng.normal(0.0, 0.03) + (math.pi if rng.uniform() < 0.5 else 0.0)
     van = rng.uniform() < 0.25
@@ -177,7 +177,7 @@ def _poles_and_trees(rng: np.random.Generator, side: float, length_m: float) -> 
 
 
 def _pole(rng: np.random.Generator, x: float, y: float, side: float) -> list[Solid]:
-    """A lamp post with its arm, or a short sign post with its plate."""
+    """Return a lamp post with its arm, or a short sign post with its plate."""
     radius = rng.uniform(0.05, 0.15)
     lamp = rng.uniform() < 0.6
     height = rng.uniform(5.0, 7.0) if lamp else rng.uniform(2.3, 2.9)
@@ -191,7 +191,7 @@ def _pole(rng: np.random.Generator, x: float, y: float, side: float) -> list[Sol
 
 
 def _tree(rng: np.random.Generator, x: float, y: float) -> list[Solid]:
-    """A trunk and a crown of balls."""
+    """Return a trunk and a crown of balls."""
     trunk, crown = rng.uniform(2.2, 3.2), rng.uniform(1.0, 1.6)
     half_z = 0.5 * (trunk + 0.6 * crown + _BURIED_M)
     top = trunk + 0.8 * crown

@@ -1,1 +1,1 @@
-"""How a map server is doing, as it goes: a page for people, and the same figures for programs."""
+"""The live state of a map server: a page for people, and the same figures for programs."""

@@ -1,4 +1,4 @@
-"""What happened between two samples of a server: two pairs of messages in, rates out."""
+"""The rates between two samples of a server, each a pair of messages."""
 
 import math
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ from triquad_format.wire.metrics_messages import ServerMetrics
 
 @dataclass(frozen=True)
 class Sample:
-    """What a server said of itself at one time."""
+    """The state that a server reported at one time."""
 
     status: ServerStatus
     metrics: ServerMetrics
@@ -30,7 +30,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Rates:
-    """What happened in an interval, per second of the server's clock."""
+    """Rates of an interval, per second of the server's clock."""
 
     seconds: float  # length of the interval
     epochs: float
@@ -61,7 +61,7 @@ def rates(before: Sample | None, after: Sample) -> Rates | None:
         return None
 
     def per_s(earlier: float, later: float) -> float:
-        return max(0.0, later - earlier) / seconds  # counts of sources that are forgotten shrink
+        return max(0.0, later - earlier) / seconds  # counts of sources that are removed shrink
 
     def each(earlier: Mapping[str, float], later: Mapping[str, float]) -> dict[str, float]:
         return {name: per_s(earlier.get(name, 0.0), count) for name, count in later.items()}

@@ -14,7 +14,7 @@ from triquad_tools.console.amounts import count, duration, milliseconds, rate, s
 from triquad_tools.top.interval import Rates, Sample
 
 _COLUMN_WIDTH, _GAP = 39, 2  # characters that a table needs, and between columns
-_SILENT_S = 5.0  # of a source, while others are heard
+_SILENT_S = 5.0  # of a source, while others are active
 _OVERDUE_EPOCH_S = 10.0  # while there is something to learn, two a second are published
 _NEARLY_FULL = 0.9  # of what the map may take
 
@@ -23,7 +23,7 @@ Rows = list[tuple[str, ...]]
 
 @dataclass(frozen=True)
 class Seen:
-    """What is known of a server."""
+    """The known state of a server."""
 
     sample: Sample
     rates: Rates | None  # None: this is the first sample of this server

@@ -1,6 +1,6 @@
-"""Which requests the page answers: of those who opened it, and of no other page in their browser.
+"""The requests that the page answers: its own, and those of no other page in the browser.
 
-A browser lets any page send requests to this machine. It says in ``Origin`` whose page asks, and in
+A browser lets any page send requests to this machine. Its ``Origin`` says whose page asks, its
 ``Host`` under which name: a name that is not ours was made to point here.
 """
 
@@ -23,7 +23,7 @@ _patching = threading.Lock()
 
 
 class AllowedOrigins:
-    """Tells which requests are answered."""
+    """Decides which requests are answered."""
 
     def __init__(self, allowed_hosts: Sequence[str] = ()) -> None:
         """``allowed_hosts`` are names of this machine beyond its addresses and its host name."""
@@ -32,7 +32,7 @@ class AllowedOrigins:
         self._own = self._given | {"localhost", name, f"{name}.local"}
 
     def refusal(self, headers: Headers) -> str | None:
-        """Why a request is not answered, or ``None``."""
+        """Return why a request is not answered, or ``None``."""
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         name = _name(hosts[0]) if len(hosts) == 1 else ""
         # Addresses cannot be made to point here by others.
@@ -47,7 +47,7 @@ class AllowedOrigins:
 
 @contextmanager
 def serving_only(allowed: AllowedOrigins) -> Iterator[None]:
-    """Servers of websockets that are started meanwhile answer what is allowed, and nothing else.
+    """Let servers of websockets that are started meanwhile answer only what is allowed.
 
     The viewer's library starts its server where no option reaches it.
     """
@@ -73,7 +73,7 @@ def serving_only(allowed: AllowedOrigins) -> Iterator[None]:
 
 
 def _name(host: str) -> str:
-    """The name or address in a ``Host`` header, without its port."""
+    """Return the name or address in a ``Host`` header, without its port."""
     try:
         return (urlsplit(f"//{host}").hostname or "").lower()
     except ValueError:

@@ -1,4 +1,4 @@
-"""One browser that looks at the map."""
+"""The session of one browser that shows the map."""
 
 from contextlib import ExitStack
 
@@ -41,11 +41,11 @@ class BrowserSession:
             raise
 
     def close(self) -> None:
-        """The browser has left."""
+        """Handle a browser that has left."""
         self._parts.close()
 
     def _show(self, shown: MapSource | History) -> None:
-        """Put the page together; of a history, each browser chooses its own moment."""
+        """Build the page; of a history, each browser chooses its own moment."""
         source: MapSource
         if isinstance(shown, History):
             source = stored = StoredSource(shown.newest(), str(shown.folder))

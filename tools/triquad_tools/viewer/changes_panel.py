@@ -1,4 +1,4 @@
-"""What appeared, vanished and moved between two checkpoints: boxes in the scene, and a list."""
+"""Objects that appeared, vanished and moved between checkpoints: boxes in the scene, and a list."""
 
 from collections.abc import Sequence
 
@@ -24,10 +24,10 @@ _PERIOD_S = 1.0
 _BEFORE = "the checkpoint before"
 _NOTHING = "There is no checkpoint before this one: choose another to compare with."
 
-# Of Okabe and Ito's colours, which all can tell apart, those that stand out on mesh and background.
+# Okabe and Ito's colours, which all can distinguish, that stand out on mesh and background.
 APPEARED, VANISHED, MOVED = "#56b4e9", "#d55e00", "#cc79a7"
 _LISTED, _MOST = 5, 50  # of each kind are in the list, and in the scene
-_ASIDE_M = 0.1  # outlines lie so far outside of what they surround
+_ASIDE_M = 0.1  # outlines lie this far outside of what they surround
 _DASH_SHARE = 0.6  # of a dash and a gap together
 _LINE_PX = 3.0
 _CORNERS = np.array(list(np.ndindex(2, 2, 2)))
@@ -48,7 +48,7 @@ class ChangesPanel(Layer):
         self.start(self._on, self._since)
 
     def refresh(self) -> None:
-        """Compare where another pair of checkpoints is wanted."""
+        """Compare if another pair of checkpoints is wanted."""
         moments = self._history.moments
         options = (_BEFORE, *map(str, reversed(moments)))
         if self._since.options != options:
@@ -67,7 +67,7 @@ class ChangesPanel(Layer):
         self._compared = pair
 
     def _pair(self, moments: Sequence[Moment]) -> tuple[Moment, ...]:
-        """The two that are compared, the earlier one first; empty: there are no two."""
+        """Return the two that are compared, the earlier one first; empty: there are no two."""
         shown = [one for one in moments if one.path == self._source.shown.path]
         if self._since.value == _BEFORE:
             others = [one for one in moments if shown and one.epoch < shown[0].epoch][-1:]
@@ -111,13 +111,13 @@ class ChangesPanel(Layer):
 
 
 def outline(cluster: Cluster) -> Doubles:
-    """The edges [12, 2, 3] of a box around a cluster, a little outside of it."""
+    """Return the edges [12, 2, 3] of a box around a cluster, a little outside of it."""
     low, high = np.array(cluster.low_m) - _ASIDE_M, np.array(cluster.high_m) + _ASIDE_M
     return np.asarray((low + _CORNERS * (high - low))[_EDGES], np.float64)
 
 
 def dashes(lines: Doubles) -> Doubles:
-    """Lines [L, 2, 3] cut into four dashes each."""
+    """Return lines [L, 2, 3] cut into four dashes each."""
     starts = np.arange(4)[:, None, None] / 4
     lows, ways = lines[:, :1], np.diff(lines, axis=1)
     begun = lows[None] + starts[..., None] * ways[None]
@@ -125,7 +125,7 @@ def dashes(lines: Doubles) -> Doubles:
 
 
 def _boxes(found: ObjectChanges) -> list[tuple[str, str, Cluster]]:
-    """Name, colour and place of what is drawn as a box."""
+    """Return name, colour and place of what is drawn as a box."""
     kinds = (
         ("A{}", APPEARED, found.appeared),
         ("V{}", VANISHED, found.vanished),
@@ -140,7 +140,7 @@ def _boxes(found: ObjectChanges) -> list[tuple[str, str, Cluster]]:
 
 
 def _list(found: ObjectChanges) -> str:
-    """How much changed, and the largest things by name, size and place."""
+    """Return how much changed, and the largest things by name, size and place."""
     moved = [move.after for move in found.moved]
     kinds = (("appeared", found.appeared), ("vanished", found.vanished), ("moved", moved))
     lines = []

@@ -21,7 +21,7 @@ _DPI, _ROW_IN, _BAR = 160, 0.3, (0.02, 0.35)  # a row of the caption; left and w
 
 
 class ScreenshotButton:
-    """A button that saves what the scene shows, with what one has to know of it below."""
+    """A button that saves what the scene shows, with a caption below."""
 
     def __init__(self, page: Page) -> None:
         self._page = page
@@ -48,7 +48,7 @@ class ScreenshotButton:
             self._button.disabled = False
 
     def _picture(self) -> Image.Image:
-        """What is on the screen, on white; a slow browser draws coarser than this on its screen."""
+        """Return the scene on white; a slow browser draws coarser than this on its screen."""
         aspect = self._page.client.camera.aspect
         width, height = round(_LONGER_PX * min(aspect, 1)), round(_LONGER_PX / max(aspect, 1))
         pixels = self._page.client.get_render(
@@ -59,7 +59,7 @@ class ScreenshotButton:
 
 
 def captioned(picture: Image.Image, state: MapState, legends: Sequence[Legend]) -> Image.Image:
-    """The picture with a strip below it: the map, its state, and what colours and lines mean."""
+    """Return the picture with a strip below: the map, its state, and what its colours mean."""
     scales = [legend.scale for legend in legends if legend.scale is not None]
     lines = [line for legend in legends for line in legend.lines]
     rows = 2 + 2 * len(scales) + len(lines)

@@ -1,4 +1,4 @@
-"""How the server is doing, in the panel of a page."""
+"""The state of the server, in the panel of a page."""
 
 import time
 
@@ -62,7 +62,7 @@ def _rows(
 
 
 def _samples_per_s(before: ServerStatus | None, now: ServerStatus) -> float | None:
-    """How fast the server learns; ``None`` where it was restarted since."""
+    """Return how fast the server learns; ``None`` where it was restarted since."""
     if before is None or before.server != now.server or now.uptime_s <= before.uptime_s:
         return None
     trained = now.samples_trained - before.samples_trained

@@ -1,4 +1,4 @@
-"""Which checkpoint of a store a page shows."""
+"""The choice of the checkpoint that a page shows."""
 
 from triquad_format.errors import TriquadError
 
@@ -32,7 +32,7 @@ class TimePanel(Layer):
         self.start()
 
     def refresh(self) -> None:
-        """Take up new checkpoints, and show the one that is wanted."""
+        """Add new checkpoints, and show the one that is wanted."""
         self._history.refresh()
         moments = self._history.moments
         if not moments:
@@ -53,7 +53,7 @@ class TimePanel(Layer):
             self._tell()
 
     def _want(self, number: int) -> None:
-        """Have the moment of this number shown, counted from 1."""
+        """Show the moment of this number, counted from 1."""
         moments = self._moments
         if 1 <= number <= len(moments):
             self._wanted = moments[number - 1].path
@@ -65,7 +65,7 @@ class TimePanel(Layer):
         self._want(chosen)
 
     def _place_of_shown(self) -> int:
-        """The number on the slider of what is shown, or of the one before where it was deleted."""
+        """Return the slider's number of what is shown, or of the one before if it was deleted."""
         epoch = self._source.state().epoch
         return sum(moment.epoch <= epoch for moment in self._moments)
 

@@ -1,4 +1,4 @@
-"""The robot in a scene: where each source of scans has been, and its newest scan."""
+"""The robot in a scene: the trail and the newest scan of each source."""
 
 import numpy as np
 import viser
@@ -14,7 +14,7 @@ from triquad_tools.viewer.sources.live_source import LiveSource
 _PERIOD_S = 0.5
 _SCAN_POINTS = 4000
 _COLOURS = ("#d55e00", "#cc79a7", "#000000", "#e69f00")
-"""Of sources in turn: of those of Okabe and Ito, which everybody tells apart, what no mesh has."""
+"""Colours of sources in turn, of Okabe and Ito, which all can distinguish; no mesh has them."""
 
 _POINT_M, _LINE_PIXELS = 0.08, 3.0
 
@@ -48,7 +48,7 @@ class TrailLayer(Layer):
             self._list.content = text_html("\n".join(map(_line, report.sources.values())))
 
     def _marks_of(self, source: ScanSource, colour: Doubles) -> list[viser.SceneNodeHandle]:
-        """The trail of a source, and points of its newest scan."""
+        """Return the trail of a source, and points of its newest scan."""
         scene, in_scene = self.page.scene, self.page.in_scene
         marks: list[viser.SceneNodeHandle] = []
         lines = [line for line in source.lines() if len(line) > 1] if self._trails.value else []
@@ -69,7 +69,7 @@ class TrailLayer(Layer):
 
 
 def _line(source: ScanSource) -> str:
-    """What the panel says of a source."""
+    """Return what the panel says of a source."""
     if source.newest is None:
         return f"{source.name}: {source.scans:,} scans"
     x, y, z = source.newest.position_m

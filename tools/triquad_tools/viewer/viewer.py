@@ -18,14 +18,14 @@ from triquad_tools.viewer.sources.map_source import MapSource
 DEFAULT_PORT = 8080
 
 _OF_ONE_WHO_LEFT = ("Queued a .* on a closed connection", "Attempted to remove an? already removed")
-"""Warnings of viser: a browser that leaves takes with it what is being drawn or removed there."""
+"""Warnings of viser that come when a browser leaves while something is drawn or removed."""
 
 
 class _OwnServer(viser.ViserServer):
-    """Does not do what a page may ask of it behind the back of whoever started it."""
+    """A server that refuses what a page may request without its user."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:  # noqa: ARG002
-        """Refuse to show the page to the internet: whoever reaches it could ask for that."""
+        """Refuse to show the page to the internet: any page's visitor could request that."""
         return None
 
 
@@ -64,7 +64,7 @@ class Viewer:
 
     @property
     def url(self) -> str:
-        """Where the page is."""
+        """The URL of the page."""
         host = self._server.get_host()
         return f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
 

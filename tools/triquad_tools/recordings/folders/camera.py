@@ -25,12 +25,12 @@ class Camera(NamedTuple):
 _TUM = Camera(
     Intrinsics(525.0, 525.0, 319.5, 239.5), ImageSize(640, 480), "the documentation of TUM RGB-D"
 )
-"""Of all three cameras, whose depth was registered by OpenNI:
+"""The intrinsics of all three cameras, whose depth was registered by OpenNI:
 https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats"""
 
 
 def choose_camera(folder: Path, given: Intrinsics | None) -> Camera:
-    """The camera that was given, that a folder has in a file, or that its name tells.
+    """Return the camera that was given, that a folder has in a file, or that its name implies.
 
     Raises:
         ToolError: it is not known, or the file is not understood.
@@ -49,7 +49,7 @@ def choose_camera(folder: Path, given: Intrinsics | None) -> Camera:
 
 
 def read_camera(path: Path) -> Camera:
-    """The camera of a file as Open3D writes it.
+    """Return the camera of a file as Open3D writes it.
 
     JSON with ``width``, ``height`` and ``intrinsic_matrix``, nine numbers, column by column.
 
@@ -72,7 +72,7 @@ def read_camera(path: Path) -> Camera:
 
 
 def check_fits(camera: Camera, size: ImageSize, path: Path) -> None:
-    """Whether an image is one of a camera.
+    """Check that an image fits a camera.
 
     Raises:
         ToolError: it has another size, or the centre of the camera lies outside of it.

@@ -1,4 +1,4 @@
-"""Folders of clouds, a file each, with a trajectory beside them."""
+"""Folders of clouds, a file each, with a trajectory next to them."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -40,13 +40,13 @@ _FORMATS = {
     ".las": _Format(check_las, read_las),
     ".laz": _Format(check_las, read_las),
 }
-_TRIED = 3  # clouds, to tell the frame of all
+_TRIED = 3  # clouds, to determine the frame of all
 _CLEARLY = 2.0  # times nearer to where the sensor was than to the origin, or the other way round
 
 
 @dataclass(frozen=True)
 class CloudOptions:
-    """How a folder of clouds is read."""
+    """The options for reading a folder of clouds."""
 
     trajectory: Path | None = None  # the file of poses; else that with a usual name
     points_in: Literal["sensor", "world"] | None = None  # their frame; else sensor, and checked
@@ -81,11 +81,11 @@ class CloudFolder:
 
     @property
     def remarks(self) -> Sequence[str]:
-        """On clouds without a pose, and on files that were not used."""
+        """The remarks on clouds without a pose, and on files that were not used."""
         return self.placed.remarks
 
     def read(self, indices: Sequence[int]) -> Iterator[PosedScan]:
-        """The finite points of the scans of these numbers."""
+        """Yield the finite points of the scans of these numbers."""
         for index in indices:
             yield self._scan(self.placed.files[index])
 
@@ -108,12 +108,12 @@ class CloudFolder:
 
 
 def is_cloud_folder(folder: Path) -> bool:
-    """Whether a folder, or one in it, holds files of points."""
+    """Return whether a folder, or one in it, holds files of points."""
     return folder.is_dir() and bool(_folders_of_clouds(folder))
 
 
 def read_cloud_folder(folder: Path, options: CloudOptions | None = None) -> CloudFolder:
-    """The clouds of a folder, or of the one folder in it that has some, with their poses.
+    """Return the clouds of a folder, or of the one folder in it that has some, with their poses.
 
     Raises:
         ToolError: there are no clouds, no trajectory or no common times, a file is damaged, or
@@ -133,7 +133,7 @@ def read_cloud_folder(folder: Path, options: CloudOptions | None = None) -> Clou
 
 
 def _folders_of_clouds(folder: Path) -> dict[Path, list[Path]]:
-    """The files of points in a folder and in those in it."""
+    """Return the files of points in a folder and in those in it."""
     folders = [folder, *sorted(path for path in folder.iterdir() if path.is_dir())]
     found = {
         each: in_order(path for path in each.iterdir() if path.suffix.lower() in _FORMATS)
@@ -165,7 +165,7 @@ def _read(path: Path) -> FilePoints:
 
 
 def _check_frame(recording: CloudFolder) -> None:
-    """Whether points lie around their sensor, not around where it was in the world.
+    """Check that points lie around their sensor, not around where it was in the world.
 
     Raises:
         ToolError: a few clouds from all over the recording lie around where it was.

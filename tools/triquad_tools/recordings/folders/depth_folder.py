@@ -32,12 +32,12 @@ _TUM_UNITS_PER_M, _OPEN3D_UNITS_PER_M = 5000.0, 1000.0
 
 @dataclass(frozen=True)
 class DepthOptions:
-    """How a folder of depth images is read."""
+    """The options for reading a folder of depth images."""
 
     trajectory: Path | None = None  # the file of poses; else that with a usual name
     intrinsics: Intrinsics | None = None  # else those of a file in the folder
     units_per_metre: float | None = None  # of a pixel; else 5000 for TUM RGB-D, 1000 for others
-    stride: int = 1  # take every so many-th row and column
+    stride: int = 1  # take every N-th row and column
 
     def __post_init__(self) -> None:
         units = self.units_per_metre
@@ -75,11 +75,11 @@ class DepthFolder:
 
     @property
     def remarks(self) -> Sequence[str]:
-        """On images without a pose, and on files that were not used."""
+        """The remarks on images without a pose, and on files that were not used."""
         return self.placed.remarks
 
     def read(self, indices: Sequence[int]) -> Iterator[PosedScan]:
-        """The scans of these numbers; one without points where an image shows nothing."""
+        """Yield the scans of these numbers; one without points where an image shows nothing."""
         for index in indices:
             file = self.placed.files[index]
             pixels = read_depth(file.path)
@@ -91,12 +91,12 @@ class DepthFolder:
 
 
 def is_depth_folder(folder: Path) -> bool:
-    """Whether a folder is laid out as those of TUM RGB-D or of Open3D are."""
+    """Return whether a folder is laid out as those of TUM RGB-D or of Open3D are."""
     return (folder / _LIST_NAME).is_file() or any((folder / _FOLDER_NAME).glob("*.png"))
 
 
 def read_depth_folder(folder: Path, options: DepthOptions | None = None) -> DepthFolder:
-    """The depth images of a folder with their poses.
+    """Return the depth images of a folder with their poses.
 
     Raises:
         ToolError: there are no images, no trajectory, no common times or no intrinsics, an
@@ -131,7 +131,7 @@ class _Images(NamedTuple):
 
 
 def _listed(folder: Path) -> _Images:
-    """As TUM has them: a line for each image, its time and its path."""
+    """Return the images that TUM lists: a line for each, its time and its path."""
     paths: list[Path] = []
     stamps: list[int] = []
     for place, text in read_lines(folder / _LIST_NAME):
@@ -148,7 +148,7 @@ def _listed(folder: Path) -> _Images:
 
 
 def _found(folder: Path) -> _Images:
-    """As Open3D has them: all that lie in a folder."""
+    """Return the images as Open3D has them: all that lie in a folder."""
     paths = in_order((folder / _FOLDER_NAME).glob("*.png"))
     if not paths:
         raise ToolError(f"{folder}: holds neither {_LIST_NAME} nor {_FOLDER_NAME}/*.png")

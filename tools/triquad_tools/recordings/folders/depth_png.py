@@ -15,7 +15,7 @@ _END_BYTES = 64  # the last chunk takes 12, and some writers append to it
 
 
 class ImageSize(NamedTuple):
-    """Of an image, pixels."""
+    """The size of an image, pixels."""
 
     width: int
     height: int
@@ -25,7 +25,7 @@ class ImageSize(NamedTuple):
 
 
 def check_depth(path: Path) -> ImageSize:
-    """The size of a depth image; pixels are not decoded.
+    """Return the size of a depth image; pixels are not decoded.
 
     Raises:
         ToolError: there is none, it is no PNG of 16 bits a pixel, or it is truncated.
@@ -37,7 +37,7 @@ def check_depth(path: Path) -> ImageSize:
     try:
         with Image.open(path, formats=["PNG"]) as image:
             mode, size = image.mode, ImageSize(*image.size)
-    except Exception as error:  # whatever the library stumbles on
+    except Exception as error:  # any error of the library
         raise ToolError(f"{path}: is no PNG image; depth comes as PNG of 16 bits") from error
     if mode not in _GREY_MODES:
         raise ToolError(
@@ -52,7 +52,7 @@ def check_depth(path: Path) -> ImageSize:
 
 
 def read_depth(path: Path) -> NDArray[np.uint16]:
-    """The pixels [rows, columns] of a depth image, in its own unit.
+    """Return the pixels [rows, columns] of a depth image, in its own unit.
 
     Raises:
         ToolError: it cannot be read.
@@ -63,5 +63,5 @@ def read_depth(path: Path) -> NDArray[np.uint16]:
     try:
         with Image.open(path, formats=["PNG"]) as image:
             return np.asarray(image).astype(np.uint16)
-    except Exception as error:  # whatever the library and its codec stumble on
+    except Exception as error:  # any error of the library and its codec
         raise ToolError(f"{path}: cannot be read as PNG: {error}; copy it again") from error

@@ -1,4 +1,4 @@
-"""What the names of recorded files say: their order, and the times at which they were taken."""
+"""The names of recorded files: their order, and the times at which they were taken."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -16,7 +16,7 @@ _PLACES = (3, 6, 9)  # decimal places of milliseconds, microseconds and nanoseco
 
 
 def in_order(paths: Iterable[Path]) -> list[Path]:
-    """Paths in the order of the numbers in their names: 2 before 10, however they are padded.
+    """Return paths in the order of the numbers in their names: 2 before 10, padded or not.
 
     Hidden files are left out: macOS adds one to each that it copies.
     """
@@ -30,7 +30,7 @@ def _key(name: str) -> list[tuple[int, str]]:
 
 
 def stamps_of_names(paths: Sequence[Path]) -> list[int] | None:
-    """Nanoseconds that the names of all files say; None where any of them says none.
+    """Return nanoseconds that the names of all files say; None where any of them says none.
 
     A time is the last number of a name: ``1700000000.25``, ``1700000000250000000`` or
     ``1700000000_250000000``, seconds and a fraction of them in whole units. Small whole numbers

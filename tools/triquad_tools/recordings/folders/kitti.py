@@ -1,7 +1,7 @@
 """Folders of scans in the style of KITTI odometry.
 
 A folder holds ``poses.txt`` (12 numbers a line: a row-major 3 x 4 pose) and scans as ``*.bin``
-(``float32`` x, y, z, intensity) beside it or in ``scans``, ``velodyne`` or
+(``float32`` x, y, z, intensity) next to it or in ``scans``, ``velodyne`` or
 ``velodyne_points/data``; scan ``i`` in the order of names belongs to line ``i``. It may hold
 ``times.txt`` (seconds, one a line) and ``calib.txt``, whose line ``Tr:`` is
 ``camera_from_lidar``: the poses are then those of the camera, as KITTI gives them, and are
@@ -38,7 +38,7 @@ class KittiFolder:
 
     @property
     def entries(self) -> Sequence[ScanEntry]:
-        """All scans."""
+        """The entries of all scans."""
         return [ScanEntry(stamp, DEFAULT_SOURCE) for stamp in self.stamps_ns.tolist()]
 
     @property
@@ -52,28 +52,28 @@ class KittiFolder:
 
     @property
     def remarks(self) -> Sequence[str]:
-        """None: nothing is left out."""
+        """No remarks: nothing is left out."""
         return ()
 
     def read(self, indices: Sequence[int]) -> Iterator[PosedScan]:
-        """The scans of these numbers."""
+        """Yield the scans of these numbers."""
         for index in indices:
             yield PosedScan(self.read_points(index), self.poses[index])
 
     def read_points(self, index: int) -> Floats:
-        """Points ``[N, 3]`` of one scan, metres, lidar frame, as the file has them."""
+        """Return points ``[N, 3]`` of one scan, metres, lidar frame, as the file has them."""
         path = self.scan_paths[index]
         _check_size(path)
         return np.fromfile(path, "<f4").reshape(-1, 4)[:, :3].astype(np.float32)
 
 
 def is_kitti_folder(folder: Path) -> bool:
-    """Whether a folder holds scans as KITTI has them."""
+    """Return whether a folder holds scans as KITTI has them."""
     return any(any((folder / name).glob("*.bin")) for name in SCAN_FOLDERS)
 
 
 def read_kitti_folder(folder: Path) -> KittiFolder:
-    """The scans, poses and times of a folder.
+    """Return the scans, poses and times of a folder.
 
     Raises:
         ToolError: the folder, its poses or its scans are missing, their counts differ, a scan

@@ -42,12 +42,12 @@ class PlacedFiles(NamedTuple):
     remarks: tuple[str, ...]  # on those that cannot, and on what else was not used
 
     def with_remarks(self, remarks: tuple[str, ...]) -> "PlacedFiles":
-        """The same files, with other remarks before their own."""
+        """Return the same files, with other remarks before their own."""
         return self._replace(remarks=(*remarks, *self.remarks))
 
     @property
     def entries(self) -> list[ScanEntry]:
-        """Of a recording that consists of these files."""
+        """The entries of a recording that consists of these files."""
         return [ScanEntry(file.stamp_ns, DEFAULT_SOURCE) for file in self.files]
 
 
@@ -59,7 +59,7 @@ class ChosenTrajectory(NamedTuple):
 
 
 def look_through(paths: Sequence[Path], check: Callable[[Path], _Found]) -> list[_Found]:
-    """What a check finds of each file, with progress: there may be many."""
+    """Return what a check finds of each file, with progress: there may be many."""
     found: list[_Found] = []
     with progress("looking through the recording", len(paths)) as report:
         for path in paths:
@@ -69,7 +69,7 @@ def look_through(paths: Sequence[Path], check: Callable[[Path], _Found]) -> list
 
 
 def choose_trajectory(folder: Path, given: Path | None) -> ChosenTrajectory:
-    """The trajectory that was given, or that a folder holds.
+    """Return the trajectory that was given, or that a folder holds.
 
     Raises:
         ToolError: there is none.

@@ -35,7 +35,7 @@ _ROUNDING_NS = 1_000_000  # files write times with as few as three decimals
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Where a sensor was, at some times or merely in some order."""
+    """The poses of a sensor, at some times or merely in some order."""
 
     path: Path
     kind: str
@@ -47,7 +47,7 @@ class Trajectory:
         return len(self.poses)
 
     def pose_at(self, stamp_ns: int) -> Doubles:
-        """The pose [4, 4] at a time, of a trajectory that has times.
+        """Return the pose [4, 4] at a time, of a trajectory that has times.
 
         Raises:
             NoTransformError: the time lies before the first pose, after the last or in a gap.
@@ -64,12 +64,12 @@ class Trajectory:
 
 
 def find_trajectories(folder: Path) -> list[Path]:
-    """The files of a folder that have the name of a trajectory, the most likely first."""
+    """Return the files of a folder that have the name of a trajectory, the most likely first."""
     return [path for name in TRAJECTORY_NAMES for path in sorted(folder.glob(name))]
 
 
 def read_trajectory(path: Path) -> Trajectory:
-    """The poses of a file.
+    """Return the poses of a file.
 
     Raises:
         ToolError: it has none, a line is no pose, or times run backwards.
@@ -114,7 +114,7 @@ def _read_tum(path: Path, lines: Sequence[Line]) -> Trajectory:
 
 
 def _poses_of_log(path: Path, lines: Sequence[Line]) -> list[Doubles]:
-    """Of five lines each: three whole numbers, and the rows of a matrix."""
+    """Return poses of five lines each: three whole numbers, and the rows of a matrix."""
     if len(lines) % 5:
         raise ToolError(
             f"{path}: {len(lines)} lines are not whole poses of Open3D's .log, which take 5 each; "

@@ -1,1 +1,1 @@
-"""From messages of ROS 2 to published scans: clouds, depth images and poses."""
+"""Turning messages of ROS 2 into published scans: clouds, depth images and poses."""

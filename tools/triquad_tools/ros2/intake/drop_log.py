@@ -1,4 +1,4 @@
-"""Messages of which no scan could be published: counted, and told in the log, but not each."""
+"""Messages of which no scan could be published: all are counted, and some logged."""
 
 import logging
 import threading
@@ -41,14 +41,14 @@ class DropLog:
     """Counts by reason; the log has the first of each topic and reason, then one line a while."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        """``clock`` tells seconds."""
+        """``clock`` returns seconds."""
         self._clock = clock
         self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
         self._kinds: dict[tuple[str, str], _Kind] = {}
 
     def counts(self) -> dict[str, int]:
-        """How many messages were dropped so far, by reason."""
+        """Return how many messages were dropped so far, by reason."""
         with self._lock:
             return dict(self._counts)
 
@@ -62,14 +62,14 @@ class DropLog:
             _log.warning("%s: %d dropped, %s: %s%s", topic_name, since, reason, text, remedy)
 
     def remark(self, topic_name: str, text: str) -> None:
-        """Log something that drops nothing by itself, not more often; a text is one reason."""
+        """Log something that drops nothing by itself, as often as a drop; a text is one reason."""
         with self._lock:
             since = self._due(topic_name, text, 1)
         if since is not None:
             _log.warning("%s: %s", topic_name, text)
 
     def _due(self, topic_name: str, reason: str, count: int) -> int | None:
-        """How many to tell of in the log, where it is time for that."""
+        """Return how many to report in the log, if it is time for that."""
         now_s = self._clock()
         kind = self._kinds.get((topic_name, reason))
         if kind is None:

@@ -1,4 +1,4 @@
-"""Telling the user of the first scan, or what is in its way while none comes."""
+"""Logging the first scan, or what prevents it while none comes."""
 
 import logging
 from collections.abc import Iterable
@@ -14,20 +14,20 @@ _MOST_LISTED = 20
 
 
 class FirstScan:
-    """Logs the first scan, or once, where none came for a while, what there is instead."""
+    """Logs the first scan or, once, if none came for a while, what there is instead."""
 
     def __init__(self, choice: TopicChoice, now_s: float) -> None:
         self._choice = choice
         self._due_s: float | None = now_s + AFTER_S
 
     def came(self, topic_name: str) -> None:
-        """A scan came."""
+        """Record that a scan came."""
         if self._due_s is not None:
             _log.info("the first scan of %s came", topic_name)
             self._due_s = None
 
     def check(self, found: Iterable[Topic], now_s: float) -> None:
-        """Log what there is, once it is time; ``found`` are all topics that somebody publishes."""
+        """Log what there is, once it is time; ``found`` are all published topics."""
         if self._due_s is not None and now_s >= self._due_s:
             self._due_s = None
             _log.warning("no cloud came in %.0f s; %s", AFTER_S, self._what_there_is(found))

@@ -1,4 +1,4 @@
-"""From messages of ROS 2 to scans that are published once their poses are known."""
+"""Turning messages of ROS 2 into scans that are published once their poses are known."""
 
 import logging
 import threading
@@ -32,17 +32,17 @@ _SCAN_BYTES = 64 * MAX_POINTS + _OTHER_BYTES  # drivers write up to 64 bytes for
 _SCANS_WAITING = WaitLimit(messages=16, bytes=256_000_000)
 _OTHERS_WAITING = WaitLimit(messages=4096, bytes=16_000_000)
 SWEEPS_WAITING = WaitLimit(messages=32, bytes=512_000_000)
-"""Sweeps that wait for their transforms."""
+"""The sweeps that may wait for their transforms."""
 _TICK_S = 0.2
 
 
 class Intake:
-    """Takes in what a robot publishes, on a thread of its own."""
+    """Receives what a robot publishes, on a thread of its own."""
 
     def __init__(
         self, session: zenoh.Session, client: Client, options: BridgeOptions, node: Node
     ) -> None:
-        """Begin to take in messages."""
+        """Begin to receive messages."""
         frame = options.scans.map_frame
         self._start = Place(frame, np.zeros(3), stamp_ns=0) if frame else None
         self.drops = DropLog()
@@ -63,7 +63,7 @@ class Intake:
 
     @property
     def place(self) -> Place | None:
-        """Where the newest scan was taken; None before there is one, and no map frame is set."""
+        """The place of the newest scan; None before there is one, and no map frame is set."""
         return self.scans.newest or self._start
 
     def close(self) -> None:
@@ -102,7 +102,7 @@ class Intake:
             self._first_scan.check(self._listener.found, time.monotonic())
 
     def _guard(self, topic_name: str, step: Callable[[], None]) -> None:
-        """Do something with a message; whatever its bytes are must not stop the intake."""
+        """Do something with a message; no bytes may stop the intake."""
         try:
             step()
         except NoScanError as error:

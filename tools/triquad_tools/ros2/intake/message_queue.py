@@ -1,4 +1,4 @@
-"""Messages that arrived and wait for the thread that reads them: the newest, within limits."""
+"""Pending messages for the thread that reads them: the newest, within limits."""
 
 import threading
 from collections import deque
@@ -23,7 +23,7 @@ class Arrival:
 
 @dataclass(frozen=True)
 class WaitLimit:
-    """How much may wait."""
+    """The limits of what may be pending."""
 
     messages: int
     bytes: int
@@ -38,7 +38,7 @@ class _Waiting:
         self.messages: deque[Arrival] = deque()
 
     def put(self, arrival: Arrival) -> list[Arrival]:
-        """Add a message; returns those that are dropped for it."""
+        """Add a message; return those that are dropped for it."""
         self.messages.append(arrival)
         self._bytes += len(arrival.payload)
         dropped = []
@@ -47,14 +47,14 @@ class _Waiting:
         return dropped
 
     def take(self) -> Arrival:
-        """The oldest message."""
+        """Return the oldest message."""
         arrival = self.messages.popleft()
         self._bytes -= len(arrival.payload)
         return arrival
 
 
 class MessageQueue:
-    """What says something about scans is read before the scans."""
+    """A queue in which messages about scans come before the scans."""
 
     def __init__(
         self, scans: WaitLimit, others: WaitLimit, dropped: Callable[[Arrival], None]
@@ -75,7 +75,7 @@ class MessageQueue:
             self._dropped(each)
 
     def take(self, timeout_s: float) -> Arrival | None:
-        """The message to read next; None where none comes in time, or the queue is closed."""
+        """Return the message to read next; None if none comes in time, or the queue is closed."""
         with self._changed:
             self._changed.wait_for(lambda: self._closed or self._first is not None, timeout_s)
             return None if self._closed or self._first is None else self._first.take()
@@ -88,5 +88,5 @@ class MessageQueue:
 
     @property
     def _first(self) -> _Waiting | None:
-        """Where the next message waits."""
+        """Return the queue of the next message."""
         return next((each for each in (self._others, self._scans) if each.messages), None)

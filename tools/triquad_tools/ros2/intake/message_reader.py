@@ -31,7 +31,7 @@ MAX_POINTS = 2_500_000
 
 
 class MessageReader:
-    """Reads messages; remembers the cameras, without which depth images say nothing."""
+    """Reads messages; remembers the cameras, which depth images need."""
 
     def __init__(self, options: ScanOptions) -> None:
         self._depth_stride = options.depth_stride
@@ -40,7 +40,7 @@ class MessageReader:
         self._cameras: dict[str, Any] = {}  # CameraInfo by its topic
 
     def sweep(self, arrival: Arrival) -> Sweep:
-        """What a cloud or a depth image shows.
+        """Return the sweep of a cloud or a depth image.
 
         Raises:
             NoScanError: it is none, or has too many points, or its camera is not known.
@@ -51,7 +51,7 @@ class MessageReader:
         return replace(sweep, stamp_ns=arrival.arrived_ns) if self._by_arrival else sweep
 
     def transforms(self, arrival: Arrival) -> list[Transform]:
-        """What a message of transforms or of a pose says.
+        """Return the transforms of a message of transforms or of a pose.
 
         Raises:
             NoScanError: it is none.
@@ -70,7 +70,7 @@ class MessageReader:
         ]
 
     def remember_camera(self, arrival: Arrival) -> None:
-        """Take in a CameraInfo.
+        """Remember a CameraInfo.
 
         Raises:
             NoScanError: it is none.
@@ -96,7 +96,7 @@ class MessageReader:
         return sweep_of_depth(message, camera, stride)
 
     def _pose(self, payload: bytes) -> Transform:
-        """Of either type: the bytes of one cannot be read as the other."""
+        """Return the pose of either type: the bytes of one cannot be read as the other."""
         try:
             found = transform_of_odometry(decode_cdr(payload, ODOMETRY))
         except NoScanError:

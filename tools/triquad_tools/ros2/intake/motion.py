@@ -1,4 +1,4 @@
-"""What is known of how the robot moves, from transforms or from a topic of poses."""
+"""The robot's known motion, from transforms or from a topic of poses."""
 
 from triquad_client.errors import InvalidScanError
 
@@ -17,7 +17,7 @@ class Motion:
     """Keeps the transforms that count, within limits: their names come from the network."""
 
     def __init__(self, *, from_topic: bool) -> None:
-        """``from_topic``: a topic of poses tells how the robot's body moves, no other may."""
+        """With ``from_topic``, only a topic of poses gives the motion of the robot's body."""
         self.frames = FrameTree(_POSES_KEPT)
         self.body_parent: str | None = None  # in which frame that topic has the body
         self._from_topic = from_topic
@@ -25,10 +25,10 @@ class Motion:
         self._newest_ns: dict[str, int] = {}  # stamp by child, of those that move
 
     def add(self, transforms: list[Transform], *, is_body: bool) -> None:
-        """Take in transforms, or the pose of the body.
+        """Add transforms, or the pose of the body.
 
         Raises:
-            NoScanError: one of them is of no use; the others were taken in.
+            NoScanError: one of them is of no use; the others were added.
         """
         if is_body:
             self._body, self.body_parent = transforms[0].child, transforms[0].parent
@@ -46,13 +46,13 @@ class Motion:
             raise refusal
 
     def forget_after(self, stamp_ns: int) -> None:
-        """Forget poses from before time went back to a stamp."""
+        """Remove poses from before time went back to a stamp."""
         for child, newest_ns in list(self._newest_ns.items()):
             if newest_ns > stamp_ns + RESTART_NS:
                 self._forget(child)
 
     def _restart(self, transform: Transform) -> None:
-        """Forget the poses of a frame whose time goes back."""
+        """Remove the poses of a frame whose time goes back."""
         if transform.stamp_ns is STATIC:
             self._newest_ns.pop(transform.child, None)
             return

@@ -1,4 +1,4 @@
-"""Sweeps that wait until it is known where they were taken."""
+"""Pending sweeps, until it is known where they were taken."""
 
 import logging
 from collections import deque
@@ -17,12 +17,12 @@ from triquad_tools.sensors.sweep import PosedScan, Sweep
 _log = logging.getLogger("triquad_ros2")
 
 _CHOICE_S = 1.0
-"""For how long after a sweep could first be placed a better frame to map in may turn up."""
+"""The time after a sweep could first be placed in which a better map frame may appear."""
 
 
 @dataclass(frozen=True)
 class Placed:
-    """A sweep with what became of it: a scan, or why there is none."""
+    """A sweep with its outcome: a scan, or why there is none."""
 
     topic_name: str
     sweep: Sweep
@@ -45,7 +45,7 @@ class Placement:
     def __init__(
         self, motion: Motion, *, map_frame: str, limit: WaitLimit, timeout_s: float
     ) -> None:
-        """``motion`` is added to by others in the meantime, on the same thread.
+        """``motion`` is extended by others meanwhile, on the same thread.
 
         Without a ``map_frame`` it is chosen, once, as the transforms come. Sweeps wait within the
         ``limit``, for ``timeout_s`` each.
@@ -59,7 +59,7 @@ class Placement:
         self._choose_s: float | None = None  # when the map frame is chosen at the latest
 
     def add(self, topic_name: str, sweep: Sweep, now_s: float) -> None:
-        """Have a sweep placed; where too many wait, those that wait for longest give up."""
+        """Have a sweep placed; if too many are pending, the oldest are dropped."""
         offsets = np.zeros(1) if sweep.offsets_s is None else sweep.offsets_s
         first, last = offsets.min(initial=0), offsets.max(initial=0)
         needs = (sweep.stamp_ns + round(first * 1e9), sweep.stamp_ns + round(last * 1e9))
@@ -68,12 +68,12 @@ class Placement:
         self._keep_within_limit(now_s)
 
     def give_up_after(self, topic_name: str, stamp_ns: int) -> None:
-        """Let sweeps of a topic wait no longer that lie after a time to which it went back."""
+        """Drop pending sweeps of a topic that lie after a time to which it went back."""
         for entry in self._waiting.get(topic_name, ()):
             entry.is_over = entry.is_over or entry.sweep.stamp_ns > stamp_ns
 
     def settle(self, now_s: float) -> Iterator[Placed]:
-        """Those that wait no longer, with what became of them."""
+        """Return the sweeps that are no longer pending, with their outcome."""
         for topic_name, entries in list(self._waiting.items()):
             while entries and (placed := self._try(entries[0], now_s)) is not None:
                 entries.popleft()
@@ -82,7 +82,7 @@ class Placement:
                 del self._waiting[topic_name]
 
     def _keep_within_limit(self, now_s: float) -> None:
-        """Give up the oldest sweeps, so that no more are left than may wait."""
+        """Drop the oldest sweeps, so that no more than the limit are pending."""
         entries = [entry for entries in self._waiting.values() for entry in entries]
         messages = len(entries)
         taken_bytes = sum(entry.sweep.memory_bytes for entry in entries)
@@ -94,7 +94,7 @@ class Placement:
             taken_bytes -= entry.sweep.memory_bytes
 
     def _try(self, entry: _Waiting, now_s: float) -> Placed | None:
-        """What becomes of a sweep; None where it waits on."""
+        """Return the outcome of a sweep; None while it is pending."""
         try:
             outcome: PosedScan | NoScanError = self._scan(entry, now_s)
         except NoTransformError as error:
@@ -131,7 +131,7 @@ class Placement:
         return scan
 
     def _warn_of_better_frame(self) -> None:
-        """Say so, once, where a frame to map in turned up too late."""
+        """Warn, once, if a better frame to map in appeared too late."""
         better = self._motion.frames.fixed_frame(self.map_frame)
         if better != self.map_frame and not self._warned:
             self._warned = True
@@ -144,7 +144,7 @@ class Placement:
             )
 
     def _best_frame(self, frame: str, now_s: float) -> str:
-        """The frame to map in, as far as is known by now."""
+        """Return the frame to map in, as far as is known by now."""
         if self._motion.body_parent is not None:
             return self._motion.body_parent
         found = self._motion.frames.fixed_frame(frame)

@@ -17,7 +17,7 @@ RESTART_NS = 10**9
 
 @dataclass(frozen=True)
 class Place:
-    """Where the robot is."""
+    """The position of the robot."""
 
     map_frame: str
     position_m: Doubles  # [3] map frame
@@ -33,7 +33,7 @@ class _Source:
     sent_ns: int = 0  # and of one that was published: sweeps wait in between
 
     def reads(self, stamp_ns: int) -> bool:
-        """Go on to a sweep that is read; whether time went back."""
+        """Go on to a sweep that is read; return whether time went back."""
         went_back = stamp_ns < self.read_ns - RESTART_NS
         self.read_ns = stamp_ns if went_back else max(self.read_ns, stamp_ns)
         return went_back
@@ -49,7 +49,7 @@ class ScanPublisher:
         self._sources: dict[str, _Source] = {}
 
     def time_went_back(self, topic_name: str, sweep: Sweep) -> bool:
-        """Whether time went back since the sweep of this topic that was read before.
+        """Return whether time went back since the sweep of this topic that was read before.
 
         Raises:
             NoScanError: the topic cannot be a source of scans.

@@ -38,7 +38,7 @@ _HISTORY = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=100)
 
 
 class TopicListener:
-    """Passes on what arrives on all wanted topics."""
+    """Forwards what arrives on all wanted topics."""
 
     def __init__(
         self,
@@ -62,12 +62,12 @@ class TopicListener:
 
     @property
     def found(self) -> list[Topic]:
-        """The topics that somebody publishes, wanted or not."""
+        """The published topics, wanted or not."""
         with self._lock:
             return list({each.topic for each in self._found})
 
     def close(self) -> None:
-        """Pass on nothing more."""
+        """Forward nothing more."""
         self._watch.close()
         with self._lock:
             self._closed = True
@@ -94,7 +94,7 @@ class TopicListener:
         self._arrived(Arrival(feed.role, name, sample.payload, time.time_ns(), attachment))
 
     def _find(self, announcement: Announcement) -> None:
-        """Somebody publishes on a topic."""
+        """Handle a topic that is published."""
         topic = announcement.topic
         role = self._choice.wants(topic)
         if role is Role.TF_STATIC and announcement.type_hash == ANY_HASH:
@@ -112,12 +112,12 @@ class TopicListener:
         if announcement.type_hash == ANY_HASH:
             self._open(Feed(role, bridge_key(topic.name), topic.name))
         else:
-            # Drivers that publish only while somebody subscribes learn it from this.
+            # Drivers that publish only while there is a subscriber learn it from this.
             what = Announcement(End.SUBSCRIPTION, topic, announcement.type_hash)
             self._node.announce(what, _SUBSCRIPTION)
 
     def _ask_old_bridges(self, topic_name: str) -> None:
-        """Take in what bridges up to 1.5 published before anybody subscribed."""
+        """Fetch what bridges up to 1.5 published before anybody subscribed."""
         feed = Feed(Role.TF_STATIC, old_bridge_cache(topic_name), topic_name)
         replies = self._session.get(
             feed.key,

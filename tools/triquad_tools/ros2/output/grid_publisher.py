@@ -36,7 +36,7 @@ class GridPublisher:
         shape: SliceShape,
         place: Callable[[], Place | None],
     ) -> None:
-        """``place`` tells where the robot is, None before that is known."""
+        """``place`` returns where the robot is, None before that is known."""
         self._publisher = publisher
         self._client = client
         self._shape = shape
@@ -83,7 +83,7 @@ class GridPublisher:
 
 
 def occupancy(found: Grid) -> NDArray[np.int8]:
-    """The values [y, x] of a slice's cells: occupied where a surface meets them."""
+    """Return the values [y, x] of a slice's cells: occupied where a surface meets them."""
     distance, status = found.distance_m[:, :, 0].T, found.status[:, :, 0].T
     is_unknown = status == Status.UNKNOWN
     values = np.where(is_unknown, UNKNOWN, FREE).astype(np.int8)
@@ -94,7 +94,7 @@ def occupancy(found: Grid) -> NDArray[np.int8]:
 
 
 def grid_message(found: Grid, place: Place) -> bytes:
-    """A slice as a message, CDR."""
+    """Return a slice as a message, CDR."""
     seconds, nanoseconds = divmod(place.stamp_ns, 10**9)
     width, height, _ = found.shape.counts
     writer = CdrWriter().numbers("<u4", seconds, nanoseconds).text(place.map_frame)

@@ -15,7 +15,7 @@ _PHASES = np.array([0.0, 1 / 3, 2 / 3])  # of red, green and blue
 
 
 class Action(IntEnum):
-    """What becomes of a marker."""
+    """The action of a marker."""
 
     ADD = 0  # or replace
     DELETE = 2
@@ -32,7 +32,7 @@ class Marker:
     corners: Doubles = field(default_factory=lambda: np.empty((0, 3)))  # [3 F, 3] map frame
 
     def payload(self) -> bytes:
-        """The message, CDR."""
+        """Return the message, CDR."""
         writer = CdrWriter().numbers("<u4", 0, 0).text(self.frame).text(_NAMESPACE)
         writer.numbers("<i4", self.number, _TRIANGLE_LIST, self.action)
         writer.numbers("<f8", 0, 0, 0, 0, 0, 0, 1, 1, 1, 1)  # pose and scale
@@ -42,7 +42,7 @@ class Marker:
 
     @staticmethod
     def _without_texture(writer: CdrWriter) -> CdrWriter:
-        """Texture, text and mesh file, of which there are none."""
+        """Return texture, text and mesh file, of which there are none."""
         nothing = np.empty(0, np.uint8)
         writer.text("").numbers("<u4", 0, 0).text("").text("").sequence(nothing)
         writer.sequence(nothing).text("").text("")
@@ -50,7 +50,7 @@ class Marker:
 
 
 def height_colours(points: Doubles) -> Floats:
-    """Red, green, blue and opacity [N, 4] of points [N, 3]; they repeat after ten metres."""
+    """Return red, green, blue and opacity [N, 4] of points [N, 3]; they repeat after ten metres."""
     turns = points[:, 2:] / _COLOURS_REPEAT_M + _PHASES
     colours = np.ones((len(points), 4), "<f4")
     colours[:, :3] = 0.55 + 0.4 * np.cos(2 * np.pi * turns)

@@ -34,7 +34,7 @@ class MeshPublisher:
         options: MeshOptions,
         place: Callable[[], Place | None],
     ) -> None:
-        """``place`` tells in which frame the map is, None before that is known."""
+        """``place`` returns the frame of the map, None before that is known."""
         self._publisher = publisher
         self._client = client
         self._options = options

@@ -37,9 +37,9 @@ class _Key:
 
 
 class TopicPublisher:
-    """Publishes to all subscribers, and notices new ones: they have nothing of the past yet.
+    """Publishes to all subscribers, and notices new ones: they lack past messages.
 
-    Nodes and bridges are told apart by their tokens; of others the first is noticed.
+    Nodes and bridges are distinguished by their tokens; of others the first is noticed.
     """
 
     def __init__(
@@ -73,11 +73,11 @@ class TopicPublisher:
 
     @property
     def is_followed(self) -> bool:
-        """Whether there is any subscriber."""
+        """Return whether there is any subscriber."""
         return any(key.is_followed for key in self._all_keys())
 
     def has_newcomers(self) -> bool:
-        """Whether any subscriber came since this was asked last."""
+        """Return whether any subscriber came since this was last called."""
         if not self._came.is_set():
             return False
         self._came.clear()
@@ -96,7 +96,7 @@ class TopicPublisher:
             return list(self._keys.values())
 
     def _appeared(self, who: Announcement) -> None:
-        """Somebody subscribes to some topic."""
+        """Handle a new subscriber of any topic."""
         if who.topic != self._topic:
             return
         if who.type_hash == NO_HASH:
@@ -119,12 +119,12 @@ class TopicPublisher:
             self._node.announce_to_bridges(what, self._delivery)
 
     def _open(self, key: str, identity: bytes | None) -> bool:
-        """Publish under a key from now on; False where it is done already."""
+        """Publish under a key from now on; return False if that is done already."""
         with self._lock:
             if key in self._keys:
                 return False
             # Large messages that may be dropped are lost without need. Last of all, since a
-            # publisher that waits for a slow subscriber holds up others of its priority.
+            # publisher that waits for a slow subscriber delays others of its priority.
             publisher = self._session.declare_publisher(
                 key,
                 congestion_control=zenoh.CongestionControl.BLOCK,

@@ -1,1 +1,1 @@
-"""How frames moved in each other, and clouds corrected by it."""
+"""The motion of frames in each other, and clouds corrected by it."""

@@ -1,4 +1,4 @@
-"""The tree of frames that robots report: which frame stands or moves how in which other."""
+"""The tree of frames that robots report: how frames stand or move in each other."""
 
 from dataclasses import dataclass
 
@@ -13,12 +13,12 @@ STATIC = None
 """The stamp of a transform that always holds."""
 
 ROOT_NAMES = ("map", "odom", "world")
-"""Frames that stand still, by the habits of ROS (REP 105), the first that there is goes first."""
+"""Frames that stand still, as usual in ROS (REP 105), in order of preference."""
 
 
 @dataclass(frozen=True)
 class Transform:
-    """Where a frame is in its parent."""
+    """The pose of a frame in its parent."""
 
     parent: str
     child: str
@@ -28,7 +28,7 @@ class Transform:
 
 @dataclass
 class _Edge:
-    """From a frame to its parent."""
+    """The edge from a frame to its parent."""
 
     parent: str
     standing: Doubles | None  # [4, 4] where it always holds
@@ -36,13 +36,13 @@ class _Edge:
 
 
 class FrameTree:
-    """Transforms over time, and where a frame was in another.
+    """Transforms over time, and the poses of a frame in another.
 
     As in tf2 a frame has one parent: a transform to another one replaces what was known of it.
     """
 
     def __init__(self, limit: int | None = None) -> None:
-        """Of each frame, only the ``limit`` newest poses are kept."""
+        """Only the ``limit`` newest poses of each frame are kept."""
         self._limit = limit
         self._edges: dict[str, _Edge] = {}
 
@@ -57,7 +57,7 @@ class FrameTree:
         return sorted(name for name, edge in self._edges.items() if edge.standing is None)
 
     def add(self, transform: Transform) -> None:
-        """Take in a transform.
+        """Add a transform.
 
         Raises:
             InvalidScanError: its pose is none.
@@ -76,34 +76,34 @@ class FrameTree:
             edge.track.add(transform.stamp_ns, position, quaternion)
 
     def with_track(self, parent: str, child: str, track: Track) -> "FrameTree":
-        """A tree that differs in where ``child`` is, and else shares what this one knows."""
+        """Return a tree that differs in where ``child`` is, and else shares what this one knows."""
         tree = FrameTree(self._limit)
         tree._edges = {**self._edges, child: _Edge(parent, None, track)}
         return tree
 
     def knows(self, child: str) -> bool:
-        """Whether a transform says where a frame is."""
+        """Return whether a transform says where a frame is."""
         return child in self._edges
 
     def __len__(self) -> int:
-        """How many frames there are of which a transform says where they are."""
+        """Return the number of frames that have a transform."""
         return len(self._edges)
 
     def forget(self, child: str) -> None:
-        """Forget where a frame is."""
+        """Remove the transforms of a frame."""
         self._edges.pop(child, None)
 
     def root(self, frame: str) -> str:
-        """The frame above all others that ``frame`` hangs on; itself where it hangs on none."""
+        """Return the topmost ancestor of ``frame``; itself if it has no parent."""
         return self._path(frame)[-1]
 
     def fixed_frame(self, frame: str) -> str:
-        """The frame to map in: of those above ``frame`` a usual one, or else the root."""
+        """Return the frame to map in: of those above ``frame`` a usual one, or else the root."""
         path = self._path(frame)
         return next((name for name in ROOT_NAMES if name in path), path[-1])
 
     def poses(self, target: str, frame: str, stamps_ns: Longs) -> Doubles:
-        """Poses [M, 4, 4] ``target_from_frame`` at times [M].
+        """Return poses [M, 4, 4] ``target_from_frame`` at times [M].
 
         Raises:
             NoTransformError: the frames do not hang together, or not at those times.
@@ -118,20 +118,20 @@ class FrameTree:
         return target_from_frame
 
     def moves(self, target: str, frame: str) -> bool:
-        """Whether it was ever reported that ``frame`` moves in ``target``."""
+        """Return whether it was ever reported that ``frame`` moves in ``target``."""
         up, down = self._path(frame), self._path(target)
         between = {*up} ^ {*down}
         return any(name in self._edges and self._edges[name].standing is None for name in between)
 
     def _path(self, frame: str) -> list[str]:
-        """The frame, its parent, and so on up to the root."""
+        """Return the frame, its parent, and so on up to the root."""
         path = [frame]
         while (edge := self._edges.get(path[-1])) is not None and edge.parent not in path:
             path.append(edge.parent)
         return path
 
     def _climb(self, path: list[str], stamps_ns: Longs) -> Doubles:
-        """Poses of the first frame of a path in the parent of the last."""
+        """Return poses of the first frame of a path in the parent of the last."""
         poses = np.broadcast_to(np.eye(4), (len(stamps_ns), 4, 4))
         for child in path:
             edge = self._edges[child]

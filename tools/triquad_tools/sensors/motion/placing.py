@@ -11,7 +11,7 @@ _MAX_KNOTS = 2048  # times of a sweep for which poses are computed; more are rou
 
 
 def place(sweep: Sweep, frames: FrameTree, target: str) -> PosedScan:
-    """A sweep as a scan in the frame ``target``.
+    """Return a sweep as a scan in the frame ``target``.
 
     Where each point has a time, the sensor's motion during the sweep is taken out: the scan is
     what a sensor would have seen that stood where it was in the middle of the sweep.
@@ -30,7 +30,7 @@ def place(sweep: Sweep, frames: FrameTree, target: str) -> PosedScan:
 
 
 def _knots(stamp_ns: int, offsets_s: Doubles) -> tuple[Longs, Longs]:
-    """Times [M] for which a pose is needed, and of each point [N] the number of its time."""
+    """Return times [M] for which a pose is needed, and of each point [N] the number of its time."""
     offsets_ns = np.round(offsets_s * 1e9).astype(np.int64)
     low, high = int(offsets_ns.min()), int(offsets_ns.max())
     step = max(1, -(-(high - low) // (_MAX_KNOTS - 1)))
@@ -42,7 +42,7 @@ def _knots(stamp_ns: int, offsets_s: Doubles) -> tuple[Longs, Longs]:
 
 
 def _moved(points: NDArray[np.floating], poses: Doubles, knot: Longs) -> Floats:
-    """Each point [N, 3] by the pose [M, 4, 4] of its number."""
+    """Move each point [N, 3] by the pose [M, 4, 4] of its number."""
     of_points = poses[:, :3].astype(np.float32)[knot]
     moved: Floats = np.einsum("nij,nj->ni", of_points[:, :, :3], points) + of_points[:, :, 3]
     return moved

@@ -1,4 +1,4 @@
-"""How one frame moved in another: poses at times, and between them."""
+"""The motion of one frame in another: poses at times, and between them."""
 
 from array import array
 from bisect import bisect_left
@@ -10,7 +10,7 @@ from triquad_format.records.arrays import Doubles, Longs
 from triquad_tools.sensors.errors import NoTransformError
 
 MAX_GAP_S = 2.0
-"""Between poses that lie farther apart nothing is interpolated."""
+"""Nothing is interpolated between poses that lie farther apart."""
 
 _WIDTH = 7  # numbers of a pose
 _NEARLY_PARALLEL = 0.9995  # quaternions, of which spherical interpolation would divide by nearly 0
@@ -49,7 +49,7 @@ class Track:
             del self._stamps[0], self._values[:_WIDTH]
 
     def poses(self, stamps_ns: Longs) -> Doubles:
-        """Poses [M, 4, 4] at times [M].
+        """Return poses [M, 4, 4] at times [M].
 
         Raises:
             NoTransformError: a time lies before the first pose, after the last, or in a gap.
@@ -68,7 +68,7 @@ class Track:
         return pose_matrices(positions, _slerp(first[:, 3:], second[:, 3:], share))
 
     def _around(self, first_ns: int, last_ns: int) -> tuple[Longs, Doubles]:
-        """Stamps [K] and values [K, 7] of the poses from one time to another, and around them."""
+        """Return stamps [K] and values [K, 7] of the poses between two times, and around them."""
         low = max(0, bisect_left(self._stamps, first_ns) - 1)
         high = bisect_left(self._stamps, last_ns) + 1
         values = np.array(self._values[_WIDTH * low : _WIDTH * high], np.float64)
@@ -96,7 +96,7 @@ class Track:
 
 
 def _slerp(first: Doubles, second: Doubles, share: Doubles) -> Doubles:
-    """Between unit quaternions [M, 4], by the shorter way."""
+    """Interpolate between unit quaternions [M, 4], by the shorter way."""
     cosine = (first * second).sum(axis=1, keepdims=True)
     second = np.where(cosine < 0, -second, second)
     cosine = np.abs(cosine)

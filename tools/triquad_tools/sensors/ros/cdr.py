@@ -13,23 +13,23 @@ class CdrWriter:
         self._data = bytearray()
 
     def numbers(self, dtype: str, *values: float) -> "CdrWriter":
-        """Numbers of one type, such as ``<f8``."""
+        """Return numbers of one type, such as ``<f8``."""
         return self._array(np.array(values, dtype))
 
     def text(self, value: str) -> "CdrWriter":
-        """A string."""
+        """Return a string."""
         data = value.encode() + b"\x00"
         self.numbers("<u4", len(data))
         self._data += data
         return self
 
     def sequence(self, values: NDArray[np.generic]) -> "CdrWriter":
-        """Elements [N, ...] of one or more numbers each."""
+        """Return elements [N, ...] of one or more numbers each."""
         self.numbers("<u4", len(values))
         return self._array(values) if len(values) else self
 
     def payload(self) -> bytes:
-        """The bytes of the message."""
+        """Return the bytes of the message."""
         return _LITTLE_ENDIAN + bytes(self._data)
 
     def _array(self, values: NDArray[np.generic]) -> "CdrWriter":

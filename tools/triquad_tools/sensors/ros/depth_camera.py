@@ -15,17 +15,17 @@ _ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 
 
 def is_depth(encoding: str) -> bool:
-    """Whether images of this encoding hold depth."""
+    """Return whether images of this encoding hold depth."""
     return encoding in _ENCODINGS
 
 
 def camera_topic(image_topic: str) -> str:
-    """Where the ``CameraInfo`` of an image is published: next to it, by the habit of ROS."""
+    """Return where the ``CameraInfo`` of an image is published: next to it, as usual in ROS."""
     return image_topic.rpartition("/")[0] + "/camera_info"
 
 
 def intrinsics_of(info: Any) -> Intrinsics:
-    """The camera of a ``CameraInfo``, for the rectified image.
+    """Return the camera of a ``CameraInfo``, for the rectified image.
 
     Raises:
         NoScanError: it is not calibrated.
@@ -42,7 +42,7 @@ def intrinsics_of(info: Any) -> Intrinsics:
 
 
 def sweep_of_depth(image: Any, info: Any, stride: int = 1) -> Sweep:
-    """What a depth image shows, in the camera's optical frame.
+    """Return the sweep of a depth image, in the camera's optical frame.
 
     Raises:
         NoScanError: it is no depth image, or does not fit to ``info``.
@@ -61,7 +61,7 @@ def sweep_of_depth(image: Any, info: Any, stride: int = 1) -> Sweep:
 
 
 def _pixels(image: Any) -> NDArray[Any]:
-    """A view [rows, columns] of an image."""
+    """Return a view [rows, columns] of an image."""
     if image.encoding not in _ENCODINGS:
         raise NoScanError(
             "encoding",

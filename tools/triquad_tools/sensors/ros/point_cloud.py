@@ -12,11 +12,11 @@ from triquad_tools.sensors.ros.header import frame_name, stamp_ns
 from triquad_tools.sensors.sweep import Sweep
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-"""Of the message's constants INT8 to FLOAT64."""
+"""The types of the message's constants INT8 to FLOAT64."""
 
 
 def sweep_of_cloud(message: Any) -> Sweep:
-    """The finite points of a ``PointCloud2``, with their times where it has some.
+    """Return the finite points of a ``PointCloud2``, with their times where it has some.
 
     Raises:
         NoScanError: it has no x, y and z, or not as floating numbers, or is not whole.
@@ -35,13 +35,13 @@ def sweep_of_cloud(message: Any) -> Sweep:
 
 
 def _times(message: Any, fields: dict[str, Any]) -> NDArray[Any] | None:
-    """The time of each point [N] as the driver wrote it, if it did."""
+    """Return the time of each point [N] as the driver wrote it, if it did."""
     name = next((name for name in TIME_FIELDS if name in fields), None)
     return None if name is None else _column(message, fields[name]).reshape(-1)
 
 
 def _points(message: Any, fields: dict[str, Any]) -> Floats:
-    """The points [N, 3], the one copy that is made of them."""
+    """Return the points [N, 3], the one copy that is made of them."""
     missing = [name for name in "xyz" if name not in fields]
     if missing:
         raise NoScanError(
@@ -65,7 +65,7 @@ def _points(message: Any, fields: dict[str, Any]) -> Floats:
 
 
 def _column(message: Any, field: Any) -> NDArray[Any]:
-    """A view [height, width] of one field."""
+    """Return a view [height, width] of one field."""
     if field.datatype not in _TYPES or field.count > 1:
         raise NoScanError(
             "field_type",
@@ -89,7 +89,7 @@ def _column(message: Any, field: Any) -> NDArray[Any]:
 
 
 def _row_step(message: Any) -> int:
-    """Bytes from row to row; drivers leave it 0 where there is one row."""
+    """Return the bytes from row to row; drivers leave it 0 if there is one row."""
     return int(message.row_step or message.width * message.point_step)
 
 

@@ -6,7 +6,7 @@ _MAX_CHARACTERS = 64
 
 
 def source_of_topic(topic: str) -> str:
-    """The name under which the scans of a topic are known: ``/lidar/points`` is ``lidar.points``.
+    """Return the source name of a topic's scans: ``/lidar/points`` is ``lidar.points``.
 
     What cannot stand in such a name becomes an underscore.
     """

@@ -9,7 +9,7 @@ from triquad_tools.sensors.ros.header import frame_name, stamp_ns
 
 
 def transforms_of_tf(message: Any, *, static: bool) -> list[Transform]:
-    """The transforms of a ``TFMessage``, which always hold where they are ``static``."""
+    """Return the transforms of a ``TFMessage``, which always hold where they are ``static``."""
     return [
         Transform(
             parent=frame_name(each.header.frame_id),
@@ -22,7 +22,7 @@ def transforms_of_tf(message: Any, *, static: bool) -> list[Transform]:
 
 
 def transform_of_odometry(message: Any) -> Transform:
-    """Where the robot's body was, as an ``Odometry`` has it."""
+    """Return where the robot's body was, as an ``Odometry`` has it."""
     return Transform(
         parent=frame_name(message.header.frame_id),
         child=frame_name(message.child_frame_id),
@@ -32,7 +32,7 @@ def transform_of_odometry(message: Any) -> Transform:
 
 
 def transform_of_pose(message: Any, body_frame: str) -> Transform:
-    """Where ``body_frame`` was, as a ``PoseStamped`` has it, which does not name it."""
+    """Return where ``body_frame`` was by a ``PoseStamped``, which does not name it."""
     return Transform(
         parent=frame_name(message.header.frame_id),
         child=body_frame,

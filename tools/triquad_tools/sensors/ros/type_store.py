@@ -22,18 +22,18 @@ OCCUPANCY_GRID = "nav_msgs/msg/OccupancyGrid"
 
 @cache
 def type_store() -> Typestore:
-    """The types of ROS 2; those used here are the same in all releases."""
+    """Return the types of ROS 2; those used here are the same in all releases."""
     return get_typestore(Stores.LATEST)
 
 
 def decode_cdr(payload: bytes, type_name: str) -> Any:
-    """The message of its bytes, as ROS 2 sends them.
+    """Return the message of its bytes, as ROS 2 sends them.
 
     Raises:
         NoScanError: they are no such message.
     """
     try:
         return type_store().deserialize_cdr(payload, type_name)
-    # Whatever the decoder raises: bytes of another type lead it anywhere.
+    # Any error of the decoder: bytes of another type lead it anywhere.
     except (SerdeError, ValueError, IndexError, MemoryError, TypeError) as error:
         raise NoScanError("decode", f"no {type_name}: {error}") from error

@@ -1,1 +1,1 @@
-"""Layers by which people ask the map: slices, unknown space, points and paths."""
+"""Layers for queries by people: slices, unknown space, points and paths."""

@@ -1,4 +1,4 @@
-"""Boxes of cells about which a map is asked."""
+"""Boxes of cells for which a map is queried."""
 
 from dataclasses import dataclass
 
@@ -21,14 +21,14 @@ class CellBox:
 
     @classmethod
     def around(cls, middle: Doubles, cell_m: float, counts: tuple[int, int, int]) -> "CellBox":
-        """The box around a point [3], metres, map frame, to whole eighths of its longest side."""
+        """Return the box around a point [3], map frame, to whole eighths of its longest side."""
         step_m = max(counts) * cell_m / _SNAPS
         x, y, z = np.round(middle / step_m) * step_m - 0.5 * cell_m * np.array(counts)
         return cls((float(x), float(y), float(z)), cell_m, counts)
 
     @property
     def size_m(self) -> Doubles:
-        """Lengths [3] of its sides."""
+        """The lengths [3] of its sides."""
         return np.asarray(self.cell_m * np.array(self.counts), np.float64)
 
     @property
@@ -37,11 +37,11 @@ class CellBox:
         return self.places(0.5 * np.array(self.counts))
 
     def places(self, cells: NDArray[np.number]) -> Doubles:
-        """Points [N, 3], metres, map frame, of cells [N, 3]: whole numbers are least corners."""
+        """Return points [N, 3], map frame, of cells [N, 3]: whole numbers are least corners."""
         return np.asarray(self.corner + self.cell_m * cells, np.float64)
 
     def ask(self, queries: MapQueries, max_distance_m: float) -> Grid:
-        """Distance and status at the middles of all cells.
+        """Return distance and status at the centres of all cells.
 
         Raises:
             TriquadError: the map does not answer.

@@ -1,4 +1,4 @@
-"""Clicks into a scene: they ask the map at a point, or lay a path for a robot."""
+"""Clicks into a scene: they query the map at a point, or add to a path for a robot."""
 
 from queue import Empty, SimpleQueue
 
@@ -22,7 +22,7 @@ _UNANSWERED = text_html("The map does not answer about this point or path.")
 
 
 class ClickLayer(Layer):
-    """Asks the map about what is clicked at, and again as the map goes on."""
+    """Queries the map at what is clicked, and again as the map changes."""
 
     def __init__(self, page: Page) -> None:
         super().__init__(page, "Clicks", _PERIOD_S)
@@ -44,12 +44,12 @@ class ClickLayer(Layer):
         self.start(self._use, self._radius)
 
     def close(self) -> None:
-        """Listen and draw no more; what was drawn and the folder go."""
+        """Listen and draw no more; remove what was drawn and the folder."""
         self.page.scene.remove_click_callback(self._clicked)
         super().close()
 
     def refresh(self) -> None:
-        """Find what was clicked at, and ask where a point, the path or the map has changed."""
+        """Find what was clicked at, and ask if a point, the path or the map has changed."""
         for control in (self._radius, self._undo, self._clear):
             control.visible = self._use.value == _LAYS or bool(self._path)
         while True:
@@ -94,7 +94,7 @@ class ClickLayer(Layer):
             self._path += (point,)
 
     def _ask(self, point: AskedPoint | None, path: tuple[AskedPoint, ...], radius_m: float) -> None:
-        """Tell and draw what the map answers about a point and a path."""
+        """Show and draw what the map answers about a point and a path."""
         queries, points = self.page.source.queries, [asked.place for asked in path]
         laid = ask_path(queries, points, radius_m) if len(points) > 1 else None
         told = text_html(_SKY) if self._sky else ""

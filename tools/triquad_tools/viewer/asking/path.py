@@ -1,4 +1,4 @@
-"""Whether a robot can move along a path, and how near it comes to what."""
+"""Queries of whether a robot can move along a path, and its clearance."""
 
 from collections.abc import Sequence
 
@@ -15,7 +15,7 @@ from triquad_tools.plots.slice_plan import BEHIND
 from triquad_tools.viewer.page.layer import Layer
 from triquad_tools.viewer.page.legends import Legend, LineMeaning, table_html
 
-_LEAST_REACH_M, _REACH_RADII = 1.0, 3.0  # how far around surfaces are looked for
+_LEAST_REACH_M, _REACH_RADII = 1.0, 3.0  # how far around surfaces are searched for
 _LEAST_WIDTH = 0.004  # of what is drawn, as a share of the distance of the eye
 _FREE = "#0072b2"
 LEGEND = Legend(
@@ -28,7 +28,7 @@ LEGEND = Legend(
 
 
 def reach_of(radius_m: float) -> float:
-    """How far around a robot of some radius its clearance is told, metres."""
+    """Return up to which clearance is reported for a robot of some radius, metres."""
     return min(max(_LEAST_REACH_M, _REACH_RADII * radius_m), MAX_DISTANCE_M)
 
 
@@ -42,7 +42,7 @@ def ask_path(queries: MapQueries, points: Sequence[Doubles], radius_m: float) ->
 
 
 def path_html(points: int, radius_m: float, answer: Polyline) -> str:
-    """What the map answers about a path of so many points."""
+    """Return what the map answers about a path of N points, as HTML."""
     rows = [("path", f"{points} points, {answer.length_m:.2f} m")]
     if answer.blocked:
         rows.append(("blocked", f"⚠ at {answer.contact_m:.2f} m"))
@@ -58,7 +58,7 @@ def path_html(points: int, radius_m: float, answer: Polyline) -> str:
 
 
 def path_legs(points: Sequence[Doubles], answer: Polyline) -> list[tuple[str, Doubles]]:
-    """Stretches of a path, each with a colour and the points [N, 3] along it."""
+    """Return stretches of a path, each with a colour and the points [N, 3] along it."""
     places = np.array(points)
     ends_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))])
     unknown_m = answer.unknown_contact_m if answer.meets_unknown else np.inf

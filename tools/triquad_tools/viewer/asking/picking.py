@@ -1,4 +1,4 @@
-"""What is seen of a map in some direction, where the backs of surfaces are not drawn."""
+"""Surface that is seen in some direction, where the backs of surfaces are not drawn."""
 
 import numpy as np
 from triquad_client.calls.queries import MapQueries
@@ -8,17 +8,17 @@ from triquad_format.records.status import Status
 from triquad_tools.viewer.page.page import Page
 
 _REACH_M = 1000.0  # the longest ray that a map answers
-_BEFORE_M = 250.0  # where the eye is far away, a ray starts so far before what it looks at
+_BEFORE_M = 250.0  # where the eye is far away, a ray starts this far before what it looks at
 _BACKS = 24  # of surfaces that a ray passes
 _BEFORE_FRONT_M = 0.2
 _BEYOND_BACK_M = 0.4  # where a ray goes on: a surface seen from behind is that thick
 
 
 def surface_along(page: Page, origin: Doubles, towards: Doubles) -> Doubles | None:
-    """The first surface [3], metres, map frame, whose front a ray meets; ``None``: it meets none.
+    """Return the first surface [3], metres, map frame, whose front a ray meets; else ``None``.
 
     Args:
-        page: whose map is looked at.
+        page: whose map is shown.
         origin: [3] metres, map frame.
         towards: [3] its direction, of any length but 0.
 
@@ -42,7 +42,7 @@ def surface_along(page: Page, origin: Doubles, towards: Doubles) -> Doubles | No
 
 
 def ground_in_view(page: Page) -> Doubles:
-    """The ground [3], map frame, below what the camera is turned about; else that itself.
+    """Return the ground [3], map frame, below what the camera is turned about; else that itself.
 
     Raises:
         TriquadError: the map does not answer.

@@ -1,4 +1,4 @@
-"""What the map says at a point, in the panel and in the scene."""
+"""A query at a point, shown in the panel and in the scene."""
 
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ _COLOUR = to_rgb("#c51b7d")  # no mesh has it
 
 
 class AskedPoint(NamedTuple):
-    """Where the map is asked."""
+    """A point at which the map is queried."""
 
     surface: tuple[float, ...]  # [3] metres, map frame: what was clicked at
     raised_m: float
@@ -39,7 +39,7 @@ def ask_point(queries: MapQueries, point: AskedPoint) -> Distances:
 
 
 def point_html(point: AskedPoint, answer: Distances) -> str:
-    """What the map answers about a point."""
+    """Return what the map answers about a point, as HTML."""
     x, y, z = point.place
     status, distance_m = Status(int(answer.status[0])), float(answer.distance_m[0])
     distance, gradient = f"no surface within {_MAX_DISTANCE_M:g} m", "none"

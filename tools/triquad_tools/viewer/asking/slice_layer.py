@@ -1,4 +1,4 @@
-"""A slice through the distances of a map, where a person puts it."""
+"""A slice through the distances of a map, placed by a person."""
 
 import numpy as np
 import viser
@@ -29,7 +29,7 @@ _MAX_DISTANCE_M = 3.0
 
 
 class SliceLayer(Layer):
-    """Draws a slice around what the camera looks at."""
+    """Draws a slice around the camera's target."""
 
     def __init__(self, page: Page) -> None:
         super().__init__(page, "Slice", _PERIOD_S)
@@ -51,7 +51,7 @@ class SliceLayer(Layer):
         self.start(self._on, self._at, self._most)
 
     def refresh(self) -> None:
-        """Ask where what is looked at, the map or a control has changed."""
+        """Ask if the camera's target, the map or a control has changed."""
         for control in (self._kind, self._at, self._here, self._most, self._text):
             control.visible = self._on.value
         if not self._on.value:

@@ -1,4 +1,4 @@
-"""Slices of a map: where they lie, what a map says there, and pictures of that."""
+"""Slices of a map: their places, queries and pictures."""
 
 from dataclasses import dataclass
 
@@ -26,7 +26,7 @@ HEIGHT_AXIS = 2
 
 @dataclass(frozen=True)
 class Slice:
-    """What a map says at the middles of one layer of cells, of one epoch.
+    """The answers at the centres of one layer of cells, of one epoch.
 
     Columns run along the first of the two axes that the slice has, rows along the second.
     """
@@ -37,7 +37,7 @@ class Slice:
 
 
 def slice_box(focus: Focus, axis: int, at_m: float) -> CellBox:
-    """One layer of cells at some x, y or z (axis 0, 1 or 2), around what is looked at."""
+    """Return a layer of cells at some x, y or z (axis 0, 1 or 2), around the camera's target."""
     counts = [_CELLS, _CELLS, _CELLS if axis == HEIGHT_AXIS else _UPRIGHT_CELLS]
     counts[axis] = 1
     cell_m = focus.side_m / _CELLS
@@ -48,7 +48,7 @@ def slice_box(focus: Focus, axis: int, at_m: float) -> CellBox:
 
 
 def slice_axes(axis: int) -> Doubles:
-    """Unit vectors [3, 3] as columns of a rotation: along a row, along a column, and across."""
+    """Return unit vectors [3, 3] as columns of a rotation: along rows, along columns, across."""
     across, up = np.delete(np.eye(3), axis, axis=0)
     return np.stack([across, up, np.cross(across, up)], axis=1)
 
@@ -67,13 +67,13 @@ def ask_slice(queries: MapQueries, box: CellBox, axis: int, max_distance_m: floa
 
 
 def line_distances(max_distance_m: float) -> Doubles:
-    """The round distances at which a slice has lines, from 0 up, metres."""
+    """Return the round distances at which a slice has lines, from 0 up, metres."""
     levels = np.asarray(_LEVELS.tick_values(0.0, max_distance_m), np.float64)
     return levels[levels < max_distance_m]
 
 
 def picture(answer: Slice, max_distance_m: float) -> Bytes:
-    """Colours [height, width, 3], the least row first, with lines at round distances.
+    """Return colours [height, width, 3], the least row first, with lines at round distances.
 
     Lines end where nothing was seen; those of the surface itself are black.
     """

@@ -1,4 +1,4 @@
-"""Where free space ends without a surface: the faces between free and unknown cells."""
+"""The border of free space without a surface: the faces between free and unknown cells."""
 
 import numpy as np
 from matplotlib.colors import to_rgb
@@ -14,14 +14,14 @@ from triquad_tools.viewer.page.page import Page
 _PERIOD_S = 1.0
 _COUNTS = (64, 64, 24)  # cells: they bound how much is asked
 _MOST_CELL_M = 0.75
-_VOXEL_CELLS = 2  # a cell of the mesh is half a voxel, as fine as what is known is told
+_VOXEL_CELLS = 2  # a cell of the mesh is half a voxel, as fine as the status is known
 _NO_DISTANCE_M = 0.01  # status is what is asked for; searching far costs most
 _COLOUR, _OPACITY = "#cc79a7", 0.4
 _LEGEND = Legend(lines=(LineMeaning(_COLOUR, "between free and unknown space"),))
 
 
 class UnknownLayer(Layer):
-    """Draws the boundary of free against unknown space around what the camera looks at."""
+    """Draws the boundary of free against unknown space around the camera's target."""
 
     def __init__(self, page: Page) -> None:
         super().__init__(page, "Unknown space", _PERIOD_S)
@@ -31,7 +31,7 @@ class UnknownLayer(Layer):
         self.start(self._on)
 
     def refresh(self) -> None:
-        """Ask where what is looked at, or the map, has changed."""
+        """Ask if the camera's target or the map has changed."""
         self._text.visible = self._on.value
         if not self._on.value:
             self.erase()
@@ -61,7 +61,7 @@ class UnknownLayer(Layer):
 
 
 def ask_boundary(queries: MapQueries, box: CellBox) -> tuple[Ints, Ints, int]:
-    """The faces of a box through which one passes from free into unknown space, and the epoch.
+    """Return the faces of a box between free and unknown space, and the epoch.
 
     Faces are as of :func:`border_faces`. Cells are coarse: where there is a surface between their
     middles, there is no such face.
@@ -79,7 +79,7 @@ def ask_boundary(queries: MapQueries, box: CellBox) -> tuple[Ints, Ints, int]:
 
 
 def border_faces(status: Bytes) -> tuple[Ints, Ints]:
-    """The faces of free cells beyond which the cell is unknown, for the status [x, y, z].
+    """Return the faces of free cells beyond which the cell is unknown, for the status [x, y, z].
 
     Returns:
         The free cells [N, 3], and the steps [N, 3] from there to the unknown ones.
@@ -92,7 +92,7 @@ def border_faces(status: Bytes) -> tuple[Ints, Ints]:
 
 
 def face_triangles(cells: Ints, steps: Ints) -> tuple[Floats, Ints]:
-    """Vertices [4 N, 3], in cells, and rows of them [2 N, 3]: two triangles of each face."""
+    """Return vertices [4 N, 3], in cells, and rows of them [2 N, 3]: two triangles of each face."""
     across = np.roll(np.abs(steps), 1, axis=1)
     up = np.roll(across, 1, axis=1)
     corner = cells + np.maximum(steps, 0)

@@ -28,9 +28,9 @@ _ENOUGH = 200  # vertices of a tile, to know where it is
 
 
 class _DrawnTile(NamedTuple):
-    """What is in the scene for a tile."""
+    """The part of the scene for a tile."""
 
-    appearance: Hashable  # where this is another one, what is drawn looks otherwise
+    appearance: Hashable  # if this is another one, the drawing is outdated
     handle: viser.GlbHandle
 
 
@@ -52,7 +52,7 @@ class MeshLayer(Layer):
         self.start(self._by, self._pixels)
 
     def close(self) -> None:
-        """Draw no more; what was drawn and the folder go."""
+        """Draw no more; remove what was drawn and the folder."""
         super().close()
         self._tiles.close()
 
@@ -64,7 +64,7 @@ class MeshLayer(Layer):
         super().erase()
 
     def refresh(self) -> None:
-        """One round: what came since the last one is drawn, and what it replaces goes."""
+        """Draw what came since the last round, and remove what it replaces."""
         self._remove_replaced()
         camera = self.page.client.camera
         pixel_m = camera.fov / max(camera.image_height, 1)  # at a distance of one metre
@@ -89,7 +89,7 @@ class MeshLayer(Layer):
             self.wake()
 
     def _colours(self, points: Doubles) -> TileColours:
-        """The colours that are chosen, for a mesh with some ``points`` [N, 3], and their legend."""
+        """Return the chosen colours, for a mesh with some ``points`` [N, 3], and their legend."""
         if self._by.value == _CONFIDENCE:
             colours = confidence_colours(self.page.source.queries)
         else:
@@ -114,6 +114,6 @@ class MeshLayer(Layer):
 
 
 def _some_vertices(tiles: Iterable[MeshTile]) -> Doubles:
-    """Vertices [N, 3] of all tiles, enough to know where these are; metres, map frame."""
+    """Return vertices [N, 3] of all tiles, enough to know where these are; metres, map frame."""
     some = [tile.origin + tile.vertices[:: max(1, len(tile.vertices) // _ENOUGH)] for tile in tiles]
     return np.concatenate([np.zeros((0, 3)), *some])

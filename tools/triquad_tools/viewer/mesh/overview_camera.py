@@ -1,4 +1,4 @@
-"""A camera that shows all of a map until a person takes it."""
+"""A camera that shows all of a map until a person moves it."""
 
 import math
 from collections import deque
@@ -19,18 +19,18 @@ _MARGIN = 1.05
 _LEAST_ASPECT = 0.1
 _GROWN = 0.02  # share of the camera's distance; a smaller step is not worth a jump
 _SAME = 1e-3
-_EYES = 64  # places where it was put last: what a browser tells is not as old as those before
+_EYES = 64  # places where it was put last: what a browser reports is not as old as those before
 
 
 class View(NamedTuple):
-    """Where a camera is and what it looks at: [3] metres, map frame."""
+    """The camera's position and target: [3] metres, map frame."""
 
     eye: Doubles
     target: Doubles
 
 
 def view_of(points: Doubles, aspect: float) -> View:
-    """A view aslant from above that has nearly all of ``points`` [N, 3] in it, at least one."""
+    """Return an oblique view from above of nearly all ``points`` [N, 3], at least one."""
     axes = view_axes(-_TOWARDS_EYE)
     seen = points @ axes.T
     middle = 0.5 * np.percentile(seen, _FRAMED, axis=0).sum(axis=0)
@@ -49,7 +49,7 @@ class OverviewCamera:
         self._taken = False
         camera = page.client.camera
         camera.fov, camera.near, camera.far = _VIEW_RAD, _NEAR_M, _FAR_M
-        # The browser tells of each place late: only one where it never was put is a person's.
+        # The browser reports each place late: only one where it never was put is a person's.
         self._eyes = deque([np.array(camera.position)], _EYES)  # [3] in the scene
         camera.on_update(self._moved)
 

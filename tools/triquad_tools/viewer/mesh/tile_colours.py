@@ -1,4 +1,4 @@
-"""What the colours of the mesh say, and how to have them in a browser as they are."""
+"""The colours of the mesh, and how to have them unchanged in a browser."""
 
 import math
 from collections.abc import Callable, Hashable
@@ -18,7 +18,7 @@ from triquad_tools.viewer.page.legends import ColourScale
 _TOWARDS_SUN = np.array([-0.50, -0.58, 0.64]) / np.linalg.norm([-0.50, -0.58, 0.64])
 _SUN, _SKY = 0.55, 0.5
 _STEP_M = 0.5  # of the ends of the scale: it stays the same as the map grows a little
-_NEAR_M = 1.0  # around a vertex, where its surface is looked for
+_NEAR_M = 1.0  # around a vertex, where its surface is searched
 
 # The browser's tone mapping, ACES Filmic as three.js has it, which viser cannot be asked to leave
 # out: a fit by Stephen Hill of the ACES reference and output transforms.
@@ -39,7 +39,7 @@ class TileColours:
 
 
 def height_colours(heights_m: NDArray[np.floating]) -> TileColours:
-    """By height in the map frame, on a scale for nearly all of heights [N], to half a metre."""
+    """Colour by height in the map frame, on a scale for nearly all heights [N], to half a metre."""
     around = HeightScale.around(heights_m)
     low_m = math.floor(around.low_m / _STEP_M) * _STEP_M
     high_m = math.ceil(around.high_m / _STEP_M) * _STEP_M
@@ -51,7 +51,7 @@ def height_colours(heights_m: NDArray[np.floating]) -> TileColours:
 
 
 def confidence_colours(queries: MapQueries) -> TileColours:
-    """By how much the rays have shown of the surface, as the map answers for its distances."""
+    """Colour by how much the rays have shown of the surface: the confidence of distances."""
     return TileColours(
         ColourScale("confidence", HEIGHTS, 0.0, 1.0),
         key=lambda tile: tile.version,
@@ -60,7 +60,7 @@ def confidence_colours(queries: MapQueries) -> TileColours:
 
 
 def lit_colours(colours: TileColours, tile: MeshTile) -> Doubles:
-    """Linear colours [V, 3] for the browser, in the light of a sun and a bright sky.
+    """Return linear colours [V, 3] for the browser, in the light of a sun and a bright sky.
 
     They are drawn without lights, which would cost a browser most of all.
     """
@@ -72,7 +72,7 @@ def lit_colours(colours: TileColours, tile: MeshTile) -> Doubles:
 
 
 def before_tone_mapping(shown: Doubles) -> Doubles:
-    """The linear colours [N, 3] that the browser shows as linear colours ``shown`` [N, 3]."""
+    """Return linear colours [N, 3] that the browser shows as linear colours ``shown`` [N, 3]."""
     a, b, c, d, e = _FIT
     wanted = np.clip(np.clip(shown, 0.0, 1.0) @ np.linalg.inv(_OUT).T, 0.0, _BRIGHTEST)
     # (1 - c y) x^2 + (a - d y) x + (b - e y) = 0

@@ -1,4 +1,4 @@
-"""Which mesh tiles a scene shows: coarse ones everywhere, finer ones where the camera is near."""
+"""The mesh tiles of a scene: coarse ones everywhere, finer ones where the camera is near."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -27,11 +27,11 @@ class NearTiles:
         self._follower: TileFollower | None = None
         self._roots: set[TileIndex] = set()  # tiles of the coarsest level that are followed
         self.ready: set[TileIndex] = set()
-        """Tiles of the coarsest level within which all of this one are there."""
+        """The tiles of the coarsest level in which all tiles of this level are loaded."""
 
     @property
     def loaded(self) -> bool:
-        """Whether all that is followed was there once."""
+        """Whether all that is followed was complete once."""
         return self._roots <= self.ready
 
     def refresh(self, roots: list[TileIndex]) -> None:
@@ -44,7 +44,7 @@ class NearTiles:
                 self.ready = self._roots
 
     def within(self, root: TileIndex) -> Iterator[tuple[TileName, MeshTile]]:
-        """The tiles within a tile of the coarsest level."""
+        """Yield the tiles within a tile of the coarsest level."""
         tiles = {} if self._follower is None else self._follower.tiles
         count = 1 << (COARSEST - self.level)
         for step in np.ndindex(count, count, count):
@@ -53,7 +53,7 @@ class NearTiles:
                 yield TileName(self.level, (x, y, z)), tiles[x, y, z]
 
     def close(self) -> None:
-        """Follow no longer."""
+        """Stop following."""
         if self._follower is not None:
             self._follower.close()
 
@@ -91,11 +91,11 @@ class TilesInView:
 
     @property
     def loaded(self) -> bool:
-        """Whether all that is in view was there once; from then on only changes come."""
+        """Whether all that is in view was complete once; from then on only changes come."""
         return self._whole_loaded and all(near.loaded for near in self._near)
 
     def refresh(self, eye: Doubles, coarsest_m: float) -> dict[TileName, MeshTile]:
-        """Fetch some of what is new; returns what of all tiles is to be drawn.
+        """Fetch some of what is new; return which tiles are to be drawn.
 
         Args:
             eye: [3] metres, map frame.
@@ -114,7 +114,7 @@ class TilesInView:
         return {name: tile for tiles in parts.values() for name, tile in tiles.items()}
 
     def close(self) -> None:
-        """Follow no longer."""
+        """Stop following."""
         self._whole.close()
         for near in self._near:
             near.close()
@@ -123,7 +123,7 @@ class TilesInView:
 def near_columns(
     roots: list[TileIndex], side_m: float, eye: Doubles, reach_m: float
 ) -> list[TileIndex]:
-    """The tiles above and below which there is one no farther from the eye than ``reach_m``.
+    """Return the tiles above and below which there is one no farther from the eye than ``reach_m``.
 
     Tiles above each other have one level: where the ground lies in the side between two of them,
     as at z = 0, meshes of two levels would leave holes all over it.

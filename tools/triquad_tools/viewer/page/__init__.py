@@ -1,1 +1,1 @@
-"""What every part of a page works with: scene, panel, colours, and threads that refresh."""
+"""The base of all parts of a page: scene, panel, colours, and threads that refresh."""

@@ -48,7 +48,7 @@ class Layer(ABC):
         self._thread.start()
 
     def wake(self, _: object = None) -> None:
-        """Have it refreshed soon."""
+        """Refresh soon."""
         self._woken.set()
 
     def close(self) -> None:
@@ -64,7 +64,7 @@ class Layer(ABC):
         """Bring scene and panel up to date."""
 
     def outdated(self, wanted: Hashable) -> bool:
-        """Whether to ask: for something else than before, or of a newer epoch.
+        """Return whether to ask: for something else than before, or of a newer epoch.
 
         The same is asked again only once it took no more than a tenth of the time.
         """
@@ -75,23 +75,23 @@ class Layer(ABC):
         return self._began_s > self._due_s and newest_epoch(queries) != self._epoch
 
     def answered(self, wanted: Hashable, epoch: int) -> None:
-        """What was :meth:`outdated` is not any more."""
+        """Record that what was :meth:`outdated` is up to date."""
         self._answered, self._epoch = wanted, epoch
         now_s = time.monotonic()
         self._due_s = now_s + max(_LEAST_ASKED_S, (now_s - self._began_s) / _SHARE)
 
     @property
     def drawn(self) -> bool:
-        """Whether anything is."""
+        """Whether anything is drawn."""
         return bool(self._marks)
 
     def node(self, name: str) -> str:
-        """A name for a node of the scene that no other has."""
+        """Return a name for a node of the scene that no other has."""
         self._nodes += 1
         return f"/{self.name}/{self._nodes}/{name}"
 
     def draw(self, marks: Sequence[viser.SceneNodeHandle], legend: Legend | None = None) -> None:
-        """Have these marks in the scene, and none that were drawn before."""
+        """Draw these marks in the scene instead of those drawn before."""
         before, self._marks = self._marks, list(marks)
         for mark in before:
             mark.remove()
@@ -124,5 +124,5 @@ class Layer(ABC):
 
 
 def newest_epoch(queries: MapQueries) -> int:
-    """The number of the map's newest epoch, a published state of it; errors as of its queries."""
+    """Return the number of the map's newest epoch, a published state; raises as its queries."""
     return queries.query_sdf(np.zeros((0, 3))).epoch

@@ -1,6 +1,6 @@
-"""What colours and lines of a scene mean, and texts in the panel of a page.
+"""The meaning of colours and lines of a scene, and texts in the panel of a page.
 
-What comes from the network is shown as it is, whatever it is.
+Texts from the network are shown as they are.
 """
 
 from collections.abc import Iterable, Sequence
@@ -29,7 +29,7 @@ class ColourScale:
 
     @property
     def ticks(self) -> list[str]:
-        """What stands at equal steps from the lower to the upper end."""
+        """Return the labels at equal steps from the lower to the upper end."""
         texts = [f"{value:.3g}" for value in np.linspace(self.low, self.high, _TICKS)]
         texts[0] = f"≤ {texts[0]}" if self.open_below else texts[0]
         texts[-1] = f"≥ {texts[-1]}" if self.open_above else texts[-1]
@@ -37,7 +37,7 @@ class ColourScale:
 
 
 class LineMeaning(NamedTuple):
-    """What lines that look alike say."""
+    """The meaning of lines that look alike."""
 
     colour: str  # as in #rrggbb
     text: str
@@ -46,7 +46,7 @@ class LineMeaning(NamedTuple):
 
 @dataclass(frozen=True)
 class Legend:
-    """What one part of a page draws."""
+    """The legend of one part of a page."""
 
     scale: ColourScale | None = None
     lines: Sequence[LineMeaning] = ()
@@ -74,19 +74,19 @@ def _scale_html(scale: ColourScale) -> str:
 
 
 def text_html(text: str) -> str:
-    """A text, line by line; nothing where it is empty."""
+    """Return a text, line by line; nothing where it is empty."""
     shown = f'<div style="{_TEXT}; white-space: pre-line">{_shown(text)}</div>'
     return shown if text else ""
 
 
 def problem_html(text: str) -> str:
-    """What goes wrong, with a sign before it; nothing where the text is empty."""
+    """Return a problem with a sign before it; nothing if the text is empty."""
     style = f"{_TEXT}; color: #9a3412; font-weight: bold"
     return f'<div style="{style}">⚠ {_shown(text)}</div>' if text else ""
 
 
 def table_html(rows: Iterable[tuple[str, str]]) -> str:
-    """Names and values, in two columns."""
+    """Return names and values, in two columns."""
     cells = "".join(
         f'<tr><td style="padding-right: 1em; opacity: 0.7">{_shown(name)}</td>'
         f"<td>{_shown(value)}</td></tr>"
@@ -96,5 +96,5 @@ def table_html(rows: Iterable[tuple[str, str]]) -> str:
 
 
 def _shown(text: str) -> str:
-    """A text of others that neither makes elements of the page nor turns its writing around."""
+    """Escape a text, so that it neither makes elements of the page nor reverses its writing."""
     return escape(printable_lines(text))

@@ -25,12 +25,12 @@ class Focus(NamedTuple):
 
 
 class Page:
-    """What each part of a page draws on; for several threads."""
+    """The page that its parts draw on; for several threads."""
 
     def __init__(
         self, client: viser.ClientHandle, source: MapSource, failed: Callable[[str, str], None]
     ) -> None:
-        """``failed`` is told which part has which problem; an empty text: none any more."""
+        """``failed`` gets a part and its problem; an empty text: none any more."""
         self.client = client
         self.scene = client.scene
         self.gui = client.gui
@@ -43,7 +43,7 @@ class Page:
         self._choosing = threading.Lock()
 
     def in_scene(self, points: NDArray[np.floating]) -> Floats:
-        """Points [..., 3] of the map frame as the scene has them."""
+        """Return points [..., 3] of the map frame as the scene has them."""
         with self._choosing:
             if self._origin is None and points.size:
                 first = np.asarray(points, np.float64).reshape(-1, 3)[0]
@@ -51,18 +51,18 @@ class Page:
         return np.asarray(points - (0.0 if self._origin is None else self._origin), np.float32)
 
     def in_map(self, points: NDArray[np.floating]) -> Doubles:
-        """Points [..., 3] of the scene in the map frame."""
+        """Return points [..., 3] of the scene in the map frame."""
         origin = np.zeros(3) if self._origin is None else self._origin
         return np.asarray(points, np.float64) + origin
 
     @property
     def eye(self) -> Doubles:
-        """Where the camera is [3], metres, map frame."""
+        """The position of the camera [3], metres, map frame."""
         return self.in_map(self.client.camera.position)
 
     @property
     def focus(self) -> Focus:
-        """What the camera is turned about."""
+        """The point that the camera is turned about."""
         camera = self.client.camera
         middle = self.in_map(camera.look_at)
         aspect = camera.image_width / max(camera.image_height, 1)

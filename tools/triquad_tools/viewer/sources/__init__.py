@@ -1,1 +1,1 @@
-"""Where a page takes its map from: a server, a file, or the checkpoints of a store."""
+"""Sources of a page's map: a server, a file, or the checkpoints of a store."""

@@ -27,7 +27,7 @@ class Moment:
     """A checkpoint."""
 
     epoch: int
-    time: str  # UTC as in RFC 3339; empty where the file does not tell
+    time: str  # UTC as in RFC 3339; empty if the file does not say
     path: Path
 
     def __str__(self) -> str:
@@ -58,19 +58,19 @@ class History:
 
     @property
     def moments(self) -> tuple[Moment, ...]:
-        """What can be shown as far as is known, the oldest first."""
+        """The checkpoints that can be shown as far as is known, the oldest first."""
         with self._reading:
             files = sorted(self._moments.keys() - self._damaged.keys(), reverse=True)
             return tuple(self._moments[file] for file in sorted(newest_of_each(files)))
 
     @property
     def damaged(self) -> tuple[str, ...]:
-        """What is wrong with those that cannot be shown, the oldest first."""
+        """The errors of those that cannot be shown, the oldest first."""
         with self._reading:
             return tuple(problem for _, problem in sorted(self._damaged.items()))
 
     def refresh(self) -> None:
-        """Take up what a server wrote or deleted meanwhile.
+        """Update from what a server wrote or deleted meanwhile.
 
         Raises:
             ToolError: the folder cannot be read.
@@ -88,7 +88,7 @@ class History:
                     known.pop(file)
 
     def opened(self, moment: Moment) -> StoredMap:
-        """The map as it was.
+        """Return the map as it was.
 
         Raises:
             DamagedError: it cannot be shown; it is a moment no longer.
@@ -104,7 +104,7 @@ class History:
             raise DamagedError(problem) from error
 
     def newest(self) -> StoredMap:
-        """The map as it was at the newest moment that can be shown.
+        """Return the map as it was at the newest moment that can be shown.
 
         Raises:
             ToolError: there is none.

@@ -16,7 +16,7 @@ _PERIOD_S = 1.0  # between questions what changed: more often, and a robot's pla
 
 
 class LiveSource:
-    """The map of a server; the client is closed by who opened it."""
+    """The map of a server; the caller closes the client."""
 
     grows = True
 
@@ -33,12 +33,12 @@ class LiveSource:
             self.sizes = TileSizes(watch.cell_m, watch.tile_side_m)
 
     def state(self) -> MapState:
-        """What the server has published last; it is asked."""
+        """Ask the server for its newest published state."""
         epoch = self.client.status().epoch
         return MapState(self.client.map_name, epoch, utc_time(time.time_ns()))
 
     def follow(self, level: int, bounds: Bounds | None = None) -> "LiveFollower":
-        """The mesh tiles of a level that meet ``bounds``, as the server makes them."""
+        """Follow the mesh tiles of a level that meet ``bounds``, as the server makes them."""
         return LiveFollower(self.client, self.client.watch_mesh(bounds, level))
 
 
@@ -57,11 +57,11 @@ class LiveFollower:
 
     @property
     def complete(self) -> bool:
-        """Whether the last refresh left nothing waiting."""
+        """Whether the last refresh left nothing pending."""
         return self._watch.complete
 
     def refresh(self) -> None:
-        """Fetch what one reply brings; once all was there, no more than one a second."""
+        """Fetch one reply; once all was complete, no more than one a second."""
         now_s = time.monotonic()
         if now_s >= self._due_s:
             self._watch.next(timeout_s=0.0)
@@ -75,5 +75,5 @@ class LiveFollower:
         return LiveFollower(self._client, watch)
 
     def close(self) -> None:
-        """Follow no longer."""
+        """Stop following."""
         self._watch.close()

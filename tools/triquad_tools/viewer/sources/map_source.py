@@ -1,4 +1,4 @@
-"""Where a page takes its map from: a server that learns, or a file."""
+"""The interface of a page's map: a server that learns, or a file."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,10 +22,10 @@ class TileFollower(Protocol):
 
     @property
     def complete(self) -> bool:
-        """Whether the last refresh left nothing waiting."""
+        """Whether the last refresh left nothing pending."""
 
     def refresh(self) -> None:
-        """Fetch some of what changed; returns soon, also where there is more.
+        """Fetch some of what changed; return soon, also if there is more.
 
         Raises:
             TriquadError: it cannot be had now; the tiles stay.
@@ -35,7 +35,7 @@ class TileFollower(Protocol):
         """Follow another box instead, and go on with the tiles that both have."""
 
     def close(self) -> None:
-        """Follow no longer."""
+        """Stop following."""
 
 
 @dataclass(frozen=True)
@@ -46,17 +46,17 @@ class TileSizes:
     tile_side_m: float  # of level 0
 
     def cell_of(self, level: int) -> float:
-        """Side of the cells of a level."""
+        """Return side of the cells of a level."""
         return self.cell_m * (1 << level)
 
     def side_of(self, level: int) -> float:
-        """Side of the tiles of a level."""
+        """Return side of the tiles of a level."""
         return self.tile_side_m * (1 << level)
 
 
 @dataclass(frozen=True)
 class MapState:
-    """Of which map a page shows what state."""
+    """The map that a page shows, and its state."""
 
     map_name: str
     epoch: int  # number of a published state of the map
@@ -64,7 +64,7 @@ class MapState:
 
 
 class MapSource(Protocol):
-    """A map to look at."""
+    """A map to show."""
 
     @property
     def title(self) -> str:
@@ -72,22 +72,22 @@ class MapSource(Protocol):
 
     @property
     def queries(self) -> MapQueries:
-        """Answers questions about the map as it is now."""
+        """The queries of the map as it is now."""
 
     @property
     def sizes(self) -> TileSizes:
-        """Of its mesh."""
+        """The sizes of its mesh."""
 
     @property
     def grows(self) -> bool:
-        """Whether more of it may become known while somebody looks."""
+        """Whether more of it may become known while it is shown."""
 
     def state(self) -> MapState:
-        """What is shown now.
+        """Return what is shown now.
 
         Raises:
             TriquadError: the server does not answer.
         """
 
     def follow(self, level: int, bounds: Bounds | None = None) -> TileFollower:
-        """The mesh tiles of a level that meet ``bounds``, metres, map frame; ``None``: all."""
+        """Follow the tiles of a level that meet ``bounds``, metres, map frame; ``None``: all."""

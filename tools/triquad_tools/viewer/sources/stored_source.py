@@ -19,7 +19,7 @@ from triquad_tools.viewer.sources.map_source import MapState, TileSizes
 
 _CELL_LEAVES = 0.5  # of a cell of level 0, as in a server's mesh
 _MAX_TILES = 500  # that are kept of an open map: some 50 to 200 MB
-_WAIT_S = 0.1  # so long one refresh makes tiles
+_WAIT_S = 0.1  # how long one refresh makes tiles
 
 
 class StoredMap:
@@ -45,7 +45,7 @@ class StoredMap:
         """The tile of a level and an index, one of :meth:`indices`."""
 
     def indices(self, level: int, bounds: Bounds | None) -> list[TileIndex]:
-        """The tiles that meet a box and may have faces, those nearest to its middle last."""
+        """Return the tiles that meet a box and may have faces, those nearest to its middle last."""
         with self._listing:
             listed = self._listed_tiles(level).indices
         tiles, side_m = np.array(list(listed), np.int64).reshape(-1, 3), self.sizes.side_of(level)
@@ -71,23 +71,23 @@ class StoredMap:
 
 
 class StoredSource:
-    """A map file that one page or several show, until :meth:`show` puts another in its place."""
+    """A map file that pages show, until :meth:`show` replaces it."""
 
     grows = False
 
     def __init__(self, shown: StoredMap, place: str) -> None:
-        """``place`` tells people where the map is from."""
+        """``place`` shows people where the map is from."""
         self.shown = shown
         self.sizes = shown.sizes
         self.title = f"{shown.opened.name} in {place}"
 
     @property
     def queries(self) -> MapQueries:
-        """Answers for the map that is shown."""
+        """The queries of the map that is shown."""
         return self.shown.opened
 
     def state(self) -> MapState:
-        """What is shown."""
+        """Return what is shown."""
         opened = self.shown.opened
         stamp = utc_time(opened.stamp_ns) if opened.stamp_ns else ""
         return MapState(opened.name, opened.epoch, stamp)
@@ -103,7 +103,7 @@ class StoredSource:
         self.shown = other
 
     def follow(self, level: int, bounds: Bounds | None = None) -> "StoredFollower":
-        """The mesh tiles of a level that meet ``bounds``, of whatever map is shown."""
+        """Follow the mesh tiles of a level that meet ``bounds``, of any map that is shown."""
         return StoredFollower(self, level, bounds)
 
 
@@ -121,7 +121,7 @@ class StoredFollower:
         self.tiles: Mapping[TileIndex, MeshTile] = {}
         """The tiles as of the last refresh, by their indices; of one map."""
         self.complete = False
-        """Whether the last refresh left nothing waiting."""
+        """Whether the last refresh left nothing pending."""
 
     def refresh(self) -> None:
         """Make tiles for a short time; until all are there, those of the map before are shown."""
@@ -139,7 +139,7 @@ class StoredFollower:
         self._publish()
 
     def moved(self, bounds: Bounds) -> "StoredFollower":
-        """Follow another box instead: what was made is still known."""
+        """Follow another box instead: what was made is kept."""
         self._bounds = bounds
         if self._of is not None:
             wanted = self._of.indices(self._level, bounds)
@@ -149,7 +149,7 @@ class StoredFollower:
         return self
 
     def close(self) -> None:
-        """Nothing is to be let go of."""
+        """Do nothing: there is nothing to release."""
 
     def _publish(self) -> None:
         if not self._changing:

@@ -14,14 +14,14 @@ from triquad_tools.sensors.point_times import TIME_FIELDS
 
 
 class FilePoints(NamedTuple):
-    """What is made of a file of points."""
+    """The content of a file of points."""
 
     points: Doubles  # [N, 3] metres, as the file has them: some may not be finite
     times: NDArray[Any] | None = None  # [N] when each was measured, in the driver's own unit
 
 
 def wanted_fields(path: Path, names: Sequence[str]) -> list[str]:
-    """Of a file's fields x, y, z, and that of times where it has one.
+    """Return a file's fields x, y, z, and that of times if it has one.
 
     Raises:
         ToolError: there is no x, y or z.
@@ -36,13 +36,13 @@ def wanted_fields(path: Path, names: Sequence[str]) -> list[str]:
 
 
 def points_of_table(table: NDArray[Any], fields: Sequence[str]) -> FilePoints:
-    """The points of a table with named columns, of which ``fields`` are wanted."""
+    """Return the points of a table with named columns, of which ``fields`` are wanted."""
     points = np.stack([table[name] for name in "xyz"], axis=1).astype(np.float64)
     return FilePoints(points, table[fields[3]] if len(fields) > 3 else None)
 
 
 def points_of_text(path: Path, file: BinaryIO, columns: Sequence[str], count: int) -> FilePoints:
-    """The points of ``count`` lines of numbers, at which a file stands.
+    """Return the points of the next ``count`` lines of numbers in a file.
 
     Raises:
         ToolError: they are no numbers.
@@ -60,7 +60,7 @@ def points_of_text(path: Path, file: BinaryIO, columns: Sequence[str], count: in
 
 
 def check_lines(path: Path, file: BinaryIO, points: int) -> None:
-    """Whether a file holds a line for each of so many points, from where it stands.
+    """Check that a file holds a line for each of ``points`` from its position on.
 
     Raises:
         ToolError: it is truncated.
@@ -71,7 +71,7 @@ def check_lines(path: Path, file: BinaryIO, points: int) -> None:
 
 
 def check_bytes(path: Path, points: int, needed: int) -> None:
-    """Whether a file has the bytes that so many points need.
+    """Check that a file has the bytes that ``points`` need.
 
     Raises:
         ToolError: it is truncated.
@@ -82,5 +82,5 @@ def check_bytes(path: Path, points: int, needed: int) -> None:
 
 
 def _truncated(path: Path, points: int, detail: str) -> ToolError:
-    """The error of a file that ends before the last of the points that it announces."""
+    """Return the error of a file that ends before the last of the points that it announces."""
     return ToolError(f"{path}: is truncated: {detail} for {points:,} points; copy it again")

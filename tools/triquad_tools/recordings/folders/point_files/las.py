@@ -13,7 +13,7 @@ from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.folders.point_files.file_points import FilePoints, check_bytes
 
 _RECORD_COUNTS = {100: 54, 243: 60}
-"""Where the header says how many records follow it, or the points, and bytes of the least one."""
+"""The place of the header's count of records or points, and the bytes of the smallest one."""
 _COUNT = struct.Struct("<I")
 _MAX_POINTS_PER_BYTE = 1000  # of LAZ; what is scanned takes a byte a point or more
 _CHUNK_TABLE_AT = struct.Struct("<q")
@@ -21,7 +21,7 @@ _CHUNK_TABLE = struct.Struct("<II")  # version, and how many chunks
 
 
 def check_las(path: Path) -> int:
-    """How many points a file announces, and holds as far as its length and its index tell.
+    """Return how many points a file announces, and has by its length and its index.
 
     Raises:
         ToolError: it is no LAS or LAZ file, or is truncated.
@@ -46,7 +46,7 @@ def check_las(path: Path) -> int:
 
 
 def read_las(path: Path) -> FilePoints:
-    """The points of a file.
+    """Return the points of a file.
 
     Raises:
         ToolError: it cannot be read.
@@ -59,7 +59,7 @@ def read_las(path: Path) -> FilePoints:
 
 
 def _check_records(path: Path, file: BinaryIO) -> None:
-    """Whether a file has room for its records; the library looks for as many as it says."""
+    """Check that a file has room for its records; the library reads as many as it says."""
     start = file.read(375)  # the header of the newest version
     file.seek(0)
     size = path.stat().st_size
@@ -75,7 +75,7 @@ def _check_records(path: Path, file: BinaryIO) -> None:
 
 
 def _check_index(path: Path, file: BinaryIO, header: Any) -> None:
-    """Whether LAZ has an index of its chunks; the library believes whatever stands there."""
+    """Check that LAZ has an index of its chunks; the library trusts any value there."""
     size = path.stat().st_size
     file.seek(header.offset_to_point_data)
     (table,) = _CHUNK_TABLE_AT.unpack(file.read(_CHUNK_TABLE_AT.size))
@@ -96,7 +96,7 @@ def _check_index(path: Path, file: BinaryIO, header: Any) -> None:
 
 @contextmanager
 def _one_error(path: Path) -> Iterator[None]:
-    """Makes a ToolError of whatever the library and its codec stumble on."""
+    """Make a ToolError of any error of the library and its codec."""
     logging.getLogger("laspy").setLevel(logging.CRITICAL)  # it says errors on standard error, too
     try:
         yield

@@ -26,7 +26,7 @@ _MAX_GROWTH = 100  # LZF makes at most 264 bytes of 3
 
 
 def check_pcd(path: Path) -> int:
-    """How many points a file announces, and holds as far as its length tells.
+    """Return how many points a file announces, and has by its length.
 
     Raises:
         ToolError: it is no PCD file with x, y and z, or is truncated.
@@ -42,7 +42,7 @@ def check_pcd(path: Path) -> int:
 
 
 def read_pcd(path: Path) -> FilePoints:
-    """The points of a file.
+    """Return the points of a file.
 
     Raises:
         ToolError: it cannot be read.
@@ -58,7 +58,7 @@ def read_pcd(path: Path) -> FilePoints:
         file.seek(0)
         try:
             table = PointCloud.from_fileobj(file).pc_data
-        except Exception as error:  # whatever the library and its codec stumble on
+        except Exception as error:  # any error of the library and its codec
             raise ToolError(f"{path}: cannot be read as PCD: {error}; write it again") from error
     return points_of_table(table, wanted_fields(path, _columns(header)))
 
@@ -86,12 +86,12 @@ def _read_header(path: Path, file: BinaryIO) -> "MetaData":
 
 
 def _columns(header: "MetaData") -> list[str]:
-    """Names of the numbers of a point; those of a field that has several are numbered."""
+    """Return names of the numbers of a point; those of a field that has several are numbered."""
     return list(header.build_dtype().names or ())
 
 
 def _length(path: Path, file: BinaryIO, header: "MetaData") -> int:
-    """Bytes that follow the header, at the end of which the file stands."""
+    """Return the bytes that follow the header, at the end of which the file's position is."""
     row_bytes = header.build_dtype().itemsize
     whole_bytes = header.points * row_bytes
     if header.data.value == "binary":

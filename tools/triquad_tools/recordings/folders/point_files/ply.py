@@ -1,7 +1,7 @@
 """PLY: the points of a cloud or a mesh.
 
-Read here, not with trimesh: that needs longer to be imported than a recording to be looked
-through, and tells neither from the header alone what is wrong nor the times of points.
+Read here, not with trimesh: its import takes longer than a recording takes to be
+checked, and it gives neither errors from the header alone nor the times of points.
 """
 
 from dataclasses import dataclass
@@ -42,7 +42,7 @@ class _Header:
 
 
 def check_ply(path: Path) -> int:
-    """How many points a file announces, and holds as far as its length tells.
+    """Return how many points a file announces, and has by its length.
 
     Raises:
         ToolError: it is no PLY file with x, y and z, or is truncated.
@@ -58,7 +58,7 @@ def check_ply(path: Path) -> int:
 
 
 def read_ply(path: Path) -> FilePoints:
-    """The points of a file.
+    """Return the points of a file.
 
     Raises:
         ToolError: it cannot be read.
