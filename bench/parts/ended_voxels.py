@@ -26,7 +26,7 @@ class EndedVoxels:
         self._scans.append(keys[keys != _NONE])
 
     def keys(self, scans: int = 1) -> Longs:
-        """Return the keys [N] of those in which rays of as many scans or more ended."""
+        """Return the keys [N] of those in which rays of at least ``scans`` scans ended."""
         keys, counts = np.unique(np.concatenate(self._scans), return_counts=True)
         return np.asarray(keys[counts >= scans])
 

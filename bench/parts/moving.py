@@ -118,7 +118,7 @@ class Look:
 
     @property
     def air_in_trail(self) -> float:
-        """The share of the trail that the field knows to be free."""
+        """The share of the trail that the field knows to be in the air."""
         return float((self.epoch.query(self.trail).sdf > _AIR_M).mean())
 
     @property

@@ -95,7 +95,7 @@ def draw(scores: Sequence[Scored], path: Path, *, title: str, neighbour: bool) -
 
 
 def _by_time(made: BenchStreet) -> tuple[list[Scored], Epoch]:
-    """Return scores after some seconds of taking scans in and training, of all cores together.
+    """Return scores after some seconds of integrating scans and training, of all cores together.
 
     The epoch is that of the settled map, of all scans.
     """

@@ -75,7 +75,7 @@ def _keep(turn: Turn, client: triquad_client.Client, kept: _Kept) -> None:
 
 
 def _load(turn: Turn, client: triquad_client.Client) -> None:
-    """Ask for what takes memory; errors of triquad are allowed."""
+    """Load the server with what takes memory; errors of triquad are allowed."""
     until = time.monotonic() + turn.random.uniform(0.2, _SQUEEZE_S)
     points = np.tile(servers.sphere(20_000), (turn.random.choice((1, 10)), 1))
     while time.monotonic() < until:

@@ -25,7 +25,7 @@ _SENDERS = 8
 _REPLY_S = 30.0
 _WARM_SHARE = 5  # memory is compared with that after one part in N
 _MAY_WAIT = (keys.FLUSH, keys.TILE_UPDATES)  # as long as their mutants ask for
-_WAIT_S = 1.3  # so long such a request is waited for: many ask for a second
+_WAIT_S = 1.3  # the timeout of such a request: many ask for a second
 
 
 def run(turn: Turn) -> None:

@@ -18,7 +18,7 @@ from triquad_tools.console.lines import print_line
 
 _GAP = 2  # spaces before each column
 _PIPE_WIDTH = 10_000  # characters: nothing is broken where a program reads
-_CELL_WIDTH = 2_000  # of a text from the network
+_CELL_WIDTH = 2_000  # of a text that others chose
 
 
 @dataclass(frozen=True)

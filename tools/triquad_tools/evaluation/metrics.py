@@ -145,7 +145,7 @@ def score_against_drive(mesh: Mesh, drive: SimulatedDrive) -> MeshScores:
 
 
 def median_angle_deg(one: NDArray[np.floating], other: NDArray[np.floating]) -> float:
-    """Return median of the angles between vectors ``[N, 3]``; NaN where there are none."""
+    """Return the median of the angles between vectors ``[N, 3]``; NaN where there are none."""
     lengths = np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
     cosines = np.einsum("ni,ni->n", one, other) / np.maximum(lengths, 1e-12)
     angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
@@ -168,7 +168,7 @@ def sample_mesh(mesh: Mesh, count: int, rng: np.random.Generator) -> Doubles:
 
 
 def mesh_area_m2(mesh: Mesh) -> float:
-    """Return area of all faces."""
+    """Return the area of all faces."""
     corners = np.asarray(mesh.vertices, np.float64)[mesh.faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return 0.5 * float(np.linalg.norm(cross, axis=1).sum())

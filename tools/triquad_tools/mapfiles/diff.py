@@ -24,7 +24,7 @@ STILL_M = 1e-3
 """The least movement that counts: several times the error of a surface point."""
 
 NOISE_M = 0.02
-"""The most by which two maps that learnt the same differ; it does not make a change great."""
+"""The greatest difference of two maps that learnt the same; it does not make a change great."""
 
 _STEPS = 8
 _LEAST_SLOPE = 0.1  # a flatter field says nothing of where its zero is

@@ -64,7 +64,7 @@ def _dense(view: MapView, box: Box, cell_m: float) -> Arrays:
     """Return all lattice points within a box."""
     corners = list(zip(box[0].tolist(), box[1].tolist(), strict=True))
     sides = [(high - low) / cell_m for low, high in corners]
-    if math.prod(side + 1 for side in sides) > MAX_CELLS:  # at most N points
+    if math.prod(side + 1 for side in sides) > MAX_CELLS:  # at most this many points
         sizes = " x ".join(f"{side:.6g}" for side in sides)
         raise _too_many(sizes, math.prod(sides), "--crop, --sparse")
     low = [math.ceil(low / cell_m - _ROUNDING) for low, _ in corners]

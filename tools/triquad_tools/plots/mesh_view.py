@@ -38,7 +38,7 @@ class View:
     height_m: float  # of what the picture shows, across the view
 
     def project(self, points: NDArray[np.floating], height: int = HEIGHT) -> Doubles:
-        """Return column, row and metres nearer than the target [N, 3], in a picture so high."""
+        """Return column, row and metres nearer than the target [N, 3], for ``height`` rows."""
         seen = (points - self.target) @ self.axes.T
         middle, per_m = np.array([WIDTH, HEIGHT]) * height / HEIGHT / 2, height / self.height_m
         return np.column_stack([middle + per_m * seen[:, :2], -seen[:, 2]])

@@ -67,12 +67,12 @@ def old_bridge_cache(topic_name: str) -> str:
 
 
 def rmw_tokens(domain: int, end: End) -> str:
-    """Return key expression of all tokens of rmw_zenoh for one end of topics."""
+    """Return the key expression of all tokens of rmw_zenoh for one end of topics."""
     return f"@ros2_lv/{domain}/*/*/*/{end.value}/**"
 
 
 def bridge_tokens(end: End) -> str:
-    """Return key expression of all tokens of bridges for one end of topics."""
+    """Return the key expression of all tokens of bridges for one end of topics."""
     return f"@/*/@ros2_lv/{end.value}/**"
 
 

@@ -42,7 +42,7 @@ class Marker:
 
     @staticmethod
     def _without_texture(writer: CdrWriter) -> CdrWriter:
-        """Return texture, text and mesh file, of which there are none."""
+        """Write texture, text and mesh file, of which there are none."""
         nothing = np.empty(0, np.uint8)
         writer.text("").numbers("<u4", 0, 0).text("").text("").sequence(nothing)
         writer.sequence(nothing).text("").text("")

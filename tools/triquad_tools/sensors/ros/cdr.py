@@ -13,18 +13,18 @@ class CdrWriter:
         self._data = bytearray()
 
     def numbers(self, dtype: str, *values: float) -> "CdrWriter":
-        """Return numbers of one type, such as ``<f8``."""
+        """Write numbers of one type, such as ``<f8``."""
         return self._array(np.array(values, dtype))
 
     def text(self, value: str) -> "CdrWriter":
-        """Return a string."""
+        """Write a string."""
         data = value.encode() + b"\x00"
         self.numbers("<u4", len(data))
         self._data += data
         return self
 
     def sequence(self, values: NDArray[np.generic]) -> "CdrWriter":
-        """Return elements [N, ...] of one or more numbers each."""
+        """Write elements [N, ...] of one or more numbers each."""
         self.numbers("<u4", len(values))
         return self._array(values) if len(values) else self
 

@@ -21,7 +21,7 @@ class CellBox:
 
     @classmethod
     def around(cls, middle: Doubles, cell_m: float, counts: tuple[int, int, int]) -> "CellBox":
-        """Return the box around a point [3], map frame, to whole eighths of its longest side."""
+        """Return the box around a point [3], metres, map frame, to eighths of its longest side."""
         step_m = max(counts) * cell_m / _SNAPS
         x, y, z = np.round(middle / step_m) * step_m - 0.5 * cell_m * np.array(counts)
         return cls((float(x), float(y), float(z)), cell_m, counts)
@@ -37,7 +37,7 @@ class CellBox:
         return self.places(0.5 * np.array(self.counts))
 
     def places(self, cells: NDArray[np.number]) -> Doubles:
-        """Return points [N, 3], map frame, of cells [N, 3]: whole numbers are least corners."""
+        """Return points [N, 3], metres, map frame, of cells [N, 3]: integers are least corners."""
         return np.asarray(self.corner + self.cell_m * cells, np.float64)
 
     def ask(self, queries: MapQueries, max_distance_m: float) -> Grid:

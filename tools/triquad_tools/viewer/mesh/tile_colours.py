@@ -18,7 +18,7 @@ from triquad_tools.viewer.page.legends import ColourScale
 _TOWARDS_SUN = np.array([-0.50, -0.58, 0.64]) / np.linalg.norm([-0.50, -0.58, 0.64])
 _SUN, _SKY = 0.55, 0.5
 _STEP_M = 0.5  # of the ends of the scale: it stays the same as the map grows a little
-_NEAR_M = 1.0  # around a vertex, where its surface is searched
+_NEAR_M = 1.0  # around a vertex, where its surface is searched for
 
 # The browser's tone mapping, ACES Filmic as three.js has it, which viser cannot be asked to leave
 # out: a fit by Stephen Hill of the ACES reference and output transforms.

@@ -46,11 +46,11 @@ class TileSizes:
     tile_side_m: float  # of level 0
 
     def cell_of(self, level: int) -> float:
-        """Return side of the cells of a level."""
+        """Return the side of the cells of a level."""
         return self.cell_m * (1 << level)
 
     def side_of(self, level: int) -> float:
-        """Return side of the tiles of a level."""
+        """Return the side of the tiles of a level."""
         return self.tile_side_m * (1 << level)
 
 
