@@ -48,7 +48,20 @@ def with_hole(record: MapRecord, *, free: bool = False) -> MapRecord:
                 if free:
                     open_air[row, byte] |= surface[row, byte]
                 surface[row, byte] = 0
-    return changed(record, evidence=dataclasses.replace(evidence, surface=surface, free=open_air))
+    before, after = (
+        np.unpackbits(bits, bitorder="little").astype(bool) for bits in (evidence.surface, surface)
+    )
+    kept = after[before]
+    without = dataclasses.replace(
+        evidence,
+        surface=surface,
+        free=open_air,
+        levels=evidence.levels[kept],
+        seen_s=np.where(surface.any(axis=1), evidence.seen_s, 0),
+        outcomes=evidence.outcomes[kept],
+        margins=evidence.margins[kept],
+    )
+    return changed(record, evidence=without)
 
 
 def steep(region: Region, share: float) -> Region:

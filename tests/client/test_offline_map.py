@@ -105,7 +105,7 @@ def assert_close(have: Any, want: Any, name: str) -> None:
 
 
 def test_every_query_of_a_client_is_compared() -> None:
-    assert set(QUESTIONS) == {name for name in vars(MapQueries) if not name.startswith("_")}
+    assert set(QUESTIONS) == {name for name in dir(MapQueries) if not name.startswith("_")}
 
 
 @pytest.mark.parametrize("name", QUESTIONS)

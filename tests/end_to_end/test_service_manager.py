@@ -148,7 +148,7 @@ def test_while_the_mapper_hangs_the_watchdog_is_not_told_that_all_is_well(
 def test_while_nobody_answers_the_watchdog_is_not_told_that_all_is_well(manager, arguments) -> None:
     with server_whose_threads_are_known(arguments) as server:
         manager.wait_for("WATCHDOG=1")
-        with stopped_threads.stopped(threads_of(server, "receiver")):
+        with stopped_threads.stopped(threads_of(server, "worker")):
             assert_nothing_more_is_well(manager, server, "a question that the server asked itself")
         manager.wait_for("WATCHDOG=1")
 

@@ -41,7 +41,7 @@ from triquad_format.records import morton
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.map_progress import MapProgress
 from triquad_format.records.region import AXES, MAX_INTEGER, MapRecord
-from triquad_server.mesh.preview import previews_of
+from triquad_map.preview import previews_of
 
 
 def assert_read_back(record: MapRecord, data: bytes | None = None) -> None:

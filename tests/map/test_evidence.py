@@ -89,7 +89,7 @@ def test_a_record_restores_it() -> None:
     for again in (restored.freeze(), FrozenEvidence.from_record(SIDE, record)):
         np.testing.assert_array_equal(again.status(asked), evidence.freeze().status(asked))
     restored.mark_surface(RNG.uniform(0, SIDE, (3000, 3)))
-    assert restored.blocks >= len(record.codes)
+    assert restored.size.blocks >= len(record.codes)
 
 
 def test_clearing_forgets_a_box_and_no_more() -> None:

@@ -1,6 +1,5 @@
 """Within a voxel, a surface ends where the last rays ended, unless it goes on beside it."""
 
-import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -193,11 +192,3 @@ def test_what_was_taken_back_is_forgotten() -> None:
         scan(number, narrow.points(rng))
     assert near(evidence, narrow.points(rng)).all()
     assert not near(evidence, Wall((16.6, 30.1), (16.8, 33.9)).points(rng)).any()
-
-
-def test_a_record_without_margins_has_none() -> None:
-    rng = np.random.default_rng(5)
-    record = seen(Wall((10.4, 30.0), (17.3, 34.0)).points(rng)).record()
-    assert record.margins is not None
-    evidence = FrozenEvidence.from_record(SIDE, dataclasses.replace(record, margins=None))
-    assert evidence.near_ends(Wall((10.0, 30.0), (18.0, 34.0)).points(rng), REACH).all()

@@ -138,7 +138,7 @@ def test_schema_is_complete() -> None:
 
 def test_the_field_of_the_map_is_shown_where_no_other_is_given() -> None:
     """Also at the border of all regions."""
-    record = random_record(62, points=400, training=False)
+    record = random_record(42, points=400, training=False)
     full = np.full((8**3, BLOCK_BYTES), 255, np.uint8)
     seen = evidence_of(np.arange(8**3), full, full)
     everywhere = dataclasses.replace(record.regions[0], evidence=seen)
@@ -210,7 +210,7 @@ def test_the_preview_of_a_street_is_its_mesh_in_few_faces(epoch):
     coarse = coarse_mesh(region, record.settings, epoch)
     with OfflineMap(record) as offline:
         detailed = offline.mesh(cell_m=0.4)
-    assert 0 < 3 * len(coarse.faces) < len(detailed.faces)
+    assert 0 < 5 * len(coarse.faces) < len(detailed.faces)
     shown, wanted = samples(coarse), samples(detailed)
     assert share_near(wanted, shown, 0.2) > 0.75
     assert share_near(shown, wanted, 0.4) > 0.95
@@ -238,7 +238,7 @@ def test_a_preview_is_a_small_part_of_its_map(epoch):
     with_preview, without = io.BytesIO(), io.BytesIO()
     previews = previews_of(record, epoch)
     size = write_map(record, with_preview, previews=previews).bytes
-    assert write_map(record, without).bytes < size < 1.06 * write_map(record, without).bytes
+    assert write_map(record, without).bytes < size < 1.04 * write_map(record, without).bytes
 
 
 def test_a_preview_is_bounded_however_much_was_seen():

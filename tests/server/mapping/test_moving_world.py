@@ -61,8 +61,9 @@ class Watched:
 
 
 def without_outcomes(region: Region) -> Region:
-    """A region of a file that does not tell what became of rays at its voxels."""
-    return replace(region, evidence=replace(region.evidence, outcomes=None))
+    """The region, had its file nothing of what became of rays at its voxels."""
+    unknown = np.zeros_like(region.evidence.outcomes)
+    return replace(region, evidence=replace(region.evidence, outcomes=unknown))
 
 
 def main_region(epoch: Epoch) -> FrozenRegion:
