@@ -19,18 +19,21 @@ BIN = $(VENV)/bin
 INSTALLED_DEMO = $(VENV)/.installed-demo
 INSTALLED = $(VENV)/.installed
 
-.PHONY: bench campaign check clean demo docs pictures pretrained test test-long
+.PHONY: bench campaign check clean demo docs kernels pictures pretrained test test-long
 
 demo: $(INSTALLED_DEMO)
 	$(BIN)/triquad-demo --out demo-out
 
 # Kernels are compiled once, not by every process that tests. Where several do, torch's threads
 # would wait for each other: seven times as long.
-test: check
-	$(BIN)/python -m triquad_server.warm_up
+test: $(INSTALLED)
+	$(MAKE) -j2 check kernels
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --maxprocesses 4 -m "not long" --durations=10
 
-test-long: $(INSTALLED)
+kernels: $(INSTALLED)
+	$(BIN)/python -m triquad_server.warm_up
+
+test-long: kernels
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --maxprocesses 4 -m long --durations=10
 
 docs: $(INSTALLED)

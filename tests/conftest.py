@@ -1,8 +1,8 @@
 """What every run of the tests does: long modules come first, and what each took is kept.
 
-``tests/durations.json`` holds the seconds of each file in a run on two quiet cores; the newest run
-is kept in ``test-durations.json`` beside the project's configuration, and the files that grew most
-are told at the end.
+``tests/durations.json`` holds the seconds of each file in a run on two quiet cores. The newest run
+is kept in ``test-durations.json`` next to the project's configuration, and the files that grew most
+are listed at the end.
 """
 
 import json
@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 _KNOWN = Path(__file__).with_name("durations.json")
-_GREW_S = 5.0  # growth of a file that is told
-_TOLD = 5  # files
+_GREW_S = 5.0  # the least growth of a file that is listed
+_LISTED = 5  # files, at most
 
 
 class Durations:
@@ -31,21 +31,22 @@ class Durations:
             return
         took = {name: round(seconds, 1) for name, seconds in sorted(self._seconds.items())}
         newest = self._config.rootpath / "test-durations.json"
-        newest.write_text(json.dumps(took, indent=1) + "\n", encoding="utf-8")
-        known = known_durations()
-        growth = {name: seconds - known.get(name, 0.0) for name, seconds in took.items()}
-        grown = sorted(growth, key=lambda name: -growth[name])[:_TOLD]
+        earlier = _read(newest)  # of files that did not run this time
+        newest.write_text(json.dumps(earlier | took, indent=1) + "\n", encoding="utf-8")
+        known = _read(_KNOWN)
+        growth = {name: took[name] - known[name] for name in took.keys() & known.keys()}
+        grown = sorted(growth, key=lambda name: -growth[name])[:_LISTED]
         for name in grown:
             if growth[name] > _GREW_S:
                 text = f"{name}: {took[name]} s, {growth[name]:+.1f} s against durations.json"
                 terminalreporter.write_line(text)
 
 
-def known_durations() -> dict[str, float]:
-    """The seconds of each file, as they were kept."""
-    if not _KNOWN.exists():
+def _read(path: Path) -> dict[str, float]:
+    """The seconds of each file, as they were kept; of none where nothing was."""
+    if not path.exists():
         return {}
-    found: dict[str, float] = json.loads(_KNOWN.read_text(encoding="utf-8"))
+    found: dict[str, float] = json.loads(path.read_text(encoding="utf-8"))
     return found
 
 
@@ -56,7 +57,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Long files first, so that none of them is what the other workers wait for in the end."""
-    known = known_durations()
+    known = _read(_KNOWN)
     root = config.rootpath
 
     def seconds(item: pytest.Item) -> float:
