@@ -395,7 +395,7 @@ with triquad_client.connect(sys.argv[1]) as client:
 def test_a_frozen_client_holds_up_nobody(tmp_path: Path) -> None:
     """Stopped amid large replies, it delays no query, no tile and no status of others for good."""
     settings = tmp_path / "settings.toml"
-    settings.write_text(servers.SMALL_TOML + "[mesh]\ncell_m = 0.025\nreply_bytes = 100000000\n")
+    settings.write_text(servers.SMALL_TOML + "[mesh]\ncell_m = 0.025\n")
     with (
         servers.server_process(["--settings", settings]) as server,
         triquad_client.connect(server.endpoint) as client,

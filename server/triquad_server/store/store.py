@@ -45,6 +45,8 @@ from triquad_server.store.restore import (
 _log = logging.getLogger(__name__)
 
 _FEATURE_DTYPE = "<f2"
+_MANY_BYTES = 2**62
+"""The size of a file that does not open: what is needed of it is soon folded into another."""
 _MAPS_NAMED = 8  # maps of a store that are named where an epoch is not found
 
 
@@ -258,7 +260,11 @@ class Store:
     def _stored_bytes(self, name: str) -> int:
         """Return the bytes of the parts in a file, needed or not."""
         checkpoint = checkpoint_file(self.folder / name)
-        return 0 if checkpoint is None else own_bytes(open_manifest(checkpoint))
+        try:
+            return 0 if checkpoint is None else own_bytes(open_manifest(checkpoint))
+        except MapFileError as error:
+            _log.warning("what is needed of %s is intact, but not all: %s", name, error)
+            return _MANY_BYTES
 
 
 def _info(path: Path, written: WrittenMap) -> CheckpointInfo:

@@ -314,10 +314,23 @@ def test_retention_by_age(tmp_path):
         assert sorted(paths(store)) == [1, 4, 9]
 
 
-def test_what_was_set_aside_can_still_be_recovered_with_its_base(store):
+def test_a_base_whose_end_is_lost_serves_until_all_is_in_another_file(store):
     records = drive(store, 3)
     base = paths(store)[1]
     base.write_bytes(base.read_bytes()[:-2000])
+    restored = store.newest()
+    assert restored is not None
+    assert_same(restored.record, records[4])
+    folded = store.fold(lambda: False)
+    assert folded is not None
+    base.unlink()
+    assert_same(read_map(folded.path), records[4])
+
+
+def test_what_was_set_aside_can_still_be_recovered_with_its_base(store):
+    records = drive(store, 3)
+    base = paths(store)[1]
+    base.write_bytes(base.read_bytes()[: base.stat().st_size * 17 // 20])
     with pytest.raises(StoreError, match="all 4 checkpoints"):
         store.newest()
     whole = grown(5, 5)
