@@ -174,6 +174,16 @@ class Service:
             queues=self._operations.queues,
         )
         self._serve_status()
+        self._open_checkpoints(checkpoints)
+        # Closed before the last checkpoint is written: it contains every reset that was answered.
+        self._parts.callback(self._operations.close)
+        self._parts.callback(self._mapper.pause)
+        self._open_intake()
+        self._announce(health)
+        self._parts.callback(self._operations.stop)  # before anything is waited for
+
+    def _open_checkpoints(self, checkpoints: CheckpointThread) -> None:
+        """Begin to write and check checkpoints, and serve what clients may ask of them."""
         checkpoints.start()
         self._parts.callback(checkpoints.close)
         store, scrub_h = self._served.store, self._settings.store.scrub_h
@@ -191,14 +201,12 @@ class Service:
             keys.CHECKPOINT, answering(CheckpointRequest, checkpoints.answer), Lane.SLOW
         )
         self._operations.serve(keys.RESET, answering(ResetRequest, resets.answer), Lane.SLOW)
-        # Closed before the last checkpoint is written: it contains every reset that was answered.
-        self._parts.callback(self._operations.close)
-        self._parts.callback(self._mapper.pause)
-        self._open_intake()
+
+    def _announce(self, health: Health) -> None:
+        """Say that the server is there, until it closes."""
         self._parts.callback(Heartbeat(self._session, health).close)
         alive = keys.alive_key(health.map_name, health.server)
         self._parts.callback(self._session.liveliness().declare_token(alive).undeclare)
-        self._parts.callback(self._operations.stop)  # before anything is waited for
 
     def _open_mapper(self, failed: Callable[[], None]) -> MapperThread:
         mapper = MapperThread(
