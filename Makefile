@@ -14,6 +14,9 @@ PIP_FLAGS ?=
 # How long make campaign takes; it goes on with what is in campaign-out/.
 CAMPAIGN_MINUTES ?= 5
 
+# Compiled Python is kept: without it, each of the many processes starts four seconds later.
+unexport PYTHONDONTWRITEBYTECODE
+
 BIN = $(VENV)/bin
 # What is installed: without torch for the demonstration, with everything for all else.
 INSTALLED_DEMO = $(VENV)/.installed-demo
