@@ -21,14 +21,14 @@ from triquad_tools.evaluation.metrics import mesh_area_m2
 from triquad_tools.simulation.scene import Scene
 from triquad_tools.simulation.solids import Solid
 
-from bench.figures import Figure, typical
-from bench.parts.ended_voxels import (
+from bench.ended_voxels import (
     EndedVoxels,
     end_keys,
     surface_share,
     voxel_centres,
     voxel_keys,
 )
+from bench.figures import Figure, typical
 from bench.parts.revisited import revisited_figures
 from bench.recorded import check_recorded
 from bench.scenes.traffic import (

@@ -13,13 +13,13 @@ from triquad_server.intake.rays import usable_rays
 from triquad_server.settings import Settings
 from triquad_tools.console.progress import progress
 
-from bench.figures import Figure
-from bench.parts.ended_voxels import (
+from bench.ended_voxels import (
     EndedVoxels,
     end_keys,
     surface_share,
     voxel_centres,
 )
+from bench.figures import Figure
 from bench.recorded import RecordedScans, recorded_scans
 from bench.street import StreamedMap
 

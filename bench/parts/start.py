@@ -28,7 +28,7 @@ def measure_start() -> list[Figure]:
         Figure("ready at the very first start", first.ready_s, "s", at_most=45),
         Figure("a scan is taken in then, after", first.mapping_s, "s"),
         Figure("resident memory after it", first.resident_mb, "MB"),
-        Figure("ready at a later start", ready_s, "s", at_most=2.5),
+        Figure("ready at a later start", ready_s, "s", at_most=2),
         Figure("resident memory after that", later[-1].resident_mb, "MB"),
     ]
 
