@@ -18,6 +18,7 @@ from triquad_client import (
     ClosedError,
     ConnectError,
     DownloadError,
+    EmptierMapError,
     InvalidInputError,
     RefusedError,
     SyncedMap,
@@ -127,18 +128,16 @@ def test_a_damaged_copy_is_mended_and_a_foreign_file_replaced(
         assert triquad_client.open_map(path).epoch == client.status().epoch
 
 
-def test_it_goes_on_answering_while_the_server_is_gone(tmp_path: Path) -> None:
-    path, store = tmp_path / "copy.triquad", tmp_path / "store"
-    settings = tmp_path / "settings.toml"
+def test_it_answers_while_the_server_is_gone_and_outlives_one_that_lost_its_map(
+    tmp_path: Path,
+) -> None:
+    path, settings = tmp_path / "copy.triquad", tmp_path / "settings.toml"
     settings.write_text(servers.SMALL_TOML)
-    options = ["--settings", settings, "--store", store]
-    with servers.server_process(options) as server:
+    with servers.server_process(["--settings", settings]) as server:
         client = triquad_client.connect(server.endpoint, timeout_s=5.0)
         learn(client, 0.0)
-        client.checkpoint()
         local = client.sync(FIRST, path)
-        before = local.query_distance(POINTS)
-        age_s = local.age_s
+        before, data, age_s = local.query_distance(POINTS), path.read_bytes(), local.age_s
         server.process.kill()
         server.wait()
     with pytest.raises(ConnectError, match="down"):
@@ -146,9 +145,19 @@ def test_it_goes_on_answering_while_the_server_is_gone(tmp_path: Path) -> None:
     assert local.age_s > age_s
     np.testing.assert_array_equal(local.query_distance(POINTS).distance_m, before.distance_m)
     assert triquad_client.open_map(path).epoch == before.epoch
-    with client, servers.server_process(options, endpoint=server.endpoint):
-        assert refreshed_once_linked(local).parts_kept > 0
-        assert_same_answers(local, client)
+    with client, servers.server_process(["--settings", settings], endpoint=server.endpoint):
+        with pytest.raises(EmptierMapError, match="The copy stays as it is.*accept_emptier=True"):
+            refresh_once_linked(local)
+        # A program that was started again, too, has the file alone.
+        with pytest.raises(EmptierMapError):
+            client.sync(FIRST, path)
+        assert path.read_bytes() == data
+        np.testing.assert_array_equal(local.query_distance(POINTS).status, before.status)
+        taken = client.sync(FIRST, path, accept_emptier=True)
+        assert not taken.query_distance(POINTS).status.any()
+        learn(client, 0.0)
+        taken.refresh()
+        assert_same_answers(taken, client)
     with pytest.raises(ClosedError):
         local.refresh()
     assert local.query_distance(POINTS).epoch == local.epoch
@@ -162,8 +171,8 @@ def refresh_until_the_link_is_lost(local: SyncedMap) -> None:
             local.refresh()
 
 
-def refreshed_once_linked(local: SyncedMap) -> SyncReport:
-    """What the copy's refresh reports; the link is set up again some time after it was lost."""
+def refresh_once_linked(local: SyncedMap) -> SyncReport:
+    """The link is set up again some time after it was lost."""
     deadline = time.monotonic() + servers.WAIT_S
     while True:
         try:

@@ -1,26 +1,19 @@
 """Rules of access control, enforced by real sessions of Zenoh."""
 
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 
-import pytest
 import zenoh
 from support.beyond import from_beyond
-from support.servers import WAIT_S, free_endpoint, raw_session
+from support.servers import free_endpoint, raw_session
 from triquad_format.wire import keys
 from triquad_format.wire.access_control import (
-    EVERYBODY,
-    THIS_MACHINE,
     Grant,
     Subject,
     Verb,
     access_control,
-    administer,
     publish,
-    serve,
     take_part_in_ros2,
-    view,
     without_credentials,
 )
 
@@ -95,16 +88,6 @@ def router(grants: tuple[Grant, ...]) -> Iterator[tuple[zenoh.Session, str]]:
         yield session, endpoint
 
 
-@pytest.fixture(scope="module")
-def guarded() -> Iterator[tuple[zenoh.Session, str]]:
-    with router(without_credentials(MAP)) as running:
-        yield running
-
-
-def here(endpoint: str) -> str:
-    return endpoint.replace("0.0.0.0", "127.0.0.1")
-
-
 def answering(session: zenoh.Session, selector: str) -> list[str]:
     replies = session.get(
         selector,
@@ -115,100 +98,8 @@ def answering(session: zenoh.Session, selector: str) -> list[str]:
     return sorted(str(reply.ok.key_expr) for reply in replies if reply.ok)
 
 
-@pytest.mark.parametrize(
-    ("selector", "answers"),
-    [
-        *((key, [key]) for key in OPEN),
-        *((key, []) for key in SECRET),
-        ("triquad/lab/query/*", sorted(OPEN)),
-        ("triquad/lab/admin/*", []),
-        ("triquad/lab/*/reset", []),
-        ("triquad/lab/**", []),
-        ("triquad/**", []),
-        ("**", []),
-    ],
-)
-def test_what_strangers_ask_for_is_answered_only_below_query(guarded, selector, answers):
-    with raw_session(connect=from_beyond(guarded[1])) as stranger:
-        assert answering(stranger, selector) == answers
-
-
-def test_programs_of_this_machine_ask_for_everything(guarded):
-    with raw_session(connect=here(guarded[1])) as program:
-        assert answering(program, SECRET[0]) == SECRET
-        assert alive(program) == 1
-
-
 def put(session: zenoh.Session, key: str) -> None:
     session.put(key, b"", congestion_control=zenoh.CongestionControl.BLOCK)
-
-
-def alive(session: zenoh.Session) -> int:
-    return len(list(session.liveliness().get(keys.alive_key("*", "*"), timeout=2.0)))
-
-
-def test_strangers_publish_scans_alone_and_find_the_map(guarded):
-    session, endpoint = guarded
-    with (
-        session.declare_subscriber("triquad/**") as received,
-        raw_session(connect=from_beyond(endpoint)) as stranger,
-    ):
-        assert alive(stranger) == 1
-        for key in ("triquad/lab/status", "triquad/lab/x", "triquad/**", "triquad/lab/scan/a"):
-            put(stranger, key)
-        assert str(received.recv().key_expr) == "triquad/lab/scan/a"
-
-
-def test_strangers_neither_see_questions_and_scans_nor_answer(guarded):
-    session, endpoint = guarded
-    with raw_session(connect=from_beyond(endpoint)) as stranger:
-        queryable = stranger.declare_queryable(OPEN[0], complete=True)
-        subscriber = stranger.declare_subscriber("triquad/lab/scan/*")
-        token = stranger.liveliness().declare_token(keys.alive_key(MAP, "forged"))
-        answering(stranger, OPEN[1])  # the declarations have arrived
-
-        with raw_session(connect=here(endpoint)) as program:
-            for _ in range(20):
-                assert answering(program, OPEN[0]) == [OPEN[0]]
-            assert alive(program) == 1
-            put(program, "triquad/lab/scan/a")
-            answering(program, OPEN[1])
-        answering(stranger, OPEN[1])
-        assert queryable.try_recv() is None
-        assert subscriber.try_recv() is None
-        token.undeclare()
-
-
-def test_a_role_grants_what_strangers_may_not():
-    grants = (Grant(EVERYBODY, view(MAP)), Grant(THIS_MACHINE, administer(MAP)))
-    with router(grants) as (_, endpoint), raw_session(connect=here(endpoint)) as admin:
-        assert answering(admin, SECRET[0]) == SECRET
-
-
-def test_a_server_behind_a_router_serves_with_the_rules_for_it():
-    section = access_control([Grant(EVERYBODY, serve(MAP) + view(MAP) + publish(MAP))])
-    endpoint = free_endpoint()
-    with (
-        raw_session("router", listen=endpoint, access_control=section),
-        raw_session(connect=endpoint) as server,
-        raw_session(connect=endpoint) as client,
-    ):
-        token = server.liveliness().declare_token(keys.alive_key(MAP, "s"))
-        scans = server.declare_subscriber(keys.all_scans_key(MAP))
-        queryable = server.declare_queryable(
-            OPEN[0],
-            zenoh.handlers.Callback(lambda query: query.reply(OPEN[0], b"x"), indirect=False),
-        )
-        asked_until = time.monotonic() + WAIT_S
-        while answering(client, OPEN[0]) != [OPEN[0]]:  # until it is declared
-            assert time.monotonic() < asked_until
-        assert alive(client) == 1
-        client.put(
-            keys.scan_key(MAP, "roof"), b"s", congestion_control=zenoh.CongestionControl.BLOCK
-        )
-        assert str(scans.recv().key_expr) == keys.scan_key(MAP, "roof")
-        queryable.undeclare()
-        token.undeclare()
 
 
 def test_a_bridge_of_ros_publishes_on_any_key_but_not_as_the_server():

@@ -6,7 +6,6 @@ import io
 from collections import Counter
 from pathlib import Path
 
-import msgpack
 import numpy as np
 import pytest
 import zstandard
@@ -67,17 +66,6 @@ def test_round_trip(tmp_path: Path, training: bool, dtype: str) -> None:
     assert info == MapFileInfo(len(data), hashlib.sha256(data).hexdigest(), record.epoch)
 
 
-@pytest.mark.parametrize(("limit", "planes"), [(1, 1), (127, 1), (128, 2), (MAX_INTEGER, 2)])
-def test_integer_features(limit: int, planes: int) -> None:
-    record = with_integers(random_record(2), limit)
-    data = file_bytes(record)
-    assert_read_back(record, data)
-    bodies = [msgpack.unpackb(p.payload) for p in parts_of(data) if p.topic == "/triquad/vertices"]
-    levels = [level for body in bodies for level in body["levels"]]
-    assert {level["integers"]["shape"][0] for level in levels} == {planes}
-    assert not any("features" in level for level in levels)
-
-
 def test_rays_of_a_cube_that_fill_several_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("triquad_format.mapfile.parts.pack.RAYS_PER_PART", 80)
     record = with_rays(random_record(2))
@@ -88,13 +76,6 @@ def test_rays_of_a_cube_that_fill_several_parts(monkeypatch: pytest.MonkeyPatch)
 
 def test_empty_map() -> None:
     assert_read_back(MapRecord("default", 0, SMALL, ()))
-
-
-@pytest.mark.parametrize("preview", [True, False])
-def test_regions_that_saw_nothing(preview: bool) -> None:
-    record = random_record(0, points=0)
-    for seen in (record, with_integers(record)):
-        assert_read_back(seen, file_bytes(seen, preview=preview))
 
 
 @pytest.mark.parametrize("integers", [True, False])
