@@ -13,7 +13,6 @@ from triquad_client.checks import Bounds
 from triquad_client.mesh.followed_mesh import FollowedMesh, KnownTiles
 from triquad_client.mesh.mesh_calls import MeshCalls
 from triquad_client.mesh.mesh_watch import MeshWatch
-from triquad_client.net.answering import Answering
 from triquad_client.net.connection import Connection
 from triquad_client.net.opening import open_connection
 from triquad_client.offline.synced_map import SyncedMap
@@ -36,6 +35,7 @@ class Client(
     def __init__(self, connection: Connection) -> None:
         """Use :func:`triquad_client.connect`."""
         super().__init__(connection)
+        self._server = connection
 
     def __enter__(self) -> "Client":
         return self
@@ -105,9 +105,6 @@ class Client(
     def maps(self) -> list[str]:
         """Return names of all maps that can be reached, also those of other servers."""
         return self._connection.maps()
-
-    def _answering(self) -> Answering:
-        return self._connection
 
 
 def connect(

@@ -1,6 +1,5 @@
 """The client where things go wrong."""
 
-import hashlib
 import socket
 import threading
 import time
@@ -16,7 +15,6 @@ from support import servers
 from triquad_client import (
     ClosedError,
     ConnectError,
-    DownloadError,
     InvalidInputError,
     NoReplyError,
     RefusedError,
@@ -27,9 +25,6 @@ from triquad_client import (
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import (
     ErrorReply,
-    MapChunk,
-    MapChunkRequest,
-    MapInfo,
     SdfReply,
     SdfRequest,
 )
@@ -179,32 +174,6 @@ def test_a_query_whose_epoch_goes_starts_again_and_gives_up_after_three_tries() 
     ):
         client.query_sdf(np.zeros((150_000, 3)))
     assert len(first_parts) == 3
-
-
-def test_a_download_with_wrong_bytes_leaves_nothing(tmp_path: Path) -> None:
-    data = b"x" * 100
-
-    def info(query: zenoh.Query, key: str) -> None:
-        with query:
-            digest = hashlib.sha256(b"y" * 100).hexdigest()
-            query.reply(key, codec.encode(MapInfo(1, len(data), digest, 60)))
-
-    def chunk(query: zenoh.Query, key: str) -> None:
-        with query:
-            asked = codec.decode(MapChunkRequest, query.payload.to_bytes())
-            part = data[asked.offset : asked.offset + asked.length]
-            query.reply(key, codec.encode(MapChunk(asked.offset, part)))
-
-    path = tmp_path / "map.triquad"
-    path.write_text("older")
-    with (
-        servers.answering({keys.MAP_INFO: info, keys.MAP_CHUNK: chunk}) as endpoint,
-        triquad_client.connect(endpoint) as client,
-        pytest.raises(DownloadError, match="SHA-256"),
-    ):
-        client.download_map(path)
-    assert path.read_text() == "older"
-    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_zenoh_configuration_file_is_used(endpoint: str, tmp_path: Path) -> None:

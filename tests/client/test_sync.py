@@ -11,13 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import triquad_client
-import zenoh
 from support import servers
 from triquad_client import (
     Client,
     ClosedError,
     ConnectError,
-    DownloadError,
     EmptierMapError,
     InvalidInputError,
     RefusedError,
@@ -25,8 +23,6 @@ from triquad_client import (
     SyncReport,
     UnknownMapError,
 )
-from triquad_format.wire import codec, keys
-from triquad_format.wire.messages import MapChunk, MapChunkRequest, MapInfo
 
 FAR_M = 60.0  # from the first room to the second: in another region
 WHOLE = ((-10, -10, -10), (FAR_M + 10, 10, 10))
@@ -223,38 +219,6 @@ def test_bounds_that_hold_nothing_are_refused(client: Client, tmp_path: Path) ->
         client.sync(((0, 0, 0), (0, 1, 1)), tmp_path / "copy.triquad")
     with pytest.raises(OSError, match="nowhere"):
         client.sync(FIRST, tmp_path / "nowhere" / "copy.triquad")
-
-
-def test_what_arrives_damaged_replaces_nothing(client: Client, tmp_path: Path) -> None:
-    path, whole = tmp_path / "copy.triquad", tmp_path / "whole.triquad"
-    client.sync(FIRST, path)
-    client.download_map(whole)
-    before, sent = path.read_bytes(), bytearray(whole.read_bytes())
-    for place in range(100, len(sent) // 2, 5000):
-        sent[place] ^= 0xFF
-
-    def info(query: zenoh.Query, key: str) -> None:
-        message = MapInfo(99, len(sent), "0" * 64, 2**20)
-        with query:
-            query.reply(key, codec.encode(message))
-
-    def chunk(query: zenoh.Query, key: str) -> None:
-        request = codec.decode(MapChunkRequest, query.payload.to_bytes())
-        data = bytes(sent[request.offset : request.offset + request.length])
-        with query:
-            query.reply(key, codec.encode(MapChunk(request.offset, data)))
-
-    path.unlink()
-    path.write_bytes(before[:1000])  # so that all of it is asked for
-    answers = {keys.MAP_INFO: info, keys.MAP_CHUNK: chunk}
-    with (
-        servers.answering(answers) as endpoint,
-        triquad_client.connect(endpoint) as liar,
-        pytest.raises(DownloadError),
-    ):
-        liar.sync(FIRST, path)
-    assert path.read_bytes() == before[:1000]
-    assert [file.name for file in tmp_path.iterdir() if ".tmp" in file.name] == []
 
 
 SYNCING = """

@@ -9,10 +9,8 @@ from support.servers import free_endpoint, raw_session
 from triquad_format.wire import keys
 from triquad_format.wire.access_control import (
     Grant,
-    Subject,
     Verb,
     access_control,
-    publish,
     take_part_in_ros2,
     without_credentials,
 )
@@ -21,40 +19,6 @@ MAP = "lab"
 OPERATIONS = [keys.operation_key(MAP, name) for name in (keys.SDF, keys.STATUS, keys.RESET)]
 SECRET = [OPERATIONS[2]]
 OPEN = OPERATIONS[:2]
-
-
-def test_a_rule_becomes_an_entry_for_each_direction():
-    robot = Subject("robot", cert_common_names=("r1",), usernames=("u",), interfaces=("eth0",))
-    section = access_control([Grant(robot, publish(MAP, ["roof"]))])
-
-    assert section == {
-        "enabled": True,
-        "default_permission": "deny",
-        "rules": [
-            {
-                "id": f"robot 0 publish {flow}",
-                "permission": "allow",
-                "flows": [flow],
-                "messages": [message],
-                "key_exprs": ["triquad/lab/scan/roof"],
-            }
-            for flow, message in (("ingress", "put"), ("egress", "declare_subscriber"))
-        ],
-        "subjects": [
-            {
-                "id": "robot",
-                "interfaces": ["eth0"],
-                "cert_common_names": ["r1"],
-                "usernames": ["u"],
-            }
-        ],
-        "policies": [
-            {
-                "subjects": ["robot"],
-                "rules": ["robot 0 publish ingress", "robot 0 publish egress"],
-            }
-        ],
-    }
 
 
 def test_no_rule_for_strangers_includes_an_operation_that_changes_the_map():

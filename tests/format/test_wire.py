@@ -5,47 +5,22 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.server_records import STATUS
 from triquad_format.errors import ProtocolVersionError, WireError
 from triquad_format.wire import codec
 from triquad_format.wire.mesh_messages import TileList, TileListRequest
 from triquad_format.wire.messages import (
-    CheckpointInfo,
     FlushReply,
     MapChunk,
     Scan,
     SdfReply,
     SdfRequest,
-    ServerStatus,
     StatusRequest,
 )
 
 POSE = np.array([[0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]], np.float64)
 POINTS = np.array([[1, 2, 3], [4, 5, 6]], np.float32)
 SCAN = Scan(POINTS, POSE, 123, "lidar", 2**62, 4)
-STATUS = ServerStatus(
-    map_name="lab",
-    server="s",
-    version="1",
-    device="cpu",
-    epoch=3,
-    settled=True,
-    scans_taken=1,
-    scans_dropped={"decode": 2},
-    scans_lost={},
-    scans_waiting=0,
-    points_dropped={},
-    requests_refused={},
-    samples_trained=9,
-    rays_kept=9,
-    loss=0.5,
-    regions=1,
-    vertices=2,
-    parameters=3,
-    memory_bytes=4,
-    uptime_s=1.5,
-    last_checkpoint=CheckpointInfo("p", 1, 2, "ab", 3),
-    store_error=None,
-)
 EXAMPLES = [
     SCAN,
     SdfRequest(np.array([1e6, 2e6, 3.0]), POINTS, True, 0),

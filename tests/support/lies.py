@@ -14,6 +14,7 @@ from triquad_format.wire.tile_codec import TileSurface, encode_tile
 COUNT = 100
 POINTS = np.random.default_rng(1).normal(size=(COUNT, 3))
 BOX = ((0, 0, 0), (1, 1, 1))
+AROUND = ((-9, -9, -9), (9, 9, 9))
 NOWHERE = ((90, 90, 90), (91, 91, 91))
 NAN, INF = float("nan"), float("inf")
 SURFACE = TileSurface(
@@ -126,6 +127,7 @@ def _questions() -> dict[str, tuple[str, Ask]]:
         "reset": (keys.RESET, lambda client, _: client.reset(NOWHERE)),
         "download": (keys.MAP_INFO, lambda client, path: client.download_map(path)),
         "chunk": (keys.MAP_CHUNK, lambda client, path: client.download_map(path)),
+        "copy": (keys.MAP_CHUNK, lambda client, path: client.sync(AROUND, path)),
     }
 
 
@@ -144,6 +146,14 @@ def _all(field: str, value: float) -> Callable[[Body], object]:
         body[field]["data"] = np.full_like(array, value).tobytes()
 
     return change
+
+
+def _rots(body: Body) -> None:
+    """A bit is flipped in each kilobyte."""
+    data = bytearray(body["data"])
+    for place in range(0, len(data), 1000):
+        data[place] ^= 0x10
+    body["data"] = bytes(data)
 
 
 def _boxes(**columns: object) -> Callable[[Body], object]:
@@ -263,7 +273,10 @@ _LIES: list[tuple[str, str, Callable[[Body], object]]] = [
     ("download", "chunks of 0 bytes", _sets(chunk_bytes=0)),
     ("chunk", "more than was asked", lambda body: body.update(data=body["data"] * 2)),
     ("chunk", "less than was asked", lambda body: body.update(data=body["data"][:-1])),
-    ("chunk", "from elsewhere", lambda body: body.update(offset=body["offset"] + 1)),
+    ("chunk", "other bytes", _rots),
+    ("copy", "other bytes", _rots),
+    ("copy", "from elsewhere", _adds("offset", 1)),
+    ("chunk", "from elsewhere", _adds("offset", 1)),
 ]  # fmt: skip
 
 LIES = [

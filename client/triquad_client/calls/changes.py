@@ -8,8 +8,7 @@ from triquad_format.wire.query_messages import ChangesReply, ChangesRequest
 
 from triquad_client import checks
 from triquad_client.checks import Bounds
-from triquad_client.net.answering import Ask
-from triquad_client.net.connection import Connection
+from triquad_client.net.connection import Ask, Connection
 
 Corner = tuple[float, float, float]
 

@@ -11,8 +11,7 @@ from triquad_format.wire.messages import MapChunk, MapChunkRequest, MapInfo, Map
 
 from triquad_client import checks
 from triquad_client.errors import DownloadError
-from triquad_client.net.answering import Ask, retried
-from triquad_client.net.connection import Connection
+from triquad_client.net.connection import Ask, Connection, retried
 
 _PREPARE_S = 120.0
 """The server writes the file before it answers."""

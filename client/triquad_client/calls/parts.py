@@ -1,6 +1,5 @@
 """Questions in parts that are asked of one epoch, and the replies joined."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
@@ -11,7 +10,7 @@ from triquad_format.wire.messages import MapReply
 
 from triquad_client import checks
 from triquad_client.errors import BadReplyError
-from triquad_client.net.answering import NEWEST, Answering, Ask, retried
+from triquad_client.net.connection import NEWEST, Answering, Ask, retried
 
 _ORIGIN_SAMPLE = 1000  # points
 
@@ -78,15 +77,14 @@ class Answered(Generic[MapReplyT]):
         return fields | {flag: fields[flag].astype(np.bool_) for flag in flags}
 
 
-class Asking(ABC):
+class Asking:
     """Asks about a map: of its newest epoch, or always of the same one."""
+
+    _server: Answering
+    """Whoever answers all of one question."""
 
     _epoch: int | None = None
     """The epoch that is asked where a question names none; ``None``: the newest."""
-
-    @abstractmethod
-    def _answering(self) -> Answering:
-        """Return who answers all of one question."""
 
     def _in_parts(
         self,
@@ -101,7 +99,7 @@ class Asking(ABC):
         Raises:
             InvalidInputError: ``at_epoch`` is neither the number of an epoch nor ``None``.
         """
-        epoch, server = self._chosen(at_epoch), self._answering()
+        epoch, server = self._chosen(at_epoch), self._server
 
         def part(start: int, epoch: int) -> Part:
             rows = slice(start, start + most)

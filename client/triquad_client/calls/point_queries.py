@@ -26,7 +26,7 @@ from triquad_map.questions.spheres import Spheres
 from triquad_client import checks
 from triquad_client.calls.parts import Asking, Part
 from triquad_client.checks import Bounds
-from triquad_client.net.answering import NEWEST, Answering, Ask, retried
+from triquad_client.net.connection import NEWEST, Answering, Ask, retried
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from triquad_client.calls.point_queries import PointQueries
 from triquad_client.calls.way_queries import WayQueries
-from triquad_client.net.answering import Answering
+from triquad_client.net.connection import Answering
 
 
 class MapQueries(PointQueries, WayQueries):
@@ -27,6 +27,3 @@ class PinnedMap(MapQueries):
         self._server = server
         self._epoch = epoch
         self.epoch = epoch
-
-    def _answering(self) -> Answering:
-        return self._server

@@ -19,8 +19,7 @@ from triquad_client import checks
 from triquad_client.calls.server import STATUS
 from triquad_client.depth_image import Intrinsics, depth_points
 from triquad_client.errors import InvalidScanError, RequestTimeoutError
-from triquad_client.net.answering import Ask
-from triquad_client.net.connection import Connection
+from triquad_client.net.connection import Ask, Connection
 from triquad_client.pose import PoseLike, rigid_pose
 
 _log = logging.getLogger("triquad_client")

@@ -16,8 +16,7 @@ from triquad_format.wire.metrics_messages import MetricsRequest, ServerMetrics
 
 from triquad_client import checks
 from triquad_client.checks import Bounds
-from triquad_client.net.answering import Ask
-from triquad_client.net.connection import Connection
+from triquad_client.net.connection import Ask, Connection
 
 STATUS = Ask(keys.STATUS, StatusRequest(), ServerStatus)
 

@@ -17,8 +17,7 @@ from triquad_format.wire.query_messages import (
 
 from triquad_client import checks
 from triquad_client.errors import BadReplyError
-from triquad_client.net.answering import Ask
-from triquad_client.net.connection import Connection
+from triquad_client.net.connection import Ask, Connection
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from triquad_map.questions.segments import Polyline, Segments, along_polyline
 
 from triquad_client import checks
 from triquad_client.calls.parts import Asking, Part
-from triquad_client.net.answering import Ask
+from triquad_client.net.connection import Ask
 from triquad_client.pose import PoseLike, rigid_pose
 
 _MOST_WAYS = 1_000
@@ -162,7 +162,7 @@ class WayQueries(Asking):
         guess = rigid_pose(world_from_sensor_guess)
         reach_m = checks.within("max_distance_m", max_distance_m)
         request = AlignRequest(few, guess, reach_m, AlignOptions.max_iterations, epoch)
-        return Alignment(**vars(self._answering().ask(Ask(keys.ALIGN, request, AlignReply))))
+        return Alignment(**vars(self._server.ask(Ask(keys.ALIGN, request, AlignReply))))
 
 
 def _ways_at_once(searches: float) -> int:

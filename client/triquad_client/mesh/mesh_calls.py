@@ -14,8 +14,7 @@ from triquad_client.checks import Bounds
 from triquad_client.errors import BadReplyError
 from triquad_client.mesh.followed_mesh import TileDecoder
 from triquad_client.mesh.mesh import Mesh
-from triquad_client.net.answering import NEWEST, Ask, retried
-from triquad_client.net.connection import Connection
+from triquad_client.net.connection import NEWEST, Ask, Connection, retried
 
 _TILES_EACH = 8
 """Tiles of one request: alone, a small one costs as much on its way as in the making. Where holes

@@ -23,8 +23,7 @@ from triquad_client.mesh.followed_mesh import (
     TileIndex,
 )
 from triquad_client.mesh.mesh import Mesh
-from triquad_client.net.answering import Answering, Ask
-from triquad_client.net.connection import cancellable
+from triquad_client.net.connection import Answering, Ask, cancellable
 
 _LONGEST_WAIT_S = 20.0  # of one request; then it is sent again
 

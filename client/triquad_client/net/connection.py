@@ -1,11 +1,13 @@
-"""The Zenoh session of a client, and requests over it."""
+"""Requests, and who answers them: a server at the other end of a connection, or a map in memory."""
 
 import weakref
+from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
 
 import zenoh
 from triquad_format.errors import RefusedError, WireError
@@ -23,29 +25,53 @@ from triquad_client.errors import (
     RequestTimeoutError,
     UnknownMapError,
 )
-from triquad_client.net.answering import PARTS_IN_FLIGHT, Answering, Ask, ReplyT
+
+NEWEST = 0
+"""Asks for the newest epoch, a published state of the map; another number pins that epoch."""
+
+PARTS_IN_FLIGHT = 4
+"""Requests of one call that wait for their replies at the same time."""
+
+_ATTEMPTS = 3
 
 _LIVELINESS_TIMEOUT_S = 3.0
 _MAX_REASON = 2_000  # characters of why a request was refused
+
+ReplyT = TypeVar("ReplyT", bound=Message)
+ResultT = TypeVar("ResultT")
 
 _cancellation: ContextVar[zenoh.CancellationToken | None] = ContextVar("cancellation", default=None)
 """The token that ends the requests of the running call."""
 
 
-@contextmanager
-def cancellable(
-    chosen: zenoh.CancellationToken | None = None,
-) -> Iterator[zenoh.CancellationToken]:
-    """Yield the token whose cancellation ends the requests of the block, each with an error.
+@dataclass(frozen=True)
+class Ask(Generic[ReplyT]):
+    """A request.
 
-    Unless one is ``chosen``, it is that of the surrounding block, where there is one.
+    Bulky ones go in the ``background``: a reply has the priority of its request, and a slow reader
+    of large replies must not delay the distance queries of others.
     """
-    token = chosen or _cancellation.get() or zenoh.CancellationToken()
-    before = _cancellation.set(token)
-    try:
-        yield token
-    finally:
-        _cancellation.reset(before)
+
+    operation: str  # of triquad_format.wire.keys
+    message: Message
+    kind: type[ReplyT]  # of the reply
+    background: bool = False
+    min_timeout_s: float = 0.0  # waits that long for the reply, where the connection would not
+    server_wait_s: float = 0.0  # and that much longer: the server may answer as late as that
+
+
+class Answering(ABC):
+    """Answers requests."""
+
+    @abstractmethod
+    def replies(
+        self, asks: Iterable[Ask[ReplyT]], at_once: int = PARTS_IN_FLIGHT
+    ) -> Iterator[ReplyT]:
+        """Yield the reply to each request, in their order; ``at_once`` are awaited at a time."""
+
+    def ask(self, request: Ask[ReplyT]) -> ReplyT:
+        """Return the reply to one request."""
+        return next(iter(self.replies([request])))
 
 
 class Connection(Answering):
@@ -208,3 +234,33 @@ class Connection(Answering):
 def closed_error() -> ClosedError:
     """Return the error for what is asked of a closed client."""
     return ClosedError("the client is closed")
+
+
+def retried(code: str, attempt: Callable[[], ResultT]) -> ResultT:
+    """Return what ``attempt`` returns; where the server refuses with ``code``, it is tried again.
+
+    This is for questions of several requests, which the server can forget meanwhile.
+    """
+    for _ in range(_ATTEMPTS - 1):
+        try:
+            return attempt()
+        except RefusedError as error:
+            if error.code != code:
+                raise
+    return attempt()
+
+
+@contextmanager
+def cancellable(
+    chosen: zenoh.CancellationToken | None = None,
+) -> Iterator[zenoh.CancellationToken]:
+    """Yield the token whose cancellation ends the requests of the block, each with an error.
+
+    Unless one is ``chosen``, it is that of the surrounding block, where there is one.
+    """
+    token = chosen or _cancellation.get() or zenoh.CancellationToken()
+    before = _cancellation.set(token)
+    try:
+        yield token
+    finally:
+        _cancellation.reset(before)

@@ -14,6 +14,7 @@ from triquad_format.records.arrays import Bools, Doubles
 from triquad_format.records.region import MapRecord
 from triquad_format.records.seen_space import surface_voxels
 from triquad_format.wire.limits import MAX_FILL_M
+from triquad_map.composition.composed_view import ComposedView
 from triquad_map.questions.answers import Answers, QuestionLimits
 from triquad_map.record_view import open_view
 from triquad_map.view import MapView
@@ -23,7 +24,7 @@ from triquad_client.calls.queries import MapQueries
 from triquad_client.checks import Bounds
 from triquad_client.errors import ClosedError
 from triquad_client.mesh.mesh import Mesh
-from triquad_client.net.answering import PARTS_IN_FLIGHT, Answering, Ask, ReplyT
+from triquad_client.net.connection import PARTS_IN_FLIGHT, Answering, Ask, ReplyT
 
 if TYPE_CHECKING:
     from triquad_client.offline.map_mesh import MapTiles, Report
@@ -45,7 +46,7 @@ class LocalMap(Answering):
         self._answers = Answers(self._epoch, _NO_LIMITS)
 
     def close(self) -> None:
-        """End the threads that compiled code works on; nothing may be asked any more."""
+        """End the threads that compiled code works on; what is asked later is slower."""
         self.opened.close()
 
     def replies(
@@ -69,6 +70,14 @@ class LocalMap(Answering):
         yield self.view
 
 
+class _ClosedMap(Answering):
+    """Answers nothing."""
+
+    def replies(self, asks: Iterable[Ask[ReplyT]], at_once: int = 0) -> Iterator[ReplyT]:  # noqa: ARG002
+        """Refuse all requests."""
+        raise ClosedError("the map is closed")
+
+
 class OfflineMap(MapQueries):
     """A map in memory; several threads may ask it.
 
@@ -79,6 +88,7 @@ class OfflineMap(MapQueries):
     def __init__(self, record: MapRecord, stamp_ns: int = 0) -> None:
         """Open a map that is in memory already; use :func:`open_map` for a file."""
         opened = LocalMap(record)
+        self._server: Answering = opened
         self._map: LocalMap | None = opened
         # Meshes need no more of it: the view has the rest in a form of its own.
         self._seen = dataclasses.replace(
@@ -104,7 +114,7 @@ class OfflineMap(MapQueries):
 
     def close(self) -> None:
         """Release the map; later queries raise :class:`ClosedError`."""
-        opened, self._map = self._map, None
+        opened, self._map, self._server = self._map, None, _ClosedMap()
         if opened is not None:
             opened.close()
 
@@ -148,7 +158,7 @@ class OfflineMap(MapQueries):
     def _tiles(
         self, cell_m: float | None, bounds: Bounds | None, fill_m: float, *, whole: bool
     ) -> "MapTiles":
-        view = self._answering().view
+        view = self._view()
         chosen_m = _CELL_LEAVES * self.leaf_m if cell_m is None else cell_m
         checked_m = checks.within("cell_m", chosen_m, CELL_RANGE_M[1], least=CELL_RANGE_M[0])
         box, fill_m = checks.box(bounds), checks.within("fill_m", fill_m, MAX_FILL_M, least=0.0)
@@ -176,13 +186,13 @@ class OfflineMap(MapQueries):
             InvalidInputError: the points are not [N, 3], or not finite.
             ClosedError: the map was closed.
         """
-        view = self._answering().view
+        view = self._view()
         return view.near_ends(checks.query_points(points), _REACH_LEAVES * self.leaf_m)
 
-    def _answering(self) -> LocalMap:
+    def _view(self) -> ComposedView:
         if self._map is None:
             raise ClosedError("the map is closed")
-        return self._map
+        return self._map.view
 
 
 def open_map(path: str | Path) -> OfflineMap:

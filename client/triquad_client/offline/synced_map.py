@@ -22,8 +22,7 @@ from triquad_client.calls.download import RemoteBytes, newest_file
 from triquad_client.calls.queries import MapQueries
 from triquad_client.checks import Bounds
 from triquad_client.errors import DownloadError, EmptierMapError
-from triquad_client.net.answering import retried
-from triquad_client.net.connection import Connection
+from triquad_client.net.connection import Connection, retried
 from triquad_client.offline.offline_map import LocalMap
 
 _EMPTIER_SHARE = 0.5
@@ -103,9 +102,6 @@ class SyncedMap(MapQueries):
         """
         return retried("chunk_gone", lambda: self._fetch(accept_emptier))
 
-    def _answering(self) -> LocalMap:
-        return self._current().map
-
     def _current(self) -> _State:
         assert self._state is not None, "refresh() comes first"
         return self._state
@@ -151,6 +147,7 @@ class SyncedMap(MapQueries):
                 server=info.server,
                 seen_bytes=_seen_bytes(wanted),
             )
+            self._server = self._state.map
             if known is not None:
                 known.map.close()
             return report
