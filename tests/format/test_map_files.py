@@ -131,14 +131,6 @@ def test_round_trip_of_any_record(
     assert_read_back(record)
 
 
-def test_features_are_rounded_to_the_file_dtype() -> None:
-    record = random_record(3, feature_dtype="<f4")
-    table = read_bytes(file_bytes(record)).regions[0].tables[0]
-    want = record.regions[0].tables[0].features.astype(np.float16)
-    assert table.features.dtype == np.float16
-    np.testing.assert_array_equal(table.features, want)
-
-
 def test_same_record_same_bytes() -> None:
     assert file_bytes(random_record(4), preview=True) == file_bytes(random_record(4), preview=True)
     assert "created" not in metadata_of(file_bytes(random_record(4)))
@@ -221,13 +213,6 @@ def test_stock_reader_sees_an_ordinary_file() -> None:
     assert encodings.pop("/preview/mesh") == "protobuf"
     assert set(encodings.values()) == {"msgpack-zstd"}
     assert parts_of(data)[-1].topic == "/triquad/manifest"
-
-
-def test_a_file_without_previews_has_no_protobuf_in_it() -> None:
-    summary = make_reader(io.BytesIO(file_bytes(random_record(6)))).get_summary()
-    assert summary is not None
-    assert not summary.schemas
-    assert {channel.message_encoding for channel in summary.channels.values()} == {"msgpack-zstd"}
 
 
 def test_previews_are_written_with_their_schema_only() -> None:

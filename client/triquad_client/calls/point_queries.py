@@ -111,14 +111,10 @@ class PointQueries(Asking):
             return Ask(keys.DISTANCE, message, DistanceReply)
 
         answered = self._in_parts(request, checked, most=MAX_SEARCHES, at_epoch=at_epoch)
+        asked_for = {"surface_point": with_point}
+        asked_for |= dict.fromkeys(("unknown_distance_m", "unknown_point"), with_distance)
         fields = answered.joined(
-            flags=["found"],
-            placed=["surface_point", "unknown_point"],
-            asked_for={
-                "surface_point": with_point,
-                "unknown_distance_m": with_distance,
-                "unknown_point": with_distance,
-            },
+            flags=["found"], placed=["surface_point", "unknown_point"], asked_for=asked_for
         )
         return with_unknown(Distances(**fields), checked, policy)
 
