@@ -111,7 +111,7 @@ def _map_of(drive: SimulatedDrive, path: Path) -> None:
             client.publish_scan(scan.points, scan.world_from_sensor)
             client.flush()
         client.settle()
-        client.download_box(path, _AROUND_M)
+        client.sync(_AROUND_M, path)
 
 
 def _run(command: str, *arguments: object, folder: Path = ROOT) -> None:

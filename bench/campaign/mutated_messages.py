@@ -11,18 +11,16 @@ from support import servers
 from support.operations import OPERATIONS
 from triquad_format.wire import codec, keys
 from triquad_format.wire.codec import Message
+from triquad_format.wire.mesh_messages import MeshRequest, TileListRequest, TileUpdatesRequest
 from triquad_format.wire.messages import (
     CheckpointRequest,
     FlushRequest,
     MapChunkRequest,
     MapInfoRequest,
-    MeshRequest,
     ResetRequest,
     Scan,
     SdfRequest,
     StatusRequest,
-    TileListRequest,
-    TileUpdatesRequest,
 )
 from triquad_format.wire.metrics_messages import MetricsRequest
 from triquad_format.wire.query_messages import (
@@ -33,9 +31,9 @@ from triquad_format.wire.query_messages import (
     GroundRequest,
     RaysRequest,
     SegmentsRequest,
+    SourcesRequest,
     SpheresRequest,
 )
-from triquad_format.wire.source_messages import SourcesRequest
 
 NUMBERS = (0, 1, -1, 2, 7, 2**15, 2**31, -(2**31), 2**53, 2**62, 2**63 - 1, -(2**63), 2**64 - 1)
 _VALUES: tuple[Any, ...] = (

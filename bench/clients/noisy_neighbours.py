@@ -17,8 +17,7 @@ import numpy as np
 import zenoh
 from triquad_format.wire import codec, keys
 from triquad_format.wire.limits import MAX_SEARCHES
-from triquad_format.wire.messages import Scan
-from triquad_format.wire.origin import RequestOrigin
+from triquad_format.wire.messages import RequestOrigin, Scan
 from triquad_format.wire.query_messages import DistanceRequest, SegmentsRequest
 from triquad_format.wire.zenoh_config import QUIET, put
 

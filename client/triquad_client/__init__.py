@@ -11,14 +11,8 @@ with triquad.connect("tcp/127.0.0.1:7447") as client:
 from triquad_format import __version__
 from triquad_format.errors import InvalidInputError, MapFileError, RefusedError, TriquadError
 from triquad_format.records.status import Status
-from triquad_format.wire.messages import (
-    CheckpointInfo,
-    FieldFit,
-    MapInfo,
-    ResetReply,
-    ServerStatus,
-    TileList,
-)
+from triquad_format.wire.mesh_messages import TileList
+from triquad_format.wire.messages import CheckpointInfo, FieldFit, MapInfo, ResetReply, ServerStatus
 from triquad_format.wire.metrics_messages import (
     CheckpointMetrics,
     OperationMetrics,
@@ -36,15 +30,20 @@ from triquad_map.questions.rays import RayRanges
 from triquad_map.questions.segments import Polyline, Segments
 from triquad_map.questions.spheres import Spheres
 
-from triquad_client.async_client import AsyncClient
+from triquad_client.async_client import (
+    AsyncClient,
+    AsyncMeshWatch,
+    AsyncPinnedMap,
+    AsyncSyncedMap,
+    connect_async,
+)
 from triquad_client.calls.changes import ChangedBox, ChangeKind, ChangeReport
-from triquad_client.calls.queries import AsyncPinnedMap, MapQueries, PinnedMap
-from triquad_client.calls.questions import SdfResult
+from triquad_client.calls.point_queries import SdfResult
+from triquad_client.calls.queries import MapQueries, PinnedMap
 from triquad_client.calls.scans import FlushReport
 from triquad_client.calls.sources import NewestScan, ScanSource, SourceReport
-from triquad_client.checks import Bounds, PoseLike
-from triquad_client.client import Client
-from triquad_client.connecting import connect, connect_async
+from triquad_client.checks import Bounds
+from triquad_client.client import Client, connect
 from triquad_client.depth_image import Intrinsics, depth_points
 from triquad_client.errors import (
     BadReplyError,
@@ -57,14 +56,13 @@ from triquad_client.errors import (
     RequestTimeoutError,
     UnknownMapError,
 )
-from triquad_client.mesh.async_mesh_watch import AsyncMeshWatch
 from triquad_client.mesh.followed_mesh import KnownTiles, MeshTile, MeshUpdate
 from triquad_client.mesh.mesh import Mesh
 from triquad_client.mesh.mesh_watch import MeshWatch
 from triquad_client.offline.offline_map import OfflineMap, open_map
-from triquad_client.offline.synced_map import AsyncSyncedMap, SyncedMap, SyncReport
+from triquad_client.offline.synced_map import SyncedMap, SyncReport
 from triquad_client.organised_cloud import empty_returns
-from triquad_client.pose import Pose
+from triquad_client.pose import Pose, PoseLike
 
 __all__ = [
     "Alignment",

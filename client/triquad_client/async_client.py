@@ -1,22 +1,108 @@
-"""The client for programs with an event loop."""
+"""The client for programs with an event loop: the blocking one, each of its calls in a thread."""
 
+import asyncio
+from collections.abc import Callable, Generator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
-from triquad_client.calls import questions
-from triquad_client.calls.operations import ClientOperations
-from triquad_client.calls.queries import AsyncMapQueries, AsyncPinnedMap
+from triquad_client.calls.queries import MapQueries, PinnedMap
 from triquad_client.checks import Bounds
-from triquad_client.client import Client
-from triquad_client.documentation import documented_as
-from triquad_client.mesh.async_mesh_watch import AsyncMeshWatch
-from triquad_client.mesh.followed_mesh import KnownTiles
-from triquad_client.net.async_driver import AsyncDriver
+from triquad_client.client import MAX_DOWNLOAD_BYTES, Client
+from triquad_client.mesh.followed_mesh import FollowedMesh, KnownTiles, MeshUpdate
+from triquad_client.mesh.mesh_watch import MeshWatch, WatchedTiles
 from triquad_client.net.connection import Connection
-from triquad_client.offline.synced_map import AsyncSyncedMap
+from triquad_client.net.in_threads import InThreads, Threads, awaited
+from triquad_client.net.opening import open_connection
+from triquad_client.offline.synced_map import SyncedMap, SyncReport
 
 
-@documented_as(Client)
-class AsyncClient(ClientOperations, AsyncMapQueries):
+class AsyncMapQueries(InThreads):
+    """Asks about the map: :class:`MapQueries` to be awaited."""
+
+    query_sdf = awaited(MapQueries.query_sdf)
+    query_distance = awaited(MapQueries.query_distance)
+    query_spheres = awaited(MapQueries.query_spheres)
+    query_segments = awaited(MapQueries.query_segments)
+    query_polyline = awaited(MapQueries.query_polyline)
+    query_rays = awaited(MapQueries.query_rays)
+    query_ground = awaited(MapQueries.query_ground)
+    query_grid = awaited(MapQueries.query_grid)
+    align = awaited(MapQueries.align)
+
+
+class AsyncPinnedMap(AsyncMapQueries):
+    """The map as it was in one epoch: :class:`PinnedMap` to be awaited."""
+
+    def __init__(self, pinned: PinnedMap, threads: Threads) -> None:
+        """Use ``AsyncClient.pinned``."""
+        super().__init__(pinned, threads)
+        self.epoch = pinned.epoch
+
+
+class AsyncSyncedMap(AsyncMapQueries):
+    """A copy of the part of a map that a box needs: :class:`SyncedMap` to be awaited."""
+
+    _blocking: SyncedMap
+
+    refresh = awaited(SyncedMap.refresh)
+
+    @property
+    def epoch(self) -> int:
+        """As :attr:`SyncedMap.epoch`."""
+        return self._blocking.epoch
+
+    @property
+    def age_s(self) -> float:
+        """As :attr:`SyncedMap.age_s`."""
+        return self._blocking.age_s
+
+    @property
+    def report(self) -> SyncReport:
+        """As :attr:`SyncedMap.report`."""
+        return self._blocking.report
+
+
+class AsyncMeshWatch(InThreads, WatchedTiles):
+    """The mesh tiles of a box, kept up to date by :meth:`next`; nothing is asked in between.
+
+    It is :class:`MeshWatch` to be awaited: use it in ``async with``, and ``async for``. Where the
+    client is closed, what is awaited raises :class:`ClosedError`. Several tasks may use it: each
+    change is reported to one of them. A cancelled task may take a change with it, which then
+    is in :attr:`tiles` without having been reported; a ``timeout_s`` does not.
+    """
+
+    _blocking: MeshWatch
+
+    next = awaited(MeshWatch.next)
+    catch_up = awaited(MeshWatch.catch_up)
+    mesh = awaited(MeshWatch.mesh)
+
+    async def __aenter__(self) -> "AsyncMeshWatch":
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+    def __aiter__(self) -> "AsyncMeshWatch":
+        """Yield updates as they come, until the watch is closed."""
+        return self
+
+    async def __anext__(self) -> MeshUpdate:
+        update = await self.next()
+        if update is None:
+            raise StopAsyncIteration
+        return update
+
+    async def close(self) -> None:
+        """End: :meth:`next` returns ``None``, and iteration ends, also in other tasks."""
+        self._blocking.close()
+
+    def _now(self) -> FollowedMesh:
+        return self._blocking._now()
+
+
+class AsyncClient(AsyncMapQueries):
     """A connection to one map of a server, for one event loop: :class:`Client` to be awaited.
 
     Scans go out in the order of the calls of :meth:`publish_scan`. :meth:`watch_mesh` itself is
@@ -25,17 +111,38 @@ class AsyncClient(ClientOperations, AsyncMapQueries):
     raise :class:`ClosedError`.
     """
 
-    def __init__(self, connection: Connection, driver: AsyncDriver) -> None:
-        """Use :func:`connect_async`."""
-        ClientOperations.__init__(self, connection)
-        self._driver = driver
-        AsyncMapQueries.__init__(self, driver.run_call)
+    _blocking: Client
+
+    publish_scan = awaited(Client.publish_scan)
+    publish_depth = awaited(Client.publish_depth)
+    restart_source = awaited(Client.restart_source)
+    flush = awaited(Client.flush)
+    settle = awaited(Client.settle)
+    changes = awaited(Client.changes)
+    sources = awaited(Client.sources)
+    tiles = awaited(Client.tiles)
+    mesh_tile = awaited(Client.mesh_tile)
+    mesh = awaited(Client.mesh)
+    status = awaited(Client.status)
+    metrics = awaited(Client.metrics)
+    checkpoint = awaited(Client.checkpoint)
+    reset = awaited(Client.reset)
+    download_map = awaited(Client.download_map)
+    maps = awaited(Client.maps)
+
+    @property
+    def map_name(self) -> str:
+        """The map this client works with."""
+        return self._blocking.map_name
 
     async def close(self) -> None:
-        await self._driver.close()
+        """End the connection. Scans that were published may still be on their way: flush first."""
+        await self._threads.close(self._blocking.close)
 
     async def pinned(self) -> AsyncPinnedMap:
-        return AsyncPinnedMap(self._run, await self._run(questions.pin_newest()))
+        """Return the map as it is now, for queries that belong together."""
+        pinned = await self._threads.run("pinned", self._blocking.pinned)
+        return AsyncPinnedMap(pinned, self._threads)
 
     def watch_mesh(
         self,
@@ -44,15 +151,70 @@ class AsyncClient(ClientOperations, AsyncMapQueries):
         max_bytes_per_s: int | None = None,
         known: KnownTiles | None = None,
     ) -> AsyncMeshWatch:
-        followed = self._followed(bounds, level, max_bytes_per_s, known)
-        return AsyncMeshWatch(self._run, followed)
+        """Follow the mesh tiles that meet ``bounds``, as :meth:`Client.watch_mesh` does."""
+        watch = self._blocking.watch_mesh(bounds, level, max_bytes_per_s, known)
+        return AsyncMeshWatch(watch, self._threads)
 
     async def sync(
         self, bounds: Bounds, path: str | Path, accept_emptier: bool = False
     ) -> AsyncSyncedMap:
-        synced = AsyncSyncedMap(Path(path), bounds, self._run, self._connection.max_download_bytes)
-        await synced.refresh(accept_emptier)
-        return synced
+        """Keep a copy of what the map needs to answer within ``bounds``: :meth:`Client.sync`."""
+        synced = await self._threads.run(
+            "sync", lambda: self._blocking.sync(bounds, path, accept_emptier)
+        )
+        return AsyncSyncedMap(synced, Threads())  # its own: it answers when the client is closed
 
-    async def maps(self) -> list[str]:
-        return await self._driver.maps()
+
+class Connecting:
+    """A client that is being connected: await it, or use it in an ``async with`` statement."""
+
+    def __init__(self, open_: Callable[[], Connection]) -> None:
+        """Use :func:`connect_async`."""
+        self._open = open_
+
+    def __await__(self) -> Generator[Any, None, AsyncClient]:
+        return self._connect().__await__()
+
+    async def __aenter__(self) -> AsyncClient:
+        self._client = await self
+        return self._client
+
+    async def __aexit__(self, *_: object) -> None:
+        await self._client.close()
+
+    async def _connect(self) -> AsyncClient:
+        opener = ThreadPoolExecutor(1, "triquad-opener")
+        opening = opener.submit(self._open)
+        try:
+            connection = await asyncio.wrap_future(opening)
+        except BaseException:
+            opening.add_done_callback(_close_late)
+            raise
+        finally:
+            opener.shutdown(wait=False)
+        return AsyncClient(Client(connection), Threads())
+
+
+def connect_async(
+    endpoint: str | None = None,
+    map: str = "default",  # noqa: A002 - the word of the command line and of the documentation
+    *,
+    timeout_s: float = 10.0,
+    config: str | Path | None = None,
+    max_download_bytes: int = MAX_DOWNLOAD_BYTES,
+) -> Connecting:
+    """Connect to a map server: ``async with connect_async(...) as client``, or await it and close.
+
+    Arguments and errors are those of :func:`connect`.
+    """
+    return Connecting(
+        lambda: open_connection(
+            endpoint, map, timeout_s, config, max_download_bytes=max_download_bytes
+        )
+    )
+
+
+def _close_late(opening: "Future[Connection]") -> None:
+    """Close what was opened although its task was cancelled meanwhile."""
+    if not opening.cancelled() and opening.exception() is None:
+        opening.result().close()

@@ -14,11 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from triquad_format.errors import InvalidInputError
 from triquad_format.records.arrays import Doubles, Floats, Ints
-from triquad_format.records.pose import RIGID_TOLERANCE, is_rotation, rotation_error
 from triquad_format.wire.limits import (
     LEVELS,
     MAX_DISTANCE_M,
-    MAX_FILL_M,
     MAX_POSITION_M,
     MIN_LENGTH_M,
     TILE_INDEX_LIMIT,
@@ -27,10 +25,6 @@ from triquad_map.questions.distance import Unknown, UnknownLike
 from triquad_map.questions.grid import GridShape
 
 from triquad_client.errors import NO_NUMBER, InvalidScanError
-from triquad_client.pose import Pose
-
-PoseLike: TypeAlias = ArrayLike | Pose
-"""A rigid pose in the map frame: a matrix [4, 4], or a position and a quaternion."""
 
 Bounds: TypeAlias = tuple[Sequence[float], Sequence[float]]
 """Minimum and maximum corner of a box, metres, map frame; sides may be infinite."""
@@ -83,32 +77,6 @@ def open_directions(vectors: ArrayLike) -> Floats:
     scaled = array / longest
     unit: Floats = (scaled / np.linalg.norm(scaled, axis=1, keepdims=True)).astype(np.float32)
     return unit
-
-
-def rigid_pose(world_from_sensor: PoseLike) -> Doubles:
-    """Return a pose [4, 4] as float64: a rotation and a translation, within 1e-3."""
-    if isinstance(world_from_sensor, Pose):
-        return world_from_sensor.matrix()
-    try:
-        pose = np.asarray(world_from_sensor, np.float64)
-    except NO_NUMBER as error:
-        raise InvalidScanError(f"world_from_sensor is not a matrix: {error}") from error
-    if pose.shape != (4, 4):
-        raise InvalidScanError(f"world_from_sensor is {list(pose.shape)}, not [4, 4]")
-    if not np.isfinite(pose).all():
-        raise InvalidScanError(f"world_from_sensor has values that are not finite:\n{pose}")
-    if not is_rotation(pose):
-        raise InvalidScanError(
-            f"world_from_sensor is not rigid: R R^T is off by {rotation_error(pose):.2g}, "
-            f"det R = {np.linalg.det(pose[:3, :3]):.3g}; remove scale, shear and mirroring"
-        )
-    if np.abs(pose[3] - (0, 0, 0, 1)).max() > RIGID_TOLERANCE:
-        raise InvalidScanError(
-            f"the last row of world_from_sensor is {pose[3]}, not 0 0 0 1; is it transposed?"
-        )
-    exact: Doubles = pose.copy()
-    exact[3] = (0, 0, 0, 1)
-    return exact
 
 
 def stamp_ns(stamp_s: float) -> int:
@@ -183,11 +151,6 @@ def tile_indices(index: Sequence[int]) -> Ints:
                 f"{TILE_INDEX_LIMIT}, such as client.tiles() lists"
             )
     return np.array([index], np.int32)
-
-
-def length_to_fill(fill_m: float) -> float:
-    """Return how far from seen surface a mesh is continued, metres."""
-    return within("fill_m", fill_m, MAX_FILL_M, least=0.0)
 
 
 def count(name: str, value: int, most: int) -> int:
@@ -290,17 +253,6 @@ def ray_origins(origins: ArrayLike, count: int) -> Doubles:
     return np.broadcast_to(places, (count, 3))
 
 
-def organised(name: str, values: ArrayLike) -> Doubles:
-    """Return an array [rows, columns, 3] as float64; values that are not finite may be in it."""
-    try:
-        array = _real_numbers(values).astype(np.float64, copy=False)
-    except NO_NUMBER as error:
-        raise InvalidScanError(f"{name}: not an array of real numbers: {error}") from error
-    if array.ndim != 3 or array.shape[2] != 3:
-        raise InvalidScanError(f"{name}: {list(array.shape)} is not [rows, columns, 3]")
-    return array
-
-
 def _points(
     points: ArrayLike,
     dtype: Any,
@@ -311,7 +263,7 @@ def _points(
 ) -> NDArray[Any]:
     """Return the first three of up to ``columns`` columns."""
     try:
-        array = _real_numbers(points)
+        array = real_numbers(points)
     except NO_NUMBER as cause:
         raise error(f"{what} are not an array [N, 3] of real numbers: {cause}") from cause
     if array.size == 0 and array.ndim == 1:
@@ -322,7 +274,8 @@ def _points(
     return array[:, :3].astype(dtype, copy=False)
 
 
-def _real_numbers(values: ArrayLike) -> NDArray[Any]:
+def real_numbers(values: ArrayLike) -> NDArray[Any]:
+    """Return an array of whole or floating numbers."""
     array = np.asarray(values)
     if array.dtype.kind not in "fiu":
         raise TypeError(f"dtype {array.dtype} is not one of real numbers")

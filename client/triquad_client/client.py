@@ -2,17 +2,28 @@
 
 from pathlib import Path
 
-from triquad_client.calls import questions
-from triquad_client.calls.operations import ClientOperations
+from triquad_client.calls.changes import ChangeCalls
+from triquad_client.calls.download import DownloadCalls
+from triquad_client.calls.point_queries import pin_newest
 from triquad_client.calls.queries import MapQueries, PinnedMap
+from triquad_client.calls.scans import ScanCalls
+from triquad_client.calls.server import ServerCalls
+from triquad_client.calls.sources import SourceCalls
 from triquad_client.checks import Bounds
-from triquad_client.mesh.followed_mesh import KnownTiles
+from triquad_client.mesh.followed_mesh import FollowedMesh, KnownTiles
+from triquad_client.mesh.mesh_calls import MeshCalls
 from triquad_client.mesh.mesh_watch import MeshWatch
-from triquad_client.net.connection import Connection, RemoteDriver
+from triquad_client.net.connection import Connection
+from triquad_client.net.opening import open_connection
 from triquad_client.offline.synced_map import SyncedMap
 
+MAX_DOWNLOAD_BYTES = 2**30
+"""Some hundred times the map of a town; larger ones need a limit of the caller's."""
 
-class Client(ClientOperations, MapQueries):
+
+class Client(
+    ScanCalls, MapQueries, MeshCalls, ChangeCalls, SourceCalls, ServerCalls, DownloadCalls
+):
     """A connection to one map of a server. Close it, or use it in a ``with`` statement.
 
     Positions are metres in the map frame. All methods may be called from several threads, and
@@ -23,9 +34,8 @@ class Client(ClientOperations, MapQueries):
 
     def __init__(self, connection: Connection) -> None:
         """Use :func:`triquad_client.connect`."""
-        ClientOperations.__init__(self, connection)
-        self._driver = RemoteDriver(connection)
-        MapQueries.__init__(self, self._driver.run)
+        super().__init__(connection)
+        self._server = connection
 
     def __enter__(self) -> "Client":
         return self
@@ -33,13 +43,18 @@ class Client(ClientOperations, MapQueries):
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    @property
+    def map_name(self) -> str:
+        """The map this client works with."""
+        return self._connection.map_name
+
     def close(self) -> None:
         """End the connection. Scans that were published may still be on their way: flush first."""
         self._connection.close()
 
     def pinned(self) -> PinnedMap:
         """Return the map as it is now, for queries that belong together."""
-        return PinnedMap(self._run, self._run(questions.pin_newest()))
+        return PinnedMap(self._connection, pin_newest(self._connection))
 
     def watch_mesh(
         self,
@@ -59,7 +74,8 @@ class Client(ClientOperations, MapQueries):
         Raises:
             InvalidInputError: an argument cannot be used, or ``known`` is of another level.
         """
-        followed = self._followed(bounds, level, max_bytes_per_s, known)
+        most = self._connection.max_download_bytes
+        followed = FollowedMesh.initial(bounds, level, max_bytes_per_s, known, max_bytes=most)
         return MeshWatch(self._connection, followed)
 
     def sync(self, bounds: Bounds, path: str | Path, accept_emptier: bool = False) -> SyncedMap:
@@ -82,10 +98,40 @@ class Client(ClientOperations, MapQueries):
             DownloadError: what arrived is not valid.
             OSError: the file cannot be read or written.
         """
-        synced = SyncedMap(Path(path), bounds, self._run, self._connection.max_download_bytes)
+        synced = SyncedMap(Path(path), bounds, self._connection)
         synced.refresh(accept_emptier)
         return synced
 
     def maps(self) -> list[str]:
         """Return names of all maps that can be reached, also those of other servers."""
-        return self._driver.maps()
+        return self._connection.maps()
+
+
+def connect(
+    endpoint: str | None = None,
+    map: str = "default",  # noqa: A002 - the word of the command line and of the documentation
+    *,
+    timeout_s: float = 10.0,
+    config: str | Path | None = None,
+    max_download_bytes: int = MAX_DOWNLOAD_BYTES,
+) -> Client:
+    """Connect to a map server.
+
+    Args:
+        endpoint: of the server, or of a router that leads to it: a host such as ``robot`` or
+            ``robot:7447``, or an endpoint of Zenoh; ``None``: where ``config`` says, and otherwise
+            port 7447 of this machine.
+        map: name of the map.
+        timeout_s: for connecting and for each request.
+        config: Zenoh configuration file (JSON5), such as one of triquad-keys with credentials.
+        max_download_bytes: the largest map file that is fetched from the server, and the most that
+            the mesh of a box may take of memory, whatever the server announces.
+
+    Raises:
+        ConnectError: nothing listens at the endpoint, or it does not let us in.
+        UnknownMapError: no server there has this map.
+        InvalidInputError: there cannot be an endpoint or a map of this name.
+    """
+    return Client(
+        open_connection(endpoint, map, timeout_s, config, max_download_bytes=max_download_bytes)
+    )

@@ -5,7 +5,7 @@ from numpy.typing import ArrayLike
 from triquad_format.records.arrays import Doubles
 
 from triquad_client import checks
-from triquad_client.errors import InvalidScanError
+from triquad_client.errors import NO_NUMBER, InvalidScanError
 
 
 def empty_returns(cloud: ArrayLike, directions: ArrayLike) -> Doubles:
@@ -23,7 +23,7 @@ def empty_returns(cloud: ArrayLike, directions: ArrayLike) -> Doubles:
     Raises:
         InvalidScanError: the two are not arrays of one shape.
     """
-    points, rays = checks.organised("cloud", cloud), checks.organised("directions", directions)
+    points, rays = _organised("cloud", cloud), _organised("directions", directions)
     if points.shape != rays.shape:
         raise InvalidScanError(
             f"cloud is {list(points.shape)} and directions are {list(rays.shape)}: give the "
@@ -32,3 +32,14 @@ def empty_returns(cloud: ArrayLike, directions: ArrayLike) -> Doubles:
     empty = np.isnan(points).any(axis=-1) | (points == 0).all(axis=-1)
     of_empty: Doubles = rays[empty]
     return of_empty
+
+
+def _organised(name: str, values: ArrayLike) -> Doubles:
+    """Return an array [rows, columns, 3] as float64; values that are not finite may be in it."""
+    try:
+        array = checks.real_numbers(values).astype(np.float64, copy=False)
+    except NO_NUMBER as error:
+        raise InvalidScanError(f"{name}: not an array of real numbers: {error}") from error
+    if array.ndim != 3 or array.shape[2] != 3:
+        raise InvalidScanError(f"{name}: {list(array.shape)} is not [rows, columns, 3]")
+    return array

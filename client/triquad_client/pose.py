@@ -1,10 +1,12 @@
 """A pose as a position and a quaternion, the way ROS and trajectory files have it."""
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 from triquad_format.records.arrays import Doubles
+from triquad_format.records.pose import RIGID_TOLERANCE, is_rotation, rotation_error
 
 from triquad_client.errors import NO_NUMBER, InvalidScanError
 
@@ -42,6 +44,36 @@ class Pose:
                 f"quaternion_xyzw = {quaternion.tolist()} has the length {length:.4g}, not 1"
             )
         return position, quaternion / length
+
+
+PoseLike: TypeAlias = ArrayLike | Pose
+"""A rigid pose in the map frame: a matrix [4, 4], or a position and a quaternion."""
+
+
+def rigid_pose(world_from_sensor: PoseLike) -> Doubles:
+    """Return a pose [4, 4] as float64: a rotation and a translation, within 1e-3."""
+    if isinstance(world_from_sensor, Pose):
+        return world_from_sensor.matrix()
+    try:
+        pose = np.asarray(world_from_sensor, np.float64)
+    except NO_NUMBER as error:
+        raise InvalidScanError(f"world_from_sensor is not a matrix: {error}") from error
+    if pose.shape != (4, 4):
+        raise InvalidScanError(f"world_from_sensor is {list(pose.shape)}, not [4, 4]")
+    if not np.isfinite(pose).all():
+        raise InvalidScanError(f"world_from_sensor has values that are not finite:\n{pose}")
+    if not is_rotation(pose):
+        raise InvalidScanError(
+            f"world_from_sensor is not rigid: R R^T is off by {rotation_error(pose):.2g}, "
+            f"det R = {np.linalg.det(pose[:3, :3]):.3g}; remove scale, shear and mirroring"
+        )
+    if np.abs(pose[3] - (0, 0, 0, 1)).max() > RIGID_TOLERANCE:
+        raise InvalidScanError(
+            f"the last row of world_from_sensor is {pose[3]}, not 0 0 0 1; is it transposed?"
+        )
+    exact: Doubles = pose.copy()
+    exact[3] = (0, 0, 0, 1)
+    return exact
 
 
 def pose_matrices(positions: Doubles, quaternions: Doubles) -> Doubles:

@@ -4,8 +4,7 @@ import numpy as np
 import zenoh
 from triquad_format.errors import WireError
 from triquad_format.wire import codec, keys
-from triquad_format.wire.messages import ErrorReply, SdfRequest
-from triquad_format.wire.origin import RequestOrigin
+from triquad_format.wire.messages import ErrorReply, RequestOrigin, SdfRequest
 
 
 class SelfQuestion:

@@ -9,17 +9,16 @@ import zenoh
 from triquad_format.wire import keys
 from triquad_format.wire.codec import Message
 from triquad_format.wire.limits import MAX_KNOWN_TILES, MAX_QUERY_POINTS, payload_limit
+from triquad_format.wire.mesh_messages import MeshRequest, TileListRequest
 from triquad_format.wire.messages import (
     CheckpointInfo,
     CheckpointRequest,
     MapChunkRequest,
     MapInfoRequest,
-    MeshRequest,
     ResetRequest,
     Scan,
     SdfRequest,
     StatusRequest,
-    TileListRequest,
 )
 from triquad_format.wire.metrics_messages import MetricsRequest
 from triquad_format.wire.query_messages import (
@@ -30,9 +29,9 @@ from triquad_format.wire.query_messages import (
     GroundRequest,
     RaysRequest,
     SegmentsRequest,
+    SourcesRequest,
     SpheresRequest,
 )
-from triquad_format.wire.source_messages import SourcesRequest
 from triquad_map.questions.answers import Answers, QuestionLimits
 
 from triquad_server.epochs.history import EpochHistory

@@ -13,7 +13,7 @@ import pytest
 import triquad_client
 import zenoh
 from support.role_files import free_tls_endpoint, opened, showing
-from support.role_matrix import ATTEMPTS, OTHERS, OWN, WILD, achieved, expected
+from support.role_matrix import ATTEMPTS, OTHERS, OWN, achieved, expected
 from support.ros_bridge import MAST, bridging, stand
 from support.ros_messages import RosMessages
 from support.ros_robot import RmwZenoh, Robot
@@ -105,18 +105,6 @@ def network(folder: KeyFolder) -> Iterator[Network]:
         yield network
 
 
-@pytest.fixture(scope="module")
-def unguarded(folder: KeyFolder) -> Iterator[Network]:
-    """With the same certificates, and without access control."""
-    text = (folder.path / "server.json5").read_text()
-    section = '"access_control": {\n    "enabled": '
-    assert f"{section}true" in text
-    file = folder.path / "unguarded.json5"
-    file.write_text(text.replace(f"{section}true", f"{section}false"))
-    with served(folder, file) as network:
-        yield network
-
-
 def results(network: Network, path: str) -> Results:
     """What everybody achieves, all at the same time."""
 
@@ -154,16 +142,6 @@ def test_nothing_is_gained_by_another_mode(network: Network, mode: str) -> None:
         opened(network.file("robot"), network.endpoints["server"], **as_member) as session,
     ):
         assert achieved(mode, session, observer) <= expected("robot", MEMBERS["robot"])
-
-
-def test_without_access_control_everybody_who_is_let_in_may_do_everything(
-    unguarded: Network,
-) -> None:
-    found = results(unguarded, "server")
-    for who in MEMBERS:
-        assert found[who] == set(ATTEMPTS) - {WILD}, who  # which servers answer to nobody
-    for who in STRANGERS:
-        assert found[who] == set(), who
 
 
 def test_roles_work_together(network: Network) -> None:

@@ -1,11 +1,9 @@
 """Depth images, from the client to what the map answers."""
 
-import asyncio
 from typing import Any
 
 import numpy as np
 import pytest
-import triquad_client
 from support import servers
 from triquad_client import Intrinsics, InvalidScanError, Status, depth_points
 
@@ -66,17 +64,6 @@ def test_a_camera_matrix_gives_the_intrinsics() -> None:
     matrix = [[60, 0, 39.5], [0, 50, 29.5], [0, 0, 1]]
     assert Intrinsics.from_matrix(matrix) == CAMERA
     assert Intrinsics.from_matrix(np.ravel(matrix)) == CAMERA  # as CameraInfo has it
-
-
-def test_the_async_client_sends_them_too() -> None:
-    async def status_of_wall(endpoint: str) -> int:
-        async with triquad_client.connect_async(endpoint) as client:
-            await client.publish_depth(wall_depth(), CAMERA, FORWARD, source="camera", stride=2)
-            await client.flush(servers.WAIT_S)
-            return int((await client.query_sdf([[9, 6, 1.5]])).status[0])
-
-    with servers.running_service() as endpoint:
-        assert asyncio.run(status_of_wall(endpoint)) == Status.SURFACE
 
 
 @pytest.mark.parametrize(

@@ -15,10 +15,8 @@ from support.exact_maps import exact_map, flat
 from triquad_client import (
     Client,
     ClosedError,
-    InvalidInputError,
     OfflineMap,
     RefusedError,
-    UnknownSpaceError,
     open_map,
 )
 from triquad_client.calls.queries import MapQueries
@@ -137,34 +135,6 @@ def test_only_its_own_epoch_can_be_asked_for(offline: OfflineMap) -> None:
         with pytest.raises(RefusedError, match=rf"kept is \[{offline.epoch}\]") as refusal:
             question(POINTS, at_epoch=offline.epoch + 1)
         assert refusal.value.code == "epoch_gone"
-
-
-@pytest.mark.parametrize(
-    "ask",
-    [
-        lambda view: view.query_sdf([[0, 0]]),
-        lambda view: view.query_sdf([[0, 0, np.nan]]),
-        lambda view: view.query_distance(POINTS, -1.0),
-        lambda view: view.query_distance(POINTS, 1e3),
-        lambda view: view.query_distance(POINTS, unknown="maybe"),
-        lambda view: view.query_spheres(POINTS, -1.0),
-        lambda view: view.query_segments(POINTS, ENDS),
-        lambda view: view.query_rays([0, 0, 0], [[0, 0, 0]]),
-        lambda view: view.query_ground(POINTS, max_drop_m=0.0),
-        lambda view: view.query_grid(BOX, cell_m=0.0),
-        lambda view: view.query_sdf(POINTS, at_epoch=0),
-        lambda view: view.query_distance([[9.0, 9, 9]], unknown="error"),
-    ],
-)
-def test_what_the_server_does_not_answer_the_file_does_not_either(
-    pair: Pair, offline: OfflineMap, ask: Question
-) -> None:
-    errors = (InvalidInputError, RefusedError, UnknownSpaceError)
-    with pytest.raises(errors) as online:
-        ask(pair.client)
-    with pytest.raises(type(online.value)) as refusal:
-        ask(offline)
-    assert str(refusal.value) == str(online.value)
 
 
 def test_a_closed_map_says_so(pair: Pair) -> None:

@@ -1,6 +1,5 @@
 """Rays that met nothing, from the client to what the map answers."""
 
-import asyncio
 from typing import Any
 
 import numpy as np
@@ -124,17 +123,6 @@ def test_where_the_robot_drove_surfaces_stay() -> None:
             Status.FREE,
             Status.FREE,
         ]
-
-
-def test_the_async_client_sends_them_too() -> None:
-    async def status_above(endpoint: str) -> int:
-        async with triquad_client.connect_async(endpoint) as client:
-            await client.publish_scan(NOTHING, POSE, no_return=UP)
-            await client.flush(servers.WAIT_S)
-            return int((await client.query_sdf([[0, 0, 6.0]])).status[0])
-
-    with servers.running_service() as endpoint:
-        assert asyncio.run(status_above(endpoint)) == Status.FREE
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,10 @@
 """Queries that are answered from one epoch, however the map goes on meanwhile."""
 
-import asyncio
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
-import triquad_client
 from support import servers
 from triquad_client import Client, InvalidInputError, RefusedError
 from triquad_server.settings import ServiceSettings
@@ -80,22 +78,3 @@ def test_what_is_no_epoch_is_refused_here(client: Client, epoch: Any) -> None:
 def test_an_epoch_may_be_any_integer(client: Client) -> None:
     epoch = client.query_sdf(POINTS).epoch
     assert client.query_sdf(POINTS, at_epoch=np.int64(epoch)).epoch == epoch
-
-
-def test_the_other_client_pins_alike() -> None:
-    with servers.running_service(SETTINGS) as endpoint:
-        asyncio.run(asyncio.wait_for(assert_pinned_stays(endpoint), servers.WAIT_S))
-
-
-async def assert_pinned_stays(endpoint: str) -> None:
-    with triquad_client.connect(endpoint) as learner:
-        await asyncio.to_thread(learn_more, learner)
-        async with triquad_client.connect_async(endpoint) as client:
-            view = await client.pinned()
-            before = await view.query_sdf(POINTS)
-            await asyncio.to_thread(learn_more, learner)
-            after = await asyncio.gather(*(view.query_sdf(POINTS) for _ in range(50)))
-            assert {result.epoch for result in after} == {view.epoch}
-            np.testing.assert_array_equal(after[0].sdf, before.sdf)
-            assert (await client.query_sdf(POINTS)).epoch > view.epoch
-            assert (await client.query_sdf(POINTS, at_epoch=view.epoch)).epoch == view.epoch

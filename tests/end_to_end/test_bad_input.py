@@ -12,13 +12,8 @@ from hypothesis import strategies as st
 from support import servers
 from support.operations import OPERATIONS
 from triquad_format.wire import codec, keys
-from triquad_format.wire.messages import (
-    MeshRequest,
-    ResetRequest,
-    SdfRequest,
-    StatusRequest,
-    TileListRequest,
-)
+from triquad_format.wire.mesh_messages import MeshRequest, TileListRequest
+from triquad_format.wire.messages import ResetRequest, SdfRequest, StatusRequest
 from triquad_format.wire.query_messages import (
     DistanceRequest,
     GroundRequest,

@@ -10,11 +10,10 @@ import triquad_client
 from support import servers
 from triquad_client import InvalidInputError, Status
 from triquad_format.wire import codec, keys
+from triquad_format.wire.mesh_messages import MeshReply, MeshRequest
 from triquad_format.wire.messages import (
     ErrorReply,
     FlushRequest,
-    MeshReply,
-    MeshRequest,
     SdfRequest,
     ServerStatus,
     StatusRequest,

@@ -1,17 +1,15 @@
 """The map of a service as a file: downloaded, and written to a store."""
 
-import math
 import shutil
 
 import numpy as np
 import pytest
 import triquad_client
 from support import servers
-from triquad_client import DownloadError, InvalidInputError, RefusedError
+from triquad_client import RefusedError
 from triquad_format.mapfile.reader import read_map
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import MapChunk, MapChunkRequest, ResetRequest
-from triquad_map.reference.evaluator import MapEvaluator
 from triquad_server.store.store import Store
 
 PROBES = np.concatenate([servers.sphere(50, radius) for radius in (2.0, 3.9, 4.0, 4.1)])
@@ -45,33 +43,6 @@ def test_chunks_of_other_files_or_beyond_the_end_are_refused(client, endpoint, t
         for length, end in ((5, 8), (2**62, None)):
             answer = peer.ask(keys.MAP_CHUNK, codec.encode(MapChunkRequest(info.sha256, 3, length)))
             assert codec.decode(MapChunk, answer).data == data[3:end]
-
-
-def test_a_box_of_the_map_is_downloaded_without_the_rest(client, tmp_path):
-    servers.learn(client)
-    client.settle(servers.WAIT_S)
-    whole = client.download_map(tmp_path / "whole.triquad")
-    low, high = (1.0, -4.5, -4.5), (4.5, 4.5, 4.5)
-    box = client.download_box(tmp_path / "box.triquad", (low, high))
-    assert box.epoch == whole.epoch
-    assert box.bytes < whole.bytes
-    points = np.random.default_rng(0).uniform(low, high, (500, 3))
-    here = MapEvaluator(read_map(tmp_path / "box.triquad")).query(points, gradient=True)
-    there = MapEvaluator(read_map(tmp_path / "whole.triquad")).query(points, gradient=True)
-    assert np.array_equal(here.sdf, there.sdf)
-    assert np.array_equal(here.status, there.status)
-    everything = client.download_box(tmp_path / "all.triquad", ((-math.inf,) * 3, (math.inf,) * 3))
-    assert read_map(tmp_path / "all.triquad").regions[0].parameters > 0
-    assert everything.epoch == whole.epoch
-    with pytest.raises(InvalidInputError, match="hold nothing"):
-        client.download_box(tmp_path / "none.triquad", (low, low))
-    with pytest.raises(DownloadError, match="nothing of the map lies between"):
-        client.download_box(tmp_path / "none.triquad", ((500, 0, 0), (501, 1, 1)))
-    assert sorted(p.name for p in tmp_path.iterdir()) == [
-        "all.triquad",
-        "box.triquad",
-        "whole.triquad",
-    ]
 
 
 def test_without_a_store_checkpoints_are_refused_and_the_status_says_so(client):

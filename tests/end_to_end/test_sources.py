@@ -17,7 +17,7 @@ from triquad_client import (
 from triquad_format.records.arrays import Doubles
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import FlushRequest
-from triquad_format.wire.source_messages import SourcesReply, SourcesRequest, SourceState
+from triquad_format.wire.query_messages import SourcesReply, SourcesRequest, SourceState
 from triquad_server.intake.source_trails import MAX_SOURCES
 from triquad_server.queries import source_queries
 

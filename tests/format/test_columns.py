@@ -1,32 +1,15 @@
 """Columns of numbers as bytes, and back."""
 
 import numpy as np
-from hypothesis import given
-from hypothesis import strategies as st
 from triquad_format.mapfile.parts.part import (
     LEVEL_BITS,
-    join_bits,
-    join_integers,
     shuffle,
     shuffle_codes,
     split_bits,
     split_integers,
     unshuffle,
-    unshuffle_codes,
 )
-from triquad_format.records.region import MAX_INTEGER, MAX_LEVEL
-
-
-@given(st.lists(st.integers(0, 2**47), unique=True))
-def test_codes_round_trip(codes: list[int]) -> None:
-    array = np.array(sorted(codes), np.int64)
-    np.testing.assert_array_equal(unshuffle_codes(shuffle_codes(array)), array)
-
-
-@given(st.lists(st.integers(-MAX_INTEGER, MAX_INTEGER), min_size=1))
-def test_integers_round_trip(integers: list[int]) -> None:
-    array = np.array(integers, np.int16)[:, None]
-    np.testing.assert_array_equal(join_integers(split_integers(array)), array)
+from triquad_format.records.region import MAX_INTEGER
 
 
 def test_literal_bytes_of_columns() -> None:
@@ -43,9 +26,3 @@ def test_literal_bytes_of_columns() -> None:
         [0x06],
         [0x08],
     ]
-
-
-@given(st.lists(st.integers(0, MAX_LEVEL)))
-def test_levels_round_trip(levels: list[int]) -> None:
-    array = np.array(levels, np.uint8)
-    np.testing.assert_array_equal(join_bits(split_bits(array, LEVEL_BITS), len(array)), array)

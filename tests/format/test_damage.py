@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fuzz.choices import Mutation
-from fuzz.damage import DAMAGE, add_bombs, change_parts
+from fuzz.damage import DAMAGE, change_parts
 from fuzz.forgery import FORGERY, forge_bombs
 from fuzz.valid_maps import READERS, Reader, Results, ValidMap, valid_maps
 from hypothesis import HealthCheck, Phase, event, given, settings
@@ -29,9 +29,7 @@ from mcap.writer import Writer
 from support.file_damage import chunks, flipped, zeroed
 from support.map_records import assert_same, random_record
 from support.mapfile_edit import (
-    assert_refused,
     file_bytes,
-    parts_of,
     read_bytes,
     rewritten,
     stored,
@@ -44,7 +42,6 @@ from triquad_format.errors import (
     TooLargeMapFileError,
     UnsupportedMapFileError,
 )
-from triquad_format.mapfile import reader
 from triquad_format.mapfile.manifest import Entry
 from triquad_format.mapfile.metadata import MapFacts
 from triquad_format.mapfile.parts.pack import pack_part, pack_record
@@ -91,13 +88,10 @@ def test_forged_maps_are_valid(
     check_mutant(maps, mutation, data, forged=True)
 
 
-@pytest.mark.parametrize("mutation", [add_bombs, forge_bombs])
 @bombs
 @given(data=st.data())
-def test_bombs_take_little_memory(
-    maps: list[ValidMap], mutation: Mutation, data: st.DataObject
-) -> None:
-    check_mutant(maps, mutation, data, forged=mutation is forge_bombs)
+def test_bombs_take_little_memory(maps: list[ValidMap], data: st.DataObject) -> None:
+    check_mutant(maps, forge_bombs, data, forged=True)
 
 
 def test_a_reader_that_checks_no_digests_is_found(
@@ -198,12 +192,6 @@ def test_files_that_are_cut_anywhere() -> None:
                 read(DATA[:offset])
 
 
-def test_every_byte_at_both_ends_is_checked() -> None:
-    for place in (*range(300), *range(len(DATA) - 300, len(DATA))):
-        with pytest.raises(MapFileError):
-            read_bytes(flipped(DATA, place))
-
-
 @pytest.mark.parametrize("number", range(len(chunks(DATA))))
 def test_a_damaged_part_is_refused_when_it_is_read(number: int) -> None:
     chunk = chunks(DATA)[number]
@@ -215,16 +203,6 @@ def test_a_damaged_part_is_refused_when_it_is_read(number: int) -> None:
             continue
         with pytest.raises(MapFileError):
             stored_record(mutant)
-
-
-def test_equal_parts_of_two_maps_are_not_mixed_up() -> None:
-    changed = random_record(7)
-    for table in changed.regions[0].tables:
-        table.features[:] *= -1
-    other = dict(enumerate(part.payload for part in parts_of(file_bytes(changed))[:-1]))
-    del other[0]
-    mixed = rewritten(file_bytes(random_record(7)), payloads=other, fitting=False)
-    assert_refused(mixed, "not the part listed")
 
 
 def test_messages_name_file_fault_and_remedy(tmp_path: Path) -> None:
@@ -310,15 +288,6 @@ def test_total_is_limited() -> None:
         with pytest.raises(TooLargeMapFileError, match="limit"):
             read_map(io.BytesIO(data), max_bytes=limit)
     assert read_map(io.BytesIO(data), max_bytes=10 * len(data)).regions
-
-
-def test_memory_error_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    def out_of_memory(*_: object) -> None:
-        raise MemoryError
-
-    monkeypatch.setattr(reader, "assemble", out_of_memory)
-    with pytest.raises(TooLargeMapFileError, match="memory"):
-        read_bytes(DATA)
 
 
 READ_WITH_LITTLE_MEMORY = """

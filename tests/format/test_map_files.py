@@ -6,7 +6,6 @@ import io
 from collections import Counter
 from pathlib import Path
 
-import msgpack
 import numpy as np
 import pytest
 import zstandard
@@ -67,17 +66,6 @@ def test_round_trip(tmp_path: Path, training: bool, dtype: str) -> None:
     assert info == MapFileInfo(len(data), hashlib.sha256(data).hexdigest(), record.epoch)
 
 
-@pytest.mark.parametrize(("limit", "planes"), [(1, 1), (127, 1), (128, 2), (MAX_INTEGER, 2)])
-def test_integer_features(limit: int, planes: int) -> None:
-    record = with_integers(random_record(2), limit)
-    data = file_bytes(record)
-    assert_read_back(record, data)
-    bodies = [msgpack.unpackb(p.payload) for p in parts_of(data) if p.topic == "/triquad/vertices"]
-    levels = [level for body in bodies for level in body["levels"]]
-    assert {level["integers"]["shape"][0] for level in levels} == {planes}
-    assert not any("features" in level for level in levels)
-
-
 def test_rays_of_a_cube_that_fill_several_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("triquad_format.mapfile.parts.pack.RAYS_PER_PART", 80)
     record = with_rays(random_record(2))
@@ -88,13 +76,6 @@ def test_rays_of_a_cube_that_fill_several_parts(monkeypatch: pytest.MonkeyPatch)
 
 def test_empty_map() -> None:
     assert_read_back(MapRecord("default", 0, SMALL, ()))
-
-
-@pytest.mark.parametrize("preview", [True, False])
-def test_regions_that_saw_nothing(preview: bool) -> None:
-    record = random_record(0, points=0)
-    for seen in (record, with_integers(record)):
-        assert_read_back(seen, file_bytes(seen, preview=preview))
 
 
 @pytest.mark.parametrize("integers", [True, False])
@@ -148,14 +129,6 @@ def test_round_trip_of_any_record(
     if training:
         record = with_progress(with_rays(record, points), MapProgress(*progress))
     assert_read_back(record)
-
-
-def test_features_are_rounded_to_the_file_dtype() -> None:
-    record = random_record(3, feature_dtype="<f4")
-    table = read_bytes(file_bytes(record)).regions[0].tables[0]
-    want = record.regions[0].tables[0].features.astype(np.float16)
-    assert table.features.dtype == np.float16
-    np.testing.assert_array_equal(table.features, want)
 
 
 def test_same_record_same_bytes() -> None:
@@ -240,13 +213,6 @@ def test_stock_reader_sees_an_ordinary_file() -> None:
     assert encodings.pop("/preview/mesh") == "protobuf"
     assert set(encodings.values()) == {"msgpack-zstd"}
     assert parts_of(data)[-1].topic == "/triquad/manifest"
-
-
-def test_a_file_without_previews_has_no_protobuf_in_it() -> None:
-    summary = make_reader(io.BytesIO(file_bytes(random_record(6)))).get_summary()
-    assert summary is not None
-    assert not summary.schemas
-    assert {channel.message_encoding for channel in summary.channels.values()} == {"msgpack-zstd"}
 
 
 def test_previews_are_written_with_their_schema_only() -> None:

@@ -22,14 +22,6 @@ def test_known_codes(dimensions, bits):
     assert morton.decode(morton.encode(top), dimensions).tolist() == top.tolist()
 
 
-@pytest.mark.parametrize(("dimensions", "side"), [(2, 64), (3, 16)])
-def test_codes_number_a_cube_without_gaps(dimensions, side):
-    cells = np.stack(np.meshgrid(*[np.arange(side)] * dimensions), axis=-1)
-    codes = morton.encode(cells)
-    assert np.array_equal(np.sort(codes, axis=None), np.arange(side**dimensions))
-    assert np.array_equal(morton.decode(codes, dimensions), cells)
-
-
 @given(st.lists(st.integers(0, 2**31 - 1), min_size=2, max_size=2))
 def test_2d_against_slow_code(cell):
     code = int(morton.encode(np.array(cell)))

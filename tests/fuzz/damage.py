@@ -1,7 +1,7 @@
 """Damage of map files. It must be found: the file reads back as it was, or is refused."""
 
 import numpy as np
-from fuzz.choices import Draw, Mutation, bomb_bytes, flipped, number, place, shuffle
+from fuzz.choices import Draw, Mutation, flipped, number, place, shuffle
 from hypothesis import strategies as st
 from support.mapfile_edit import parts_of, rewritten, with_fitting_crcs
 
@@ -30,11 +30,6 @@ def change_numbers(draw: Draw, data: bytes) -> bytes:
     return with_fitting_crcs(data[:at] + new + data[at + size :])
 
 
-def flip_bits_within_crcs(draw: Draw, data: bytes) -> bytes:
-    """Some bits are flipped anywhere; the checksums of data and summary fit."""
-    return with_fitting_crcs(flipped(draw, data, 8))
-
-
 def change_parts(draw: Draw, data: bytes) -> bytes:
     """Parts are others, doubled or swapped; MCAP's checksums fit, digests do not."""
     payloads = [part.payload for part in parts_of(data)[:-1]]
@@ -48,16 +43,9 @@ def change_parts(draw: Draw, data: bytes) -> bytes:
     return rewritten(data, payloads=dict(enumerate(payloads)), fitting=False)
 
 
-def add_bombs(draw: Draw, data: bytes) -> bytes:
-    """A part takes far more than its file, and is not the one that is listed."""
-    at = place(draw, parts_of(data)[:-1])
-    return rewritten(data, payloads={at: bytes(bomb_bytes(draw))}, fitting=False)
-
-
 DAMAGE: tuple[Mutation, ...] = (
     flip_bits,
     cut,
     change_numbers,
-    flip_bits_within_crcs,
     change_parts,
 )

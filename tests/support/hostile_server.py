@@ -1,58 +1,48 @@
-"""A server that answers in the right form, but for what a lie changes."""
+"""A server that changes the replies of a real one on their way to the client."""
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import msgpack
 import numpy as np
+import triquad_client
 import zenoh
-from support.honest_replies import honest_reply
+from support import servers
 from support.operations import OPERATIONS
-from support.servers import MAP, raw_session
-from triquad_format.wire import (
-    codec,
-    keys,
-    messages,
-    metrics_messages,
-    query_messages,
-    source_messages,
-)
+from triquad_format.wire import codec, keys
 from triquad_tools.demo.server import free_endpoint
 
 Body = dict[str, Any]
 """A message as a msgpack map: what an encoder of messages would refuse, it can hold."""
 
-_KINDS = {
-    kind.__name__: kind
-    for module in (messages, query_messages, source_messages, metrics_messages)
-    for kind in vars(module).values()
-    if isinstance(kind, type) and issubclass(kind, codec.Message)
-}
-
 
 @dataclass
 class HostileServer:
-    """Answers each question with what ``lie`` makes of the honest reply's bytes."""
+    """Answers each question with what ``lie`` makes of the bytes of the real server's reply."""
 
     endpoint: str
-    lie: Callable[[str, bytes], bytes | zenoh.ZBytes] = lambda _, honest: honest
+    real: zenoh.Session  # of a client of the real server
+    lie: Callable[[str, bytes], bytes] = lambda _, honest: honest
     refusal: bytes | None = None  # is the reply instead, as an error
-    answered: list[str] = field(default_factory=list)  # operations
-    sent_bytes: int = 0
 
     def answer(self, operation: str, query: zenoh.Query) -> None:
-        assert query.payload is not None
-        payload = query.payload.to_bytes()
-        kind = _KINDS[msgpack.unpackb(payload)["kind"]]
-        self.answered.append(operation)
         if self.refusal is not None:
             query.reply_err(self.refusal)
             return
-        reply = self.lie(operation, codec.encode(honest_reply(codec.decode(kind, payload))))
-        self.sent_bytes += len(reply)
-        query.reply(query.key_expr, reply)
+        (honest,) = self.real.get(
+            str(query.key_expr),
+            payload=query.payload,
+            attachment=query.attachment,
+            timeout=servers.WAIT_S,
+        )
+        if honest.ok is None:
+            query.reply_err(honest.err.payload)
+        else:
+            query.reply(query.key_expr, self.lie(operation, honest.ok.payload.to_bytes()))
 
 
 def told(operation: str, change: Callable[[Body], object]) -> Callable[[str, bytes], bytes]:
@@ -75,18 +65,32 @@ def packed(values: object, dtype: str = "<f4") -> Body:
 
 @contextmanager
 def hostile_server() -> Iterator[HostileServer]:
-    """A router that claims to have the default map, and answers all its operations."""
-    server = HostileServer(free_endpoint())
-    with raw_session("router", listen=server.endpoint) as session, ExitStack() as declared:
+    """A router before a service that has learnt a sphere: all questions and scans pass it."""
+    with (
+        TemporaryDirectory() as store,
+        servers.running_service(store=Path(store)) as endpoint,
+        servers.raw_session(connect=endpoint) as real,
+        ExitStack() as declared,
+    ):
+        with triquad_client.connect(endpoint) as client:
+            servers.learn(client, scans=3)
+            client.settle(servers.WAIT_S)
+        server = HostileServer(free_endpoint(), real)
+        session = declared.enter_context(servers.raw_session("router", listen=server.endpoint))
         for operation in OPERATIONS:
-            key = keys.operation_key(MAP, operation)
 
             def reply(query: zenoh.Query, operation: str = operation) -> None:
                 with query:
                     server.answer(operation, query)
 
-            queryable = session.declare_queryable(key, reply)
-            declared.callback(queryable.undeclare)
-        token = session.liveliness().declare_token(keys.alive_key(MAP, "x"))
+            key = keys.operation_key(servers.MAP, operation)
+            declared.callback(session.declare_queryable(key, reply).undeclare)
+
+        def forward(sample: zenoh.Sample) -> None:
+            real.put(str(sample.key_expr), sample.payload)
+
+        scans = session.declare_subscriber(keys.all_scans_key(servers.MAP), forward)
+        declared.callback(scans.undeclare)
+        token = session.liveliness().declare_token(keys.alive_key(servers.MAP, "x"))
         declared.callback(token.undeclare)
         yield server

@@ -3,18 +3,27 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from support.honest_replies import CHUNK_BYTES, EPOCH, SURFACE, TILE
 from support.hostile_server import Body, packed
 from triquad_client import Client
 from triquad_format.wire import keys
-from triquad_format.wire.tile_codec import encode_tile
+from triquad_format.wire.tile_codec import TileSurface, encode_tile
 
 COUNT = 100
 POINTS = np.random.default_rng(1).normal(size=(COUNT, 3))
 BOX = ((0, 0, 0), (1, 1, 1))
+AROUND = ((-9, -9, -9), (9, 9, 9))
+NOWHERE = ((90, 90, 90), (91, 91, 91))
 NAN, INF = float("nan"), float("inf")
+SURFACE = TileSurface(
+    np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0)], np.uint16),
+    np.zeros(3, np.uint8),
+    np.zeros(3, np.uint8),
+    faces=np.array([(0, 1, 2)], np.int32),
+)
+TILE = encode_tile(SURFACE)
 
 Ask = Callable[[Client, Path], object]
 
@@ -50,19 +59,19 @@ def _within(path: str, **fields: object) -> Callable[[Body], object]:
 
 def _flush(client: Client, _: Path) -> object:
     client.publish_scan(POINTS, np.eye(4))
-    return client.flush(1.0)
+    return client.flush(9.0)
 
 
 def _watch(client: Client, _: Path) -> object:
     with client.watch_mesh() as watch:
-        return watch.next(1.0)
+        return watch.next(0.0)
 
 
 def _watch_on(client: Client, _: Path) -> object:
-    """A second update, after an honest first one of revision 3."""
+    """A second update, after an honest first one."""
     with client.watch_mesh() as watch:
-        watch.next(1.0)
-        return watch.next(1.0)
+        watch.next(0.0)
+        return watch.next(0.0)
 
 
 def _sources_on(client: Client, _: Path) -> object:
@@ -81,11 +90,15 @@ def _second(change: Callable[[Body], object]) -> Callable[[Body], object]:
     return lie
 
 
+def _pinned(client: Client, _: Path) -> object:
+    return client.query_sdf(POINTS, at_epoch=client.status().epoch)
+
+
 def _questions() -> dict[str, tuple[str, Ask]]:
     return {
         "sdf": (keys.SDF, lambda client, _: client.query_sdf(POINTS)),
         "gradient": (keys.SDF, lambda client, _: client.query_sdf(POINTS, gradient=True)),
-        "sdf of epoch": (keys.SDF, lambda client, _: client.query_sdf(POINTS, at_epoch=EPOCH)),
+        "sdf of epoch": (keys.SDF, _pinned),
         "distance": (
             keys.DISTANCE,
             lambda client, _: client.query_distance(
@@ -98,11 +111,11 @@ def _questions() -> dict[str, tuple[str, Ask]]:
         "ground": (keys.GROUND, lambda client, _: client.query_ground(POINTS)),
         "grid": (keys.GRID, lambda client, _: client.query_grid(BOX, 0.25)),
         "align": (keys.ALIGN, lambda client, _: client.align(POINTS, np.eye(4))),
-        "changes": (keys.CHANGES, lambda client, _: client.changes(EPOCH)),
+        "changes": (keys.CHANGES, lambda client, _: client.changes(client.status().epoch)),
         "sources": (keys.SOURCES, lambda client, _: client.sources(max_points=10)),
         "sources again": (keys.SOURCES, _sources_on),
         "tiles": (keys.TILE_LIST, lambda client, _: client.tiles()),
-        "tile": (keys.MESH, lambda client, _: client.mesh_tile(0, 0, 0)),
+        "tile": (keys.MESH, lambda client, _: client.mesh_tile(-1, -1, -1)),
         "mesh": (keys.MESH, lambda client, _: client.mesh()),
         "filled mesh": (keys.MESH, lambda client, _: client.mesh(fill_m=1.0)),
         "watch": (keys.TILE_UPDATES, _watch),
@@ -111,13 +124,48 @@ def _questions() -> dict[str, tuple[str, Ask]]:
         "metrics": (keys.METRICS, lambda client, _: client.metrics()),
         "flush": (keys.FLUSH, _flush),
         "checkpoint": (keys.CHECKPOINT, lambda client, _: client.checkpoint()),
-        "reset": (keys.RESET, lambda client, _: client.reset()),
+        "reset": (keys.RESET, lambda client, _: client.reset(NOWHERE)),
         "download": (keys.MAP_INFO, lambda client, path: client.download_map(path)),
         "chunk": (keys.MAP_CHUNK, lambda client, path: client.download_map(path)),
+        "copy": (keys.MAP_CHUNK, lambda client, path: client.sync(AROUND, path)),
     }
 
 
 QUESTIONS = _questions()
+
+
+def _adds(field: str, more: Any) -> Callable[[Body], object]:
+    return lambda body: body.update({field: body[field] + more})
+
+
+def _all(field: str, value: float) -> Callable[[Body], object]:
+    """All values of an array, of which there may be any number."""
+
+    def change(body: Body) -> None:
+        array = np.frombuffer(body[field]["data"], body[field]["dtype"])
+        body[field]["data"] = np.full_like(array, value).tobytes()
+
+    return change
+
+
+def _rots(body: Body) -> None:
+    """A bit is flipped in each kilobyte."""
+    data = bytearray(body["data"])
+    for place in range(0, len(data), 1000):
+        data[place] ^= 0x10
+    body["data"] = bytes(data)
+
+
+def _boxes(**columns: object) -> Callable[[Body], object]:
+    """Two boxes that changed, of which some columns are wrong."""
+    right = {
+        "minimum": all_values(0, "<f8", (2, 3)),
+        "maximum": all_values(1, "<f8", (2, 3)),
+        "appeared": packed([0, 1], "|u1"),
+        "epochs": packed([1, 1], "<i8"),
+        "voxels": packed([3, 4], "<i8"),
+    }
+    return _sets(**right | columns)
 
 
 def _has_faces(faces: list[list[int]]) -> Callable[[Body], object]:
@@ -139,7 +187,7 @@ _LIES: list[tuple[str, str, Callable[[Body], object]]] = [
     ("sdf", "two dimensions", _sets(sdf=all_values(1, shape=(COUNT, 1)))),
     ("sdf", "2^39 values declared", lambda body: body["sdf"].update(shape=[2**39])),
     ("sdf", "another kind", _sets(kind="DistanceReply")),
-    ("sdf of epoch", "another epoch", _sets(epoch=EPOCH + 1)),
+    ("sdf of epoch", "another epoch", _adds("epoch", 1)),
     ("gradient", "no gradient", _sets(gradient=None)),
     ("gradient", "one gradient", _sets(gradient=packed([[0, 0, 1]]))),
     ("gradient", "infinite gradient", _sets(gradient=all_values(INF, shape=(COUNT, 3)))),
@@ -173,43 +221,41 @@ _LIES: list[tuple[str, str, Callable[[Body], object]]] = [
     ("align", "inlier share 7", _sets(inlier_share=7.0)),
     ("align", "covariance infinite", _sets(covariance=all_values(INF, "<f8", (6, 6)))),
     ("align", "a thousand million steps", _sets(iterations=10**9)),
-    ("changes", "since another epoch", _sets(since=3)),
-    ("changes", "negative epochs", _sets(epochs=packed([-1, -2], "<i8"))),
-    ("changes", "corner no number", _sets(minimum=all_values(NAN, "<f8", (2, 3)))),
-    ("changes", "fewer voxels", _sets(voxels=packed([3], "<i8"))),
-    ("sources", "too many points", _within("sources/lidar/newest",
+    ("changes", "since another epoch", _adds("since", 1)),
+    ("changes", "negative epochs", _boxes(epochs=packed([-1, -2], "<i8"))),
+    ("changes", "corner no number", _boxes(minimum=all_values(NAN, "<f8", (2, 3)))),
+    ("changes", "fewer voxels", _boxes(voxels=packed([3], "<i8"))),
+    ("sources", "too many points", _within("sources/*/newest",
                                            points=all_values(0, shape=(5000, 3)))),
-    ("sources", "no pose", _within("sources/lidar/newest",
+    ("sources", "no pose", _within("sources/*/newest",
                                    world_from_sensor=all_values(0, "<f8", (4, 4)))),
-    ("sources", "trail no number", _within("sources/lidar", trail=all_values(NAN, "<f8", (2, 3)))),
-    ("sources", "fewer pieces", _within("sources/lidar", pieces=packed([0], "<i8"))),
-    ("sources again", "turns back", _second(_sets(revision=1))),
+    ("sources", "trail no number", _within("sources/*", trail=all_values(NAN, "<f8", (2, 3)))),
+    ("sources", "fewer pieces", _within("sources/*", pieces=packed([], "<i8"))),
+    ("sources again", "turns back", _second(_sets(revision=0))),
     ("tiles", "one epoch too few", _sets(changed=packed([], "<i8"))),
     ("tiles", "side no number", _sets(tile_side_m=NAN)),
     ("tiles", "no side", _sets(tile_side_m=0.0)),
     ("tile", "corner that is not there", _has_faces([[0, 1, 99]])),
     ("tile", "negative corner", _has_faces([[0, 1, -1]])),
-    ("mesh", "corner that is not there", _has_faces([[0, 1, 99]])),
-    ("tile", "no tile", _sets(data=bytes(len(TILE)))),
+    ("tile", "no tile", _sets(data=bytes(64), sizes=packed([64], "<i8"))),
     ("tile", "half a tile", _sets(data=TILE[:9], sizes=packed([9], "<i8"))),
     ("tile", "cells no number", _sets(cell_m=NAN)),
     ("tile", "side 1e30 m", _sets(tile_side_m=1e30)),
     ("tile", "marks unasked", _sets(filled=packed([0], "|u1"))),
-    ("mesh", "more bytes than told", _sets(data=TILE + b"x")),
-    ("mesh", "fewer bytes than told", _sets(data=TILE[:-1])),
-    ("mesh", "more tiles", _sets(data=2 * TILE, sizes=packed([len(TILE)] * 2, "<i8"))),
-    ("mesh", "bytes fewer than none", _sets(sizes=packed([-3], "<i8"))),
+    ("mesh", "more bytes than told", _adds("data", b"x")),
+    ("mesh", "fewer bytes than told", lambda body: body.update(data=body["data"][:-1])),
+    ("tile", "bytes fewer than none", _sets(sizes=packed([-3], "<i8"))),
     ("filled mesh", "fewer marks than faces", _sets(filled=packed([], "|u1"))),
-    ("mesh", "another epoch", _sets(epoch=EPOCH + 1)),
+    ("mesh", "another epoch", _adds("epoch", 1)),
     ("filled mesh", "without marks", _sets(filled=None)),
     ("filled mesh", "more marks than faces", _sets(filled=packed([0, 1, 0], "|u1"))),
-    ("filled mesh", "marks that are none", _sets(filled=packed([2], "|u1"))),
+    ("filled mesh", "marks that are none", _all("filled", 2)),
     ("watch", "cells no number", _sets(cell_m=NAN)),
     ("watch", "side 1e30 m", _sets(tile_side_m=1e30)),
     ("watch", "epoch -5", _sets(epoch=-5)),
     ("watch", "sizes that are too large", _sets(sizes=packed([2**40], "<i8"))),
-    ("watch", "version -1", _sets(versions=packed([-1], "<i8"))),
-    ("watch again", "turns back", _second(_sets(revision=1))),
+    ("watch", "version -1", _all("versions", -1)),
+    ("watch again", "turns back", _second(_sets(revision=0))),
     ("watch again", "another server", _second(_sets(server="y"))),
     ("status", "negative counts", _sets(scans_taken=-4)),
     ("status", "no time", _sets(uptime_s=NAN)),
@@ -218,17 +264,19 @@ _LIES: list[tuple[str, str, Callable[[Body], object]]] = [
     ("metrics", "too few buckets", _within("operations/*/answers", counts=packed([1], "<i8"))),
     ("metrics", "negative buckets",
      _within("operations/*/answers", counts=packed([1, -1, 0], "<i8"))),
-    ("metrics", "bounds no number", _sets(bounds_s=packed([NAN, NAN], "<f8"))),
+    ("metrics", "bounds no number", _all("bounds_s", NAN)),
     ("flush", "negative counts", _sets(taken=-1)),
     ("checkpoint", "no digest", _sets(sha256="../../etc/passwd")),
     ("reset", "epoch -1", _sets(epoch=-1)),
     ("download", "2^62 bytes", _sets(bytes=2**62)),
     ("download", "epoch 2^53 and 1", _sets(epoch=2**53 + 1)),
     ("download", "chunks of 0 bytes", _sets(chunk_bytes=0)),
-    ("download", "another digest", _sets(sha256="0" * 64)),
     ("chunk", "more than was asked", lambda body: body.update(data=body["data"] * 2)),
     ("chunk", "less than was asked", lambda body: body.update(data=body["data"][:-1])),
-    ("chunk", "from elsewhere", lambda body: body.update(offset=body["offset"] + CHUNK_BYTES)),
+    ("chunk", "other bytes", _rots),
+    ("copy", "other bytes", _rots),
+    ("copy", "from elsewhere", _adds("offset", 1)),
+    ("chunk", "from elsewhere", _adds("offset", 1)),
 ]  # fmt: skip
 
 LIES = [

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 from support.servers import WAIT_S
-from triquad_format.wire.messages import TileUpdatesRequest
+from triquad_format.wire.mesh_messages import TileUpdatesRequest
 from triquad_server.fair_queue import Owner
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from fuzz.choices import Mutation
-from fuzz.damage import DAMAGE, add_bombs
+from fuzz.damage import DAMAGE
 from fuzz.forgery import FORGERY, forge_bombs
 from fuzz.valid_maps import READERS, ValidMap, valid_maps
 from hypothesis import HealthCheck, Phase, given, seed, settings
@@ -33,7 +33,7 @@ _HANG_S = 20.0
 _LIMIT_BYTES = 64 * 2**20
 """Memory that a reader may take in addition to the size of the file."""
 
-_MUTATIONS = (*DAMAGE * 3, *FORGERY * 3, add_bombs, forge_bombs)
+_MUTATIONS = (*DAMAGE * 3, *FORGERY * 3, forge_bombs)
 _READ, _ENDED = "read", "ended"
 _CHUNK = 50  # mutants between two checks of the time
 

@@ -8,7 +8,7 @@ from triquad_format.wire.query_messages import ChangesReply, ChangesRequest
 
 from triquad_client import checks
 from triquad_client.checks import Bounds
-from triquad_client.net.call import Ask, Call, ask
+from triquad_client.net.connection import Ask, Connection
 
 Corner = tuple[float, float, float]
 
@@ -46,16 +46,35 @@ class ChangeReport:
     boxes: tuple[ChangedBox, ...]  # those of most voxels first
 
 
-def changes(since: int | ChangeReport | None, bounds: Bounds | None) -> Call[ChangeReport]:
-    """Return what changed within ``bounds`` since an epoch, or since an earlier report."""
-    if isinstance(since, ChangeReport):
-        epoch, server = since.epoch, since.server
-    else:
-        epoch, server = checks.chosen_epoch(since, "since"), ""
-    minimum, maximum = checks.box(bounds)
-    request = ChangesRequest(since=epoch, server=server, minimum=minimum, maximum=maximum)
-    reply = yield from ask(Ask(keys.CHANGES, request, ChangesReply))
-    return ChangeReport(reply.epoch, reply.since, reply.server, boxes=_boxes(reply))
+class ChangeCalls:
+    """The call that tells what changed."""
+
+    _connection: Connection
+
+    def changes(
+        self, since: int | ChangeReport | None = None, bounds: Bounds | None = None
+    ) -> ChangeReport:
+        """Return where surface appeared or vanished since an epoch, a published state of the map.
+
+        What appeared and vanished again is not listed. To follow the map, give the report before:
+        its epoch, and its server, so that a restart is noticed whatever the epochs' numbers.
+
+        Args:
+            since: number of an epoch, of this run of the server; or an earlier report; ``None``:
+                the newest, to which nothing is listed.
+            bounds: corners of a box, metres, map frame; ``None``: everywhere.
+
+        Raises:
+            RefusedError: ``epoch_gone``: the server was restarted, does not remember as far back,
+                or has not published that epoch. Ask for what you need of the map again.
+        """
+        if isinstance(since, ChangeReport):
+            epoch, server = since.epoch, since.server
+        else:
+            epoch, server = checks.chosen_epoch(since, "since"), ""
+        request = ChangesRequest(epoch, server, *checks.box(bounds))
+        reply = self._connection.ask(Ask(keys.CHANGES, request, ChangesReply))
+        return ChangeReport(reply.epoch, reply.since, reply.server, boxes=_boxes(reply))
 
 
 def _boxes(reply: ChangesReply) -> tuple[ChangedBox, ...]:

@@ -4,19 +4,14 @@ import hashlib
 import shutil
 from pathlib import Path
 
-from triquad_format.errors import FormatError
 from triquad_format.mapfile.durable_file import replacing
 from triquad_format.mapfile.index import check_range
-from triquad_format.mapfile.writer import MapFileInfo, write_map
-from triquad_format.records.crop import crop_record
 from triquad_format.wire import keys
 from triquad_format.wire.messages import MapChunk, MapChunkRequest, MapInfo, MapInfoRequest
-from triquad_map.stored_map import StoredMap
 
 from triquad_client import checks
-from triquad_client.checks import Bounds
 from triquad_client.errors import DownloadError
-from triquad_client.net.call import Ask, Call, Run, ask, ask_each, offload, retried
+from triquad_client.net.connection import Ask, Connection, retried
 
 _PREPARE_S = 120.0
 """The server writes the file before it answers."""
@@ -24,14 +19,14 @@ _PREPARE_S = 120.0
 _BLOCK_BYTES = 2**23
 
 
-def newest_file(training: bool, max_bytes: int) -> Call[MapInfo]:
+def newest_file(connection: Connection, training: bool = False) -> MapInfo:
     """Return the file of the newest epoch, which the server keeps for a while.
 
     Raises:
-        DownloadError: it is larger than ``max_bytes``.
+        DownloadError: it is larger than this client takes.
     """
-    request = MapInfoRequest(checks.flag("training", training))
-    info = yield from ask(
+    request, max_bytes = MapInfoRequest(training), connection.max_download_bytes
+    info = connection.ask(
         Ask(keys.MAP_INFO, request, MapInfo, background=True, min_timeout_s=_PREPARE_S)
     )
     if info.bytes > max_bytes:
@@ -45,14 +40,14 @@ def newest_file(training: bool, max_bytes: int) -> Call[MapInfo]:
 class RemoteBytes:
     """The bytes of one map file on the server; see :class:`RandomAccess`."""
 
-    def __init__(self, run: Run, info: MapInfo, max_bytes: int) -> None:
-        """Open a file of which ``max_bytes`` may be read in all."""
+    def __init__(self, connection: Connection, info: MapInfo) -> None:
+        """Open a file that the server keeps for a while."""
         self.name = f"the map of epoch {info.epoch}"
         self.size = info.bytes
         self.bytes_read = 0
-        self._run = run
+        self._connection = connection
         self._info = info
-        self._max_bytes = max_bytes
+        self._max_bytes = connection.max_download_bytes
 
     def read(self, offset: int, length: int) -> bytes:
         """Return exactly ``length`` bytes from ``offset`` on.
@@ -67,7 +62,7 @@ class RemoteBytes:
             raise DownloadError(f"{self.name} names more than {self._max_bytes} bytes to be read")
         end = offset + length
         starts = range(offset, end, self._info.chunk_bytes)
-        chunks = self._run(ask_each(starts, lambda at: self._ask(at, end)))
+        chunks = list(self._connection.replies(self._ask(at, end) for at in starts))
         for chunk, start in zip(chunks, starts, strict=True):
             if chunk.offset != start:
                 raise DownloadError(f"chunk at {chunk.offset} came, not {start}")
@@ -83,46 +78,42 @@ class RemoteBytes:
         return Ask(keys.MAP_CHUNK, request, MapChunk, background=True)
 
 
-def fetch(path: Path, training: bool, max_bytes: int) -> Call[MapInfo]:
-    """Write the newest map to ``path``, as ``Client.download_map``."""
+class DownloadCalls:
+    """The calls that fetch the map, or a part of it, as a file."""
 
-    def job(run: Run) -> MapInfo:
-        info = run(newest_file(training, max_bytes))
-        _check_space(path, info.bytes)
-        remote = RemoteBytes(run, info, max_bytes)
-        digest = hashlib.sha256()
-        with replacing(path) as file:
-            for offset in range(0, info.bytes, _BLOCK_BYTES):
-                data = remote.read(offset, min(_BLOCK_BYTES, info.bytes - offset))
-                digest.update(data)
-                file.write(data)
-            found = digest.hexdigest()
-            if found != info.sha256:
-                raise DownloadError(f"the file's SHA-256 is {found}, not {info.sha256}")
-        return info
+    _connection: Connection
 
-    # Newer map files may push this one out of the server: then the newest is used.
-    return retried("chunk_gone", lambda: offload(job))
+    def download_map(self, path: str | Path, training: bool = False) -> MapInfo:
+        """Write the newest map to a file, checked against its digest, all of it or nothing.
+
+        Args:
+            path: the file; an older one is replaced.
+            training: with the state from which training can go on.
+
+        Raises:
+            DownloadError: what arrived is not what the server announced.
+            OSError: the file cannot be written.
+        """
+        training = checks.flag("training", training)
+        # Newer map files may push this one out of the server: then the newest is used.
+        return retried("chunk_gone", lambda: _fetch(self._connection, Path(path), training))
 
 
-def fetch_box(path: Path, bounds: Bounds, max_bytes: int) -> Call[MapFileInfo]:
-    """Write what answers in the bounds, as ``Client.download_box``."""
-    low, high = checks.finite_box(bounds)
-
-    def job(run: Run) -> MapFileInfo:
-        try:
-            info = run(newest_file(training=False, max_bytes=max_bytes))
-            stored = StoredMap(RemoteBytes(run, info, max_bytes))
-            record = crop_record(stored.box(low, high), low, high)
-            if not record.has_evidence:
-                raise DownloadError(
-                    f"nothing of the map lies between {low.tolist()} and {high.tolist()}"
-                )
-            return write_map(record, path, stamp_ns=stored.manifest.stamp_ns or None)
-        except FormatError as error:
-            raise DownloadError(str(error)) from error
-
-    return (yield from retried("chunk_gone", lambda: offload(job)))
+def _fetch(connection: Connection, path: Path, training: bool) -> MapInfo:
+    """Write the newest map to ``path``."""
+    info = newest_file(connection, training)
+    _check_space(path, info.bytes)
+    remote = RemoteBytes(connection, info)
+    digest = hashlib.sha256()
+    with replacing(path) as file:
+        for offset in range(0, info.bytes, _BLOCK_BYTES):
+            data = remote.read(offset, min(_BLOCK_BYTES, info.bytes - offset))
+            digest.update(data)
+            file.write(data)
+        found = digest.hexdigest()
+        if found != info.sha256:
+            raise DownloadError(f"the file's SHA-256 is {found}, not {info.sha256}")
+    return info
 
 
 def _check_space(path: Path, size: int) -> None:

@@ -1,7 +1,8 @@
-"""A question in parts that are asked of one epoch, and the replies joined."""
+"""Questions in parts that are asked of one epoch, and the replies joined."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeVar
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from triquad_format.records.arrays import Doubles, Floats
@@ -9,76 +10,117 @@ from triquad_format.wire.messages import MapReply
 
 from triquad_client import checks
 from triquad_client.errors import BadReplyError
-from triquad_client.net.call import NEWEST, Ask, Call, ask, ask_each, retried
+from triquad_client.net.connection import NEWEST, Answering, Ask, retried
 
 _ORIGIN_SAMPLE = 1000  # points
 
 MapReplyT = TypeVar("MapReplyT", bound=MapReply)
 
 
-def in_parts(
-    request: Callable[[slice, int], Ask[MapReplyT]], count: int, *, most: int, at_epoch: int | None
-) -> Call[Sequence[MapReplyT]]:
-    """Return the replies about ``count`` items, ``most`` at a time, all from one epoch.
+@dataclass(frozen=True)
+class Part:
+    """What one request asks about: some of the items of a question, of one epoch."""
 
-    ``request`` makes what is asked about some of the items, of the epoch of some number.
+    rows: slice
+    epoch: int
+    origin: Doubles  # [3] metres, map frame: positions travel relative to it, in single precision
 
-    Raises:
-        InvalidInputError: ``at_epoch`` is neither the number of an epoch nor ``None``, the newest.
-    """
-
-    # Its annotation is quoted: it would be evaluated again with each call.
-    def parts(epoch: int) -> "Call[Sequence[MapReplyT]]":
-        first = yield from ask(request(slice(0, most), epoch))
-        if count <= most:
-            return [first]
-        rest = yield from ask_each(
-            range(most, count, most), lambda start: request(slice(start, start + most), first.epoch)
-        )
-        return [first, *rest]
-
-    epoch = checks.chosen_epoch(at_epoch)
-    if epoch != NEWEST:
-        return (yield from parts(epoch))
-    # The map may go on while the parts are under way: then all of it is asked again.
-    return (yield from retried("epoch_gone", lambda: parts(NEWEST)))
+    def offsets(self, points: Doubles) -> Floats:
+        """Return this part of the points [N, 3] of the question, as they travel."""
+        return (points[self.rows] - self.origin).astype(np.float32)
 
 
-def joined(
-    replies: Sequence[MapReply],
-    *,
-    flags: Sequence[str] = (),
-    asked_for: Mapping[str, bool] | None = None,
-) -> dict[str, Any]:
-    """Return the fields of replies about parts as one, arrays end to end, as a result takes them.
+@dataclass(frozen=True)
+class Answered(Generic[MapReplyT]):
+    """The parts of a question, and the reply to each, all from one epoch."""
 
-    Args:
-        replies: one or more.
-        flags: fields that become truth values.
-        asked_for: fields that are there on request, and whether they were; results have them under
-            the same name with an underscore before it, and ``None`` where they were not.
+    parts: Sequence[Part]
+    replies: Sequence[MapReplyT]
 
-    Raises:
-        BadReplyError: the replies do not fit together, or lack what was asked for.
-    """
-    try:
-        fields = {
-            name: np.concatenate([getattr(reply, name) for reply in replies])
-            if isinstance(value, np.ndarray)
-            else value
-            for name, value in vars(replies[0]).items()
-        }
-    except ValueError as error:
-        raise BadReplyError(f"the replies about parts do not fit together: {error}") from error
-    for name, wanted in (asked_for or {}).items():
-        part = fields.pop(name)
-        if wanted and part is None:
-            raise BadReplyError(f"the reply lacks {name}, which was asked for")
-        fields[f"_{name}"] = part if wanted else None
-    return fields | {flag: fields[flag].astype(np.bool_) for flag in flags}
+    def joined(
+        self,
+        *,
+        flags: Sequence[str] = (),
+        placed: Sequence[str] = (),
+        asked_for: Mapping[str, bool] | None = None,
+    ) -> dict[str, Any]:
+        """Return the fields of the replies as one, arrays end to end, as a result takes them.
+
+        Args:
+            flags: fields that become truth values.
+            placed: fields of positions relative to the origin of the part, or ``None``.
+            asked_for: fields that are there on request, and whether they were; results have them
+                under the same name with an underscore before it, and ``None`` where they were not.
+
+        Raises:
+            BadReplyError: the replies do not fit together, or lack what was asked for.
+        """
+        try:
+            fields = {
+                name: np.concatenate([getattr(reply, name) for reply in self.replies])
+                if isinstance(value, np.ndarray)
+                else value
+                for name, value in vars(self.replies[0]).items()
+            }
+        except ValueError as error:
+            raise BadReplyError(f"the replies about parts do not fit together: {error}") from error
+        for name in placed:
+            if fields[name] is not None:
+                counts = [len(getattr(reply, name)) for reply in self.replies]
+                origins = np.repeat([part.origin for part in self.parts], counts, axis=0)
+                fields[name] = fields[name] + origins
+        for name, wanted in (asked_for or {}).items():
+            part = fields.pop(name)
+            if wanted and part is None:
+                raise BadReplyError(f"the reply lacks {name}, which was asked for")
+            fields[f"_{name}"] = part if wanted else None
+        return fields | {flag: fields[flag].astype(np.bool_) for flag in flags}
 
 
-def origin_of(points: Doubles) -> Doubles:
+class Asking:
+    """Asks about a map: of its newest epoch, or always of the same one."""
+
+    _server: Answering
+    """Whoever answers all of one question."""
+
+    _epoch: int | None = None
+    """The epoch that is asked where a question names none; ``None``: the newest."""
+
+    def _in_parts(
+        self,
+        request: Callable[[Part], Ask[MapReplyT]],
+        places: Doubles,
+        *,
+        most: int,
+        at_epoch: int | None,
+    ) -> Answered[MapReplyT]:
+        """Return the replies about items at ``places`` [N, 3], ``most`` at a time.
+
+        Raises:
+            InvalidInputError: ``at_epoch`` is neither the number of an epoch nor ``None``.
+        """
+        epoch, server = self._chosen(at_epoch), self._server
+
+        def part(start: int, epoch: int) -> Part:
+            rows = slice(start, start + most)
+            return Part(rows, epoch, _origin_of(places[rows]))
+
+        def answered() -> Answered[MapReplyT]:
+            first = part(0, epoch)
+            (reply,) = server.replies([request(first)])
+            rest = [part(start, reply.epoch) for start in range(most, len(places), most)]
+            replies = server.replies(request(each) for each in rest)
+            return Answered([first, *rest], [reply, *replies])
+
+        # The map may go on while the parts are under way: then all of it is asked again.
+        return retried("epoch_gone", answered) if epoch == NEWEST else answered()
+
+    def _chosen(self, at_epoch: int | None) -> int:
+        """Return the number of the epoch to ask."""
+        return checks.chosen_epoch(self._epoch if at_epoch is None else at_epoch)
+
+
+def _origin_of(points: Doubles) -> Doubles:
     """Return an origin [3] among points [N, 3], from which they travel in single precision."""
     if not len(points):
         return np.zeros(3)
@@ -87,8 +129,3 @@ def origin_of(points: Doubles) -> Doubles:
     some = points[:: max(1, len(points) // _ORIGIN_SAMPLE)]
     middle = len(some) // 2
     return np.asarray(np.partition(some, middle, axis=0)[middle])
-
-
-def offsets_from(points: Doubles, origin: Doubles) -> Floats:
-    """Return points [N, 3] as they travel: relative to an origin [3]."""
-    return (points - origin).astype(np.float32)

@@ -11,15 +11,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 from triquad_format.errors import FormatError, InvalidInputError, RefusedError
 from triquad_format.printable import printable
+from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.wire import keys
 from triquad_format.wire.messages import FlushReply, FlushRequest, Scan, ServerStatus
 
 from triquad_client import checks
-from triquad_client.calls import admin
-from triquad_client.checks import PoseLike
+from triquad_client.calls.server import STATUS
+from triquad_client.depth_image import Intrinsics, depth_points
 from triquad_client.errors import InvalidScanError, RequestTimeoutError
-from triquad_client.net.call import Ask, Call, Pause, ask_each
-from triquad_client.net.connection import Connection
+from triquad_client.net.connection import Ask, Connection
+from triquad_client.pose import PoseLike, rigid_pose
 
 _log = logging.getLogger("triquad_client")
 
@@ -46,12 +47,12 @@ class _Source:
     """The progress of a source."""
 
     session: int = field(default_factory=lambda: secrets.randbits(62))
-    next_sequence: int = 0
+    sequence: int = 0  # of the next scan
     stamp_ns: int = 0
 
 
-class ScanPublisher:
-    """Numbers and sends the scans of one client."""
+class ScanCalls:
+    """The calls that publish scans, and that wait until they are in the map."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
@@ -60,63 +61,98 @@ class ScanPublisher:
         self._sources: dict[str, _Source] = {}
         self._warned: set[str] = set()  # what was logged
 
-    def publish(
+    def publish_scan(
         self,
         points: ArrayLike,
         world_from_sensor: PoseLike,
-        stamp_s: float | None,
-        *,
-        source: str,
-        no_return: ArrayLike | None,
+        stamp_s: float | None = None,
+        source: str = "default",
+        no_return: ArrayLike | None = None,
     ) -> None:
-        """Send a scan; arguments as in ``Client.publish_scan``."""
-        try:
-            key = keys.scan_key(self._connection.map_name, source)
-        except FormatError as error:
-            raise InvalidScanError(str(error)) from error
-        pose = checks.rigid_pose(world_from_sensor)
+        """Send a scan to be learnt. Returns once it is handed to the network.
+
+        Args:
+            points: [N, 3] metres, sensor frame; points that are not finite are left out, and so
+                are up to 13 more columns, such as intensities.
+            world_from_sensor: rigid pose of the sensor in the map frame: [4, 4], or a
+                :class:`Pose` of position and quaternion.
+            stamp_s: seconds since 1970, never running backwards within a source; ``None``: now.
+            source: name of the sensor.
+            no_return: directions [M, 3], sensor frame, of any length but 0, of rays that met
+                nothing within the sensor's range: the space along them is free. A ray of which
+                this is not known does not belong here; see docs/client.md. ``points`` may be
+                empty where there are any.
+
+        Raises:
+            InvalidScanError: the scan cannot be used; nothing was sent.
+        """
+        pose = rigid_pose(world_from_sensor)
         directions = None if no_return is None else checks.open_directions(no_return)
         # Rays that all met nothing are a scan, too.
         least = 1 if directions is None or len(directions) == 0 else 0
         cloud = np.ascontiguousarray(checks.scan_points(points, least=least))
-        stamp_ns = time.time_ns() if stamp_s is None else checks.stamp_ns(stamp_s)
-        # Locked while sending: the server takes a scan that is overtaken by its successor for lost.
-        with self._sending:
-            with self._lock:
-                state = self._sources.setdefault(source, _Source())
-            if stamp_ns < state.stamp_ns and stamp_s is None:
-                stamp_ns = state.stamp_ns  # the system's clock was set back
-            if stamp_ns < state.stamp_ns:
-                raise InvalidScanError(
-                    f"stamp_s = {stamp_s!r} lies before {state.stamp_ns / 1e9!r}, that of an "
-                    f"earlier scan of source {source!r}; publish in order"
-                )
-            scan = Scan(
-                points=cloud,
-                world_from_sensor=pose,
-                stamp_ns=stamp_ns,
-                source=source,
-                session=state.session,
-                sequence=state.next_sequence,
-                no_return=directions,
-            )
-            self._connection.put(key, scan)
-            state.next_sequence += 1
-            state.stamp_ns = stamp_ns
+        stamp_ns = None if stamp_s is None else checks.stamp_ns(stamp_s)
+        self._publish(source, cloud, pose, stamp_ns=stamp_ns, no_return=directions)
 
-    def restart(self, source: str) -> None:
-        """Let the next scan of a source have any stamp; as ``Client.restart_source``."""
+    def publish_depth(
+        self,
+        depth: ArrayLike,
+        intrinsics: Intrinsics,
+        world_from_camera: PoseLike,
+        stamp_s: float | None = None,
+        source: str = "default",
+        stride: int = 1,
+    ) -> None:
+        """Send a depth image to be learnt. Returns once it is handed to the network.
+
+        Servers ignore what is nearer than 1.5 m unless set otherwise: see ``range_min_m`` in
+        docs/settings.md, which each source can have for itself.
+
+        Args:
+            depth: [rows, columns] along the optical axis: metres as floating numbers, or
+                millimetres as ``uint16``. A pixel that is 0 or not finite shows nothing.
+            intrinsics: of the camera; the image must be rectified.
+            world_from_camera: pose of the camera's optical frame (x to the right, y down, z
+                forward) in the map frame, as in :meth:`publish_scan`.
+            stamp_s: as in :meth:`publish_scan`.
+            source: name of the camera.
+            stride: every how many rows and columns one is taken, where an image has more pixels
+                than a scan may have points.
+
+        Raises:
+            InvalidScanError: the image cannot be used; nothing was sent.
+        """
+        points = depth_points(depth, intrinsics, stride)
+        self.publish_scan(points, world_from_camera, stamp_s, source)
+
+    def restart_source(self, source: str = "default") -> None:
+        """Let the time of a source begin again, as that of a simulation that was started again.
+
+        Its next scan may have any stamp. :meth:`flush` counts only those from then on.
+        """
         with self._sending, self._lock:
             self._sources.pop(source, None)
 
-    def flush(self, timeout_s: float, pending: int) -> Call[FlushReport]:
-        """Wait for the server; arguments as in ``Client.flush``."""
+    def flush(self, timeout_s: float = 30.0, pending: int = 0) -> FlushReport:
+        """Wait until what this client published is dealt with and queries see it.
+
+        Args:
+            timeout_s: how long, at most.
+            pending: number of scans that may still be under way: more than 0 lets a fast
+                publisher run ahead of the server by as many.
+
+        Returns:
+            What became of the scans so far.
+
+        Raises:
+            RefusedError: ``timeout``, where that was not long enough.
+        """
         wait_s = checks.within("timeout_s", timeout_s, checks.LONGEST_S, least=0.0)
         if pending < 0:
             raise InvalidInputError(f"pending = {pending!r}: use 0 or more")
         requests = list(self._requests(wait_s, pending))
         # All at once: each waits for its source, and they share the time.
-        replies = yield from ask_each(requests, _ask_flush, at_once=len(requests))
+        replies = list(self._connection.replies(map(_ask_flush, requests), at_once=len(requests)))
         refusals = [
             f"source {request.source!r}: {reply.last_refusal}"
             for request, reply in zip(requests, replies, strict=True)
@@ -132,16 +168,49 @@ class ScanPublisher:
             warnings=warnings,
         )
 
-    def settle(self, timeout_s: float) -> Call[ServerStatus]:
-        """Wait for the scans and what is learnt from them; as ``Client.settle``."""
+    def settle(self, timeout_s: float = 600.0) -> ServerStatus:
+        """Wait until what this client published is dealt with and nothing is left to learn.
+
+        Raises:
+            RequestTimeoutError: it still had some after ``timeout_s``.
+        """
         deadline = checks.deadline(timeout_s)
         # A status that overtakes the last scan would say that there is nothing left to learn.
-        while not (yield from self._dealt_with_by(deadline)):
+        while not self._dealt_with_by(deadline):
             _check_time(deadline, timeout_s)
-        while not (now := (yield from admin.status())).settled:
+        while not (now := self._connection.ask(STATUS)).settled:
             _check_time(deadline, timeout_s)
-            yield Pause(_SETTLE_PAUSE_S)
+            time.sleep(_SETTLE_PAUSE_S)
         return now
+
+    def _publish(
+        self,
+        source: str,
+        points: Floats,
+        pose: Doubles,
+        *,
+        stamp_ns: int | None,
+        no_return: Floats | None,
+    ) -> None:
+        try:
+            key = keys.scan_key(self._connection.map_name, source)
+        except FormatError as error:
+            raise InvalidScanError(str(error)) from error
+        # Locked while sending: the server takes a scan that is overtaken by its successor for lost.
+        with self._sending:
+            with self._lock:
+                state = self._sources.setdefault(source, _Source())
+            if stamp_ns is None:  # never backwards, also where the system's clock was set back
+                stamp_ns = max(time.time_ns(), state.stamp_ns)
+            if stamp_ns < state.stamp_ns:
+                raise InvalidScanError(
+                    f"stamp_s = {stamp_ns / 1e9!r} lies before {state.stamp_ns / 1e9!r}, that of "
+                    f"an earlier scan of source {source!r}; publish in order"
+                )
+            scan = Scan(points, pose, stamp_ns, source, state.session, state.sequence, no_return)
+            self._connection.put(key, scan)
+            state.sequence += 1
+            state.stamp_ns = stamp_ns
 
     def _log_new(self, warnings: tuple[str, ...]) -> None:
         """Log each warning once; the server says it in other words where it says it again."""
@@ -151,11 +220,11 @@ class ScanPublisher:
         for text in new:
             _log.warning("%s", printable(text))
 
-    def _dealt_with_by(self, deadline: float) -> Call[bool]:
+    def _dealt_with_by(self, deadline: float) -> bool:
         """Return whether the scans are, after some waiting: servers bound the time of a request."""
         wait_s = min(max(deadline - time.monotonic(), 0.0), _SETTLE_FLUSH_S)
         try:
-            yield from self.flush(wait_s, pending=0)
+            self.flush(wait_s)
         except RefusedError as error:
             if error.code != "timeout":
                 raise
@@ -167,7 +236,7 @@ class ScanPublisher:
         with self._lock:
             states = dict(self._sources)
         for source, state in states.items():
-            target = state.next_sequence - 1 - pending // len(states)
+            target = state.sequence - 1 - pending // len(states)
             if target >= 0:
                 yield FlushRequest(
                     source=source,

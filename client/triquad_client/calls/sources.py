@@ -8,7 +8,7 @@ from triquad_format.errors import InvalidInputError
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.wire import keys
 from triquad_format.wire.limits import MAX_SAMPLE_POINTS
-from triquad_format.wire.source_messages import (
+from triquad_format.wire.query_messages import (
     ScanSample,
     SourcesReply,
     SourcesRequest,
@@ -17,7 +17,7 @@ from triquad_format.wire.source_messages import (
 
 from triquad_client import checks
 from triquad_client.errors import BadReplyError
-from triquad_client.net.call import Ask, Call, ask
+from triquad_client.net.connection import Ask, Connection
 
 
 @dataclass(frozen=True)
@@ -62,20 +62,35 @@ class SourceReport:
     sources: Mapping[str, ScanSource]  # by name
 
 
-def sources(since: SourceReport | None, max_points: int) -> Call[SourceReport]:
-    """Return all sources; only what is new since ``since`` travels."""
-    if since is not None and not isinstance(since, SourceReport):
-        raise InvalidInputError(f"since = {since!r}: give what an earlier call returned")
-    limit = checks.count("max_points", max_points, MAX_SAMPLE_POINTS)
-    known = since or SourceReport(server="", revision=0, sources={})
-    request = SourcesRequest(server=known.server, revision=known.revision, max_points=limit)
-    reply = yield from ask(Ask(keys.SOURCES, request, SourcesReply, background=True))
-    goes_on = reply.server == known.server
-    if goes_on and reply.revision < known.revision:
-        raise BadReplyError(f"revision {reply.revision} comes after {known.revision}")
-    before = known.sources if goes_on else {}
-    found = {name: _source(name, state, before) for name, state in reply.sources.items()}
-    return SourceReport(reply.server, reply.revision, found)
+class SourceCalls:
+    """The call that tells where the sources of scans have been."""
+
+    _connection: Connection
+
+    def sources(self, since: SourceReport | None = None, max_points: int = 5_000) -> SourceReport:
+        """Return where each source of scans has been, and its newest scan.
+
+        To follow them, give the report before: only what is new travels, and the report has all.
+
+        Args:
+            since: the report before; ``None``: nothing is known yet.
+            max_points: 0 to 10,000: as many points of each newest scan come, evenly drawn.
+
+        Raises:
+            NoReplyError: the server may be of a release that does not know this question.
+        """
+        if since is not None and not isinstance(since, SourceReport):
+            raise InvalidInputError(f"since = {since!r}: give what an earlier call returned")
+        limit = checks.count("max_points", max_points, MAX_SAMPLE_POINTS)
+        known = since or SourceReport(server="", revision=0, sources={})
+        request = SourcesRequest(server=known.server, revision=known.revision, max_points=limit)
+        reply = self._connection.ask(Ask(keys.SOURCES, request, SourcesReply, background=True))
+        goes_on = reply.server == known.server
+        if goes_on and reply.revision < known.revision:
+            raise BadReplyError(f"revision {reply.revision} comes after {known.revision}")
+        before = known.sources if goes_on else {}
+        found = {name: _source(name, state, before) for name, state in reply.sources.items()}
+        return SourceReport(reply.server, reply.revision, found)
 
 
 def _source(name: str, state: SourceState, before: Mapping[str, ScanSource]) -> ScanSource:

@@ -3,23 +3,24 @@
 import hashlib
 import math
 import secrets
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.errors import InvalidInputError
-from triquad_format.records.arrays import Doubles
+from triquad_format.errors import InvalidInputError, WireError
+from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.wire.limits import MAX_KNOWN_TILES
-from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
+from triquad_format.wire.mesh_messages import TileUpdates, TileUpdatesRequest
+from triquad_format.wire.tile_codec import TileSurface, decode_tile, decoded_bytes
 from triquad_map.tile_join import joined
 from triquad_map.triangles import Triangles
 
 from triquad_client import checks
 from triquad_client.checks import Bounds
-from triquad_client.errors import BadReplyError
+from triquad_client.errors import BadReplyError, DownloadError
 from triquad_client.mesh.mesh import Mesh
-from triquad_client.mesh.tile_decoder import TileDecoder
 
 _REPLY_BYTES = 1_000_000
 
@@ -194,6 +195,42 @@ class FollowedMesh:
         return KnownTiles(
             server=self.server, level=self.level, tile_side_m=self.tile_side_m, tiles=tiles
         )
+
+
+class DecodedTile(NamedTuple):
+    """A tile, and what it was decoded from."""
+
+    data: bytes
+    surface: TileSurface
+
+
+class TileDecoder:
+    """Decodes tiles, which take a given memory and no more, in however many replies they come."""
+
+    def __init__(self, max_bytes: int, kept_bytes: int = 0) -> None:
+        """Decode up to ``max_bytes``, of which others take ``kept_bytes`` already."""
+        self._max_bytes = max_bytes
+        self._taken = kept_bytes
+
+    def decode(self, sizes: Longs, data: bytes) -> Iterator[DecodedTile]:
+        """Yield tiles whose ``sizes`` [T] in bytes add up to ``data``, one after the other.
+
+        Raises:
+            BadReplyError: they are not valid.
+            DownloadError: all take more than they may.
+        """
+        for size, end in zip(sizes.tolist(), np.cumsum(sizes).tolist(), strict=True):
+            part = data[end - size : end]
+            try:
+                self._taken += decoded_bytes(part)  # before any of it is made
+                if self._taken > self._max_bytes:
+                    raise DownloadError(
+                        f"the mesh takes more than {self._max_bytes} bytes: ask for a smaller box "
+                        "or a coarser level, or connect with a larger max_download_bytes"
+                    )
+                yield DecodedTile(part, decode_tile(part))
+            except WireError as error:
+                raise BadReplyError(f"a tile of the reply: {error}") from error
 
 
 def _unpacked(updates: TileUpdates, decoder: TileDecoder) -> dict[TileIndex, MeshTile]:

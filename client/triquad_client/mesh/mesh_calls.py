@@ -1,76 +1,80 @@
 """Calls that fetch a surface as triangles, in the background of all else."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 from triquad_format.records.arrays import Bools, Ints
 from triquad_format.wire import keys
-from triquad_format.wire.messages import MeshReply, MeshRequest, TileList, TileListRequest
+from triquad_format.wire.limits import MAX_FILL_M
+from triquad_format.wire.mesh_messages import MeshReply, MeshRequest, TileList, TileListRequest
 from triquad_map.tile_join import TileJoin
 
 from triquad_client import checks
 from triquad_client.checks import Bounds
 from triquad_client.errors import BadReplyError
+from triquad_client.mesh.followed_mesh import TileDecoder
 from triquad_client.mesh.mesh import Mesh
-from triquad_client.mesh.tile_decoder import TileDecoder
-from triquad_client.net.call import NEWEST, Ask, Call, ask, offload, retried, take_each
+from triquad_client.net.connection import NEWEST, Ask, Connection, retried
 
 _TILES_EACH = 8
 """Tiles of one request: alone, a small one costs as much on its way as in the making. Where holes
 are filled, each may take a part of a second, and goes alone."""
 
 
-def fetch_tiles(bounds: Bounds | None, level: int, fill_m: float = 0.0) -> Call[TileList]:
-    """Return the tiles that meet the bounds."""
-    minimum, maximum = checks.box(bounds)
-    request = TileListRequest(
-        minimum,
-        maximum,
-        NEWEST,
-        level=checks.level_of_detail(level),
-        fill_m=checks.length_to_fill(fill_m),
-    )
-    return (yield from ask(Ask(keys.TILE_LIST, request, TileList, background=True)))
+class MeshCalls:
+    """The calls that fetch the mesh, as it is now."""
 
+    _connection: Connection
 
-def fetch_tile(index: Sequence[int], level: int, max_bytes: int) -> Call[Mesh]:
-    """Return the newest mesh of one tile; errors as of :func:`fetch_mesh`."""
-    level, tiles = checks.level_of_detail(level), checks.tile_indices(index)
-    reply = yield from ask(_ask_mesh(tiles, NEWEST, level, fill_m=0.0))
-    (tile,) = _decoded(reply, tiles, TileDecoder(max_bytes), filled=False)
-    return tile
+    def tiles(self, bounds: Bounds | None = None, level: int = 0) -> TileList:
+        """Return the mesh tiles that meet ``bounds``, with the epoch in which each last changed.
 
+        Args:
+            bounds: corners of a box, metres, map frame; ``None``: everywhere.
+            level: of detail: 0, 1 or 2, each with cells and tiles twice as large as the one before.
+        """
+        return self._list(bounds, level, fill_m=0.0)
 
-def fetch_mesh(
-    bounds: Bounds | None, level: int, max_bytes: int, fill_m: float = 0.0
-) -> Call[Mesh]:
-    """Return the faces whose centroids lie in the bounds, from one epoch.
+    def mesh_tile(self, x: int, y: int, z: int, level: int = 0) -> Mesh:
+        """Return the newest mesh of one tile of a level's lattice, as :meth:`tiles` names it."""
+        level, tiles = checks.level_of_detail(level), checks.tile_indices((x, y, z))
+        reply = self._connection.ask(_ask_mesh(tiles, NEWEST, level, fill_m=0.0))
+        decoder = TileDecoder(self._connection.max_download_bytes)
+        (tile,) = _decoded(reply, tiles, decoder, filled=False)
+        return tile
 
-    Raises:
-        BadReplyError: a reply is not valid.
-        DownloadError: its tiles take more than ``max_bytes``.
-    """
-    box, level = checks.box(bounds), checks.level_of_detail(level)
-    fill_m = checks.length_to_fill(fill_m)
-    each = 1 if fill_m > 0 else _TILES_EACH
+    def mesh(self, bounds: Bounds | None = None, level: int = 0, fill_m: float = 0.0) -> Mesh:
+        """Return the mesh in ``bounds`` (faces by their centroids), its tiles joined, of one epoch.
 
-    def fetch() -> Call[Mesh]:
-        listed = yield from fetch_tiles(bounds, level, fill_m)
-        join = TileJoin(listed.tile_side_m, box, marked=fill_m > 0)
-        firsts = range(0, len(listed.tiles), each)
-        parts = [listed.tiles[first : first + each] for first in firsts]
-        decoder = TileDecoder(max_bytes)
+        Args:
+            bounds: corners of a box, metres, map frame; ``None``: everywhere.
+            level: of detail: 0, 1 or 2, each with cells twice as large as the one before.
+            fill_m: also the surface up to so far from what was seen, 0 to 5 m, where the field
+                continues it into ``UNKNOWN`` space; those faces are marked in ``Mesh.filled``.
+        """
+        box, level = checks.box(bounds), checks.level_of_detail(level)
+        fill_m = checks.within("fill_m", fill_m, MAX_FILL_M, least=0.0)
+        each = 1 if fill_m > 0 else _TILES_EACH
 
-        def take(tiles: Ints, reply: MeshReply) -> None:
-            for tile in _decoded(reply, tiles, decoder, filled=fill_m > 0):
-                join.add(tile)
+        def fetch() -> Mesh:
+            listed = self._list(bounds, level, fill_m)
+            join = TileJoin(listed.tile_side_m, box, marked=fill_m > 0)
+            decoder = TileDecoder(self._connection.max_download_bytes)
+            firsts = range(0, len(listed.tiles), each)
+            parts = [listed.tiles[first : first + each] for first in firsts]
+            asks = (_ask_mesh(tiles, listed.epoch, level, fill_m) for tiles in parts)
+            for tiles, reply in zip(parts, self._connection.replies(asks), strict=True):
+                for tile in _decoded(reply, tiles, decoder, filled=fill_m > 0):
+                    join.add(tile)
+            return Mesh.of(join.mesh(), listed.epoch)
 
-        yield from take_each(
-            parts, lambda tiles: _ask_mesh(tiles, listed.epoch, level, fill_m=fill_m), take
-        )
-        return (yield from offload(lambda _: Mesh.of(join.mesh(), listed.epoch)))
+        return retried("epoch_gone", fetch)
 
-    return (yield from retried("epoch_gone", fetch))
+    def _list(self, bounds: Bounds | None, level: int, fill_m: float) -> TileList:
+        minimum, maximum = checks.box(bounds)
+        level = checks.level_of_detail(level)
+        request = TileListRequest(minimum, maximum, NEWEST, level=level, fill_m=fill_m)
+        return self._connection.ask(Ask(keys.TILE_LIST, request, TileList, background=True))
 
 
 def _ask_mesh(tiles: Ints, epoch: int, level: int, fill_m: float) -> Ask[MeshReply]:

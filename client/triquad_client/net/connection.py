@@ -1,23 +1,22 @@
-"""The Zenoh session of a client, requests over it, and the driver that makes them."""
+"""Requests, and who answers them: a server at the other end of a connection, or a map in memory."""
 
-import json
 import weakref
-from collections.abc import Iterable, Mapping
-from pathlib import Path
-from typing import Any, TypeAlias
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
 
 import zenoh
-from triquad_format.errors import FormatError, InvalidInputError, RefusedError, WireError
+from triquad_format.errors import RefusedError, WireError
 from triquad_format.printable import printable
 from triquad_format.wire import codec, keys
 from triquad_format.wire.codec import Message
-from triquad_format.wire.endpoints import full_endpoint
-from triquad_format.wire.messages import ErrorReply
-from triquad_format.wire.origin import RequestOrigin
-from triquad_format.wire.reply import MAX_COUNT, check_answers
-from triquad_format.wire.zenoh_config import QUIET, fill, put
+from triquad_format.wire.messages import ErrorReply, RequestOrigin
+from triquad_format.wire.reply import check_answers
 
-from triquad_client import checks
 from triquad_client.errors import (
     BadReplyError,
     ClosedError,
@@ -26,25 +25,56 @@ from triquad_client.errors import (
     RequestTimeoutError,
     UnknownMapError,
 )
-from triquad_client.net.call import Ask, Batch, BlockingDriver, ReplyT, exchange
-from triquad_client.net.diagnosis import why_no_link
 
-_HERE = "127.0.0.1"
+NEWEST = 0
+"""Asks for the newest epoch, a published state of the map; another number pins that epoch."""
+
+PARTS_IN_FLIGHT = 4
+"""Requests of one call that wait for their replies at the same time."""
+
+_ATTEMPTS = 3
+
 _LIVELINESS_TIMEOUT_S = 3.0
 _MAX_REASON = 2_000  # characters of why a request was refused
 
-_OF_CLIENTS: Mapping[str, Any] = {
-    "mode": "client",
-    "connect/timeout_ms": 0,  # one attempt, not retries
-    "transport/link/rx/max_message_size": codec.MAX_MESSAGE_BYTES,
-}
-"""The settings of Zenoh for a client, besides what a file says."""
+ReplyT = TypeVar("ReplyT", bound=Message)
+ResultT = TypeVar("ResultT")
 
-Receiver: TypeAlias = Any
-"""``None``, or a ``zenoh.handlers.Callback[zenoh.Reply]``: the overloads of Zenoh take no union."""
+_cancellation: ContextVar[zenoh.CancellationToken | None] = ContextVar("cancellation", default=None)
+"""The token that ends the requests of the running call."""
 
 
-class Connection:
+@dataclass(frozen=True)
+class Ask(Generic[ReplyT]):
+    """A request.
+
+    Bulky ones go in the ``background``: a reply has the priority of its request, and a slow reader
+    of large replies must not delay the distance queries of others.
+    """
+
+    operation: str  # of triquad_format.wire.keys
+    message: Message
+    kind: type[ReplyT]  # of the reply
+    background: bool = False
+    min_timeout_s: float = 0.0  # waits that long for the reply, where the connection would not
+    server_wait_s: float = 0.0  # and that much longer: the server may answer as late as that
+
+
+class Answering(ABC):
+    """Answers requests."""
+
+    @abstractmethod
+    def replies(
+        self, asks: Iterable[Ask[ReplyT]], at_once: int = PARTS_IN_FLIGHT
+    ) -> Iterator[ReplyT]:
+        """Yield the reply to each request, in their order; ``at_once`` are awaited at a time."""
+
+    def ask(self, request: Ask[ReplyT]) -> ReplyT:
+        """Return the reply to one request."""
+        return next(iter(self.replies([request])))
+
+
+class Connection(Answering):
     """An open session, bound to one map. Safe for use by several threads."""
 
     def __init__(
@@ -72,23 +102,66 @@ class Connection:
         """Close the session; closing twice does no harm. What is under way ends unanswered."""
         self._close()
 
-    def send(
-        self,
-        ask: Ask[Any],
-        receiver: Receiver = None,
-        cancellation: zenoh.CancellationToken | None = None,
-    ) -> Iterable[zenoh.Reply]:
-        """Send a request; its reply comes from what is returned, or to ``receiver``.
+    def replies(
+        self, asks: Iterable[Ask[ReplyT]], at_once: int = PARTS_IN_FLIGHT
+    ) -> Iterator[ReplyT]:
+        """Yield the reply to each request, in their order; ``at_once`` are awaited at a time.
+
+        Nothing of a reply is used before all of it was checked.
+
+        Raises:
+            RefusedError: the server refused.
+            RequestTimeoutError: there was no reply in time.
+            BadReplyError: a reply cannot be decoded, or is no answer to what was asked.
+            NoReplyError: there was none; also UnknownMapError, where the map is not there.
+            ClosedError: the session was closed.
+            ConnectError: it is broken.
+        """
+        waiting: deque[tuple[Ask[ReplyT], Iterable[zenoh.Reply]]] = deque()
+        for ask in asks:
+            waiting.append((ask, self._send(ask)))
+            if len(waiting) >= at_once:
+                yield self._received(*waiting.popleft())
+        while waiting:
+            yield self._received(*waiting.popleft())
+
+    def put(self, key: str, message: Message) -> None:
+        """Publish a message; blocks where the network is slower than the publisher.
 
         Raises:
             ClosedError: the session was closed.
             ConnectError: it is broken.
         """
+        try:
+            self._session.put(
+                key,
+                codec.encode(message),
+                encoding=keys.encoding(type(message)),
+                # The default drops large samples even on an idle network.
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                priority=zenoh.Priority.DATA,
+            )
+        except zenoh.ZError as error:
+            raise self._broken(error) from error
+
+    def maps(self, map_name: str = "*") -> list[str]:
+        """Return the maps of all servers in reach, or those of this name; raises as :meth:`put`."""
+        try:
+            replies = self._session.liveliness().get(
+                keys.alive_key(map_name, "*"),
+                timeout=_LIVELINESS_TIMEOUT_S,
+                cancellation_token=_cancellation.get(),
+            )
+        except zenoh.ZError as error:
+            raise self._broken(error) from error
+        names = {str(reply.ok.key_expr).split("/")[1] for reply in replies if reply.ok}
+        return sorted(filter(keys.is_name, names))
+
+    def _send(self, ask: Ask[Any]) -> Iterable[zenoh.Reply]:
         timeout_s = self._timeout_s(ask)
         try:
-            replies: Iterable[zenoh.Reply] = self._session.get(
+            return self._session.get(
                 self._key(ask),
-                receiver,
                 payload=codec.encode(ask.message),
                 encoding=keys.encoding(type(ask.message)),
                 attachment=codec.encode(RequestOrigin(self._id, timeout_s)),
@@ -96,20 +169,17 @@ class Connection:
                 priority=zenoh.Priority.BACKGROUND if ask.background else zenoh.Priority.DATA,
                 congestion_control=zenoh.CongestionControl.BLOCK,
                 consolidation=zenoh.ConsolidationMode.NONE,
-                cancellation_token=cancellation,
+                cancellation_token=_cancellation.get(),
             )
         except zenoh.ZError as error:
             raise self._broken(error) from error
-        return replies
 
-    def read(self, ask: Ask[ReplyT], reply: zenoh.Reply) -> ReplyT:
-        """Return the message of a reply. Nothing of it is used before all of it was checked.
+    def _received(self, ask: Ask[ReplyT], replies: Iterable[zenoh.Reply]) -> ReplyT:
+        for reply in replies:
+            return self._read(ask, reply)
+        raise self._no_reply_error(ask)
 
-        Raises:
-            RefusedError: the server refused.
-            RequestTimeoutError: there was no reply in time.
-            BadReplyError: it cannot be decoded, or is no answer to what was asked.
-        """
+    def _read(self, ask: Ask[ReplyT], reply: zenoh.Reply) -> ReplyT:
         try:
             if reply.ok is not None:
                 answer = codec.decode(ask.kind, reply.ok.payload.to_bytes())
@@ -127,8 +197,8 @@ class Connection:
             printable(reason.code, _MAX_REASON), printable(reason.message, _MAX_REASON)
         )
 
-    def no_reply_error(self, ask: Ask[Any], available: list[str]) -> Exception:
-        """Return the error for a request that got no reply, where there are these maps."""
+    def _no_reply_error(self, ask: Ask[Any]) -> Exception:
+        """Return the error for a request that got no reply at all."""
         if self.is_closed:
             return closed_error()
         info = self._session.info
@@ -136,58 +206,18 @@ class Connection:
             return ConnectError(
                 "the link to the server is down; it is set up again once the server is back"
             )
+        available = self.maps()
         if self.map_name not in available:
             return UnknownMapError(self.map_name, available)
-        if ask.operation.startswith("admin/"):
-            return NoReplyError(
-                f"no reply on {self._key(ask)} although the map is there: access control forbids "
-                "it (without roles to all but programs of the server's machine that connect to "
-                "127.0.0.1, with roles to all but those of an admin), or the server is stopping or "
-                "older than this operation"
-            )
-        return NoReplyError(
-            f"no reply on {self._key(ask)} although the map is there: the server is stopping "
-            "or older than this question, access control forbids the request, or a message "
-            "exceeds a size limit"
+        why = (
+            "access control forbids it (without roles to all but programs of the server's machine "
+            "that connect to 127.0.0.1, with roles to all but those of an admin), or the server is "
+            "stopping or older than this operation"
+            if ask.operation.startswith("admin/")
+            else "the server is stopping or older than this question, access control forbids the "
+            "request, or a message exceeds a size limit"
         )
-
-    def put(self, key: str, message: Message) -> None:
-        """Publish a message; blocks where the network is slower than the publisher.
-
-        Raises as :meth:`send`.
-        """
-        try:
-            self._session.put(
-                key,
-                codec.encode(message),
-                encoding=keys.encoding(type(message)),
-                # The default drops large samples even on an idle network.
-                congestion_control=zenoh.CongestionControl.BLOCK,
-                priority=zenoh.Priority.DATA,
-            )
-        except zenoh.ZError as error:
-            raise self._broken(error) from error
-
-    def look_for_maps(
-        self,
-        receiver: Receiver = None,
-        cancellation: zenoh.CancellationToken | None = None,
-        map_name: str = "*",
-    ) -> Iterable[zenoh.Reply]:
-        """Ask all servers in reach for their maps, or for one of this name.
-
-        Replies and errors are as of :meth:`send`.
-        """
-        try:
-            replies: Iterable[zenoh.Reply] = self._session.liveliness().get(
-                keys.alive_key(map_name, "*"),
-                receiver,
-                timeout=_LIVELINESS_TIMEOUT_S,
-                cancellation_token=cancellation,
-            )
-        except zenoh.ZError as error:
-            raise self._broken(error) from error
-        return replies
+        return NoReplyError(f"no reply on {self._key(ask)} although the map is there: {why}")
 
     def _key(self, ask: Ask[Any]) -> str:
         return keys.operation_key(self.map_name, ask.operation)
@@ -201,101 +231,36 @@ class Connection:
         return ConnectError(f"the connection is broken: {error}")
 
 
-class RemoteDriver(BlockingDriver):
-    """Runs calls over a connection, in the threads that make them."""
-
-    def __init__(
-        self, connection: Connection, cancellation: zenoh.CancellationToken | None = None
-    ) -> None:
-        """Run calls; once ``cancellation`` is cancelled, each ends with an error."""
-        self._connection = connection
-        self._cancellation = cancellation
-
-    def maps(self) -> list[str]:
-        """Return names of the maps of all servers that can be reached."""
-        return map_names(self._connection.look_for_maps(cancellation=self._cancellation))
-
-    async def _replies(self, batch: Batch) -> list[Any]:
-        return await exchange(batch, self._send, self._receive)
-
-    async def _send(self, ask: Ask[Any]) -> Iterable[zenoh.Reply]:
-        return self._connection.send(ask, cancellation=self._cancellation)
-
-    async def _receive(self, ask: Ask[Any], replies: Iterable[zenoh.Reply]) -> Any:
-        for reply in replies:
-            return self._connection.read(ask, reply)
-        raise self._connection.no_reply_error(ask, self.maps())
-
-
 def closed_error() -> ClosedError:
     """Return the error for what is asked of a closed client."""
     return ClosedError("the client is closed")
 
 
-def map_names(replies: Iterable[zenoh.Reply]) -> list[str]:
-    """Return the maps that the replies to :meth:`Connection.look_for_maps` name."""
-    names = {str(reply.ok.key_expr).split("/")[1] for reply in replies if reply.ok}
-    return sorted(filter(keys.is_name, names))
+def retried(code: str, attempt: Callable[[], ResultT]) -> ResultT:
+    """Return what ``attempt`` returns; where the server refuses with ``code``, it is tried again.
+
+    This is for questions of several requests, which the server can forget meanwhile.
+    """
+    for _ in range(_ATTEMPTS - 1):
+        try:
+            return attempt()
+        except RefusedError as error:
+            if error.code != code:
+                raise
+    return attempt()
 
 
-def open_connection(
-    endpoint: str | None,
-    map_name: str,
-    timeout_s: float,
-    config: str | Path | None,
-    *,
-    max_download_bytes: int,
-) -> Connection:
-    """Return a connection to a server; arguments and errors as of ``triquad_client.connect``."""
-    timeout_s = checks.within("timeout_s", timeout_s, checks.LONGEST_S, least=0.0)
-    most = checks.count("max_download_bytes", max_download_bytes, MAX_COUNT)
-    where = f"with {config}" if endpoint is None and config else f"to {endpoint or _HERE}"
+@contextmanager
+def cancellable(
+    chosen: zenoh.CancellationToken | None = None,
+) -> Iterator[zenoh.CancellationToken]:
+    """Yield the token whose cancellation ends the requests of the block, each with an error.
+
+    Unless one is ``chosen``, it is that of the surrounding block, where there is one.
+    """
+    token = chosen or _cancellation.get() or zenoh.CancellationToken()
+    before = _cancellation.set(token)
     try:
-        keys.check_name("map", map_name)
-        configured = _configuration(endpoint, timeout_s, config)
-    except FormatError as error:
-        raise InvalidInputError(str(error)) from error
-    except zenoh.ZError as error:
-        raise ConnectError(f"cannot connect {where}: {_reason(error)}") from error
-    try:
-        session = zenoh.open(configured)
-    except zenoh.ZError as error:
-        why = why_no_link(configured, timeout_s) or (
-            f"{_reason(error)} Start triquad-server there, or check the endpoint and the "
-            "credentials."
-        )
-        raise ConnectError(f"cannot connect {where}: {why}") from error
-    connection = Connection(session, map_name, timeout_s, max_download_bytes=most)
-    try:
-        # Asked for by name first: there may be any number of others.
-        if not map_names(connection.look_for_maps(map_name=map_name)):
-            raise UnknownMapError(map_name, map_names(connection.look_for_maps()))
-    except BaseException:
-        connection.close()
-        raise
-    return connection
-
-
-def _configuration(endpoint: str | None, timeout_s: float, file: str | Path | None) -> zenoh.Config:
-    config = zenoh.Config() if file is None else _read_configuration(file)
-    fill(config, {**QUIET, **_OF_CLIENTS}, unset=zenoh.Config())
-    put(config, {"transport/unicast/open_timeout": int(timeout_s * 1000)})
-    if endpoint is not None or not json.loads(config.get_json("connect/endpoints")):
-        only_tls = json.loads(config.get_json("transport/link/protocols")) == ["tls"]
-        protocol = "tls" if only_tls else "tcp"
-        full = full_endpoint(_HERE if endpoint is None else endpoint, protocol)
-        put(config, {"connect/endpoints": [full]})
-    return config
-
-
-def _read_configuration(file: str | Path) -> zenoh.Config:
-    try:
-        config: zenoh.Config = zenoh.Config.from_file(str(file))
-    except zenoh.ZError as error:
-        raise ConnectError(f"Zenoh configuration {file}: {_reason(error)}") from error
-    return config
-
-
-def _reason(error: zenoh.ZError) -> str:
-    """Return what Zenoh says, on one line, without where in Zenoh it happened."""
-    return " ".join(str(error).split(" at /", 1)[0].split())
+        yield token
+    finally:
+        _cancellation.reset(before)

@@ -1,10 +1,10 @@
 """A map file that answers as a server does, without one."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from numpy.typing import ArrayLike
 from triquad_format.errors import InvalidInputError, RefusedError
@@ -13,6 +13,8 @@ from triquad_format.mapfile.reader import read_map_file
 from triquad_format.records.arrays import Bools, Doubles
 from triquad_format.records.region import MapRecord
 from triquad_format.records.seen_space import surface_voxels
+from triquad_format.wire.limits import MAX_FILL_M
+from triquad_map.composition.composed_view import ComposedView
 from triquad_map.questions.answers import Answers, QuestionLimits
 from triquad_map.record_view import open_view
 from triquad_map.view import MapView
@@ -22,7 +24,7 @@ from triquad_client.calls.queries import MapQueries
 from triquad_client.checks import Bounds
 from triquad_client.errors import ClosedError
 from triquad_client.mesh.mesh import Mesh
-from triquad_client.net.call import Batch, BlockingDriver, Call, ResultT
+from triquad_client.net.connection import PARTS_IN_FLIGHT, Answering, Ask, ReplyT
 
 if TYPE_CHECKING:
     from triquad_client.offline.map_mesh import MapTiles, Report
@@ -35,8 +37,8 @@ _NO_LIMITS = QuestionLimits(points=2**62, searches=2**62)
 """No limits, since nobody else waits."""
 
 
-class LocalDriver(BlockingDriver):
-    """Runs calls over the map in a record, as fast as possible here; for several threads."""
+class LocalMap(Answering):
+    """Answers requests about the map in a record, as fast as possible here; for several threads."""
 
     def __init__(self, record: MapRecord) -> None:
         self.opened = open_view(record)
@@ -44,14 +46,19 @@ class LocalDriver(BlockingDriver):
         self._answers = Answers(self._epoch, _NO_LIMITS)
 
     def close(self) -> None:
-        """End the threads that compiled code works on; nothing may be asked any more."""
+        """End the threads that compiled code works on; what is asked later is slower."""
         self.opened.close()
 
-    async def _replies(self, batch: Batch) -> list[Any]:
-        return [
-            batch.take(item, self._answers.answer(batch.request(item).message))
-            for item in batch.items
-        ]
+    def replies(
+        self,
+        asks: Iterable[Ask[ReplyT]],
+        at_once: int = PARTS_IN_FLIGHT,  # noqa: ARG002 - nothing is under way here
+    ) -> Iterator[ReplyT]:
+        """Yield the reply to each request, one after the other."""
+        for ask in asks:
+            reply = self._answers.answer(ask.message)
+            assert isinstance(reply, ask.kind)
+            yield reply
 
     @contextmanager
     def _epoch(self, number: int) -> Iterator[MapView]:
@@ -63,6 +70,14 @@ class LocalDriver(BlockingDriver):
         yield self.view
 
 
+class _ClosedMap(Answering):
+    """Answers nothing."""
+
+    def replies(self, asks: Iterable[Ask[ReplyT]], at_once: int = 0) -> Iterator[ReplyT]:  # noqa: ARG002
+        """Refuse all requests."""
+        raise ClosedError("the map is closed")
+
+
 class OfflineMap(MapQueries):
     """A map in memory; several threads may ask it.
 
@@ -72,9 +87,9 @@ class OfflineMap(MapQueries):
 
     def __init__(self, record: MapRecord, stamp_ns: int = 0) -> None:
         """Open a map that is in memory already; use :func:`open_map` for a file."""
-        super().__init__(self._answer)
-        driver = LocalDriver(record)
-        self._driver: LocalDriver | None = driver
+        opened = LocalMap(record)
+        self._server: Answering = opened
+        self._map: LocalMap | None = opened
         # Meshes need no more of it: the view has the rest in a form of its own.
         self._seen = dataclasses.replace(
             record,
@@ -88,7 +103,7 @@ class OfflineMap(MapQueries):
         """Side of the voxels in which rays ended."""
         self.stamp_ns = stamp_ns
         """The time when its epoch was written, nanoseconds since 1970; 0: the file does not say."""
-        self.compiled = driver.opened.compiled
+        self.compiled = opened.opened.compiled
         """True where compiled code answers, as in the server; else numpy, which is far slower."""
 
     def __enter__(self) -> "OfflineMap":
@@ -99,9 +114,9 @@ class OfflineMap(MapQueries):
 
     def close(self) -> None:
         """Release the map; later queries raise :class:`ClosedError`."""
-        driver, self._driver = self._driver, None
-        if driver is not None:
-            driver.close()
+        opened, self._map, self._server = self._map, None, _ClosedMap()
+        if opened is not None:
+            opened.close()
 
     def mesh(
         self,
@@ -143,10 +158,10 @@ class OfflineMap(MapQueries):
     def _tiles(
         self, cell_m: float | None, bounds: Bounds | None, fill_m: float, *, whole: bool
     ) -> "MapTiles":
-        view = self._opened().view
+        view = self._view()
         chosen_m = _CELL_LEAVES * self.leaf_m if cell_m is None else cell_m
         checked_m = checks.within("cell_m", chosen_m, CELL_RANGE_M[1], least=CELL_RANGE_M[0])
-        box, fill_m = checks.box(bounds), checks.length_to_fill(fill_m)
+        box, fill_m = checks.box(bounds), checks.within("fill_m", fill_m, MAX_FILL_M, least=0.0)
         if not self.compiled:
             raise InvalidInputError(
                 "meshes of map files are made by compiled code, and numba is missing: "
@@ -171,17 +186,13 @@ class OfflineMap(MapQueries):
             InvalidInputError: the points are not [N, 3], or not finite.
             ClosedError: the map was closed.
         """
-        view = self._opened().view
+        view = self._view()
         return view.near_ends(checks.query_points(points), _REACH_LEAVES * self.leaf_m)
 
-    def _answer(self, call: Call[ResultT]) -> ResultT:
-        return self._opened().run(call)
-
-    def _opened(self) -> LocalDriver:
-        driver = self._driver
-        if driver is None:
+    def _view(self) -> ComposedView:
+        if self._map is None:
             raise ClosedError("the map is closed")
-        return driver
+        return self._map.view
 
 
 def open_map(path: str | Path) -> OfflineMap:

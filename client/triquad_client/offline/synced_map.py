@@ -1,6 +1,5 @@
 """A copy of the part of a server's map that a box needs: it answers also while the link is down."""
 
-import asyncio
 import dataclasses
 import threading
 import time
@@ -20,12 +19,11 @@ from triquad_map.stored_map import StoredMap
 
 from triquad_client import checks
 from triquad_client.calls.download import RemoteBytes, newest_file
-from triquad_client.calls.queries import AsyncMapQueries, MapQueries
+from triquad_client.calls.queries import MapQueries
 from triquad_client.checks import Bounds
-from triquad_client.documentation import documented_as
 from triquad_client.errors import DownloadError, EmptierMapError
-from triquad_client.net.call import AsyncRun, Call, ResultT, Run, offload, retried
-from triquad_client.offline.offline_map import LocalDriver
+from triquad_client.net.connection import Connection, retried
+from triquad_client.offline.offline_map import LocalMap
 
 _EMPTIER_SHARE = 0.5
 """A map that knows less than this of what the copy knows was lost. A server that goes on from its
@@ -52,26 +50,24 @@ class _State:
     """The state of a copy, as a whole: threads see one or the next."""
 
     sha256: str  # of the file on the server that it was made from
-    driver: LocalDriver
+    map: LocalMap
     checked_s: float  # of the monotonic clock, when the server had nothing newer
     report: SyncReport  # of the last update
     server: str  # the run of the server that it was made from
     seen_bytes: int  # see :func:`_seen_bytes`
 
 
-class LocalCopy:
-    """The copy; for several threads. It is empty until :meth:`_update` has run."""
+class SyncedMap(MapQueries):
+    """The part of a map that a box needs, copied to this machine; several threads may ask it.
 
-    def __init__(self, path: Path, bounds: Bounds, max_bytes: int) -> None:
-        """Take the ``path`` of the file and the corners ``bounds`` of the box.
+    Queries are answered from the copy: what it does not have is unknown. Each is answered from one
+    epoch, and ``at_epoch`` may be none but :attr:`epoch`.
+    """
 
-        ``max_bytes`` may be fetched at a time.
-
-        Raises:
-            InvalidInputError: the bounds are not a box, or contain nothing.
-        """
+    def __init__(self, path: Path, bounds: Bounds, connection: Connection) -> None:
+        """Use ``Client.sync``."""
         self._path = path
-        self._max_bytes = max_bytes
+        self._connection = connection
         self._low, self._high = checks.finite_box(bounds)
         self._updating = threading.Lock()
         self._state: _State | None = None
@@ -91,22 +87,29 @@ class LocalCopy:
         """The cost of bringing the copy up to date the last time."""
         return self._current().report
 
-    def _answer(self, call: Call[ResultT]) -> ResultT:
-        """Answer a call, all of it from one epoch."""
-        return self._current().driver.run(call)
+    def refresh(self, accept_emptier: bool = False) -> SyncReport:
+        """Fetch what changed on the server. Where that fails, the copy stays as it was.
 
-    def _update(self, accept_emptier: bool) -> Call[SyncReport]:
-        """Fetch what changed, as :meth:`SyncedMap.refresh`."""
-        return retried("chunk_gone", lambda: offload(lambda run: self._fetch(run, accept_emptier)))
+        Args:
+            accept_emptier: take the map also where the server was started again and knows less than
+                half of what the copy does.
+
+        Raises:
+            TriquadError: the server cannot be reached, as for any call of :class:`Client`.
+            EmptierMapError: the server has lost its map, and ``accept_emptier`` is not set.
+            DownloadError: what arrived is not valid.
+            OSError: the file cannot be written.
+        """
+        return retried("chunk_gone", lambda: self._fetch(accept_emptier))
 
     def _current(self) -> _State:
-        assert self._state is not None, "_update() comes first"
+        assert self._state is not None, "refresh() comes first"
         return self._state
 
-    def _fetch(self, run: Run, accept_emptier: bool) -> SyncReport:
+    def _fetch(self, accept_emptier: bool) -> SyncReport:
         with self._updating:
             asked_s = time.monotonic()
-            info = run(newest_file(training=False, max_bytes=self._max_bytes))
+            info = newest_file(self._connection)
             known = self._state
             if known is not None and known.sha256 == info.sha256:
                 report = SyncReport(info.epoch, 0, 0, parts_kept=known.report.parts)
@@ -114,7 +117,7 @@ class LocalCopy:
                     known, checked_s=asked_s, report=report, server=info.server
                 )
                 return report
-            remote = RemoteBytes(run, info, self._max_bytes)
+            remote = RemoteBytes(self._connection, info)
             try:
                 stored = StoredMap(remote)
                 wanted = stored.parts_in(self._low, self._high)
@@ -138,14 +141,15 @@ class LocalCopy:
             )
             self._state = _State(
                 info.sha256,
-                LocalDriver(record),
+                LocalMap(record),
                 checked_s=asked_s,
                 report=report,
                 server=info.server,
                 seen_bytes=_seen_bytes(wanted),
             )
+            self._server = self._state.map
             if known is not None:
-                known.driver.close()
+                known.map.close()
             return report
 
     def _refuse_emptier(self, info: MapInfo, seen_bytes: int) -> None:
@@ -199,52 +203,3 @@ def _write(path: Path, manifest: Manifest, payloads: Mapping[PartKey, bytes]) ->
     own = {entry.key: dataclasses.replace(entry, file=None) for entry in manifest.entries}
     parts = (Part(key, payloads[key]) for key in own)
     write_parts(path, manifest.facts, parts, stamp_ns=manifest.stamp_ns or None, known=own)
-
-
-class SyncedMap(LocalCopy, MapQueries):
-    """The part of a map that a box needs, copied to this machine; several threads may ask it.
-
-    Queries are answered from the copy: what it does not have is unknown. Each is answered from one
-    epoch, and ``at_epoch`` may be none but :attr:`epoch`.
-    """
-
-    def __init__(self, path: Path, bounds: Bounds, run: Run, max_bytes: int) -> None:
-        """Use ``Client.sync``."""
-        LocalCopy.__init__(self, path, bounds, max_bytes)
-        MapQueries.__init__(self, self._answer)
-        self._ask_server = run
-
-    def refresh(self, accept_emptier: bool = False) -> SyncReport:
-        """Fetch what changed on the server. Where that fails, the copy stays as it was.
-
-        Args:
-            accept_emptier: take the map also where the server was started again and knows less than
-                half of what the copy does.
-
-        Raises:
-            TriquadError: the server cannot be reached, as for any call of :class:`Client`.
-            EmptierMapError: the server has lost its map, and ``accept_emptier`` is not set.
-            DownloadError: what arrived is not valid.
-            OSError: the file cannot be written.
-        """
-        return self._ask_server(self._update(accept_emptier))
-
-
-@documented_as(SyncedMap)
-class AsyncSyncedMap(LocalCopy, AsyncMapQueries):
-    """The part of a map that a box needs, copied to this machine.
-
-    It is :class:`SyncedMap` to be awaited: a thread answers the queries.
-    """
-
-    def __init__(self, path: Path, bounds: Bounds, run: AsyncRun, max_bytes: int) -> None:
-        """Use ``AsyncClient.sync``."""
-        LocalCopy.__init__(self, path, bounds, max_bytes)
-        AsyncMapQueries.__init__(self, self._answer_in_thread)
-        self._ask_server = run
-
-    async def refresh(self, accept_emptier: bool = False) -> SyncReport:  # noqa: D102 - as above
-        return await self._ask_server(self._update(accept_emptier))
-
-    async def _answer_in_thread(self, call: Call[ResultT]) -> ResultT:
-        return await asyncio.to_thread(self._answer, call)

@@ -4,18 +4,14 @@ A message is a msgpack map that has ``triquad`` (the protocol version), ``kind``
 its class) and its fields; an array is one of its dtype, shape and raw little-endian bytes. The
 messages themselves are in :mod:`triquad_format.wire.messages`; ``docs/wire-protocol.md`` is the
 specification.
-
-Before a message is unpacked, its structure is checked. A few megabytes can contain millions of tiny
-objects, or nest thousands deep; unpacking them would block everything else for seconds and take
-a hundred times their size. The headers alone are read, whose bytes are those of
-https://github.com/msgpack/msgpack/blob/master/spec.md
 """
 
+import dataclasses
 import functools
 import math
 import types
 import typing
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar, get_args, get_origin
 
@@ -24,13 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triquad_format.errors import ProtocolVersionError, WireError
+from triquad_format.wire.structure import check_structure
 
 PROTOCOL_VERSION = 1
 MAX_MESSAGE_BYTES = 256 * 2**20
 _MAX_WIRE_STRING_BYTES = 65_536
 _MAX_ITEMS = 65_536
-MAX_OBJECTS = 20_000
-_MAX_DEPTH = 16
 # To begin with: a refusal for want of memory must not want 256 KiB.
 _BUFFER_BYTES = 4096
 
@@ -43,25 +38,6 @@ _ITEM_BYTES = {
 _ARRAY_KEYS = {"dtype", "shape", "data"}
 _MAX_DIMENSIONS = 4
 _MAX_SIZE = 2**40  # of an array along one axis, and of all axes together
-
-# How many bytes follow the first of a header: a length, or a count.
-_LENGTH_BYTES = {0xC4: 1, 0xC5: 2, 0xC6: 4, 0xD9: 1, 0xDA: 2, 0xDB: 4}  # binaries and strings
-_COUNT_BYTES = {0xDC: 2, 0xDD: 4, 0xDE: 2, 0xDF: 4}  # arrays and maps
-
-
-def _sizes() -> bytes:
-    """Return an object's size by its first byte; 0: it does not give it, or contains others."""
-    sizes = bytearray(256)
-    for code in (*range(0x80), *range(0xE0, 0x100), 0xC0, 0xC2, 0xC3):  # small numbers, nil, truth
-        sizes[code] = 1
-    for code in range(0xA0, 0xC0):  # short strings
-        sizes[code] = 1 + (code & 0x1F)
-    for code, size in zip(range(0xCA, 0xD4), (4, 8, 1, 2, 4, 8, 1, 2, 4, 8), strict=True):
-        sizes[code] = 1 + size  # numbers
-    return bytes(sizes)
-
-
-_SIZES = _sizes()
 
 MessageT = TypeVar("MessageT", bound="Message")
 
@@ -178,49 +154,6 @@ def unpack_array(name: str, packed: object) -> NDArray[np.generic]:
     return np.frombuffer(data, dtype).reshape(shape)
 
 
-def check_structure(payload: bytes, max_objects: int = MAX_OBJECTS) -> None:
-    """Refuse a msgpack object that is incomplete, too deep, or made of too many objects.
-
-    Raises:
-        WireError: the text says which.
-    """
-    at, objects = 0, 1  # as many as the headers so far announce
-    missing, around = 1, [0]  # objects still to come, in the innermost one and in those around it
-    while missing or len(around) > 1:
-        if not missing:
-            missing = around.pop()
-            continue
-        if at >= len(payload):
-            raise WireError("not a triquad message: it is incomplete")
-        missing -= 1
-        size = _SIZES[payload[at]]
-        if size:
-            at += size
-            continue
-        at, children = _header(payload, at)
-        objects += children
-        if objects > max_objects:
-            raise WireError(f"not a triquad message: more than {max_objects} objects")
-        if children:
-            around.append(missing)
-            missing = children
-        if len(around) > _MAX_DEPTH:
-            raise WireError(f"not a triquad message: nested more than {_MAX_DEPTH} deep")
-    if at != len(payload):
-        raise WireError("not a triquad message: it is incomplete, or something follows it")
-
-
-def binary_offsets(payload: bytes) -> Iterator[range]:
-    """Yield where the bytes of each binary lie in a valid msgpack object, in their order."""
-    at, objects = 0, 1
-    while objects:
-        code = payload[at]
-        end, children = _header(payload, at)
-        if 0xC4 <= code <= 0xC6:
-            yield range(at + 1 + _LENGTH_BYTES[code], end)
-        at, objects = end, objects - 1 + children
-
-
 def _unpack_map(payload: bytes) -> dict[str, object]:
     if len(payload) > MAX_MESSAGE_BYTES:
         raise WireError(f"message of {len(payload)} bytes exceeds {MAX_MESSAGE_BYTES}")
@@ -239,104 +172,78 @@ def _unpack_map(payload: bytes) -> dict[str, object]:
     return body
 
 
-def _header(payload: bytes, at: int) -> tuple[int, int]:
-    """Return where the next header is, and how many objects the one at ``at`` announces."""
-    code = payload[at]
-    if _SIZES[code]:
-        return at + _SIZES[code], 0
-    at += 1
-    if code <= 0x8F:
-        return at, 2 * (code & 0x0F)
-    if code <= 0x9F:
-        return at, code & 0x0F
-    if code in _LENGTH_BYTES:
-        size = _LENGTH_BYTES[code]
-        return at + size + int.from_bytes(payload[at : at + size], "big"), 0
-    if code in _COUNT_BYTES:
-        size = _COUNT_BYTES[code]
-        count = int.from_bytes(payload[at : at + size], "big")
-        return at + size, count if code <= 0xDD else 2 * count
-    raise WireError(f"not a triquad message: type {code:#x} does not occur in one")
-
-
 @dataclass(frozen=True)
 class Form:
-    """The encoding of a field's values. Both take the field's name, for errors, and a value."""
+    """The encoding of a field's values, by its annotation."""
 
-    pack: Callable[[str, Any], object]
-    unpack: Callable[[str, object], Any]
+    scalar: type | None = None
+    array: ArraySpec | None = None
+    message: type[Message] | None = None
+    key: "Form | None" = None  # of a map, and the form of its items
+    item: "Form | None" = None
+    optional: bool = False
+
+    def pack(self, name: str, value: Any) -> object:
+        """Return a value as it travels; ``name`` is the field's, for errors."""
+        if value is None and self.optional:
+            return None
+        if self.array is not None:
+            if not isinstance(value, np.ndarray):
+                raise WireError(f"{name}: expected an array, got {type(value).__name__}")
+            self.array.check(name, value)
+            return pack_array(value)
+        if self.message is not None:
+            if not isinstance(value, self.message):
+                raise WireError(f"{name}: expected {self.message.__name__}, got {value!r}")
+            return _pack_fields(name, value)
+        return self._plain(name, value, lambda form: form.pack)
+
+    def unpack(self, name: str, value: object) -> Any:
+        """Return the value that travelled; ``name`` is the field's, for errors."""
+        if value is None and self.optional:
+            return None
+        if self.array is not None:
+            array = unpack_array(name, value)
+            self.array.check(name, array)
+            return array
+        if self.message is not None:
+            if not isinstance(value, dict):
+                fields = ", ".join(self.message.annotations())
+                raise WireError(f"{name}: expected a map with {fields}")
+            return _unpack_fields(name, self.message, value)
+        return self._plain(name, value, lambda form: form.unpack)
+
+    def _plain(
+        self, name: str, value: Any, way: Callable[["Form"], Callable[[str, Any], Any]]
+    ) -> Any:
+        """Return a number, a text or a map, which travel as they are but for a map's items."""
+        if self.key is None or self.item is None:
+            return _scalar(self.scalar, name, value)
+        if not isinstance(value, dict):
+            raise WireError(f"{name}: expected dict, got {type(value).__name__}")
+        key_way, item_way = way(self.key), way(self.item)
+        return {
+            key_way(f"{name} key", key): item_way(f"{name}[{key!r}]", item)
+            for key, item in value.items()
+        }
 
 
 def _form(annotation: Any) -> Form:
-    spec = _array_spec(annotation)
-    if spec is not None:
-        return _array_form(spec)
-    annotation = _plain(annotation)
+    """Return the form of an annotation, which may have metadata."""
+    for extra in getattr(annotation, "__metadata__", ()):
+        if isinstance(extra, ArraySpec):
+            return Form(array=extra)
+    if hasattr(annotation, "__metadata__"):
+        return _form(annotation.__origin__)
     if isinstance(annotation, type) and issubclass(annotation, Message):
-        return _message_form(annotation)
-    origin = get_origin(annotation)
-    if origin in (types.UnionType, typing.Union):
-        (inner,) = (arg for arg in get_args(annotation) if arg is not type(None))
-        return _optional_form(_form(inner))
-    if origin is dict:
-        key_type, item = get_args(annotation)
-        return _map_form(_plain(key_type), _form(item))
-    scalar = functools.partial(_scalar, annotation)
-    return Form(scalar, scalar)
-
-
-def _array_form(spec: ArraySpec) -> Form:
-    def pack(name: str, array: Any) -> object:
-        if not isinstance(array, np.ndarray):
-            raise WireError(f"{name}: expected an array, got {type(array).__name__}")
-        spec.check(name, array)
-        return pack_array(array)
-
-    def unpack(name: str, packed: object) -> NDArray[np.generic]:
-        array = unpack_array(name, packed)
-        spec.check(name, array)
-        return array
-
-    return Form(pack, unpack)
-
-
-def _message_form(kind: type[Message]) -> Form:
-    def pack(name: str, message: Any) -> object:
-        if not isinstance(message, kind):
-            raise WireError(f"{name}: expected {kind.__name__}, got {message!r}")
-        return _pack_fields(name, message)
-
-    def unpack(name: str, body: object) -> Message:
-        if not isinstance(body, dict):
-            raise WireError(f"{name}: expected a map with {', '.join(kind.annotations())}")
-        return _unpack_fields(name, kind, body)
-
-    return Form(pack, unpack)
-
-
-def _optional_form(form: Form) -> Form:
-    def pack(name: str, value: Any) -> object:
-        return None if value is None else form.pack(name, value)
-
-    def unpack(name: str, value: object) -> Any:
-        return None if value is None else form.unpack(name, value)
-
-    return Form(pack, unpack)
-
-
-def _map_form(key_type: Any, form: Form) -> Form:
-    def each(name: str, entries: Any, by: Callable[[str, Any], Any]) -> dict[Any, Any]:
-        if not isinstance(entries, dict):
-            raise WireError(f"{name}: expected dict, got {type(entries).__name__}")
-        return {
-            _scalar(key_type, f"{name} key", key): by(f"{name}[{key!r}]", entry)
-            for key, entry in entries.items()
-        }
-
-    return Form(
-        lambda name, entries: each(name, entries, form.pack),
-        lambda name, entries: each(name, entries, form.unpack),
-    )
+        return Form(message=annotation)
+    choices = get_args(annotation)
+    if get_origin(annotation) is dict:
+        return Form(key=_form(choices[0]), item=_form(choices[1]))
+    if get_origin(annotation) in (types.UnionType, typing.Union):
+        (inner,) = (choice for choice in choices if choice is not type(None))
+        return dataclasses.replace(_form(inner), optional=True)
+    return Form(scalar=annotation)
 
 
 def _pack_fields(name: str, message: Message) -> dict[str, object]:
@@ -354,18 +261,6 @@ def _unpack_fields(name: str, kind: type[MessageT], body: Mapping[str, object]) 
         elif not hasattr(kind, field):  # without a default, for those who speak as before it came
             raise WireError(f"{name}.{field}: missing")
     return kind(**fields)
-
-
-def _array_spec(annotation: Any) -> ArraySpec | None:
-    for extra in getattr(annotation, "__metadata__", ()):
-        if isinstance(extra, ArraySpec):
-            return extra
-    return None
-
-
-def _plain(annotation: Any) -> Any:
-    """Return the type in an annotation, without its metadata."""
-    return annotation.__origin__ if hasattr(annotation, "__metadata__") else annotation
 
 
 def _scalar(annotation: Any, name: str, value: object) -> Any:

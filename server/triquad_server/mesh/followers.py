@@ -11,7 +11,7 @@ from triquad_format.errors import FormatError, RefusedError
 from triquad_format.records.arrays import Ints
 from triquad_format.wire import keys
 from triquad_format.wire.limits import MAX_KNOWN_TILES, MAX_WAIT_S
-from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
+from triquad_format.wire.mesh_messages import TileUpdates, TileUpdatesRequest
 from triquad_map.box import check_box
 from triquad_map.compiled.mesh.tile_lattice import TileIndex, TileLattice, check_level
 

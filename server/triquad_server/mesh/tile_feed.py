@@ -6,7 +6,7 @@ import threading
 import time
 
 from triquad_format.errors import RefusedError
-from triquad_format.wire.messages import TileUpdatesRequest
+from triquad_format.wire.mesh_messages import TileUpdatesRequest
 from triquad_format.wire.metrics_messages import QueueMetrics
 from triquad_map.compiled.mesh.tile_lattice import TileIndex
 from triquad_map.compiled.priority import lower_priority

@@ -5,7 +5,7 @@ from triquad_format.errors import RefusedError
 from triquad_format.records.arrays import Ints
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.wire.limits import MAX_FILL_M, MAX_TILES_ASKED, TILE_INDEX_LIMIT
-from triquad_format.wire.messages import MeshReply, MeshRequest, TileList, TileListRequest
+from triquad_format.wire.mesh_messages import MeshReply, MeshRequest, TileList, TileListRequest
 from triquad_format.wire.tile_codec import encode_tile
 from triquad_map.box import check_box
 from triquad_map.compiled.mesh.mesher import mesh_tile

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
-from triquad_format.wire.messages import TileUpdates
+from triquad_format.wire.mesh_messages import TileUpdates
 from triquad_map.compiled.priority import lower_priority
 
 from triquad_server.fair_queue import Owner

@@ -3,7 +3,7 @@
 import numpy as np
 from triquad_format.errors import RefusedError
 from triquad_format.wire.limits import MAX_SAMPLE_POINTS
-from triquad_format.wire.source_messages import (
+from triquad_format.wire.query_messages import (
     ScanSample,
     SourcesReply,
     SourcesRequest,

@@ -7,7 +7,7 @@ from collections import OrderedDict
 from dataclasses import dataclass
 
 import zenoh
-from triquad_format.wire.origin import RequestOrigin, read_origin
+from triquad_format.wire.messages import RequestOrigin, read_origin
 
 from triquad_server.fair_queue import Owner
 

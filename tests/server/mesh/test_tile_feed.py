@@ -7,7 +7,7 @@ from contextlib import closing
 import pytest
 from support import servers
 from support.requests import PendingRequest, held_tile_updates
-from triquad_format.wire.messages import TileUpdates
+from triquad_format.wire.mesh_messages import TileUpdates
 from triquad_map.compiled.team import Team
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.mapping.mapper import Mapper

@@ -6,7 +6,7 @@ from contextlib import closing
 import zenoh
 from support.servers import WAIT_S, free_endpoint, raw_session
 from triquad_format.wire import codec
-from triquad_format.wire.origin import RequestOrigin
+from triquad_format.wire.messages import RequestOrigin
 from triquad_server.serving.client_sessions import ClientSessions
 
 

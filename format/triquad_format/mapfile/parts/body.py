@@ -20,7 +20,8 @@ from triquad_format.mapfile.parts.part import (
 )
 from triquad_format.records.arrays import Longs
 from triquad_format.records.field_settings import RegionIndex
-from triquad_format.wire.codec import MAX_OBJECTS, ArraySpec, check_structure, unpack_array
+from triquad_format.wire.codec import ArraySpec, unpack_array
+from triquad_format.wire.structure import MAX_OBJECTS, check_structure
 
 _MAX_REGION_INDEX = 2**31 - 1
 _MAX_ITEMS = 64

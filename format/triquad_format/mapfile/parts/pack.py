@@ -50,7 +50,8 @@ from triquad_format.records.region import (
     surface_counts,
 )
 from triquad_format.records.replay_rays import STEPS, ReplayRays
-from triquad_format.wire.codec import binary_offsets, pack_array
+from triquad_format.wire.codec import pack_array
+from triquad_format.wire.structure import binary_offsets
 
 SAMPLES_PER_PART = 1 << 17
 RAYS_PER_PART = 1 << 21

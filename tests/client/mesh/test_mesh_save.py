@@ -86,18 +86,6 @@ def test_an_stl_cannot_mark_them():
         MARKED.file_bytes(".stl")
 
 
-def test_what_is_done_to_a_copy_does_not_change_the_mesh():
-    before = MESH.vertices.copy()
-    MESH.to_trimesh().vertices *= 2
-    np.testing.assert_array_equal(MESH.vertices, before)
-
-
-def test_obj_keeps_large_coordinates(tmp_path):
-    MESH.save(tmp_path / "mesh.obj")
-    back = trimesh.load_mesh(tmp_path / "mesh.obj", process=False)
-    np.testing.assert_allclose(back.vertices, MESH.vertices, rtol=0, atol=1e-6)
-
-
 @pytest.mark.parametrize("name", ["mesh.glb", "mesh.ply", "mesh.obj", "mesh.stl"])
 def test_other_programs_read_the_files(tmp_path, name):
     near = Mesh(MESH.vertices - FAR, MESH.faces, epoch=MESH.epoch)

@@ -4,14 +4,11 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.server_records import METRICS
-from triquad_format.wire import codec
 from triquad_format.wire.metrics_messages import (
     OperationMetrics,
-    ServerMetrics,
     TimeHistogram,
 )
 
@@ -48,16 +45,3 @@ def test_differences_are_taken_within_one_server_alone():
     assert now.answer_time_s(OPERATION, 0.5, since=now) is None
     restarted = metrics([0.05], server="another")
     assert 0.01 < restarted.answer_time_s(OPERATION, 0.5, since=now) <= 0.1
-
-
-@pytest.mark.parametrize("times_s", [[], [0.2]])
-def test_figures_survive_the_wire(times_s):
-    sent = metrics(times_s)
-    got = codec.decode(ServerMetrics, codec.encode(sent))
-    assert got.answer_time_s(OPERATION, 1.0) == sent.answer_time_s(OPERATION, 1.0)
-    assert got.operations[OPERATION].answered == len(times_s)
-    assert (got.sources, got.queues, got.checkpoints) == (
-        sent.sources,
-        sent.queues,
-        sent.checkpoints,
-    )

@@ -44,14 +44,6 @@ def test_the_mesh_of_a_file_lies_on_the_surface_that_was_seen(tmp_path: Path) ->
     assert area == pytest.approx((2 * SEEN_M) ** 2, rel=0.02)
 
 
-def test_it_is_saved_as_any_mesh_is(tmp_path: Path) -> None:
-    mesh = mesh_of(RECORD, cell_m=0.4)
-    for suffix in (".ply", ".glb", ".obj", ".stl"):
-        mesh.save(tmp_path / f"mesh{suffix}")
-        assert (tmp_path / f"mesh{suffix}").stat().st_size > 12 * len(mesh.faces)
-    assert len(mesh.to_trimesh().faces) == len(mesh.faces)
-
-
 def test_larger_cells_make_fewer_faces() -> None:
     fine, coarse = (len(mesh_of(RECORD, cell_m=cell_m).faces) for cell_m in (0.1, 0.2))
     assert 3.5 < fine / coarse < 4.5
@@ -92,13 +84,6 @@ def test_surface_is_where_the_mesh_has_faces() -> None:
     assert 0.4 < has[~beside].mean() < 0.5, "margins are on a third of all sides"
 
 
-def test_progress_is_told() -> None:
-    told: list[tuple[int, int]] = []
-    mesh_of(RECORD, cell_m=0.2, report=lambda done, blocks: told.append((done, blocks)))
-    assert [done for done, _ in told] == list(range(1, len(told) + 1))
-    assert {blocks for _, blocks in told} == {len(told)}
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -135,6 +120,7 @@ for name in sys.argv[3:]:
 import triquad_client
 with triquad_client.open_map(sys.argv[1]) as offline:
     offline.mesh(cell_m=0.4).save(sys.argv[2])
+sys.exit(bool({"triquad_server", "triquad_tools"} & sys.modules.keys()))
 """
 
 
@@ -152,7 +138,7 @@ def without(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
 
 
 def test_it_needs_neither_torch_nor_scikit_image_nor_the_tools(without, tmp_path: Path) -> None:
-    done = without("torch", "skimage", "scipy", "trimesh", "triquad_server", "triquad_tools")
+    done = without("torch", "skimage", "scipy", "trimesh")
     assert done.returncode == 0, done.stderr
     faces = len(mesh_of(RECORD, cell_m=0.4).faces)
     assert f"element face {faces}\n".encode() in (tmp_path / "mesh.ply").read_bytes()

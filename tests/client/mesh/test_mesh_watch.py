@@ -15,40 +15,9 @@ import pytest
 import triquad_client
 import zenoh
 from support import servers
-from support.requests import tile_updates
-from triquad_client import Client, InvalidInputError, MeshWatch, RequestTimeoutError
-from triquad_format.wire import codec, keys
-from triquad_format.wire.messages import (
-    ErrorReply,
-    MeshReply,
-    MeshRequest,
-    ServerStatus,
-    TileList,
-    TileListRequest,
-    TileUpdates,
-)
-from triquad_format.wire.tile_codec import decode_tile
-from triquad_server.settings import MeshSettings, ServiceSettings
-
-POSE = np.eye(4)
-SETTINGS = servers.SMALL.model_copy(update={"mesh": MeshSettings(tile_cells=16, tolerance_m=0.1)})
-
-
-def digests(watch: MeshWatch) -> dict[tuple[int, int, int], str]:
-    return {index: tile.digest for index, tile in watch.tiles.items()}
-
-
-def learn(client: Client, points: np.ndarray | None = None) -> None:
-    for _ in range(3):
-        client.publish_scan(servers.sphere() if points is None else points, POSE)
-    client.flush(servers.WAIT_S)
-    client.settle(servers.WAIT_S)
-
-
-def half(side: int) -> np.ndarray:
-    """The half of the ball at x > 0, or at x < 0."""
-    points = servers.sphere(12_000)
-    return points[np.sign(points[:, 0]) == side]
+from support.watched_ball import SETTINGS, digests, half, learn
+from triquad_client import Client, InvalidInputError, RequestTimeoutError
+from triquad_format.wire import keys
 
 
 @pytest.fixture
@@ -60,6 +29,14 @@ def endpoint() -> Iterator[str]:
 @pytest.fixture
 def client(endpoint: str) -> Iterator[Client]:
     with triquad_client.connect(endpoint) as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def learnt() -> Iterator[Client]:
+    """A client of a server that has learnt the ball."""
+    with servers.service_and_client(SETTINGS) as client:
+        learn(client)
         yield client
 
 
@@ -122,18 +99,10 @@ def test_of_known_tiles_only_the_difference_travels(client: Client) -> None:
         assert {index for index in whole if index[0] >= 1} <= gone
 
 
-def test_nothing_comes_while_nothing_changes(client: Client) -> None:
-    learn(client)
-    with client.watch_mesh() as watch:
-        watch.catch_up()
-        assert watch.next(0.3) is None
-
-
-def test_levels_are_the_same_surface_with_fewer_faces(client: Client) -> None:
-    learn(client)
+def test_levels_are_the_same_surface_with_fewer_faces(learnt: Client) -> None:
     faces = []
     for level in range(3):
-        with client.watch_mesh(level=level) as watch:
+        with learnt.watch_mesh(level=level) as watch:
             watch.catch_up()
             mesh = watch.mesh()
             faces.append(len(mesh.faces))
@@ -143,10 +112,9 @@ def test_levels_are_the_same_surface_with_fewer_faces(client: Client) -> None:
     assert faces[0] > 2 * faces[1] > 4 * faces[2] > 0
 
 
-def test_a_watch_of_a_box_has_the_tiles_that_meet_it(client: Client) -> None:
-    learn(client)
+def test_a_watch_of_a_box_has_the_tiles_that_meet_it(learnt: Client) -> None:
     bounds = ((0.2, 0.2, -9), (9, 9, 9))
-    with client.watch_mesh(bounds) as watch:
+    with learnt.watch_mesh(bounds) as watch:
         watch.catch_up()
         assert watch.tiles
         assert all(x >= 0 and y >= 0 for x, y, _ in watch.tiles)
@@ -154,9 +122,8 @@ def test_a_watch_of_a_box_has_the_tiles_that_meet_it(client: Client) -> None:
         assert (mesh.vertices[mesh.faces].mean(axis=1)[:, :2] >= 0.2).all()
 
 
-def test_a_cap_makes_replies_small(client: Client) -> None:
-    learn(client)
-    with client.watch_mesh() as free, client.watch_mesh(max_bytes_per_s=20_000) as capped:
+def test_a_cap_makes_replies_small(learnt: Client) -> None:
+    with learnt.watch_mesh() as free, learnt.watch_mesh(max_bytes_per_s=20_000) as capped:
         free.catch_up()
         largest = max(tile.size_bytes for tile in free.tiles.values())
         sizes = []
@@ -188,72 +155,6 @@ def test_a_watch_that_waits_ends_when_something_comes(client: Client, endpoint: 
 
 
 @pytest.mark.parametrize(
-    ("changes", "code"),
-    [
-        ({"minimum": np.full(3, np.nan)}, "bad_request"),
-        ({"minimum": np.ones(3), "maximum": np.zeros(3)}, "bad_request"),
-        ({"level": 7}, "bad_request"),
-        ({"level": -1}, "bad_request"),
-        ({"revision": -1}, "bad_request"),
-        ({"revision": 10**12}, "bad_request"),
-        ({"max_bytes": 0}, "bad_request"),
-        ({"max_bytes_per_s": -1}, "bad_request"),
-        ({"timeout_s": -1.0}, "bad_request"),
-        ({"timeout_s": np.inf}, "bad_request"),
-        ({"timeout_s": np.nan}, "bad_request"),
-        ({"client": ""}, "bad_request"),
-        ({"client": "a/b"}, "bad_request"),
-        ({"known_versions": np.ones(3, np.int64)}, "bad_request"),
-        (
-            {
-                "known": np.zeros((100_001, 3), np.int32),
-                "known_versions": np.zeros(100_001, np.int64),
-            },
-            "too_large",
-        ),
-    ],
-)
-def test_bad_requests_are_refused(endpoint: str, changes: dict[str, object], code: str) -> None:
-    with servers.raw_session(connect=endpoint) as session:
-        peer = servers.RawPeer(session)
-        assert peer.refusal(keys.TILE_UPDATES, tile_updates(**changes)) == code
-        assert isinstance(peer.ask(keys.TILE_UPDATES, codec.encode(tile_updates())), bytes)
-
-
-@pytest.mark.parametrize("level", [-1, 3, 2**62])
-def test_levels_that_there_are_not_are_refused(endpoint: str, level: int) -> None:
-    everywhere = np.full(3, np.inf)
-    with servers.raw_session(connect=endpoint) as session:
-        peer = servers.RawPeer(session)
-        assert (
-            peer.refusal(keys.MESH, MeshRequest(np.zeros((1, 3), np.int32), 0, level))
-            == "bad_request"
-        )
-        asks = TileListRequest(-everywhere, everywhere, 0, level)
-        assert peer.refusal(keys.TILE_LIST, asks) == "bad_request"
-
-
-def test_single_tiles_have_levels_too(client: Client, endpoint: str) -> None:
-    learn(client)
-    everywhere = np.full(3, np.inf)
-    with servers.raw_session(connect=endpoint) as session:
-        peer = servers.RawPeer(session)
-        answer = peer.ask(
-            keys.TILE_LIST, codec.encode(TileListRequest(-everywhere, everywhere, 0, 2))
-        )
-        assert isinstance(answer, bytes)
-        listed = codec.decode(TileList, answer)
-        assert listed.tile_side_m == pytest.approx(6.4)
-        assert (listed.changed > 0).all()
-        answer = peer.ask(keys.MESH, codec.encode(MeshRequest(listed.tiles[:1], listed.epoch, 2)))
-        assert isinstance(answer, bytes)
-        reply = codec.decode(MeshReply, answer)
-        tile = decode_tile(reply.data)
-        assert len(tile.faces) > 0
-        assert 3.0 < tile.positions(reply.cell_m).max() <= 6.4
-
-
-@pytest.mark.parametrize(
     "arguments",
     [
         {"level": 3},
@@ -265,83 +166,10 @@ def test_single_tiles_have_levels_too(client: Client, endpoint: str) -> None:
     ],
 )
 def test_bad_arguments_are_refused_before_anything_is_sent(
-    client: Client, arguments: dict[str, object]
+    learnt: Client, arguments: dict[str, object]
 ) -> None:
     with pytest.raises(InvalidInputError):
-        client.watch_mesh(**arguments)  # type: ignore[arg-type]
-
-
-def held_by(session: zenoh.Session) -> "zenoh.handlers.FifoChannel":
-    """A request that waits at the server once this returns."""
-    key = keys.operation_key(servers.MAP, keys.TILE_UPDATES)
-    payload = codec.encode(tile_updates(timeout_s=50.0))
-    answers = session.get(key, payload=payload, timeout=servers.WAIT_S)
-    assert servers.RawPeer(session).refusal(keys.FLUSH, b"") == "bad_request"  # it went later
-    return answers
-
-
-def test_too_many_followers_are_told_to_come_back() -> None:
-    few = SETTINGS.model_copy(update={"service": ServiceSettings(request_queue=2)})
-    with servers.running_service(few) as endpoint, servers.raw_session(connect=endpoint) as session:
-        held = [held_by(session) for _ in range(2)]
-        assert servers.RawPeer(session).refusal(keys.TILE_UPDATES, tile_updates()) == "busy"
-        assert len(held) == 2
-
-
-def test_a_server_that_stops_says_so() -> None:
-    service = servers.running_service(SETTINGS)
-    with servers.raw_session(connect=service.__enter__()) as session:
-        answers = held_by(session)
-        service.__exit__(None, None, None)
-        (reply,) = answers
-        code = codec.decode(ErrorReply, reply.err.payload.to_bytes()).code
-        assert code in ("timeout", "busy")  # held by then, or about to be
-
-
-def tiles_by_hand(peer: servers.RawPeer, **changes: object) -> TileUpdates:
-    answer = peer.ask(keys.TILE_UPDATES, codec.encode(tile_updates(**changes)))
-    assert not isinstance(answer, ErrorReply)
-    assert answer is not None
-    return codec.decode(TileUpdates, answer)
-
-
-def test_the_protocol_by_hand(client: Client, endpoint: str) -> None:
-    """As the document says: a cursor, small replies, tiles decoded by its words."""
-    learn(client)
-    with servers.raw_session(connect=endpoint) as session:
-        peer = servers.RawPeer(session)
-        known: dict[tuple[int, int, int], bytes] = {}
-        versions: dict[tuple[int, int, int], int] = {}
-        reply = tiles_by_hand(peer, max_bytes=1)
-        while not reply.complete:
-            assert len(reply.tiles) <= 1, "more than max_bytes only where a tile is larger"
-            for (x, y, z), version in zip(
-                reply.tiles.tolist(), reply.versions.tolist(), strict=True
-            ):
-                known[x, y, z], versions[x, y, z] = reply.data, version
-            reply = tiles_by_hand(
-                peer,
-                max_bytes=1,
-                server=reply.server,
-                revision=reply.revision,
-                known=np.array(list(versions), np.int32).reshape(-1, 3),
-                known_versions=np.array(list(versions.values()), np.int64),
-            )
-        for x, y, z in reply.tiles.tolist():
-            known[x, y, z] = reply.data
-        with client.watch_mesh() as watch:
-            watch.catch_up()
-            assert watch.tiles.keys() == known.keys()
-            for index, data in known.items():
-                surface = decode_tile(data)
-                tile = watch.tiles[index]
-                np.testing.assert_array_equal(surface.positions(0.1), tile.vertices)
-                np.testing.assert_array_equal(surface.faces, tile.faces)
-        later = tiles_by_hand(peer, server=reply.server, revision=reply.revision)
-        assert (later.complete, len(later.tiles), later.restart) == (True, 0, False)
-        strange = tiles_by_hand(peer, server="another", revision=10**6)
-        assert strange.restart
-        assert strange.server == reply.server
+        learnt.watch_mesh(**arguments)  # type: ignore[arg-type]
 
 
 def test_a_restarted_server_is_followed_anew(tmp_path: Path) -> None:
@@ -376,24 +204,24 @@ def test_a_restarted_server_is_followed_anew(tmp_path: Path) -> None:
 FROZEN = """
 import sys
 import numpy as np, triquad_client
-from triquad_client.net.call import Ask
+from triquad_client.net.connection import Ask
 from triquad_format.wire import keys
 from triquad_format.wire import codec
-from triquad_format.wire.messages import TileUpdatesRequest, TileUpdates
+from triquad_format.wire.mesh_messages import TileUpdatesRequest, TileUpdates
 everywhere = np.full(3, np.inf)
 with triquad_client.connect(sys.argv[1]) as client:
     asks = TileUpdatesRequest(-everywhere, everywhere, 0, "", 0, np.zeros((0, 3), np.int32),
         np.zeros(0, np.int64), 100_000_000, 60.0, "frozen", 0)
     ask = Ask(keys.TILE_UPDATES, asks, TileUpdates, background=True)
-    pending = [client._connection.send(ask) for _ in range(24)]
-    print(len(client._connection.read(ask, next(iter(pending[0]))).data), flush=True)
+    pending = [client._connection._send(ask) for _ in range(24)]
+    print(len(client._connection._read(ask, next(iter(pending[0]))).data), flush=True)
     for replies in pending[1:]:
         list(replies)
 """
 
 
 def test_a_frozen_client_holds_up_nobody(tmp_path: Path) -> None:
-    """Stopped amid large replies, it delays no query, no tile and no status of others for good."""
+    """Stopped amid large replies, it delays no query and no tile of others for good."""
     settings = tmp_path / "settings.toml"
     settings.write_text(servers.SMALL_TOML + "[mesh]\ncell_m = 0.025\n")
     with (
@@ -411,7 +239,6 @@ def test_a_frozen_client_holds_up_nobody(tmp_path: Path) -> None:
                 assert frozen.stdout is not None
                 assert int(frozen.stdout.readline()) > 100_000
                 os.kill(frozen.pid, signal.SIGSTOP)
-                statuses = collect_statuses(server.endpoint)
                 for _ in range(20):  # while Zenoh gives up the frozen one, and after
                     with client.watch_mesh() as late:
                         late.catch_up(servers.WAIT_S)
@@ -428,27 +255,12 @@ def test_a_frozen_client_holds_up_nobody(tmp_path: Path) -> None:
                 stat = Path(f"/proc/{frozen.pid}/stat")
                 if stat.exists():
                     assert stat.read_text().rpartition(")")[2].split()[0] == "T"
-                assert next(statuses).server == next(statuses).server
-                statuses.close()
             finally:
                 frozen.kill()
 
 
-def collect_statuses(endpoint: str) -> Iterator[ServerStatus]:
-    """The server's status as it comes."""
-    with servers.raw_session(connect=endpoint) as session:
-        channel = zenoh.handlers.RingChannel(4)
-        subscriber = session.declare_subscriber(keys.status_key(servers.MAP), channel)
-        try:
-            while True:
-                yield codec.decode(ServerStatus, subscriber.recv().payload.to_bytes())
-        finally:
-            subscriber.undeclare()
-
-
-def test_iteration_ends_with_the_watch(client: Client) -> None:
-    learn(client)
-    watch = client.watch_mesh()
+def test_iteration_ends_with_the_watch(learnt: Client) -> None:
+    watch = learnt.watch_mesh()
     seen = threading.Event()
 
     def follow() -> int:

@@ -1,0 +1,26 @@
+"""A ball that a server learns half by half, while its mesh is watched."""
+
+import numpy as np
+from support import servers
+from triquad_client import AsyncMeshWatch, Client, MeshWatch
+from triquad_server.settings import MeshSettings
+
+SETTINGS = servers.SMALL.model_copy(update={"mesh": MeshSettings(tile_cells=16, tolerance_m=0.1)})
+
+
+def digests(watch: MeshWatch | AsyncMeshWatch) -> dict[tuple[int, int, int], str]:
+    return {index: tile.digest for index, tile in watch.tiles.items()}
+
+
+def learn(client: Client, points: np.ndarray | None = None) -> None:
+    """Have the server learn the ball, or other points, and settle."""
+    for _ in range(3):
+        client.publish_scan(servers.sphere() if points is None else points, np.eye(4))
+    client.flush(servers.WAIT_S)
+    client.settle(servers.WAIT_S)
+
+
+def half(side: int) -> np.ndarray:
+    """The half of the ball at x > 0, or at x < 0."""
+    points = servers.sphere(12_000)
+    return points[np.sign(points[:, 0]) == side]
