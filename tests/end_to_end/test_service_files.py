@@ -11,7 +11,7 @@ from triquad_client import DownloadError, InvalidInputError, RefusedError
 from triquad_format.mapfile.reader import read_map
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import MapChunk, MapChunkRequest, ResetRequest
-from triquad_map.reference.evaluator import MapEvaluator
+from triquad_map.composition.recorded_view import RecordedView
 from triquad_server.store.store import Store
 
 PROBES = np.concatenate([servers.sphere(50, radius) for radius in (2.0, 3.9, 4.0, 4.1)])
@@ -56,8 +56,8 @@ def test_a_box_of_the_map_is_downloaded_without_the_rest(client, tmp_path):
     assert box.epoch == whole.epoch
     assert box.bytes < whole.bytes
     points = np.random.default_rng(0).uniform(low, high, (500, 3))
-    here = MapEvaluator(read_map(tmp_path / "box.triquad")).query(points, gradient=True)
-    there = MapEvaluator(read_map(tmp_path / "whole.triquad")).query(points, gradient=True)
+    here = RecordedView(read_map(tmp_path / "box.triquad")).query(points, gradient=True)
+    there = RecordedView(read_map(tmp_path / "whole.triquad")).query(points, gradient=True)
     assert np.array_equal(here.sdf, there.sdf)
     assert np.array_equal(here.status, there.status)
     everything = client.download_box(tmp_path / "all.triquad", ((-math.inf,) * 3, (math.inf,) * 3))

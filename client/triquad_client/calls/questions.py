@@ -36,7 +36,6 @@ from triquad_format.wire.query_messages import (
     SpheresReply,
     SpheresRequest,
 )
-from triquad_map.asked import asked
 from triquad_map.questions.align import FINE_POINTS, Alignment, AlignOptions, thinned
 from triquad_map.questions.distance import (
     DistanceOptions,
@@ -50,6 +49,7 @@ from triquad_map.questions.ground import Ground
 from triquad_map.questions.rays import RayOptions, RayRanges
 from triquad_map.questions.segments import Polyline, SegmentOptions, Segments, along_polyline
 from triquad_map.questions.spheres import Spheres
+from triquad_map.view import asked
 
 from triquad_client import checks
 from triquad_client.calls.parts import in_parts, joined, offsets_from, origin_of

@@ -12,8 +12,7 @@ from triquad_format.errors import InvalidInputError
 from triquad_format.records.arrays import Doubles
 from triquad_format.wire.limits import MAX_KNOWN_TILES
 from triquad_format.wire.messages import TileUpdates, TileUpdatesRequest
-from triquad_map.tile_join import joined
-from triquad_map.triangles import Triangles
+from triquad_map.triangles import Triangles, joined
 
 from triquad_client import checks
 from triquad_client.checks import Bounds

@@ -6,7 +6,7 @@ import numpy as np
 from triquad_format.records.arrays import Bools, Ints
 from triquad_format.wire import keys
 from triquad_format.wire.messages import MeshReply, MeshRequest, TileList, TileListRequest
-from triquad_map.tile_join import TileJoin
+from triquad_map.triangles import TileJoin
 
 from triquad_client import checks
 from triquad_client.checks import Bounds

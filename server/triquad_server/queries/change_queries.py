@@ -6,8 +6,8 @@ import numpy as np
 from triquad_format.errors import RefusedError
 from triquad_format.records.arrays import Bools, Bytes, Longs
 from triquad_format.wire.query_messages import ChangesReply, ChangesRequest
-from triquad_map.box import check_box
 from triquad_map.clusters import Boxes, tight_boxes
+from triquad_map.questions.checks import check_box
 
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.history import EpochHistory
