@@ -44,7 +44,7 @@ class ChangeQueries:
             raise RefusedError(
                 "epoch_gone",
                 f"epoch {request.since} is one of server {request.server[:64]!r}, and this is "
-                f"{self._server!r}: it was restarted; ask for the map anew, then for changes "
+                f"{self._server!r}: it was restarted; ask for the map again, then for changes "
                 f"since its epoch, {newest.number} now or later",
             )
         since = request.since or newest.number

@@ -98,19 +98,19 @@ def check_robot_box(name: str, box: Box, leaf_m: float) -> None:
 
 
 class ChangeSettings(BaseModel):
-    """How quickly a surface is taken back that rays pass through, in a world that changes."""
+    """How quickly a surface is removed that rays pass through, in a world that changes."""
 
     model_config = SECTION
 
     static: bool = False
-    """The world stands still: no surface is ever taken back."""
+    """The world stands still: no surface is ever removed."""
 
     scans: Annotated[int, Field(ge=1, le=1000)] = 3
     """Scans in a row, at least, of which rays pass where a surface was, and none ends there."""
 
     doubt: Annotated[float, Field(ge=1e-9, le=0.5)] = 0.01
-    """How probable such rays may be, at most, if the surface were still there: told by how often
-    rays ended and passed there before."""
+    """Largest probability of such rays if the surface were still there, by how often rays ended and
+    passed there before."""
 
 
 class TrainingSettings(BaseModel):
@@ -131,7 +131,7 @@ class TrainingSettings(BaseModel):
     map keeps more, by `rays_per_voxel`."""
 
     rays_per_voxel: Annotated[float, Field(ge=0.01, le=10_000)] = 12.0
-    """A large map keeps so many rays for each voxel with surface."""
+    """Rays that a large map keeps for each voxel with surface."""
 
     pool_bytes: Annotated[int, Field(ge=10_000, le=2**50)] = 500_000_000
     """Bytes of all rays that are kept; a map too large for that keeps fewer for each voxel."""
@@ -140,14 +140,14 @@ class TrainingSettings(BaseModel):
     """Share of a batch that is drawn from the newest scans while they stream in."""
 
     samples_per_ray: Annotated[float, Field(ge=0, le=1000)] = 48.0
-    """Each new ray raises the training budget of its region by so many samples."""
+    """Samples by which each new ray raises the training budget of its region."""
 
     max_budget_samples: Annotated[int, Field(ge=1, le=10_000_000_000)] = 24_000_000
     """Largest training budget of the map, in samples, shared by its regions as they have surface; a
     large map has a larger one, by `samples_per_voxel`."""
 
     samples_per_voxel: Annotated[float, Field(ge=0.01, le=1_000_000)] = 240.0
-    """The budget of a large map is at most so many samples for each voxel with surface."""
+    """Largest training budget of a large map, in samples for each voxel with surface."""
 
     max_regions: Annotated[int, Field(ge=1, le=1_000_000)] = 256
     """Regions of the map; a scan that would need more is refused."""
@@ -258,5 +258,5 @@ class MetricsSettings(BaseModel):
     same."""
 
     address: Annotated[str, Field(min_length=1, max_length=255)] = "127.0.0.1"
-    """Of the network interface that is listened on: `0.0.0.0` for all; whoever reaches it may
+    """Address of the network interface that is listened on: `0.0.0.0` for all; all who reach it may
     read."""
