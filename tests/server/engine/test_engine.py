@@ -121,27 +121,27 @@ def test_an_old_decoder_moves_less_than_a_young_one(compiled: bool) -> None:
 
 
 @pytest.mark.parametrize("compiled", [False, True], ids=["tensors", "compiled"])
-def test_what_is_held_stays_as_it_is_and_all_else_learns_as_ever(compiled: bool) -> None:
+def test_fixed_rows_stay_as_they_are_and_all_others_learn(compiled: bool) -> None:
     settings = CASES[0]
     batch = samples(settings, 4000, seed=2)
     fields = [trained(settings) for _ in range(3)]
-    before, held_in, free = fields
-    rows = np.random.default_rng(0).random(len(held_in.features) - 50) < 0.5
-    held_in.fix(rows)
-    for field in (held_in, free):
+    before, fixed_in, free = fields
+    rows = np.random.default_rng(0).random(len(fixed_in.features) - 50) < 0.5
+    fixed_in.fix(rows)
+    for field in (fixed_in, free):
         trainer = CompiledTrainer(field, GradientSums(), TEAM) if compiled else TensorTrainer(field)
         trainer.train(batch, RATES)
     stay = np.zeros(len(before.features), np.bool_)
     stay[: len(rows)] = rows
     for part in PARTS:
-        held, old, new = (getattr(f.features, part) for f in (held_in, before, free))
+        held, old, new = (getattr(f.features, part) for f in (fixed_in, before, free))
         np.testing.assert_array_equal(held[stay], old[stay])
         np.testing.assert_allclose(held[~stay], new[~stay], rtol=1e-5, atol=1e-7)
     pairs = zip(before.mlp, free.mlp, strict=True)
     moved = [not np.array_equal(x.values, y.values) for x, y in pairs]
     kept = [
         np.array_equal(getattr(x, of), getattr(y, of))
-        for x, y in zip(before.mlp, held_in.mlp, strict=True)
+        for x, y in zip(before.mlp, fixed_in.mlp, strict=True)
         for of in PARTS
     ]
     assert all(moved)
