@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from triquad_server.settings.leaf_lengths import IN_LEAVES
-from triquad_server.settings.schemas import setting_schemas
+from triquad_server.settings.settings import setting_schemas
 
 PAGE = Path(__file__).with_name("settings.md")
 

@@ -27,11 +27,10 @@ _ROUNDS = 7
 
 _OPEN = """
 import sys, time
-import numpy
 from triquad_map.stored_map import StoredMap
 started = time.perf_counter()
 with StoredMap.open(sys.argv[1]) as stored:
-    stored.query(numpy.array([[10.0, 0.0, 0.5]]), gradient=True)
+    stored.box((9.0, -1.0, -0.5), (11.0, 1.0, 1.5))
 print(time.perf_counter() - started)
 """
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from triquad_client import Mesh
 from triquad_format.records.arrays import Bools, Doubles
-from triquad_map.compiled.mesh.marching_cubes import centroids
-from triquad_map.compiled.mesh.mesher import mesh_tile
+from triquad_map.mesh.marching_cubes import centroids
+from triquad_map.mesh.mesher import mesh_tile
 from triquad_map.questions.segments import SegmentOptions, segments
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mesh.tile_cache import tile_lattice

@@ -7,11 +7,9 @@ from pathlib import Path
 
 import numpy as np
 from triquad_client import OfflineMap, open_map
-from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.arrays import Doubles
 from triquad_map.questions.distance import DistanceOptions, distances
-from triquad_map.reference.evaluator import MapEvaluator
 from triquad_server.epochs.epoch import Epoch
 
 from bench.figures import Figure, compare, seconds
@@ -34,15 +32,10 @@ def measure_offline(made: BenchStreet) -> list[Figure]:
         with open_map(path) as offline:
             first_s = seconds(lambda: offline.query_distance(points[:1]))
             figures = _differences(offline, epoch, points) + _ratios(offline, epoch, points)
-        plain = MapEvaluator(read_map(path))
-    few = points[:1000]
-    distances(plain, few[:1], DistanceOptions())
-    plain_s = seconds(lambda: distances(plain, few, DistanceOptions()))
     return [
         *figures,
         Figure("open the file of the street", opening_s, "s", at_most=2),
         Figure("the first distance, with fitting all surfels", first_s, "s", at_most=2),
-        Figure("1,000 distances without compiled code", 1e3 * plain_s, "ms"),
     ]
 
 

@@ -21,7 +21,6 @@ from triquad_format.wire.metrics_messages import (
     SourceMetrics,
     TimeHistogram,
 )
-from triquad_map.asked import NotAskedError
 from triquad_map.questions.align import Alignment
 from triquad_map.questions.distance import Distances, Unknown, UnknownSpaceError
 from triquad_map.questions.grid import Grid
@@ -29,6 +28,7 @@ from triquad_map.questions.ground import Ground
 from triquad_map.questions.rays import RayRanges
 from triquad_map.questions.segments import Polyline, Segments
 from triquad_map.questions.spheres import Spheres
+from triquad_map.view import NotAskedError
 
 from triquad_client.async_client import (
     AsyncClient,

@@ -10,7 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Longs
 
-from triquad_map.sorted_keys import rows_of
+
+def rows_of(keys: Longs, wanted: Longs) -> Longs:
+    """Return rows [N] of ``wanted`` [N] in increasing ``keys`` [K]; -1 for what is not there."""
+    if len(keys) == 0:
+        return np.full(len(wanted), -1, np.int64)
+    rows = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    return np.where(keys[rows] == wanted, rows, -1)
+
 
 _CELL_VOXELS = 2
 """A cluster is made of cells of this side, which touch: its voxels lie up to as far apart."""

@@ -1,45 +1,28 @@
-"""The map in a record as something to ask, as fast as this installation can."""
+"""The map in a record as something to ask, for those who may be without numba."""
 
-import functools
-import logging
-from collections.abc import Callable
-from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
+from triquad_format.errors import TriquadError
 from triquad_format.records.region import MapRecord
 
-from triquad_map.composition.composed_view import ComposedView
-from triquad_map.reference.evaluator import MapEvaluator
-
-_log = logging.getLogger(__name__)
+if TYPE_CHECKING:
+    from triquad_map.composition.recorded_view import RecordedView
 
 
-@dataclass(frozen=True)
-class OpenView:
-    """A map that can be asked until it is closed."""
-
-    view: ComposedView
-    compiled: bool  # whether compiled code answers, as in a server; numpy is far slower
-    close: Callable[[], None]
+class NoCompiledCodeError(TriquadError):
+    """Compiled code answers for maps, and numba, which compiles it, cannot be imported."""
 
 
-def open_view(record: MapRecord) -> OpenView:
-    """Return the map of a record: answered by compiled code where numba is installed, else numpy.
+def open_view(record: MapRecord) -> "RecordedView":
+    """Return the map of a record, to be asked until it is closed.
 
-    This is the one door to compiled code for those who must do without numba.
+    Raises:
+        NoCompiledCodeError: there is no numba, or one that does not go with this numpy.
     """
     try:
-        from triquad_map.compiled.recorded_view import RecordedView
-    except ImportError as error:  # no numba, or one that does not go with this numpy
-        _tell_what_to_install(str(error))
-        return OpenView(MapEvaluator(record), compiled=False, close=lambda: None)
-    view = RecordedView(record)
-    return OpenView(view, compiled=True, close=view.close)
-
-
-@functools.cache  # once
-def _tell_what_to_install(reason: str) -> None:
-    _log.warning(
-        "no compiled code (%s): numpy answers some forty times as slowly, the first distance after "
-        "ten seconds for 100 m of street; pip install 'triquad[fast]'",
-        reason,
-    )
+        from triquad_map.composition.recorded_view import RecordedView
+    except ImportError as error:
+        raise NoCompiledCodeError(
+            "maps are asked by compiled code, and numba is missing: pip install 'triquad[fast]'"
+        ) from error
+    return RecordedView(record)

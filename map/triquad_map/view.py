@@ -1,11 +1,28 @@
 """The interface of every map, live or from a file; all questions are put together from this."""
 
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeVar
 
+from triquad_format.errors import TriquadError
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats
 
-from triquad_map.asked import asked
+PartT = TypeVar("PartT")
+
+
+class NotAskedError(TriquadError, AttributeError):
+    """A part of an answer that was not asked for."""
+
+
+def asked(name: str, part: PartT | None, argument: str) -> PartT:
+    """Return the part called ``name``, so that who asked for it need not prove that it is there.
+
+    Raises:
+        NotAskedError: it is ``None``, as the query's ``argument`` was left out.
+    """
+    if part is None:
+        raise NotAskedError(f"{name} was not asked for: give the query {argument}=True")
+    return part
+
 
 NO_LENGTH_M = 1e-6
 """A vector of no more than this length has no direction."""

@@ -43,9 +43,8 @@ from triquad_server.intake.scan import ScanIntake
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.intake.source_trails import SourceTrails
-from triquad_server.mapping.listeners import MapListeners
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mapping.mapper_thread import MapperThread
+from triquad_server.mapping.mapper_thread import MapListeners, MapperThread
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_feed import TileFeed
 from triquad_server.mesh.tile_queries import TileQueries
@@ -101,7 +100,7 @@ class Service:
         self._session = session
         self._served = served
         self._settings = settings
-        self._scans = ScanQueue(settings.service.scan_queue, settings.service.scan_queue_bytes)
+        self._scans = ScanQueue(settings.service.scan_queue)
         self._operations = Operations(
             session, served.name, settings.service, give_way=self._scans.give_way
         )
@@ -256,7 +255,6 @@ class Service:
             cache,
             self._epochs,
             server=server,
-            settings=self._settings.mesh,
             limit=self._settings.service.request_queue,
         )
         self._parts.callback(feed.close)

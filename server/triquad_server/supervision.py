@@ -35,7 +35,7 @@ class Supervision(Phases):
 
     def serving(self, health: Health, question: SelfQuestion) -> None:
         """Report that the server serves, and from now on its state."""
-        self._manager.tell("READY=1", status=health.summary())
+        self._manager.notify("READY=1", status=health.summary())
         if self._manager.listens:
             self._thread = threading.Thread(
                 target=self._run, args=(health, question), name="supervision"
@@ -45,7 +45,7 @@ class Supervision(Phases):
     def stopping(self) -> None:
         """Report that the server stops."""
         self._stopping.set()
-        self._manager.tell(
+        self._manager.notify(
             "STOPPING=1", status="what waits is answered, and the last checkpoint is written"
         )
 
@@ -62,16 +62,16 @@ class Supervision(Phases):
             problem = None
             if watchdog_s is not None and not self._stopping.is_set():
                 problem = _problem(health, question, watchdog_s)
-            self._tell(None if self._stopping.is_set() else problem)
+            self._report(None if self._stopping.is_set() else problem)
             if not self._stopping.is_set():
-                self._manager.tell(status=health.summary())
+                self._manager.notify(status=health.summary())
 
-    def _tell(self, problem: str | None) -> None:
+    def _report(self, problem: str | None) -> None:
         """Report that the server is alive, or log why not."""
         if problem is None and self._manager.watchdog_s is not None:
-            self._manager.tell("WATCHDOG=1")
+            self._manager.notify("WATCHDOG=1")
         elif problem is not None and self._was_well:
-            _log.error("the service manager is not told any more that all is well: %s", problem)
+            _log.error("the service manager gets no more signs that all is well: %s", problem)
         self._was_well = problem is None
 
 

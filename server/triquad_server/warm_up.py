@@ -126,7 +126,7 @@ class _SyntheticMap:
         (region, *_) = self._restored.regions
         pool = region.training.rays.pool
         blocks = region.evidence.live.surface_blocks()
-        region.field.hold(region.field.tree.rows_under(blocks, BLOCK_VOXELS))
+        region.field.fix(region.field.tree.rows_under(blocks, BLOCK_VOXELS))
         region.field.live_view().evaluate(self._directions.astype(np.float32), gradient=True)
         pool.focus(blocks)
         self._restored.train()

@@ -98,7 +98,7 @@ def test_what_cannot_be_told_is_refused_with_the_remedy(client, endpoint):
         client.changes(since=now.epoch + 1000)
     assert caught.value.code == "epoch_gone"
     restarted = ChangeReport(epoch=now.epoch, since=1, server="feed", boxes=())
-    with pytest.raises(RefusedError, match="restarted; ask for the map anew") as caught:
+    with pytest.raises(RefusedError, match="restarted; ask for the map again") as caught:
         client.changes(since=restarted)
     assert caught.value.code == "epoch_gone"
     for bad in (0, -1, 1.5, "now", True, 2**63):

@@ -126,7 +126,7 @@ def test_asked_to_stop_while_it_starts_it_says_that_it_stops(manager, arguments)
 
 
 def assert_nothing_more_is_well(manager: Manager, server: ServerProcess, why: str) -> None:
-    server.wait_for(f"is not told any more that all is well: {why}")
+    server.wait_for(f"gets no more signs that all is well: {why}")
     before = len(manager.heard)
     for _ in range(12):  # more than a period of the watchdog has
         manager.wait_for("STATUS=")
@@ -176,5 +176,5 @@ def test_a_manager_that_cannot_be_told_stops_nothing(manager, monkeypatch, argum
         assert_answers_at_once(server.endpoint)
         server.process.send_signal(signal.SIGTERM)
         assert server.wait() == 0
-    assert "the service manager could not be told" in server.log
+    assert "the service manager could not be notified" in server.log
     assert manager.heard == []

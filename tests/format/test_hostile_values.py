@@ -198,7 +198,7 @@ def test_a_query_does_not_forget_that_a_part_is_refused() -> None:
     with stored(edited(DATA, EVIDENCE, too_far((2, 3)))) as map_file:
         for _ in range(2):
             with pytest.raises(FormatError, match="evidence"):
-                map_file.query(POINT)
+                map_file.box(POINT[0] - 1, POINT[0] + 1)
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ from triquad_format.records.crop import without_training
 from triquad_format.records.region import seen_voxels
 from triquad_format.records.status import Status
 from triquad_format.recovery.recovered_map import RecoveredMap, recover
-from triquad_map.reference.evaluator import MapEvaluator
+from triquad_map.composition.recorded_view import RecordedView
 from triquad_map.view import FieldAnswer
 
 SQUARES = dataclasses.replace(SMALL, depth=9)
@@ -73,7 +73,7 @@ def places() -> NDArray[np.float64]:
 
 @cache
 def whole_answer() -> FieldAnswer:
-    return MapEvaluator(RECORD).query(places())
+    return RecordedView(RECORD).query(places())
 
 
 def in_lost_regions(points: NDArray[np.float64], recovery: RecoveredMap) -> NDArray[np.bool_]:
@@ -89,7 +89,7 @@ def in_lost_regions(points: NDArray[np.float64], recovery: RecoveredMap) -> NDAr
 def assert_answers(recovery: RecoveredMap) -> None:
     """Where no loss reaches all is as before, and nothing that is known is wrong."""
     points, before = places(), whole_answer()
-    after = MapEvaluator(recovery.record).query(points)
+    after = RecordedView(recovery.record).query(points)
     known = after.status != Status.UNKNOWN
     known &= ~in_lost_regions(points, recovery)
     np.testing.assert_array_equal(after.sdf[known], before.sdf[known])
@@ -147,8 +147,8 @@ def test_outside_of_the_boxes_that_are_told_nothing_changes(recovered: Recover) 
     )
     outside = ((points < loss.minimum) | (points > loss.maximum)).any(axis=1)
     assert outside.sum() > 1000
-    before = MapEvaluator(record).query(points[outside])
-    after = MapEvaluator(recovery.record).query(points[outside])
+    before = RecordedView(record).query(points[outside])
+    after = RecordedView(recovery.record).query(points[outside])
     assert np.array_equal(before.sdf, after.sdf, equal_nan=True)
     assert np.array_equal(before.status, after.status)
 

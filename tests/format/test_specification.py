@@ -17,8 +17,8 @@ from triquad_format.mapfile.writer import write_map
 from triquad_format.records import morton
 from triquad_format.records.region import MapRecord
 from triquad_format.records.replay_rays import are_held_out
-from triquad_map.compiled.evidence.outcomes import outcome_counts
-from triquad_map.reference.evaluator import MapEvaluator
+from triquad_map.compiled.evidence.observations import outcome_counts
+from triquad_map.composition.recorded_view import RecordedView
 
 NEIGHBOURS = ((0, 0, 0), (1, 0, 0), (0, -1, 0), (1, -1, 0), (0, 0, 1))
 WIDE = dataclasses.replace(SMALL, depth=10)
@@ -90,12 +90,15 @@ def surface_voxels(region: Region) -> NDArray[np.float64]:
 
 def assert_agree(answers: Map, record: MapRecord, points: NDArray[np.float64]) -> None:
     have_sdf, have_gradient = answers.distance(points)
-    want = MapEvaluator(record).query(points, gradient=True)
+    want = RecordedView(record).query(points, gradient=True)
     np.testing.assert_array_equal(answers.status(points), want.status)
     np.testing.assert_allclose(have_sdf, want.sdf, rtol=1e-5, atol=1e-5)
     assert np.isfinite(have_sdf).any()
     apart = ~np.isclose(have_gradient, want.gradient, rtol=1e-3, atol=1e-3, equal_nan=True)
-    assert apart.any(1).mean() < 1e-3  # a sum that rounds to the other side of max(y, 0)
+    # On borders of cells, and in sums next to max(y, 0), rounding decides on the side.
+    halves = 2 * points / record.settings.leaf_m
+    within = (np.abs(halves - np.round(halves)) > 1e-3).all(axis=1)
+    assert apart.any(1)[within].mean() < 1e-3
 
 
 def assert_same_support(answers: Map, record: MapRecord) -> None:
@@ -182,11 +185,11 @@ def test_one_place_is_read_by_the_index(tmp_path: Path) -> None:
     path = write_variant(tmp_path / "map.triquad", "many squares")
     record = read_map(path)
     points = probes(spec_reader.load(path), 8)
-    assert np.isfinite(MapEvaluator(record).query(points).sdf).sum() > 8
+    assert np.isfinite(RecordedView(record).query(points).sdf).sum() > 8
     for point in points:
         file, parts = spec_reader.read_near(path, point[None])
         near = Map(file.values, parts)
-        have, want = near.distance(point[None])[0], MapEvaluator(record).query(point[None])
+        have, want = near.distance(point[None])[0], RecordedView(record).query(point[None])
         np.testing.assert_allclose(have, want.sdf, rtol=1e-5, atol=1e-5)
         assert near.status(point[None]) == want.status
         assert file.file.bytes_read < path.stat().st_size / 4

@@ -77,7 +77,7 @@ def error_of(alignment: Alignment, true: NDArray[np.float64] = TRUE) -> NDArray[
     return np.concatenate([true[:3, 3] - found[:3, 3], rotation_error(found, true)])
 
 
-@hypothesis_settings(max_examples=25, deadline=None)
+@hypothesis_settings(max_examples=8, deadline=None)
 @given(st.integers(0, 2**31), st.floats(0.0, 1.0), st.floats(0.0, 10.0))
 def test_a_scan_is_put_back_to_where_it_was_taken(seed: int, metres: float, degrees: float) -> None:
     found = align(view_of(YARD), scan_of(YARD), guessed(metres, degrees, seed), OPTIONS)
@@ -253,6 +253,7 @@ def test_a_scan_is_put_back_into_a_map_that_was_learnt() -> None:
         assert np.degrees(np.linalg.norm(error[3:])) < 0.5
 
 
+@pytest.mark.long
 def test_withheld_real_scans_are_put_back() -> None:
     if not SEOSAN.is_dir():
         pytest.skip("real scans seosan01 are not in ../shared/data")

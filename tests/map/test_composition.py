@@ -10,8 +10,8 @@ from support.map_records import evidence_of, random_record, with_support
 from triquad_format.records import morton
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.region import BLOCK_BYTES, MapRecord
-from triquad_map.composition.region import no_surfels
-from triquad_map.reference.evaluator import MapEvaluator
+from triquad_map.compiled.surfels.surfel_search import no_surfels
+from triquad_map.composition.recorded_view import RecordedView
 
 TWO = ((0, 0, 0), (1, 0, 0))
 APART = ((0, 0, 0), (1, 0, 0), (1, 1, 0), (-4, 2, 1))
@@ -71,7 +71,7 @@ def across_the_border(record: MapRecord, count: int, spread_m: float) -> np.ndar
 def test_the_nearest_unknown_space_may_lie_in_another_region(spread_m: float) -> None:
     record = widely_seen(random_record(3, indices=TWO, training=False))
     points = across_the_border(record, 40, spread_m)
-    found = MapEvaluator(record).nearest_unknown(points, 1.2)
+    found = RecordedView(record).nearest_unknown(points, 1.2)
     slow = SlowSpace(record)
     expected = [slow.nearest_unknown(point, 1.2) for point in points]
     np.testing.assert_allclose(found.distance, expected, atol=1e-9)
@@ -88,10 +88,10 @@ def test_the_nearest_surface_is_that_of_the_region_where_it_is_nearest(
     record = with_support(random_record(4, indices=indices, points=60, training=False))
     leaf_m = record.settings.leaf_m
     points = np.random.default_rng(5).uniform(-20, 30, (200, 3))
-    found = MapEvaluator(record).nearest_surface(points, 9.0)
+    found = RecordedView(record).nearest_surface(points, 9.0)
     best = np.full(len(points), 9.0)
     for region in record.regions:
-        alone = MapEvaluator(dataclasses.replace(record, regions=(region,)))
+        alone = RecordedView(dataclasses.replace(record, regions=(region,)))
         corner = record.settings.region_corner(region.index)
         nearest = no_surfels(np.full(len(points), 1e4))
         alone.region_views[0].surfels.find_nearest((points - corner) / leaf_m, nearest)
@@ -114,8 +114,8 @@ def test_confidence_fades_with_the_age_since_anything_was_seen_anywhere() -> Non
         for region, times in zip((old, new), seen_s, strict=True)
     )
     far_left = np.random.default_rng(6).uniform(-8, 0, (50, 3))
-    both = MapEvaluator(dataclasses.replace(record, regions=regions))
-    alone = MapEvaluator(dataclasses.replace(record, regions=regions[:1]))
+    both = RecordedView(dataclasses.replace(record, regions=regions))
+    alone = RecordedView(dataclasses.replace(record, regions=regions[:1]))
     aged, fresh = (view.nearest_surface(far_left, 3.0) for view in (both, alone))
     same = (aged.distance == fresh.distance) & aged.found
     assert same.sum() > 10

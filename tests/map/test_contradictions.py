@@ -9,8 +9,8 @@ from triquad_format.records.region import seen_voxels
 from triquad_map.compiled.evidence.carving import Reach
 from triquad_map.compiled.evidence.contradictions import Disbelief
 from triquad_map.compiled.evidence.live_evidence import LiveEvidence
-from triquad_map.compiled.evidence.outcomes import outcome_counts
-from triquad_map.compiled.evidence.sightings import Sighting
+from triquad_map.compiled.evidence.observations import outcome_counts
+from triquad_map.compiled.evidence.observed import Sighting
 from triquad_map.compiled.surfels.surfel_map import surfel_voxels
 from triquad_map.surface import SurfelKind, nothing_shown
 

@@ -5,8 +5,8 @@ from triquad_format.records.status import Status
 from triquad_map.compiled.evidence.carving import Reach
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
 from triquad_map.compiled.evidence.live_evidence import LiveEvidence
-from triquad_map.compiled.evidence.sightings import Sighting
-from triquad_map.composition.region import Work
+from triquad_map.compiled.evidence.observed import Sighting
+from triquad_map.compiled.team import Work
 from triquad_map.surface import LEVELS
 
 SIDE = 64

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from support import small_world
 from triquad_map.compiled.evidence.live_evidence import LiveEvidence
-from triquad_map.compiled.evidence.sightings import Sighting
+from triquad_map.compiled.evidence.observed import Sighting
+from triquad_map.compiled.field.frozen_field import field_samples
 from triquad_map.compiled.surfels.surfel_map import first_surfels
-from triquad_map.composition.field_view import field_samples, in_one
-from triquad_map.composition.region import no_surfels
+from triquad_map.compiled.surfels.surfel_search import no_surfels
+from triquad_map.compiled.team import in_one
 from triquad_map.surface import FieldSample, SurfelKind, Surfels, fit_surfels, nothing_shown
 from triquad_server.mapping.mapper import Mapper
 

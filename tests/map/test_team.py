@@ -6,8 +6,7 @@ import threading
 
 import numpy as np
 import pytest
-from triquad_map.compiled.priority import lower_priority
-from triquad_map.compiled.team import THREADS, Team
+from triquad_map.compiled.team import THREADS, Team, lower_priority
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ from triquad_format.records.crop import crop_record
 from triquad_format.records.region import MAX_SEEN_S, masked, seen_voxels, surface_counts
 from triquad_format.records.seen_space import owned_evidence
 from triquad_format.recovery.recovered_map import recover
-from triquad_map.compiled.evidence.outcomes import outcome_codes
+from triquad_map.compiled.evidence.observations import outcome_codes
 
 CUBES = dataclasses.replace(SMALL, depth=9)
 """Two cubes to a side."""

@@ -292,7 +292,7 @@ def test_no_state_left_on_streams():
 
 def test_format_needs_neither_server_nor_torch():
     code = (
-        "import sys, triquad_format.mapfile.reader, triquad_map.reference.evaluator\n"
+        "import sys, triquad_format.mapfile.reader, triquad_map.stored_map\n"
         "import triquad_format.records.crop\n"
         "bad = {'torch', 'numba', 'zenoh', 'skimage', 'triquad_server'} & set(sys.modules)\n"
         "assert not bad, bad"

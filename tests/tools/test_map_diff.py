@@ -9,7 +9,7 @@ from support.map_records import random_record
 from support.small_world import settings, settled_epoch, settled_mapper, world
 from triquad_client import OfflineMap
 from triquad_format.mapfile.writer import write_map
-from triquad_map.reference.evaluator import MapEvaluator
+from triquad_map.composition.recorded_view import RecordedView
 from triquad_tools.commands.inspect import main
 from triquad_tools.mapfiles.diff import compare, difference, surface_points
 
@@ -33,7 +33,7 @@ def test_surface_points_lie_on_the_surface_of_their_voxel():
     with OfflineMap(RAISED) as raised:
         points = surface_points(raised)
     assert len(points) == POINTS
-    assert np.abs(MapEvaluator(RAISED).query(points).sdf).max() <= 1e-4
+    assert np.abs(RecordedView(RAISED).query(points).sdf).max() <= 1e-4
     inside = np.abs(points[:, :2]).max(axis=1) < 1.9
     np.testing.assert_allclose(points[inside, 2], 0.15, atol=2e-4)
 

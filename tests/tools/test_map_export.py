@@ -17,9 +17,9 @@ from triquad_format.mapfile.writer import write_map
 from triquad_format.records.crop import crop_record
 from triquad_format.records.seen_space import surface_voxels
 from triquad_format.records.status import Status
-from triquad_map.compiled.mesh.mesher import mesh_tile
-from triquad_map.reference.evaluator import MapEvaluator
-from triquad_map.tile_join import joined
+from triquad_map.composition.recorded_view import RecordedView
+from triquad_map.mesh.mesher import mesh_tile
+from triquad_map.triangles import joined
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.tile_cache import tile_lattice
 from triquad_server.mesh.tile_queries import surface_tiles
@@ -53,7 +53,7 @@ def test_meshes_lie_on_the_surface(map_file, tmp_path):
     assert len(ply.faces) > 10_000
     np.testing.assert_array_equal(ply.faces, glb.faces)
     np.testing.assert_allclose(ply.vertices, glb.vertices, atol=1e-4)
-    answer = MapEvaluator(read_map(map_file)).query(ply.vertices)
+    answer = RecordedView(read_map(map_file)).query(ply.vertices)
     assert np.quantile(np.abs(answer.sdf), 0.95) < 0.01
     mesh = trimesh.Trimesh(ply.vertices, ply.faces, process=False)
     assert len(mesh.edges_unique) < 2 * len(ply.faces)  # tiles are joined
@@ -128,7 +128,7 @@ def test_dense_grid(map_file, tmp_path):
     np.testing.assert_allclose(grid["origin_m"], [0.2, -4.6, -2])
     assert grid["cell_m"] == 0.2
     cells = np.indices(grid["sdf"].shape).reshape(3, -1).T
-    answer = MapEvaluator(read_map(map_file)).query(grid["origin_m"] + cells * grid["cell_m"])
+    answer = RecordedView(read_map(map_file)).query(grid["origin_m"] + cells * grid["cell_m"])
     np.testing.assert_allclose(grid["sdf"].ravel(), answer.sdf, atol=1e-4)
     assert (grid["status"].ravel() != answer.status).mean() < 1e-3  # on borders of voxels
     assert (answer.status == Status.SURFACE).any()
@@ -160,7 +160,7 @@ def test_sparse_grid(map_file, tmp_path):
     assert len(np.unique(indices, axis=0)) == len(indices)
     record = read_map(map_file)
     points = (indices[:, None] * 8 + np.indices((8, 8, 8)).reshape(3, -1).T) * grid["cell_m"]
-    answer = MapEvaluator(record).query(points.reshape(-1, 3))
+    answer = RecordedView(record).query(points.reshape(-1, 3))
     np.testing.assert_allclose(sdf.ravel(), answer.sdf, atol=1e-4)
     # Around every voxel with seen surface there is a margin for interpolation.
     held = {tuple(index) for index in indices.tolist()}
@@ -176,7 +176,7 @@ def test_a_sparse_grid_within_a_box(map_file, tmp_path):
     assert (corners + 1.4 >= LOW - 0.8).all()
     assert (corners <= HIGH + 0.8).all()
     points = corners[:, None] + np.indices((8, 8, 8)).reshape(3, -1).T * grid["cell_m"]
-    answer = MapEvaluator(read_map(map_file)).query(points.reshape(-1, 3))
+    answer = RecordedView(read_map(map_file)).query(points.reshape(-1, 3))
     np.testing.assert_allclose(grid["sdf"].ravel(), answer.sdf, atol=1e-4)
 
 

@@ -15,7 +15,7 @@ from triquad_format.mapfile.writer import write_map
 from triquad_format.records.crop import SLACK_LEAVES, crop_record, without_training
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.map_progress import MapProgress
-from triquad_map.reference.evaluator import MapEvaluator
+from triquad_map.composition.recorded_view import RecordedView
 from triquad_tools.commands.pack import main
 
 CUBE = tuple(itertools.product((0, 1), repeat=3))
@@ -52,8 +52,8 @@ def test_crop_answers_in_the_box_as_before(low, high):
     record = random_record(2, indices=CUBE, points=200)
     cropped = crop_record(record, low, high)
     points = box_points(low, high)
-    before = MapEvaluator(record).query(points, gradient=True)
-    after = MapEvaluator(cropped).query(points, gradient=True)
+    before = RecordedView(record).query(points, gradient=True)
+    after = RecordedView(cropped).query(points, gradient=True)
     np.testing.assert_array_equal(before.sdf, after.sdf)
     np.testing.assert_array_equal(before.status, after.status)
     np.testing.assert_array_equal(before.gradient, after.gradient)
@@ -64,7 +64,7 @@ def test_crop_at_default_settings():
     low, high = [-300.3, 100.1, -50], [-200.2, 380.4, 60]
     cropped = crop_record(record, low, high)
     points = box_points(low, high)
-    before, after = (MapEvaluator(r).query(points, gradient=True) for r in (record, cropped))
+    before, after = (RecordedView(r).query(points, gradient=True) for r in (record, cropped))
     np.testing.assert_array_equal(before.sdf, after.sdf)
     np.testing.assert_array_equal(before.status, after.status)
     kept, all_ = (sum(len(t.codes) for t in r.regions[0].tables) for r in (cropped, record))

@@ -10,7 +10,7 @@ from support.small_world import settings, settled_mapper, world
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.reader import read_map
 from triquad_format.records.crop import crop_record
-from triquad_map.reference.evaluator import MapEvaluator
+from triquad_map.composition.recorded_view import RecordedView
 from triquad_tools.commands.pack import main
 from triquad_tools.mapfiles.field_change import draw_probes, field_change
 from triquad_tools.mapfiles.packing import INTEGER_ERROR_M
@@ -60,7 +60,7 @@ def test_a_trained_map_keeps_to_the_limit_and_shrinks(street, name, limit_m, req
 def test_statuses_stay(street, coarse):
     region = street.regions[0]
     points = draw_probes(street.settings, region, np.random.default_rng(5), 2000).points
-    before, after = (MapEvaluator(record).query(points) for record in (street, coarse.record))
+    before, after = (RecordedView(record).query(points) for record in (street, coarse.record))
     np.testing.assert_array_equal(before.status, after.status)
 
 
@@ -76,7 +76,7 @@ def test_integers_survive_the_file_and_become_floats_again(coarse, tmp_path):
     assert_same(read_map(tmp_path / "map.triquad"), packed)
     floats = dequantised(packed)
     points = np.random.default_rng(0).uniform(-20, 20, (2000, 3))
-    before, after = (MapEvaluator(record).query(points).sdf for record in (packed, floats))
+    before, after = (RecordedView(record).query(points).sdf for record in (packed, floats))
     np.testing.assert_array_equal(before, after)
 
 

@@ -18,10 +18,10 @@ from triquad_format.wire.query_messages import (
     SpheresReply,
     SpheresRequest,
 )
-from triquad_map.asked import asked
 from triquad_map.questions.distance import Distances, Unknown, UnknownLike, with_unknown
 from triquad_map.questions.grid import Grid
 from triquad_map.questions.spheres import Spheres
+from triquad_map.view import asked
 
 from triquad_client import checks
 from triquad_client.calls.parts import Asking, Part

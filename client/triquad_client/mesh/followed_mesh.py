@@ -14,8 +14,7 @@ from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.wire.limits import MAX_KNOWN_TILES
 from triquad_format.wire.mesh_messages import TileUpdates, TileUpdatesRequest
 from triquad_format.wire.tile_codec import TileSurface, decode_tile, decoded_bytes
-from triquad_map.tile_join import joined
-from triquad_map.triangles import Triangles
+from triquad_map.triangles import Triangles, joined
 
 from triquad_client import checks
 from triquad_client.checks import Bounds

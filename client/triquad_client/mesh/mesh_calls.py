@@ -7,7 +7,7 @@ from triquad_format.records.arrays import Bools, Ints
 from triquad_format.wire import keys
 from triquad_format.wire.limits import MAX_FILL_M
 from triquad_format.wire.mesh_messages import MeshReply, MeshRequest, TileList, TileListRequest
-from triquad_map.tile_join import TileJoin
+from triquad_map.triangles import TileJoin
 
 from triquad_client import checks
 from triquad_client.checks import Bounds

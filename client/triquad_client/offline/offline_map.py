@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from numpy.typing import ArrayLike
-from triquad_format.errors import InvalidInputError, RefusedError
+from triquad_format.errors import RefusedError
 from triquad_format.mapfile.checkpoint_folder import checkpoint_files, map_folder
 from triquad_format.mapfile.reader import read_map_file
 from triquad_format.records.arrays import Bools, Doubles
@@ -41,13 +41,12 @@ class LocalMap(Answering):
     """Answers requests about the map in a record, as fast as possible here; for several threads."""
 
     def __init__(self, record: MapRecord) -> None:
-        self.opened = open_view(record)
-        self.view = self.opened.view
+        self.view = open_view(record)
         self._answers = Answers(self._epoch, _NO_LIMITS)
 
     def close(self) -> None:
-        """End the threads that compiled code works on; what is asked later is slower."""
-        self.opened.close()
+        """End the threads that compiled code works on; nothing may be asked any more."""
+        self.view.close()
 
     def replies(
         self,
@@ -103,8 +102,6 @@ class OfflineMap(MapQueries):
         """Side of the voxels in which rays ended."""
         self.stamp_ns = stamp_ns
         """The time when its epoch was written, nanoseconds since 1970; 0: the file does not say."""
-        self.compiled = opened.opened.compiled
-        """True where compiled code answers, as in the server; else numpy, which is far slower."""
 
     def __enter__(self) -> "OfflineMap":
         return self
@@ -137,7 +134,7 @@ class OfflineMap(MapQueries):
 
         Raises:
             InvalidInputError: the bounds are not a box, the cells or ``fill_m`` are out of range,
-                there are more than 50 million faces, or numba is not installed.
+                or there are more than 50 million faces.
             ClosedError: the map was closed.
         """
         return self._tiles(cell_m, bounds, fill_m, whole=True).joined(report)
@@ -150,7 +147,7 @@ class OfflineMap(MapQueries):
             fill_m: as of :meth:`mesh`.
 
         Raises:
-            InvalidInputError: the cells or ``fill_m`` are out of range, or numba is not installed.
+            InvalidInputError: the cells or ``fill_m`` are out of range.
             ClosedError: the map was closed.
         """
         return self._tiles(cell_m, None, fill_m, whole=False)
@@ -162,11 +159,6 @@ class OfflineMap(MapQueries):
         chosen_m = _CELL_LEAVES * self.leaf_m if cell_m is None else cell_m
         checked_m = checks.within("cell_m", chosen_m, CELL_RANGE_M[1], least=CELL_RANGE_M[0])
         box, fill_m = checks.box(bounds), checks.within("fill_m", fill_m, MAX_FILL_M, least=0.0)
-        if not self.compiled:
-            raise InvalidInputError(
-                "meshes of map files are made by compiled code, and numba is missing: "
-                "pip install 'triquad[fast]'"
-            )
         from triquad_client.offline.map_mesh import MapTiles, map_lattice
 
         lattice = map_lattice(checked_m, _REACH_LEAVES * self.leaf_m, whole=whole)
@@ -198,10 +190,9 @@ class OfflineMap(MapQueries):
 def open_map(path: str | Path) -> OfflineMap:
     """Return the map in a file, read whole and checked.
 
-    With numba installed (``pip install 'triquad[fast]'``) it answers as fast as a server; without
-    it some forty times as slowly, as a warning in the log says. The surfels, on which distances
-    depend, are made at the first question that needs them: half a second for 100 m of street, or
-    ten seconds without numba.
+    It is answered as fast as by a server, by compiled code: that takes numba. The surfels, on which
+    distances depend, are made at the first question that needs them: half a second for 100 m of
+    street.
 
     Args:
         path: a map file, next to which the other files lie that contain parts of it; or a server's
@@ -210,6 +201,7 @@ def open_map(path: str | Path) -> OfflineMap:
     Raises:
         MapFileError: it is no map file, is damaged, or needs a newer reader.
         OSError: it cannot be read.
+        NoCompiledCodeError: numba is missing: ``pip install 'triquad[fast]'``.
     """
     chosen = Path(path)
     if chosen.is_dir():

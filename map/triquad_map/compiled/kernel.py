@@ -29,7 +29,6 @@ by zero gives no exception, for which each division would test (a sixth of the t
 _CONSTANTS = (
     "triquad_format/records/",
     "triquad_map/compiled/kernel.py",
-    "triquad_map/composition/region.py",
     "triquad_map/surface.py",
     "triquad_map/view.py",
 )

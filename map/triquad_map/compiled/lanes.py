@@ -1,4 +1,4 @@
-"""Eight numbers at once, as kernels compute with them.
+"""Instructions that kernels cannot say in Python: eight numbers at once, and prefetching.
 
 The compiler makes vector instructions of long loops, but not of loops over eight numbers, nor does
 it find by itself the few of them that are small enough. So here a vector of the processor is a
@@ -182,3 +182,29 @@ def lowest_bit(_: Any, bits: Any) -> Any:
         return _call(builder, "llvm.cttz.i64", _INT64, [wide, ir.Constant(ir.IntType(1), 1)])
 
     return types.int64(bits), generate
+
+
+_INT32 = ir.IntType(32)
+
+
+@kernel_code
+def prefetch_row(_: Any, table: Any, row: Any) -> Any:
+    """Ask for ``table[row]`` to be brought into the cache."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        kind, row_kind = signature.args
+        data = context.make_array(kind)(context, builder, args[0])
+        number = context.cast(builder, args[1], row_kind, types.intp)
+        indices = [number, context.get_constant(types.intp, 0)]
+        row_start = cgutils.get_item_pointer(
+            context, builder, kind, data, indices, wraparound=False
+        )
+        bytes_ = ir.IntType(8).as_pointer()
+        address = builder.bitcast(row_start, bytes_)
+        kind_of_call = ir.FunctionType(ir.VoidType(), [bytes_, _INT32, _INT32, _INT32])
+        call = cgutils.get_or_insert_function(builder.module, kind_of_call, "llvm.prefetch.p0")
+        # To read, for all cache levels, data.
+        builder.call(call, [address, *(ir.Constant(_INT32, flag) for flag in (0, 3, 1))])
+        return context.get_dummy_value()
+
+    return types.void(table, row), generate

@@ -1,14 +1,29 @@
-"""Splits the loops of compiled code over the cores; kernels run without Python's lock."""
+"""Splits the loops of compiled code over the cores, by threads of a priority; kernels run without
+Python's lock.
+"""
 
 import contextlib
 import os
+import sys
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import partial
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
-from triquad_map.compiled.priority import lower_priority
+
+def lower_priority(niceness: int) -> None:
+    """Have the calling thread leave the cores to threads of less ``niceness``, 0 being the least.
+
+    The niceness is added to that of the process, whichever thread started this one. Where the
+    system does not know priorities of single threads, nothing happens.
+    """
+    if niceness and sys.platform == "linux":
+        # Not what the thread has: it may have been started by one that was lowered itself.
+        nice = os.getpriority(os.PRIO_PROCESS, os.getpid()) + niceness
+        with contextlib.suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), nice)
+
 
 THREADS = max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1)
 """Threads that share the work: one per core that this process may use."""
@@ -18,6 +33,22 @@ OtherT = TypeVar("OtherT")
 
 _MIN_SHARE = 2048
 """Points of a field below which splitting work costs more than it gains."""
+
+
+Work = Callable[[int, int], None]
+"""Does the part ``range(first, last)`` of some work."""
+
+
+class Split(Protocol):
+    """Runs work over ``range(count)``, in parts at the same time where it is worth it."""
+
+    def __call__(self, count: int, work: Work, least: int = ...) -> None:
+        """Run work; ``least`` is how many a part has at least, where the default is too many."""
+
+
+def in_one(count: int, work: Work, least: int = 0) -> None:  # noqa: ARG001
+    """Do all work on the caller's thread alone: a :class:`Split`."""
+    work(0, count)
 
 
 class _Part:
@@ -64,7 +95,7 @@ class Team:
         """Run ``work(part)`` for every part of ``range(THREADS)``, at the same time."""
         self._run(work, THREADS)
 
-    def split(self, count: int, work: Callable[[int, int], None], least: int = _MIN_SHARE) -> None:
+    def split(self, count: int, work: Work, least: int = _MIN_SHARE) -> None:
         """Run ``work(first, last)`` over ``range(count)``, in parallel where it is worth it.
 
         ``least`` is how many a thread is given at least.

@@ -1,19 +1,22 @@
-"""Sparse voxels in compiled code: a hash index of 3-D cells, and bits of voxels in blocks.
+"""Sparse voxels in compiled code: a hash index of cells, and bits of voxels in blocks.
 
 Everything that is sparse in space is kept in rows that such an index finds by the cells of an
 unbounded lattice. What is one bit a voxel is kept in masks of blocks, cubes of 8 x 8 x 8 voxels:
 a byte holds the 8 voxels of one column along z.
 """
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
+from triquad_format.records import morton
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Ints, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
 
 from triquad_map.compiled.kernel import kernel
+
+CoordinateT = TypeVar("CoordinateT")
 
 EMPTY = np.int64(-1)
 _MULTIPLIER = 0x9E3779B97F4A7C15 - (1 << 64)  # 2**64 / golden ratio, as a signed number
@@ -63,6 +66,23 @@ def home_slot(key: Any, mask: int) -> Any:
     What is multiplied carries to higher bits only, and a key has the x of its cell from bit 42 on.
     """
     return (key * _MULTIPLIER >> 40) & mask
+
+
+@register_jitable
+def morton_code(first: CoordinateT, second: CoordinateT) -> CoordinateT:
+    """Return 2-D Morton codes of non-negative int64 coordinates below 2**31: numbers or tensors.
+
+    Those of :mod:`triquad_format.records.morton`.
+    """
+    codes: CoordinateT = _spread(first) | (_spread(second) << 1)
+    return codes
+
+
+@register_jitable
+def _spread(bits: Any) -> Any:
+    for shift, mask in morton.SPREAD_2D:
+        bits = (bits | (bits << shift)) & mask
+    return bits
 
 
 @kernel(inline="always")

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 
-from triquad_map.composition.field_view import FieldView, in_one
-from triquad_map.composition.region import MapRegion, RegionFrame, Split
+from triquad_map.compiled.surfels.nearest_surface import RegionFrame
+from triquad_map.compiled.team import Split, in_one
+from triquad_map.composition.field_view import FieldView, MapRegion
 from triquad_map.view import NearestSurface, NearestUnknown
 
 Rows = NDArray[np.intp]
@@ -32,8 +33,6 @@ class ComposedView(FieldView):
         """Compose regions; ``split`` shares the work of a question among threads."""
         super().__init__(settings, regions, split)
         self.epoch = epoch
-        self.region_views = tuple(regions)
-        self._by_index = {region.index: region for region in regions}
         self._newest_s = max((region.evidence.newest_s for region in regions), default=0)
 
     @property
@@ -106,7 +105,7 @@ class ComposedView(FieldView):
         else:
             homes, owners = np.unique(cells, axis=0, return_inverse=True)
             owners = owners.reshape(-1)
-        known = np.array([tuple(home) in self._by_index for home in homes.tolist()], np.bool_)
+        known = np.array([tuple(home) in self._regions_at for home in homes.tolist()], np.bool_)
         # Most points that are far from the map need nothing more, however many cells they lie in.
         nowhere = np.flatnonzero(~known[owners])
         found.distance[nowhere] = 0.0
@@ -121,9 +120,9 @@ class ComposedView(FieldView):
     def _improve_in_cell(self, found: NearestUnknown, points: Doubles, home: RegionIndex) -> None:
         """Do as :meth:`_improve_unknown`, of points in the cell of one region."""
         # Mostly that is all: what it finds is nearer than the other cells.
-        self._search_region(found, points, self._by_index[home])
+        self._search_region(found, points, self._regions_at[home])
         for cell in self._cells_around(points, float(found.distance.max())):
-            region = self._by_index.get(cell)
+            region = self._regions_at.get(cell)
             if region is None:
                 self._search_empty_cell(found, points, cell)
             elif cell != home:

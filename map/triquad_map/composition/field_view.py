@@ -8,33 +8,53 @@ its core, away from the overlap, a region is the only one that covers a point.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Longs
-from triquad_format.records.field_settings import FieldSettings
+from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats
+from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.status import Status
 
-from triquad_map.composition.region import (
-    FieldEngine,
-    FieldRegion,
-    FieldValues,
-    Split,
-    Work,
-    in_grid,
-)
-from triquad_map.surface import FieldSample, SampleField
+from triquad_map.compiled.evidence.evidence import FrozenEvidence
+from triquad_map.compiled.field.frozen_field import FieldEngine, FieldValues
+from triquad_map.compiled.surfels.surfel_map import SurfelMap
+from triquad_map.compiled.team import Split, in_one
 from triquad_map.view import FieldAnswer
 
 _REACH_VOXELS = 0.5
 """The reach of a surface beyond the voxels in which rays ended, in voxels."""
 
 
+class MapRegion(Protocol):
+    """A region of a map that does not change."""
+
+    @property
+    def index(self) -> RegionIndex:
+        """The index of the region."""
+
+    @property
+    def centre(self) -> Doubles:
+        """[3] metres, map frame."""
+
+    @property
+    def engine(self) -> FieldEngine:
+        """The engine that computes its field."""
+
+    @property
+    def evidence(self) -> FrozenEvidence:
+        """The space that rays have shown of it."""
+
+    @property
+    def surfels(self) -> SurfelMap:
+        """The surfels of its surface. They must not be asked for within a :class:`Split`."""
+
+
 @dataclass(frozen=True)
 class _Owned:
     """Points of a query that one region answers for."""
 
-    region: FieldRegion
+    region: MapRegion
     points: slice | NDArray[np.intp]  # which of the query's
 
 
@@ -46,7 +66,7 @@ class _Owners:
     shared: NDArray[np.intp]  # points that other regions may cover, too
 
     @property
-    def only(self) -> FieldRegion | None:
+    def only(self) -> MapRegion | None:
         """The region that owns all points, and alone covers them, if one does."""
         if len(self.groups) == 1 and not len(self.shared):
             (owned,) = self.groups
@@ -59,20 +79,15 @@ _NONE_SHARED = np.zeros(0, np.intp)
 _ALL = slice(None)
 
 
-def in_one(count: int, work: Work, least: int = 0) -> None:  # noqa: ARG001
-    """Do all work on the caller's thread alone: a :class:`Split`."""
-    work(0, count)
-
-
 class FieldView:
     """Field and status of an immutable map, for any thread."""
 
     def __init__(
-        self, settings: FieldSettings, regions: Sequence[FieldRegion], split: Split = in_one
+        self, settings: FieldSettings, regions: Sequence[MapRegion], split: Split = in_one
     ) -> None:
         """View regions; ``split`` shares the work of a question among threads."""
         self._settings = settings
-        self._field_regions = tuple(regions)
+        self.region_views = tuple(regions)
         self._split = split
         self._regions_at = {region.index: region for region in regions}
         self._cells = np.array([region.index for region in regions], np.float64).reshape(-1, 3).T
@@ -107,26 +122,7 @@ class FieldView:
         self._split(len(points), work)
         return distances
 
-    def distances_in_grid(self, axes: Doubles, points: Longs) -> Floats:
-        """Do as :meth:`distances`, but for rounding, at points of a grid: in half the time.
-
-        Args:
-            axes: [3, S] its coordinates on each axis, metres, map frame.
-            points: [N, 3] the points, by their numbers on the axes.
-        """
-        region = self._only_region(axes.min(axis=1), axes.max(axis=1))
-        if region is None:
-            return self.distances(in_grid(axes, points))
-        local = (axes - region.centre[:, None]).astype(np.float32)
-        distances = np.empty(len(points), np.float32)
-
-        def work(first: int, last: int) -> None:
-            distances[first:last] = region.engine.evaluate_in_grid(local, points[first:last])
-
-        self._split(len(points), work)
-        return distances
-
-    def _only_region(self, low: Doubles, high: Doubles) -> FieldRegion | None:
+    def _only_region(self, low: Doubles, high: Doubles) -> MapRegion | None:
         """Return the region that alone covers the box between two corners [3], if one does."""
         pitch_m = self._settings.region_pitch_m
         core_m = self._settings.region_side_m / 2 - self._settings.overlap_m
@@ -165,7 +161,7 @@ class FieldView:
         reach = reach_m / self._settings.leaf_m
         surface = np.zeros(axes.shape[1:] * 3, np.bool_)
         cells = np.floor(axes / self._settings.region_pitch_m + 0.5)
-        for region in self._field_regions:
+        for region in self.region_views:
             owned = [
                 slice(*np.searchsorted(axis, (at, at + 1)))
                 for axis, at in zip(cells, region.index, strict=True)
@@ -216,7 +212,7 @@ class FieldView:
         outside = ((self._cells < low) | (self._cells > high)).any(axis=0)
         groups = []
         for number in np.flatnonzero(~outside).tolist():
-            region = self._field_regions[number]
+            region = self.region_views[number]
             if (low == high).all():
                 groups.append(_Owned(region, _ALL))
                 continue
@@ -234,7 +230,7 @@ class FieldView:
             status[owned.points] = self._status_in(owned.region, points[owned.points], reach)
         return status
 
-    def _status_in(self, region: FieldRegion, points: Doubles, reach: float) -> Bytes:
+    def _status_in(self, region: MapRegion, points: Doubles, reach: float) -> Bytes:
         voxels = self._settings.leaf_coordinates(points - region.centre)
         return region.evidence.status(voxels, reach)
 
@@ -261,7 +257,7 @@ class FieldView:
         value_sum = np.zeros(len(points))
         slope_sum = np.zeros((len(points), 3))  # of weight * value
         tilt_sum = np.zeros((len(points), 3))  # of weight
-        for region in self._field_regions:
+        for region in self.region_views:
             offsets = points - region.centre
             mine = np.flatnonzero((np.abs(offsets) < half).all(axis=1))
             if len(mine) == 0:
@@ -283,7 +279,7 @@ class FieldView:
         return FieldValues(sdf.astype(np.float32), slopes.astype(np.float32))
 
 
-def _values_in(region: FieldRegion, points: Doubles, gradient: bool) -> FieldValues:
+def _values_in(region: MapRegion, points: Doubles, gradient: bool) -> FieldValues:
     """Return the field of a region at points [N, 3]."""
     return region.engine.evaluate((points - region.centre).astype(np.float32), gradient)
 
@@ -302,22 +298,3 @@ def _ramp_gradient(offsets: Doubles, ramps: Doubles, overlap_m: float) -> Double
         [ramps[:, 1] * ramps[:, 2], ramps[:, 0] * ramps[:, 2], ramps[:, 0] * ramps[:, 1]], axis=1
     )
     return slopes * others
-
-
-def field_samples(engine: FieldEngine, settings: FieldSettings, split: Split) -> SampleField:
-    """Return the field of a region in voxels, at its leaf coordinates."""
-
-    def sample(voxels: Doubles) -> FieldSample:
-        local = settings.offsets(voxels).astype(np.float32)
-        values = np.empty(len(local), np.float32)
-        gradients = np.empty((len(local), 3), np.float32)
-
-        def work(first: int, last: int) -> None:
-            part = engine.evaluate(local[first:last], True)
-            values[first:last] = part.sdf / settings.leaf_m
-            gradients[first:last] = part.gradient
-
-        split(len(local), work)
-        return FieldSample(values, gradients)
-
-    return sample

@@ -16,11 +16,9 @@ from triquad_format.wire.codec import Message
 from triquad_format.wire.limits import (
     MAX_DISTANCE_M,
     MAX_ITERATIONS,
-    MAX_POSITION_M,
     MAX_QUERY_POINTS,
     MAX_RANGE_M,
     MAX_SEARCHES,
-    MIN_LENGTH_M,
     RAY_M_PER_SEARCH,
     SEGMENT_M_PER_SEARCH,
 )
@@ -42,6 +40,7 @@ from triquad_format.wire.query_messages import (
     SpheresRequest,
 )
 
+from triquad_map.questions import checks
 from triquad_map.questions.align import AlignOptions, align
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.questions.grid import GridShape, grid
@@ -50,8 +49,6 @@ from triquad_map.questions.rays import RayOptions, rays
 from triquad_map.questions.segments import SegmentOptions, segments
 from triquad_map.questions.spheres import spheres
 from triquad_map.view import MapView
-
-_DECIMALS = 5  # of positions, metres
 
 
 @dataclass(frozen=True)
@@ -87,7 +84,7 @@ class Answers:
 
     def sdf(self, request: SdfRequest) -> SdfReply:
         """Return the trained field, and status."""
-        points = _points("point", request.origin, request.points, most=self._limits.points)
+        points = checks.points("point", request.origin, request.points, most=self._limits.points)
         with self._view(request.epoch) as view:
             answer = view.query(points, request.gradient)
             return SdfReply(
@@ -100,7 +97,7 @@ class Answers:
     def distance(self, request: DistanceRequest) -> DistanceReply:
         """Return distances to the nearest surface."""
         points = self._searched("point", request.origin, request.points)
-        reach_m = _within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M)
+        reach_m = checks.within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M)
         options = DistanceOptions(reach_m, request.surface_point, request.unknown_distance)
         with self._view(request.epoch) as view:
             answer = distances(view, points, options)
@@ -125,7 +122,7 @@ class Answers:
     def spheres(self, request: SpheresRequest) -> SpheresReply:
         """Return what spheres contain."""
         centres = self._searched("sphere", request.origin, request.centres)
-        _same_length(request.centres, "radii_m", request.radii_m)
+        checks.same_length(request.centres, "radii_m", request.radii_m)
         good = (request.radii_m >= 0) & (request.radii_m <= MAX_DISTANCE_M)
         if not good.all():
             worst = int((~good).argmax())
@@ -140,11 +137,11 @@ class Answers:
     def segments(self, request: SegmentsRequest) -> SegmentsReply:
         """Return what a ball meets on segments."""
         starts = self._searched("start", request.origin, request.starts)
-        _same_length(request.starts, "ends", request.ends)
+        checks.same_length(request.starts, "ends", request.ends)
         ends = self._searched("end", request.origin, request.ends)
         options = SegmentOptions(
-            _within("radius_m", request.radius_m, MAX_DISTANCE_M, least=0.0),
-            _within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M),
+            checks.within("radius_m", request.radius_m, MAX_DISTANCE_M, least=0.0),
+            checks.within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M),
         )
         lengths = np.linalg.norm(ends - starts, axis=1)
         if lengths.max(initial=0.0) > MAX_RANGE_M:  # each step waits for the one before
@@ -171,7 +168,7 @@ class Answers:
     def rays(self, request: RaysRequest) -> RaysReply:
         """Return how far rays reach."""
         starts = self._searched("start", request.origin, request.starts)
-        _same_length(request.starts, "directions", request.directions)
+        checks.same_length(request.starts, "directions", request.directions)
         directions = request.directions.astype(np.float64)
         lengths = np.linalg.norm(directions, axis=1)
         bad = ~(np.abs(lengths - 1.0) < 1e-3)
@@ -180,7 +177,7 @@ class Answers:
             raise RefusedError(
                 "bad_request", f"direction {worst} has length {lengths[worst]:g}, not 1"
             )
-        reach_m = _within("max_range_m", request.max_range_m, MAX_RANGE_M)
+        reach_m = checks.within("max_range_m", request.max_range_m, MAX_RANGE_M)
         self._check_count(
             len(starts) * reach_m / RAY_M_PER_SEARCH, f"{len(starts)} rays of {reach_m:g} m"
         )
@@ -192,7 +189,7 @@ class Answers:
     def ground(self, request: GroundRequest) -> GroundReply:
         """Return what lies below points."""
         points = self._searched("point", request.origin, request.points)
-        drop_m = _within("max_drop_m", request.max_drop_m, MAX_DISTANCE_M)
+        drop_m = checks.within("max_drop_m", request.max_drop_m, MAX_DISTANCE_M)
         self._check_count(
             len(points) * drop_m / RAY_M_PER_SEARCH, f"{len(points)} points with {drop_m:g} m below"
         )
@@ -209,14 +206,14 @@ class Answers:
     def grid(self, request: GridRequest) -> GridReply:
         """Return distance and status at a grid's cells."""
         counts = (int(request.counts[0]), int(request.counts[1]), int(request.counts[2]))
-        cell_m = _within("cell_m", request.cell_m, MAX_DISTANCE_M)
+        cell_m = checks.within("cell_m", request.cell_m, MAX_DISTANCE_M)
         if min(counts) < 1 or not np.isfinite(request.corner).all():
             raise RefusedError(
                 "bad_request", f"not a grid: counts {counts}, corner {request.corner}"
             )
         shape = GridShape(request.corner, cell_m, counts)
         self._check_count(shape.cells, f"{shape.cells} cells")
-        reach_m = _within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M)
+        reach_m = checks.within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M)
         with self._view(request.epoch) as view:
             answer = grid(view, shape, reach_m)
         return GridReply(answer.epoch, answer.distance_m, answer.status)
@@ -230,8 +227,8 @@ class Answers:
                 f"world_from_sensor is no rotation and translation: {request.world_from_sensor}",
             )
         options = AlignOptions(
-            _within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M),
-            int(_within("max_iterations", request.max_iterations, MAX_ITERATIONS, least=1)),
+            checks.within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M),
+            int(checks.within("max_iterations", request.max_iterations, MAX_ITERATIONS, least=1)),
         )
         with self._view(request.epoch) as view:
             answer = align(
@@ -249,7 +246,7 @@ class Answers:
         )
 
     def _searched(self, what: str, origin: Doubles, offsets: Floats) -> Doubles:
-        return _points(what, origin, offsets, most=self._limits.searches)
+        return checks.points(what, origin, offsets, most=self._limits.searches)
 
     def _check_count(self, count: float, what: str) -> None:
         if count > self._limits.searches:
@@ -269,43 +266,6 @@ _ANSWERS: dict[type[Message], Callable[[Answers, Any], Message]] = {
     GridRequest: Answers.grid,
     AlignRequest: Answers.align,
 }
-
-
-def _points(what: str, origin: Doubles, offsets: Floats, most: int) -> Doubles:
-    """Return points [N, 3] of the map frame.
-
-    Raises:
-        RefusedError: they are too many, or not all of them are places.
-    """
-    if len(offsets) > most:
-        raise RefusedError(
-            "too_large", f"{len(offsets)} points exceed the limit of {most}: split the request"
-        )
-    points = origin + offsets.astype(np.float64)
-    # Of NaN, neither is true.
-    if points.min(initial=0.0) >= -MAX_POSITION_M and points.max(initial=0.0) <= MAX_POSITION_M:
-        # Single precision from an origin is good to that. Unrounded, a point that somebody chose on
-        # a face of voxels would lie on one side or the other by what else is in the request.
-        rounded: Doubles = np.round(points, _DECIMALS)
-        return rounded
-    index = int((np.abs(points) <= MAX_POSITION_M).all(axis=1).argmin())
-    if not np.isfinite(points[index]).all():
-        raise RefusedError("bad_request", f"{what} {index} is not finite: {points[index]}")
-    raise RefusedError(
-        "bad_request",
-        f"{what} {index} is {points[index]}: use coordinates up to {MAX_POSITION_M:g} m",
-    )
-
-
-def _within(name: str, value: float, most: float, least: float = MIN_LENGTH_M) -> float:
-    if not least <= value <= most:
-        raise RefusedError("bad_request", f"{name} = {value}: use {least:g} to {most:g}")
-    return float(value)
-
-
-def _same_length(first: Floats, name: str, second: Floats) -> None:
-    if len(first) != len(second):
-        raise RefusedError("bad_request", f"{len(second)} {name} for {len(first)} points")
 
 
 def _relative(points: Doubles, origin: Doubles) -> Floats:

@@ -1,9 +1,10 @@
 """True distances to the nearest surface, at any range."""
 
 import dataclasses
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from enum import Enum
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +12,8 @@ from triquad_format.errors import TriquadError
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats
 from triquad_format.records.status import Status
 
-from triquad_map.asked import asked
-from triquad_map.questions.joined import joined
 from triquad_map.surface import DISC_RADIUS
-from triquad_map.view import NO_LENGTH_M, MapView, NearestSurface
+from triquad_map.view import NO_LENGTH_M, MapView, NearestSurface, asked
 
 # Arrays take numbers sooner than they take members of an enumeration.
 _SURFACE, _UNKNOWN = int(Status.SURFACE), int(Status.UNKNOWN)
@@ -110,7 +109,19 @@ class Distances:
 def distances(view: MapView, points: Doubles, options: DistanceOptions) -> Distances:
     """Return distances from ``points`` [N, 3], metres, map frame, to the nearest seen surface."""
     firsts = range(0, max(1, len(points)), _PART_POINTS)
-    return joined([_distances(view, points[at : at + _PART_POINTS], options) for at in firsts])
+    return _joined([_distances(view, points[at : at + _PART_POINTS], options) for at in firsts])
+
+
+def _joined(answers: Sequence[Distances]) -> Distances:
+    """Return the answers to consecutive points as one."""
+    if len(answers) == 1:
+        return answers[0]
+    columns: dict[str, Any] = {}
+    for field in fields(Distances):
+        parts = [getattr(answer, field.name) for answer in answers]
+        if isinstance(parts[0], np.ndarray):
+            columns[field.name] = np.concatenate(parts)
+    return dataclasses.replace(answers[0], **columns)
 
 
 def _distances(view: MapView, points: Doubles, options: DistanceOptions) -> Distances:
@@ -211,8 +222,8 @@ def _join_rays(
     close = np.hypot(height, beyond)
     is_point = ~normal.any(axis=1)
     close[is_point] = distance[rows[is_point]] - DISC_RADIUS * view.voxel_m
-    feet = points[rows] - height[:, None] * normal
-    ended = view.status(feet, reach_m=0.0) == _SURFACE  # else beyond an edge
+    below = points[rows] - height[:, None] * normal  # the points, moved onto the planes
+    ended = view.status(below, reach_m=0.0) == _SURFACE  # else beyond an edge
     behind = ended & (height < 0) & (height > -_FIELD_VOXELS * view.voxel_m) & (beyond == 0)
     side = np.where(behind, -1.0, 1.0)
     share = _surfel_share(view, distance[rows])

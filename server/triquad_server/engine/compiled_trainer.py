@@ -30,7 +30,7 @@ from triquad_map.compiled.field.field import (
     transposed,
 )
 from triquad_map.compiled.kernel import inner_kernel, kernel
-from triquad_map.compiled.row_access import prefetch_row
+from triquad_map.compiled.lanes import prefetch_row
 from triquad_map.compiled.team import THREADS, Team, share
 
 from triquad_server.engine.gradient_sums import GradientSums, Touched
@@ -41,7 +41,7 @@ EPSILON = 1e-10
 _NEGLIGIBLE = 1e-8
 _MAX_CORRECTED = 1 << 20
 _AHEAD = 12  # rows that are fetched into the cache in advance
-_NONE_HELD = np.zeros(0, np.bool_)
+_NONE_FIXED = np.zeros(0, np.bool_)
 
 
 class ParameterRows(NamedTuple):
@@ -122,12 +122,12 @@ def _step_touched(
     touched: tuple[Touched, ...],
     sums: tuple[Floats, ...],
     parameter: ParameterRows,
-    held: Bools,
+    fixed: Bools,
     rates: CompiledRates,
 ) -> None:
     """Apply Adam to the ``count`` rows that the thread ``part`` touched, and clear their sums.
 
-    A row that several threads touched is updated by the first of them. Rows that are ``held`` [N]
+    A row that several threads touched is updated by the first of them. Rows that are ``fixed`` [N]
     take no step.
     """
     rows = touched[part].rows
@@ -148,7 +148,7 @@ def _step_touched(
             for k in range(sums[part].shape[1]):
                 sums[part][row, k] += sums[other][row, k]
                 sums[other][row, k] = 0
-        if mine and row < len(held) and held[row]:
+        if mine and row < len(fixed) and fixed[row]:
             sums[part][row] = 0
         elif mine:
             _step_row(row, sums[part], parameter, rates)
@@ -272,15 +272,25 @@ class CompiledTrainer:
     def _step(self, counts: list[int], mlp_sums: list[Mlp], rates: Rates) -> None:
         """Apply Adam to the MLP and to the touched rows, ``counts`` of them by each thread."""
         compiled = CompiledRates.of(rates)
-        if self._field.held is None:
+        fixed = self._field.fixed
+        if fixed is None:
             self._step_mlp(mlp_sums, compiled)
+            fixed = _NONE_FIXED
         sums, features = self._sums, _parameter_rows(self._field.features)
-        held = _NONE_HELD if self._field.held is None else self._field.held
-        self._team.each(
-            lambda part: _step_touched(
-                part, counts[part], sums.step, sums.touched, sums.features, features, held, compiled
+
+        def work(part: int) -> None:
+            _step_touched(
+                part,
+                counts[part],
+                sums.step,
+                sums.touched,
+                sums.features,
+                parameter=features,
+                fixed=fixed,
+                rates=compiled,
             )
-        )
+
+        self._team.each(work)
 
     def _step_mlp(self, sums: list[Mlp], rates: CompiledRates) -> None:
         """Apply Adam to the MLP, by the gradients of each thread."""

@@ -154,12 +154,12 @@ class LiveField:
         for part in self.mlp:
             part.steps[:] = mlp_steps
         self.mlp_steps = mlp_steps  # to read its own from a GPU would have to wait for it
-        self.held: Rows | None = None
+        self.fixed: Rows | None = None
         """The mask of the first rows [N] that stay fixed, as does the MLP; None: no rows."""
 
         self.version = 0  # rises with each step of training
         self._frequencies = memory.put(frequencies)
-        self._vertices_held = 0
+        self._vertices_fixed = 0
         self._generator = generator
 
     @property
@@ -169,8 +169,8 @@ class LiveField:
 
     @property
     def vertices_that_learn(self) -> int:
-        """The number of vertices that are not held."""
-        return self.vertices - self._vertices_held
+        """The number of vertices that are not fixed."""
+        return self.vertices - self._vertices_fixed
 
     @property
     def parameters(self) -> int:
@@ -221,13 +221,13 @@ class LiveField:
         """Return the field in its own memory: for its thread alone, and valid until it changes."""
         return self.memory.field(self.settings, self.tree.freeze(), self.numbers)
 
-    def hold(self, rows: Bools | None) -> None:
+    def fix(self, rows: Bools | None) -> None:
         """From now on, keep the feature ``rows`` [N] and the MLP unchanged; None: train all.
 
         Rows that are added later are trained.
         """
-        self.held = None if rows is None else self.memory.put(rows)
-        self._vertices_held = 0 if rows is None else int(rows[1:].sum())
+        self.fixed = None if rows is None else self.memory.put(rows)
+        self._vertices_fixed = 0 if rows is None else int(rows[1:].sum())
 
     def freeze(self) -> FrozenField:
         """Return the field as it is now; both share their numbers until this one changes."""

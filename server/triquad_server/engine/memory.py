@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from triquad_format.records.field_settings import FieldSettings
 from triquad_map.compiled.field.field import FieldArrays
-from triquad_map.compiled.field.frozen_field import FrozenCompiledField
+from triquad_map.compiled.field.frozen_field import FieldEngine, FrozenCompiledField
 from triquad_map.compiled.field.quadtree import FrozenQuadtree, LiveQuadtree
-from triquad_map.composition.region import FieldEngine
 
 Array = NDArray[Any]
 
@@ -96,7 +95,7 @@ def memory_on(device: str) -> Memory:
     """Return the memory of the fields that are trained on a device, ``cpu`` or another of torch."""
     if device == "cpu":
         return ArrayMemory()
-    from triquad_server.engine.tensor_memory import TensorMemory  # its import takes 200 MB
+    from triquad_server.engine.tensor_field import TensorMemory  # its import takes 200 MB
 
     return TensorMemory(device)
 

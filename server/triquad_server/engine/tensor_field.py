@@ -13,20 +13,20 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from triquad_format.records.arrays import Floats, Longs
+from triquad_format.records.arrays import Floats
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES
 from triquad_map.compiled.field.field import FieldArrays
+from triquad_map.compiled.field.frozen_field import FieldValues
 from triquad_map.compiled.field.quadtree import (
     PLANE_BITS,
     FrozenQuadtree,
     LiveQuadtree,
-    morton_code,
 )
-from triquad_map.compiled.voxel_index import home_slot, longest_probe
-from triquad_map.composition.region import FieldValues, in_grid
+from triquad_map.compiled.voxel_index import home_slot, longest_probe, morton_code
 
 from triquad_server.engine.live_field import LiveField
+from triquad_server.engine.memory import Array, FieldNumbers
 
 _CHUNK = 131_072  # points that tensors are made for at a time
 
@@ -159,10 +159,6 @@ class TensorField:
             np.concatenate([part.gradient for part in parts]),
         )
 
-    def evaluate_in_grid(self, axes: Floats, points: Longs) -> Floats:
-        """Evaluate distances in a grid; see :class:`triquad_map.composition.region.FieldEngine`."""
-        return self.evaluate(in_grid(axes, points), gradient=False).sdf
-
     def sdf(self, points: Tensor) -> Tensor:
         """Return the signed distance [N] in metres; differentiable in the points."""
         corners = self.around(points)
@@ -218,3 +214,29 @@ class TensorField:
         with torch.no_grad():
             value = self.sdf(tensor)
         return FieldValues(value.cpu().numpy(), np.zeros((0, 3), np.float32))
+
+
+class TensorMemory:
+    """Keeps numbers in tensors on one device."""
+
+    def __init__(self, device: str) -> None:
+        self.device = device
+
+    def put(self, array: Array) -> Tensor:
+        """Return a copy of an array."""
+        return torch.tensor(array, device=self.device)
+
+    def room(self, count: int, like: Tensor) -> Tensor:
+        """Return ``count`` rows shaped as those of ``like``, not initialised."""
+        return like.new_empty((count, *like.shape[1:]))
+
+    def array(self, rows: Tensor) -> Array:
+        """Return rows as an array; from another device, a copy, for which all work there ends."""
+        array: Array = rows.cpu().numpy()
+        return array
+
+    def field(
+        self, settings: FieldSettings, tree: FrozenQuadtree, numbers: FieldNumbers
+    ) -> TensorField:
+        """Return the field in tensors."""
+        return TensorField(settings, tree, FieldTensors(*numbers))

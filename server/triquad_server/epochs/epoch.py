@@ -10,13 +10,12 @@ from triquad_format.records.map_progress import MapProgress
 from triquad_format.records.region import MapRecord, Region
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
 from triquad_map.compiled.surfels.surfel_map import SurfelMap
+from triquad_map.compiled.team import Split, in_one
 from triquad_map.composition.composed_view import ComposedView
-from triquad_map.composition.field_view import in_one
-from triquad_map.composition.region import Split
 
-from triquad_server.array_memory import Buffers
 from triquad_server.engine.field_record import region_record
 from triquad_server.engine.memory import FrozenField
+from triquad_server.epochs.array_memory import Buffers
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,7 @@ class Epoch(ComposedView):
         self.progress = progress or MapProgress()
         self._name = name
 
-    def asked_with(self, split: Split = in_one) -> ComposedView:
+    def with_split(self, split: Split = in_one) -> ComposedView:
         """Return the same map, whose answers ``split`` runs: by default, the caller's thread alone.
 
         It is for callers that give way to queries, which have threads of their own.

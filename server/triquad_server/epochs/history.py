@@ -74,7 +74,7 @@ class EpochHistory:
         for listener in self._listeners:
             listener()
 
-    def let_go(self) -> None:
+    def remove_expired(self) -> None:
         """Remove the epochs that have expired.
 
         Call this from time to time: requests for the newest leave older ones as they are.

@@ -111,7 +111,7 @@ class SurfaceHistory:
             raise RefusedError(
                 "epoch_gone",
                 f"changes since epoch {since} are not known: the newest epoch is {until}, and the "
-                f"oldest to ask from is {oldest}; ask for the map anew, then for changes since "
+                f"oldest to ask from is {oldest}; ask for the map again, then for changes since "
                 f"its epoch",
             )
         newest_first = reversed([changes for changes in kept if changes.epoch <= until])

@@ -36,7 +36,7 @@ class _Pending:
 
     request: Request
     asks: FlushRequest
-    give_up_at: float  # monotonic, seconds: a scan that has not arrived by then is lost
+    overdue_at: float  # monotonic, seconds: a scan that has not arrived by then is lost
     deadline: float  # monotonic, seconds
 
     @property
@@ -164,16 +164,13 @@ class FlushHandler:
         self._excess = []
         outcomes = [(entry, self._outcome(entry, now)) for entry in self._pending]
         self._pending = [entry for entry, outcome in outcomes if outcome is None]
-        if any(self._ledger.settled(*entry.scan) for entry in self._pending):
+        if any(self._ledger.is_settled(*entry.scan) for entry in self._pending):
             self._publish_soon()
         return refused + [(entry, outcome) for entry, outcome in outcomes if outcome is not None]
 
     def _outcome(self, entry: _Pending, now: float) -> Outcome | None:
         """Return the answer to a request; ``None`` if it stays pending."""
-        if now >= entry.give_up_at and not self._ledger.arrived(*entry.scan):
-            reply = self._ledger.give_up(*entry.scan)
-        else:
-            reply = self._ledger.outcome(*entry.scan)
+        reply = self._ledger.outcome(*entry.scan, overdue=now >= entry.overdue_at)
         if reply is not None or now < entry.deadline:
             return reply
         asks = entry.asks
@@ -184,8 +181,6 @@ class FlushHandler:
 
     def _time_left_s(self) -> float | None:
         """Return how long until time alone decides on a request; ``None``: it never does."""
-        times = [entry.deadline for entry in self._pending]
-        times += [
-            entry.give_up_at for entry in self._pending if not self._ledger.arrived(*entry.scan)
-        ]
-        return max(0.0, min(times) - time.monotonic()) if times else None
+        now = time.monotonic()
+        times = [at for entry in self._pending for at in (entry.overdue_at, entry.deadline)]
+        return min((at - now for at in times if at > now), default=None)

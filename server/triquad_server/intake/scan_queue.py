@@ -23,6 +23,9 @@ _GIVE_WAY_S = 0.05
 """Each request waits this many seconds at most: it is late then, but scans that do not fit in the
 queue are lost."""
 
+_MAX_BYTES = 100_000_000
+"""The bytes of the scans of all sources that wait; of the source that has most, the oldest goes."""
+
 _SCAN_BYTES = 2_000  # memory of a scan in addition to its points
 
 
@@ -33,7 +36,7 @@ class ScanQueue:
     or of the one that has most.
     """
 
-    def __init__(self, limit: int, limit_bytes: int = 2**40) -> None:
+    def __init__(self, limit: int, limit_bytes: int = _MAX_BYTES) -> None:
         """Let at most ``limit`` scans of each source wait, and ``limit_bytes`` of all together."""
         self.limit = limit
         self.limit_bytes = limit_bytes
@@ -70,7 +73,7 @@ class ScanQueue:
         with self._taken:
             backwards = self.ledger.arrive(scan)
             if backwards is None:
-                self.ledger.turn_away(scan, text)
+                self.ledger.refuse(scan, text)
             self.dropped.add(backwards or reason)
 
     def take(self, passed_over: Collection[str] = ()) -> Scan | None:

@@ -24,7 +24,7 @@ _TOO_NEAR_SHARE, _TOO_FAR_SHARE = 0.1, 0.5
 """The shares of points above which their loss is reported. Points too far still show free space."""
 _MAX_SOURCES = 256  # sources that are kept; the one heard of longest ago is removed
 _MAX_WARNINGS = 1024  # warnings that are kept, the same way
-_MAX_TOLD = 50  # warnings for a client at once
+_MAX_SHOWN = 50  # warnings for a client at once
 _RANGES = 1000  # of a scan, at most, of which the median is taken
 
 _NEAR_LEAVES, _GOOD_LEAVES = 18.0, 40.0
@@ -49,7 +49,7 @@ class _Warning:
     """A warning as it was last reported."""
 
     text: str
-    told: int  # scans reported so far, where it is about scans
+    reported: int  # scans reported so far, where it is about scans
     seen: int  # scans known so far
     due_s: float  # monotonic: not again before
     pause_s: float
@@ -113,38 +113,37 @@ class ScanWarnings:
                 for (source, _), warning in self._warnings.items()
                 if wanted(source) and warning.met_s >= since_s
             ]
-        return "\n".join(texts[-_MAX_TOLD:]) or None
+        return "\n".join(texts[-_MAX_SHOWN:]) or None
 
     def _check_scans(self) -> None:
         ledger = self._scans.ledger
         thin_m, leaf_m = self._settings.scan.thin_m, self._settings.field.leaf_m
-        for source, lost in ledger.losses().items():
+        for source, counts in ledger.by_source().items():
             self._count(
                 source,
                 "never arrived",
-                lost.never_arrived,
+                counts.never_arrived,
                 "of its scans never arrived: the link broke, or they were published before this "
                 "server started",
             )
             self._count(
                 source,
                 "lost",
-                lost.pushed_out,
+                counts.pushed_out,
                 f"of its scans were lost, since the server does not keep up: publish fewer, or "
                 f"fewer points a scan, or set a larger scan.thin_m (it is {thin_m:g}) or, for a "
                 f"new map, field.leaf_m (it is {leaf_m:g})",
             )
-        for source, refusal in ledger.refused().items():
-            text = f"of its scans were refused, the last since {refusal.last}"
-            self._count(source, "refused", refusal.scans, text)
+            text = f"of its scans were refused, the last since {counts.last_refusal}"
+            self._count(source, "refused", counts.refused, text)
 
     def _count(self, source: str, cause: str, count: int, text: str) -> None:
         """Warn of ``count`` scans so far, if they became more."""
         before = self._warnings.get((source, cause))
-        told, seen = (before.told, before.seen) if before else (0, 0)
-        if count > told:
+        reported, seen = (before.reported, before.seen) if before else (0, 0)
+        if count > reported:
             met_s = self._now() if before is None or count > seen else before.met_s
-            self._warn(source, cause, f"{count - told} {text}", scans=count, met_s=met_s)
+            self._warn(source, cause, f"{count - reported} {text}", scans=count, met_s=met_s)
 
     def _check_ranges(self, source: str, points: _Points) -> None:
         own = self._settings.sources.get(source, ANY_SOURCE)
@@ -200,7 +199,7 @@ class ScanWarnings:
         pause_s = _FIRST_PAUSE_S if before is None else min(2 * before.pause_s, _LONGEST_PAUSE_S)
         text = f"source {source!r}: {text}"
         self._warnings[source, cause] = _Warning(
-            text, told=scans, seen=scans, due_s=now + pause_s, pause_s=pause_s, met_s=met_s
+            text, reported=scans, seen=scans, due_s=now + pause_s, pause_s=pause_s, met_s=met_s
         )
         self._warnings.move_to_end((source, cause))
         if len(self._warnings) > _MAX_WARNINGS:

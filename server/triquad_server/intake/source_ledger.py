@@ -2,9 +2,8 @@
 
 import threading
 import time
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 from triquad_format.wire.messages import FlushReply, Scan
 from triquad_format.wire.metrics_messages import SourceMetrics
@@ -16,10 +15,9 @@ MAX_SOURCES_LISTED = 64
 
 MAX_SEQUENCE = 2**48
 
-_AHEAD_AT_ONCE = 1000
-_AHEAD_PER_S = 1000
-"""The largest leap of sequences: as many scans as may get lost at once, and in each second in
-which the session was silent. A source that leaps farther does not count on from its last one."""
+MAX_LEAP = 1_000_000
+"""The most by which a sequence may lie above the last of its session: half a day of lost scans. One
+that lies farther ahead is forged or corrupt, and must not make those that follow seem old."""
 
 FORGOTTEN = "*"
 """The name that stands for all forgotten sources where losses are listed."""
@@ -27,61 +25,59 @@ FORGOTTEN = "*"
 _MAX_COUNT = 2**63 - 1
 
 
-class Refusals(NamedTuple):
-    """The refused scans of one source."""
-
-    scans: int
-    last: str  # why the last of them was refused
-
-
-class Losses(NamedTuple):
-    """The lost scans of one source."""
-
-    pushed_out: int  # pushed out of the full queue
-    never_arrived: int
-
-
 @dataclass
-class _Track:
-    """Counters of one session of one source; scans of one session stay in order all the way."""
+class ScanCounts:
+    """What became of the scans of a session, or of several."""
 
-    arrived: int = -1  # highest sequence that arrived or was given up
-    done: int = -1  # highest sequence that came out of the queue
-    waiting: int = 0  # scans in the queue
-    unpublished: int | None = None  # lowest sequence taken that no epoch shows yet
-    stamp_ns: int = -(2**63)
+    sessions: int = 1
     taken: int = 0
     refused: int = 0
-    pushed_out: int = 0  # pushed out of the full queue
+    pushed_out: int = 0  # of the full queue
     never_arrived: int = 0
-    last_refusal: str | None = None
-    heard_s: float = field(default_factory=time.monotonic)  # when it was last heard of, monotonic
+    last_refusal: str | None = None  # why the last of them was refused
+    heard_s: float = -float("inf")  # when a session was last heard of, monotonic
 
     @property
     def lost(self) -> int:
-        """The number of lost scans, of either kind."""
-        return self.pushed_out + self.never_arrived
+        """The number of lost scans, pushed out or never arrived."""
+        return min(_MAX_COUNT, self.pushed_out + self.never_arrived)
 
-    def lose_up_to(self, sequence: int) -> None:
-        """Count scans up to and with ``sequence`` that did not arrive as lost."""
-        self.never_arrived += max(0, sequence - self.arrived)
-        self.arrived = max(self.arrived, sequence)
+    def plus(self, other: "ScanCounts") -> "ScanCounts":
+        """Return these counts and those of ``other`` sessions together."""
+        newest = max(self, other, key=lambda counts: counts.heard_s)
+        return ScanCounts(
+            self.sessions + other.sessions,
+            self.taken + other.taken,
+            self.refused + other.refused,
+            self.pushed_out + other.pushed_out,
+            self.never_arrived + other.never_arrived,
+            newest.last_refusal or self.last_refusal or other.last_refusal,
+            newest.heard_s,
+        )
 
-    def is_ahead(self, sequence: int) -> bool:
-        """Return whether a sequence lies farther ahead than scans can have got lost since."""
-        if self.arrived < 0:
-            return False  # it may have begun long before this process
-        silent_s = time.monotonic() - self.heard_s
-        return sequence - self.arrived > _AHEAD_AT_ONCE + _AHEAD_PER_S * silent_s
+
+@dataclass
+class _Session:
+    """The scans of one session of one source, which stay in order all the way."""
+
+    counts: ScanCounts = field(default_factory=ScanCounts)
+    arrived: int = -1  # highest sequence so far
+    waiting: deque[int] = field(default_factory=deque)  # sequences of the scans in the queue
+    unpublished: int | None = None  # lowest sequence taken that no epoch shows yet
+    stamp_ns: int = -(2**63)
+
+    def is_settled(self, sequence: int) -> bool:
+        """Return whether all scans up to a sequence arrived, and left the queue."""
+        return sequence <= self.arrived and not (self.waiting and self.waiting[0] <= sequence)
+
+    def is_shown(self, sequence: int) -> bool:
+        """Return whether an epoch shows all scans that were taken up to a sequence."""
+        return self.unpublished is None or self.unpublished > sequence
 
     def refuse(self, text: str) -> None:
         """Count a refused scan."""
-        self.refused += 1
-        self.last_refusal = text
-
-    def settled(self, sequence: int) -> bool:
-        """Return whether a scan was taken, refused or lost."""
-        return sequence <= (self.done if self.waiting else self.arrived)
+        self.counts.refused += 1
+        self.counts.last_refusal = text
 
 
 class SourceLedger:
@@ -92,184 +88,142 @@ class SourceLedger:
 
     def __init__(self) -> None:
         self.changed = threading.Condition()  # notified when the outcome of a scan may be known
-        self._tracks: OrderedDict[tuple[str, int], _Track] = OrderedDict()
-        self._forgotten = Losses(0, 0)
+        self._sessions: OrderedDict[tuple[str, int], _Session] = OrderedDict()
+        self._forgotten = ScanCounts(sessions=0)
 
     def arrive(self, scan: Scan) -> str | None:
         """Record a scan's arrival; return the reason if its sequence or stamp refuses it."""
         with self.changed:
             if not 0 <= scan.sequence < MAX_SEQUENCE:
                 return "bad_sequence"
-            track = self._track(scan.source, scan.session)
-            if track.is_ahead(scan.sequence):
+            session = self._session(scan)
+            if 0 <= session.arrived < scan.sequence - MAX_LEAP:
                 return "sequence_ahead"
-            track.heard_s = time.monotonic()
-            if scan.sequence <= track.arrived:
+            session.counts.heard_s = time.monotonic()
+            if scan.sequence <= session.arrived:
                 return "sequence_backwards"
-            track.lose_up_to(scan.sequence - 1)
-            track.arrived = scan.sequence
-            if scan.stamp_ns < track.stamp_ns:
-                track.refuse(
+            session.counts.never_arrived += scan.sequence - session.arrived - 1
+            session.arrived = scan.sequence
+            before_ns, session.stamp_ns = session.stamp_ns, scan.stamp_ns
+            if scan.stamp_ns < before_ns:  # a clock that was set back costs one scan
+                session.refuse(
                     f"scan {scan.sequence}: its stamp {scan.stamp_ns} ns lies before the "
-                    f"{track.stamp_ns} ns of the scan before; stamp scans in order"
+                    f"{before_ns} ns of the scan before; stamp scans in order"
                 )
-                track.stamp_ns = scan.stamp_ns  # a clock that was set back costs one scan
                 self.changed.notify_all()
                 return "time_backwards"
-            track.stamp_ns = scan.stamp_ns
-            track.waiting += 1
+            session.waiting.append(scan.sequence)
             return None
 
     def take(self, scan: Scan) -> None:
         """Record that a scan went into the map."""
         with self.changed:
-            track = self._leave_queue(scan)
-            track.taken += 1
-            if track.unpublished is None:
-                track.unpublished = scan.sequence
+            session = self._leave_queue(scan)
+            session.counts.taken += 1
+            if session.unpublished is None:
+                session.unpublished = scan.sequence
 
     def refuse(self, scan: Scan, text: str) -> None:
-        """Record that the map refused a scan."""
+        """Record that a scan was refused: by the map, or before it was queued."""
         with self.changed:
             self._leave_queue(scan).refuse(f"scan {scan.sequence}: {text}")
-
-    def turn_away(self, scan: Scan, text: str) -> None:
-        """Record that a scan that just arrived is not queued.
-
-        Earlier ones may still wait there, so this settles none of them.
-        """
-        with self.changed:
-            track = self._track(scan.source, scan.session)
-            track.waiting = max(0, track.waiting - 1)
-            track.refuse(f"scan {scan.sequence}: {text}")
-            self.changed.notify_all()
 
     def push_out(self, scan: Scan) -> None:
         """Record that a scan was pushed out of the full queue."""
         with self.changed:
-            self._leave_queue(scan).pushed_out += 1
+            self._leave_queue(scan).counts.pushed_out += 1
 
     def publish(self) -> None:
         """Record that an epoch shows all scans that were taken so far."""
         with self.changed:
-            shown = [track for track in self._tracks.values() if track.unpublished is not None]
-            for track in shown:
-                track.unpublished = None
-            if shown:
-                self.changed.notify_all()
+            for session in self._sessions.values():
+                session.unpublished = None
+            self.changed.notify_all()
 
-    def give_up(self, source: str, session: int, sequence: int) -> FlushReply | None:
-        """Count scans up to ``sequence`` that did not arrive as lost; return as :meth:`outcome`.
-
-        Sequences that cannot have been sent are answered but not recorded, be it of a session that
-        is unknown or far ahead in one: requests must not push out, nor delay, sources of scans.
-        """
-        with self.changed:
-            track = self._tracks.get((source, session))
-            if track is None:
-                return FlushReply(
-                    taken=0,
-                    refused=0,
-                    lost=sequence + 1,
-                    last_refusal=None,
-                    warnings=f"source {source!r}: none of this client's scans arrived: access "
-                    "control does not let it publish as this source (a role names its sources), "
-                    "or the server was started again since",
-                )
-            if track.is_ahead(sequence):
-                lost = track.lost + sequence - track.arrived
-                return FlushReply(track.taken, track.refused, lost, track.last_refusal)
-            track.lose_up_to(sequence)
-            return self.outcome(source, session, sequence)
-
-    def arrived(self, source: str, session: int, sequence: int) -> bool:
-        """Return whether a scan, or a later one of its session, arrived."""
-        with self.changed:
-            track = self._tracks.get((source, session))
-            return track is not None and sequence <= track.arrived
-
-    def settled(self, source: str, session: int, sequence: int) -> bool:
+    def is_settled(self, source: str, session: int, sequence: int) -> bool:
         """Return whether a scan was taken, refused or lost."""
         with self.changed:
-            track = self._tracks.get((source, session))
-            return track is not None and track.settled(sequence)
+            known = self._sessions.get((source, session))
+            return known is not None and known.is_settled(sequence)
 
-    def outcome(self, source: str, session: int, sequence: int) -> FlushReply | None:
-        """Return a session's counts, once the scan is settled and an epoch shows it if taken."""
+    def outcome(
+        self, source: str, session: int, sequence: int, *, overdue: bool = False
+    ) -> FlushReply | None:
+        """Return a session's counts, once the scan is settled and an epoch shows it if taken.
+
+        Scans that are ``overdue`` and did not arrive are answered as lost. That is not recorded:
+        they may still come, and requests must neither push out nor delay sources of scans.
+        """
         with self.changed:
-            track = self._tracks.get((source, session))
-            if track is None or not track.settled(sequence):
+            known = self._sessions.get((source, session))
+            if known is None:
+                return _of_stranger(source, sequence) if overdue else None
+            missing = max(0, sequence - known.arrived)
+            newest = min(sequence, known.arrived)
+            if missing and not overdue:
                 return None
-            if track.unpublished is not None and track.unpublished <= sequence:
+            if not known.is_settled(newest) or not known.is_shown(newest):
                 return None
-            return FlushReply(track.taken, track.refused, track.lost, track.last_refusal)
+            counts = known.counts
+            lost = min(_MAX_COUNT, counts.lost + missing)
+            return FlushReply(counts.taken, counts.refused, lost, counts.last_refusal)
 
     def lost(self) -> dict[str, int]:
         """Return the number of lost scans, by source."""
-        return {source: min(_MAX_COUNT, sum(lost)) for source, lost in self.losses().items()}
+        return {source: counts.lost for source, counts in self.by_source().items() if counts.lost}
 
-    def losses(self) -> dict[str, Losses]:
-        """Return the lost scans, by source and by cause."""
+    def by_source(self) -> dict[str, ScanCounts]:
+        """Return what became of the scans of each source, the one heard of last first."""
         with self.changed:
-            found = {FORGOTTEN: self._forgotten} if any(self._forgotten) else {}
-            for (source, _), track in self._tracks.items():
-                if track.lost:
-                    found[source] = _with_losses(found.get(source, Losses(0, 0)), track)
+            found: dict[str, ScanCounts] = {}
+            for (source, _), session in reversed(self._sessions.items()):
+                known = found.get(source, ScanCounts(sessions=0))
+                found[source] = known.plus(session.counts)
+            if self._forgotten.lost:
+                found[FORGOTTEN] = self._forgotten
             return found
 
-    def sources(self) -> dict[str, SourceMetrics]:
+    def metrics(self) -> dict[str, SourceMetrics]:
         """Return the scans of each source; of many, those heard of longest ago are merged."""
         now = time.monotonic()
-        found: dict[str, SourceMetrics] = {}
-        with self.changed:
-            for (source, _), track in reversed(self._tracks.items()):
-                name = source if source in found or len(found) < MAX_SOURCES_LISTED else FORGOTTEN
-                found[name] = _with_track(found.get(name), track, now - track.heard_s)
-        return found
+        listed: dict[str, ScanCounts] = {}
+        for source, counts in self.by_source().items():
+            if source == FORGOTTEN:
+                continue
+            name = source if len(listed) < MAX_SOURCES_LISTED else FORGOTTEN
+            listed[name] = listed.get(name, ScanCounts(sessions=0)).plus(counts)
+        return {
+            name: SourceMetrics(one.sessions, one.taken, one.refused, one.lost, now - one.heard_s)
+            for name, one in listed.items()
+        }
 
-    def refused(self) -> dict[str, Refusals]:
-        """Return the refused scans, by source."""
-        with self.changed:
-            found: dict[str, Refusals] = {}
-            for (source, _), track in self._tracks.items():
-                if track.last_refusal is not None:
-                    before = found[source].scans if source in found else 0
-                    found[source] = Refusals(before + track.refused, track.last_refusal)
-            return found
-
-    def _leave_queue(self, scan: Scan) -> _Track:
-        track = self._track(scan.source, scan.session)
-        track.waiting = max(0, track.waiting - 1)
-        track.done = max(track.done, scan.sequence)
+    def _leave_queue(self, scan: Scan) -> _Session:
+        session = self._session(scan)
+        # One that was forgotten meanwhile knows of no scan.
+        if scan.sequence in session.waiting:
+            session.waiting.remove(scan.sequence)
         self.changed.notify_all()
-        return track
+        return session
 
-    def _track(self, source: str, session: int) -> _Track:
-        """Return the track of a session, now the most recent one."""
-        track = self._tracks.setdefault((source, session), _Track())
-        self._tracks.move_to_end((source, session))
-        if len(self._tracks) > MAX_SESSIONS:
-            _, forgotten = self._tracks.popitem(last=False)
-            self._forgotten = _with_losses(self._forgotten, forgotten)
-        return track
-
-
-def _with_losses(before: Losses, track: _Track) -> Losses:
-    """Return the losses of a source, with those of one more session."""
-    return Losses(
-        pushed_out=min(_MAX_COUNT, before.pushed_out + track.pushed_out),
-        never_arrived=min(_MAX_COUNT, before.never_arrived + track.never_arrived),
-    )
+    def _session(self, scan: Scan) -> _Session:
+        """Return the session of a scan, now the most recent one."""
+        key = (scan.source, scan.session)
+        session = self._sessions.setdefault(key, _Session())
+        self._sessions.move_to_end(key)
+        if len(self._sessions) > MAX_SESSIONS:
+            _, forgotten = self._sessions.popitem(last=False)
+            self._forgotten = self._forgotten.plus(forgotten.counts)
+        return session
 
 
-def _with_track(before: SourceMetrics | None, track: _Track, age_s: float) -> SourceMetrics:
-    """Return the scans of a source, with those of one more of its sessions."""
-    if before is None:
-        return SourceMetrics(1, track.taken, track.refused, track.lost, age_s)
-    return SourceMetrics(
-        sessions=before.sessions + 1,
-        taken=before.taken + track.taken,
-        refused=before.refused + track.refused,
-        lost=min(_MAX_COUNT, before.lost + track.lost),
-        age_s=min(before.age_s, age_s),
+def _of_stranger(source: str, sequence: int) -> FlushReply:
+    """Return the reply about a session of which nothing is known."""
+    return FlushReply(
+        taken=0,
+        refused=0,
+        lost=sequence + 1,
+        last_refusal=None,
+        warnings=f"source {source!r}: none of this client's scans arrived: access control does "
+        "not let it publish as this source (a role names its sources), or the server was started "
+        "again since",
     )

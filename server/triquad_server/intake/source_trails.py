@@ -1,14 +1,15 @@
 """Records where each source of scans has been, and its newest scan, for viewers."""
 
+import math
 import threading
 from collections import OrderedDict
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from triquad_format.records.arrays import Bools, Doubles, Longs
 from triquad_format.wire.limits import MAX_SAMPLE_POINTS
 from triquad_format.wire.messages import Scan
-from triquad_map.compiled.voxel_index import with_room
 
 from triquad_server.intake.rays import ScanRays
 
@@ -18,8 +19,6 @@ MAX_SOURCES = 256
 MAX_POSITIONS = 8192
 """The positions of a trail at most. Once it has that many, every second one is dropped, and from
 then on they are twice as far apart: all of the way remains visible."""
-
-_LEAST_ROOM = 16  # positions: a client that invents sources gets no more of each
 
 _JUMP_LEAVES = 250.0
 """A sensor that is farther away than this from one scan to the next has not moved there: 50 m with
@@ -56,37 +55,12 @@ class SourceDelta:
     newest: TakenScan | None  # where the new positions begin
 
 
-@dataclass
-class _Trail:
-    """The positions of a sensor: a bounded number, oldest first."""
+class _Place(NamedTuple):
+    """A place of a sensor on its trail."""
 
-    count: int = 0
-    positions: Doubles = field(default_factory=lambda: np.empty((0, 3)))
-    pieces: Longs = field(default_factory=lambda: np.empty(0, np.int64))
-    revisions: Longs = field(default_factory=lambda: np.empty(0, np.int64))
-
-    def add(self, position: Doubles, piece: int, revision: int) -> None:
-        """Add a position."""
-        if self.count == len(self.positions):
-            room = max(_LEAST_ROOM, 2 * self.count)
-            self.positions = with_room(self.positions, room)
-            self.pieces = with_room(self.pieces, room)
-            self.revisions = with_room(self.revisions, room)
-        self.positions[self.count] = position
-        self.pieces[self.count] = piece
-        self.revisions[self.count] = revision
-        self.count += 1
-
-    def keep(self, kept: Bools) -> None:
-        """Drop the positions that are not ``kept`` [count]."""
-        before, self.count = self.count, int(kept.sum())
-        for column in (self.positions, self.pieces, self.revisions):
-            column[: self.count] = column[:before][kept]
-
-    def after(self, revision: int) -> slice:
-        """Return the positions that were added after a revision."""
-        first = np.searchsorted(self.revisions[: self.count], revision, side="right")
-        return slice(int(first), self.count)
+    position: tuple[float, float, float]  # metres, map frame
+    piece: int  # rises where the sensor jumped
+    revision: int
 
 
 @dataclass
@@ -94,56 +68,66 @@ class _Source:
     """The trail and the newest scan of one source."""
 
     rewritten: int  # revision since which the trail was only added to
-    spacing_m: float  # of the trail's positions
+    spacing_m: float  # of the trail's places
     scans: int = 0
     newest: TakenScan | None = None
-    trail: _Trail = field(default_factory=_Trail)
+    trail: list[_Place] = field(default_factory=list)  # oldest first
+
+    @property
+    def positions(self) -> Doubles:
+        """The positions [N, 3] of the trail."""
+        return _positions(self.trail)
 
     def add(self, taken: TakenScan, jump_m: float) -> None:
         """Add the source's newest scan."""
-        jumped = self.newest is None or _apart(taken.position, self.newest.position) > jump_m
+        jumped = self.newest is None or math.dist(taken.position, self.newest.position) > jump_m
         self.scans += 1
         self.newest = taken
-        trail = self.trail
-        last = trail.count - 1
-        if not jumped and _apart(taken.position, trail.positions[last]) < self.spacing_m:
-            return
-        piece = int(trail.pieces[last]) + jumped if trail.count else 0
-        if trail.count == MAX_POSITIONS:
-            trail.keep(np.arange(trail.count) % 2 == 0)
+        piece = 0
+        if self.trail:
+            last = self.trail[-1]
+            if not jumped and math.dist(taken.position, last.position) < self.spacing_m:
+                return
+            piece = last.piece + jumped
+        if len(self.trail) == MAX_POSITIONS:
+            del self.trail[1::2]
             self.spacing_m *= 2.0
             self.rewritten = taken.revision
-        trail.add(taken.position, piece, taken.revision)
+        x, y, z = taken.position.tolist()
+        self.trail.append(_Place((x, y, z), piece, taken.revision))
 
     def forget(self, minimum: Doubles, maximum: Doubles, revision: int) -> None:
         """Forget where the source has been within a box; the trail is interrupted there.
 
         Its newest scan is forgotten where it, or the last of the trail, lies in the box.
         """
-        trail = self.trail
-        inside = _within(trail.positions[: trail.count], minimum, maximum)
+        inside = _within(self.positions, minimum, maximum)
         newest = self.newest
         if newest is not None:
             here = _within(newest.position[None], minimum, maximum)
             if here.any() or inside[-1:].any():
                 self.newest = None
         if inside.any() or newest is not self.newest:
-            trail.pieces[: trail.count] += np.cumsum(inside)
-            trail.keep(~inside)
+            gaps = np.cumsum(inside).tolist()
+            self.trail = [
+                place._replace(piece=place.piece + gaps[row])
+                for row, place in enumerate(self.trail)
+                if not inside[row]
+            ]
             self.rewritten = revision
 
     def delta(self, revision: int) -> SourceDelta:
         """Return the changes since a revision."""
         whole = self.rewritten > revision
-        chosen = slice(0, self.trail.count) if whole else self.trail.after(revision)
+        new = [place for place in self.trail if whole or place.revision > revision]
         newest = self.newest
         if newest is not None and not whole and newest.revision <= revision:
             newest = None
         return SourceDelta(
             self.scans,
             whole,
-            trail=self.trail.positions[chosen].copy(),
-            pieces=self.trail.pieces[chosen].copy(),
+            trail=_positions(new),
+            pieces=np.array([place.piece for place in new], np.int64),
             newest=newest,
         )
 
@@ -185,7 +169,7 @@ class SourceTrails:
             self._revision += 1
             for name, source in list(self._sources.items()):
                 source.forget(minimum, maximum, self._revision)
-                if source.newest is None and source.trail.count == 0:
+                if source.newest is None and not source.trail:
                     del self._sources[name]
 
     def since(self, revision: int) -> tuple[int, dict[str, SourceDelta]]:
@@ -207,10 +191,11 @@ def evenly(points: Doubles, count: int) -> Doubles:
     return points.take(chosen, axis=0)
 
 
+def _positions(places: list[_Place]) -> Doubles:
+    """Return the positions [N, 3] of places."""
+    return np.array([place.position for place in places], np.float64).reshape(-1, 3)
+
+
 def _within(positions: Doubles, minimum: Doubles, maximum: Doubles) -> Bools:
     """Return whether each of the positions [N, 3] lies between two corners [3]."""
     return np.asarray(((positions >= minimum) & (positions <= maximum)).all(axis=1))
-
-
-def _apart(one: Doubles, other: Doubles) -> float:
-    return float(np.linalg.norm(one - other))

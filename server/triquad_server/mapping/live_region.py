@@ -6,12 +6,12 @@ from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.region import Region
 from triquad_map.compiled.evidence.growth import EvidenceSize
 from triquad_map.compiled.evidence.live_evidence import LiveEvidence
-from triquad_map.composition.field_view import field_samples
+from triquad_map.compiled.field.frozen_field import field_samples
 
-from triquad_server.array_memory import buffers_of, bytes_by_part
 from triquad_server.engine.field_record import field_from_record, region_record
 from triquad_server.engine.live_field import LiveField, initial_field
 from triquad_server.engine.trainer import Loss
+from triquad_server.epochs.array_memory import buffers_of, bytes_by_part
 from triquad_server.epochs.epoch import FrozenRegion
 from triquad_server.intake.rays import ScanRays
 from triquad_server.mapping.map_snapshot import RegionSnapshot

@@ -1,19 +1,53 @@
 """The regions of the live map: made as scans enter them, within the limits of the map."""
 
-from collections.abc import Iterable, Iterator
+import itertools
+import math
+from collections.abc import Collection, Iterable, Iterator
 
 import numpy as np
 from triquad_format.records.arrays import Doubles
-from triquad_format.records.field_settings import RegionIndex
+from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.region import Region
 
 from triquad_server.errors import ScanRefusedError
 from triquad_server.intake.rays import ScanRays
 from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.memory_budget import NO_SIZE, MemoryBudget
-from triquad_server.mapping.regions_around import regions_around
 from triquad_server.mapping.replay.region_setup import RegionSetup
-from triquad_server.mapping.training.fair_share import FairShare
+from triquad_server.mapping.training.training_budget import FairShare
+
+
+def regions_around(
+    rays: ScanRays, there: Collection[RegionIndex], field: FieldSettings
+) -> list[RegionIndex]:
+    """Return regions whose cubes hold an end point or the sensor, and existing ones in between.
+
+    Rays that met nothing, and the robot, make no region: they are recorded in existing ones.
+    """
+    half = field.region_side_m / 2
+    pitch = field.region_pitch_m
+
+    def spanned(column: Doubles) -> range:
+        low, high = column.min() - half, column.max() + half
+        return range(math.floor(low / pitch) + 1, math.ceil(high / pitch))
+
+    columns = [np.append(rays.ends[:, axis], rays.origin[axis]) for axis in range(3)]
+    x, y, z = map(spanned, columns)
+    around = list(itertools.product(x, y, z))
+
+    def holds_any(index: RegionIndex) -> bool:
+        near = [np.abs(column - i * pitch) < half for column, i in zip(columns, index, strict=True)]
+        return bool((near[0] & near[1] & near[2]).any())
+
+    if len(around) > 1:
+        around = [index for index in around if index in there or holds_any(index)]
+    free = rays.free_corners
+    reached = [spanned(np.append(columns[axis], free[:, axis])) for axis in range(3)]
+    return around + [
+        index
+        for index in there
+        if index not in around and all(map(range.__contains__, reached, index))
+    ]
 
 
 class LiveRegions:

@@ -3,25 +3,34 @@
 import logging
 import threading
 import time
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 from triquad_format.errors import TriquadError
 from triquad_format.wire.messages import Scan
-from triquad_map.compiled.priority import lower_priority
+from triquad_map.compiled.team import lower_priority
 
+from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.errors import ScanRefusedError
+from triquad_server.intake.rays import ScanRays
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.mapping.command_queue import Command, CommandQueue
-from triquad_server.mapping.listeners import MapListeners
-from triquad_server.mapping.map_fit import map_fit
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mapping.progress import Progress
+from triquad_server.mapping.progress import Progress, map_fit
 from triquad_server.mapping.publish_schedule import PublishSchedule
 from triquad_server.mapping.thread_time import Activity, ThreadTime
 from triquad_server.process.threads import NICENESS
+
+
+@dataclass(frozen=True)
+class MapListeners:
+    """Functions that the mapper's thread calls; they are quick, and raise nothing."""
+
+    scan_taken: Sequence[Callable[[Scan, ScanRays], None]] = ()  # with what of it is used
+    published: Sequence[Callable[[Epoch], None]] = ()  # before others can see the epoch
+
 
 _log = logging.getLogger(__name__)
 
@@ -144,7 +153,7 @@ class MapperThread:
         ``else_s`` is the time of all but scans in the last round; return the same of this one.
         """
         self._wake.clear()
-        self._epochs.let_go()
+        self._epochs.remove_expired()
         self._run_commands()
         if self._paused.is_set():
             self.time.begin(Activity.IDLE)

@@ -1,8 +1,13 @@
-"""The progress of a map, in figures."""
+"""The progress of a map, in figures, and how well it fits its held-out rays."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
+import numpy as np
 from triquad_format.wire.messages import FieldFit
+from triquad_map import field_fit
+
+from triquad_server.mapping.live_region import LiveRegion
 
 
 @dataclass(frozen=True)
@@ -29,3 +34,22 @@ class Progress:
     loss: float = 0.0  # as of the newest epoch
     fit: FieldFit | None = None  # of the newest epoch, to the rays that are held out
     map: MapFigures = MapFigures()
+
+
+def map_fit(regions: Iterable[LiveRegion]) -> FieldFit | None:
+    """Return how well regions fit, as they were judged last; ``None`` where none was."""
+    judgements = [(region.centre, region.training.judgement) for region in regions]
+    judged = [(centre, judgement.fit) for centre, judgement in judgements if judgement.fit]
+    fit = field_fit.map_fit(judged)
+    if fit is None:
+        return None
+    return FieldFit(
+        rays=fit.rays,
+        median_m=fit.median_m,
+        upper_m=fit.upper_m,
+        worst=fit.worst,
+        worst_median_m=fit.worst_median_m.astype(np.float32),
+        repairing=sum(int(places.forgotten.sum()) for _, places in judged),
+        repaired=sum(judgement.repairs.done for _, judgement in judgements),
+        given_up=sum(judgement.repairs.given_up for _, judgement in judgements),
+    )

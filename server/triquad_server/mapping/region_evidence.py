@@ -11,7 +11,7 @@ from triquad_map.compiled.evidence.carving import Reach
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
 from triquad_map.compiled.evidence.growth import EvidenceSize
 from triquad_map.compiled.evidence.live_evidence import LiveEvidence, Marks
-from triquad_map.compiled.evidence.sightings import Sighting
+from triquad_map.compiled.evidence.observed import Sighting
 from triquad_map.compiled.surfels.surfel_map import SurfelMap, first_surfels
 from triquad_map.compiled.voxel_index import empty_keys, thin
 from triquad_map.surface import SampleField, ShownByRays, nothing_shown

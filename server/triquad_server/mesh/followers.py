@@ -12,8 +12,8 @@ from triquad_format.records.arrays import Ints
 from triquad_format.wire import keys
 from triquad_format.wire.limits import MAX_KNOWN_TILES, MAX_WAIT_S
 from triquad_format.wire.mesh_messages import TileUpdates, TileUpdatesRequest
-from triquad_map.box import check_box
-from triquad_map.compiled.mesh.tile_lattice import TileIndex, TileLattice, check_level
+from triquad_map.mesh.tile_lattice import TileIndex, TileLattice, check_level
+from triquad_map.questions.checks import check_box
 
 from triquad_server.fair_queue import Owner, first_to_go
 from triquad_server.mesh.tile_level import CachedTile
@@ -21,7 +21,7 @@ from triquad_server.mesh.tile_level import CachedTile
 BURST_S = 1.0
 """The seconds of silence after which a client may be sent as many seconds' worth at once."""
 
-MAX_HELD_BYTES = 64_000_000
+MAX_PENDING_BYTES = 64_000_000
 """The memory of all pending requests; more are refused, of the client that has most."""
 
 _REFRESH_GRACE_S = 10.0
@@ -134,7 +134,7 @@ def check_updates(asks: TileUpdatesRequest, server: str, revision: int) -> None:
             f"max_bytes = {asks.max_bytes}, max_bytes_per_s = {asks.max_bytes_per_s}: "
             "use at least 1, and at least 0",
         )
-    _check_held(asks)
+    _check_known(asks)
     newest = revision if asks.server == server else 0
     if asks.server in ("", server) and not 0 <= asks.revision <= newest:
         raise RefusedError(
@@ -150,19 +150,19 @@ def one_too_many(pending: Sequence[Follower], sending: int, limit: int) -> tuple
     It is None if, with the replies being sent, they are no more than the ``limit``, and do not
     take too much memory.
     """
-    held = sum(follower.nbytes for follower in pending)
+    taken = sum(follower.nbytes for follower in pending)
     if len(pending) + sending > limit:
         sizes = [(follower.request.owner, 1) for follower in pending]
         text = f"{limit} followers of the mesh wait already; try later"
-    elif held > MAX_HELD_BYTES:
+    elif taken > MAX_PENDING_BYTES:
         sizes = [(follower.request.owner, follower.nbytes) for follower in pending]
-        text = f"followers of the mesh take {held} bytes already: name fewer known tiles"
+        text = f"followers of the mesh take {taken} bytes already: name fewer known tiles"
     else:
         return None
     return first_to_go(sizes), text
 
 
-def _check_held(asks: TileUpdatesRequest) -> None:
+def _check_known(asks: TileUpdatesRequest) -> None:
     if len(asks.known) != len(asks.known_versions):
         raise RefusedError(
             "bad_request", f"{len(asks.known_versions)} versions of {len(asks.known)} known tiles"

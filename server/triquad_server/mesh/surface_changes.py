@@ -105,8 +105,8 @@ class SurfaceChanges:
     def _compare(self, old: _Recorded, new: _Recorded) -> tuple[_Recorded, Changes]:
         """Return what is to be recorded, and what changed."""
         voxels = new.voxels
-        now, told = self._offsets(new), self._offsets(old)
-        before, margins = told, old.margins
+        now, last = self._offsets(new), self._offsets(old)
+        before, margins = last, old.margins
         gone = np.zeros(0, np.int64)
         if voxels is not old.voxels:
             before = np.full(len(voxels.keys), np.nan, np.float32)
@@ -114,7 +114,7 @@ class SurfaceChanges:
             _, rows, old_rows = np.intersect1d(
                 voxels.keys, old.voxels.keys, assume_unique=True, return_indices=True
             )
-            before[rows], margins[rows] = told[old_rows], old.margins[old_rows]
+            before[rows], margins[rows] = last[old_rows], old.margins[old_rows]
             gone = np.delete(old.voxels.keys, old_rows)
         moved = np.abs(now - before)
         is_new = np.isnan(before)
@@ -128,9 +128,9 @@ class SurfaceChanges:
         many_left = count(left) >= np.maximum(_LEFT_VOXELS, _LEFT_SHARE * size)
         drifted = 2 * count(moved > self._tolerance_m) > size
         reported = drifted | many_left | (count(is_new) > 0)
-        is_told = reported[voxels.group]
-        offsets = np.where(is_told, now, before)
-        margins = np.where(is_told[:, None], voxels.margins, margins)
+        is_reported = reported[voxels.group]
+        offsets = np.where(is_reported, now, before)
+        margins = np.where(is_reported[:, None], voxels.margins, margins)
         places = is_new | (left & many_left[voxels.group])
         keys = np.concatenate([gone, voxels.keys[places]])
         return replace(new, offsets=offsets, margins=margins), Changes(

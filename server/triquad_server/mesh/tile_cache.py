@@ -9,20 +9,15 @@ from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.wire.limits import LEVELS
 from triquad_format.wire.tile_codec import encode_tile
-from triquad_map.compiled.mesh.mesher import mesh_tile
-from triquad_map.compiled.mesh.tile_border import TileBorder
-from triquad_map.compiled.mesh.tile_lattice import TileIndex, TileLattice
 from triquad_map.compiled.team import THREADS, Team
 from triquad_map.composition.composed_view import ComposedView
+from triquad_map.mesh.mesher import mesh_tile
+from triquad_map.mesh.tile_lattice import TileBorder, TileIndex, TileLattice
 
 from triquad_server.epochs.epoch import Epoch
-from triquad_server.mesh.answered_tiles import AnsweredTiles
 from triquad_server.mesh.surface_changes import SurfaceChanges
 from triquad_server.mesh.tile_level import CachedTile, TileBytes, TileDelta, TileLevel
 from triquad_server.settings import MeshSettings
-
-_ANSWERED_BYTES = 8_000_000
-"""The memory of tiles of one epoch that were requested by name: some 230 m of street."""
 
 
 def tile_lattice(settings: MeshSettings, level: int) -> TileLattice:
@@ -53,19 +48,17 @@ class TileCache:
         self.revision = 0  # number of times that bytes of any tile came to differ
         self.tiles_made = 0  # so far
         self._bytes = TileBytes(settings.cache_bytes)
-        # Those that are requested by name.
-        self.answered = AnsweredTiles(min(_ANSWERED_BYTES, settings.cache_bytes))
 
     @property
     def made_from(self) -> int:
-        """Return the number of the epoch from which tiles are made; -1 after :meth:`let_go`."""
+        """Return the number of the epoch from which tiles are made; -1 after :meth:`release`."""
         view = self._view
         return -1 if view is None else view.epoch
 
     @property
     def nbytes(self) -> int:
         """Return the bytes of the encoded tiles that are kept."""
-        return self._bytes.size + self.answered.nbytes
+        return self._bytes.size
 
     def lattice(self, level: int) -> TileLattice:
         """Return where the tiles of a level lie."""
@@ -81,9 +74,9 @@ class TileCache:
             if epoch.number > self.epoch:
                 self._record_changes(epoch)
             if epoch.number == self.epoch and (to_make or self._view is not None):
-                self._view = epoch.asked_with()
+                self._view = epoch.with_split()
 
-    def let_go(self) -> None:
+    def release(self) -> None:
         """Keep no epoch for making tiles until the next refresh, since it takes memory."""
         with self._lock:
             self._view = None

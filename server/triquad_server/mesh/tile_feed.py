@@ -8,8 +8,8 @@ import time
 from triquad_format.errors import RefusedError
 from triquad_format.wire.mesh_messages import TileUpdatesRequest
 from triquad_format.wire.metrics_messages import QueueMetrics
-from triquad_map.compiled.mesh.tile_lattice import TileIndex
-from triquad_map.compiled.priority import lower_priority
+from triquad_map.compiled.team import lower_priority
+from triquad_map.mesh.tile_lattice import TileIndex
 
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.mesh.followers import (
@@ -25,18 +25,18 @@ from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_level import CachedTile, TileDelta
 from triquad_server.mesh.tile_senders import TileSenders
 from triquad_server.process.threads import NICENESS
-from triquad_server.settings import MeshSettings
 
 _log = logging.getLogger(__name__)
 
 _STOPPING = "the server is stopping"
 _REPLY_BYTES = 1_000_000  # bytes of the tiles of one reply; a single tile may be larger
-_HOLDS_S = 5.0
+_KEPT_S = 5.0
 """The seconds for which an epoch is kept for making tiles after the last follower."""
 
 _NOW_S = 0.0  # there may be something to do at once
 _SLICE_S = 0.2  # time for which tiles are made for one follower, then for the next
 _GIVE_WAY_S = 0.1
+_REFRESH_PERIOD_S = 0.5  # between searches for changed tiles, at least
 _MAX_REFRESH_SHARE = 4
 """Refreshing the cache takes at most one part in this many of the thread's time."""
 
@@ -50,7 +50,6 @@ class TileFeed:
         epochs: EpochHistory,
         *,
         server: str,
-        settings: MeshSettings,
         limit: int,
     ) -> None:
         """Begin to answer; ``server`` is the name that replies carry.
@@ -61,7 +60,6 @@ class TileFeed:
         self._cache = cache
         self._epochs = epochs
         self._server = server
-        self._settings = settings
         self._limit = limit
         self._changed = threading.Condition()  # what is pending, woken, or whether to stop
         self._woken = False  # there is a new request or epoch, or a reply was sent
@@ -129,8 +127,8 @@ class TileFeed:
         lower_priority(NICENESS)
         while True:
             with self._changed:
-                if not self._changed.wait_for(self._is_wanted, _HOLDS_S):
-                    self._cache.let_go()
+                if not self._changed.wait_for(self._is_wanted, _KEPT_S):
+                    self._cache.release()
                     self._changed.wait_for(self._is_wanted)
                 if self._stopping:
                     break
@@ -162,9 +160,7 @@ class TileFeed:
         except Exception:
             _log.exception("an internal error, while changes of the surface were searched for")
         now = time.monotonic()
-        self._next_refresh_s = now + max(
-            self._settings.update_period_s, _MAX_REFRESH_SHARE * (now - started)
-        )
+        self._next_refresh_s = now + max(_REFRESH_PERIOD_S, _MAX_REFRESH_SHARE * (now - started))
         is_current = self._epochs.newest.number <= self._cache.made_from
         return math.inf if is_current else self._next_refresh_s
 
@@ -189,11 +185,12 @@ class TileFeed:
         if self._senders.is_sending_to(follower):
             return math.inf
         state = (self._cache.epoch, self._cache.revision)
-        if self._cache.made_from < 0 or follower.nothing_at == state:
-            return self._answer_if_late(follower, knows_all=follower.nothing_at == state)
+        is_current = follower.is_current(self._cache.epoch)
+        if follower.nothing_at == state:
+            return self._answer_if_late(follower, complete=is_current)
         ready_s = self._senders.ready_s(follower)
-        if ready_s > time.monotonic():
-            return min(ready_s, self._answer_if_late(follower, knows_all=False))
+        if self._cache.made_from < 0 or ready_s > time.monotonic():
+            return min(self._answer_if_late(follower), max(ready_s, self._next_refresh_s))
         asks = follower.asks
         delta = self._cache.delta(
             asks.level, asks.minimum, asks.maximum, known_to=follower.known_to, known=follower.known
@@ -202,22 +199,22 @@ class TileFeed:
             self._send(follower, self._filled(follower, delta))
         elif delta.to_make:
             self._make(asks.level, delta.missing or delta.outdated)
-        elif follower.restart and follower.is_current(self._cache.epoch):
+        elif follower.restart and is_current:
             self._send(follower, TileReply(complete=True, revision=delta.revision))
         else:
-            follower.known_to = delta.revision
-            follower.nothing_at = state
-            return self._answer_if_late(follower, knows_all=True)
+            follower.known_to, follower.nothing_at = delta.revision, state
         return _NOW_S
 
-    def _answer_if_late(self, follower: Follower, *, knows_all: bool) -> float:
-        """Answer a follower without tiles, if its time is over; return when it is."""
+    def _answer_if_late(self, follower: Follower, *, complete: bool = False) -> float:
+        """Answer a follower without tiles, if its time is over; return when it is.
+
+        ``complete``: it knows everything.
+        """
         late_s = follower.late_s(self._cache.epoch)
-        if time.monotonic() >= late_s:
-            complete = knows_all and follower.is_current(self._cache.epoch)
-            self._send(follower, TileReply(complete=complete, revision=follower.known_to))
-            return math.inf
-        return late_s
+        if time.monotonic() < late_s:
+            return late_s
+        self._send(follower, TileReply(complete=complete, revision=follower.known_to))
+        return math.inf
 
     def _make(self, level: int, indices: list[TileIndex]) -> None:
         """Make tiles for a moment; queries come first."""

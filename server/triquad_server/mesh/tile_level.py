@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from triquad_format.records.arrays import Doubles
-from triquad_map.compiled.mesh.tile_border import TileBorder
-from triquad_map.compiled.mesh.tile_lattice import TileIndex, TileLattice
+from triquad_map.mesh.tile_lattice import TileBorder, TileIndex, TileLattice
 
 from triquad_server.mesh.surface_changes import Changes
 

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 from triquad_format.wire.mesh_messages import TileUpdates
-from triquad_map.compiled.priority import lower_priority
+from triquad_map.compiled.team import lower_priority
 
 from triquad_server.fair_queue import Owner
 from triquad_server.mesh.followers import BURST_S, Follower
@@ -42,15 +42,12 @@ class Bandwidth:
     def __init__(self) -> None:
         self._buckets: OrderedDict[str, _Bucket] = OrderedDict()
 
-    def may_send(self, client: str, bytes_per_s: float, now_s: float) -> bool:
-        """Return whether a client may be sent to again."""
-        return math.isinf(bytes_per_s) or self._filled(client, bytes_per_s, now_s).tokens > 0
-
     def ready_s(self, client: str, bytes_per_s: float, now_s: float) -> float:
-        """Return when a client may be sent to again, monotonic seconds."""
-        if self.may_send(client, bytes_per_s, now_s):
+        """Return when a client may be sent to again, monotonic seconds: now, if it may."""
+        if math.isinf(bytes_per_s):
             return now_s
-        return now_s + (1.0 - self._buckets[client].tokens) / bytes_per_s
+        tokens = self._filled(client, bytes_per_s, now_s).tokens
+        return now_s if tokens > 0 else now_s + (1.0 - tokens) / bytes_per_s
 
     def spend(self, client: str, count: int, bytes_per_s: float, now_s: float) -> None:
         """Count bytes that are sent to a client."""

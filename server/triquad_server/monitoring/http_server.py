@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from http.server import BaseHTTPRequestHandler
 from typing import Any
 
-from triquad_map.compiled.priority import lower_priority
+from triquad_map.compiled.team import lower_priority
 
 from triquad_server.errors import ListenError, ServerError
 from triquad_server.health import Health
@@ -150,8 +150,8 @@ def _page(path: str, shown: Metrics | str) -> tuple[int, str, str]:
 
 
 def _health(health: Health) -> dict[str, object]:
-    """Return what a supervisor is told; ``problem`` is ``None`` where all is well."""
+    """Return what a supervisor reads; ``problem`` is ``None`` where all is well."""
     status = health.status()
     names = ("server", "epoch", "settled", "scans_taken", "uptime_s")
-    told = {name: getattr(status, name) for name in names}
-    return {"problem": health.problem(), "map": status.map_name, **told}
+    shown = {name: getattr(status, name) for name in names}
+    return {"problem": health.problem(), "map": status.map_name, **shown}

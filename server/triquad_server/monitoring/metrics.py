@@ -7,7 +7,7 @@ import numpy as np
 import zenoh
 from triquad_format.wire.metrics_messages import QueueMetrics, ServerMetrics
 
-from triquad_server.array_memory import bytes_by_part
+from triquad_server.epochs.array_memory import bytes_by_part
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.surface_history import SurfaceHistory
 from triquad_server.health import Health
@@ -48,7 +48,7 @@ class Metrics:
             bounds_s=np.array(BOUNDS_S),
             operations={name: one.metrics() for name, one in health.operations.copy().items()},
             queues={"scans": QueueMetrics(len(scans), scans.limit), **queues},
-            sources=scans.ledger.sources(),
+            sources=scans.ledger.metrics(),
             scan_bytes_received=scans.received_bytes,
             memory_bytes=self._memory_bytes(kept.epochs),
             resident_bytes=resident_bytes(),

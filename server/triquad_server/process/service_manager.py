@@ -24,9 +24,9 @@ class ServiceManager:
 
     def starting(self, stage: str) -> None:
         """Report that the server begins the next stage of its start, which may take a while."""
-        self.tell(f"EXTEND_TIMEOUT_USEC={_STAGE_S * 1_000_000}", status=stage)
+        self.notify(f"EXTEND_TIMEOUT_USEC={_STAGE_S * 1_000_000}", status=stage)
 
-    def tell(self, *lines: str, status: str = "") -> None:
+    def notify(self, *lines: str, status: str = "") -> None:
         """Send lines such as ``READY=1``, and a status in words."""
         if not self.listens:
             return
@@ -36,4 +36,4 @@ class ServiceManager:
                 sender.settimeout(5.0)  # a manager that does not listen must not stop the server
                 sender.sendto("\n".join(lines).encode(), self._address)
         except OSError as error:
-            _log.warning("the service manager could not be told %s: %s", lines[0], error)
+            _log.warning("the service manager could not be notified of %s: %s", lines[0], error)

@@ -6,8 +6,8 @@ import numpy as np
 from triquad_format.errors import RefusedError
 from triquad_format.records.arrays import Bools, Bytes, Longs
 from triquad_format.wire.query_messages import ChangesReply, ChangesRequest
-from triquad_map.box import check_box
 from triquad_map.clusters import Boxes, tight_boxes
+from triquad_map.questions.checks import check_box
 
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.history import EpochHistory
@@ -44,7 +44,7 @@ class ChangeQueries:
             raise RefusedError(
                 "epoch_gone",
                 f"epoch {request.since} is one of server {request.server[:64]!r}, and this is "
-                f"{self._server!r}: it was restarted; ask for the map anew, then for changes "
+                f"{self._server!r}: it was restarted; ask for the map again, then for changes "
                 f"since its epoch, {newest.number} now or later",
             )
         since = request.since or newest.number

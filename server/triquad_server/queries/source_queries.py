@@ -40,7 +40,7 @@ class SourceQueries:
         if request.revision < 0 or known > revision:
             raise RefusedError(
                 "bad_request",
-                f"revision = {request.revision} is not one that this server told: use that of the "
+                f"revision = {request.revision} is not one that this server gave: use that of the "
                 "reply before, or 0",
             )
         new = sum(source.newest is not None for source in deltas.values())

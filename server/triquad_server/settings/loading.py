@@ -19,8 +19,12 @@ from pydantic_settings import (
 from triquad_format.errors import SettingsError
 
 from triquad_server.settings.leaf_lengths import follows_leaf
-from triquad_server.settings.schemas import SOURCE_SECTION, setting_schemas
-from triquad_server.settings.settings import Settings, UnfitSettingsError
+from triquad_server.settings.settings import (
+    SOURCE_SECTION,
+    Settings,
+    UnfitSettingsError,
+    setting_schemas,
+)
 
 _PREFIX, _DELIMITER = "TRIQUAD_", "__"
 

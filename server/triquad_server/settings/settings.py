@@ -1,21 +1,28 @@
 """All settings of the server: one record, of a record per section."""
 
+from typing import Any
+
 from pydantic import BaseModel, ValidationError, model_validator
 from triquad_format.errors import FormatError, SettingsError
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.wire.keys import check_name
 
-from triquad_server.settings.change import ChangeSettings
 from triquad_server.settings.leaf_lengths import DEFAULT_LEAF_M, at_leaf, follows_leaf
-from triquad_server.settings.memory import MemorySettings
-from triquad_server.settings.mesh import MeshSettings
-from triquad_server.settings.metrics import MetricsSettings
-from triquad_server.settings.scan import ScanSettings
-from triquad_server.settings.section import RECORD
-from triquad_server.settings.service import ServiceSettings
-from triquad_server.settings.source import SourceSettings, check_robot_box
-from triquad_server.settings.store import StoreSettings
-from triquad_server.settings.training import TrainingSettings
+from triquad_server.settings.sections import (
+    RECORD,
+    ChangeSettings,
+    MemorySettings,
+    MeshSettings,
+    MetricsSettings,
+    ScanSettings,
+    ServiceSettings,
+    SourceSettings,
+    StoreSettings,
+    TrainingSettings,
+    check_robot_box,
+)
+
+SOURCE_SECTION = "sources.NAME"
 
 Key = tuple[str, ...]
 """A setting: its section, for a source its name, and its key."""
@@ -138,3 +145,17 @@ class Settings(BaseModel):
     def _table(self, key: Key) -> BaseModel:
         table: BaseModel = getattr(self, key[0]) if len(key) == 2 else self.sources[key[1]]
         return table
+
+
+def setting_schemas() -> dict[str, dict[str, Any]]:
+    """The JSON schema of each setting: by section, then by key.
+
+    The sections of all sources are one, ``sources.NAME``.
+    """
+    schema = Settings.model_json_schema()
+    references = {**schema["properties"]}
+    references[SOURCE_SECTION] = references.pop("sources")["additionalProperties"]
+    return {
+        section: schema["$defs"][reference["$ref"].rpartition("/")[2]]["properties"]
+        for section, reference in references.items()
+    }

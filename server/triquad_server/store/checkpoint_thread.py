@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import CheckpointInfo, CheckpointRequest
 from triquad_format.wire.metrics_messages import CheckpointMetrics
-from triquad_map.compiled.priority import lower_priority
+from triquad_map.compiled.team import lower_priority
 
 from triquad_server.errors import (
     LastCheckpointError,

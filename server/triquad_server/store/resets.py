@@ -4,7 +4,7 @@ import logging
 
 from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import ResetReply, ResetRequest
-from triquad_map.box import check_box
+from triquad_map.questions.checks import check_box
 
 from triquad_server.errors import StoreError
 from triquad_server.intake.source_trails import SourceTrails

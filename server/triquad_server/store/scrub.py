@@ -10,7 +10,7 @@ from pathlib import Path
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.checkpoint_folder import CheckpointFile, checkpoint_files
 from triquad_format.mapfile.index import FileBytes, MapIndex, named
-from triquad_map.compiled.priority import lower_priority
+from triquad_map.compiled.team import lower_priority
 
 from triquad_server.process.threads import NICENESS
 

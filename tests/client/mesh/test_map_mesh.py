@@ -144,14 +144,6 @@ def test_it_needs_neither_torch_nor_scikit_image_nor_the_tools(without, tmp_path
     assert f"element face {faces}\n".encode() in (tmp_path / "mesh.ply").read_bytes()
 
 
-def test_without_numba_the_error_names_the_extra(without) -> None:
-    done = without("numba", "llvmlite")
-    assert done.returncode == 1
-    last = done.stderr.splitlines()[-1]
-    assert last.startswith("triquad_format.errors.InvalidInputError: meshes of map files")
-    assert last.endswith("numba is missing: pip install 'triquad[fast]'")
-
-
 def test_tile_by_tile_it_is_the_same_surface() -> None:
     with OfflineMap(RECORD) as offline:
         whole = offline.mesh(cell_m=0.2)

@@ -2,8 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 from triquad_client.mesh.mesh import compacted
-from triquad_map.tile_join import TileJoin, joined
-from triquad_map.triangles import Triangles
+from triquad_map.triangles import TileJoin, Triangles, joined
 
 EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)
 

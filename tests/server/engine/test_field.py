@@ -12,8 +12,7 @@ from triquad_map.compiled.evidence.live_evidence import LiveEvidence
 from triquad_server.engine.field_record import field_from_record, region_record
 from triquad_server.engine.live_field import Batch, LiveField, Rates, initial_field
 from triquad_server.engine.memory import memory_on
-from triquad_server.engine.tensor_field import FieldTensors, TensorField
-from triquad_server.engine.tensor_memory import TensorMemory
+from triquad_server.engine.tensor_field import FieldTensors, TensorField, TensorMemory
 from triquad_server.engine.tensor_trainer import TensorTrainer
 
 TENSORS = TensorMemory("cpu")

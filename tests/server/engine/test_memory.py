@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from support import small_world
 from triquad_format.records.field_settings import FieldSettings
-from triquad_server.array_memory import buffers_of
 from triquad_server.engine.gradient_sums import GradientSums
 from triquad_server.engine.live_field import Batch, LiveField, Parameter, Rates, initial_field
 from triquad_server.engine.memory import ArrayMemory, Memory
-from triquad_server.engine.tensor_memory import TensorMemory
+from triquad_server.engine.tensor_field import TensorMemory
 from triquad_server.engine.trainer import trainer_of
+from triquad_server.epochs.array_memory import buffers_of
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.process.threads import Teams
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from support.small_world import settings, settled_mapper, world
 from triquad_format.records.status import Status
-from triquad_map.reference.evaluator import MapEvaluator
+from triquad_map.composition.recorded_view import RecordedView
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
 
@@ -20,7 +20,7 @@ def test_the_numpy_evaluator_gives_the_same_answers(epoch: Epoch) -> None:
     anywhere = RNG.uniform(hits.min(axis=0) - 30, hits.max(axis=0) + 30, (5000, 3))
     points = np.concatenate([near, anywhere])
     live = epoch.query(points, gradient=True)
-    offline = MapEvaluator(epoch.record()).query(points, gradient=True)
+    offline = RecordedView(epoch.record()).query(points, gradient=True)
     np.testing.assert_array_equal(offline.status, live.status)
     np.testing.assert_allclose(offline.sdf, live.sdf, atol=1e-5)
     known = np.isfinite(live.sdf)

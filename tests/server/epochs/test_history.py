@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from support.servers import WAIT_S
 from triquad_format.errors import RefusedError
 from triquad_format.records.field_settings import FieldSettings
-from triquad_map.composition.field_view import in_one
+from triquad_map.compiled.team import in_one
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.settings import ServiceSettings
@@ -90,7 +90,7 @@ def test_what_is_pinned_goes_also_where_no_newer_epoch_comes():
     epochs.get(1)
     epochs.add(epoch(2))
     clock.now = 31.0
-    epochs.let_go()
+    epochs.remove_expired()
     assert is_gone(epochs, 1)
 
 
@@ -178,11 +178,11 @@ def test_once_no_epoch_follows_only_the_newest_and_those_asked_for_stay():
     epochs = history(kept=4, pinned=1, clock=clock)
     for number in range(2, 6):
         epochs.add(epoch(number))
-    epochs.let_go()
+    epochs.remove_expired()
     assert [kept.number for kept in epochs.kept().epochs] == [2, 3, 4, 5]
     epochs.get(3)
     clock.now += 10 * ServiceSettings().publish_period_s + 1
-    epochs.let_go()
+    epochs.remove_expired()
     assert [kept.number for kept in epochs.kept().epochs] == [3, 5]
 
 

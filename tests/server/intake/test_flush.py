@@ -130,5 +130,6 @@ def test_questions_about_strangers_push_nobody_out(handler, ledger, monkeypatch)
         stranger = PendingRequest(asks(4, session=session))
         handler.add(stranger)
         assert stranger.reply == none_arrived(5)
-    assert ledger.arrived("lidar", 7, 0)
+    ledger.take(servers.scan(0))
+    assert ledger.is_settled("lidar", 7, 0)
     assert ledger.lost() == {}

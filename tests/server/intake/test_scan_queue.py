@@ -17,9 +17,9 @@ def arrive_and_take(ledger, sequence):
 def test_a_taken_scan_is_settled_at_once_but_done_only_when_published():
     ledger = SourceLedger()
     assert ledger.arrive(SCAN) is None
-    assert not ledger.settled(*SOURCE, 0)
+    assert not ledger.is_settled(*SOURCE, 0)
     ledger.take(SCAN)
-    assert ledger.settled(*SOURCE, 0)
+    assert ledger.is_settled(*SOURCE, 0)
     assert ledger.outcome(*SOURCE, 0) is None
     ledger.publish()
     reply = ledger.outcome(*SOURCE, 0)
@@ -41,11 +41,11 @@ def test_a_scan_is_not_settled_while_an_earlier_one_waits():
     ledger.arrive(servers.scan(0))
     ledger.arrive(servers.scan(1))
     ledger.arrive(servers.scan(2, stamp_ns=0))
-    assert not ledger.settled(*SOURCE, 2)
+    assert not ledger.is_settled(*SOURCE, 2)
     ledger.take(servers.scan(0))
-    assert not ledger.settled(*SOURCE, 1)
+    assert not ledger.is_settled(*SOURCE, 1)
     ledger.refuse(servers.scan(1), "no points")
-    assert ledger.settled(*SOURCE, 2)
+    assert ledger.is_settled(*SOURCE, 2)
     ledger.publish()
     assert ledger.outcome(*SOURCE, 2).last_refusal == "scan 1: no points"
 
@@ -78,20 +78,19 @@ def test_a_clock_that_was_far_ahead_or_is_set_back_costs_one_scan():
 def test_a_leap_that_no_loss_explains_changes_nothing_for_the_scans_that_follow():
     ledger = SourceLedger()
     arrive_and_take(ledger, 0)
-    ledger.publish()
     assert ledger.arrive(servers.scan(2**40)) == "sequence_ahead"
-    assert ledger.give_up(*SOURCE, 2**40).lost == 2**40
-    assert not ledger.arrived(*SOURCE, 1)
     assert ledger.arrive(servers.scan(900)) is None
     assert ledger.lost() == {"lidar": 899}
 
 
-def test_sequences_may_leap_by_what_a_long_silence_explains(monkeypatch):
+def test_a_question_about_a_far_sequence_changes_nothing_for_the_scans_that_follow():
     ledger = SourceLedger()
     arrive_and_take(ledger, 0)
-    now = source_ledger.time.monotonic()
-    monkeypatch.setattr(source_ledger.time, "monotonic", lambda: now + 3600)
-    assert ledger.arrive(servers.scan(3_000_000)) is None
+    ledger.publish()
+    assert ledger.outcome(*SOURCE, 2**40) is None
+    assert ledger.outcome(*SOURCE, 2**40, overdue=True).lost == 2**40
+    assert ledger.arrive(servers.scan(900)) is None
+    assert ledger.lost() == {"lidar": 899}
 
 
 def test_sequences_out_of_range_or_order_are_refused_and_change_nothing():
@@ -106,22 +105,13 @@ def test_sequences_out_of_range_or_order_are_refused_and_change_nothing():
     assert (reply.taken, reply.refused, reply.lost) == (1, 0, 4)
 
 
-def test_what_is_given_up_counts_as_lost():
-    ledger = SourceLedger()
-    arrive_and_take(ledger, 0)
-    ledger.publish()
-    ledger.give_up(*SOURCE, 2)
-    assert ledger.outcome(*SOURCE, 2).lost == 2
-    assert ledger.arrive(servers.scan(2)) == "sequence_backwards"
-
-
 def test_sessions_remembered_are_bounded_and_losses_are_not_forgotten(monkeypatch):
     monkeypatch.setattr(source_ledger, "MAX_SESSIONS", 3)
     ledger = SourceLedger()
     for session in range(10):
         ledger.arrive(servers.scan(1, session=session))
     assert ledger.lost() == {"*": 7, "lidar": 3}
-    assert not ledger.arrived("lidar", 0, 1)
+    assert ledger.outcome("lidar", 0, 1) is None
 
 
 def test_losses_of_a_hostile_publisher_still_fit_a_message():
@@ -139,7 +129,7 @@ def test_sources_that_are_listed_are_bounded_and_the_others_are_put_together(mon
         scan = servers.scan(3, source=source, session=session)
         ledger.arrive(scan)
         ledger.take(scan)
-    sources = ledger.sources()
+    sources = ledger.metrics()
     assert set(sources) == {"front", "rear", "*"}
     front, others = sources["front"], sources["*"]
     assert (front.sessions, front.taken, front.lost) == (2, 2, 6)
@@ -153,7 +143,7 @@ def test_a_full_queue_pushes_out_the_oldest_scan_and_counts_it():
     for sequence in range(3):
         queue.put(servers.scan(sequence))
     assert ledger.lost() == {"lidar": 1}
-    assert ledger.settled(*SOURCE, 0)
+    assert ledger.is_settled(*SOURCE, 0)
     assert queue.take().sequence == 1
     assert len(queue) == 2  # the one in hand is not in the map yet
     assert queue.take().sequence == 2
@@ -173,12 +163,12 @@ def test_waiting_for_an_outcome_ends_with_the_publication():
     publisher.join()
 
 
-def test_a_scan_turned_away_says_nothing_of_those_that_wait():
+def test_a_scan_that_is_not_queued_says_nothing_of_those_that_wait():
     ledger = SourceLedger()
     first, second = servers.scan(sequence=0), servers.scan(sequence=1)
     ledger.arrive(first)
     ledger.arrive(second)
-    ledger.turn_away(second, "too many points")
+    ledger.refuse(second, "too many points")
     asked = (first.source, first.session, 1)
     assert ledger.outcome(*asked) is None, "the first still waits"
     ledger.take(first)

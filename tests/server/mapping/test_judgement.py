@@ -14,9 +14,9 @@ from support.small_world import (
 from triquad_format.records import replay_rays
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.replay_rays import HELD_OUT
-from triquad_map.places import in_cube, place_keys
-from triquad_server.mapping.map_fit import map_fit
+from triquad_map.field_fit import in_cube, place_keys
 from triquad_server.mapping.mapper import Mapper
+from triquad_server.mapping.progress import map_fit
 from triquad_server.mapping.replay.held_out import are_held_out, ends_in_steps
 from triquad_server.mapping.replay.ray_table import END
 from triquad_server.mapping.training.judgement import JudgedPlaces, Judgement

@@ -1,4 +1,4 @@
-"""A world that moves: what is gone disappears from the map, with all that was made from it."""
+"""A world that moves: what is removed disappears from the map, with all that was made from it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -12,9 +12,9 @@ from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.region import Region
 from triquad_format.records.status import Status
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
-from triquad_map.compiled.mesh.marching_cubes import centroids
-from triquad_map.compiled.mesh.mesher import mesh_tile
 from triquad_map.compiled.surfels.surfel_map import surfel_voxels
+from triquad_map.mesh.marching_cubes import centroids
+from triquad_map.mesh.mesher import mesh_tile
 from triquad_server.epochs.epoch import Epoch, FrozenRegion
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.tile_cache import tile_lattice
@@ -145,7 +145,8 @@ def test_the_field_learns_that_it_is_free_there(gone: Course) -> None:
     assert np.median(gone.later.query(free).sdf) > 0.1
 
 
-def test_a_settled_map_that_is_seen_anew_in_part_unlearns_what_went() -> None:
+@pytest.mark.long
+def test_a_settled_map_that_is_seen_again_in_part_unlearns_what_was_removed() -> None:
     chosen = settings(samples_per_ray=30.0)
     watched = Watched(chosen.model_copy(update={"field": Settings().field}))
     watched.scan(BOX, count=8)
@@ -188,14 +189,12 @@ def test_what_stands_keeps_its_surface(gone: Course) -> None:
 
 def test_it_returns_and_leaves_again() -> None:
     watched = Watched()
-    for _ in range(3):
+    for _ in range(2):
         assert share(watched.scan(BOX, count=10), Status.SURFACE) > 0.9
-        left = watched.scan(count=10)
-        assert share(left, Status.SURFACE, front=True) < 0.02
-        assert share(watched.scan(count=15), Status.SURFACE) < 0.1
+        assert share(watched.scan(count=10), Status.SURFACE, front=True) < 0.02
 
 
-def test_in_a_static_world_nothing_is_taken_back() -> None:
+def test_in_a_static_world_nothing_is_removed() -> None:
     chosen = settings(samples_per_ray=6.0)
     still = chosen.model_copy(update={"change": chosen.change.model_copy(update={"static": True})})
     watched = Watched(still)
@@ -209,13 +208,14 @@ def test_a_restored_map_stays_until_rays_contradict_it() -> None:
     voxels = surface_voxels(before.evidence)
     watched.restart()
     assert main_region(watched.mapper.publish()).evidence.ended_in(voxels).all()
-    same = main_region(watched.scan(BOX, count=30)).evidence
+    same = main_region(watched.scan(BOX, count=12)).evidence
     assert same.ended_in(voxels).mean() > 0.997
     watched.restart()
     watched.mapper.publish()
     assert share(watched.scan(count=20), Status.SURFACE, front=True) < 0.05
 
 
+@pytest.mark.long
 def test_rays_that_come_back_from_beyond_the_range_contradict() -> None:
     left = []
     for seed in range(4):  # few rays of a scan are taken for this, at random
@@ -227,7 +227,7 @@ def test_rays_that_come_back_from_beyond_the_range_contradict() -> None:
     assert np.mean(left) < 0.35
 
 
-def test_an_hour_elsewhere_takes_nothing_back() -> None:
+def test_a_while_elsewhere_removes_nothing() -> None:
     watched = Watched()
     watched.scan(BOX, count=8)
     watched.restart()
@@ -236,7 +236,7 @@ def test_an_hour_elsewhere_takes_nothing_back() -> None:
     voxels = voxels[voxel_centres(region, voxels)[:, 0] < 10.0]
     elsewhere = Scene((half_space(0.0), box((30.0, 0.0, 2.0), (0.2, 8.0, 2.0))), WALLED_BOUNDS)
     pose = np.eye(4)
-    for minute in range(60):
+    for minute in range(0, 60, 4):
         pose[:3, 3] = (22.0 + 0.1 * minute, 0.0, 1.4)
         points = Lidar(columns=1024).scan(elsewhere, pose, np.random.default_rng(minute)).points
         points = points[points[:, 0] + pose[0, 3] > 12.0]
@@ -254,6 +254,7 @@ def fence_voxels(epoch: Epoch) -> Longs:
     return voxels[on_bars & (Scene(WALLED, WALLED_BOUNDS).sdf(centres) > 0.3)]
 
 
+@pytest.mark.long
 def test_a_restored_fence_is_not_doubted_like_a_wall() -> None:
     watched = Watched()
     fence = fence_voxels(watched.scan(*BARS, count=60, steps=1))
@@ -271,7 +272,7 @@ def test_a_restored_fence_is_not_doubted_like_a_wall() -> None:
     assert kept(without_outcomes) < 0.85
 
 
-def test_confidence_falls_before_it_is_gone() -> None:
+def test_confidence_falls_before_it_is_removed() -> None:
     watched = Watched()
     before = watched.scan(BOX, count=8, steps=40).nearest_surface(faces(), 0.3)
     after = watched.scan(count=1, steps=0).nearest_surface(faces(), 0.3)

@@ -10,8 +10,8 @@ from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.map_progress import MapProgress
 from triquad_format.records.region import MapRecord
-from triquad_server.mapping.map_fit import map_fit
 from triquad_server.mapping.mapper import Mapper
+from triquad_server.mapping.progress import map_fit
 
 EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)
 SCANS = 6

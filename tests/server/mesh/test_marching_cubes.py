@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 from skimage import measure
-from triquad_map.compiled.mesh.marching_cubes import COUNTS, Crossings
+from triquad_map.mesh.marching_cubes import COUNTS, Crossings
 
 SIDE = 12
 

@@ -30,7 +30,7 @@ def feed(monkeypatch):
     settings, teams = servers.SMALL, Teams()
     epochs = EpochHistory(Mapper("m", settings, "cpu", teams=teams).publish(), settings.service)
     cache = TileCache(settings.mesh, teams.meshing)
-    feed = TileFeed(cache, epochs, server="s", settings=settings.mesh, limit=LIMIT)
+    feed = TileFeed(cache, epochs, server="s", limit=LIMIT)
     with closing(teams), closing(feed):
         yield feed
 
@@ -46,7 +46,7 @@ def test_who_follows_too_often_is_refused_and_no_other(feed):
 
 
 def test_who_names_too_many_tiles_is_refused_and_no_other(feed, monkeypatch):
-    monkeypatch.setattr(followers, "MAX_HELD_BYTES", 100_000)
+    monkeypatch.setattr(followers, "MAX_PENDING_BYTES", 100_000)
     greedy = [pending("greedy", known=150) for _ in range(2)]
     honest = [pending("honest") for _ in range(2)]
     for request in (*greedy, *honest):
@@ -57,31 +57,31 @@ def test_who_names_too_many_tiles_is_refused_and_no_other(feed, monkeypatch):
 
 
 class WatchedCache(TileCache):
-    """Tells when it lets go."""
+    """Notifies of when it lets go."""
 
     def __init__(self, settings: MeshSettings, team: Team) -> None:
         super().__init__(settings, team)
-        self.lets_go = threading.Event()
+        self.released = threading.Event()
 
-    def let_go(self) -> None:
-        super().let_go()
-        self.lets_go.set()
+    def release(self) -> None:
+        super().release()
+        self.released.set()
 
 
-def test_an_epoch_is_held_for_those_who_follow_alone(monkeypatch):
-    monkeypatch.setattr(tile_feed, "_HOLDS_S", 0.01)
+def test_an_epoch_is_kept_for_those_who_follow_alone(monkeypatch):
+    monkeypatch.setattr(tile_feed, "_KEPT_S", 0.01)
+    monkeypatch.setattr(tile_feed, "_REFRESH_PERIOD_S", 0.1)
     settings, teams = servers.SMALL, Teams()
     epochs = EpochHistory(Mapper("m", settings, "cpu", teams=teams).publish(), settings.service)
-    mesh = MeshSettings(update_period_s=0.1)
-    cache = WatchedCache(mesh, teams.meshing)
-    feed = TileFeed(cache, epochs, server="s", settings=mesh, limit=LIMIT)
+    cache = WatchedCache(settings.mesh, teams.meshing)
+    feed = TileFeed(cache, epochs, server="s", limit=LIMIT)
     with closing(teams), closing(feed):
         for _ in range(2):
-            cache.lets_go.clear()
+            cache.released.clear()
             follower = PendingRequest(held_tile_updates(0, timeout_s=1.0), "follower")
             feed.add(follower)
             reply = follower.reply
             assert isinstance(reply, TileUpdates)
             assert reply.complete
-            assert cache.lets_go.wait(servers.WAIT_S)
+            assert cache.released.wait(servers.WAIT_S)
             assert cache.made_from == -1

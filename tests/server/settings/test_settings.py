@@ -13,7 +13,7 @@ from triquad_format.records.field_settings import FieldSettings
 from triquad_server import cli
 from triquad_server.settings import MeshSettings, Settings, SourceSettings
 from triquad_server.settings.loading import PRESETS, load_settings, settings_toml
-from triquad_server.settings.schemas import setting_schemas
+from triquad_server.settings.settings import setting_schemas
 
 ROOT = Path(__file__).parents[3]
 

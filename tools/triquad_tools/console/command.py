@@ -5,6 +5,7 @@ import sys
 from collections.abc import Callable, Mapping
 
 from triquad_format.errors import FormatError, TriquadError
+from triquad_map.record_view import NoCompiledCodeError
 
 from triquad_tools.console.interrupts import no_interrupt_lost
 from triquad_tools.console.lines import print_remark
@@ -50,7 +51,7 @@ def run(
         return complain(command, error, FAILED)
     except OSError as error:
         return complain(command, _in_words(error), BAD_INPUT)
-    except (ToolError, FormatError) as error:
+    except (ToolError, FormatError, NoCompiledCodeError) as error:
         return complain(command, error, BAD_INPUT)
     except TriquadError as error:
         # What the client refuses to send is a ValueError, too; all else is the server's failure.

@@ -5,7 +5,7 @@ from triquad_format.mapfile.reader import MapFile
 from triquad_format.records import morton
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.region import MapRecord
-from triquad_map.reference.evaluator import MapEvaluator
+from triquad_map.record_view import NoCompiledCodeError, open_view
 
 from triquad_tools.console.command import ToolError
 
@@ -46,8 +46,10 @@ def _field(record: MapRecord) -> str:
     if not centres:
         return ""
     points = np.concatenate(centres)
-    with np.errstate(all="ignore"):  # an overflow is what this checks for
-        answer = MapEvaluator(record).query(points)
+    try:
+        answer = open_view(record).query(points)
+    except NoCompiledCodeError:
+        return "field not computed, as numba is missing"
     if not np.isfinite(answer.sdf).all():
         first = points[int(np.argmin(np.isfinite(answer.sdf)))]
         raise FailedCheckError(f"the field at {first.tolist()} is not finite")

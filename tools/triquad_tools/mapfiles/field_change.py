@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import MapRecord, Region, seen_voxels
-from triquad_map.reference.evaluator import MapEvaluator
+from triquad_map.record_view import open_view
 
 QUANTILE = 0.99
 
@@ -84,7 +84,7 @@ def field_change(before: MapRecord, after: MapRecord, seed: int) -> FieldChange:
         for kind, field in zip(kinds, dataclasses.fields(probes), strict=True):
             kind.append(getattr(probes, field.name) + centre)
     everywhere = Probes(*(np.concatenate(kind) for kind in kinds))
-    old, new = (MapEvaluator(record).query(everywhere.points).sdf for record in (before, after))
+    old, new = (open_view(record).query(everywhere.points).sdf for record in (before, after))
     # Outside the cube of a region at the map's border there is no distance.
     return everywhere.change(np.nan_to_num(new - old))
 

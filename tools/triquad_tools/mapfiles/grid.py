@@ -51,7 +51,7 @@ def export_grid(record: MapRecord, box: Box | None, cell_m: float, sparse: bool,
     filled = box if box is not None else evidence_bounds(record)
     if filled is None:
         raise ToolError("no ray has shown anything of this map: there is no box to fill")
-    view = open_view(record).view
+    view = open_view(record)
     grid = _sparse(view, record, box, cell_m=cell_m) if sparse else _dense(view, filled, cell_m)
     with replacing(path) as stream:
         np.savez(stream, epoch=record.epoch, cell_m=cell_m, **grid)

@@ -132,7 +132,7 @@ class _RegionProbes:
         region = dataclasses.replace(self._record.regions[0], tables=tables)
         opened = open_view(dataclasses.replace(self._record, regions=(region,)))
         try:
-            return np.nan_to_num(opened.view.query(self.points.points).sdf)
+            return np.nan_to_num(opened.query(self.points.points).sdf)
         finally:
             opened.close()
 

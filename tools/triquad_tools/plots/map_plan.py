@@ -12,7 +12,7 @@ from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
 from triquad_format.records.region import MapRecord
 from triquad_format.records.seen_space import owned_evidence
 from triquad_map.height_scale import HeightScale
-from triquad_map.reference.evaluator import MapEvaluator
+from triquad_map.record_view import open_view
 
 from triquad_tools.console.report import centimetres
 from triquad_tools.plots.plan import (
@@ -102,7 +102,7 @@ def sample_errors(record: MapRecord) -> SampleErrors:
             labels += [np.zeros(len(ends)), training.sample_labels[near].astype(np.float64)]
     every = sum(map(len, points)) // _MOST_SAMPLES + 1
     asked = np.concatenate(points)[::every]
-    answer = MapEvaluator(record).query(asked)
+    answer = open_view(record).query(asked)
     return SampleErrors(asked, np.abs(answer.sdf - np.concatenate(labels)[::every]))
 
 

@@ -107,15 +107,6 @@ def cells_at(leaves: Longs) -> set[int]:
     return set(np.unique(morton.encode(leaves >> _LEAVES_LOG2)).tolist())
 
 
-def cells_near(leaves: NDArray[np.floating], reach: float) -> set[int]:
-    """Return codes of squares or cubes within ``reach`` leaves of places [N, 2 or 3] in leaves."""
-    cells: set[int] = set()
-    for corner in np.ndindex(*(2,) * leaves.shape[1]):
-        near = np.floor(leaves + (2 * np.array(corner) - 1) * reach).astype(np.int64)
-        cells |= cells_at(np.maximum(near, 0))
-    return cells
-
-
 @dataclass(frozen=True)
 class Column:
     """A shuffled column ``[N, *row]`` of a part, in one of several dtypes."""

@@ -17,14 +17,12 @@ from triquad_format.records.region import OUTCOME_BITS, surface_counts
 from triquad_format.records.region import Evidence as EvidenceRecord
 from triquad_format.records.status import Status
 
-from triquad_map.compiled.evidence.margins import (
+from triquad_map.compiled.evidence.seen_voxels import SeenVoxels, find_unknown, surface_in_grid
+from triquad_map.compiled.evidence.support import (
     SurfaceEnds,
     margins_that_count,
     near_ends,
 )
-from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
-from triquad_map.compiled.evidence.surface_grid import surface_in_grid
-from triquad_map.compiled.evidence.unknown_search import find_unknown
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.voxel_index import (
     SHIFT,
@@ -127,15 +125,25 @@ class FrozenEvidence:
         return int(self.seen_s.max(initial=0))
 
     def status(self, voxels: Doubles, reach: float = 0.5) -> Bytes:
-        """Return status values [N]; see :class:`triquad_map.composition.region.SeenSpace`."""
+        """Return values of :class:`Status` [N] at leaf coordinates [N, 3].
+
+        ``SURFACE`` reaches ``reach`` voxels beyond those in which rays ended.
+        """
         return _status(voxels, reach, self.seen)
 
     def surface_in_grid(self, axes: Sequence[Doubles], reach: float) -> Bools:
-        """Find surface in a grid; see :class:`triquad_map.composition.region.SeenSpace`."""
+        """Return which points [X, Y, Z] of a grid have the status ``SURFACE``, by :meth:`status`.
+
+        ``axes`` are their leaf coordinates [X], [Y] and [Z], increasing.
+        """
         return surface_in_grid(axes, reach, self.seen)
 
     def near_ends(self, voxels: Doubles, reach: float) -> Bools:
-        """Return where rays ended; see :class:`triquad_map.composition.region.SeenSpace`."""
+        """Return whether leaf coordinates [N, 3] lie where rays ended.
+
+        That is within ``reach`` voxels of one in which they did, on each axis, and not in its
+        margins (:attr:`triquad_format.records.region.Evidence.margins`).
+        """
         return near_ends(voxels, reach, self.seen, self._firsts, self.margins)
 
     def ended_in(self, voxels: Longs) -> Bools:
@@ -145,7 +153,11 @@ class FrozenEvidence:
     def find_unknown(
         self, voxels: Doubles, blocks: range, distances: Doubles, nearest: Doubles
     ) -> None:
-        """Find unknown voxels; see :class:`triquad_map.composition.region.SeenSpace`."""
+        """Lower ``distances`` [N] to those from ``voxels`` [N, 3] to the nearest unknown voxel.
+
+        Points are leaf coordinates, as are the ``nearest`` [N, 3] of unknown space; distances are
+        in voxels. Only blocks whose indices are in ``blocks`` on each axis are searched.
+        """
         find_unknown(voxels, self.seen, (blocks.start, blocks.stop), distances, nearest)
 
     def surface_cells(self) -> Longs:

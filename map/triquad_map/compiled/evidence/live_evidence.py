@@ -18,12 +18,11 @@ from triquad_map.compiled.evidence.contradictions import (
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
 from triquad_map.compiled.evidence.growth import EvidenceSize, NewEnds, new_blocks, new_ends
 from triquad_map.compiled.evidence.observations import Observations
+from triquad_map.compiled.evidence.observed import Sighting
 from triquad_map.compiled.evidence.ray_surfels import ray_surfels
 from triquad_map.compiled.evidence.seen_voxels import SeenVoxels, mark_ends
-from triquad_map.compiled.evidence.sightings import Sighting
+from triquad_map.compiled.team import Split, in_one
 from triquad_map.compiled.voxel_index import VoxelIndex, with_room
-from triquad_map.composition.field_view import in_one
-from triquad_map.composition.region import Split
 from triquad_map.surface import SampleField, Surfels
 
 _MIN_CAPACITY = 256

@@ -1,17 +1,27 @@
-"""The support of each surface voxel by rays: how strong it is, and where in it they ended."""
+"""The support of each surface voxel by rays: how strong it is, and where in the voxel they ended.
 
+A surface may end within a voxel, at the corner of a house or where no sensor saw any farther. How
+many quarters of a voxel on each of its sides lie beyond all ends shows where: they are its margins,
+as files have them. A margin counts only where the surface does not go on beyond that side: in
+between, few rays leave gaps. And it counts only where rays would have ended in it: by as many scans
+as hit the voxel, or one next to it.
+"""
+
+import math
 from typing import NamedTuple
 
 import numpy as np
-from triquad_format.records.arrays import Bytes, Floats
+from numpy.typing import NDArray
+from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.region import BLOCK_BYTES
 
-from triquad_map.compiled.evidence.observed import EIGHTHS, Observed, ObservedVoxel
-from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.row_access import prefetch_row
-from triquad_map.compiled.voxel_index import SHIFT
-from triquad_map.surface import LEAST_STRENGTH, LEVELS, SECTORS_COUNTED
+from triquad_map.compiled.evidence.observed import EIGHTHS, Observed, ObservedVoxel, Voxel
+from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
+from triquad_map.compiled.kernel import inner_kernel, kernel
+from triquad_map.compiled.lanes import prefetch_row
+from triquad_map.compiled.voxel_index import LOW, SHIFT, byte_of, find_block, is_set, unpack
+from triquad_map.surface import LEAST_STRENGTH, LEVELS, MARGIN_STEP, SECTORS_COUNTED
 
 
 class Support(NamedTuple):
@@ -73,3 +83,159 @@ def fill_support(surface: Bytes, observed: Observed, weights: Floats, support: S
                 support.beyond[at, axis] = _quarters(voxel.lowest[axis])
                 support.beyond[at, axis + 3] = _quarters(above)
             at += 1
+
+
+_SIDES = 6
+_MARGINS = 4  # from 0 on
+
+_CHANCE = 0.1
+"""A margin counts where the chance is less that all scans missed a surface that goes on."""
+
+_BEYOND = np.array([[1 << axis, 0, 8 << axis] for axis in range(3)])
+"""The bit of the side on which a voxel is next to another: less, level or greater, by axis."""
+
+_BITS_SET = np.array([byte.bit_count() for byte in range(256)], np.uint8)
+
+_LEAST_SCANS = np.array(
+    # A margin begins half a step earlier than its number says.
+    [math.ceil(math.log(_CHANCE) / math.log(1 - MARGIN_STEP * (m + 0.5))) for m in range(_MARGINS)]
+)
+"""The number of scans that would have hit a surface that goes on, by the margin."""
+
+Scans = NDArray[np.int16]
+
+
+class SurfaceEnds(NamedTuple):
+    """The ends of rays in surface voxels [S], as kernels take them."""
+
+    firsts: Longs  # [B] number of the first surface voxel of each block
+    scans: Bytes  # [S] of which rays ended in each voxel
+    beyond: Bytes  # [S, 6] quarters of it on each side, at the end of which none did
+
+
+@inner_kernel()
+def _add_block(row: int, shift: Voxel, seen: SeenVoxels, ends: SurfaceEnds, around: Scans) -> None:
+    """Add the voxels of a block that is ``shift`` blocks from the one in ``around``."""
+    number = ends.firsts[row]
+    for byte in range(BLOCK_BYTES):
+        bits = int(seen.surface[row, byte])
+        x = (byte >> SHIFT) + shift[0] * BLOCK_VOXELS + 1
+        y = (byte & LOW) + shift[1] * BLOCK_VOXELS + 1
+        if bits != 0 and 0 <= x < len(around) and 0 <= y < len(around):
+            at = number
+            for inner in range(BLOCK_VOXELS):
+                if bits >> inner & 1:
+                    z = inner + shift[2] * BLOCK_VOXELS + 1
+                    if 0 <= z < len(around):
+                        around[x, y, z] = 1 + ends.scans[at]
+                    at += 1
+        number += _BITS_SET[bits]
+
+
+@inner_kernel()
+def _fill_around(row: int, seen: SeenVoxels, ends: SurfaceEnds, around: Scans) -> None:
+    """Fill in a block's voxels and those next to it: scans and 1; 0: no surface."""
+    around[:] = 0
+    x, y, z = unpack(seen.blocks.row_keys[row])
+    for i in range(-1, 2):
+        for j in range(-1, 2):
+            for k in range(-1, 2):
+                corner = ((x + i) << SHIFT, (y + j) << SHIFT, (z + k) << SHIFT)
+                near = find_block(seen.blocks, corner[0], corner[1], corner[2], seen.side)
+                if near >= 0:
+                    _add_block(near, (i, j, k), seen, ends, around)
+
+
+@inner_kernel()
+def _look_around(voxel: Voxel, around: Scans) -> tuple[int, int]:
+    """Return the most scans that hit a voxel or one next to it, and where surface goes on.
+
+    A bit for each side says whether any of the nine voxels beyond it has surface.
+    """
+    most = goes_on = 0
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                known = int(around[voxel[0] + i - 1, voxel[1] + j - 1, voxel[2] + k - 1])
+                if known > 0:
+                    most = max(most, known - 1)
+                    goes_on |= _BEYOND[0, i] | _BEYOND[1, j] | _BEYOND[2, k]
+    return most, goes_on
+
+
+@inner_kernel()
+def _fill_margins(voxel: Voxel, beyond: Bytes, around: Scans, margins: Bytes) -> None:
+    """Fill in the ``margins`` [6] of a voxel, whose place in ``around`` is given."""
+    scans, goes_on = _look_around(voxel, around)
+    for side in range(_SIDES):
+        if not goes_on >> side & 1 and scans >= _LEAST_SCANS[beyond[side]]:
+            margins[side] = beyond[side]
+
+
+@kernel()
+def margins_that_count(seen: SeenVoxels, ends: SurfaceEnds) -> Bytes:
+    """Return the margins [S, 6] of all surface voxels; 0: none counts."""
+    margins = np.zeros((len(ends.beyond), _SIDES), np.uint8)
+    side = BLOCK_VOXELS + 2
+    around = np.zeros((side, side, side), np.int16)
+    for row in range(len(seen.surface)):
+        number = ends.firsts[row]
+        known = False  # what lies around
+        for byte in range(BLOCK_BYTES):
+            bits = int(seen.surface[row, byte])
+            for inner in range(BLOCK_VOXELS if bits else 0):
+                if not bits >> inner & 1:
+                    continue
+                if not known:
+                    _fill_around(row, seen, ends, around)
+                    known = True
+                voxel = ((byte >> SHIFT) + 1, (byte & LOW) + 1, inner + 1)
+                _fill_margins(voxel, ends.beyond[number], around, margins[number])
+                number += 1
+    return margins
+
+
+@inner_kernel()
+def _number_of(row: int, voxel: Voxel, firsts: Longs, seen: SeenVoxels) -> int:
+    """Return the number of a surface voxel, in the block ``row``, among all."""
+    last = byte_of(voxel[0], voxel[1])
+    number = firsts[row]
+    for byte in range(last):
+        number += _BITS_SET[seen.surface[row, byte]]
+    below = int(seen.surface[row, last]) & (1 << (voxel[2] & LOW)) - 1
+    return int(number + _BITS_SET[below])
+
+
+@inner_kernel()
+def _holds(point: Doubles, voxel: Voxel, margins: Bytes) -> bool:
+    """Return whether a point near a voxel lies in none of its ``margins`` [6]."""
+    for side in range(_SIDES):
+        inside = point[side % 3] - voxel[side % 3]
+        depth = inside if side < 3 else 1 - inside
+        if margins[side] > 0 and depth < margins[side] * MARGIN_STEP:
+            return False
+    return True
+
+
+@kernel()
+def near_ends(
+    points: Doubles, reach: float, seen: SeenVoxels, firsts: Longs, margins: Bytes
+) -> Bools:
+    """Return whether ``points`` [N, 3] lie within ``reach`` of surface voxels, not in margins.
+
+    All is in voxels. The reach is on each axis, and beyond sides without a margin. ``firsts`` [B]
+    are the numbers of the first surface voxel of each block, ``margins`` [S, 6] those that count.
+    """
+    near = np.zeros(len(points), np.bool_)
+    for i in range(len(points)):
+        x0, y0, z0 = np.floor(points[i] - reach)
+        x1, y1, z1 = np.floor(points[i] + reach)
+        for x in range(int(x0), int(x1) + 1):
+            for y in range(int(y0), int(y1) + 1):
+                for z in range(int(z0), int(z1) + 1):
+                    row = -1 if near[i] else find_block(seen.blocks, x, y, z, seen.side)
+                    if row >= 0 and is_set(seen.surface, row, x, y, z):
+                        voxel = (x, y, z)
+                        number = _number_of(row, voxel, firsts, seen)
+                        near[i] = _holds(points[i], voxel, margins[number])
+    return near

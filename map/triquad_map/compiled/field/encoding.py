@@ -13,7 +13,7 @@ from triquad_format.records.region import AXES
 from triquad_map.compiled.field.feature_rows import add_rows, add_to_row, row_slopes
 from triquad_map.compiled.field.quadtree import Shape, Vertices, block_key
 from triquad_map.compiled.kernel import inner_kernel, kernel
-from triquad_map.compiled.row_access import prefetch_row
+from triquad_map.compiled.lanes import prefetch_row
 from triquad_map.compiled.voxel_index import EMPTY, find_row
 
 BATCH = 64
@@ -180,30 +180,6 @@ def interpolate(batch: PointBatch, levels: int, features: Floats) -> None:
                 weights = _weights(batch, at, t)
                 add_rows(batch.features, t, h * size, features, _corner_rows(batch, at, t), weights)
     _transpose_features(batch, levels * size)
-
-
-@inner_kernel(fastmath=True)
-def interpolate_plane(
-    batch: PointBatch, plane: int, geometry: Geometry, vertices: Vertices, features: Floats
-) -> None:
-    """Do as :func:`locate` and :func:`interpolate`, with the features of one plane alone."""
-    size = features.shape[1]
-    _find_blocks(batch, plane, geometry, vertices)
-    _find_cells(batch, plane, geometry)
-    batch.features[:] = 0
-    for t in range(BATCH):
-        block = vertices.rows[batch.blocks[plane, t]]
-        for h in range(geometry.levels):
-            at = plane * geometry.levels + h
-            corner, side = batch.corners[at, t], (1 << h) + 1
-            rows = (
-                block[corner],
-                block[corner + side],
-                block[corner + 1],
-                block[corner + side + 1],
-            )
-            add_rows(batch.features, t, h * size, features, rows, _weights(batch, at, t))
-    _transpose_features(batch, geometry.levels * size)
 
 
 @inner_kernel(fastmath=True)

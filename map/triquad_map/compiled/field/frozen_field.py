@@ -1,14 +1,32 @@
 """A field that answers from arrays which do not change, such as those of an epoch or of a file."""
 
+from dataclasses import dataclass
+from typing import Protocol
+
 import numpy as np
-from triquad_format.records.arrays import Floats, Longs
+from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import Region
 
 from triquad_map.compiled.field.field import FieldArrays, evaluate, make_field
-from triquad_map.compiled.field.grid import evaluate_in_grid
 from triquad_map.compiled.field.quadtree import FrozenQuadtree, LiveQuadtree
-from triquad_map.composition.region import FieldValues
+from triquad_map.compiled.team import Split
+from triquad_map.surface import FieldSample, SampleField
+
+
+@dataclass(frozen=True)
+class FieldValues:
+    """Signed distances [N] and, where asked for, their gradients [N, 3] (else [0, 3])."""
+
+    sdf: Floats
+    gradient: Floats
+
+
+class FieldEngine(Protocol):
+    """An engine that computes the field of one region."""
+
+    def evaluate(self, points: Floats, gradient: bool) -> FieldValues:
+        """Return the field at points [N, 3], metres from the region's centre."""
 
 
 class FrozenCompiledField:
@@ -28,12 +46,6 @@ class FrozenCompiledField:
         scale = np.float32(self.settings.logit_scale_m)
         return FieldValues(logits * scale, gradients * scale)
 
-    def evaluate_in_grid(self, axes: Floats, points: Longs) -> Floats:
-        """Return distances in a grid; see :class:`triquad_map.composition.region.FieldEngine`."""
-        logits = np.empty(len(points), np.float32)
-        evaluate_in_grid(axes, points, self._field, logits)
-        return np.asarray(logits * np.float32(self.settings.logit_scale_m))
-
 
 def recorded_field(settings: FieldSettings, region: Region) -> FrozenCompiledField:
     """Return the field of a region as a file has it."""
@@ -50,3 +62,22 @@ def recorded_field(settings: FieldSettings, region: Region) -> FrozenCompiledFie
         np.asarray(region.frequencies, np.float32),
     )
     return FrozenCompiledField(settings, tree.freeze(), arrays)
+
+
+def field_samples(engine: FieldEngine, settings: FieldSettings, split: Split) -> SampleField:
+    """Return the field of a region in voxels, at its leaf coordinates."""
+
+    def sample(voxels: Doubles) -> FieldSample:
+        local = settings.offsets(voxels).astype(np.float32)
+        values = np.empty(len(local), np.float32)
+        gradients = np.empty((len(local), 3), np.float32)
+
+        def work(first: int, last: int) -> None:
+            part = engine.evaluate(local[first:last], True)
+            values[first:last] = part.sdf / settings.leaf_m
+            gradients[first:last] = part.gradient
+
+        split(len(local), work)
+        return FieldSample(values, gradients)
+
+    return sample

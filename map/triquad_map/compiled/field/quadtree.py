@@ -9,10 +9,9 @@ all blocks that it touches.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
-from numba.extending import register_jitable
 from triquad_format.records import morton
 from triquad_format.records.arrays import Bools, Bytes, Ints, Longs
 from triquad_format.records.field_settings import FieldSettings
@@ -26,10 +25,9 @@ from triquad_map.compiled.voxel_index import (
     find_row,
     find_slot,
     make_row,
+    morton_code,
     with_room,
 )
-
-CoordinateT = TypeVar("CoordinateT")
 
 _AXES = np.array(AXES)
 PLANE_BITS = 40
@@ -57,23 +55,6 @@ class Shape(NamedTuple):
     levels: int  # H
     limit: int  # blocks along the side of the cube
     starts: Longs  # [H] first vertex of each level within a block
-
-
-@register_jitable
-def morton_code(first: CoordinateT, second: CoordinateT) -> CoordinateT:
-    """Return 2-D Morton codes of non-negative int64 coordinates below 2**31: numbers or tensors.
-
-    Those of :mod:`triquad_format.records.morton`.
-    """
-    codes: CoordinateT = _spread(first) | (_spread(second) << 1)
-    return codes
-
-
-@register_jitable
-def _spread(bits: Any) -> Any:
-    for shift, mask in morton.SPREAD_2D:
-        bits = (bits | (bits << shift)) & mask
-    return bits
 
 
 @kernel(inline="always")

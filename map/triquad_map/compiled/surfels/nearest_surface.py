@@ -6,13 +6,20 @@ import numpy as np
 from triquad_format.records.arrays import Bytes, Doubles, Floats, Longs
 
 from triquad_map.compiled.kernel import inner_kernel, kernel
-from triquad_map.compiled.surfels.surfel_search import find_nearest
+from triquad_map.compiled.surfels.surfel_search import NearestSurfels, find_nearest
 from triquad_map.compiled.surfels.surfel_tree import SurfelTree
-from triquad_map.composition.region import NearestSurfels, RegionFrame
 from triquad_map.surface import HALF_LIFE_S, SurfelKind
 from triquad_map.view import NO_LENGTH_M, NearestSurface
 
 _RAY_DISC = int(SurfelKind.RAY_DISC)
+
+
+class RegionFrame(NamedTuple):
+    """The place of a region's leaf coordinates in the map, and the time of the query."""
+
+    corner: tuple[float, float, float]  # where they are 0, metres, map frame
+    leaf_m: float
+    newest_s: int  # when anything in the map was seen last, seconds since 1970
 
 
 class ShownSurfels(NamedTuple):

@@ -14,11 +14,10 @@ from triquad_format.records.region import BLOCK_BYTES, surface_counts
 
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
 from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.surfels.nearest_surface import ShownSurfels, improve_nearest
-from triquad_map.compiled.surfels.surfel_search import find_nearest
+from triquad_map.compiled.surfels.nearest_surface import RegionFrame, ShownSurfels, improve_nearest
+from triquad_map.compiled.surfels.surfel_search import NearestSurfels, find_nearest
 from triquad_map.compiled.surfels.surfel_tree import TreeShape, surfel_tree, tree_shape
 from triquad_map.compiled.voxel_index import LOW, SHIFT, keys_of
-from triquad_map.composition.region import NearestSurfels, RegionFrame
 from triquad_map.surface import (
     SampleField,
     ShownByRays,

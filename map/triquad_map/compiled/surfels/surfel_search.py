@@ -2,8 +2,7 @@
 
 From the root of the tree down, the nearest box first, and no box that lies farther than the
 nearest surfel so far. Boxes and surfels are checked eight at a time. The surfel that was found
-for the point before is a first bound, so points are taken in an order in which neighbours follow
-each other.
+for the point before is a first bound: points that follow each other are mostly neighbours.
 """
 
 from typing import NamedTuple
@@ -38,7 +37,6 @@ from triquad_map.compiled.surfels.surfel_tree import (
     Z,
 )
 from triquad_map.compiled.voxel_index import CELL_LIMIT
-from triquad_map.composition.region import NearestSurfels
 from triquad_map.surface import SMOOTHING
 
 _FARTHEST = CELL_LIMIT / 2
@@ -63,14 +61,25 @@ _WAITING = 1024
 _NONE = -1
 _NO_LENGTH = np.float32(1e-9)
 
-_CELL_BITS = 7  # of each coordinate of the cells that put points in order
-_DIGIT_BITS = 11  # of a cell's code that are counted at a time
-_DIGIT = (1 << _DIGIT_BITS) - 1
-_DIGITS = 2
-_BEYOND = 1 + 1e-9  # so that the greatest coordinate lies in the last cell
-
 Place = tuple[float, float, float]
 Vectors = tuple[Lanes, Lanes, Lanes]
+
+
+class NearestSurfels(NamedTuple):
+    """The nearest surfels of N points of one region, in leaf coordinates; improved in place."""
+
+    distances: Doubles  # [N] voxels; what lies farther than this is not searched for
+    closest: Doubles  # [N, 3] their points that are nearest
+    means: Doubles  # [N, 3] about the same, over all that is nearly as near
+    rows: Ints  # [N] number of the surfel, -1 where there is none
+
+
+def no_surfels(limits: Doubles) -> NearestSurfels:
+    """Return what is known of points before surfels within ``limits`` [N] voxels are found."""
+    count = len(limits)
+    return NearestSurfels(
+        limits.copy(), np.zeros((count, 3)), np.zeros((count, 3)), np.full(count, -1, np.int32)
+    )
 
 
 class Room(NamedTuple):
@@ -254,62 +263,6 @@ def _first_limit(tree: SurfelTree, at: Place, distance: float, leaf: int) -> flo
     return _limit(distance, at)
 
 
-@inner_kernel(fastmath=True)
-def _spread(cell: int) -> int:
-    """Return a number's bits, each at three times its place."""
-    code = 0
-    for bit in range(_CELL_BITS):
-        code |= (cell >> bit & 1) << 3 * bit
-    return code
-
-
-@inner_kernel(fastmath=True)
-def _cell_codes(points: Doubles) -> Ints:
-    """Return Morton codes [N] of the points' cells, with a given number along the longest side."""
-    codes = np.zeros(len(points), np.int32)
-    side = 1.0
-    for axis in range(3):
-        low, high = _ends(points, axis)
-        side = max(side, high - low)
-    scale = (1 << _CELL_BITS) / (side * _BEYOND)
-    for axis in range(3):
-        low, _ = _ends(points, axis)
-        for i in range(len(points)):
-            codes[i] |= _spread(int((points[i, axis] - low) * scale)) << axis
-    return codes
-
-
-@inner_kernel(fastmath=True)
-def _ends(points: Doubles, axis: int) -> tuple[float, float]:
-    """Return the least and the greatest coordinate."""
-    low = high = points[0, axis]
-    for i in range(len(points)):
-        low, high = min(low, points[i, axis]), max(high, points[i, axis])
-    return low, high
-
-
-@inner_kernel(fastmath=True)
-def _spatial_order(points: Doubles) -> Ints:
-    """Return numbers of points [N, 3] in an order in which neighbours mostly follow each other."""
-    codes = _cell_codes(points)
-    order, before = np.empty(len(points), np.int32), np.empty(len(points), np.int32)
-    for i in range(len(points)):
-        order[i] = i
-    for digit in range(_DIGITS):
-        shift = digit * _DIGIT_BITS
-        ends = np.zeros(_DIGIT + 2, np.int32)  # of the points with lesser digits
-        for i in range(len(points)):
-            ends[(codes[i] >> shift & _DIGIT) + 1] += 1
-        for value in range(_DIGIT):
-            ends[value + 1] += ends[value]
-        order, before = before, order
-        for point in before:
-            own = codes[point] >> shift & _DIGIT
-            order[ends[own]] = point
-            ends[own] += 1
-    return order
-
-
 @kernel(fastmath=True)
 def find_nearest(points: Doubles, tree: SurfelTree, nearest: NearestSurfels) -> None:
     """Improve ``nearest`` where a surfel of the region lies nearer to ``points`` [N, 3].
@@ -327,7 +280,7 @@ def find_nearest(points: Doubles, tree: SurfelTree, nearest: NearestSurfels) -> 
         np.empty(LANES, np.float32),
     )
     before = np.int64(_NONE)
-    for i in _spatial_order(points):
+    for i in range(len(points)):
         at = (points[i, 0], points[i, 1], points[i, 2])
         if not max(abs(at[0]), abs(at[1]), abs(at[2])) < _FARTHEST:
             continue

@@ -7,7 +7,7 @@ A bin is a cube of four leaves; cubes that lie far apart may share one. Rays are
 import numpy as np
 from triquad_format.records.arrays import Bools, Floats, Ints, Longs
 from triquad_map.compiled.kernel import inner_kernel, kernel
-from triquad_map.compiled.row_access import prefetch_row
+from triquad_map.compiled.lanes import prefetch_row
 from triquad_map.compiled.voxel_index import Index, block_key, find_row, pack
 
 from triquad_server.mapping.replay.ray_table import COLUMNS, END, RayTable

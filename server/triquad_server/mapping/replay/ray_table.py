@@ -16,10 +16,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Doubles, Floats, Ints, Longs
-from triquad_map.compiled.field.quadtree import morton_code
 from triquad_map.compiled.kernel import inner_kernel, kernel
-from triquad_map.compiled.row_access import prefetch_row
+from triquad_map.compiled.lanes import prefetch_row
 from triquad_map.compiled.team import Team
+from triquad_map.compiled.voxel_index import morton_code
 
 from triquad_server.engine.live_field import Batch
 from triquad_server.intake.rays import ScanRays

@@ -4,7 +4,7 @@ import numpy as np
 from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
 from triquad_format.records.region import TrainingState
 from triquad_format.records.replay_rays import HELD_OUT
-from triquad_map.places import in_cube
+from triquad_map.field_fit import in_cube
 
 from triquad_server.mapping.replay.held_out import are_held_out
 from triquad_server.mapping.replay.kept_rays import KeptRays

@@ -5,7 +5,7 @@ from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_map.compiled.team import Team
 from triquad_map.compiled.voxel_index import Index, VoxelIndex
-from triquad_map.places import place_keys
+from triquad_map.field_fit import place_keys
 
 from triquad_server.engine.live_field import Batch
 from triquad_server.mapping.replay.kept_rays import KeptRays

@@ -64,7 +64,7 @@ class Focus:
     def release(self) -> None:
         """Let all of the region learn."""
         self._seen_since = None
-        self._field.hold(None)
+        self._field.fix(None)
         self._pool.focus(None)
 
     def apply(self, samples: int) -> None:
@@ -85,10 +85,10 @@ class Focus:
             self.release()
             return
         seen = cells_of(seen_since)
-        held = self._field.tree.rows_under(elsewhere, BLOCK_VOXELS)
+        fixed = self._field.tree.rows_under(elsewhere, BLOCK_VOXELS)
         learning = self._field.tree.rows_under(seen, BLOCK_VOXELS)
-        if (learning & ~held).sum() < _LEAST_FREE * learning.sum():
+        if (learning & ~fixed).sum() < _LEAST_FREE * learning.sum():
             self.release()
             return
-        self._field.hold(held)
+        self._field.fix(fixed)
         self._pool.focus(seen)

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
 from triquad_format.records.field_settings import FieldSettings
-from triquad_map.field_fit import PlaceFits
-from triquad_map.places import Places
-from triquad_map.sorted_keys import rows_of
+from triquad_map.clusters import rows_of
+from triquad_map.field_fit import PlaceFits, Places
 
 from triquad_server.mapping.replay.held_out import ray_keys
 from triquad_server.mapping.replay.ray_table import END
@@ -42,7 +41,7 @@ class JudgedPlaces(PlaceFits):
     """The fit of a field to its places, and where it was better before."""
 
     forgotten: Bools  # [P] where the same rays fit worse than they did
-    forgotten_keys: Longs  # of these, as of :func:`triquad_map.places.place_keys`
+    forgotten_keys: Longs  # of these, as of :func:`triquad_map.field_fit.place_keys`
     repaired: int  # places that had forgotten before, and no longer have
     given_up: int  # places that had, and that training did not repair
 

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
 from triquad_format.records.field_settings import FieldSettings
-from triquad_map.places import place_keys
-from triquad_map.sorted_keys import rows_of
+from triquad_map.clusters import rows_of
+from triquad_map.field_fit import place_keys
 
 from triquad_server.mapping.training.group_means import GroupMeans
 

@@ -8,7 +8,7 @@ from triquad_format.records.arrays import Doubles, Floats, Longs
 from triquad_format.records.region import TrainingState
 from triquad_map.compiled.evidence.live_evidence import LiveEvidence
 from triquad_map.compiled.surfels.surfel_map import SurfelMap
-from triquad_map.composition.region import no_surfels
+from triquad_map.compiled.surfels.surfel_search import no_surfels
 
 from triquad_server.engine.field_record import training_state
 from triquad_server.engine.live_field import LiveField
@@ -18,12 +18,11 @@ from triquad_server.intake.rays import ScanRays
 from triquad_server.mapping.replay.ray_table import END, rays_through, samples_alone
 from triquad_server.mapping.replay.region_rays import RegionRays
 from triquad_server.mapping.replay.region_setup import RegionSetup
-from triquad_server.mapping.training.fair_share import FairShare
 from triquad_server.mapping.training.focus import Focus
 from triquad_server.mapping.training.judgement import Judgement, Repairs
 from triquad_server.mapping.training.learnt_places import VISITS, LearntPlaces
 from triquad_server.mapping.training.slopes import Slopes
-from triquad_server.mapping.training.training_budget import TrainingBudget
+from triquad_server.mapping.training.training_budget import FairShare, TrainingBudget
 
 _log = logging.getLogger(__name__)
 

@@ -1,11 +1,41 @@
 """A region's budget of training: how many samples, on which rays, and at which rates."""
 
+import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from triquad_server.engine.live_field import Rates
+from triquad_server.mapping.replay.kept_rays import RAY_BYTES
 from triquad_server.settings import TrainingSettings
 
+_STEP = 1.1
+"""The factor between the possible numbers of rays per voxel: changing it is expensive, so it is
+done seldom."""
+
+
+@dataclass(frozen=True)
+class FairShare:
+    """The share of a voxel with surface, the same everywhere: all places are learnt alike."""
+
+    rays: float  # rays that are kept
+    samples: float  # samples that may be left to train on
+    rays_share: float  # share of `training.rays_per_voxel` that memory has room for
+
+    @classmethod
+    def of(cls, voxels: int, training: TrainingSettings) -> "FairShare":
+        """Return the share in a map of ``voxels`` voxels with surface."""
+        count = max(1, voxels)
+        wanted = max(training.pool_rays / count, training.rays_per_voxel)
+        kept = min(wanted, training.pool_bytes / RAY_BYTES / count)
+        return cls(
+            rays=_STEP ** math.floor(math.log(kept, _STEP)),
+            samples=max(training.max_budget_samples / count, training.samples_per_voxel),
+            rays_share=min(1.0, kept / training.rays_per_voxel),
+        )
+
+
 _LEAST_RATE = 0.02  # share of the learning rate with which the last samples are trained
+_COOLDOWN = 8.0  # samples left per ray below which the learning rate falls
 _REPAIR_SHARE = 0.5  # share of a batch that is drawn where the field has forgotten
 _REPAIR_VISITS = 16  # samples on each ray there
 _REPAIR_ROUNDS = 3
@@ -113,5 +143,5 @@ class TrainingBudget:
         It falls the later, the fewer the ``rays`` are from which there is something to learn: so
         what is new learns quickly where much has settled.
         """
-        enough = self._settings.cooldown * max(1, rays)
+        enough = _COOLDOWN * max(1, rays)
         return min(1.0, max(_LEAST_RATE, (self.samples / enough) ** 2))

@@ -14,11 +14,10 @@ from triquad_format.records.status import Status
 from triquad_format.wire.tile_codec import STEPS, TileSurface
 
 from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.mesh.filling import FilledVoxels, cells_around, filled_voxels, on_filled
-from triquad_map.compiled.mesh.marching_cubes import Crossings, centroids
-from triquad_map.compiled.mesh.tile_border import TileBorder
-from triquad_map.compiled.mesh.tile_lattice import TileIndex, TileLattice
 from triquad_map.composition.composed_view import ComposedView
+from triquad_map.mesh.filling import FilledVoxels, cells_around, filled_voxels, on_filled
+from triquad_map.mesh.marching_cubes import Crossings, centroids
+from triquad_map.mesh.tile_lattice import TileBorder, TileIndex, TileLattice
 from triquad_map.triangles import Triangles
 
 _FINE = 0.5
@@ -179,6 +178,5 @@ def _lattice_values(
     if around is not None:
         around.put(volume)
         asked = points[np.isnan(volume[tuple(points.T)])]
-    axes = (first[:, None] + np.arange(lattice.cells + 1)) * np.float64(lattice.cell_m)
-    _enter(view.distances_in_grid(axes, asked), asked, volume)
+    _enter(view.distances((first + asked) * np.float64(lattice.cell_m)), asked, volume)
     return volume, points

@@ -21,8 +21,8 @@ from triquad_format.records.arrays import Bools, Bytes, Doubles, Longs
 from triquad_format.records.cells import cell_names, cells_of_boxes
 from triquad_format.records.status import Status
 
+from triquad_map.clusters import rows_of
 from triquad_map.composition.composed_view import ComposedView
-from triquad_map.sorted_keys import rows_of
 from triquad_map.surface import FieldSample, SampleField, SurfelKind, fit_surfels
 
 _STEEPNESS = 0.7

@@ -1,1 +1,0 @@
-"""A map answered with numpy alone: the reference for compiled code."""

@@ -1,0 +1,262 @@
+"""The sections of the settings, a record each: fields with ranges, and what they mean."""
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from triquad_server.settings.leaf_lengths import length
+
+RECORD = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+# Neither text nor a truth value is a number.
+SECTION = RECORD | ConfigDict(strict=True)
+
+
+class ScanSettings(BaseModel):
+    """Which points of a scan are used, and where its rays are sampled."""
+
+    model_config = SECTION
+
+    range_min_m: float = length(1.5, least_m=0, most_m=1000)
+    """Nearer points are dropped."""
+
+    range_max_m: float = length(50.0, least_m=0, most_m=1e4)
+    """How far rays reach: farther points are dropped, and the space up to this range is free, as
+    on rays without a return. At least `range_min_m`."""
+
+    thin_m: float = length(0.05, least_m=1e-3, most_m=10)
+    """One point is kept per voxel of this side, or per patch, as the sensor sees it."""
+
+    thin_by: Literal["voxel", "direction"] = "voxel"
+    """Of which points one is kept: of those in a voxel, or of those in the same direction and,
+    within a fifth, the same distance. Voxels keep the rows of a lidar on flat tops; of a dense
+    sensor with noise they keep too many outliers."""
+
+    surface_share: Annotated[float, Field(ge=0.01, le=1)] = 0.5
+    """Share of the training samples that lie around end points; the others lie in free space."""
+
+    spread_m: float = length(0.08, least_m=1e-3, most_m=10)
+    """Standard deviation of the distance of samples from their end point, along the ray."""
+
+    truncation_m: float = length(0.3, least_m=0.01, most_m=20)
+    """Largest distance of such samples from their end point."""
+
+    behind_m: float = length(0.8, least_m=0, most_m=100)
+    """Samples of free space end so far behind the end point."""
+
+    max_points: Annotated[int, Field(ge=1, le=20_000_000)] = 500_000
+    """A larger scan is refused."""
+
+
+_Coordinate = Annotated[float, Field(ge=-20, le=20)]
+# A file has lists, not tuples.
+_Corner = Annotated[tuple[_Coordinate, _Coordinate, _Coordinate], Field(strict=False)]
+Box = Annotated[tuple[_Corner, _Corner], Field(strict=False)]
+
+_MAX_BOX_VOXELS = 100_000  # that are marked with each scan
+
+
+class SourceSettings(BaseModel):
+    """What is particular to the scans of one source."""
+
+    model_config = SECTION
+
+    range_min_m: Annotated[float, Field(ge=0, le=1000)] | None = None
+    """Nearer points are dropped; by default as in `[scan]`."""
+
+    range_max_m: Annotated[float, Field(ge=0, le=1e4)] | None = None
+    """How far rays reach; by default as in `[scan]`."""
+
+    no_return: bool = True
+    """Whether rays of which a scan says that they met nothing are believed."""
+
+    robot_box_m: Box | None = None
+    """Two corners, metres, sensor frame, of the space that the robot takes up: points in it are
+    dropped, and where the robot has been it is free."""
+
+
+ANY_SOURCE = SourceSettings()
+"""Of a source that has no section."""
+
+
+def check_robot_box(name: str, box: Box, leaf_m: float) -> None:
+    """Refuse a box that holds nothing, or very many voxels of side ``leaf_m``.
+
+    Raises:
+        ValueError: it is named as ``name``.
+    """
+    sides = [high - low for low, high in zip(*box, strict=True)]
+    if min(sides) <= 0:
+        raise ValueError(
+            f"{name} = {box}: the first corner has the smaller x, y and z, the second the larger"
+        )
+    if math.prod(side / leaf_m for side in sides) > _MAX_BOX_VOXELS:
+        raise ValueError(
+            f"{name} = {box} has more than {_MAX_BOX_VOXELS} voxels of field.leaf_m = "
+            f"{leaf_m:g}: use a smaller box, or larger leaves"
+        )
+
+
+class ChangeSettings(BaseModel):
+    """How quickly a surface is removed that rays pass through, in a world that changes."""
+
+    model_config = SECTION
+
+    static: bool = False
+    """The world stands still: no surface is ever removed."""
+
+    scans: Annotated[int, Field(ge=1, le=1000)] = 3
+    """Scans in a row, at least, of which rays pass where a surface was, and none ends there."""
+
+    doubt: Annotated[float, Field(ge=1e-9, le=0.5)] = 0.01
+    """Largest probability of such rays if the surface were still there, by how often rays ended and
+    passed there before."""
+
+
+class TrainingSettings(BaseModel):
+    """How the field is trained."""
+
+    model_config = SECTION
+
+    batch: Annotated[int, Field(ge=1, le=10_000_000)] = 16_384
+    """Samples per step, at most: it is one for each 14 vertices of a region, and at least 4096, so
+    that a street learns alike in one region and across several. While scans stream in, it is half
+    of that: of as many samples, more and smaller steps learn sooner."""
+
+    learning_rate: Annotated[float, Field(ge=0, le=1)] = 0.01
+    """Learning rate of Adam, before it cools."""
+
+    pool_rays: Annotated[int, Field(ge=100, le=1_000_000_000)] = 1_200_000
+    """Rays that are kept for training, over the whole map, spread evenly over its surface; a large
+    map keeps more, by `rays_per_voxel`."""
+
+    rays_per_voxel: Annotated[float, Field(ge=0.01, le=10_000)] = 12.0
+    """Rays that a large map keeps for each voxel with surface."""
+
+    pool_bytes: Annotated[int, Field(ge=10_000, le=2**50)] = 500_000_000
+    """Bytes of all rays that are kept; a map too large for that keeps fewer for each voxel."""
+
+    fresh_share: Annotated[float, Field(ge=0, le=1)] = 0.25
+    """Share of a batch that is drawn from the newest scans while they stream in."""
+
+    samples_per_ray: Annotated[float, Field(ge=0, le=1000)] = 48.0
+    """Samples by which each new ray raises the training budget of its region."""
+
+    max_budget_samples: Annotated[int, Field(ge=1, le=10_000_000_000)] = 24_000_000
+    """Largest training budget of the map, in samples, shared by its regions as they have surface; a
+    large map has a larger one, by `samples_per_voxel`."""
+
+    samples_per_voxel: Annotated[float, Field(ge=0.01, le=1_000_000)] = 240.0
+    """Largest training budget of a large map, in samples for each voxel with surface."""
+
+    max_regions: Annotated[int, Field(ge=1, le=1_000_000)] = 256
+    """Regions of the map; a scan that would need more is refused."""
+
+    seed: Annotated[int, Field(ge=0, le=2**31)] = 42
+    """Seed of all random choices."""
+
+
+class MeshSettings(BaseModel):
+    """The lattice of mesh tiles, and how clients follow them."""
+
+    model_config = SECTION
+
+    cell_m: float = length(0.1, least_m=0.005, most_m=10)
+    """Side of the cells of marching cubes."""
+
+    tile_cells: Annotated[int, Field(ge=4, le=256)] = 64
+    """Cells along the side of a tile."""
+
+    reach_m: float = length(0.02, least_m=0, most_m=1)
+    """Centres of faces lie at most this far from voxels with seen surface; twice and four times as
+    far on levels of detail 1 and 2."""
+
+    tolerance_m: float = length(0.01, least_m=0, most_m=1)
+    """A tile changes where its surface moved by more."""
+
+    cache_bytes: Annotated[int, Field(ge=0, le=2**40)] = 200_000_000
+    """Bytes of encoded tiles that are cached; others are made again when they are asked for."""
+
+
+class StoreSettings(BaseModel):
+    """When checkpoints are written and how far back they are kept."""
+
+    model_config = SECTION
+
+    period_s: Annotated[float, Field(ge=0, le=1e7)] = 60.0
+    """Time between checkpoints while the map changes; 0: only on request."""
+
+    keep: Annotated[int, Field(ge=2, le=1_000_000)] = 20
+    """Newest checkpoints that stay on disk; two always do."""
+
+    keep_age_s: Annotated[float, Field(ge=0, le=1e10)] = 0.0
+    """Older checkpoints are deleted; 0: of any age stay."""
+
+    keep_bytes: Annotated[int, Field(ge=0, le=2**60)] = 4_000_000_000
+    """The oldest checkpoints are deleted while all take more; 0: no limit."""
+
+    protect_h: Annotated[float, Field(ge=0, le=1e6)] = 24.0
+    """Hours for which the map as it was before a reset stays on disk, whatever the limits above
+    say; 0: a reset keeps nothing."""
+
+    protect_bytes: Annotated[int, Field(ge=0, le=2**60)] = 4_000_000_000
+    """Bytes of all checkpoints that are kept for that. A reset that would need more is refused: so
+    nothing pushes out what is kept already; 0: no limit."""
+
+    scrub_h: Annotated[float, Field(ge=0, le=1e6)] = 24.0
+    """Hours between checks of all checkpoints on disk, which find what rots there; 0: none."""
+
+
+class ServiceSettings(BaseModel):
+    """Limits of the network service."""
+
+    model_config = SECTION
+
+    scan_queue: Annotated[int, Field(ge=1, le=10_000)] = 32
+    """Scans of each source that wait; the oldest is pushed out, and counted. Sources take turns."""
+
+    request_queue: Annotated[int, Field(ge=1, le=10_000)] = 64
+    """Requests of each client that wait, and an eighth of those of all; of more, the newest of the
+    client that has most of them is refused."""
+
+    publish_period_s: Annotated[float, Field(ge=0.01, le=3600)] = 0.5
+    """Time between epochs while the map changes."""
+
+    epochs_kept: Annotated[int, Field(ge=1, le=1000)] = 4
+    """Newest epochs that requests can ask for by number; a while after the last one was published,
+    the newest alone."""
+
+    epochs_pinned: Annotated[int, Field(ge=0, le=1000)] = 8
+    """Older epochs that stay because they were asked for by number; of more, the one that was asked
+    for longest ago is removed."""
+
+    pin_s: Annotated[float, Field(ge=0, le=1e6)] = 30.0
+    """Time for which an epoch stays after it was last asked for by number."""
+
+
+class MemorySettings(BaseModel):
+    """How much memory the map may take."""
+
+    model_config = SECTION
+
+    max_bytes: Annotated[int, Field(ge=1_000_000, le=2**50)] = 2_000_000_000
+    """Of the live map with its newest epoch. A scan that would make it larger is refused as
+    `map_full`; one that shows nothing new is taken on, and all else goes on too."""
+
+    epochs_bytes: Annotated[int, Field(ge=0, le=2**50)] = 300_000_000
+    """Of older epochs that can be asked for by number, beyond what they share with newer ones;
+    those that were asked for last stay first."""
+
+
+class MetricsSettings(BaseModel):
+    """Figures for Prometheus and health for supervisors, over HTTP."""
+
+    model_config = SECTION
+
+    port: Annotated[int, Field(ge=0, le=65535)] = 0
+    """Where `/metrics` and `/healthz` are answered; 0: nowhere. The flag `--metrics-port` says the
+    same."""
+
+    address: Annotated[str, Field(min_length=1, max_length=255)] = "127.0.0.1"
+    """Address of the network interface that is listened on: `0.0.0.0` for all; all who reach it may
+    read."""
