@@ -15,7 +15,7 @@ from triquad_server.settings import (
     Settings,
     TrainingSettings,
 )
-from triquad_tools.evaluation.map_scores import ask_withheld, score_withheld
+from triquad_tools.evaluation.map_scores import score_withheld
 from triquad_tools.recordings.cloud import is_withheld, world_points
 from triquad_tools.recordings.folders.kitti import KittiFolder, read_kitti_folder
 
@@ -50,7 +50,7 @@ def mapped(
         assert (bridged.taken, bridged.lost) == (len(taken), 0), bridged.bridge.dropped
         bridged.client.settle(600.0)
         clouds = (world_points(scan, *RANGES_M) for scan in folder.read(withheld))
-        return score_withheld(ask_withheld(bridged.client.query_sdf, clouds)).sdf_median_m
+        return score_withheld(bridged.client.query_sdf, clouds).sdf_median_m
 
 
 def test_the_map_is_as_good_as_that_of_the_client() -> None:

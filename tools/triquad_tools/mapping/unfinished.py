@@ -4,12 +4,11 @@ import hashlib
 import json
 import shutil
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 from triquad_format.mapfile.durable_file import replacing
-from triquad_format.records.region import MapRecord
 from triquad_server.mapping.mapper import Mapper
+from triquad_server.process.threads import Teams
 from triquad_server.settings import Settings, StoreSettings
 from triquad_server.store.store import Store
 
@@ -20,14 +19,6 @@ MAP_NAME = "recording"
 _POSITIONS = "positions.json"
 _SECTIONS = {"field", "scan", "change", "training", "sources"}  # that a map depends on
 _KEEP = StoreSettings(period_s=0.0, keep=2)
-
-
-@dataclass(frozen=True)
-class Position:
-    """The position at which to go on."""
-
-    record: MapRecord | None  # None: with an empty map
-    scans_taken: int
 
 
 def mapping_key(selection: Selection, settings: Settings) -> str:
@@ -77,22 +68,26 @@ class UnfinishedMap:
         with suppress(OSError):  # other files in the folder are kept
             self.folder.rmdir()
 
-    def position(self) -> Position:
-        """Return the position at which to go on.
+    def resumed(self, settings: Settings, device: str, teams: Teams) -> tuple[Mapper, int]:
+        """Return a mapper that goes on with the map, and how many scans it has taken.
 
         Raises:
             StoreError: there are checkpoints, but none can be read.
         """
-        newest = self._store.newest()
-        if newest is None:
-            return Position(None, 0)
-        epoch = newest.record.epoch
-        if str(epoch) not in self._scans_taken:
-            raise ToolError(
-                f"{self.folder}: {_POSITIONS} says nothing of epoch {epoch}; delete the folder to "
-                "begin anew"
-            )
-        return Position(newest.record, self._scans_taken[str(epoch)])
+        newest, taken = self._store.newest(), 0
+        if newest is not None:
+            epoch = str(newest.record.epoch)
+            if epoch not in self._scans_taken:
+                raise ToolError(
+                    f"{self.folder}: {_POSITIONS} says nothing of epoch {epoch}; delete the folder "
+                    "to begin anew"
+                )
+            taken = self._scans_taken[epoch]
+        record = None if newest is None else newest.record
+        mapper = Mapper(MAP_NAME, settings, device, record=record, teams=teams)
+        # What comes from now on is of a later epoch than the checkpoint.
+        mapper.publish()
+        return mapper, taken
 
     def save(self, mapper: Mapper, scans_taken: int) -> None:
         """Write a checkpoint from which the map can go on.
