@@ -51,11 +51,3 @@ def test_what_goes_wrong_is_a_status_and_one_line(capsys, raised, status, line):
 
     assert run("tool", work, failures=(KeyError,)) == status
     assert capsys.readouterr().err == f"{line}\n"
-
-
-def test_a_defect_keeps_its_trace():
-    def work():
-        raise ValueError
-
-    with pytest.raises(ValueError):
-        run("tool", work)

@@ -92,9 +92,3 @@ def test_withheld_points_are_scored_over_all_clouds() -> None:
     assert scores.sdf_p90_m == pytest.approx(0.08)
     assert scores.surface_sdf_median_m == pytest.approx(0.02)
     assert scores.surface_sdf_p90_m == pytest.approx(0.03)
-
-
-def test_no_withheld_points_score_nothing() -> None:
-    scores = score_withheld(_exact(DRIVE.scene), [])
-    assert scores.points == 0
-    assert np.isnan([scores.surface_ratio, scores.sdf_median_m]).all()

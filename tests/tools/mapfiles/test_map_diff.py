@@ -1,4 +1,3 @@
-import dataclasses
 import json
 import math
 
@@ -36,18 +35,6 @@ def test_surface_points_lie_on_the_surface_of_their_voxel():
     assert np.abs(MapEvaluator(RAISED).query(points).sdf).max() <= 1e-4
     inside = np.abs(points[:, :2]).max(axis=1) < 1.9
     np.testing.assert_allclose(points[inside, 2], 0.15, atol=2e-4)
-
-
-def test_surface_ends_where_rays_did():
-    region = GROUND.regions[0]
-    with OfflineMap(GROUND) as ground:
-        outermost = ground.surface_voxels()[:, 0] > 9.8
-    margins = np.zeros((POINTS, 6), np.uint8)
-    margins[outermost, 3] = 3  # quarters of a voxel, at the side of greater x
-    evidence = dataclasses.replace(region.evidence, margins=margins)
-    cut = dataclasses.replace(GROUND, regions=(dataclasses.replace(region, evidence=evidence),))
-    with OfflineMap(cut) as ground:
-        assert len(surface_points(ground)) == POINTS - 100
 
 
 def test_a_map_does_not_differ_from_itself():

@@ -1,4 +1,4 @@
-"""Meshes and grids that ``triquad-pack`` writes, opened by the libraries that people use."""
+"""Meshes that ``triquad-pack`` writes, opened by the libraries that people use."""
 
 import re
 
@@ -12,7 +12,6 @@ from support.small_world import settings, settled_epoch
 from triquad_client import Mesh
 from triquad_format.mapfile.reader import read_map
 from triquad_format.records.crop import crop_record
-from triquad_format.records.status import Status
 from triquad_map.compiled.mesh.mesher import mesh_tile
 from triquad_map.reference.evaluator import MapEvaluator
 from triquad_map.tile_join import joined
@@ -115,45 +114,11 @@ def test_a_mesh_within_a_box(map_file, tmp_path):
     assert 0 < len(part.faces) == inside.sum() < len(whole.faces)
 
 
-def test_dense_grid(map_file, tmp_path):
-    grid = np.load(export(map_file, tmp_path, "grid.npz", "--crop", *BOX))
-    assert grid["sdf"].dtype == np.float32
-    assert grid["status"].dtype == np.uint8
-    assert grid["sdf"].shape == grid["status"].shape == (61, 44, 26)
-    np.testing.assert_allclose(grid["origin_m"], [0.2, -4.6, -2])
-    assert grid["cell_m"] == 0.2
-    cells = np.indices(grid["sdf"].shape).reshape(3, -1).T
-    answer = MapEvaluator(read_map(map_file)).query(grid["origin_m"] + cells * grid["cell_m"])
-    np.testing.assert_allclose(grid["sdf"].ravel(), answer.sdf, atol=1e-4)
-    assert (grid["status"].ravel() != answer.status).mean() < 1e-3  # on borders of voxels
-    assert (answer.status == Status.SURFACE).any()
-
-
-def test_a_grid_without_a_box_holds_all_evidence_and_nan_where_no_region_is(tmp_path):
-    source, out = tmp_path / "in.triquad", tmp_path / "out.npz"
-    record = random_record(1)
-    source.write_bytes(file_bytes(record))
-    assert main([str(source), str(out), "--cell", "0.5"]) == 0
-    grid = np.load(out)
-    np.testing.assert_allclose(grid["origin_m"], [-8, -8, -8])
-    assert grid["sdf"].shape == (33, 33, 33)
-    assert grid["epoch"] == record.epoch
-    wide = ["--crop", "-12", "-1", "-1", "0", "1", "1"]
-    assert main([str(source), str(out), "--cell", "0.5", "--force", *wide]) == 0
-    grid = np.load(out)
-    outside = grid["origin_m"][0] + 0.5 * np.arange(len(grid["sdf"])) <= -8
-    assert np.isnan(grid["sdf"][outside]).all()
-    assert (grid["status"][outside] == Status.UNKNOWN).all()
-    assert np.isfinite(grid["sdf"][~outside]).all()
-
-
 def test_a_map_that_has_seen_nothing(tmp_path, capsys):
     source = tmp_path / "in.triquad"
     source.write_bytes(file_bytes(crop_record(random_record(1), [7.9] * 3, [7.95] * 3)))
     assert main([str(source), str(tmp_path / "out.ply")]) == 0
     assert " 0 faces" in capsys.readouterr().out
-    assert main([str(source), str(tmp_path / "out.npz")]) == 2
-    assert "no ray has shown anything" in capsys.readouterr().err
 
 
 def test_refusals(map_file, tmp_path, capsys):
@@ -163,11 +128,8 @@ def test_refusals(map_file, tmp_path, capsys):
         assert text in capsys.readouterr().err.splitlines()[-1]
         assert list(tmp_path.iterdir()) == []
 
-    wide = ["--crop", "-400", "-400", "-400", "400", "400", "400"]
-    refused("4000 x 4000 x 4000 = 6.4e+10 points", "grid.npz", *wide)
-    refused("use --crop or a larger --cell", "grid.npz", *wide)
     refused("--cell = 0.001 is out of range: use 0.01 to 10", "mesh.ply", "--cell", "0.001")
-    refused(".triquad, .ply, .glb, .obj, .stl, .npz", "mesh.gltf")
+    refused(".triquad, .ply, .glb, .obj, .stl, .png", "mesh.gltf")
     refused("--fill is of meshes that can mark it, .ply, .glb, .obj", "a.stl", "--fill", "1")
     refused("--fill = 6.0 is out of range: use 0 to 5", "mesh.ply", "--fill", "6")
     refused("of map files", "mesh.ply", "--max-error", "2mm")

@@ -21,14 +21,6 @@ def test_ply_round_trip_keeps_the_precision(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read.faces, TETRAHEDRON.faces)
 
 
-def test_ply_without_faces_is_a_cloud(tmp_path: Path) -> None:
-    points = np.random.default_rng(0).normal(size=(100, 3))
-    Mesh(points, np.empty((0, 3), np.int32), epoch=1).save(tmp_path / "cloud.ply")
-    read = read_mesh(tmp_path / "cloud.ply")
-    np.testing.assert_array_equal(read.vertices, points)
-    assert read.faces.shape == (0, 3)
-
-
 def test_glb_round_trip_has_z_up_again(tmp_path: Path) -> None:
     TETRAHEDRON.save(tmp_path / "a.glb")
     read = read_mesh(tmp_path / "a.glb")

@@ -48,14 +48,12 @@ def test_open3d_and_kitti_come_without_times(tmp_path):
     ("text", "words"),
     [
         ("", "holds no poses"),
-        ("# nothing\n\n", "holds no poses"),
         ("1 2 3 4 5\n", ":1: 5 numbers, where a pose has 8 .t x y z qx qy qz qw."),
         ("time x y z qx qy qz qw\n", ":1: 'time' is not a number of seconds"),
         (f"{LINE}\n2 0 0 0\n", ":2: 4 numbers where a pose has 8"),
         (f"{LINE}\n2 0 0 zero 0 0 0 1\n", ":2: 'zero' is not a number"),
         (f"{LINE}\n2 0 0 nan 0 0 0 1\n", ":2: 'nan' is not finite"),
         (f"{LINE}\n2 0 0 0 1 0 0 1\n", ":2: .* has the length 1.414, not 1"),
-        (f"{LINE}\n2 0 0 0 0 0 0 0\n", ":2: .* has the length 0, not 1"),
         (f"{LINE}\n0.5 0 0 0 0 0 0 1\n", ":2: 0.5 s is before the line above: sort"),
         ("1700000000000000000 0 0 0 0 0 0 1\n", ":1: .* out of range: times are seconds"),
         ("0 0 1\n1 0 0 0\n0 1 0 0\n", "3 lines are not whole poses of Open3D's .log"),
@@ -100,12 +98,10 @@ def test_commas_and_comments_are_allowed(tmp_path):
     ("names", "stamps"),
     [
         (["1700000000.25.ply", "cloud_1700000001.5.ply"], [START_NS + 250_000_000, None]),
-        (["1700000000250000000.pcd"], [START_NS + 250_000_000]),
         (["scan1700000000250.pcd"], [START_NS + 250_000_000]),
         (["1700000000.pcd"], [START_NS]),
         (["a_1700000000_250000000.pcd"], [START_NS + 250_000_000]),
         (["1700000000_25000000.pcd", "1700000000_250000000.pcd"], [START_NS + 25_000_000, None]),
-        (["1700000000_250000.pcd"], [START_NS + 250_000_000]),
         (["frame-12.5.laz"], [12_500_000_000]),
     ],
 )

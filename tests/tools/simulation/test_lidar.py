@@ -2,7 +2,6 @@ import math
 
 import numpy as np
 import pytest
-from triquad_tools.recordings.cloud import thin
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.scene import Scene
 from triquad_tools.simulation.solids import box, half_space, sphere
@@ -120,9 +119,3 @@ def test_true_hits_of_a_drive_are_thinned_surface_points(world: Scene) -> None:
     assert len(np.unique(cells, axis=0)) == len(cells)
     every = np.concatenate([scan.true_hits for scan in made])
     assert len(np.unique(np.floor(every / 0.1).astype(int), axis=0)) == len(hits)
-
-
-def test_thinning_keeps_the_first_point_of_each_voxel() -> None:
-    points = np.array([[0.9, 0.0, 0.0], [0.1, 0.1, 0.1], [-0.1, 0.0, 0.0], [1.0, 0.0, 0.0]])
-    np.testing.assert_array_equal(thin(points, 1.0), points[[0, 2, 3]])
-    assert thin(np.empty((0, 3)), 1.0).shape == (0, 3)

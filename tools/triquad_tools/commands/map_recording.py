@@ -48,7 +48,8 @@ def _map(options: argparse.Namespace) -> int:
         closing(Teams()) as teams,
     ):
         _prepare(settings, device, teams, stop=stop.is_set)
-        mapper, taken = unfinished.resumed(settings, device, teams)
+        mapper = unfinished.resumed(settings, device, teams)
+        taken = unfinished.scans_taken
         if taken:
             print_line(f"going on after scan {taken}, from {unfinished.folder}")
         mapping = MappingRun(mapper, unfinished, settings, stop=stop.is_set)

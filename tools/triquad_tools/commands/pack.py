@@ -17,7 +17,6 @@ from triquad_format.wire.limits import MAX_FILL_M
 from triquad_tools.console.arguments import add_version, error_limit, not_negative, positive
 from triquad_tools.console.command import FAILED, OK, ToolError, refuse, run
 from triquad_tools.console.lines import print_line
-from triquad_tools.mapfiles.grid import export_grid
 from triquad_tools.mapfiles.packing import DTYPES, pack_map
 from triquad_tools.mapfiles.source import (
     Box,
@@ -31,13 +30,13 @@ from triquad_tools.mapfiles.source import (
 
 _COMMAND = "triquad-pack"
 _DAMAGE = (DamagedMapFileError, NothingLeftError)
-_MAP, _MESHES, _GRID, _PICTURE = ".triquad", (".ply", ".glb", ".obj", ".stl"), ".npz", ".png"
+_MAP, _MESHES, _PICTURE = ".triquad", (".ply", ".glb", ".obj", ".stl"), ".png"
 _MARKED = (".ply", ".glb", ".obj")  # meshes that can show which faces fill holes
-_SUFFIXES = (_MAP, *_MESHES, _GRID, _PICTURE)
+_SUFFIXES = (_MAP, *_MESHES, _PICTURE)
 _PLANES = ("XY", "XZ", "YZ")
-_GRID_CELL_M = 0.2
 _CELL_RANGE_M = (0.01, 10.0)
-_MARGIN_CELLS = 16  # so far around its box a map is needed for a mesh or a grid
+_MARGIN_M = 3.2  # so far around its box a map is needed for a mesh of cells of 0.2 m
+_MARGIN_CELLS = 16  # or of larger ones
 
 _Add = Callable[..., argparse.Action]
 
@@ -51,7 +50,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=_COMMAND,
         description="Rewrite a map file: smaller, cropped, an earlier epoch of it, what is intact "
-        "of it, in the newest version, or as a mesh, a picture or an array of distances.",
+        "of it, in the newest version, or as a mesh or a picture.",
         epilog="Exit status: 0 done; 1 IN is damaged (with --recover: something of it is lost), or "
         "nothing lies in the box; 2 wrong usage, or input that cannot be used.",
     )
@@ -86,7 +85,7 @@ def _add_content(add: _Add) -> None:
 
 
 def _add_target(add: _Add) -> None:
-    cell = f"side of cells (default: half a leaf of a mesh, {_GRID_CELL_M:g} of {_GRID})"
+    cell = "side of cells of a mesh or a picture (default: half a leaf)"
     add("--cell", type=positive, metavar="M", help=cell)
     fill = (
         "of a mesh: continue surface into unknown space, where the field does, up to so far from "
@@ -132,7 +131,7 @@ def _check_usage(options: argparse.Namespace) -> None:
         f"--max-error makes integers: leave out --precision {options.precision}": (
             options.max_error and options.precision
         ),
-        "--cell is of meshes and grids: a map file has none": options.cell and suffix == _MAP,
+        "--cell is of meshes: a map file has none": options.cell and suffix == _MAP,
         f"--fill is of meshes that can mark it, {', '.join(_MARKED)}": (
             options.fill and suffix not in _MARKED
         ),
@@ -177,12 +176,10 @@ def _export(options: argparse.Namespace, path: Path) -> int:
         check_range("--cell", options.cell, *_CELL_RANGE_M)
     if options.fill:
         check_range("--fill", options.fill, 0.0, MAX_FILL_M)
-    margin_m = _MARGIN_CELLS * (options.cell or _GRID_CELL_M) + options.fill
+    margin_m = max(_MARGIN_M, _MARGIN_CELLS * (options.cell or 0.0)) + options.fill
     needed = None if box is None else box + [[-margin_m], [margin_m]]
     source, complete = _source(options, path, needed, training=False)
-    if output.suffix == _GRID:
-        written = export_grid(source.record, box, options.cell or _GRID_CELL_M, path=output)
-    elif output.suffix == _PICTURE:
+    if output.suffix == _PICTURE:
         from triquad_tools.plots.picture import export_picture  # slow to import
 
         written = export_picture(source, box, options.cell, path=output)
