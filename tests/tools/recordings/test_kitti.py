@@ -64,6 +64,14 @@ def test_scans_are_found_in_each_layout(tmp_path: Path, under: str) -> None:
     assert _stamps(folder) == [0, 100_000_000]
 
 
+def test_scans_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    folder = _folder(tmp_path, f"{IDENTITY}\n" * 2, scans=0, under=".")
+    for name in ("10.bin", "2.bin"):
+        np.zeros((1, 4), "<f4").tofile(folder / name)
+    (folder / "._2.bin").write_bytes(b"of macOS")
+    assert [file.path.name for file in read_kitti_folder(folder).files] == ["2.bin", "10.bin"]
+
+
 def test_calibration_turns_rotations_too(tmp_path: Path) -> None:
     # A turn of the camera by 90 degrees about its y (down) turns the lidar about -z; the lidar,
     # 0.5 m behind the camera, swings around it.

@@ -2,8 +2,8 @@
 
 A folder holds ``poses.txt`` (12 numbers a line: a row-major 3 x 4 pose) and scans as ``*.bin``
 (``float32`` x, y, z, intensity) next to it or in ``scans``, ``velodyne`` or
-``velodyne_points/data``; scan ``i`` in the order of names belongs to line ``i``. It may hold
-``times.txt`` (seconds, one a line) and ``calib.txt``, whose line ``Tr:`` is
+``velodyne_points/data``; scan ``i``, by the numbers in the names, belongs to line ``i``. It may
+hold ``times.txt`` (seconds, one a line) and ``calib.txt``, whose line ``Tr:`` is
 ``camera_from_lidar``: the poses are then those of the camera, as KITTI gives them, and are
 turned into poses of the lidar.
 """
@@ -15,6 +15,7 @@ import numpy as np
 from triquad_format.records.arrays import Doubles
 
 from triquad_tools.console.command import ToolError
+from triquad_tools.recordings.folders.file_names import in_order
 from triquad_tools.recordings.folders.scan_folder import PlacedFile, ScanFolder
 from triquad_tools.recordings.folders.trajectory import DEFAULT_PERIOD_NS
 from triquad_tools.recordings.recording import Stream
@@ -68,7 +69,7 @@ def _read_scan(file: PlacedFile) -> PosedScan:
 
 def _scan_paths(folder: Path) -> list[Path]:
     for name in SCAN_FOLDERS:
-        if paths := sorted((folder / name).glob("*.bin")):
+        if paths := in_order((folder / name).glob("*.bin")):
             return paths
     raise ToolError(f"{folder}: holds no *.bin in any of {', '.join(SCAN_FOLDERS)}")
 

@@ -35,11 +35,12 @@ def read_points(path: Path) -> FilePoints:
     """
     try:
         columns, rows = _READERS[path.suffix.lower()](path)
-    except (OSError, KeyboardInterrupt):
+    except (OSError, KeyboardInterrupt, ModuleNotFoundError):
         raise
     except BaseException as error:  # a damaged file leads the libraries anywhere, to panics too
         reason = " ".join(str(error).split())
-        raise ToolError(f"{path}: cannot be read: {reason:.200}; write or copy it again") from error
+        remedy = "write it with x, y and z, or copy it again"
+        raise ToolError(f"{path}: cannot be read: {reason:.200}; {remedy}") from error
     missing = [name for name in "xyz" if name not in columns]
     if missing and rows:
         raise ToolError(
