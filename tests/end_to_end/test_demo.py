@@ -22,7 +22,7 @@ from triquad_tools.mapfiles.meshfile import read_mesh
 GOOD = DemoResults(
     seed=1,
     intake=Intake(60, 60, 0, 0, 6.0, 30.0, True, 15_000_000),
-    queries=ProbeReport(500, 0, None, 60, 0, 1000, 2.0, 3.0, 4.0, 5.0, [3.0]),
+    queries=ProbeReport(500, 0, None, 60, 0, 1000, 2.0, 4.0, 5.0),
     street=StreetScores(0.012, 0.006, 0.03, 4.0, 0.99, 100_000, 0.999, 10_000),
     mesh=MeshScores(0.011, 0.007, 0.98, 0.04, 0.96, 0.97, 0.01, 1000, 1000),
     map_bytes=2_000_000,
