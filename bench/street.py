@@ -17,7 +17,6 @@ from triquad_tools.evaluation.map_scores import (
     score_street,
 )
 from triquad_tools.evaluation.metrics import (
-    STREET_SAMPLES_MAX,
     STREET_VOXEL_M,
     MeshScores,
     ScoreSettings,
@@ -41,7 +40,7 @@ class BenchStreet(DrivenStreet):
     """A drive of 10 s, and the truth about it."""
 
     visible: Doubles  # [M, 3] exact surface points that the lidar hit
-    samples_max: int = STREET_SAMPLES_MAX  # of a mesh, to score it
+    samples_max: int = ScoreSettings.samples_max  # of a mesh, to score it
 
     def mesh_scores(self, mesh: Mesh) -> MeshScores:
         """Return scores of a mesh within the scene's bounds."""

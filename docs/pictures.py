@@ -55,11 +55,6 @@ def height_slice(out: Path) -> None:
     _run("triquad-inspect", f"{_DEMO}/map.triquad", "--slice", 1, *area, "--plot", out)
 
 
-def errors(out: Path) -> None:
-    """The errors of a map of an exact street."""
-    _run("triquad-eval", "map", f"{_DEMO}/map.triquad", "--street", _STREET, "--plot", out)
-
-
 def difference(out: Path) -> None:
     """What changed between two drives down a street with boxes on it."""
     with tempfile.TemporaryDirectory() as folder:
@@ -92,7 +87,6 @@ PICTURES: dict[str, Callable[[Path], None]] = {
     "map.png": map_from_above,
     "plan.png": plan,
     "slice.png": height_slice,
-    "errors.png": errors,
     "difference.png": difference,
     "preview.png": preview,
     "tradeoffs.png": tradeoffs,

@@ -13,13 +13,12 @@ import numpy as np
 import triquad_server
 from rich.console import Console
 from triquad_client import Client
+from triquad_tools.commands.top import Sample, page
 from triquad_tools.simulation.lidar import Lidar, SimulatedScan, drive
 from triquad_tools.simulation.street import street
-from triquad_tools.top.interval import Sample, rates
-from triquad_tools.top.page import Seen, page
 
 PICTURE = Path(__file__).parent / "images" / "top.svg"
-_WIDTH = 126  # characters: three columns
+_WIDTH = 100  # characters
 _SECONDS, _RATE_HZ = 30, 4
 
 
@@ -62,13 +61,12 @@ def main() -> None:
         time.sleep(_SECONDS / 4)
         before = Sample(client.status(), client.metrics())
         time.sleep(1.0)
-        after = Sample(client.status(), client.metrics())
+        after = before.after(client.status(), client.metrics())
         over.set()
         planner.join()
         sensors.join()
     console = Console(width=_WIDTH, file=StringIO(), record=True)
-    seen = Seen(after, rates(before, after))
-    console.print(page("map default at tcp/robot:7447", seen, _WIDTH))
+    console.print(page("map default at tcp/robot:7447", after))
     console.save_svg(str(PICTURE), title="triquad-top --connect robot")
 
 

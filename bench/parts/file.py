@@ -13,14 +13,13 @@ from triquad_format.mapfile.writer import MapFileInfo, write_map
 from triquad_format.records.region import MapRecord
 from triquad_map.preview import previews_of
 from triquad_server.epochs.epoch import Epoch
-from triquad_tools.mapfiles.field_change import field_change
-from triquad_tools.mapfiles.packing import INTEGER_ERROR_M
-from triquad_tools.mapfiles.quantise import quantise
+from triquad_tools.mapfiles.quantise import field_change, quantise
 
 from bench.figures import Figure, seconds
 from bench.street import BenchStreet, settled_mapper
 
 _LARGE_BYTES = 100_000_000
+_INTEGER_ERROR_M = 0.0015  # gives most features one byte
 _SEED = 2  # of the points at which the file is compared with the live map
 _OFFLINE_SEED = 4
 _ROUNDS = 7
@@ -48,7 +47,7 @@ def measure_file(made: BenchStreet) -> list[Figure]:
 def _sizes(epoch: Epoch, record: MapRecord, made: BenchStreet, folder: Path) -> list[Figure]:
     plain = _written(epoch, record, folder / "fp16.triquad")
     stored = read_map(folder / "fp16.triquad")
-    eighth, tight = quantise(stored, INTEGER_ERROR_M), quantise(stored, 0.002)
+    eighth, tight = quantise(stored, _INTEGER_ERROR_M), quantise(stored, 0.002)
     small = _written(epoch, eighth.record, folder / "int8.triquad")
     least = _written(epoch, tight.record, folder / "2mm.triquad")
     live = field_change(record, stored, _SEED)

@@ -17,7 +17,7 @@ from triquad_server.settings import Settings
 from triquad_tools.console.arguments import count, positive, seed
 from triquad_tools.console.report import Row, print_rows
 from triquad_tools.evaluation.map_scores import score_street, street_probes
-from triquad_tools.evaluation.metrics import score_against_drive
+from triquad_tools.evaluation.metrics import STREET_VOXEL_M, ScoreSettings, score_against_scene
 from triquad_tools.simulation.lidar import SimulatedDrive
 from triquad_tools.simulation.street import street_drive
 
@@ -38,7 +38,8 @@ def _variant(encoding: str, drive: SimulatedDrive) -> list[Figure]:
     epoch = mapper.publish()
     field = score_street(epoch.query, street_probes(drive, np.random.default_rng(0)))
     with OfflineMap(epoch.record()) as opened:
-        mesh = score_against_drive(opened.mesh(), drive)
+        visible = drive.true_hits(STREET_VOXEL_M)
+        mesh = score_against_scene(opened.mesh(), drive.scene, visible, ScoreSettings())
     return [
         Figure(f"{encoding}: parameters", epoch.parameters / 1e6, "M"),
         Figure(f"{encoding}: training samples", mapper.samples_trained / 1e6, "M"),

@@ -35,7 +35,6 @@ WITHOUT_TORCH = (
     "ros2",
     "sensors",
     "simulation",
-    "top",
 )
 
 

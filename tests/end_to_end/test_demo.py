@@ -13,30 +13,20 @@ from triquad_tools.commands import demo
 from triquad_tools.console.command import ToolError
 from triquad_tools.demo import steps
 from triquad_tools.demo.probe import Probe, ProbeReport, ask_until
-from triquad_tools.demo.results import (
-    DemoResults,
-    Intake,
-    MapSize,
-    Restart,
-    broken_promises,
-    table_rows,
-)
+from triquad_tools.demo.results import DemoResults, Intake, broken_promises, table_rows
 from triquad_tools.demo.server import DemoServer
-from triquad_tools.evaluation import metrics
 from triquad_tools.evaluation.map_scores import StreetScores
 from triquad_tools.evaluation.metrics import MeshScores
 from triquad_tools.mapfiles.meshfile import read_mesh
 
 GOOD = DemoResults(
     seed=1,
-    cpus=2,
-    intake=Intake(60, 60, 0, 0, 2_400_000, 6.0, 30.0, True, 15_000_000),
-    queries=ProbeReport(500, 0, None, 60, 0, 1000, 2.0, 3.0, 4.0, 5.0, [3.0]),
+    intake=Intake(60, 60, 0, 0, 6.0, 30.0, True, 15_000_000),
+    queries=ProbeReport(500, 0, None, 60, 0, 1000, 2.0, 4.0, 5.0),
     street=StreetScores(0.012, 0.006, 0.03, 4.0, 0.99, 100_000, 0.999, 10_000),
     mesh=MeshScores(0.011, 0.007, 0.98, 0.04, 0.96, 0.97, 0.01, 1000, 1000),
-    restart=Restart(50_000, 0.0001, 0),
-    size=MapSize(2_000_000, 20_000_000, 1_000_000),
-    phases_s={"simulate": 1.0, "learn": 30.0},
+    map_bytes=2_000_000,
+    parameters=1_000_000,
 )
 
 QUALITY = ("SDF error", "gradient angle", "mesh F-score", "houses UNKNOWN")
@@ -46,13 +36,12 @@ def test_a_few_scans_leave_all_results(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(steps, "_SETTLE_LIMIT_S", 3.0)
-    monkeypatch.setattr(metrics, "STREET_SAMPLES_MAX", 100_000)
     out = tmp_path / "out"
     before = signal.getsignal(signal.SIGTERM)
     code = demo.main(["--out", str(out), "--scans", "2"])
     assert signal.getsignal(signal.SIGTERM) is before
     output = capsys.readouterr()
-    for name in ("scans taken in", "training", "SDF error", "mesh F-score", "after a restart"):
+    for name in ("scans taken in", "training", "SDF error", "mesh F-score", "map file"):
         assert name in output.out
     assert "the first run of all compiles" in output.err
     # Two scans and a second do not make a good map; everything else is promised of them too.
@@ -63,14 +52,12 @@ def test_a_few_scans_leave_all_results(
     assert (results["intake"]["taken"], results["intake"]["lost"]) == (2, 0)
     assert results["queries"]["queries"] > 0
     assert results["queries"]["errors"] == results["queries"]["epochs_backwards"] == 0
-    assert results["restart"]["points"] == results["street"]["near_points"]
-    assert results["size"]["bytes"] == (out / "map.triquad").stat().st_size
-    assert results["size"]["bytes"] < results["size"]["bytes_with_training"]
+    assert results["map_bytes"] == (out / "map.triquad").stat().st_size
     assert all(region.training is None for region in read_map(out / "map.triquad").regions)
     faces = [len(read_mesh(out / name).faces) for name in ("street.ply", "street.glb")]
     assert faces[0] == faces[1] > 1000
     assert (out / "street.png").read_bytes().startswith(b"\x89PNG")
-    assert (out / "server.log").read_text().count("stopped\n") == 2
+    assert (out / "server.log").read_text().count("stopped\n") == 1
 
 
 def test_results_as_promised_break_nothing() -> None:
@@ -81,7 +68,6 @@ def test_results_as_promised_break_nothing() -> None:
     assert values["SDF error"] == "1.20 cm"
     assert values["mesh F-score"] == "97.00 %"
     assert values["map file"] == "2.00 MB"
-    assert values["after a restart"] == "0.100 mm"
 
 
 @pytest.mark.parametrize(
@@ -92,8 +78,6 @@ def test_results_as_promised_break_nothing() -> None:
         ("street", {"gradient_angle_deg": 12.5}, "gradient angle (deg) is 12.5"),
         ("street", {"houses_unknown_ratio": 0.97}, "houses UNKNOWN is 0.97; promised is at least"),
         ("mesh", {"f_score": 0.949}, "mesh F-score is 0.949; promised is at least 0.95"),
-        ("restart", {"sdf_difference_max_m": 0.003}, "restart difference (m) is 0.003"),
-        ("restart", {"statuses_changed": 1}, "statuses changed by the restart is 1"),
         ("intake", {"lost": 2}, "scans lost or refused is 2; promised is at most 0"),
         ("queries", {"errors": 3}, "query errors is 3"),
         ("queries", {"epochs_backwards": 1}, "answers from an older epoch is 1"),
@@ -106,18 +90,6 @@ def test_a_broken_promise_is_named_with_its_value(
     broken = broken_promises(dataclasses.replace(GOOD, **{part: changed}))
     assert len(broken) == 1
     assert words in broken[0]
-
-
-def test_a_map_that_still_learns_may_change_over_a_restart() -> None:
-    learning = dataclasses.replace(
-        GOOD,
-        intake=dataclasses.replace(GOOD.intake, settled=False),
-        restart=Restart(50_000, 0.1, 3),
-    )
-    assert broken_promises(learning) == []
-    notes = {row.name: row.note for row in table_rows(learning)}
-    assert "still learning" in notes["training"]
-    assert "went on learning" in notes["after a restart"]
 
 
 def test_a_server_that_cannot_start_is_reported_with_its_last_line(tmp_path: Path) -> None:

@@ -15,9 +15,10 @@ from triquad_server.settings import (
     Settings,
     TrainingSettings,
 )
-from triquad_tools.evaluation.map_scores import ask_withheld, score_withheld
+from triquad_tools.evaluation.map_scores import score_withheld
 from triquad_tools.recordings.cloud import is_withheld, world_points
-from triquad_tools.recordings.folders.kitti import KittiFolder, read_kitti_folder
+from triquad_tools.recordings.folders.kitti import read_kitti_folder
+from triquad_tools.recordings.folders.scan_folder import ScanFolder
 
 SEOSAN = Path(__file__).resolve().parents[3] / "shared" / "data" / "seosan01"
 PERIOD_S = 0.1
@@ -36,7 +37,7 @@ Publish = Callable[[int], None]
 
 
 def mapped(
-    folder: KittiFolder, endpoint: str, way: Callable[[Bridged], AbstractContextManager[Publish]]
+    folder: ScanFolder, endpoint: str, way: Callable[[Bridged], AbstractContextManager[Publish]]
 ) -> float:
     """The median |SDF| at scans that were withheld, of a map of the others, in metres."""
     withheld = [i for i in range(SCANS) if is_withheld(i, WITHHELD_EVERY)]
@@ -50,7 +51,7 @@ def mapped(
         assert (bridged.taken, bridged.lost) == (len(taken), 0), bridged.bridge.dropped
         bridged.client.settle(600.0)
         clouds = (world_points(scan, *RANGES_M) for scan in folder.read(withheld))
-        return score_withheld(ask_withheld(bridged.client.query_sdf, clouds)).sdf_median_m
+        return score_withheld(bridged.client.query_sdf, clouds).sdf_median_m
 
 
 def test_the_map_is_as_good_as_that_of_the_client() -> None:
@@ -60,18 +61,21 @@ def test_the_map_is_as_good_as_that_of_the_client() -> None:
 
     @contextmanager
     def by_client(bridged: Bridged) -> Iterator[Publish]:
-        yield lambda index: bridged.client.publish_scan(
-            folder.read_points(index), folder.poses[index]
-        )
+        def publish(index: int) -> None:
+            (scan,) = folder.read([index])
+            bridged.client.publish_scan(scan.points, scan.world_from_sensor)
+
+        yield publish
 
     @contextmanager
     def by_ros(bridged: Bridged) -> Iterator[Publish]:
         with robot(bridged.endpoint) as r2:
 
             def publish(index: int) -> None:
-                second = (int(folder.stamps_ns[index]) - T0) / SECOND
-                r2.cloud(second, folder.read_points(index))
-                r2.tf(second, ("map", "lidar", folder.poses[index]))
+                (scan,) = folder.read([index])
+                second = (folder.entries[index].stamp_ns - T0) / SECOND
+                r2.cloud(second, scan.points)
+                r2.tf(second, ("map", "lidar", scan.world_from_sensor))
 
             yield publish
 

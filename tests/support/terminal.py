@@ -34,19 +34,10 @@ class Terminal:
         pages = self.shown[self._waiting_from :].split(_HOME)
         return _CONTROLS.sub("", pages[-2] if len(pages) > 1 else "")
 
-    @property
-    def modes(self) -> list[object]:
-        """How the terminal treats what is typed."""
-        return termios.tcgetattr(self.device)
-
     def resize(self, columns: int, lines: int) -> None:
         """Have it so many columns and lines."""
         size = struct.pack("HHHH", lines, columns, 0, 0)
         fcntl.ioctl(self.device, termios.TIOCSWINSZ, size)
-
-    def type(self, keys: bytes) -> None:
-        """Type some keys."""
-        os.write(self.device, keys)
 
     def wait_for(self, pattern: str) -> str:
         """Return the page once it holds this; what was shown before does not count."""

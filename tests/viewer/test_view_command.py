@@ -54,4 +54,4 @@ def test_addresses_that_are_not_ours_are_refused(
 def test_ports_that_are_none_are_refused(port: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
         main(["map.triquad", "--port", port])
-    assert f"{port!r} is not a port: use 0 to 65535" in capsys.readouterr().err
+    assert f"{port!r} is not a whole number: use 0 to 65535" in capsys.readouterr().err

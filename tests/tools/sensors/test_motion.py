@@ -71,14 +71,6 @@ def test_a_track_says_nothing_of_before_after_and_gaps() -> None:
     assert track.poses(at(T0, T0 + SECOND, T0 + 5 * SECOND)).shape == (3, 4, 4)
 
 
-def test_a_track_may_be_bounded() -> None:
-    track = Track(limit=3)
-    for second in range(10):
-        track.add(second * SECOND, np.zeros(3), np.array([0, 0, 0, 1.0]))
-    assert len(track) == 3
-    assert track.span_ns == (7 * SECOND, 9 * SECOND)
-
-
 @given(seed=st.integers(0, 1000))
 def test_a_tree_composes_what_it_was_told(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -37,13 +37,6 @@ def test_points_come_out_as_they_went_in(
     assert (sweep.stamp_ns, sweep.frame, sweep.offsets_s) == (STAMP_NS, "lidar", None)
 
 
-def test_coordinates_need_not_lie_side_by_side() -> None:
-    expected = points()
-    message = ROS.cloud(expected[:, [1, 0, 2]], STAMP_NS)
-    message.fields[0].name, message.fields[1].name = "y", "x"
-    assert np.array_equal(sweep_of_cloud(message).points, expected)
-
-
 def test_an_organised_cloud_may_have_padded_rows() -> None:
     expected = points(12)
     message = ROS.cloud(expected, STAMP_NS)

@@ -1,11 +1,9 @@
 """``triquad-demo``: the whole of triquad on one simulated street."""
 
 import argparse
-import os
 import shutil
 import sys
 import threading
-import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
@@ -97,64 +95,40 @@ def run_demo(
     Raises:
         ToolError, TriquadError, FormatError, OSError: a step failed; the server is stopped.
     """
-    laps = _Laps()
     out.mkdir(parents=True, exist_ok=True)
     # What an earlier demonstration left in its store and log is removed.
     shutil.rmtree(out / "store" / steps.MAP, ignore_errors=True)
     (out / "server.log").unlink(missing_ok=True)
     street = driven_street(street_drive(street_seed, scans))
-    laps.end("simulate")
     print_remark(
         "starting triquad-server (the first run of all compiles for half a minute or more) ..."
     )
     with DemoServer(out, steps.MAP, endpoint=endpoint) as server:
-        laps.end("start")
         if started is not None:
             started()
-            laps.end("wait")
         learnt = steps.learn(server.endpoint, street)
-        laps.end("learn")
         if not learnt.intake.settled:
             print_remark("the server is still learning; it is scored as it is now")
-        scored = steps.score(server.endpoint, street)
-        laps.end("score")
+        scored = steps.score(server.endpoint, street, out)
         server.stop()
-        laps.end("stop")
-    print_remark("starting triquad-server again, from its checkpoint ...")
-    with DemoServer(out, steps.MAP, endpoint=endpoint) as server:
-        restart = steps.compare(server.endpoint, scored)
-        server.stop()
-    laps.end("restart")
-    size = steps.pack(scored, out / "map.triquad")
-    laps.end("pack")
-    steps.draw(scored.surface, [out / "street.glb", out / "street.ply"], out / "street.png")
-    laps.end("draw")
-    cpus = os.cpu_count() or 1
-    parts = (learnt.intake, learnt.queries, scored.street, scored.mesh, restart, size)
-    results = DemoResults(street_seed, cpus, *parts, laps.seconds)
+    results = DemoResults(
+        street_seed,
+        learnt.intake,
+        learnt.queries,
+        scored.street,
+        scored.mesh,
+        map_bytes=(out / "map.triquad").stat().st_size,
+        parameters=scored.parameters,
+    )
     (out / "results.json").write_text(json_text(results) + "\n", encoding="utf-8")
     return results
-
-
-class _Laps:
-    """The duration of each phase."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._since = time.monotonic()
-
-    def end(self, phase: str) -> None:
-        """End a phase; the next begins."""
-        now = time.monotonic()
-        self.seconds[phase] = now - self._since
-        self._since = now
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=_COMMAND,
-        description="Map a simulated street with a real server, ask it while it learns, score the "
-        "map against the exact street, restart the server and ask again. Takes some minutes.",
+        description="Map a simulated street with a real server, ask it while it learns, and score "
+        "the map against the exact street. Takes some minutes.",
         epilog="Exit status: 0 all is as the README promises, 1 something is not or failed, "
         "2 wrong usage.",
     )
@@ -162,13 +136,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="default: demo-out")
     add("--scans", type=count, default=60, metavar="N", help="a metre apart (default: 60)")
     add("--view", action="store_true", help="show in a browser how the street grows")
-    add(
-        "--port",
-        type=port,
-        default=DEFAULT_PORT,
-        metavar="N",
-        help=f"of that page ({DEFAULT_PORT})",
-    )
+    of_page = f"of that page ({DEFAULT_PORT})"
+    add("--port", type=port, default=DEFAULT_PORT, metavar="N", help=of_page)
     add("--seed", type=seed, default=1, metavar="N", help="of the street (default: 1)")
     add_version(parser)
     return parser

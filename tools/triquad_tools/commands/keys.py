@@ -8,7 +8,7 @@ from pathlib import Path
 
 from triquad_format.wire.roles import Holder, Role
 
-from triquad_tools.console.arguments import add_version, positive
+from triquad_tools.console.arguments import add_version, positive, whole
 from triquad_tools.console.command import OK, run
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.report import print_columns
@@ -72,11 +72,9 @@ def _list(options: argparse.Namespace) -> int:
     hosts = ", ".join(folder.hosts) or "this machine"
     rows = [(name, name, hosts, "", _day(folder.certificate(name).expires)) for name in LISTENING]
     for entry in folder.entries.values():
-        holder, expires = entry.holder, entry.expires
-        domain = "" if holder.ros2_domain is None else str(holder.ros2_domain)
-        rows.append(
-            (holder.name, holder.role.value, ", ".join(holder.sources), domain, _day(expires))
-        )
+        holder, domain = entry.holder, entry.holder.ros2_domain
+        told = (", ".join(holder.sources), "" if domain is None else str(domain))
+        rows.append((holder.name, holder.role.value, *told, _day(entry.expires)))
     titles = ("name", "role", "hosts or sources", "ROS 2 domain", "expires")
     print_columns(titles, rows, words=("role", "hosts or sources", "expires"))
     return OK
@@ -108,17 +106,19 @@ def _parser() -> argparse.ArgumentParser:
     hosts += "itself finds it without"
     init.add_argument("--host", action="append", default=[], metavar="HOST", help=hosts)
     _add_sources(init, default=" (default: default)")
+    with_days = [init]
     for role, may in _ROLES.items():
         add = command(role.value, f"add one who {may}", _add)
         add.set_defaults(role=role)
         add.add_argument("name", metavar="NAME", help="of the client")
         if role is not Role.VIEWER:
             _add_sources(add, required=role is Role.ROBOT)
-        _add_days(add)
+        with_days.append(add)
     renew = command("renew", "issue new certificates before the old ones expire", _renew)
     renew.add_argument("name", nargs="+", metavar="NAME", help="of a client, server or router")
-    for with_days in (init, renew):
-        _add_days(with_days)
+    until = f"until the certificate expires (default: {_DAYS:g})"
+    for one in (*with_days, renew):
+        one.add_argument("--days", type=positive, default=_DAYS, metavar="N", help=until)
     remove = command("remove", "take a role away", _remove)
     remove.add_argument("name", metavar="NAME", help="of a client")
     command("list", "tell who has which role, and until when", _list)
@@ -129,22 +129,8 @@ def _parser() -> argparse.ArgumentParser:
 def _add_sources(
     command: argparse.ArgumentParser, *, default: str = "", required: bool = False
 ) -> None:
+    add = command.add_argument
     sources = f"of scans that the robot publishes, and nobody else, repeatable{default}"
-    command.add_argument(
-        "--source", action="append", required=required, metavar="NAME", help=sources
-    )
+    add("--source", action="append", required=required, metavar="NAME", help=sources)
     domain = "let nodes of ROS 2 with this certificate take part in this domain"
-    command.add_argument("--ros2-domain", type=_domain, metavar="N", help=domain)
-
-
-def _add_days(command: argparse.ArgumentParser) -> None:
-    until = f"until the certificate expires (default: {_DAYS:g})"
-    command.add_argument("--days", type=positive, default=_DAYS, metavar="N", help=until)
-
-
-def _domain(text: str) -> int:
-    if not text.isascii() or not text.isdigit() or int(text) > _LAST_DOMAIN:
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not a domain of ROS 2: use 0 to {_LAST_DOMAIN}"
-        )
-    return int(text)
+    add("--ros2-domain", type=partial(whole, 0, _LAST_DOMAIN), metavar="N", help=domain)

@@ -9,8 +9,6 @@ from pathlib import Path
 
 from triquad_server.device import choose_device
 from triquad_server.errors import StoreError
-from triquad_server.intake.scan_queue import ScanQueue
-from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.process.threads import Teams
 from triquad_server.settings import Settings
@@ -21,7 +19,7 @@ from triquad_tools.console.arguments import add_version
 from triquad_tools.console.command import OK, ToolError, run
 from triquad_tools.console.lines import print_line, print_remark
 from triquad_tools.console.progress import progress
-from triquad_tools.mapping.mapping_run import MappingRun, resumed_mapper, stop_requests
+from triquad_tools.mapping.mapping_run import MappingRun, stop_requests
 from triquad_tools.mapping.output import SUFFIXES, write_output
 from triquad_tools.mapping.unfinished import UnfinishedMap, mapping_key
 from triquad_tools.recordings.arguments import add_recording
@@ -50,16 +48,14 @@ def _map(options: argparse.Namespace) -> int:
         closing(Teams()) as teams,
     ):
         _prepare(settings, device, teams, stop=stop.is_set)
-        at = unfinished.position()
-        if at.scans_taken:
-            print_line(f"going on after scan {at.scans_taken}, from {unfinished.folder}")
-        mapper = resumed_mapper(at.record, settings, device, teams=teams)
-        warnings = ScanWarnings(ScanQueue(1), settings)
-        mapping = MappingRun(mapper, unfinished, warnings, stop=stop.is_set)
-        mapping.take(selection, at.scans_taken)
+        mapper = unfinished.resumed(settings, device, teams)
+        taken = unfinished.scans_taken
+        if taken:
+            print_line(f"going on after scan {taken}, from {unfinished.folder}")
+        mapping = MappingRun(mapper, unfinished, settings, stop=stop.is_set)
+        mapping.take(selection, taken)
         _check_result(mapper, mapping, selection)
-        mapping.settle()
-        unfinished.save(mapper, len(selection))  # should the output not be written
+        mapping.settle()  # which saves the map, should the output not be written
         record = mapper.changes_since(None).record
         try:
             written = write_output(

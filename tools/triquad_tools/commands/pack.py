@@ -17,8 +17,7 @@ from triquad_format.wire.limits import MAX_FILL_M
 from triquad_tools.console.arguments import add_version, error_limit, not_negative, positive
 from triquad_tools.console.command import FAILED, OK, ToolError, refuse, run
 from triquad_tools.console.lines import print_line
-from triquad_tools.mapfiles.grid import export_grid
-from triquad_tools.mapfiles.packing import chosen_precision, pack_map
+from triquad_tools.mapfiles.packing import DTYPES, pack_map
 from triquad_tools.mapfiles.source import (
     Box,
     NothingLeftError,
@@ -31,13 +30,13 @@ from triquad_tools.mapfiles.source import (
 
 _COMMAND = "triquad-pack"
 _DAMAGE = (DamagedMapFileError, NothingLeftError)
-_MAP, _MESHES, _GRID, _PICTURE = ".triquad", (".ply", ".glb", ".obj", ".stl"), ".npz", ".png"
+_MAP, _MESHES, _PICTURE = ".triquad", (".ply", ".glb", ".obj", ".stl"), ".png"
 _MARKED = (".ply", ".glb", ".obj")  # meshes that can show which faces fill holes
-_SUFFIXES = (_MAP, *_MESHES, _GRID, _PICTURE)
+_SUFFIXES = (_MAP, *_MESHES, _PICTURE)
 _PLANES = ("XY", "XZ", "YZ")
-_GRID_CELL_M = 0.2
 _CELL_RANGE_M = (0.01, 10.0)
-_MARGIN_CELLS = 16  # so far around its box a map is needed for a mesh or a grid
+_MARGIN_M = 3.2  # so far around its box a map is needed for a mesh of cells of 0.2 m
+_MARGIN_CELLS = 16  # or of larger ones
 
 _Add = Callable[..., argparse.Action]
 
@@ -51,7 +50,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=_COMMAND,
         description="Rewrite a map file: smaller, cropped, an earlier epoch of it, what is intact "
-        "of it, in the newest version, or as a mesh, a picture or an array of distances.",
+        "of it, in the newest version, or as a mesh or a picture.",
         epilog="Exit status: 0 done; 1 IN is damaged (with --recover: something of it is lost), or "
         "nothing lies in the box; 2 wrong usage, or input that cannot be used.",
     )
@@ -65,51 +64,34 @@ def _parser() -> argparse.ArgumentParser:
 def _add_source(add: _Add) -> None:
     add("input", type=Path, metavar="IN", help="map file, or folder of checkpoints")
     add("output", type=Path, metavar="OUT", help="its name ends in " + ", ".join(_SUFFIXES))
-    add(
-        "--at",
-        metavar="EPOCH_OR_TIME",
-        help="take the newest checkpoint of the folder IN that is not after this, such as 120 or "
-        "2026-01-31T12:00:00Z (default: the newest of all)",
-    )
+    at = "take the newest checkpoint of the folder IN that is not after this, such as 120 or "
+    at += "2026-01-31T12:00:00Z (default: the newest of all)"
+    add("--at", metavar="EPOCH_OR_TIME", help=at)
     add("--recover", action="store_true", help="save what is intact of a damaged file")
 
 
 def _add_content(add: _Add) -> None:
-    add("--precision", choices=("fp16", "fp32", "int8"), help="of features (default: as in IN)")
-    add(
-        "--max-error",
-        type=error_limit,
-        metavar="LENGTH",
-        help="features as coarse integers as move 99 %% of distances by less than this, such as "
-        "2mm; drops training state (default with int8: 1.5mm)",
+    add("--precision", choices=tuple(DTYPES), help="of features (default: as in IN)")
+    error = (
+        "features as coarse integers as move 99 %% of distances by less than this, such as 2mm; "
     )
-    add(
-        "--crop",
-        type=float,
-        nargs=6,
-        metavar=("XMIN", "YMIN", "ZMIN", "XMAX", "YMAX", "ZMAX"),
-        help="keep what answers in this box need, metres, map frame; only that is read, unless IN "
-        "has training state that is kept",
-    )
+    error += "drops training state"
+    add("--max-error", type=error_limit, metavar="LENGTH", help=error)
+    corners = ("XMIN", "YMIN", "ZMIN", "XMAX", "YMAX", "ZMAX")
+    box = "keep what answers in this box need, metres, map frame; only that is read, unless IN has "
+    box += "training state that is kept"
+    add("--crop", type=float, nargs=6, metavar=corners, help=box)
     add("--no-training", action="store_true", help="drop what only further training needs")
 
 
 def _add_target(add: _Add) -> None:
-    add(
-        "--cell",
-        type=positive,
-        metavar="M",
-        help=f"side of cells (default: half a leaf of a mesh, {_GRID_CELL_M:g} of {_GRID})",
+    cell = "side of cells of a mesh or a picture (default: half a leaf)"
+    add("--cell", type=positive, metavar="M", help=cell)
+    fill = (
+        "of a mesh: continue surface into unknown space, where the field does, up to so far from "
     )
-    add(
-        "--fill",
-        type=not_negative,
-        default=0.0,
-        metavar="M",
-        help="of a mesh: continue surface into unknown space, where the field does, up to so far "
-        f"from what was seen, at most {MAX_FILL_M:g} m; those faces are marked",
-    )
-    add("--sparse", action="store_true", help=f"{_GRID}: only blocks around surface, not a box")
+    fill += f"what was seen, at most {MAX_FILL_M:g} m; those faces are marked"
+    add("--fill", type=not_negative, default=0.0, metavar="M", help=fill)
     add("--force", action="store_true", help="replace OUT where it exists")
 
 
@@ -120,21 +102,16 @@ def _pack(options: argparse.Namespace) -> int:
     if path != options.input:
         checkpoint = checkpoint_file(path)
         print_line(f"epoch {checkpoint and checkpoint.epoch}, from {path}")
-        if options.at is None:
-            _tell_set_aside(path)
+        # Those newer than the newest valid one, which were damaged.
+        for newer in set_aside(path.parent) if options.at is None else ():
+            if newer.name > path.name:
+                told = "is newer, but damaged: --recover saves what is intact of it"
+                print_line(f"{_COMMAND}: {newer} {told}")
     write = _pack_map if options.output.suffix == _MAP else _export
     try:
         return write(options, path)
     except MemoryError as error:
         raise ToolError("it does not fit into memory: use --crop") from error
-
-
-def _tell_set_aside(path: Path) -> None:
-    """Name the checkpoints newer than the newest valid one, which were damaged."""
-    for newer in (aside for aside in set_aside(path.parent) if aside.name > path.name):
-        print_line(
-            f"{_COMMAND}: {newer} is newer, but damaged: --recover saves what is intact of it"
-        )
 
 
 def _check_usage(options: argparse.Namespace) -> None:
@@ -152,13 +129,12 @@ def _check_usage(options: argparse.Namespace) -> None:
             rounds and suffix != _MAP
         ),
         f"--max-error makes integers: leave out --precision {options.precision}": (
-            options.max_error and options.precision in ("fp16", "fp32")
+            options.max_error and options.precision
         ),
-        "--cell is of meshes and grids: a map file has none": options.cell and suffix == _MAP,
+        "--cell is of meshes: a map file has none": options.cell and suffix == _MAP,
         f"--fill is of meshes that can mark it, {', '.join(_MARKED)}": (
             options.fill and suffix not in _MARKED
         ),
-        f"--sparse is of {_GRID}": options.sparse and suffix != _GRID,
     }
     refuse(problems)
 
@@ -181,10 +157,15 @@ def _check_target(source: Path, target: Path, force: bool) -> None:
 
 
 def _pack_map(options: argparse.Namespace, path: Path) -> int:
-    precision = chosen_precision(options.precision, options.max_error)
-    training = not options.no_training and precision.max_error_m is None
+    training = not options.no_training and options.max_error is None
     source, complete = _source(options, path, box=_box(options.crop), training=training)
-    written = pack_map(source, precision, options.output, bytes_before=path.stat().st_size)
+    written = pack_map(
+        source,
+        options.output,
+        precision=options.precision,
+        max_error_m=options.max_error,
+        bytes_before=path.stat().st_size,
+    )
     print_line(f"{options.output}: {written}")
     return OK if complete else FAILED
 
@@ -195,13 +176,10 @@ def _export(options: argparse.Namespace, path: Path) -> int:
         check_range("--cell", options.cell, *_CELL_RANGE_M)
     if options.fill:
         check_range("--fill", options.fill, 0.0, MAX_FILL_M)
-    margin_m = _MARGIN_CELLS * (options.cell or _GRID_CELL_M) + options.fill
+    margin_m = max(_MARGIN_M, _MARGIN_CELLS * (options.cell or 0.0)) + options.fill
     needed = None if box is None else box + [[-margin_m], [margin_m]]
     source, complete = _source(options, path, needed, training=False)
-    if output.suffix == _GRID:
-        cell_m = options.cell or _GRID_CELL_M
-        written = export_grid(source.record, box, cell_m, sparse=options.sparse, path=output)
-    elif output.suffix == _PICTURE:
+    if output.suffix == _PICTURE:
         from triquad_tools.plots.picture import export_picture  # slow to import
 
         written = export_picture(source, box, options.cell, path=output)

@@ -1,10 +1,8 @@
-"""``triquad-replay``: publish a recording to a map server."""
+"""``triquad-replay``: publish a recording to a map server, or tell what it holds."""
 
 import argparse
-import itertools
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from functools import partial
 
 from triquad_client import Client, FlushReport, connect
@@ -13,9 +11,9 @@ from triquad_tools.console.arguments import add_version, positive
 from triquad_tools.console.command import FAILED, OK, run
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.progress import Speed, progress
+from triquad_tools.console.report import print_columns
 from triquad_tools.console.server_arguments import DEFAULT_MAP, add_server
-from triquad_tools.recordings.arguments import add_recording, flags_of, options_of
-from triquad_tools.recordings.listing import print_contents
+from triquad_tools.recordings.arguments import add_recording, options_of
 from triquad_tools.recordings.opening import open_recording
 from triquad_tools.recordings.publishing import (
     FLUSH_TIMEOUT_S,
@@ -23,163 +21,126 @@ from triquad_tools.recordings.publishing import (
     wait_until_settled,
 )
 from triquad_tools.recordings.recording import ScanEntry
-from triquad_tools.recordings.selection import Selection, open_selected
-from triquad_tools.sensors.sweep import PosedScan
+from triquad_tools.recordings.selection import Selection, length_s, open_selected
 
 _COMMAND = "triquad-replay"
 _LOOK_PERIOD_S = 1.0  # between questions how many scans were lost
 
-
-@dataclass(frozen=True)
-class Pace:
-    """The times of sending; by default as soon as the server has integrated the scans before."""
-
-    rate_hz: float | None = None
-    speed: float | None = None  # times the pace at which they were taken
-
-    @property
-    def by_server(self) -> bool:
-        """Whether the server sets the pace: nothing is lost then."""
-        return self.rate_hz is None and self.speed is None
-
-    def due_s(self, stamps_ns: Sequence[int]) -> list[float]:
-        """Return when each scan is to be sent, seconds after the first."""
-        if self.speed is not None:
-            return [(stamp - stamps_ns[0]) / 1e9 / self.speed for stamp in stamps_ns]
-        period_s = 0.0 if self.rate_hz is None else 1.0 / self.rate_hz
-        return [index * period_s for index in range(len(stamps_ns))]
-
-
-@dataclass(frozen=True)
-class ReplayReport:
-    """The outcome of a replay."""
-
-    published: int
-    skipped: int  # not sent: no point was left of them
-    flush: FlushReport
-    refusals: dict[str, int]  # on the server meanwhile, by reason
-    seconds: float  # until the server had integrated all
-
-    @property
-    def complete(self) -> bool:
-        """Whether every scan is in the map."""
-        return self.flush.lost == self.flush.refused == 0
+DueTimes = Callable[[Sequence[int]], list[float]]
+"""Returns when scans are sent, seconds after the first, by their stamps in nanoseconds."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool: 0 done, 1 scans were lost or refused or the server failed, 2 bad input."""
-    work = partial(_replay, _parser().parse_args(argv))
-    return run(_COMMAND, work, interrupted="interrupted; scans that were sent are in the map")
+    options = _parser().parse_args(argv)
+    work = _list if options.list else _replay
+    interrupted = "interrupted; scans that were sent are in the map"
+    return run(_COMMAND, partial(work, options), interrupted=interrupted)
+
+
+def _list(options: argparse.Namespace) -> int:
+    """Print all streams, what is wrong, and how to map it."""
+    path = options.recording
+    recording = open_recording(path, options_of(options))
+    titles = ("stream", "type", "count", "frame", "use")
+    rows = [(s.name, s.kind, f"{s.count:,}", s.frame, s.use) for s in recording.streams]
+    print_columns(titles, rows, words=("type", "frame", "use"))
+    for remark in recording.remarks:
+        print_line(remark)
+    entries = recording.entries
+    if not entries:
+        print_line(f"{path}: nothing of it can be mapped as it is")
+        return FAILED
+    seconds = length_s(entries)
+    rate = f", {(len(entries) - 1) / seconds:.1f} a second" if seconds > 0 else ""
+    print_line(f"{len(entries):,} scans in {seconds:.1f} s{rate}")
+    same = " with the same options" if options_of(options).given else ""
+    print_line(f"to map it{same}: triquad-map {path} {path.resolve().stem}.triquad")
+    return OK
 
 
 def _replay(options: argparse.Namespace) -> int:
-    if options.list:
-        recording = open_recording(options.recording, options_of(options))
-        mappable = print_contents(options.recording, recording, flags_of(options))
-        return OK if mappable else FAILED
     selection = open_selected(options)
     with connect(options.connect, options.map or DEFAULT_MAP, config=options.config) as client:
-        report = _publish_all(client, selection, options)
-        print_line(_summary(report))
+        before = client.status().scans_dropped
+        publisher = _Publisher(client, options.source, by_server=options.rate is None)
+        publisher.publish(selection, options.rate or _at_once)
+        flush = client.flush(FLUSH_TIMEOUT_S)
+        seconds = publisher.seconds
+        after = client.status().scans_dropped
+        refusals = {reason: count - before.get(reason, 0) for reason, count in after.items()}
+        rate = f"{seconds:.1f} s, {publisher.published / max(seconds, 1e-9):.1f} scans/s"
+        print_line(f"{publisher.summary(flush, refusals)}, {rate}")
+        if flush.last_refusal:
+            print_line(f"last refusal: {flush.last_refusal}")
         if options.settle:
             status = wait_until_settled(client)
             trained = f"{status.samples_trained / 1e6:.1f} M samples trained"
             print_line(f"settled: epoch {status.epoch}, {trained}")
-    return OK if report.complete else FAILED
-
-
-def _publish_all(client: Client, selection: Selection, options: argparse.Namespace) -> ReplayReport:
-    """Publish the chosen scans and wait until the server has dealt with them."""
-    before = client.status().scans_dropped
-    publisher = _Publisher(client, options.pace, options.source)
-    rounds = itertools.count() if options.loop else range(1)
-    for number in rounds:
-        publisher.play(selection, number)
-    flush = client.flush(FLUSH_TIMEOUT_S)
-    seconds = publisher.seconds
-    after = client.status().scans_dropped
-    refusals = {reason: count - before.get(reason, 0) for reason, count in after.items()}
-    refusals = {reason: count for reason, count in refusals.items() if count > 0}
-    return ReplayReport(
-        publisher.published, publisher.skipped, flush, refusals=refusals, seconds=seconds
-    )
+    return OK if flush.lost == flush.refused == 0 else FAILED
 
 
 class _Publisher:
     """Sends scans at a pace, and shows progress."""
 
-    def __init__(self, client: Client, pace: Pace, source: str | None) -> None:
+    def __init__(self, client: Client, source: str | None, *, by_server: bool) -> None:
+        """With ``by_server``, the server sets the pace, so that nothing is lost."""
         self._client = client
-        self._pace = pace
         self._source = source
-        self._started = time.monotonic()
-        self._lost_before = self._lost_now = _lost(client)
-        self._next_look = self._started
+        self._by_server = by_server
+        self._started = self._next_look = time.monotonic()
+        self._lost_before = self._lost_now = self._lost()
         self.published = 0
-        self.skipped = 0
+        self.skipped = 0  # not sent: no point was left of them
 
     @property
     def seconds(self) -> float:
         """The seconds since the first scan was sent."""
         return time.monotonic() - self._started
 
-    def play(self, selection: Selection, number: int) -> None:
-        """Send all chosen scans, which go on in time after ``number`` rounds before."""
-        entries = selection.entries
-        stamps = [entry.stamp_ns for entry in entries]
-        length_ns = max(stamps) - min(stamps)
-        round_ns = length_ns + length_ns // max(1, len(stamps) - 1)
-        due_s = self._pace.due_s(stamps)
-        began_s = self.seconds
-        with progress("publishing", len(selection)) as report:
-            for done, (entry, scan) in enumerate(zip(entries, selection.scans(), strict=True)):
-                time.sleep(max(0.0, began_s + due_s[done] - self.seconds))
-                self._send(entry, scan, entry.stamp_ns + number * round_ns)
-                report(done + 1, self._note(done + 1, len(selection), self.seconds - began_s))
+    def publish(self, selection: Selection, due_times: DueTimes) -> None:
+        """Send all chosen scans, each when it is due."""
+        entries, total = selection.entries, len(selection)
+        due_s = due_times([entry.stamp_ns for entry in entries])
+        with progress("publishing", total) as report:
+            for done, scan in enumerate(selection.scans(), start=1):
+                entry: ScanEntry = entries[done - 1]
+                time.sleep(max(0.0, due_s[done - 1] - self.seconds))
+                if len(scan.points):
+                    source = self._source or entry.source
+                    pose, stamp_s = scan.world_from_sensor, entry.stamp_ns / 1e9
+                    self._client.publish_scan(scan.points, pose, stamp_s, source=source)
+                    self.published += 1
+                    if self._by_server:
+                        keep_few_pending(self._client, self.published)
+                else:
+                    self.skipped += 1
+                report(done, self._note(done, total))
 
-    def _send(self, entry: ScanEntry, scan: PosedScan, stamp_ns: int) -> None:
-        if len(scan.points) == 0:
-            self.skipped += 1
-            return
-        source = self._source or entry.source
-        self._client.publish_scan(
-            scan.points, scan.world_from_sensor, stamp_ns / 1e9, source=source
-        )
-        self.published += 1
-        if self._pace.by_server:
-            keep_few_pending(self._client, self.published)
+    def summary(self, flush: FlushReport, refusals: dict[str, int]) -> str:
+        """Return what became of the scans; ``refusals`` are the server's counts by reason."""
+        reasons = ", ".join(f"{reason}: {count}" for reason, count in refusals.items() if count > 0)
+        parts = [
+            f"{self.published} scans published",
+            f"{flush.taken} taken",
+            f"{flush.refused} refused" + (f" ({reasons})" if flush.refused and reasons else ""),
+            f"{flush.lost} lost",
+        ]
+        if self.skipped:
+            parts.append(f"{self.skipped} without points not sent")
+        return ", ".join(parts)
 
-    def _note(self, done: int, total: int, seconds: float) -> str:
-        speed = Speed.of(done, total - done, seconds)
+    def _note(self, done: int, total: int) -> str:
         if time.monotonic() >= self._next_look:
             self._next_look = time.monotonic() + _LOOK_PERIOD_S
-            self._lost_now = _lost(self._client)
-        lost = self._lost_now - self._lost_before
-        rate = f"{speed.per_s:.1f} /s, {lost} lost, {speed.left_s:.0f} s left"
-        return f"{done} of {total} scans, {rate}"
+            self._lost_now = self._lost()
+        speed = Speed.of(done, total - done, self.seconds)
+        rate = f"{speed.per_s:.1f} /s, {self._lost_now - self._lost_before} lost"
+        return f"{done} of {total} scans, {rate}, {speed.left_s:.0f} s left"
 
-
-def _lost(client: Client) -> int:
-    """Return how many scans the server has lost so far, of all sources."""
-    return sum(client.status().scans_lost.values())
-
-
-def _summary(report: ReplayReport) -> str:
-    flush = report.flush
-    rate_hz = report.published / max(report.seconds, 1e-9)
-    reasons = ", ".join(f"{reason}: {count}" for reason, count in report.refusals.items())
-    parts = [
-        f"{report.published} scans published",
-        f"{flush.taken} taken",
-        f"{flush.refused} refused" + (f" ({reasons})" if flush.refused and reasons else ""),
-        f"{flush.lost} lost",
-    ]
-    if report.skipped:
-        parts.append(f"{report.skipped} without points not sent")
-    line = f"{', '.join(parts)}, {report.seconds:.1f} s, {rate_hz:.1f} scans/s"
-    if flush.last_refusal:
-        line += f"\nlast refusal: {flush.last_refusal}"
-    return line
+    def _lost(self) -> int:
+        """Return how many scans the server has lost so far, of all sources."""
+        return sum(self._client.status().scans_lost.values())
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -195,29 +156,20 @@ def _parser() -> argparse.ArgumentParser:
     add("--list", action="store_true", help="tell what the recording holds, and publish nothing")
     add_server(parser)
     add("--source", metavar="NAME", help="publish as this sensor (default: as the recording says)")
-    pace = parser.add_mutually_exclusive_group()
-    pace.add_argument(
-        "--rate",
-        dest="pace",
-        type=_pace,
-        default=Pace(),
-        metavar="HZ|FACTORx",
-        help="scans a second, or 2x: twice as fast as recorded; whatever the server takes",
-    )
-    pace.add_argument(
-        "--as-recorded",
-        dest="pace",
-        action="store_const",
-        const=Pace(speed=1.0),
-        help="--rate 1x; folders without times are taken as 10 Hz",
-    )
-    add("--loop", action="store_true", help="begin again at the end, until Ctrl-C")
+    rate = "scans a second, or 1x: as recorded, 2x: twice as fast; whatever the server takes"
+    add("--rate", type=due_times, metavar="HZ|FACTORx", help=rate)
     add("--settle", action="store_true", help="wait until the server has learnt all of it")
     add_version(parser)
     return parser
 
 
-def _pace(text: str) -> Pace:
+def due_times(text: str) -> DueTimes:
+    """Return when scans are due at a rate in Hz, or at a multiple of the recorded pace (``2x``)."""
+    factor = positive(text.removesuffix("x"))
     if text.endswith("x"):
-        return Pace(speed=positive(text[:-1]))
-    return Pace(rate_hz=positive(text))
+        return lambda stamps_ns: [(stamp - stamps_ns[0]) / 1e9 / factor for stamp in stamps_ns]
+    return lambda stamps_ns: [number / factor for number in range(len(stamps_ns))]
+
+
+def _at_once(stamps_ns: Sequence[int]) -> list[float]:
+    return [0.0] * len(stamps_ns)

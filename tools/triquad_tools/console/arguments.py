@@ -3,13 +3,13 @@
 import argparse
 import math
 import re
+from functools import partial
 from pathlib import Path
 
 import triquad_format
 
 _PER_METRE = {"mm": 1000.0, "cm": 100.0, "m": 1.0}
 _LEAST_ERROR_M, _LARGEST_ERROR_M = 1e-5, 0.1
-_LAST_PORT = 65_535
 
 
 def add_version(parser: argparse.ArgumentParser) -> None:
@@ -61,22 +61,20 @@ def error_limit(text: str) -> float:
     return metres
 
 
-def count(text: str) -> int:
-    """Return a whole number of at least 1."""
-    if not text.isascii() or not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a count: use 1, 2, ...")
+def whole(least: int, most: int | None, text: str) -> int:
+    """Return a whole number of a range; without ``most`` it has no end."""
+    digits = text.isascii() and text.isdigit()
+    if not digits or int(text) < least or (most is not None and int(text) > most):
+        values = f"{least}, {least + 1}, ..." if most is None else f"{least} to {most}"
+        raise argparse.ArgumentTypeError(f"{text!r:.40} is not a whole number: use {values}")
     return int(text)
 
 
-def seed(text: str) -> int:
-    """Return a whole number of at least 0."""
-    if not text.isascii() or not text.isdigit():
-        raise argparse.ArgumentTypeError(f"{text!r} is not a seed: use 0, 1, ...")
-    return int(text)
+count = partial(whole, 1, None)
+"""Returns a whole number of at least 1."""
 
+seed = partial(whole, 0, None)
+"""Returns a whole number of at least 0."""
 
-def port(text: str) -> int:
-    """Return a port to listen on; 0: any that is free."""
-    if not text.isascii() or not text.isdigit() or int(text) > _LAST_PORT:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a port: use 0 to {_LAST_PORT}")
-    return int(text)
+port = partial(whole, 0, 65_535)
+"""Returns a port to listen on; 0: any that is free."""

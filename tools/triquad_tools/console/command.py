@@ -7,13 +7,12 @@ from collections.abc import Callable, Mapping
 from triquad_format.errors import FormatError, TriquadError
 from triquad_map.record_view import NoCompiledCodeError
 
-from triquad_tools.console.interrupts import no_interrupt_lost
+from triquad_tools.console.interrupts import INTERRUPTED, interruptible
 from triquad_tools.console.lines import print_remark
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
-INTERRUPTED, NOBODY_READS = 130, 141
-"""The statuses of shells: 128 and the number of SIGINT, or of SIGPIPE."""
-
+NOBODY_READS = 141
+"""The status of shells: 128 and the number of SIGPIPE."""
 
 _kept: list[KeyboardInterrupt] = []
 """The interrupts, with their frames: what a compiler has half done may not be cleaned up."""
@@ -39,7 +38,7 @@ def run(
         interrupted: what the line says after Ctrl-C.
     """
     try:
-        with no_interrupt_lost():
+        with interruptible():
             status = work()
         sys.stdout.flush()
         return status

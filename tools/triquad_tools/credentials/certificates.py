@@ -15,9 +15,8 @@ LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")
 """Names of the machine itself, which every server certificate holds."""
 
 _AUTHORITY_DAYS = 3650
+_CLIENT = ExtendedKeyUsageOID.CLIENT_AUTH
 _CLOCK_SKEW = datetime.timedelta(hours=1)  # that a robot's clock may be behind the authority's
-
-Key = ec.EllipticCurvePrivateKey
 
 
 @dataclass(frozen=True)
@@ -47,30 +46,28 @@ class Authority:
     @classmethod
     def create(cls, name: str) -> "Authority":
         """Make a new authority, valid for ten years."""
-        return cls(_signed(name, _AUTHORITY_DAYS, None, []))
+        return cls(_signed(name, _AUTHORITY_DAYS, None))
 
     def client(self, common_name: str, days: float) -> Certificate:
         """Issue a certificate for a client, which cannot pass for a server with it."""
-        usage = x509.ExtendedKeyUsage([ExtendedKeyUsageOID.CLIENT_AUTH])
-        return _signed(common_name, days, self.own, [usage])
+        return _signed(common_name, days, self.own, x509.ExtendedKeyUsage([_CLIENT]))
 
     def server(self, common_name: str, hosts: Sequence[str], days: float) -> Certificate:
         """Issue a certificate to listen on ``hosts``, names or addresses, and to connect."""
-        usages = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
         names = [_general_name(host) for host in dict.fromkeys((*LOCAL_HOSTS, *hosts))]
-        extensions = [x509.ExtendedKeyUsage(usages), x509.SubjectAlternativeName(names)]
-        return _signed(common_name, days, self.own, extensions)
+        usage = x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH, _CLIENT])
+        return _signed(common_name, days, self.own, usage, x509.SubjectAlternativeName(names))
 
 
 def _signed(
-    common_name: str, days: float, issuer: Certificate | None, extensions: list[x509.ExtensionType]
+    common_name: str, days: float, issuer: Certificate | None, *extensions: x509.ExtensionType
 ) -> Certificate:
     """Make a key with a certificate that ``issuer`` signs, or without one the key itself."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
     now = datetime.datetime.now(datetime.timezone.utc)
-    is_authority = issuer is None
-    constraints = x509.BasicConstraints(ca=is_authority, path_length=0 if is_authority else None)
+    path_length = 0 if issuer is None else None
+    constraints = x509.BasicConstraints(ca=issuer is None, path_length=path_length)
     builder = (
         x509.CertificateBuilder()
         .subject_name(name)
@@ -83,15 +80,15 @@ def _signed(
     )
     for extension in extensions:
         builder = builder.add_extension(extension, critical=False)
-    load = serialization.load_pem_private_key
-    signing = cast(Key, load(issuer.key_pem, password=None)) if issuer else key
-    key_pem = key.private_bytes(
-        serialization.Encoding.PEM,
-        serialization.PrivateFormat.PKCS8,
-        serialization.NoEncryption(),
+    signing = key
+    if issuer is not None:
+        loaded = serialization.load_pem_private_key(issuer.key_pem, password=None)
+        signing = cast(ec.EllipticCurvePrivateKey, loaded)
+    pem, plain = serialization.Encoding.PEM, serialization.NoEncryption()
+    return Certificate(
+        builder.sign(signing, hashes.SHA256()).public_bytes(pem),
+        key.private_bytes(pem, serialization.PrivateFormat.PKCS8, plain),
     )
-    pem = builder.sign(signing, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
-    return Certificate(pem, key_pem)
 
 
 def _general_name(host: str) -> x509.GeneralName:

@@ -6,8 +6,7 @@ from anyone but the server or a router.
 
 import base64
 import json
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 from triquad_format.wire.endpoints import DEFAULT_PORT
 
@@ -31,30 +30,24 @@ def connecting(
 ) -> bytes:
     """Return the file of a client, which finds the server at one of ``hosts``."""
     once = {"timeout_ms": 0, "exit_on_failure": True}  # one attempt at each
-    values = {
-        "mode": "client",
-        "connect": {"endpoints": [_endpoint(host) for host in hosts], **once},
-        # ROS 2 keeps the last messages of some topics, which needs their times.
-        "timestamping": {"enabled": True},
-    }
+    connect = {"endpoints": [_endpoint(host) for host in hosts], **once}
+    # ROS 2 keeps the last messages of some topics, which needs their times.
+    values = {"mode": "client", "connect": connect, "timestamping": {"enabled": True}}
     return _text(title, _tls(own, authority, "connect"), access, values)
 
 
-def _text(title: str, tls: object, access: object, values: dict[str, Any]) -> bytes:
+def _text(title: str, tls: object, access: object, values: Mapping[str, object]) -> bytes:
     """Return a file that neither looks for others nor shares memory, as zenoh_config.QUIET."""
     off = {"enabled": False}
-    values = {
-        **values,
-        "scouting": {"multicast": off, "gossip": off},
-        "transport": {"shared_memory": off, "link": {"protocols": ["tls"], "tls": tls}},
-        "access_control": access,
-    }
-    return (_WARNING.format(title=title) + json.dumps(values, indent=2) + "\n").encode()
+    transport = {"shared_memory": off, "link": {"protocols": ["tls"], "tls": tls}}
+    scouting = {"multicast": off, "gossip": off}
+    whole = {**values, "scouting": scouting, "transport": transport, "access_control": access}
+    return (_WARNING.format(title=title) + json.dumps(whole, indent=2) + "\n").encode()
 
 
-def _tls(own: Certificate, authority: Certificate, *sides: str) -> dict[str, Any]:
+def _tls(own: Certificate, authority: Certificate, *sides: str) -> dict[str, object]:
     """Have both ends of a link show their certificates, and end it when one expires."""
-    section: dict[str, Any] = {
+    section: dict[str, object] = {
         "root_ca_certificate_base64": _base64(authority.pem),
         "enable_mtls": True,
         "verify_name_on_connect": True,

@@ -19,6 +19,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from triquad_format.mapfile.durable_file import replacing
 from triquad_format.wire.access_control import access_control
 from triquad_format.wire.roles import ROUTER, SERVER, Holder, Role, client_grants, server_grants
 
@@ -32,7 +33,6 @@ LISTENING = (SERVER, ROUTER)
 _HOST = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9.-]*[A-Za-z0-9])?|[0-9A-Fa-f:]*:[0-9A-Fa-f:.]*")
 _NAME_LENGTH = 48  # with role and issue it has to fit into the 64 characters of a common name
 _AUTHORITY = "authority"
-_REGISTER = "register.json"
 
 
 @dataclass(frozen=True)
@@ -58,15 +58,14 @@ class KeyFolder:
             OSError: it cannot be read.
         """
         self.path = path
-        register = path / _AUTHORITY / _REGISTER
         try:
-            read = json.loads(register.read_bytes())
+            read = json.loads(self._register.read_bytes())
             self.hosts = tuple(read["hosts"])
-            self.entries = {entry["name"]: _entry(**entry) for entry in read["roles"]}
+            self.entries = {role["name"]: _entry(**role) for role in read["roles"]}
         except FileNotFoundError as error:
             raise ToolError(f"{path} holds no keys: triquad-keys init {path}") from error
         except (ValueError, KeyError, TypeError) as error:
-            raise ToolError(f"{register} is damaged: {error!r}") from error
+            raise ToolError(f"{self._register} is damaged: {error!r}") from error
         self.authority = Authority(self.certificate(_AUTHORITY))
 
     @classmethod
@@ -90,7 +89,8 @@ class KeyFolder:
         _store(path, _AUTHORITY, authority.own)
         for name in LISTENING:
             _store(path, name, authority.server(name, hosts, days))
-        _write(path / _AUTHORITY / _REGISTER, _register(hosts, {}))
+        register = json.dumps({"hosts": hosts, "roles": []})
+        _write(path / _AUTHORITY / "register.json", register.encode())
         created = cls(path)
         created._write_access()
         return created
@@ -106,7 +106,7 @@ class KeyFolder:
             raise ToolError(f"{holder.name!r} is not a name for a role: choose another")
         if len(holder.name) > _NAME_LENGTH:
             raise ToolError(f"{holder.name!r} has more than {_NAME_LENGTH} characters")
-        for other in self.holders:
+        for other in (entry.holder for entry in self.entries.values()):
             if other.name == holder.name:
                 raise ToolError(
                     f"{other.name!r} is there already, with the role {other.role.value}: "
@@ -142,11 +142,6 @@ class KeyFolder:
         self._write_access()
         self._file(name).unlink(missing_ok=True)  # it may have been moved to its holder
 
-    @property
-    def holders(self) -> tuple[Holder, ...]:
-        """The entries of all clients."""
-        return tuple(entry.holder for entry in self.entries.values())
-
     def holder(self, name: str) -> Holder:
         """Return the client of this name.
 
@@ -174,23 +169,25 @@ class KeyFolder:
 
     def _write_access(self) -> None:
         """Write the register, and the files of the server and the router that follow from it."""
-        _write(self.path / _AUTHORITY / _REGISTER, _register(self.hosts, self.entries))
-        access = access_control(server_grants(self.holders))
+        entries = self.entries.values()
+        roles = [
+            {**asdict(one.holder), "role": one.holder.role.value, "expires": str(one.expires)}
+            for one in entries
+        ]
+        register = json.dumps({"hosts": self.hosts, "roles": roles}, indent=2)
+        _write(self._register, register.encode())
+        access = access_control(server_grants(tuple(one.holder for one in entries)))
         for name in LISTENING:
             own, authority = self.certificate(name), self.authority.own
             text = configurations.listening(f"the {name}", own, authority, access)
             _write(self._file(name), text)
 
+    @property
+    def _register(self) -> Path:
+        return self.path / _AUTHORITY / "register.json"
+
     def _file(self, name: str) -> Path:
         return self.path / f"{name}.json5"
-
-
-def _register(hosts: Sequence[str], entries: dict[str, Entry]) -> bytes:
-    roles = [
-        {**asdict(one.holder), "role": one.holder.role.value, "expires": one.expires.isoformat()}
-        for one in entries.values()
-    ]
-    return (json.dumps({"hosts": hosts, "roles": roles}, indent=2) + "\n").encode()
 
 
 def _entry(*, role: str, sources: list[str], expires: str, **others: Any) -> Entry:
@@ -204,14 +201,6 @@ def _store(path: Path, name: str, certificate: Certificate) -> None:
 
 
 def _write(path: Path, data: bytes) -> None:
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
-    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    try:
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    with replacing(path) as stream:
+        os.fchmod(stream.fileno(), 0o600)  # before there is anything to read in it
+        stream.write(data)

@@ -1,27 +1,21 @@
 """The steps of the demonstration, each against a running server."""
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from triquad_client import CheckpointInfo, Client, Mesh, SdfResult, connect
-from triquad_format.mapfile.reader import read_map
-from triquad_format.mapfile.writer import write_map
-from triquad_format.records.arrays import Doubles
-from triquad_format.records.crop import without_training
-from triquad_map.preview import previews_of
+from triquad_client import Client, Mesh, connect
 
 from triquad_tools.console.progress import progress
 from triquad_tools.demo.probe import Probe, ProbeReport
-from triquad_tools.demo.results import Intake, MapSize, Restart
+from triquad_tools.demo.results import Intake
 from triquad_tools.evaluation.map_scores import DrivenStreet, StreetScores, score_street
 from triquad_tools.evaluation.metrics import (
-    STREET_SETTINGS,
+    STREET_VOXEL_M,
     MeshScores,
-    compare_mesh,
-    drive_truth,
+    ScoreSettings,
+    score_against_scene,
     scored_box,
 )
 from triquad_tools.plots.picture import draw_mesh
@@ -32,7 +26,6 @@ MAP = "demo"
 _SEED = 0  # of the points that are asked
 _SETTLE_LIMIT_S = 70.0
 _QUERY_POINTS = 1_000
-_RESTART_POINTS = 50_000
 
 
 @dataclass(frozen=True)
@@ -45,15 +38,11 @@ class Learnt:
 
 @dataclass(frozen=True)
 class Scored:
-    """The scores of the map, and what the server said before it was stopped."""
+    """The map against the exact street."""
 
     street: StreetScores
     mesh: MeshScores
-    surface: Mesh
     parameters: int
-    checkpoint: CheckpointInfo
-    points: Doubles  # [N, 3] where it was asked
-    answers: SdfResult
 
 
 def learn(endpoint: str, street: DrivenStreet) -> Learnt:
@@ -62,6 +51,23 @@ def learn(endpoint: str, street: DrivenStreet) -> Learnt:
     with connect(endpoint, MAP) as client, Probe(endpoint, MAP, points) as probe:
         intake = _stream(client, street)
         return Learnt(intake, probe.finish())
+
+
+def score(endpoint: str, street: DrivenStreet, out: Path) -> Scored:
+    """Compare the map with the exact street; leave the map, its mesh and a picture in a folder."""
+    settings, visible = ScoreSettings(), street.drive.true_hits(STREET_VOXEL_M)
+    with connect(endpoint, MAP) as client, progress("scoring") as report:
+        report(0.0, "distances")
+        field = score_street(client.query_sdf, street.probes)
+        report(0.0, "mesh")
+        surface = client.mesh(scored_box(visible, settings))
+        client.download_map(out / "map.triquad")
+        parameters = client.status().parameters
+        report(0.0, "mesh against the exact surface")
+        scores = score_against_scene(surface, street.drive.scene, visible, settings)
+        report(0.0, f"{scores.samples:,} samples of the mesh")
+    _draw(surface, out)
+    return Scored(field, scores, parameters)
 
 
 def _stream(client: Client, street: DrivenStreet) -> Intake:
@@ -74,7 +80,6 @@ def _stream(client: Client, street: DrivenStreet) -> Intake:
         taken=flush.taken,
         refused=flush.refused,
         lost=flush.lost,
-        points=sum(len(scan.points) for scan in street.scans),
         seconds=taken_in - started,
         learning_s=time.monotonic() - started,
         settled=status.settled,
@@ -82,57 +87,10 @@ def _stream(client: Client, street: DrivenStreet) -> Intake:
     )
 
 
-def score(endpoint: str, street: DrivenStreet) -> Scored:
-    """Compare the map with the exact street, and have the server write it to its store."""
-    rng = np.random.default_rng(_SEED)
-    points = rng.permutation(street.probes.near)[:_RESTART_POINTS]
-    with connect(endpoint, MAP) as client, progress("scoring") as report:
-        report(0.0, "distances")
-        field = score_street(client.query_sdf, street.probes)
-        report(0.0, "mesh")
-        truth = drive_truth(street.drive, STREET_SETTINGS)
-        surface = client.mesh(scored_box(truth.points, STREET_SETTINGS))
-        checkpoint = client.checkpoint()
-        answers = client.query_sdf(points)
-        parameters = client.status().parameters
-        report(0.0, "mesh against the exact surface")
-        scores = compare_mesh(surface, truth, STREET_SETTINGS).scores
-        report(0.0, f"{scores.samples:,} samples of the mesh")
-    return Scored(
-        street=field,
-        mesh=scores,
-        surface=surface,
-        parameters=parameters,
-        checkpoint=checkpoint,
-        points=points,
-        answers=answers,
-    )
-
-
-def compare(endpoint: str, scored: Scored) -> Restart:
-    """Ask a restarted server what was asked before."""
-    with connect(endpoint, MAP) as client:
-        answers = client.query_sdf(scored.points)
-    change = np.abs(answers.sdf - scored.answers.sdf)
-    return Restart(
-        points=len(change),
-        sdf_difference_max_m=float(change.max()) if len(change) else 0.0,
-        statuses_changed=int((answers.status != scored.answers.status).sum()),
-    )
-
-
-def pack(scored: Scored, path: Path) -> MapSize:
-    """Write the map without the state that only training needs."""
-    record = without_training(read_map(scored.checkpoint.path))
-    packed = write_map(record, path, previews=previews_of(record))
-    return MapSize(packed.bytes, scored.checkpoint.bytes, scored.parameters)
-
-
-def draw(surface: Mesh, paths: Sequence[Path], picture: Path) -> None:
-    """Save the mesh, and a picture of it."""
+def _draw(surface: Mesh, out: Path) -> None:
     with progress("drawing") as report:
-        for path in paths:
-            report(0.0, path.name)
-            surface.save(path)
-        report(0.0, picture.name)
-        draw_mesh(f"map {MAP!r}, epoch {surface.epoch}", surface, picture)
+        for name in ("street.glb", "street.ply"):
+            report(0.0, name)
+            surface.save(out / name)
+        report(0.0, "street.png")
+        draw_mesh(f"map {MAP!r}, epoch {surface.epoch}", surface, out / "street.png")

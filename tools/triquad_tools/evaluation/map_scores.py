@@ -3,13 +3,13 @@
 ``docs/tools.md`` defines every figure. What is asked, a file or a server, is a callable here.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from triquad_client import SdfResult
-from triquad_format.records.arrays import Bytes, Doubles, Floats
+from triquad_format.records.arrays import Doubles
 from triquad_format.records.status import Status
 from triquad_map.view import FieldAnswer
 
@@ -118,29 +118,13 @@ def score_street(query: MapQuery, probes: StreetProbes) -> StreetScores:
     )
 
 
-@dataclass(frozen=True)
-class WithheldAnswer:
-    """The answer of a map at points of a scan that it never saw."""
-
-    points: Doubles  # [N, 3] map frame
-    distance_m: Floats  # [N] magnitude; infinite where no region is around
-    status: Bytes  # [N]
-
-
-def ask_withheld(query: MapQuery, clouds: Iterable[Doubles]) -> Iterator[WithheldAnswer]:
-    """Ask a map at the points ``[N, 3]`` of scans that it never saw, map frame."""
-    for cloud in clouds:
-        answer = query(cloud)
-        distance_m = np.nan_to_num(np.abs(answer.sdf), nan=np.inf)
-        yield WithheldAnswer(cloud, distance_m, answer.status)
-
-
-def score_withheld(answers: Iterable[WithheldAnswer]) -> WithheldScores:
-    """Return scores of a map by what it says of scans that it never saw."""
+def score_withheld(query: MapQuery, clouds: Iterable[Doubles]) -> WithheldScores:
+    """Return scores of a map at the points ``[N, 3]``, map frame, of scans that it never saw."""
     distances = [np.empty(0, np.float32)]
     statuses = [np.empty(0, np.uint8)]
-    for answer in answers:
-        distances.append(answer.distance_m)
+    for cloud in clouds:
+        answer = query(cloud)
+        distances.append(np.nan_to_num(np.abs(answer.sdf), nan=np.inf))
         statuses.append(answer.status)
     distance, status = np.concatenate(distances), np.concatenate(statuses)
     on_surface = distance[status == Status.SURFACE]

@@ -13,17 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from triquad_client import Mesh
-from triquad_format.records.arrays import Bools, Doubles
+from triquad_format.records.arrays import Doubles
 
 from triquad_tools.recordings.cloud import thin
-from triquad_tools.simulation.lidar import SimulatedDrive
 from triquad_tools.simulation.scene import Scene
 
 STREET_VOXEL_M = 0.05
 """The spacing of the points of a simulated street that completion asks for."""
-
-STREET_SAMPLES_MAX = 3_000_000
-"""The samples of its mesh: more change the scores by little."""
 
 Distances = Callable[[Doubles], Doubles]
 """Distances ``[N]`` of places ``[N, 3]`` to a surface, metres; infinite beyond a limit, perhaps."""
@@ -37,12 +33,10 @@ class ScoreSettings:
     accuracy_cut_m: float = 0.2  # samples farther than this are left out
     completion_cut_m: float = 2.0  # greater distances count as this
     voxel_m: float = 0.02  # samples and truth are thinned to this
-    samples_max: int = 10_000_000  # drawn from the mesh before thinning
+    samples_max: int = (
+        3_000_000  # drawn from the mesh before thinning: more change scores by little
+    )
     seed: int = 0  # of these samples: scores can be repeated
-
-
-STREET_SETTINGS = ScoreSettings(samples_max=STREET_SAMPLES_MAX)
-"""The settings for meshes of a simulated street."""
 
 
 @dataclass(frozen=True)
@@ -60,27 +54,8 @@ class MeshScores:
     references: int  # points of the truth
 
 
-@dataclass(frozen=True)
-class Truth:
-    """The truth that a mesh should match."""
-
-    points: Doubles  # [M, 3] of surface that it should have, one per voxel
-    distances: Distances
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """A mesh compared with the truth."""
-
-    mesh: Mesh
-    truth: Truth
-    settings: ScoreSettings
-    scores: MeshScores
-    missing: Doubles  # [K, 3] points of the truth: the mesh is no nearer than the threshold
-
-
-def cloud_truth(reference: Doubles, settings: ScoreSettings) -> Truth:
-    """Return a cloud ``[M, 3]`` of true surface points, metres.
+def score_against_cloud(mesh: Mesh, reference: Doubles, settings: ScoreSettings) -> MeshScores:
+    """Return scores of a mesh against a cloud ``[M, 3]`` of true surface points, metres.
 
     The spacing of the cloud bounds the accuracy from below: a cloud of 3 cm spacing shows no
     mesh as better than about 1.5 cm.
@@ -92,56 +67,36 @@ def cloud_truth(reference: Doubles, settings: ScoreSettings) -> Truth:
         found: Doubles = tree.query(places, distance_upper_bound=cut, workers=-1)[0]
         return found
 
-    return Truth(points, distances)
-
-
-def scene_truth(scene: Scene, visible: Doubles, settings: ScoreSettings) -> Truth:
-    """Return the truth of an exact scene; completion asks for points that a sensor has seen.
-
-    Args:
-        scene: gives the exact distance of each sample, without the floor that a cloud has.
-        visible: ``[M, 3]`` exact surface points that the sensor has seen
-            (see :meth:`triquad_tools.simulation.lidar.SimulatedDrive.true_hits`).
-        settings: thresholds.
-    """
-    points = _thinned_reference(visible, settings)
-    return Truth(points, lambda places: np.abs(scene.sdf(places)))
-
-
-def drive_truth(drive: SimulatedDrive, settings: ScoreSettings) -> Truth:
-    """Return all that the lidar of a simulated drive hit, 5 cm apart."""
-    return scene_truth(drive.scene, drive.true_hits(STREET_VOXEL_M), settings)
-
-
-def compare_mesh(mesh: Mesh, truth: Truth, settings: ScoreSettings) -> Comparison:
-    """Compare a mesh with the truth, in the same frame."""
-    samples = _samples(mesh, truth.points, settings)
-    missing_m = np.full(len(truth.points), settings.completion_cut_m)
-    if len(samples):
-        found = _tree(samples).query(
-            truth.points, distance_upper_bound=settings.completion_cut_m, workers=-1
-        )[0]
-        missing_m = np.minimum(missing_m, found)
-    scores = _scores(truth.distances(samples), missing_m, settings)
-    missing = truth.points[missing_m >= settings.threshold_m]
-    return Comparison(mesh, truth, settings, scores, missing)
-
-
-def score_against_cloud(mesh: Mesh, reference: Doubles, settings: ScoreSettings) -> MeshScores:
-    """Return scores of a mesh against a cloud; see :func:`cloud_truth`."""
-    return compare_mesh(mesh, cloud_truth(reference, settings), settings).scores
+    return _scored(mesh, points, distances, settings)
 
 
 def score_against_scene(
     mesh: Mesh, scene: Scene, visible: Doubles, settings: ScoreSettings
 ) -> MeshScores:
-    """Return scores of a mesh against an exact scene; see :func:`scene_truth`."""
-    return compare_mesh(mesh, scene_truth(scene, visible, settings), settings).scores
+    """Return scores of a mesh against an exact scene, without the floor that a cloud has.
+
+    Args:
+        mesh: in the frame of the scene.
+        scene: gives the exact distance of each sample of the mesh.
+        visible: ``[M, 3]`` exact surface points that the sensor has seen, which the mesh should
+            have (see :meth:`triquad_tools.simulation.lidar.SimulatedDrive.true_hits`).
+        settings: thresholds.
+    """
+    points = _thinned_reference(visible, settings)
+    return _scored(mesh, points, lambda places: np.abs(scene.sdf(places)), settings)
 
 
-def score_against_drive(mesh: Mesh, drive: SimulatedDrive) -> MeshScores:
-    """Return scores of a mesh against all that the lidar of a simulated drive hit."""
-    return compare_mesh(mesh, drive_truth(drive, STREET_SETTINGS), STREET_SETTINGS).scores
+def _scored(
+    mesh: Mesh, truth: Doubles, distances: Distances, settings: ScoreSettings
+) -> MeshScores:
+    """Return scores of a mesh by the distances of its samples, and of ``truth`` [M, 3] to them."""
+    samples = _samples(mesh, truth, settings)
+    missing_m = np.full(len(truth), settings.completion_cut_m)
+    if len(samples):
+        cut = settings.completion_cut_m
+        found = _tree(samples).query(truth, distance_upper_bound=cut, workers=-1)[0]
+        missing_m = np.minimum(missing_m, found)
+    return _scores(distances(samples), missing_m, settings)
 
 
 def median_angle_deg(one: NDArray[np.floating], other: NDArray[np.floating]) -> float:
@@ -188,14 +143,9 @@ def _samples(mesh: Mesh, reference: Doubles, settings: ScoreSettings) -> Doubles
     if count == 0:
         return np.empty((0, 3))
     samples = sample_mesh(mesh, count, np.random.default_rng(settings.seed))
-    return thin(samples[is_scored(samples, reference, settings)], settings.voxel_m)
-
-
-def is_scored(places: Doubles, reference: Doubles, settings: ScoreSettings) -> Bools:
-    """Return whether places ``[N, 3]`` lie where a mesh is scored."""
     low, high = np.array(scored_box(reference, settings))
-    inside: Bools = ((places >= low) & (places <= high)).all(axis=1)
-    return inside
+    inside = ((samples >= low) & (samples <= high)).all(axis=1)
+    return thin(samples[inside], settings.voxel_m)
 
 
 def scored_box(reference: Doubles, settings: ScoreSettings) -> tuple[list[float], list[float]]:

@@ -4,8 +4,7 @@ from triquad_tools.console.report import Row, centimetres, percent
 from triquad_tools.evaluation.map_scores import StreetScores, WithheldScores
 from triquad_tools.evaluation.metrics import MeshScores
 
-TRUSTED = "SURFACE points"
-"""The points of some figures: those that a user would trust."""
+_TRUSTED = "SURFACE points"  # those that a user would trust
 
 
 def mesh_rows(scores: MeshScores) -> list[Row]:
@@ -18,8 +17,6 @@ def mesh_rows(scores: MeshScores) -> list[Row]:
         Row("completion ratio", percent(scores.completion_ratio)),
         Row("F-score", percent(scores.f_score), "of both ratios"),
         Row("outliers", percent(scores.outlier_ratio), "mesh beyond the accuracy cut"),
-        Row("mesh samples", f"{scores.samples:,}"),
-        Row("reference points", f"{scores.references:,}"),
     ]
 
 
@@ -31,9 +28,7 @@ def street_rows(scores: StreetScores) -> list[Row]:
         Row("SDF error, 95 %", centimetres(scores.sdf_error_p95_m)),
         Row("gradient angle", f"{scores.gradient_angle_deg:.1f} deg", "median"),
         Row("of these SURFACE", percent(scores.near_surface_ratio)),
-        Row("points", f"{scores.near_points:,}"),
         Row("houses UNKNOWN", percent(scores.houses_unknown_ratio), "deeper than 0.5 m in them"),
-        Row("points in houses", f"{scores.house_points:,}"),
     ]
 
 
@@ -44,7 +39,7 @@ def withheld_rows(scores: WithheldScores) -> list[Row]:
         Row("UNKNOWN", percent(scores.unknown_ratio), "of all points"),
         Row("|SDF|, median", centimetres(scores.sdf_median_m), "all points"),
         Row("|SDF|, 90 %", centimetres(scores.sdf_p90_m), "all points"),
-        Row("|SDF|, median", centimetres(scores.surface_sdf_median_m), TRUSTED),
-        Row("|SDF|, 90 %", centimetres(scores.surface_sdf_p90_m), TRUSTED),
+        Row("|SDF|, median", centimetres(scores.surface_sdf_median_m), _TRUSTED),
+        Row("|SDF|, 90 %", centimetres(scores.surface_sdf_p90_m), _TRUSTED),
         Row("points", f"{scores.points:,}"),
     ]

@@ -26,6 +26,7 @@ STILL_M = 1e-3
 NOISE_M = 0.02
 """The greatest difference of two maps that learnt the same; it does not make a change great."""
 
+_LISTED = 20  # tiles, at most
 _STEPS = 8
 _LEAST_SLOPE = 0.1  # a flatter field says nothing of where its zero is
 
@@ -76,11 +77,6 @@ class Change:
         only_in_one = self.appeared or self.vanished or self.newly_seen or self.no_longer_known
         return bool(only_in_one) or self.moved_p95_m >= STILL_M
 
-    @property
-    def size(self) -> tuple[float, float]:
-        """The sort key of changes: the volume, then how far the surface moved."""
-        return self.changed_m3, 0.0 if np.isnan(self.moved_p95_m) else self.moved_p95_m
-
 
 @dataclass(frozen=True)
 class TileChange:
@@ -108,7 +104,10 @@ def compare(a: "OfflineMap", b: "OfflineMap") -> Comparison:
 def difference(comparison: Comparison, tile_m: float) -> MapDiff:
     """Return the figures of a comparison, in all and per cube of side ``tile_m``."""
     tiles = [tile for tile in _tiles(comparison, tile_m) if tile.change.differs]
-    tiles.sort(key=lambda tile: tile.change.size, reverse=True)
+    tiles.sort(
+        key=lambda tile: (tile.change.changed_m3, np.nan_to_num(tile.change.moved_p95_m)),
+        reverse=True,
+    )
     return MapDiff(tile_m, _change(comparison.old, comparison.new), tuple(tiles))
 
 
@@ -138,20 +137,20 @@ def surface_points(opened: "OfflineMap") -> Doubles:
     return found[opened.has_surface(found)]
 
 
-def print_diff(diff: MapDiff, limit: int) -> None:
-    """Print the totals, and a table of the ``limit`` tiles that changed most."""
+def print_diff(diff: MapDiff) -> None:
+    """Print the totals, and a table of the tiles that changed most."""
     if not diff.tiles:
         print_line(f"  no difference at {diff.total.points_a:,} surface points")
         return
     titles = ("from x m", "y m", "z m", "points A", "in B", "appeared %", "newly seen %",
               "vanished %", "no longer known %", "moved cm", "95 % cm")  # fmt: skip
     rows = [
-        (*(f"{low:g}" for low in tile.low_m), *_cells(tile.change)) for tile in diff.tiles[:limit]
+        (*(f"{low:g}" for low in tile.low_m), *_cells(tile.change)) for tile in diff.tiles[:_LISTED]
     ]
     print_columns(titles, [*rows, ("all", "", "", *_cells(diff.total))])
     left = len(diff.tiles) - len(rows)
     if left > 0:
-        print_line(f"  and {left} more: --limit {len(diff.tiles)} shows all")
+        print_line(f"  and {left} more: --json prints all")
 
 
 def _sighting(of: "OfflineMap", by: "OfflineMap") -> Sighting:

@@ -1,36 +1,50 @@
-"""Features as integers times a scale, as coarse as an error of the distances allows.
+"""Features as integers times a step, as coarse as an error of the distances allows.
 
-A vector is its integers times the scale of its table (a plane and level). Rounding with scales
-``q_t`` moves the distance at a point by a random amount of variance
-
-    sum over the tables t of  S * g_t**2 * (4 / 9) * q_t**2 / 12
-
-(``S`` feature size, ``g_t`` rms derivative of the distance by a feature of the table's level,
-4 / 9 the mean of the summed squares of the four hat weights), while a table of ``V_t`` vertices
-costs ``-V_t * S * log2(q_t)`` bits and a constant. The least bits for a given error have
-``q_t = factor * sqrt(V_t) / g_t``; the one ``factor`` left is searched for by evaluating.
+The step of a table (a plane and level) grows with the square root of its vertices: of all steps
+that move distances by the same error, those take nearly the fewest bits (searched for each table
+by its own effect on distances, files were 2 to 3 % smaller). What the steps share, one factor, is
+searched for by evaluating the map.
 """
 
 import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 from triquad_format.errors import FormatError
-from triquad_format.records.arrays import Floats
-from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import MAX_INTEGER, MapRecord, Region, VertexTable, masked
+from triquad_format.records.arrays import Doubles, Floats
+from triquad_format.records.region import MAX_INTEGER, MapRecord, VertexTable, seen_voxels
 from triquad_map.record_view import open_view
 
-from triquad_tools.mapfiles.field_change import FieldChange, draw_probes, field_change
-
 _SEARCH_SEED, _MEASURE_SEED = 0, 1
-_QUANTILE_PER_RMS = 3.2  # of the changes; seen 3.1 to 3.3; only where the search begins
+_FIRST_STEP = 1e-3  # in features of a table of one vertex; only where the search begins
 _MARGIN = 0.95  # of the limit: quantiles at other points differ by some percent
 _CLOSE, _AIM = 0.97, 0.985  # of the limit within that margin: where the search ends, and its aim
 _EVALUATIONS_MAX = 16
-_NOISE = 0.01  # in features, to see how much they move distances: about what rounding does
-_GROWTH_MAX = 8.0  # of the factor from one evaluation to the next
+_GROWTH_MAX = 8.0  # of the steps from one evaluation to the next
+
+_PROBES, _LEAST_PROBES = 20_000, 1_000  # points of each kind, and at least in each region
+_SURFACE_LEAVES = 1.0  # status SURFACE: half a leaf around the voxel's own half
+_NEAR_LEAVES = 1.5
+_FREE_LEAVES = 0.5
+
+
+@dataclass(frozen=True)
+class FieldChange:
+    """Magnitudes of the change of the distance, metres."""
+
+    surface_m: float  # 99 % quantile where the status is SURFACE
+    near_m: float  # up to 1.5 leaves from the centre of a surface voxel, on each axis
+    free_m: float  # in voxels that a ray passed through
+    largest_m: float  # of all points
+
+    @property
+    def quantile_m(self) -> float:
+        """The largest of the three quantiles."""
+        return max(self.surface_m, self.near_m, self.free_m)
 
 
 @dataclass(frozen=True)
@@ -44,7 +58,7 @@ class QuantisedMap:
 def quantise(record: MapRecord, max_error_m: float) -> QuantisedMap:
     """Return the coarsest integer features of which 99 of 100 distances are off by ``max_error_m``.
 
-    The limit holds in each region for each kind of points of :class:`FieldChange`.
+    The limit holds for each kind of points of :class:`FieldChange`.
 
     Args:
         record: the map; it may have integer features already, the error is from those.
@@ -53,109 +67,105 @@ def quantise(record: MapRecord, max_error_m: float) -> QuantisedMap:
     Raises:
         FormatError: even the finest integers change distances by more.
     """
-    regions = tuple(
-        _quantise_region(record.settings, region, max_error_m) for region in record.regions
-    )
-    packed = dataclasses.replace(record, regions=regions)
+    change_of, limit = _changes(record, _SEARCH_SEED), _MARGIN * max_error_m
+    step, best, error = _FIRST_STEP, None, 0.0
+    for _ in range(_EVALUATIONS_MAX):
+        rounded = _with_tables(record, partial(_rounded, step=step))
+        error = change_of(rounded).quantile_m
+        if error <= limit:
+            best = rounded
+            if error >= _CLOSE * limit or error == 0.0:
+                break
+        step *= min(_AIM * limit / max(error, 1e-12), _GROWTH_MAX)
+    if best is None:
+        raise FormatError(
+            f"integers change distances by {error * 1e3:.3f} mm, more than "
+            f"{max_error_m * 1e3:.3f} mm; allow a larger error"
+        )
+    regions = tuple(dataclasses.replace(region, training=None) for region in best.regions)
+    packed = dataclasses.replace(best, regions=regions)
     return QuantisedMap(packed, field_change(record, packed, _MEASURE_SEED))
 
 
 def dequantised(record: MapRecord) -> MapRecord:
     """Return the map with float32 features where it has integers; it answers as before."""
+    return _with_tables(
+        record,
+        lambda table: (
+            table
+            if table.scale is None
+            else dataclasses.replace(table, features=table.vectors(), scale=None)
+        ),
+    )
+
+
+def field_change(before: MapRecord, after: MapRecord, seed: int) -> FieldChange:
+    """Return how far distances moved between two maps that have the same regions and evidence."""
+    return _changes(before, seed)(after)
+
+
+def _changes(before: MapRecord, seed: int) -> Callable[[MapRecord], FieldChange]:
+    """Return what measures how far the distances of other maps are from those of this one."""
+    kinds = probes(before, seed)
+    points = np.concatenate(kinds)
+    old = _distances(before, points)
+    ends = np.cumsum([len(kind) for kind in kinds])[:-1]
+
+    def change(after: MapRecord) -> FieldChange:
+        # Outside the cube of a region at the map's border there is no distance.
+        moved = np.abs(np.nan_to_num(_distances(after, points) - old))
+        surface, near, free = map(_quantile, np.split(moved, ends))
+        return FieldChange(surface, near, free, largest_m=float(moved.max(initial=0.0)))
+
+    return change
+
+
+def probes(record: MapRecord, seed: int) -> list[Doubles]:
+    """Return random points [N, 3], map frame, metres, of each kind of :class:`FieldChange`.
+
+    There are none of a kind of which the evidence knows no voxel.
+    """
+    rng, settings = np.random.default_rng(seed), record.settings
+    count = max(_PROBES // max(len(record.regions), 1), _LEAST_PROBES)
+    middle = (1 << (settings.depth - 1)) - 0.5
+    kinds: list[list[Doubles]] = [[np.zeros((0, 3))] for _ in range(3)]
+    for region in record.regions:
+        surface = seen_voxels(region.evidence, region.evidence.surface)
+        free = seen_voxels(region.evidence, region.evidence.free)
+        chosen = ((surface, _SURFACE_LEAVES), (surface, _NEAR_LEAVES), (free, _FREE_LEAVES))
+        for kind, (voxels, reach) in zip(kinds, chosen, strict=True):
+            if len(voxels):
+                leaves = voxels[rng.integers(len(voxels), size=count)] - middle
+                leaves = leaves + rng.uniform(-reach, reach, leaves.shape)
+                kind.append(leaves * settings.leaf_m + settings.region_centre(region.index))
+    return [np.concatenate(kind) for kind in kinds]
+
+
+def _distances(record: MapRecord, points: Doubles) -> Floats:
+    view = open_view(record)
+    try:
+        return view.query(points).sdf
+    finally:
+        view.close()
+
+
+def _with_tables(record: MapRecord, change: Callable[[VertexTable], VertexTable]) -> MapRecord:
     regions = tuple(
-        dataclasses.replace(region, tables=tuple(map(_floats, region.tables)))
+        dataclasses.replace(region, tables=tuple(map(change, region.tables)))
         for region in record.regions
     )
     return dataclasses.replace(record, regions=regions)
 
 
-def _floats(table: VertexTable) -> VertexTable:
-    if table.scale is None:
-        return table
-    return dataclasses.replace(table, features=table.vectors(), scale=None)
-
-
-def _quantise_region(settings: FieldSettings, region: Region, max_error_m: float) -> Region:
-    probes = _RegionProbes(settings, region)
-    limit = _MARGIN * max_error_m
-    weights = _relative_scales(settings, region.tables, probes)
-    # Where the formula of the module's head predicts the error.
-    vertices = max(sum(len(table.codes) for table in region.tables), 1)
-    factor = limit / (_QUANTILE_PER_RMS * math.sqrt(settings.feature_size * vertices / 27))
-    best, error = None, 0.0
-    for _ in range(_EVALUATIONS_MAX):
-        tables = tuple(
-            _rounded(table, factor * weight)
-            for table, weight in zip(region.tables, weights, strict=True)
-        )
-        error = probes.points.change(probes.moves(tables)).quantile_m
-        if error <= limit:
-            best = tables
-            if error >= _CLOSE * limit or error == 0.0:
-                break
-        factor *= min(_AIM * limit / max(error, 1e-12), _GROWTH_MAX)
-    if best is None:
-        raise FormatError(
-            f"region {region.index}: integers change distances by {error * 1e3:.3f} mm, "
-            f"more than {max_error_m * 1e3:.3f} mm; allow a larger error"
-        )
-    return dataclasses.replace(region, tables=best, training=None)
-
-
-def _rounded(table: VertexTable, scale: float) -> VertexTable:
+def _rounded(table: VertexTable, step: float) -> VertexTable:
     """Return the nearest integers; the scale grows where the largest feature needs it."""
     vectors = table.vectors()
-    least = float(np.abs(vectors).max(initial=0.0)) / MAX_INTEGER
-    used = np.float32(max(scale, least * (1 + 1e-6), float(np.finfo(np.float32).tiny)))
-    integers = np.rint(vectors / used).astype(np.int16)
-    return dataclasses.replace(table, features=integers, scale=float(used))
+    least = float(np.abs(vectors).max(initial=0.0)) / MAX_INTEGER * (1 + 1e-6)
+    wanted = step * math.sqrt(len(table.codes))
+    scale = np.float32(max(wanted, least, float(np.finfo(np.float32).tiny)))
+    integers = np.rint(vectors / scale).astype(np.int16)
+    return dataclasses.replace(table, features=integers, scale=float(scale))
 
 
-class _RegionProbes:
-    """One region's field at points where rays have been, asked again with other features."""
-
-    def __init__(self, settings: FieldSettings, region: Region) -> None:
-        # At the origin, alone and without evidence: no more than its field is asked.
-        alone = dataclasses.replace(
-            region, index=(0, 0, 0), evidence=masked(region.evidence, np.uint8(0)), training=None
-        )
-        self._record = MapRecord("", 0, settings, regions=(alone,))
-        self.points = draw_probes(settings, region, np.random.default_rng(_SEARCH_SEED))
-        self._before = self._distances(region.tables)
-
-    def moves(self, tables: tuple[VertexTable, ...]) -> Floats:
-        """Return how far distances move [P], metres, where the region has these tables."""
-        return self._distances(tables) - self._before
-
-    def _distances(self, tables: tuple[VertexTable, ...]) -> Floats:
-        """Return signed distances [P], metres; 0 outside the region's cube."""
-        region = dataclasses.replace(self._record.regions[0], tables=tables)
-        opened = open_view(dataclasses.replace(self._record, regions=(region,)))
-        try:
-            return np.nan_to_num(opened.query(self.points.points).sdf)
-        finally:
-            opened.close()
-
-
-def _relative_scales(
-    settings: FieldSettings, tables: tuple[VertexTable, ...], probes: _RegionProbes
-) -> list[float]:
-    """Return ``sqrt(V) / g`` of each table; ``g`` from the effect of noise in its level."""
-    rng = np.random.default_rng(_SEARCH_SEED)
-    rms = {}
-    for level in settings.levels:
-        noisy = tuple(_noisy(t, rng) if t.level == level else t for t in tables)
-        moves = probes.moves(noisy)
-        rms[level] = float(np.linalg.norm(moves)) / math.sqrt(max(len(moves), 1))
-    least = 1e-3 * max(rms.values()) or 1.0  # no level may become arbitrarily coarse
-    # Three planes of the level move distances by this.
-    per_slope = _NOISE * math.sqrt(settings.feature_size / 9)
-    return [
-        math.sqrt(len(table.codes)) / (max(rms[table.level], least) / per_slope) for table in tables
-    ]
-
-
-def _noisy(table: VertexTable, rng: np.random.Generator) -> VertexTable:
-    vectors = table.vectors()
-    noise = rng.uniform(-_NOISE / 2, _NOISE / 2, vectors.shape)
-    return dataclasses.replace(table, features=vectors + noise.astype(np.float32), scale=None)
+def _quantile(values: NDArray[np.floating]) -> float:
+    return float(np.quantile(values, 0.99)) if len(values) else 0.0

@@ -3,12 +3,12 @@
 import re
 import tempfile
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from triquad_format.mapfile.checkpoint_folder import checkpoint_at, checkpoint_files, map_folder
-from triquad_format.mapfile.index import FileBytes, MapIndex, file_in, named
 from triquad_format.mapfile.parts.part import TRAINING_TOPICS
 from triquad_format.mapfile.reader import MapFile, read_map_file
 from triquad_format.records.arrays import Doubles
@@ -19,9 +19,11 @@ from triquad_map.stored_map import StoredMap
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
 
+if TYPE_CHECKING:  # slow to import
+    from triquad_client import Client, OfflineMap
+
 Box = Doubles
 """Opposite corners ``[2, 3]`` of a box, metres, map frame; the lower one first."""
-
 
 _ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws|unixsock-stream)/")
 
@@ -32,10 +34,6 @@ class Access:
 
     map_name: str
     config: Path | None = None  # of Zenoh, with credentials
-
-
-class MissingFilesError(ToolError):
-    """A map file whose parts lie in files that are not there."""
 
 
 class NothingLeftError(ToolError):
@@ -73,6 +71,21 @@ def is_endpoint(target: str) -> bool:
     return _ENDPOINT.match(target) is not None
 
 
+def open_map(target: str, access: Access) -> "Client | OfflineMap":
+    """Return the map in the file ``target``, or that of the server at the endpoint ``target``.
+
+    Raises:
+        TriquadError: no server there has the map.
+        FormatError: the file cannot be read as a map.
+        OSError: it cannot be read at all.
+    """
+    import triquad_client
+
+    if is_endpoint(target):
+        return triquad_client.connect(target, access.map_name, config=access.config)
+    return triquad_client.open_map(target)
+
+
 @contextmanager
 def map_file(target: str, access: Access, when: str | None = None) -> Iterator[Path]:
     """Yield a map's file: ``target`` itself, a checkpoint of it, or a server's newest epoch.
@@ -91,7 +104,7 @@ def map_file(target: str, access: Access, when: str | None = None) -> Iterator[P
         return
     if when is not None:
         raise ToolError(f"{target} is a server, which has its newest epoch only: leave out --at")
-    import triquad_client  # slow to import
+    import triquad_client
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "map.triquad"
@@ -102,21 +115,15 @@ def map_file(target: str, access: Access, when: str | None = None) -> Iterator[P
 
 
 def read_whole(path: Path) -> MapFile:
-    """Return the map in a file, checked.
+    """Return the map in a file, checked, with the parts in other files that it needs.
 
     Raises:
-        MissingFilesError: it needs other files that are not in its folder; the text names them.
         ToolError: it is a folder.
-        MapFileError: it is not a map file, is damaged, or needs a newer reader.
+        MapFileError: it is not a map file, is damaged, lacks files, or needs a newer reader.
         OSError: it cannot be read.
     """
     if path.is_dir():
         raise ToolError(f"{path} is a folder: --log lists the checkpoints in it")
-    missing = [name for name in _needed_files(path) if not file_in(path.parent, name).exists()]
-    if missing:
-        raise MissingFilesError(
-            f"{path} needs {', '.join(missing)}: not in its folder, copy what is missing there"
-        )
     return read_map_file(path)
 
 
@@ -127,8 +134,7 @@ def read_source(path: Path, box: Box | None, training: bool) -> SourceMap:
 
     Raises:
         NothingLeftError: no region lies in the box.
-        FormatError: the box is empty, or the file cannot be read.
-        ToolError: it needs other files, which are missing.
+        FormatError: the box is empty, or the file, or one that it needs, cannot be read.
         OSError: it cannot be read.
     """
     source = None if box is None else _box(path, box, training)
@@ -155,8 +161,3 @@ def _box(path: Path, box: Box, training: bool) -> SourceMap | None:
         if training and topics & set(TRAINING_TOPICS):
             return None
         return SourceMap(stored.box(box[0], box[1]), stored.manifest.stamp_ns or None)
-
-
-def _needed_files(path: Path) -> list[str]:
-    with closing(FileBytes(path)) as source, named(str(path)):
-        return list(MapIndex(source).manifest.files)

@@ -7,15 +7,14 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from triquad_format.records.region import MapRecord
 from triquad_server.errors import ScanRefusedError
+from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.process.threads import Teams
 from triquad_server.settings import Settings
 
 from triquad_tools.console.progress import Speed, progress
-from triquad_tools.mapping.unfinished import MAP_NAME, UnfinishedMap
+from triquad_tools.mapping.unfinished import UnfinishedMap
 from triquad_tools.recordings.selection import Selection
 
 _SAVE_PERIOD_S = 60.0
@@ -41,16 +40,6 @@ def stop_requests() -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
 
-def resumed_mapper(
-    record: MapRecord | None, settings: Settings, device: str, *, teams: Teams
-) -> Mapper:
-    """Return a mapper that goes on with a map; ``None``: with an empty one."""
-    mapper = Mapper(MAP_NAME, settings, device, record=record, teams=teams)
-    # What comes from now on is of a later epoch than the checkpoint.
-    mapper.publish()
-    return mapper
-
-
 class MappingRun:
     """Integrates the scans of a recording and trains until nothing is left to learn."""
 
@@ -58,13 +47,13 @@ class MappingRun:
         self,
         mapper: Mapper,
         unfinished: UnfinishedMap,
-        warnings: ScanWarnings,
+        settings: Settings,
         stop: Callable[[], bool],
     ) -> None:
-        """``warnings`` gets what is used of each scan; ``stop()`` is called between steps."""
+        """``stop()`` is called between steps."""
         self._mapper = mapper
         self._unfinished = unfinished
-        self._warnings = warnings
+        self._warnings = ScanWarnings(ScanQueue(1), settings)
         self._stop = stop
         self._next_save = time.monotonic() + _SAVE_PERIOD_S
         self.scans_taken = 0  # or refused: those that need not be taken again
@@ -78,21 +67,17 @@ class MappingRun:
             KeyboardInterrupt: the user wants to stop; all that was done is saved.
         """
         self.scans_taken = start
-        total = len(selection)
-        entries = selection.entries
+        total, entries = len(selection), selection.entries
         began = time.monotonic()
         with progress("mapping", total) as report:
             for scan in selection.scans(start):
                 self._between_steps()
                 entry = entries[self.scans_taken]
                 try:
-                    rays = self._mapper.ingest(
-                        scan.points,
-                        scan.world_from_sensor,
-                        entry.stamp_ns // 1_000_000_000,
-                        source=entry.source,
-                    )
-                    self._warnings.add(entry.source, len(scan.points), rays)
+                    stamp_s = entry.stamp_ns // 1_000_000_000
+                    pose, source = scan.world_from_sensor, entry.source
+                    rays = self._mapper.ingest(scan.points, pose, stamp_s, source=source)
+                    self._warnings.add(source, len(scan.points), rays)
                     self._warnings.check()
                 except ScanRefusedError as error:
                     self.refusals[error.reason] += 1
@@ -105,7 +90,7 @@ class MappingRun:
                 report(taken, f"{taken} of {total} scans, {rate}")
 
     def settle(self) -> None:
-        """Train until nothing is left to learn.
+        """Train until nothing is left to learn, and save the map.
 
         Raises:
             KeyboardInterrupt: the user wants to stop; all that was done is saved.
@@ -121,11 +106,15 @@ class MappingRun:
                 speed = Speed.of(done, left, time.monotonic() - began)
                 rate = f"{speed.per_s / 1e6:.2f} M samples/s, {speed.left_s:.0f} s left"
                 report(total - left, rate)
+        self._save()
 
     def _between_steps(self) -> None:
-        if self._stop():
-            self._unfinished.save(self._mapper, self.scans_taken)
+        stop = self._stop()
+        if stop or time.monotonic() >= self._next_save:
+            self._save()
+        if stop:
             raise KeyboardInterrupt
-        if time.monotonic() >= self._next_save:
-            self._unfinished.save(self._mapper, self.scans_taken)
-            self._next_save = time.monotonic() + _SAVE_PERIOD_S
+
+    def _save(self) -> None:
+        self._unfinished.save(self._mapper, self.scans_taken)
+        self._next_save = time.monotonic() + _SAVE_PERIOD_S

@@ -4,12 +4,11 @@ import hashlib
 import json
 import shutil
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 from triquad_format.mapfile.durable_file import replacing
-from triquad_format.records.region import MapRecord
 from triquad_server.mapping.mapper import Mapper
+from triquad_server.process.threads import Teams
 from triquad_server.settings import Settings, StoreSettings
 from triquad_server.store.store import Store
 
@@ -20,14 +19,6 @@ MAP_NAME = "recording"
 _POSITIONS = "positions.json"
 _SECTIONS = {"field", "scan", "change", "training", "sources"}  # that a map depends on
 _KEEP = StoreSettings(period_s=0.0, keep=2)
-
-
-@dataclass(frozen=True)
-class Position:
-    """The position at which to go on."""
-
-    record: MapRecord | None  # None: with an empty map
-    scans_taken: int
 
 
 def mapping_key(selection: Selection, settings: Settings) -> str:
@@ -54,7 +45,8 @@ class UnfinishedMap:
         self._positions = self.folder / _POSITIONS
         self._check_ours()
         self._store = Store(self.folder, MAP_NAME, _KEEP)
-        self._scans_taken: dict[str, int] = {}  # by epoch
+        self.scans_taken = 0
+        self._taken_by: dict[str, int] = {}  # scans by epoch
         try:
             if self._positions.exists():
                 self._read_positions()
@@ -67,7 +59,7 @@ class UnfinishedMap:
     def close(self) -> None:
         """Unlock the folder; what is in it stays, unless nothing was saved yet."""
         self._store.close()
-        if not self._scans_taken:
+        if not self._taken_by:
             self.remove()
 
     def remove(self) -> None:
@@ -77,22 +69,26 @@ class UnfinishedMap:
         with suppress(OSError):  # other files in the folder are kept
             self.folder.rmdir()
 
-    def position(self) -> Position:
-        """Return the position at which to go on.
+    def resumed(self, settings: Settings, device: str, teams: Teams) -> Mapper:
+        """Return a mapper that goes on with the map, which has taken :attr:`scans_taken` scans.
 
         Raises:
             StoreError: there are checkpoints, but none can be read.
         """
         newest = self._store.newest()
-        if newest is None:
-            return Position(None, 0)
-        epoch = newest.record.epoch
-        if str(epoch) not in self._scans_taken:
-            raise ToolError(
-                f"{self.folder}: {_POSITIONS} says nothing of epoch {epoch}; delete the folder to "
-                "begin anew"
-            )
-        return Position(newest.record, self._scans_taken[str(epoch)])
+        if newest is not None:
+            epoch = str(newest.record.epoch)
+            if epoch not in self._taken_by:
+                raise ToolError(
+                    f"{self.folder}: {_POSITIONS} says nothing of epoch {epoch}; delete the folder "
+                    "to begin anew"
+                )
+            self.scans_taken = self._taken_by[epoch]
+        record = None if newest is None else newest.record
+        mapper = Mapper(MAP_NAME, settings, device, record=record, teams=teams)
+        # What comes from now on is of a later epoch than the checkpoint.
+        mapper.publish()
+        return mapper
 
     def save(self, mapper: Mapper, scans_taken: int) -> None:
         """Write a checkpoint from which the map can go on.
@@ -103,7 +99,7 @@ class UnfinishedMap:
         known = self._store.base_epoch
         changes = mapper.changes_since(known)
         # First: a checkpoint without its position would be of no use.
-        self._scans_taken[str(changes.record.epoch)] = scans_taken
+        self._taken_by[str(changes.record.epoch)] = scans_taken
         self._write_positions()
         if changes.record.epoch != known:
             self._store.write(changes)
@@ -118,7 +114,7 @@ class UnfinishedMap:
             )
 
     def _write_positions(self) -> None:
-        text = json.dumps({"key": self._key, "scans_taken": self._scans_taken})
+        text = json.dumps({"key": self._key, "scans_taken": self._taken_by})
         with replacing(self._positions) as stream:
             stream.write(text.encode())
 
@@ -126,7 +122,7 @@ class UnfinishedMap:
         path = self._positions
         try:
             read = json.loads(path.read_text())
-            key, self._scans_taken = read["key"], dict(read["scans_taken"])
+            key, self._taken_by = read["key"], dict(read["scans_taken"])
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise ToolError(f"{path} is damaged; delete {self.folder} to begin anew") from error
         if key != self._key:

@@ -1,15 +1,15 @@
-"""A picture of how two maps differ: what moved, and what is there in only one of them."""
+"""A picture of how two maps differ: how far surface moved, and what only one of them has."""
 
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.patches import FancyArrowPatch, Rectangle
+from matplotlib.patches import Rectangle
 from triquad_format.records.status import Status
 
 from triquad_tools.mapfiles.diff import Comparison
-from triquad_tools.mapfiles.object_changes import Cluster, Move, ObjectChanges
+from triquad_tools.mapfiles.object_changes import Cluster, ObjectChanges
 from triquad_tools.plots.plan import (
     ERRORS,
     FREE,
@@ -24,17 +24,14 @@ from triquad_tools.plots.plan import (
 
 # From Okabe and Ito's colours, which all can distinguish.
 APPEARED, VANISHED, NEWLY_SEEN, NO_LONGER_KNOWN = "#0072b2", "#d55e00", "#56b4e9", "#f0e442"
-MOVED = "#000000"
 _LEAST_RANGE_CM = 5.0
 _LINE_PT = 1.5
-_ARROWHEAD_PT = 8
-_LABEL_PT = (8, 8)  # from the arrow's head
 _BESIDE_M = 0.1  # outlines lie this far outside of what they surround
-_NOTE = "outlined: what appeared or vanished as a whole; arrows: what moved"
+_NOTE = "outlined: what appeared or vanished as a whole"
 
 
 def draw_diff(title: str, comparison: Comparison, objects: ObjectChanges, path: Path) -> None:
-    """Draw a plan of the movement, and one of what appeared, vanished and moved as a whole.
+    """Draw a plan of the movement, and one of what appeared or vanished as a whole.
 
     Raises:
         OSError: ``path`` cannot be written.
@@ -76,10 +73,6 @@ def _draw_presence(
     for found, colour in ((objects.appeared, APPEARED), (objects.vanished, VANISHED)):
         for cluster in found:
             _draw_box(axes, cluster, colour)
-    for move in objects.moved:
-        _draw_box(axes, move.before, VANISHED)
-        _draw_box(axes, move.after, APPEARED)
-        _draw_arrow(axes, move)
 
 
 def _draw_box(axes: Axes, cluster: Cluster, colour: str) -> None:
@@ -89,15 +82,3 @@ def _draw_box(axes: Axes, cluster: Cluster, colour: str) -> None:
     axes.add_patch(
         Rectangle(corner, width, depth, fill=False, edgecolor=colour, linewidth=_LINE_PT)
     )
-
-
-def _draw_arrow(axes: Axes, move: Move) -> None:
-    """Draw from where a cluster was to where it is, and how far that is."""
-    start, end = ((place[0], place[1]) for place in (move.before.middle_m, move.after.middle_m))
-    arrow = FancyArrowPatch(
-        start, end, color=MOVED, linewidth=_LINE_PT, arrowstyle="->",
-        mutation_scale=_ARROWHEAD_PT, shrinkA=0, shrinkB=0,
-    )  # fmt: skip
-    axes.add_patch(arrow)
-    length = f"{move.distance_m:.1f} m"
-    axes.annotate(length, end, xytext=_LABEL_PT, textcoords="offset points", color=MOVED)

@@ -12,8 +12,7 @@ from triquad_client import Grid, OfflineMap, Status
 from triquad_format.records.seen_space import evidence_bounds
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.evaluation.open_map import open_map
-from triquad_tools.mapfiles.source import Access, is_endpoint, read_whole
+from triquad_tools.mapfiles.source import Access, is_endpoint, open_map, read_whole
 from triquad_tools.plots.plan import (
     FREE,
     Layer,

@@ -4,7 +4,7 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
@@ -12,16 +12,11 @@ from rosbags.typesys import Stores, get_typestore
 
 from triquad_tools.console.command import ToolError
 
-_SUFFIXES = (".bag", ".mcap", ".db3")
-_REPAIR = {
-    ".bag": "rosbag reindex",
-    ".mcap": "mcap recover",
-    ".db3": "ros2 bag reindex",
-}
+_REPAIR = {".bag": "rosbag reindex", ".mcap": "mcap recover", ".db3": "ros2 bag reindex"}
+"""What saves a damaged file, by the suffixes that bags have."""
 
 
-@dataclass(frozen=True)
-class Message:
+class Message(NamedTuple):
     """A message as it was recorded."""
 
     connection: Connection
@@ -29,22 +24,19 @@ class Message:
     payload: bytes
 
 
+@dataclass(frozen=True)
 class OpenBag:
     """A bag that can be read."""
 
-    def __init__(self, bag: "Bag", reader: AnyReader) -> None:
-        """Use :meth:`Bag.open`."""
-        self._bag = bag
-        self._reader = reader
+    bag: "Bag"
+    reader: AnyReader
 
     @property
     def connections(self) -> list[Connection]:
         """The recorded connections: several may be of one topic."""
-        return self._reader.connections
+        return self.reader.connections
 
-    def messages(
-        self, connections: Collection[Connection], start_ns: int | None = None
-    ) -> Iterator[Message]:
+    def messages(self, connections: Collection[Connection]) -> Iterator[Message]:
         """Yield the messages of some connections in the order in which they were recorded.
 
         Raises:
@@ -52,12 +44,12 @@ class OpenBag:
         """
         if not connections:
             return
-        messages = self._reader.messages(connections, start=start_ns)
+        messages = self.reader.messages(connections)
         while True:
             try:
                 message = next(messages, None)
             except Exception as error:  # a damaged file leads the readers anywhere
-                raise self._bag.damaged(error) from error
+                raise self.bag.damaged(error) from error
             if message is None:
                 return
             yield Message(*message)
@@ -68,14 +60,12 @@ class OpenBag:
         Raises:
             ToolError: its bytes are no such message.
         """
-        kind = message.connection.msgtype
+        kind, topic = message.connection.msgtype, message.connection.topic
         try:
-            return self._reader.deserialize(message.payload, kind)
+            return self.reader.deserialize(message.payload, kind)
         except Exception as error:  # as above
-            topic = message.connection.topic
-            raise ToolError(f"{self._bag.path}: a message on {topic} is no {kind}: {error}") from (
-                error
-            )
+            text = f"{self.bag.path}: a message on {topic} is no {kind}: {error}"
+            raise ToolError(text) from error
 
 
 @dataclass(frozen=True)
@@ -104,26 +94,25 @@ class Bag:
 
     def damaged(self, error: Exception) -> ToolError:
         """Return the error for a bag that cannot be read."""
-        suffixes = {file.suffix for file in _bag_files(self.path)} or {self.path.suffix}
-        repair = " or ".join(f"'{_REPAIR[suffix]}'" for suffix in sorted(suffixes & {*_REPAIR}))
+        files = _bag_files(self.path) if self.path.is_dir() else self.files
+        repairs = sorted({_REPAIR[file.suffix] for file in files})
         words = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-        remedy = f"; where it was cut off or damaged, {repair} saves what is left" if repair else ""
-        return ToolError(f"{self.path}: the bag cannot be read ({words}){remedy}")
+        return ToolError(
+            f"{self.path}: the bag cannot be read ({words}); where it was cut off or damaged, "
+            f"{' or '.join(map(repr, repairs)) or 'a copy'} saves what is left"
+        )
 
 
 def find_bag(path: Path) -> Bag | None:
     """Return the bag at a path: a file, a folder that ROS 2 wrote, or one of parts of a bag."""
     if path.is_file():
-        return Bag(path, (path,)) if path.suffix in _SUFFIXES else None
+        return Bag(path, (path,)) if path.suffix in _REPAIR else None
     if (path / "metadata.yaml").is_file():
         return Bag(path, (path,))
     files = _bag_files(path)
     return Bag(path, files) if files else None
 
 
-def _bag_files(path: Path) -> tuple[Path, ...]:
-    if path.is_file():
-        return (path,)
-    return tuple(
-        sorted(file for file in path.glob("*") if file.suffix in _SUFFIXES and file.is_file())
-    )
+def _bag_files(folder: Path) -> tuple[Path, ...]:
+    files = (file for file in folder.glob("*") if file.suffix in _REPAIR and file.is_file())
+    return tuple(sorted(files))

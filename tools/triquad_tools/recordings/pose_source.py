@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.ros_options import RosOptions
-from triquad_tools.recordings.ros_survey import SeenCloud, Survey
+from triquad_tools.recordings.options import ReadingOptions
+from triquad_tools.recordings.ros_content import RosContent, SeenCloud
 from triquad_tools.sensors.errors import NoTransformError
 from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES, FrameTree
 
@@ -34,14 +34,9 @@ class PoseSource:
             return error
         return None
 
-    @property
-    def moves(self) -> bool:
-        """Return whether they are poses at all: transforms that always hold are none."""
-        return self.frames.moves(self.target, self.body)
-
 
 def choose_poses(
-    found: Survey, clouds: Sequence[SeenCloud], options: RosOptions
+    content: RosContent, clouds: Sequence[SeenCloud], options: ReadingOptions
 ) -> PoseSource | None:
     """Return the source that places the most clouds; None if there is no pose at all.
 
@@ -49,38 +44,45 @@ def choose_poses(
         ToolError: the source that was asked for does not exist.
     """
     for transform in options.transforms:
-        found.frames.add(transform)
+        content.frames.add(transform)
     frame = clouds[0].frame
-    sources = [_of_tf(found, frame, options)]
-    sources += [_of_topic(found, topic, frame, options) for topic in found.poses]
+    names = [TF, *content.poses]
     if options.poses is not None:
-        sources = [source for source in sources if source.name == options.poses]
-        if not sources:
-            there = ", ".join([TF, *found.poses])
-            raise ToolError(f"--poses {options.poses}: there are no such poses, only {there}")
-    sources = [source for source in sources if source.moves]
-    return max(sources, key=lambda source: _merit(source, clouds), default=None)
+        if options.poses not in names:
+            raise ToolError(
+                f"--poses {options.poses}: there are no such poses, only {', '.join(names)}"
+            )
+        names = [options.poses]
+    sources = [
+        _of_tf(content.frames, frame, options)
+        if name == TF
+        else _of_topic(content, name, frame, options)
+        for name in names
+    ]
+    # Transforms that always hold are no poses.
+    moving = [source for source in sources if source.frames.moves(source.target, source.body)]
+
+    def merit(source: PoseSource) -> tuple[int, bool]:
+        placed = sum(source.find(cloud) is None for cloud in clouds)
+        return placed, source.target in ROOT_NAMES
+
+    return max(moving, key=merit, default=None)
 
 
-def _merit(source: PoseSource, clouds: Sequence[SeenCloud]) -> tuple[int, bool]:
-    placed = sum(source.find(cloud) is None for cloud in clouds)
-    return placed, source.target in ROOT_NAMES
-
-
-def _of_tf(found: Survey, frame: str, options: RosOptions) -> PoseSource:
+def _of_tf(frames: FrameTree, frame: str, options: ReadingOptions) -> PoseSource:
     """Return all transforms. If they do not reach the sensor, finding a cloud says so."""
-    frames, body = found.frames, frame
+    body = frame
     if not frames.moves(frames.root(frame), frame):
         body = next(iter(frames.moving), frame)
     return PoseSource(TF, frames, options.map_frame or frames.fixed_frame(body), body)
 
 
-def _of_topic(found: Survey, topic: str, frame: str, options: RosOptions) -> PoseSource:
+def _of_topic(content: RosContent, topic: str, frame: str, options: ReadingOptions) -> PoseSource:
     """Return the poses of a topic, in the tree of all transforms but those that say the same."""
-    poses = found.poses[topic]
+    poses = content.poses[topic]
     # Where a topic does not name the body, it is what the sensor is fixed to.
-    body = options.body_frame or poses.child or found.frames.root(frame)
-    frames = found.frames.with_track(poses.parent, body, poses.track)
+    body = options.body_frame or poses.child or content.frames.root(frame)
+    frames = content.frames.with_track(poses.parent, body, poses.track)
     target = options.map_frame or frames.fixed_frame(body)
     assumed = not (options.body_frame or poses.child)
     return PoseSource(topic, frames, target, body, assumed=assumed)

@@ -25,8 +25,8 @@ class Stream:
     name: str  # of the topic, or of the files
     kind: str  # type of the messages, or of the files
     count: int
-    frame: str  # of the sensor, or parent and child of poses; empty where there is none
     use: str  # in plain words: what is made of it, or why nothing
+    frame: str = ""  # of the sensor, or parent and child of poses
 
 
 class Recording(Protocol):

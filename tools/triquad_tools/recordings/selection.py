@@ -1,6 +1,7 @@
 """The part of a recording that is to be mapped."""
 
 import argparse
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -50,36 +51,35 @@ def open_selected(options: argparse.Namespace) -> Selection:
     recording = open_recording(options.recording, reading)
     for remark in recording.remarks:
         print_remark(f"{options.recording}: {remark}")
-    if not recording.entries:
+    entries = recording.entries
+    if not entries:
         raise ToolError(f"{options.recording}: nothing of it can be mapped")
-    indices = _chosen(recording.entries, options)
+    indices = _chosen(entries, options)
     if not indices:
         raise ToolError(
-            f"{options.recording}: no scan is left of {len(recording.entries)} in "
-            f"{_length_s(recording.entries):.1f} s: see --start, --end, --every and --skip-every"
+            f"{options.recording}: no scan is left of {len(entries)} in {length_s(entries):.1f} s: "
+            "see --start, --end, --every and --skip-every"
         )
     way = repr((options.recording.resolve(), reading, options.range_min))
     return Selection(recording, indices, options.range_min, way)
+
+
+def length_s(entries: Sequence[ScanEntry]) -> float:
+    """Return the seconds between the first and the last of some scans."""
+    stamps = [entry.stamp_ns for entry in entries]
+    return (max(stamps) - min(stamps)) / 1e9
 
 
 def _chosen(entries: Sequence[ScanEntry], options: argparse.Namespace) -> list[int]:
     """Return the numbers of scans within the times, every Nth of each sensor, not withheld."""
     first_ns = min(entry.stamp_ns for entry in entries)
     end_s = float("inf") if options.end is None else options.end
-    numbers: dict[str, int] = {}
+    before: Counter[str] = Counter()  # scans of each sensor
     chosen: list[int] = []
     for index, entry in enumerate(entries):
-        number = numbers[entry.source] = numbers.get(entry.source, -1) + 1
-        after_s = (entry.stamp_ns - first_ns) / 1e9
-        if (
-            options.start <= after_s <= end_s
-            and number % options.every == 0
-            and not is_withheld(index, options.skip_every)
-        ):
+        nth = before[entry.source] % options.every == 0
+        before[entry.source] += 1
+        timely = options.start <= (entry.stamp_ns - first_ns) / 1e9 <= end_s
+        if nth and timely and not is_withheld(index, options.skip_every):
             chosen.append(index)
     return chosen
-
-
-def _length_s(entries: Sequence[ScanEntry]) -> float:
-    stamps = [entry.stamp_ns for entry in entries]
-    return (max(stamps) - min(stamps)) / 1e9

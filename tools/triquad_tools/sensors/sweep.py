@@ -17,6 +17,13 @@ class Sweep:
     offsets_s: Doubles | None = None  # [N] seconds after the stamp at which each was measured
 
     @property
+    def span_ns(self) -> tuple[int, int]:
+        """When its first and its last point were measured, nanoseconds since 1970."""
+        offsets = np.zeros(1) if self.offsets_s is None else self.offsets_s
+        first, last = offsets.min(initial=0), offsets.max(initial=0)
+        return self.stamp_ns + round(first * 1e9), self.stamp_ns + round(last * 1e9)
+
+    @property
     def memory_bytes(self) -> int:
         """The bytes of its arrays."""
         return self.points.nbytes + (0 if self.offsets_s is None else self.offsets_s.nbytes)

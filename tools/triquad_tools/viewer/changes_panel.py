@@ -1,4 +1,4 @@
-"""Objects that appeared, vanished and moved between checkpoints: boxes in the scene, and a list."""
+"""Objects that appeared or vanished between checkpoints: boxes in the scene, and a list."""
 
 from collections.abc import Sequence
 
@@ -25,7 +25,7 @@ _BEFORE = "the checkpoint before"
 _NOTHING = "There is no checkpoint before this one: choose another to compare with."
 
 # Okabe and Ito's colours, which all can distinguish, that stand out on mesh and background.
-APPEARED, VANISHED, MOVED = "#56b4e9", "#d55e00", "#cc79a7"
+APPEARED, VANISHED = "#56b4e9", "#d55e00"
 _LISTED, _MOST = 5, 50  # of each kind are in the list, and in the scene
 _ASIDE_M = 0.1  # outlines lie this far outside of what they surround
 _DASH_SHARE = 0.6  # of a dash and a gap together
@@ -81,7 +81,6 @@ class ChangesPanel(Layer):
             lines=(
                 LineMeaning(APPEARED, f"appeared (A): free space in epoch {before.epoch}"),
                 LineMeaning(VANISHED, f"vanished (V): free space in epoch {after.epoch}", "dashed"),
-                LineMeaning(MOVED, "moved (M): dashed before, solid after"),
             )
         )
         marks: list[viser.SceneNodeHandle] = []
@@ -91,9 +90,6 @@ class ChangesPanel(Layer):
             top = cluster.middle_m + [0, 0, cluster.size_m[2] / 2 + 2 * _ASIDE_M]
             place = self.page.in_scene(top)
             marks.append(self.page.scene.add_label(self.node("name"), name, position=place))
-        if found.moved:
-            ways = [(move.before.middle_m, move.after.middle_m) for move in found.moved[:_MOST]]
-            marks.append(self._lines(np.array(ways), MOVED))
         self.draw(marks, legend)
         self._tell(f"From {before}\nto {after}:", legend.html + text_html(_list(found)))
 
@@ -129,8 +125,6 @@ def _boxes(found: ObjectChanges) -> list[tuple[str, str, Cluster]]:
     kinds = (
         ("A{}", APPEARED, found.appeared),
         ("V{}", VANISHED, found.vanished),
-        ("M{} before", VANISHED, [move.before for move in found.moved]),
-        ("M{}", APPEARED, [move.after for move in found.moved]),
     )
     return [
         (name.format(number), colour, cluster)
@@ -141,8 +135,7 @@ def _boxes(found: ObjectChanges) -> list[tuple[str, str, Cluster]]:
 
 def _list(found: ObjectChanges) -> str:
     """Return how much changed, and the largest things by name, size and place."""
-    moved = [move.after for move in found.moved]
-    kinds = (("appeared", found.appeared), ("vanished", found.vanished), ("moved", moved))
+    kinds = (("appeared", found.appeared), ("vanished", found.vanished))
     lines = []
     for kind, clusters in kinds:
         lines.append(f"{len(clusters)} {kind}")
@@ -155,5 +148,4 @@ def _list(found: ObjectChanges) -> str:
         f"newly seen: {len(found.newly_seen)}, no longer known: {len(found.no_longer_known)} "
         "(not drawn: one of the two has never been there)"
     )
-    small = found.small.appeared + found.small.vanished
-    return "\n".join([*lines, f"{small} things of fewer than {LEAST_POINTS} voxels are left out"])
+    return "\n".join([*lines, f"things of fewer than {LEAST_POINTS} voxels are left out"])

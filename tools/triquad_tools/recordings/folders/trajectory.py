@@ -15,7 +15,6 @@ from triquad_client.pose import Pose
 from triquad_format.records.arrays import Doubles, Longs
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.folders.kitti import DEFAULT_PERIOD_NS
 from triquad_tools.recordings.text_lines import (
     Line,
     parse_numbers,
@@ -26,7 +25,9 @@ from triquad_tools.recordings.text_lines import (
 from triquad_tools.sensors.errors import NoTransformError
 from triquad_tools.sensors.motion.frame_tree import FrameTree, Transform
 
-TRAJECTORY_NAMES = ("trajectory.txt", "trajectory.log", "poses.txt", "groundtruth.txt", "*.tum")
+DEFAULT_PERIOD_NS = 100_000_000
+"""The time between scans of a recording without times."""
+
 WORLD, SENSOR = "world", "sensor"
 """The frames of a trajectory."""
 
@@ -43,9 +44,6 @@ class Trajectory:
     stamps_ns: Longs  # [n]; ten a second where the file has no times
     frames: FrameTree | None  # the sensor's motion; None where the file has no times
 
-    def __len__(self) -> int:
-        return len(self.poses)
-
     def pose_at(self, stamp_ns: int) -> Doubles:
         """Return the pose [4, 4] at a time, of a trajectory that has times.
 
@@ -61,11 +59,6 @@ class Trajectory:
                 raise
             pose = self.poses[nearest]
         return pose
-
-
-def find_trajectories(folder: Path) -> list[Path]:
-    """Return the files of a folder that have the name of a trajectory, the most likely first."""
-    return [path for name in TRAJECTORY_NAMES for path in sorted(folder.glob(name))]
 
 
 def read_trajectory(path: Path) -> Trajectory:

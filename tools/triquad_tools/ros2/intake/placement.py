@@ -60,10 +60,7 @@ class Placement:
 
     def add(self, topic_name: str, sweep: Sweep, now_s: float) -> None:
         """Have a sweep placed; if too many are pending, the oldest are dropped."""
-        offsets = np.zeros(1) if sweep.offsets_s is None else sweep.offsets_s
-        first, last = offsets.min(initial=0), offsets.max(initial=0)
-        needs = (sweep.stamp_ns + round(first * 1e9), sweep.stamp_ns + round(last * 1e9))
-        entry = _Waiting(topic_name, sweep, needs, now_s + self._timeout_s)
+        entry = _Waiting(topic_name, sweep, sweep.span_ns, now_s + self._timeout_s)
         self._waiting.setdefault(topic_name, deque()).append(entry)
         self._keep_within_limit(now_s)
 

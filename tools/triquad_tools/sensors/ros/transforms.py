@@ -31,7 +31,7 @@ def transform_of_odometry(message: Any) -> Transform:
     )
 
 
-def transform_of_pose(message: Any, body_frame: str) -> Transform:
+def transform_of_pose(message: Any, body_frame: str = "") -> Transform:
     """Return where ``body_frame`` was by a ``PoseStamped``, which does not name it."""
     return Transform(
         parent=frame_name(message.header.frame_id),

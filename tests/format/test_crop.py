@@ -1,0 +1,105 @@
+"""A map without what no answer in a box needs."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from support.map_records import SMALL, assert_same, random_record, with_rays
+from triquad_format.errors import FormatError
+from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.writer import write_map
+from triquad_format.records.crop import SLACK_LEAVES, crop_record
+from triquad_map.composition.recorded_view import RecordedView
+
+CUBE = tuple(itertools.product((0, 1), repeat=3))
+
+
+def box_points(low, high, count=2000):
+    """Points in a box, many of them on its faces, edges and on leaf borders."""
+    low, high = np.asarray(low, float), np.asarray(high, float)
+    points = np.random.default_rng(0).uniform(low, high, (count, 3))
+    share = np.random.default_rng(1).integers(0, 4, (count, 3))
+    points = np.where(share == 0, low, np.where(share == 1, high, points))
+    snapped = np.clip(np.round(points[: count // 4] * 8) / 8, low, high)
+    return np.concatenate([points, snapped])
+
+
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [
+        ([-1, -1, -1], [1, 1, 1]),
+        ([-100, 2, 2], [100, 2.1, 2.1]),
+        ([6.0001, 6, 6], [6.0002, 7, 7]),
+    ],
+)
+def test_a_crop_answers_in_the_box_as_before(low, high):
+    record = random_record(2, indices=CUBE, points=200)
+    cropped = crop_record(record, low, high)
+    points = box_points(low, high)
+    before = RecordedView(record).query(points, gradient=True)
+    after = RecordedView(cropped).query(points, gradient=True)
+    np.testing.assert_array_equal(before.sdf, after.sdf)
+    np.testing.assert_array_equal(before.status, after.status)
+    np.testing.assert_array_equal(before.gradient, after.gradient)
+
+
+def test_a_crop_keeps_the_training_budget_of_the_samples_it_keeps():
+    record = random_record(4, points=100)
+    before = record.regions[0].training
+    after = crop_record(record, [-100, -100, 0], [100, 100, 100]).regions[0].training
+    kept = len(after.sample_points)
+    assert 0 < kept < 100
+    assert after.budget_samples == math.ceil(before.budget_samples * kept / 100)
+    empty = crop_record(record, [7.9, 7.9, 7.9], [7.95, 7.95, 7.95]).regions[0].training
+    assert len(empty.sample_points) == empty.budget_samples == 0
+    everything = crop_record(record, [-100] * 3, [100] * 3).regions[0].training
+    assert everything.budget_samples == before.budget_samples
+
+
+def test_a_crop_keeps_the_rays_that_end_in_the_box():
+    record = with_rays(random_record(4, points=100))
+    before = record.regions[0].training
+    low, high = [0.0] * 3, [3 * SMALL.leaf_m] * 3
+    after = crop_record(record, low, high).regions[0].training
+    ends, slack_m = before.rays.ends_m(SMALL), SLACK_LEAVES * SMALL.leaf_m
+    inside = ((ends >= -slack_m) & (ends <= high[0] + slack_m)).all(axis=1)
+    assert 0 < inside.sum() < 100
+    np.testing.assert_array_equal(after.rays.ends, before.rays.ends[inside])
+    np.testing.assert_array_equal(
+        after.rays.origins[after.rays.origin_of],
+        before.rays.origins[before.rays.origin_of[inside]],
+    )
+    assert len(after.rays.origins) == len(np.unique(before.rays.origin_of[inside]))
+    kept = len(after.sample_points) + len(after.rays)
+    assert after.budget_samples == math.ceil(before.budget_samples * kept / 300)
+
+
+def test_a_crop_can_be_written_and_keeps_training_rows(tmp_path):
+    record = random_record(4, indices=CUBE, points=100)
+    cropped = crop_record(record, [-1, -1, -1], [1, 1, 1])
+    write_map(cropped, tmp_path / "map.triquad")
+    assert_same(read_map(tmp_path / "map.triquad"), cropped)
+    table, old = cropped.regions[0].tables[3], record.regions[0].tables[3]
+    rows = np.searchsorted(old.codes, table.codes)
+    training, before = cropped.regions[0].training, record.regions[0].training
+    np.testing.assert_array_equal(training.table_means[3], before.table_means[3][rows])
+    np.testing.assert_array_equal(training.table_steps[3], before.table_steps[3][rows])
+    assert 0 < len(training.sample_points) < len(before.sample_points)
+    assert np.abs(training.sample_points).max() <= 1 + SMALL.leaf_m
+
+
+def test_a_crop_drops_regions_that_the_box_does_not_meet():
+    record = random_record(5, indices=CUBE)
+    assert [r.index for r in crop_record(record, [0, 0, 0], [1, 1, 1]).regions] == [(0, 0, 0)]
+    assert crop_record(record, [500, 0, 0], [501, 1, 1]).regions == ()
+    everything = crop_record(record, [-1e9] * 3, [1e9] * 3)
+    assert_same(everything, record)
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [([0, 0, 0], [1, 0, 1]), ([0, 0, 0], [1, np.nan, 1]), ([0] * 3, [np.inf] * 3)]
+)
+def test_bad_boxes(low, high):
+    with pytest.raises(FormatError, match="box"):
+        crop_record(random_record(), low, high)

@@ -1,0 +1,214 @@
+"""A recording in, a map out: no server, and nothing lost by an interruption."""
+
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+from support import servers
+from support.bags import drive, messages_for, write_bag
+from support.kitti_folder import write_folder
+from triquad_client import Status, open_map
+from triquad_format.mapfile.reader import read_map
+from triquad_tools.commands.map_recording import main
+from triquad_tools.mapfiles.meshfile import read_mesh
+from triquad_tools.mapping.output import write_output
+
+COUNT = 8
+POSES = np.tile(np.eye(4), (COUNT, 1, 1))
+POSES[:, 0, 3] = 0.05 * np.arange(COUNT)
+STAMPS = [10**18 + i * 10**8 for i in range(COUNT)]
+SPHERE = servers.sphere(2000)
+# Long enough to be interrupted while it trains.
+LONG = ("--set", "training.samples_per_ray=150", "--set", "training.batch=2048")
+
+
+@pytest.fixture(scope="module")
+def settings(tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = tmp_path_factory.mktemp("settings") / "small.toml"
+    path.write_text(servers.SMALL_TOML)
+    return str(path)
+
+
+def scans() -> list[np.ndarray]:
+    """What a sensor sees of a sphere around the map's origin while it moves."""
+    return [(SPHERE - pose[:3, 3]).astype(np.float32) for pose in POSES]
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = tmp_path_factory.mktemp("recording") / "scans"
+    write_folder(path, scans(), POSES, STAMPS)
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def whole(recording: str, settings: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The map of the recording, made without an interruption, with its training state."""
+    path = tmp_path_factory.mktemp("whole") / "whole.triquad"
+    assert main([recording, str(path), "--settings", settings, "--training"]) == 0
+    assert not path.with_name("whole.triquad.part").exists()
+    return path
+
+
+def error_of(path: Path) -> float:
+    with open_map(path) as opened:
+        answer = opened.query_sdf(SPHERE)
+        assert (answer.status == Status.SURFACE).mean() > 0.95
+        return float(np.nanmedian(np.abs(answer.sdf)))
+
+
+def assert_no_scan_is_lost(path: Path, whole: Path) -> None:
+    ours, theirs = (read_map(one).regions[0].evidence for one in (path, whole))
+    assert np.array_equal(ours.codes, theirs.codes)
+    assert np.array_equal(ours.surface, theirs.surface)
+
+
+def test_a_bag_gives_the_map_of_its_folder(tmp_path: Path, settings: str, whole: Path) -> None:
+    messages = drive(messages_for("mcap"), scans(), POSES, STAMPS, np.eye(4))
+    bag, output = write_bag(tmp_path / "bag", "mcap", messages), tmp_path / "bag.triquad"
+    assert main([str(bag), str(output), "--settings", settings]) == 0
+    assert abs(error_of(output) - error_of(whole)) < 0.01
+    assert_no_scan_is_lost(output, whole)
+    # Training state is kept on request alone.
+    regions = [read_map(path).regions[0] for path in (output, whole)]
+    assert [region.training is not None for region in regions] == [False, True]
+
+
+def test_the_name_says_what_is_written(tmp_path: Path, whole: Path) -> None:
+    record = read_map(whole)
+    for name in ("map.ply", "map.glb"):
+        assert "faces" in write_output(record, tmp_path / name, cell_m=0.2, training=False)
+        radii = np.linalg.norm(read_mesh(tmp_path / name).vertices, axis=1)
+        assert np.median(np.abs(radii - servers.RADIUS_M)) < 0.1
+    write_output(record, tmp_path / "map.png", cell_m=0.2, training=False)
+    assert imread(tmp_path / "map.png").std() > 0.02
+
+
+@contextmanager
+def mapping(*arguments: object, until: str) -> Iterator[tuple[subprocess.Popen[str], list[str]]]:
+    """The command as a process that has begun with a stage, and what it says."""
+    code = "from triquad_tools.commands.entry_points import map_recording as run; exit(run())"
+    line = [sys.executable, "-c", code, *map(str, arguments)]
+    with subprocess.Popen(line, stderr=subprocess.PIPE, text=True) as process:
+        begun = threading.Event()
+        said: list[str] = []
+
+        def read() -> None:
+            assert process.stderr is not None
+            for text in process.stderr:
+                said.append(text)
+                if text.startswith(until):
+                    begun.set()
+            begun.set()
+
+        reader = threading.Thread(target=read)
+        reader.start()
+        try:
+            assert begun.wait(servers.WAIT_S)
+            yield process, said
+        finally:
+            process.kill()
+            reader.join()
+
+
+def test_after_ctrl_c_the_same_command_goes_on(
+    tmp_path: Path, recording: str, settings: str, whole: Path, capsys
+) -> None:
+    output = tmp_path / "map.triquad"
+    arguments = [recording, str(output), "--settings", settings]
+    with mapping(*arguments, *LONG, until="training") as (process, said):
+        process.send_signal(signal.SIGINT)
+        assert process.wait(servers.WAIT_S) == 130
+    assert said[-1] == "triquad-map: interrupted; the same command goes on where it was\n"
+    assert not output.exists()
+    for other in ((), (*LONG, "--range-min", "0.1")):
+        assert main([*arguments, *other]) == 2
+        assert "of another recording, or with other flags or settings" in capsys.readouterr().err
+    assert main([*arguments, *LONG]) == 0
+    assert f"going on after scan {COUNT}" in capsys.readouterr().out
+    assert error_of(output) < 0.1
+    assert_no_scan_is_lost(output, whole)
+    assert not output.with_name("map.triquad.part").exists()
+
+
+def test_after_a_kill_the_same_command_makes_the_map(
+    tmp_path: Path, recording: str, settings: str, whole: Path
+) -> None:
+    output = tmp_path / "map.triquad"
+    arguments = [recording, str(output), "--settings", settings]
+    with mapping(*arguments, until="mapping") as (process, _):
+        process.kill()
+        process.wait()
+    assert not output.exists()
+    assert main(arguments) == 0
+    assert_no_scan_is_lost(output, whole)
+
+
+@pytest.mark.long
+def test_however_often_it_is_interrupted_no_scan_is_lost(
+    tmp_path: Path, recording: str, settings: str, whole: Path
+) -> None:
+    output = tmp_path / "map.triquad"
+    arguments = [recording, str(output), "--settings", settings]
+    for moment in ("preparing", "mapping", "mapping", "training", "training"):
+        with mapping(*arguments, until=moment) as (process, _):
+            process.send_signal(signal.SIGINT)
+            process.wait(servers.WAIT_S)
+    if not output.exists():
+        assert main(arguments) == 0
+    assert_no_scan_is_lost(output, whole)
+
+
+def test_what_somebody_else_put_beside_the_output_stays(
+    tmp_path: Path, recording: str, settings: str, capsys
+) -> None:
+    mine = tmp_path / "map.triquad.part" / "recording" / "mine.txt"
+    mine.parent.mkdir(parents=True)
+    mine.write_text("precious")
+    assert main([recording, str(tmp_path / "map.triquad"), "--settings", settings]) == 2
+    assert "holds something else; move it away" in capsys.readouterr().err
+    assert mine.read_text() == "precious"
+
+
+def test_a_recording_of_which_nothing_can_be_used_is_told(
+    tmp_path: Path, recording: str, settings: str, capsys
+) -> None:
+    near = ("--set", "scan.range_min_m=30", "--settings", settings)
+    assert main([recording, str(tmp_path / "map.triquad"), *near]) == 2
+    words = "nothing was mapped: 8 of 8 scans could not be used (empty: 8); the last: scan 7"
+    assert words in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_input_that_cannot_be_used_is_refused(tmp_path: Path, recording: str, capsys) -> None:
+    exists, other = tmp_path / "exists.triquad", tmp_path / "a.triquad"
+    exists.write_bytes(b"x")
+    for arguments, words in (
+        ((tmp_path / "nowhere", other), "no such file or folder"),
+        ((tmp_path, other), "no recording that is understood"),
+        ((recording, tmp_path / "a.obj2"), "use a name that ends in"),
+        ((recording, exists), "give --force to replace it"),
+        ((recording, tmp_path / "none" / "a.triquad"), "is not a folder: make it first"),
+        ((recording, other, "--set", "scan.range=5"), "unknown setting"),
+        ((recording, other, "--start", "99"), "no scan is left"),
+        ((recording, other, "--stride", "2"), "for which --stride means nothing"),
+        ((recording, other, "--no-deskew"), "for which --no-deskew means nothing"),
+    ):
+        assert main(list(map(str, arguments))) == 2
+        assert words in capsys.readouterr().err
+    assert exists.read_bytes() == b"x"
+
+
+def test_a_preset_lies_below_the_settings(tmp_path: Path, recording: str, settings: str) -> None:
+    output = tmp_path / "map.triquad"
+    command = [recording, str(output), "--every", str(COUNT), "--preset", "long-range"]
+    assert main([*command, "--settings", settings]) == 0
+    field = read_map(output).settings
+    assert (field.leaf_m, field.depth) == (0.4, 7)

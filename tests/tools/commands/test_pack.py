@@ -1,0 +1,143 @@
+import dataclasses
+import io
+import itertools
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from support.checkpoint_folder import HOUR_NS, START_NS, map_at, write_checkpoints
+from support.map_records import SMALL, assert_same, random_record, with_progress
+from support.mapfile_edit import file_bytes, rewritten
+from triquad_format.mapfile.reader import read_map, read_map_file
+from triquad_format.mapfile.writer import write_map
+from triquad_format.records.crop import crop_record, without_training
+from triquad_format.records.map_progress import MapProgress
+from triquad_tools.commands.pack import main
+
+CUBE = tuple(itertools.product((0, 1), repeat=3))
+
+
+@pytest.fixture
+def map_file(tmp_path):
+    path = tmp_path / "in.triquad"
+    path.write_bytes(file_bytes(random_record(1, indices=CUBE, points=200), preview=True))
+    return path
+
+
+def test_tool_packs(map_file, tmp_path, capsys):
+    out = tmp_path / "out.triquad"
+    box = ["--crop", "-1", "-1", "-1", "2.5", "2", "2"]
+    assert main([str(map_file), str(out), *box, "--no-training"]) == 0
+    assert "bytes" in capsys.readouterr().out
+    assert out.stat().st_size < map_file.stat().st_size / 2
+    expected = crop_record(read_map(map_file), [-1, -1, -1], [2.5, 2, 2])
+    assert_same(read_map(out), without_training(expected))
+
+
+def test_a_packed_map_still_tells_what_it_was_made_of(tmp_path):
+    record = with_progress(random_record(1), MapProgress(60, 116_000_000, 0.25))
+    write_map(record, tmp_path / "in.triquad")
+    out = tmp_path / "out.triquad"
+    options = ["--crop", "-4", "-4", "-4", "4", "4", "4", "--no-training"]
+    assert main([str(tmp_path / "in.triquad"), str(out), *options]) == 0
+    assert read_map(out).progress == record.progress
+
+
+def test_tool_changes_precision(tmp_path):
+    record = random_record(7, feature_dtype="<f4")
+    fine, coarse = tmp_path / "fine.triquad", tmp_path / "coarse.triquad"
+    fine.write_bytes(file_bytes(record, preview=True, feature_dtype="<f4"))
+    assert main([str(fine), str(coarse), "--precision", "fp16"]) == 0
+    assert read_map(coarse).regions[0].tables[0].features.dtype == np.float16
+    again = tmp_path / "again.triquad"
+    assert main([str(fine), str(again)]) == 0
+    assert again.read_bytes() == fine.read_bytes()
+
+
+def test_tool_refuses(map_file, tmp_path, capsys):
+    out = tmp_path / "out.triquad"
+
+    def refused(status, text, *arguments):
+        assert main([str(a) for a in arguments]) == status
+        error = capsys.readouterr().err
+        assert text in error
+        assert error.count("\n") == 1
+
+    before = map_file.read_bytes()
+    link = tmp_path / "link.triquad"
+    link.symlink_to(map_file)
+    refused(2, "is the input", map_file, map_file, "--force")
+    refused(2, "is the input", map_file, link, "--force")
+    out.write_bytes(b"precious")
+    refused(2, "--force", map_file, out)
+    assert out.read_bytes() == b"precious"
+    refused(1, "box", map_file, out, "--force", "--crop", *["900", "0", "0", "901", "1", "1"])
+    refused(2, "box", map_file, out, "--force", "--crop", *["1", "0", "0", "0", "1", "1"])
+    refused(2, "no such file", tmp_path / "none", out, "--force")
+    broken = tmp_path / "broken"
+    broken.write_bytes(before[:-50])
+    refused(1, "incomplete", broken, out, "--force")
+    assert out.read_bytes() == b"precious"
+    assert main([str(map_file), str(out), "--force"]) == 0
+    assert map_file.read_bytes() == before
+    with pytest.raises(SystemExit, match="2"):
+        main([str(map_file)])
+
+
+def test_tool_reads_only_what_the_box_needs(tmp_path, capsys):
+    wide = dataclasses.replace(SMALL, depth=10)
+    source, out = tmp_path / "in.triquad", tmp_path / "out.triquad"
+    record = random_record(2, settings=wide, points=2000, training=False)
+    write_map(record, source)
+    box = ["--crop", "-60", "-60", "-60", "-40", "-40", "-40"]
+    assert main([str(source), str(out), *box]) == 0
+    assert_same(read_map(out), crop_record(record, [-60] * 3, [-40] * 3))
+    summary = make_reader(io.BytesIO(source.read_bytes())).get_summary()
+    far = summary.chunk_indexes[-2]  # of the last evidence, in the opposite corner
+    data = bytearray(source.read_bytes())
+    data[far.chunk_start_offset + far.chunk_length // 2] ^= 1
+    source.write_bytes(data)
+    assert main([str(source), str(out), *box, "--force"]) == 0
+    assert main([str(source), str(out), "--force"]) == 1
+    assert "damaged" in capsys.readouterr().err
+
+
+def test_tool_takes_an_epoch_of_a_store(tmp_path, capsys):
+    store, out = tmp_path / "store", tmp_path / "out.triquad"
+    (store / "street").mkdir(parents=True)
+    write_checkpoints(store / "street", (3, 5, 9))
+
+    def epoch(*options):
+        assert main([str(store), str(out), "--force", *options]) == 0
+        printed = capsys.readouterr().out.splitlines()[0]
+        record = read_map(out)
+        assert_same(record, map_at(record.epoch))
+        assert printed.startswith(f"epoch {record.epoch}, from {store / 'street'}")
+        return record.epoch
+
+    assert epoch() == 9
+    assert epoch("--at", "5") == 5
+    assert epoch("--at", "8") == 5
+    assert epoch("--at", "2026-01-31T13:30:00Z") == 5
+    assert read_map_file(out).manifest.stamp_ns == START_NS + HOUR_NS
+    assert main([str(store / "street"), str(out), "--at", "2"]) == 2
+    assert "no checkpoint of 2 or before" in capsys.readouterr().err
+    assert main([str(out), str(tmp_path / "o.triquad"), "--at", "2"]) == 2
+    assert "--at asks for a folder" in capsys.readouterr().err
+    newest = store / "street" / "epoch-000000009.delta.triquad"
+    assert main([str(store), str(newest), "--force"]) == 2
+    assert "would pass for a checkpoint" in capsys.readouterr().err
+    (store / "street" / "epoch-000000003.triquad").unlink()
+    assert main([str(store), str(out), "--force"]) == 1
+    assert "epoch-000000003.triquad" in capsys.readouterr().err
+    assert main([str(store), str(out), "--force", "--recover"]) == 1
+    assert_same(read_map(out).regions, map_at(9).regions[1:])
+
+
+def test_tool_refuses_newer_files(map_file, tmp_path, capsys):
+    out = tmp_path / "out.triquad"
+    newer = rewritten(map_file.read_bytes(), metadata={"min_reader_version": "2"})
+    map_file.write_bytes(newer)
+    assert main([str(map_file), str(out)]) == 2
+    assert "map file version 2" in capsys.readouterr().err
+    assert not out.exists()

@@ -1,0 +1,56 @@
+"""What all commands have in common, as processes."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import triquad_format
+
+COMMANDS = ("demo", "evaluate", "inspect", "keys", "pack", "replay", "top")
+WAIT_S = 60.0
+
+
+def command(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    code = f"import sys; from triquad_tools.commands.entry_points import {name}; sys.exit({name}())"
+    line = [sys.executable, "-c", code, *map(str, arguments)]
+    return subprocess.run(line, capture_output=True, text=True, timeout=WAIT_S)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_each_command_tells_its_version(name: str) -> None:
+    done = command(name, "--version")
+    assert (done.returncode, done.stdout) == (0, f"triquad {triquad_format.__version__}\n")
+
+
+def test_a_file_that_is_not_there_is_named_without_numbers(tmp_path: Path) -> None:
+    missing = tmp_path / "missing.triquad"
+    done = command("inspect", missing)
+    assert done.returncode == 2
+    assert f"{missing}: no such f" in done.stderr
+    assert "Errno" not in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_nobody_who_reads_the_output_is_no_error() -> None:
+    code = """
+import sys
+from triquad_tools.console.command import run
+
+def work():
+    for line in range(100_000):
+        print(line)
+    return 0
+
+sys.exit(run("triquad-test", work))
+"""
+    line = [sys.executable, "-c", code]
+    with subprocess.Popen(
+        line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        assert process.stdout.readline() == "0\n"
+        process.stdout.close()  # as head does
+        assert process.stderr.read() == ""
+        assert process.wait(WAIT_S) == 141

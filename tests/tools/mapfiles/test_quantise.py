@@ -1,0 +1,114 @@
+"""Integer features: files shrink, and distances move by no more than was allowed."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from support.map_records import assert_same, random_record
+from support.mapfile_edit import file_bytes, read_bytes
+from support.small_world import settings, settled_mapper, world
+from triquad_format.errors import FormatError
+from triquad_format.mapfile.reader import read_map
+from triquad_format.records.crop import crop_record
+from triquad_map.composition.recorded_view import RecordedView
+from triquad_tools.commands.pack import main
+from triquad_tools.mapfiles.quantise import dequantised, field_change, probes, quantise
+
+OTHER_SEED = 77
+FINE_M, COARSE_M = 0.0015, 0.005
+
+
+@pytest.fixture(scope="module")
+def street():
+    """A piece of a trained map, as its file has it."""
+    record = settled_mapper(settings(), world(2)).publish().record()
+    return read_bytes(file_bytes(crop_record(record, [0, -8, -3], [16, 8, 5])))
+
+
+@pytest.fixture(scope="module")
+def fine(street):
+    return quantise(street, FINE_M)
+
+
+@pytest.fixture(scope="module")
+def coarse(street):
+    return quantise(street, COARSE_M)
+
+
+def test_random_maps_keep_to_the_limit():
+    record = random_record(2, indices=((0, 0, 0), (1, 0, 0)), points=60)
+    packed = quantise(record, 0.01)
+    assert field_change(record, packed.record, OTHER_SEED).quantile_m <= 0.01
+    assert packed.change.quantile_m <= 0.01
+    for region in packed.record.regions:
+        assert region.training is None
+        assert all(table.features.dtype == np.int16 for table in region.tables)
+
+
+@pytest.mark.parametrize(("name", "limit_m"), [("fine", FINE_M), ("coarse", COARSE_M)])
+def test_a_trained_map_keeps_to_the_limit_and_shrinks(street, name, limit_m, request):
+    packed = request.getfixturevalue(name)
+    fresh = field_change(street, packed.record, OTHER_SEED)
+    assert 0.5 * limit_m < fresh.quantile_m <= limit_m  # and does not waste it
+    assert packed.change.largest_m < 4 * limit_m
+    assert len(file_bytes(packed.record)) < 0.7 * len(file_bytes(street))
+
+
+def test_statuses_stay(street, coarse):
+    points = np.concatenate(probes(street, 5))[::10]
+    before, after = (RecordedView(record).query(points) for record in (street, coarse.record))
+    np.testing.assert_array_equal(before.status, after.status)
+
+
+def test_the_error_is_from_the_map_that_was_packed(street, fine):
+    again = quantise(fine.record, 0.004)
+    assert field_change(fine.record, again.record, OTHER_SEED).quantile_m <= 0.004
+    assert field_change(street, again.record, OTHER_SEED).quantile_m <= 0.005
+
+
+def test_integers_survive_the_file_and_become_floats_again(coarse, tmp_path):
+    packed = coarse.record
+    (tmp_path / "map.triquad").write_bytes(file_bytes(packed))
+    assert_same(read_map(tmp_path / "map.triquad"), packed)
+    floats = dequantised(packed)
+    points = np.random.default_rng(0).uniform(-20, 20, (2000, 3))
+    before, after = (RecordedView(record).query(points).sdf for record in (packed, floats))
+    np.testing.assert_array_equal(before, after)
+
+
+def test_a_map_without_evidence():
+    nothing_seen = crop_record(random_record(1), [7.9, 7.9, 7.9], [7.95, 7.95, 7.95])
+    assert quantise(nothing_seen, 0.001).change.largest_m == 0
+    assert quantise(dataclasses.replace(nothing_seen, regions=()), 0.001).record.regions == ()
+
+
+def test_a_limit_that_integers_cannot_keep(street):
+    with pytest.raises(FormatError, match="allow a larger error"):
+        quantise(street, 1e-9)
+
+
+def test_tool(street, coarse, tmp_path, capsys):
+    source, out = tmp_path / "in.triquad", tmp_path / "out.triquad"
+    source.write_bytes(file_bytes(street, preview=True))
+    assert main([str(source), str(out), "--max-error", "5mm"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "99 % of distances moved by less than" in lines[1]
+    assert "training state" in lines[2]
+    assert_same(read_map(out), coarse.record)
+    assert out.stat().st_size < 0.7 * source.stat().st_size
+    # Integers stay what they are unless floats are asked for.
+    copy, floats = tmp_path / "copy.triquad", tmp_path / "floats.triquad"
+    assert main([str(out), str(copy)]) == 0
+    assert_same(read_map(copy), read_map(out))
+    assert main([str(out), str(floats), "--precision", "fp32"]) == 0
+    assert_same(read_map(floats), dequantised(read_map(out)))
+    capsys.readouterr()
+    assert main([str(out), str(copy), "--max-error", "0.5cm", "--force"]) == 0
+    assert "both errors add up" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("length", ["2", "-2mm", "nanmm", "0mm", "1m"])
+def test_lengths_that_are_none(tmp_path, capsys, length):
+    with pytest.raises(SystemExit, match="2"):
+        main([str(tmp_path / "in"), str(tmp_path / "out.triquad"), f"--max-error={length}"])
+    assert "mm" in capsys.readouterr().err

@@ -1,0 +1,221 @@
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from support import depth_images
+from support.depth_images import CAMERA, HALF_ROOM_M, room_depth, write_depth, write_intrinsics
+from support.trajectories import drive, matrices, write_log, write_tum
+from triquad_client.depth_image import Intrinsics
+from triquad_tools.console.command import ToolError
+from triquad_tools.recordings.folders import depth_folder
+from triquad_tools.recordings.folders.depth_folder import is_depth_folder, read_depth
+from triquad_tools.recordings.folders.scan_folder import ScanFolder
+from triquad_tools.recordings.options import ReadingOptions
+
+START_NS = 1_305_031_102_160_407_000
+STEP_NS = 33_000_000
+COUNT = 5
+STAMPS = [START_NS + STEP_NS * number for number in range(COUNT)]
+POSES = drive(COUNT, step_m=0.1, turn_rad=0.2, start=(0.3, -0.2, 0.1))
+
+
+def read_depth_folder(folder: Path, **options) -> ScanFolder:
+    return depth_folder.read_depth_folder(folder, ReadingOptions(**options))
+
+
+def _tum(folder: Path, units: float = 5000.0) -> Path:
+    folder.mkdir(exist_ok=True)
+    write_tum(folder / "groundtruth.txt", STAMPS, POSES)
+    write_intrinsics(folder / "camera_intrinsic.json")
+    paths = depth_images.write_list(folder, STAMPS)
+    for path, pose in zip(paths, matrices(POSES), strict=True):
+        write_depth(path, room_depth(pose), units)
+    return folder
+
+
+def _open3d(folder: Path, units: float = 1000.0) -> Path:
+    write_log(folder / "trajectory.log", POSES)
+    write_intrinsics(folder / "camera_intrinsic.json")
+    for number, pose in enumerate(matrices(POSES)):
+        name = f"{number + 1:05d}-{number * 33369:012d}.png"  # as Redwood names them
+        write_depth(folder / "depth" / name, room_depth(pose), units)
+    return folder
+
+
+def _off_the_walls_m(recording: ScanFolder) -> float:
+    """How far any point lies from the walls of the room, at most."""
+    worst = 0.0
+    for scan in recording.read(range(len(recording.entries))):
+        pose = scan.world_from_sensor
+        points = scan.points @ pose[:3, :3].T + pose[:3, 3]
+        worst = max(worst, float(np.abs(np.abs(points).max(axis=1) - HALF_ROOM_M).max()))
+    return worst
+
+
+def test_images_of_tum_show_the_room(tmp_path):
+    recording = read_depth_folder(_tum(tmp_path))
+    assert is_depth_folder(tmp_path)
+    assert [entry.stamp_ns for entry in recording.entries] == STAMPS
+    assert {entry.source for entry in recording.entries} == {"default"}
+    assert [(s.name, s.count) for s in recording.streams] == [
+        ("depth/*.png", COUNT),
+        ("groundtruth.txt", COUNT),
+    ]
+    assert not recording.remarks
+    assert _off_the_walls_m(recording) < 5e-4
+    (scan,) = recording.read([0])
+    assert scan.points.shape == (48 * 64, 3)
+
+
+def test_images_of_open3d_show_the_room(tmp_path):
+    recording = read_depth_folder(_open3d(tmp_path))
+    assert is_depth_folder(tmp_path)
+    assert len(recording.entries) == COUNT
+    assert np.diff([entry.stamp_ns for entry in recording.entries]).min() > 0
+    assert _off_the_walls_m(recording) < 2e-3
+
+
+def test_images_of_open3d_go_with_a_trajectory_of_tum_by_their_times(tmp_path):
+    write_tum(tmp_path / "trajectory.txt", STAMPS, POSES)
+    for stamp, pose in zip(STAMPS[1:], matrices(POSES)[1:], strict=True):
+        write_depth(tmp_path / "depth" / f"{stamp}.png", room_depth(pose), 1000.0)
+    recording = read_depth_folder(tmp_path, intrinsics=CAMERA)
+    assert [entry.stamp_ns for entry in recording.entries] == STAMPS[1:]
+    assert _off_the_walls_m(recording) < 2e-3
+
+
+def test_units_and_stride_can_be_given(tmp_path):
+    folder = _open3d(tmp_path, units=6553.5)
+    recording = read_depth_folder(folder, units_per_metre=6553.5, stride=4)
+    assert _off_the_walls_m(recording) < 5e-4
+    (scan,) = recording.read([2])
+    assert scan.points.shape == (12 * 16, 3)
+
+
+def test_the_camera_of_tum_is_known_by_the_name_of_its_folder(tmp_path):
+    folder = tmp_path / "rgbd_dataset_freiburg1_desk"
+    _tum(folder)
+    (folder / "camera_intrinsic.json").unlink()
+    with pytest.raises(ToolError, match=r"64 x 48 pixels, and the camera of .* 640 x 480"):
+        read_depth_folder(folder)
+    for path in (folder / "depth").iterdir():
+        write_depth(path, np.full((480, 640), 2.0), 5000.0)
+    (scan,) = read_depth_folder(folder).read([0])
+    np.testing.assert_allclose(scan.points[0], [-319.5 * 2 / 525, -239.5 * 2 / 525, 2], rtol=1e-6)
+
+
+def test_an_image_that_shows_nothing_is_a_scan_without_points(tmp_path):
+    _open3d(tmp_path)
+    write_depth(next((tmp_path / "depth").iterdir()), np.zeros((48, 64)), 1000.0)
+    counts = [len(scan.points) for scan in read_depth_folder(tmp_path).read(range(COUNT))]
+    assert sorted(counts) == [0, 3072, 3072, 3072, 3072]
+
+
+@given(arrays(np.uint16, st.tuples(st.integers(1, 9), st.integers(1, 9))))
+def test_pixels_come_back(tmp_path_factory, pixels):
+    path = tmp_path_factory.mktemp("png") / "a.png"
+    write_depth(path, pixels.astype(np.float64), 1.0)
+    np.testing.assert_array_equal(read_depth(path), pixels)
+
+
+def test_a_damaged_image_is_told_before_the_first_scan(tmp_path):
+    path = sorted((_open3d(tmp_path) / "depth").iterdir())[3]
+    whole = path.read_bytes()
+    damaged = bytearray(whole)
+    damaged[len(whole) // 2] ^= 0xFF
+    for content in (whole[: len(whole) // 2], whole[:20], b"", bytes(damaged)):
+        path.write_bytes(content)
+        with pytest.raises(ToolError, match=f"{re.escape(path.name)}: cannot be read as PNG"):
+            read_depth_folder(tmp_path)
+
+
+@pytest.mark.parametrize("mode", ["L", "RGB"])
+def test_images_of_colour_or_8_bits_are_refused(tmp_path, mode):
+    from PIL import Image
+
+    path = next((_open3d(tmp_path) / "depth").iterdir())
+    Image.new(mode, (64, 48)).save(path)
+    with pytest.raises(ToolError, match=f"{path.name}: is an image of mode {mode}: depth takes 16"):
+        read_depth_folder(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("{", "has no width, height and intrinsic_matrix"),
+        ("[1, 2]", "has no width"),
+        ('{"width": 64, "height": 48}', "'intrinsic_matrix'"),
+        ('{"width": 64, "height": 48, "intrinsic_matrix": [1, 2]}', "has no width"),
+        (
+            '{"width": 64, "height": 48, "intrinsic_matrix": [60, 0, 31, 0, 60, 23, 0, 0, 1]}',
+            "column by column",
+        ),
+        (
+            '{"width": 640, "height": 480, "intrinsic_matrix": [60, 0, 0, 0, 60, 0, 31, 23, 1]}',
+            "64 x 48 pixels, and the camera of camera_intrinsic.json 640 x 480",
+        ),
+    ],
+)
+def test_intrinsics_that_are_not_understood_or_do_not_fit_are_refused(tmp_path, text, words):
+    (_open3d(tmp_path) / "camera_intrinsic.json").write_text(text)
+    with pytest.raises(ToolError, match=words):
+        read_depth_folder(tmp_path)
+
+
+def test_given_intrinsics_of_larger_images_are_refused(tmp_path):
+    camera = Intrinsics(525, 525, 319.5, 239.5)
+    with pytest.raises(ToolError, match=r"64 x 48 pixels, and the centre .* at 319.5, 239.5"):
+        read_depth_folder(_open3d(tmp_path), intrinsics=camera)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("# nothing\n", "depth.txt: lists no images"),
+        ("1.0\n", "depth.txt:1: '1.0' where a line is the time"),
+        ("soon depth/a.png\n", "depth.txt:1: 'soon' is not a number of seconds"),
+        ("1.0 depth/none.png\n", "depth.txt:1: .*none.png: no such file"),
+        ("2.0 depth.txt\n1.0 depth.txt\n", "depth.txt:2: 1.0 s is before the line above"),
+    ],
+)
+def test_a_list_that_is_not_understood_is_refused(tmp_path, text, words):
+    (_tum(tmp_path) / "depth.txt").write_text(text)
+    with pytest.raises(ToolError, match=words):
+        read_depth_folder(tmp_path)
+
+
+def test_what_is_missing_is_named(tmp_path):
+    with pytest.raises(ToolError, match="nowhere: no such folder"):
+        read_depth_folder(tmp_path / "nowhere")
+    assert not is_depth_folder(tmp_path)
+    with pytest.raises(ToolError, match=r"holds neither depth.txt nor depth/\*.png"):
+        read_depth_folder(tmp_path)
+    _open3d(tmp_path)
+    (tmp_path / "trajectory.log").unlink()
+    with pytest.raises(ToolError, match="holds no trajectory"):
+        read_depth_folder(tmp_path)
+    (tmp_path / "camera_intrinsic.json").unlink()
+    with pytest.raises(ToolError, match=r"camera is not known: .*--intrinsics FX,FY,CX,CY"):
+        read_depth_folder(tmp_path)
+    write_log(tmp_path / "trajectory.log", POSES[:3])
+    with pytest.raises(ToolError, match="5 files such as .*, and 3 poses"):
+        read_depth_folder(tmp_path, intrinsics=CAMERA)
+
+
+def test_a_list_with_poses_of_another_clock_or_none_is_refused(tmp_path):
+    """Unless there is one for each image: then they go in order, and it is said."""
+    _tum(tmp_path)
+    for count, words in ((4, "no file has a pose: .*the times of one clock"), (COUNT, "")):
+        stamps = [stamp - START_NS for stamp in STAMPS[:count]]
+        write_tum(tmp_path / "groundtruth.txt", stamps, POSES[:count])
+        if words:
+            with pytest.raises(ToolError, match=words):
+                read_depth_folder(tmp_path)
+    assert "are of another clock" in read_depth_folder(tmp_path).remarks[0]
+    write_log(tmp_path / "groundtruth.txt", POSES[:4])
+    with pytest.raises(ToolError, match="and the trajectory has no times: give every file one"):
+        read_depth_folder(tmp_path)

@@ -1,0 +1,116 @@
+"""The poses that belong to files of one scan each."""
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from triquad_tools.console.command import ToolError
+from triquad_tools.recordings.folders.file_names import stamps_of_names
+from triquad_tools.recordings.folders.scan_folder import PlacedFile
+from triquad_tools.recordings.folders.trajectory import Trajectory, read_trajectory
+from triquad_tools.sensors.errors import NoTransformError
+
+TRAJECTORY_NAMES = ("trajectory.txt", "trajectory.log", "poses.txt", "groundtruth.txt", "*.tum")
+
+_WHY = {
+    "pose_early": "before the first pose",
+    "pose_late": "after the last pose",
+    "pose_gap": "between poses that lie too far apart",
+}
+
+
+class PlacedFiles(NamedTuple):
+    """The files that can be mapped, in the order of their stamps."""
+
+    files: list[PlacedFile]
+    trajectory: Trajectory  # from which their poses are
+    remarks: list[str]  # on those that cannot, and on what else was not used
+
+
+def place_files(
+    folder: Path,
+    given: Path | None,
+    paths: Sequence[Path],
+    stamps_ns: Sequence[int] | None = None,
+) -> PlacedFiles:
+    """Give the files of a folder their poses: by their times, or else one to one in order.
+
+    Args:
+        folder: holds the trajectory, unless that is given.
+        given: the file of the trajectory.
+        paths: the files, one at least, in order.
+        stamps_ns: when each was taken; ``None``: as their names say, if they do.
+
+    Raises:
+        ToolError: there is no trajectory, or neither way is possible.
+    """
+    path, remarks = _choose(folder, given)
+    trajectory = read_trajectory(path)
+    stamps = stamps_of_names(paths) if stamps_ns is None else stamps_ns
+    timed = stamps is not None and trajectory.frames is not None
+    if stamps is not None and timed:
+        placed = _by_time(paths, stamps, trajectory, remarks)
+        if placed.files:
+            return placed
+    if len(paths) == len(trajectory.poses):
+        poses = zip(paths, trajectory.stamps_ns.tolist(), trajectory.poses, strict=True)
+        if timed:
+            remarks.append(
+                f"the times of the files, such as {paths[0].name}, are of another clock than those "
+                f"of {path.name}: files and poses, of which there are as many, go in order"
+            )
+        return PlacedFiles([PlacedFile(*each) for each in poses], trajectory, remarks)
+    if stamps is not None and timed:
+        raise _no_common_time(stamps, trajectory, paths[0].parent)
+    what = "the trajectory has no times" if stamps is not None else "their names hold no times"
+    raise ToolError(
+        f"{paths[0].parent}: {len(paths)} files such as {paths[0].name}, and "
+        f"{len(trajectory.poses)} poses in {path}, and {what}: give every file one pose, or times "
+        "to both"
+    )
+
+
+def _choose(folder: Path, given: Path | None) -> tuple[Path, list[str]]:
+    """Return the file of the trajectory, and a remark where there are several."""
+    if given is not None:
+        if not given.is_file():
+            raise ToolError(f"{given}: no such file")
+        return given, []
+    found = [path for name in TRAJECTORY_NAMES for path in sorted(folder.glob(name))]
+    if not found:
+        raise ToolError(
+            f"{folder}: holds no trajectory, {', '.join(TRAJECTORY_NAMES)}: put one there, or name "
+            "it with --trajectory"
+        )
+    others = ", ".join(path.name for path in found[1:])
+    remark = f"poses are those of {found[0].name}, not of {others}: --trajectory FILE chooses"
+    return found[0], [remark] if others else []
+
+
+def _by_time(
+    paths: Sequence[Path], stamps_ns: Sequence[int], trajectory: Trajectory, remarks: list[str]
+) -> PlacedFiles:
+    placed: list[PlacedFile] = []
+    left_out: Counter[str] = Counter()
+    for stamp, path in sorted(zip(stamps_ns, paths, strict=True)):
+        try:
+            placed.append(PlacedFile(path, stamp, trajectory.pose_at(stamp)))
+        except NoTransformError as error:
+            left_out[error.reason] += 1
+    told = [
+        f"{count} of {len(paths)} files are left out: they were taken {_WHY[reason]} of "
+        f"{trajectory.path.name}"
+        for reason, count in left_out.items()
+    ]
+    return PlacedFiles(placed, trajectory, [*remarks, *told])
+
+
+def _no_common_time(stamps_ns: Sequence[int], trajectory: Trajectory, folder: Path) -> ToolError:
+    first, last = (stamp / 1e9 for stamp in (min(stamps_ns), max(stamps_ns)))
+    start, end = (stamp / 1e9 for stamp in trajectory.stamps_ns[[0, -1]].tolist())
+    return ToolError(
+        f"{folder}: no file has a pose: they were taken from {first:.3f} to {last:.3f} s, and "
+        f"{trajectory.path} goes from {start:.3f} to {end:.3f} s, with gaps of at most 2 s; write "
+        "both with the times of one clock"
+    )

@@ -1,1 +1,0 @@
-"""Files of one cloud each: PLY, PCD, LAS and LAZ."""
