@@ -11,7 +11,7 @@ from support.kitti_folder import write_folder
 from triquad_client import Mesh
 from triquad_format.mapfile.writer import write_map
 from triquad_tools.commands.evaluate import main
-from triquad_tools.plots.error_picture import BEYOND, ERROR_STOPS, MISSING
+from triquad_tools.plots.error_picture import BEYOND, ERRORS, MISSING
 from triquad_tools.plots.mesh_view import HEIGHT, WIDTH
 
 GROUND_CELLS = 40
@@ -74,17 +74,15 @@ def test_what_the_mesh_lacks_is_orange(drawn):
     assert share(whole, MISSING) < 0.001  # a point in the air
     lacking, scores = drawn(sheet([0.0], left_out=1.0))
     assert scores["completion_ratio"] == pytest.approx(0.75, abs=0.03)
-    orange, right = share(lacking, MISSING), share(lacking, ERROR_STOPS[0])
+    orange, right = share(lacking, MISSING), share(lacking, ERRORS(0.0))
     assert orange / (orange + right) == pytest.approx(0.25, abs=0.06)
 
 
 def test_errors_have_the_colours_of_the_scale(drawn):
-    stops = len(ERROR_STOPS) - 1
-    heights = [0.0, 0.4 / stops, 0.8 / stops]
-    pixels, scores = drawn(sheet(heights))
+    pixels, scores = drawn(sheet([0.0, 0.4 / 6, 0.8 / 6]))
     assert scores["outlier_ratio"] == 0.0
-    assert all(share(pixels, colour) > 0.05 for colour in ERROR_STOPS[:5:2])
-    assert share(pixels, ERROR_STOPS[-1]) == 0.0
+    assert all(share(pixels, ERRORS(place / 6)) > 0.05 for place in (0, 2, 4))
+    assert share(pixels, ERRORS(1.0)) == 0.0
     assert share(pixels, BEYOND) == 0.0
 
 
@@ -104,7 +102,7 @@ def test_a_mesh_that_is_all_elsewhere_leaves_all_of_the_truth_orange(drawn):
     pixels, scores = drawn(Mesh(mesh.vertices + [0.0, 0.0, 50.0], mesh.faces))
     assert scores["f_score"] == 0.0
     assert share(pixels, MISSING) > 0.1
-    assert share(pixels, ERROR_STOPS[0]) < 0.001
+    assert share(pixels, ERRORS(0.0)) < 0.001
 
 
 def test_withheld_points_are_orange_where_the_map_knows_nothing(tmp_path, capsys):
@@ -120,7 +118,7 @@ def test_withheld_points_are_orange_where_the_map_knows_nothing(tmp_path, capsys
     assert "SURFACE" in capsys.readouterr().out
     pixels = read_picture(out)
     assert share(pixels, MISSING) > 0.001
-    assert share(pixels, ERROR_STOPS[0]) > 0.005
+    assert share(pixels, ERRORS(0.0)) > 0.005
     assert main([*command, "--range-max", "0.01", "--plot", str(tmp_path / "none.png")]) == 2
     assert "the withheld scans have no points in range" in capsys.readouterr().err
     assert not (tmp_path / "none.png").exists()

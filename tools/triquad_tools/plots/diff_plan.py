@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.patches import FancyArrowPatch, Rectangle
+from matplotlib.patches import Rectangle
 from triquad_format.records.status import Status
 
 from triquad_tools.mapfiles.diff import Comparison
@@ -27,7 +27,6 @@ APPEARED, VANISHED, NEWLY_SEEN, NO_LONGER_KNOWN = "#0072b2", "#d55e00", "#56b4e9
 MOVED = "#000000"
 _LEAST_RANGE_CM = 5.0
 _LINE_PT = 1.5
-_ARROWHEAD_PT = 8
 _LABEL_PT = (8, 8)  # from the arrow's head
 _BESIDE_M = 0.1  # outlines lie this far outside of what they surround
 _NOTE = "outlined: what appeared or vanished as a whole; arrows: what moved"
@@ -84,20 +83,18 @@ def _draw_presence(
 
 def _draw_box(axes: Axes, cluster: Cluster, colour: str) -> None:
     """Outline a cluster, a little outside of it."""
-    (x, y, _), (width, depth, _) = (cluster.low_m, cluster.size_m + 2 * _BESIDE_M)
-    corner = (x - _BESIDE_M, y - _BESIDE_M)
+    x, y, _ = np.array(cluster.low_m) - _BESIDE_M
+    width, depth, _ = cluster.size_m + 2 * _BESIDE_M
     axes.add_patch(
-        Rectangle(corner, width, depth, fill=False, edgecolor=colour, linewidth=_LINE_PT)
+        Rectangle((x, y), width, depth, fill=False, edgecolor=colour, linewidth=_LINE_PT)
     )
 
 
 def _draw_arrow(axes: Axes, move: Move) -> None:
     """Draw from where a cluster was to where it is, and how far that is."""
-    start, end = ((place[0], place[1]) for place in (move.before.middle_m, move.after.middle_m))
-    arrow = FancyArrowPatch(
-        start, end, color=MOVED, linewidth=_LINE_PT, arrowstyle="->",
-        mutation_scale=_ARROWHEAD_PT, shrinkA=0, shrinkB=0,
-    )  # fmt: skip
-    axes.add_patch(arrow)
+    (x, y, _), (end_x, end_y, _) = move.before.middle_m, move.after.middle_m
+    start, end = (x, y), (end_x, end_y)
+    line = {"color": MOVED, "linewidth": _LINE_PT, "arrowstyle": "->", "shrinkA": 0, "shrinkB": 0}
+    axes.annotate("", end, start, arrowprops=line)
     length = f"{move.distance_m:.1f} m"
     axes.annotate(length, end, xytext=_LABEL_PT, textcoords="offset points", color=MOVED)

@@ -23,22 +23,11 @@ from triquad_tools.plots.plan import Scale
 
 MISSING = "#e69f00"
 BEYOND = "#8b1a1a"
-ERROR_STOPS: Doubles = np.array(
-    [
-        [0.755, 0.862, 0.941],
-        [0.561, 0.732, 0.915],
-        [0.387, 0.598, 0.870],
-        [0.244, 0.461, 0.798],
-        [0.149, 0.324, 0.695],
-        [0.109, 0.189, 0.563],
-        [0.094, 0.047, 0.406],
-    ]
-)
-"""``[7, 3]`` sRGB, from no error to the greatest: of even steps in Oklab."""
+ERRORS = LinearSegmentedColormap.from_list(
+    "errors", ["#c1dcf0", "#629adc", "#2653b1", "#180c68"]
+).with_extremes(over=BEYOND)
+"""From no error to the greatest, light to dark."""
 
-_COLOURS = LinearSegmentedColormap.from_list("errors", ERROR_STOPS.tolist()).with_extremes(
-    over=BEYOND
-)
 _WITHHELD_HIGH_M = 0.2
 
 
@@ -54,10 +43,8 @@ def draw_mesh_errors(title: str, comparison: Comparison, path: Path) -> None:
     distances_m[scored] = comparison.truth.distances(np.asarray(mesh.vertices[scored], np.float64))
     faces = mesh.faces[scored[mesh.faces].all(axis=1)]
     lacking = np.asarray(comparison.missing, np.float64)
-    view = view_along(
-        np.concatenate([mesh.vertices[np.unique(faces)], lacking]), mesh.vertices[faces]
-    )
-    picture = Picture(view)
+    shown = np.concatenate([mesh.vertices[np.unique(faces)], lacking])
+    picture = Picture(view_along(shown, mesh.vertices[faces]))
     high_m = settings.accuracy_cut_m
     picture.add_mesh(mesh.vertices, faces, error_colours(distances_m, high_m))
     picture.add_points(lacking, np.tile(to_rgb(MISSING), (len(lacking), 1)))
@@ -65,17 +52,16 @@ def draw_mesh_errors(title: str, comparison: Comparison, path: Path) -> None:
     aside = 100.0 * (1.0 - len(faces) / max(len(mesh.faces), 1))
     legend = Legend(
         title,
-        Scale("mesh to truth, cm (line: threshold)", _COLOURS, 0.0, 100.0 * high_m),
+        Scale("mesh to truth, cm (line: threshold)", ERRORS, 0.0, 100.0 * high_m),
         beyond=(False, beyond),
         notes=[
             f"farther than the scale: {percent(scores.outlier_ratio)}" if beyond else "",
             f"outside of the truth's box, not scored: {aside:.2g} %" if aside else "",
-            view.outside(np.concatenate([mesh.vertices[faces].mean(axis=1), lacking])),
         ],
         limit=100.0 * settings.threshold_m,
         named=[(MISSING, f"no mesh:\n{percent(1.0 - scores.completion_ratio)}\nof the truth")],
     )
-    save_mesh_sheet(path, picture.pixels(), view, legend)
+    save_mesh_sheet(path, picture, legend)
 
 
 def draw_withheld(
@@ -94,20 +80,19 @@ def draw_withheld(
     points = np.concatenate([answer.points for answer in answers])
     colours = error_colours(distances_m, _WITHHELD_HIGH_M)
     colours[unknown] = to_rgb(MISSING)
-    view = view_along(points, np.zeros((0, 3, 3)))
-    picture = Picture(view)
+    picture = Picture(view_along(points, np.zeros((0, 3, 3))))
     picture.add_points(points, colours)
     more = mean_or_nan(~unknown & (distances_m > _WITHHELD_HIGH_M))
     legend = Legend(
         title,
-        Scale("map at the points: |distance| in cm", _COLOURS, 0.0, 100.0 * _WITHHELD_HIGH_M),
+        Scale("map at the points: |distance| in cm", ERRORS, 0.0, 100.0 * _WITHHELD_HIGH_M),
         beyond=(False, bool(more)),
-        notes=[f"farther than the scale: {percent(more)}" if more else "", view.outside(points)],
+        notes=[f"farther than the scale: {percent(more)}" if more else ""],
         named=[(MISSING, f"UNKNOWN:\n{percent(scores.unknown_ratio)}")],
     )
-    save_mesh_sheet(path, picture.pixels(), view, legend)
+    save_mesh_sheet(path, picture, legend)
 
 
 def error_colours(distances_m: NDArray[np.floating], high_m: float) -> Doubles:
     """Return colours ``[N, 3]``, sRGB in [0, 1], of distances ``[N]``, the greatest ``high_m``."""
-    return np.asarray(_COLOURS(np.asarray(distances_m, np.float64) / high_m)[:, :3], np.float64)
+    return np.asarray(ERRORS(np.asarray(distances_m, np.float64) / high_m)[:, :3], np.float64)
