@@ -14,7 +14,7 @@ from triquad_client.checks import Bounds
 from triquad_client.mesh.followed_mesh import MeshTile, TileIndex
 from triquad_tools.recordings.publishing import wait_until_settled
 from triquad_tools.viewer.sources.live_source import LiveSource
-from triquad_tools.viewer.sources.map_source import COARSEST, MapState, TileSizes
+from triquad_tools.viewer.sources.map_source import COARSEST, TileFollower, TileSizes
 from triquad_tools.viewer.viewer import Viewer
 
 from bench.clients.browser import opened_page, running_browser, wait_until_drawn
@@ -110,12 +110,8 @@ class RepeatedFollower:
     tiles: Mapping[TileIndex, MeshTile]
     complete: bool = True
 
-    def refresh(self) -> None:
+    def next(self, timeout_s: float) -> None:
         """Do nothing: no tile changes."""
-
-    def moved(self, bounds: Bounds) -> "RepeatedFollower":  # noqa: ARG002
-        """Do nothing: more tiles than requested do no harm."""
-        return self
 
     def close(self) -> None:
         """Do nothing: there is nothing to release."""
@@ -144,12 +140,13 @@ class RepeatedSource:
                 )
         return cls(client, live.sizes, followers)
 
-    def state(self) -> MapState:
-        """Return the state of a synthetic map."""
-        return MapState(self.title, 0, "")
-
-    def follow(self, level: int, bounds: Bounds | None = None) -> RepeatedFollower:  # noqa: ARG002
-        """Return all tiles of a level."""
+    def follow(
+        self,
+        level: int,
+        bounds: Bounds | None = None,  # noqa: ARG002
+        before: TileFollower | None = None,  # noqa: ARG002
+    ) -> RepeatedFollower:
+        """Return all tiles of a level: more than requested do no harm."""
         return self.followers[level]
 
 

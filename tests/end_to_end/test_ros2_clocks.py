@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 from support import servers
-from support.ros_bridge import MAST, bridging, stand
+from support.ros_bridge import bridging, stand
 from support.ros_robot import robot
 
 
@@ -20,7 +20,6 @@ def test_a_simulation_may_begin_again(
     endpoint: str, transforms_first: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
     with bridging(endpoint) as bridged, robot(endpoint) as r2:
-        r2.tf(0, ("base_link", "lidar", MAST), static=True)
         stand(r2, 100, 101)
         r2.cloud(100.5, servers.sphere())
         bridged.wait_for(lambda: bridged.taken == 1)
@@ -35,7 +34,6 @@ def test_a_simulation_may_begin_again(
 
 def test_a_bag_may_begin_again_while_a_cloud_still_waits(endpoint: str) -> None:
     with bridging(endpoint, "--wait-s", 60) as bridged, robot(endpoint) as r2:
-        r2.tf(0, ("base_link", "lidar", MAST), static=True)
         stand(r2, 100, 101)
         r2.cloud(100.5, servers.sphere())
         bridged.wait_for(lambda: bridged.taken == 1)
@@ -50,7 +48,6 @@ def test_a_bag_may_begin_again_while_a_cloud_still_waits(endpoint: str) -> None:
 @pytest.mark.parametrize("ahead_s", [3, 3600])
 def test_a_stamp_far_ahead_costs_one_cloud(endpoint: str, ahead_s: int) -> None:
     with bridging(endpoint, "--wait-s", 60) as bridged, robot(endpoint) as r2:
-        r2.tf(0, ("base_link", "lidar", MAST), static=True)
         r2.cloud(0.1, servers.sphere())
         r2.cloud(0.2 + ahead_s, servers.sphere())
         for number in range(3, 9):
@@ -62,7 +59,6 @@ def test_a_stamp_far_ahead_costs_one_cloud(endpoint: str, ahead_s: int) -> None:
 
 def test_a_stamp_a_little_before_the_last_costs_that_cloud(endpoint: str) -> None:
     with bridging(endpoint) as bridged, robot(endpoint) as r2:
-        r2.tf(0, ("base_link", "lidar", MAST), static=True)
         stand(r2, 0, 1)
         for second in (0.1, 0.5, 0.3, 0.7):
             r2.cloud(second, servers.sphere())
@@ -72,7 +68,6 @@ def test_a_stamp_a_little_before_the_last_costs_that_cloud(endpoint: str) -> Non
 
 def test_clocks_that_differ_do_not_matter_by_arrival(endpoint: str) -> None:
     with bridging(endpoint, "--clock", "arrival") as bridged, robot(endpoint) as r2:
-        r2.tf(0, ("base_link", "lidar", MAST), static=True)
         stand(r2, 5)
         r2.cloud(-1e9, servers.sphere())
         later = itertools.count(6)

@@ -63,22 +63,23 @@ def test_markers_show_the_mesh_and_what_changes(server: str, way: str) -> None:
         assert changed < len(markers.triangles) + 10, "what did not change is not sent again"
 
 
-@pytest.mark.parametrize("token", [True, False])
-def test_whoever_listens_late_gets_the_whole_mesh(server: str, token: bool) -> None:
-    with shown(server) as client:
-        for _ in range(2):
-            with listening(server, "/triquad/mesh", MARKER, token=token) as rviz:
-                shown_once_complete(rviz, client)
-        with (
-            listening(server, "/triquad/mesh", MARKER) as first,
-            listening(server, "/triquad/mesh", MARKER) as second,
-        ):
-            shown_once_complete(first, client)
-            shown_once_complete(second, client)
+def test_whoever_listens_late_gets_the_whole_mesh(server: str) -> None:
+    with (
+        shown(server) as client,
+        listening(server, "/triquad/mesh", MARKER) as first,
+        listening(server, "/triquad/mesh", MARKER) as second,
+    ):
+        shown_once_complete(first, client)
+        shown_once_complete(second, client)
 
 
-def test_markers_are_coloured_by_height_in_the_frame_of_the_map(server: str) -> None:
+def test_markers_carry_colours_frame_and_what_rmw_zenoh_attaches(server: str) -> None:
     with shown(server), listening(server, "/triquad/mesh", MARKER) as rviz:
+        attached = [struct.unpack("<qqB16s", rviz.sample().attachment.to_bytes()) for _ in range(3)]
+        assert [number for number, *_ in attached] == [1, 2, 3]
+        assert {length for _, _, length, _ in attached} == {16}
+        assert len({identity for *_, identity in attached}) == 1
+        assert all(stamp_ns > 1_600_000_000 * 10**9 for _, stamp_ns, *_ in attached)
         while len((marker := rviz.message()).points) < SOME_POINTS:
             assert marker.points or marker.action == marker.DELETEALL
         assert (marker.header.frame_id, marker.ns) == ("world", "triquad")
@@ -93,9 +94,8 @@ def test_markers_are_coloured_by_height_in_the_frame_of_the_map(server: str) -> 
         assert np.ptp(colours, axis=0).max() > 0.01
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_grids_say_what_the_map_says(server: str, way: str) -> None:
-    with shown(server) as client, listening(server, "/triquad/grid", GRID, way) as nav2:
+def test_grids_say_what_the_map_says(server: str) -> None:
+    with shown(server) as client, listening(server, "/triquad/grid", GRID) as nav2:
         grid = nav2.message()
         assert (grid.info.width, grid.info.height) == (120, 120)
         assert grid.info.resolution == pytest.approx(0.1)
@@ -128,21 +128,6 @@ def test_grids_go_with_the_robot(server: str) -> None:
         r2.cloud(0, servers.sphere())
         while (origin := nav2.message().info.origin.position.x) != pytest.approx(24.0):
             assert origin == pytest.approx(-6.0)
-
-
-def test_messages_carry_what_rmw_zenoh_attaches(server: str) -> None:
-    with shown(server), listening(server, "/triquad/mesh", MARKER) as rviz:
-        numbers, identities = [], set()
-        for _ in range(3):
-            attachment = rviz.sample().attachment.to_bytes()
-            assert len(attachment) == 33
-            number, stamp_ns, length = struct.unpack_from("<qqB", attachment)
-            assert stamp_ns > 1_600_000_000 * 10**9
-            assert length == 16
-            numbers.append(number)
-            identities.add(attachment[17:])
-        assert numbers == [1, 2, 3]
-        assert len(identities) == 1
 
 
 def test_nodes_and_bridges_find_the_topics_and_their_types(server: str) -> None:

@@ -78,6 +78,7 @@ def bridging(endpoint: str, *arguments: object, router: str | None = None) -> It
 
 
 def stand(robot: Robot, *seconds: float) -> None:
-    """The robot stands where it is, at several times."""
+    """The robot stands where it is, at several times, with the lidar on its mast."""
+    robot.tf(0, ("base_link", "lidar", MAST), static=True)
     for second in seconds:
         robot.tf(second, ("map", "odom", shifted()), ("odom", "base_link", shifted(*AT)))

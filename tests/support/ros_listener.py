@@ -21,12 +21,12 @@ GRID = "nav_msgs/msg/OccupancyGrid"
 class Listener:
     """A subscription to one topic, whose messages are decoded with rosbags."""
 
-    def __init__(self, session: zenoh.Session, key: str, type_name: str, token: str | None) -> None:
+    def __init__(self, session: zenoh.Session, key: str, type_name: str, token: str) -> None:
         self._types = RosMessages().types
         self._type_name = type_name
         self._samples: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
         self._subscriber = session.declare_subscriber(key, zenoh.handlers.FifoChannel(1000))
-        self._token = token and session.liveliness().declare_token(token)
+        self._token = session.liveliness().declare_token(token)
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
@@ -46,9 +46,7 @@ class Listener:
 
 
 @contextmanager
-def listening(
-    endpoint: str, topic: str, type_name: str, way: str = "rmw", token: bool = True
-) -> Iterator[Listener]:
+def listening(endpoint: str, topic: str, type_name: str, way: str = "rmw") -> Iterator[Listener]:
     """Listen as a node of rmw_zenoh does, of ROS 2 ``humble`` or a later one, or as a bridge."""
     package, _, name = type_name.split("/")
     dds = f"{package}::msg::dds_::{name}_"
@@ -63,7 +61,7 @@ def listening(
             key = topic.lstrip("/")
             type_key = type_name.replace("/", "§")
             lives = f"@/{session.zid()}/@ros2_lv/MS/{key.replace('/', '§')}/{type_key}/:1:0:0,5"
-        listener = Listener(session, key, type_name, lives if token else None)
+        listener = Listener(session, key, type_name, lives)
         try:
             yield listener
         finally:

@@ -21,13 +21,14 @@ def test_near_tiles_are_whole_columns_with_a_tile_within_reach(
     eye: tuple[float, ...], reach_m: float, seed: int
 ) -> None:
     roots = [(x, y, z) for x, y, z in np.random.default_rng(seed).integers(-9, 9, (20, 3)).tolist()]
+    away_m = {
+        root: np.linalg.norm(np.clip(eye, SIDE_M * low, SIDE_M * (low + 1)) - eye)
+        for root in roots
+        for low in (np.array(root),)
+    }
+    near = {root[:2] for root in roots if away_m[root] <= reach_m}
     chosen = near_columns(roots, SIDE_M, np.array(eye), reach_m)
-    for x, y, z in roots:
-        distances_m = [
-            np.linalg.norm(np.clip(eye, SIDE_M * low, SIDE_M * (low + 1)) - eye)
-            for low in (np.array(root) for root in roots if root[:2] == (x, y))
-        ]
-        assert ((x, y, z) in chosen) == (min(distances_m) <= reach_m)
+    assert chosen == [root for root in roots if root[:2] in near]
 
 
 def test_near_tiles_are_those_of_the_server() -> None:

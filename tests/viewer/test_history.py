@@ -11,15 +11,14 @@ from support.changing_store import EMPTY, box_at, write_checkpoint
 from triquad_tools.console.command import ToolError
 from triquad_tools.viewer.sources.history import DamagedError, History
 from triquad_tools.viewer.sources.map_source import COARSEST
-from triquad_tools.viewer.sources.stored_source import StoredFollower, StoredMap, StoredSource
+from triquad_tools.viewer.sources.stored_map import StoredMap, StoredTiles
 
 ORIGIN = [[0.0, 0.0, 1.0]]
 
 
-def completed(follower: StoredFollower) -> StoredFollower:
-    follower.refresh()
+def completed(follower: StoredTiles) -> StoredTiles:
     while not follower.complete:
-        follower.refresh()
+        follower.next(0.0)
     return follower
 
 
@@ -31,14 +30,13 @@ def test_few_maps_stay_open_but_those_that_are_shown_do(tmp_path: Path) -> None:
     others = [weakref.ref(history.opened(moment)) for moment in history.moments[1:]]
     gc.collect()
     assert [other() is None for other in others] == [True, False, False, False, False]
-    shown.opened.query_sdf(ORIGIN)
+    shown.queries.query_sdf(ORIGIN)
     assert history.opened(history.moments[5]) is others[4](), "the last one is open still"
 
 
 def test_tiles_of_a_file_are_its_mesh(tmp_path: Path) -> None:
-    stored = StoredMap(write_checkpoint(tmp_path, 1, box_at(3, 3)))
-    source = StoredSource(stored, "file")
-    whole = stored.opened.mesh(cell_m=source.sizes.cell_of(COARSEST))
+    source = StoredMap(write_checkpoint(tmp_path, 1, box_at(3, 3)), "file")
+    whole = source.queries.mesh(cell_m=source.sizes.cell_of(COARSEST))
     tiles = completed(source.follow(COARSEST)).tiles
     assert sum(len(tile.faces) for tile in tiles.values()) == len(whole.faces)
     for index, made in tiles.items():
@@ -48,10 +46,10 @@ def test_tiles_of_a_file_are_its_mesh(tmp_path: Path) -> None:
 
 
 def test_a_box_has_the_tiles_that_meet_it(tmp_path: Path) -> None:
-    source = StoredSource(StoredMap(write_checkpoint(tmp_path, 1, EMPTY)), "file")
+    source = StoredMap(write_checkpoint(tmp_path, 1, EMPTY), "file")
     follower = completed(source.follow(0, ((1.0, 1.0, 0.0), (2.0, 2.0, 1.0))))
     assert set(follower.tiles) == {(0, 0, 0)}
-    moved = follower.moved(((-2.0, 1.0, 0.0), (2.0, 2.0, 1.0)))
+    moved = source.follow(0, ((-2.0, 1.0, 0.0), (2.0, 2.0, 1.0)), follower)
     assert set(moved.tiles) == {(0, 0, 0)}, "what both have is there at once"
     assert set(completed(moved).tiles) == {(0, 0, 0), (-1, 0, 0)}
 
@@ -87,26 +85,10 @@ def test_damaged_checkpoints_are_named_and_left_out(
     write_checkpoint(tmp_path, 1, EMPTY)
     damage(write_checkpoint(tmp_path, 2, EMPTY))
     history = History(tmp_path)
-    assert history.newest().opened.epoch == 1
+    assert history.newest().queries.epoch == 1
     assert [moment.epoch for moment in history.moments] == [1]
     (problem,) = history.damaged
     assert problem.startswith("epoch-000000002.triquad is left out: ")
-
-
-def test_another_moment_is_shown_once_it_is_known(tmp_path: Path) -> None:
-    write_checkpoint(tmp_path, 1, EMPTY)
-    write_checkpoint(tmp_path, 2, box_at(3, 3))
-    history = History(tmp_path)
-    first, second = history.moments
-    source = StoredSource(history.newest(), "store")
-    follower = completed(source.follow(COARSEST))
-    assert {tile.version for tile in follower.tiles.values()} == {2}
-    source.show(history.opened(first))
-    assert source.state().epoch == 1
-    assert {tile.version for tile in follower.tiles.values()} == {2}
-    assert {tile.version for tile in completed(follower).tiles.values()} == {1}
-    flip(second.path)
-    source.show(history.opened(second))  # it is open still
 
 
 def test_a_moment_that_cannot_be_shown_is_none_any_more(tmp_path: Path) -> None:
@@ -114,7 +96,7 @@ def test_a_moment_that_cannot_be_shown_is_none_any_more(tmp_path: Path) -> None:
     flip(write_checkpoint(tmp_path, 2, EMPTY))
     write_checkpoint(tmp_path, 3, EMPTY)
     history = History(tmp_path)
-    assert history.newest().opened.epoch == 3
+    assert history.newest().queries.epoch == 3
     with pytest.raises(DamagedError, match="epoch-000000002"):
         history.opened(history.moments[1])
     assert [moment.epoch for moment in history.moments] == [1, 3]

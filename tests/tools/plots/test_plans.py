@@ -13,7 +13,7 @@ from triquad_format.mapfile.writer import write_map
 from triquad_map.height_scale import HEIGHT_STOPS
 from triquad_tools.commands.inspect import main
 from triquad_tools.plots.diff_plan import APPEARED, VANISHED
-from triquad_tools.plots.map_plan import sample_errors, seen_columns
+from triquad_tools.plots.map_plan import seen_columns
 from triquad_tools.plots.plan import (
     FREE,
     HEIGHTS,
@@ -98,7 +98,7 @@ def test_a_legend_names_every_colour():
     figure = Figure(layout="constrained")
     layers = [Layer("wall", "#ff0000", np.eye(2, dtype=bool))]
     draw_layers(figure.subplots(), layers)
-    (legend,) = figure.legends
+    (legend,) = [axes.get_legend() for axes in figure.axes]
     assert [text.get_text() for text in legend.get_texts()] == [
         "wall",
         "nothing was seen (UNKNOWN)",
@@ -119,27 +119,18 @@ def test_columns_have_their_highest_surface():
     assert seen_columns(record).tops.max() == pytest.approx(1.1 + 10 * 0.2)
 
 
-def test_errors_are_those_of_the_labels():
-    found = sample_errors(exact_map(flat(0.1), label_error_m=0.03))
-    np.testing.assert_allclose(found.errors_m, 0.03, atol=1e-5)
-    assert len(found.points) == 2000
-    assert not len(sample_errors(exact_map(flat(0.1), label_error_m=0.5)).points)
-    assert not len(sample_errors(exact_map(flat(0.1))).points)
-
-
 # The command
 
 
 def test_picture_of_a_map(tmp_path, capsys):
     path, picture = tmp_path / "map.triquad", tmp_path / "map.png"
     # A table on the ground shows in the colours of both heights.
-    record = exact_map(table(0.1, 1.1), label_error_m=0.03)
+    record = exact_map(table(0.1, 1.1))
     write_map(record, path, feature_dtype="<f4", stamp_ns=10**18)
     assert main([str(path), "--plot", str(picture)]) == 0
     assert "map 'ground'" in capsys.readouterr().out
     pixels = read_picture(picture)
-    coverage = pixels[:, : pixels.shape[1] // 2]  # beside the errors
-    ground, top = (share(coverage, HEIGHT_STOPS[end]) for end in (0, -1))
+    ground, top = (share(pixels, HEIGHT_STOPS[end]) for end in (0, -1))
     assert top / ground == pytest.approx(4.0 / 96.0, rel=0.1)
 
 

@@ -3,7 +3,7 @@
 import pytest
 import zenoh
 from triquad_tools.ros2.intake.drop_log import LOG_PERIOD_S, DropLog
-from triquad_tools.ros2.intake.message_queue import Arrival, MessageQueue, WaitLimit
+from triquad_tools.ros2.intake.message_queue import Arrival, MessageQueue
 from triquad_tools.ros2.topic_choice import Role
 
 
@@ -31,26 +31,22 @@ def test_topics_without_end_take_no_memory_without_end() -> None:
     for number in range(3000):
         drops.add(f"/{number}", "decode", "no cloud")
     assert drops.counts() == {"decode": 3000}
-    assert len(drops._kinds) == 1000
+    assert len(drops._logged_s) == 1000
 
 
 def arrival(name: str, role: Role = Role.CLOUD, size: int = 10) -> Arrival:
     return Arrival(role, name, zenoh.ZBytes(bytes(size)), 0)
 
 
-def test_the_newest_messages_wait_within_limits_and_transforms_come_first() -> None:
+def test_the_newest_messages_wait_within_limits_and_transforms_stay() -> None:
     dropped: list[str] = []
-    messages = MessageQueue(
-        WaitLimit(messages=3, bytes=100),
-        WaitLimit(messages=2, bytes=1000),
-        lambda message: dropped.append(message.topic_name),
-    )
+    messages = MessageQueue(3, 10_100, lambda message: dropped.append(message.topic_name))
+    messages.put(arrival("tf", Role.TF))
     for name in "abcd":
         messages.put(arrival(name))
-    assert dropped == ["a"], "more messages than may wait"
-    messages.put(arrival("large", size=90))
+    assert dropped == ["a"], "more scans than may wait"
+    messages.put(arrival("large", size=7_000))
     assert dropped == ["a", "b", "c"], "more bytes than may wait"
-    messages.put(arrival("tf", Role.TF))
     taken = [messages.take(0.0) for _ in range(4)]
     assert [each and each.topic_name for each in taken] == ["tf", "d", "large", None]
     messages.put(arrival("late"))

@@ -60,7 +60,7 @@ def test_damaged_messages_stop_nothing(endpoint: str, poses: str) -> None:
     rng = np.random.default_rng(5)
     with bridging(endpoint, *chosen, "--wait-s", 0.1) as bridged, robot(endpoint) as r2:
         messages = good_messages()
-        for _ in range(150):
+        for _ in range(60):
             for topic, (type_name, payload) in messages.items():
                 r2.wire.publish(topic, type_name, damaged(payload, rng))
         for topic in ("/tf", "/tf_static", "/odom"):
@@ -69,5 +69,5 @@ def test_damaged_messages_stop_nothing(endpoint: str, poses: str) -> None:
         name = good.strip("/").replace("/", ".")
         bridged.wait_for(lambda: name in bridged.client.sources().sources)
         dropped = bridged.bridge.dropped
-    assert dropped["decode"] > 50
+    assert dropped["decode"] > 20
     assert "internal" not in dropped, dropped

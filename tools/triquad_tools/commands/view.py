@@ -17,7 +17,7 @@ from triquad_tools.console.server_arguments import DEFAULT_MAP, add_server, serv
 from triquad_tools.viewer.sources.history import History
 from triquad_tools.viewer.sources.live_source import LiveSource
 from triquad_tools.viewer.sources.map_source import MapSource
-from triquad_tools.viewer.sources.stored_source import StoredMap, StoredSource
+from triquad_tools.viewer.sources.stored_map import StoredMap
 from triquad_tools.viewer.viewer import DEFAULT_PORT, Viewer
 
 _COMMAND = "triquad-view"
@@ -59,9 +59,9 @@ def _shown(options: argparse.Namespace) -> Iterator[MapSource | History]:
         yield _store(options.file)
     else:
         with progress(f"opening {options.file}") as report:
-            source = StoredSource(StoredMap(options.file), options.file.name)
-            report(1, _name(source.shown))
-        yield source
+            stored = StoredMap(options.file, options.file.name)
+            report(1, _name(stored))
+        yield stored
 
 
 def _store(path: Path) -> History:
@@ -77,7 +77,7 @@ def _store(path: Path) -> History:
 
 
 def _name(shown: StoredMap) -> str:
-    return f"map {shown.opened.name!r}, epoch {shown.opened.epoch}"
+    return f"map {shown.queries.name!r}, epoch {shown.queries.epoch}"
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -77,8 +77,8 @@ def _draw_presence(
 
 def _draw_box(axes: Axes, cluster: Cluster, colour: str) -> None:
     """Outline a cluster, a little outside of it."""
-    (x, y, _), (width, depth, _) = (cluster.low_m, cluster.size_m + 2 * _BESIDE_M)
-    corner = (x - _BESIDE_M, y - _BESIDE_M)
+    x, y, _ = np.array(cluster.low_m) - _BESIDE_M
+    width, depth, _ = cluster.size_m + 2 * _BESIDE_M
     axes.add_patch(
-        Rectangle(corner, width, depth, fill=False, edgecolor=colour, linewidth=_LINE_PT)
+        Rectangle((x, y), width, depth, fill=False, edgecolor=colour, linewidth=_LINE_PT)
     )

@@ -4,12 +4,12 @@ Own code, as VTK takes 560 MB, and does not run where no library of OpenGL is in
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Ints
-from triquad_map.compiled.kernel import kernel
 from triquad_map.height_scale import GAMMA
 
 WIDTH, HEIGHT = 1340, 740
@@ -26,6 +26,8 @@ _SOME = 200_000  # faces or points are enough to choose a view
 _FINER = 2  # pixels for one of the picture, along each side
 _TO_LIGHT = (-0.45, -0.65, -0.6)  # right, down and forward of a view: over the left shoulder
 _AMBIENT = 0.55  # of the light; the rest comes from there
+_APART_PIXELS = 0.7  # between points of a triangle: no square of a pixel lies between them
+_MOST_POINTS = 1_000_000  # that are drawn together
 _POINT_PIXELS, _LEAST_POINT_M = 2.5, 0.02  # side of a point: the greater of both
 
 
@@ -48,15 +50,15 @@ class View:
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         return np.asarray(normals @ self.axes[2] < 0.0)
 
-    def outside(self, points: NDArray[np.floating]) -> str:
-        """Return a remark on those of points [N, 3], one at least, beyond the picture's edges."""
-        right, down, _ = ((points - self.target) @ self.axes.T).T
-        beyond = np.abs(down) > self.height_m / 2
-        beyond |= np.abs(right) > WIDTH / HEIGHT * self.height_m / 2
-        if not beyond.any():
-            return ""
-        share, reach_m = 100.0 * float(beyond.mean()), float(np.hypot(right, down).max())
-        return f"beyond the edges: {share:.2g} %, up to {reach_m:.3g} m from the picture's middle"
+    @property
+    def description(self) -> str:
+        """What it shows, in words."""
+        turn_deg = math.degrees(math.atan2(self.axes[2, 1], self.axes[2, 0]))
+        return (
+            f"parallel projection, {self.height_m * WIDTH / HEIGHT:.3g} m wide, looking down and "
+            f"to {turn_deg:.0f}° from +x; faces seen from behind (ceilings), and what lies far "
+            "away from all else, are left out"
+        )
 
 
 def vertex_normals(vertices: Doubles, faces: Ints) -> Doubles:
@@ -114,76 +116,63 @@ class Picture:
     """A picture of faces and points in their colours; what is nearer hides what is farther."""
 
     def __init__(self, view: View) -> None:
-        self._view = view
+        self.view = view
         self._shape = (HEIGHT * _FINER, WIDTH * _FINER)
-        self._light = np.tile(BACKGROUND**GAMMA, (*self._shape, 1))
-        self._nearness = np.full(self._shape, -np.inf)
+        count = self._shape[0] * self._shape[1]
+        self._light = np.tile((BACKGROUND**GAMMA).astype(np.float32), (count, 1))
+        self._nearness = np.full(count, -np.inf, np.float32)
 
     def add_mesh(self, vertices: Doubles, faces: Ints, colours: Doubles) -> None:
         """Draw the faces that show their outer sides; ``colours`` [V, 3] are sRGB in [0, 1].
 
         Level ground has its own colour; light is white, so that it changes none into another.
         """
-        axes = self._view.axes
-        to_light = np.array(_TO_LIGHT) @ axes / np.linalg.norm(_TO_LIGHT)
+        to_light = np.array(_TO_LIGHT) @ self.view.axes / np.linalg.norm(_TO_LIGHT)
         lambert = np.maximum(vertex_normals(vertices, faces) @ to_light, 0.0)
         light = _AMBIENT + (1.0 - _AMBIENT) * lambert / max(float(to_light[2]), 0.1)
-        shown = faces[self._view.facing(vertices[faces])]
-        owners = np.full(self._shape, -1, np.int32)
-        weights = np.zeros((*self._shape, 3), np.float32)
-        corners = self._view.project(vertices, self._shape[0])
-        _draw(corners, np.ascontiguousarray(shown, np.int32), self._nearness, owners, weights)
-        covered = owners >= 0
-        lit = colours**GAMMA * light[:, None]
-        self._light[covered] = np.einsum(
-            "pc,pck->pk", weights[covered], lit[shown[owners[covered]]]
-        )
+        at = self.view.project(vertices, self._shape[0])
+        corners = np.column_stack([at, colours**GAMMA * light[:, None]]).astype(np.float32)
+        for points in _points_of(corners[faces[self.view.facing(vertices[faces])]]):
+            self._draw(points)
 
     def add_points(self, points: Doubles, colours: Doubles) -> None:
         """Draw points [N, 3] as squares in plain colours [N, 3], sRGB in [0, 1]."""
-        at = self._view.project(points, self._shape[0])
-        at = np.column_stack([at, colours**GAMMA])[np.argsort(at[:, 2])]
-        side = max(_POINT_PIXELS * _FINER, _LEAST_POINT_M * self._shape[0] / self._view.height_m)
-        for down, right in np.ndindex(math.ceil(side), math.ceil(side)):
-            columns, rows = np.floor(at[:, :2] + [right - side / 2, down - side / 2]).T.astype(int)
-            inside = (rows >= 0) & (rows < self._shape[0])
-            inside &= (columns >= 0) & (columns < self._shape[1])
-            rows, columns, seen = rows[inside], columns[inside], at[inside]
-            free = seen[:, 2] >= self._nearness[rows, columns]
-            self._light[rows[free], columns[free]] = seen[free, 3:]
+        at = np.column_stack([self.view.project(points, self._shape[0]), colours**GAMMA])
+        at = at[np.argsort(at[:, 2])]
+        side = max(_POINT_PIXELS * _FINER, _LEAST_POINT_M * self._shape[0] / self.view.height_m)
+        for step in np.ndindex(math.ceil(side), math.ceil(side)):
+            self._draw(at + np.array([*(np.array(step) - side / 2), 0.0, 0.0, 0.0, 0.0]))
 
     def pixels(self) -> Bytes:
         """Return the picture [HEIGHT, WIDTH, 3]."""
         fine = self._light.reshape(HEIGHT, _FINER, WIDTH, _FINER, 3).mean(axis=(1, 3))
         return np.asarray(np.round(255.0 * np.clip(fine, 0.0, 1.0) ** (1.0 / GAMMA)), np.uint8)
 
+    def _draw(self, points: NDArray[np.floating]) -> None:
+        """Draw points [N, 6]: column, row, nearness and linear colour; the nearest are seen.
 
-@kernel()
-def _draw(corners: Doubles, faces: Ints, nearness: Doubles, owners: Ints, weights: Floats) -> None:
-    """Draw triangles into a z-buffer: in each pixel the nearest face and weights of its corners."""
-    height, width = nearness.shape
-    for f in range(faces.shape[0]):
-        ax, ay, an = corners[faces[f, 0]]
-        bx, by, bn = corners[faces[f, 1]]
-        cx, cy, cn = corners[faces[f, 2]]
-        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-        if area == 0.0:
-            continue
-        left = int(max(np.ceil(min(ax, bx, cx) - 0.5), 0.0))
-        right = int(min(np.floor(max(ax, bx, cx) - 0.5), width - 1.0))
-        top = int(max(np.ceil(min(ay, by, cy) - 0.5), 0.0))
-        bottom = int(min(np.floor(max(ay, by, cy) - 0.5), height - 1.0))
-        for row in range(top, bottom + 1):
-            y = row + 0.5
-            for column in range(left, right + 1):
-                x = column + 0.5
-                wa = ((bx - x) * (cy - y) - (by - y) * (cx - x)) / area
-                wb = ((cx - x) * (ay - y) - (cy - y) * (ax - x)) / area
-                wc = 1.0 - wa - wb
-                near = wa * an + wb * bn + wc * cn
-                if min(wa, wb, wc) >= 0.0 and near > nearness[row, column]:
-                    nearness[row, column] = near
-                    owners[row, column] = f
-                    weights[row, column, 0] = wa
-                    weights[row, column, 1] = wb
-                    weights[row, column, 2] = wc
+        Of those in one pixel the last is: they come in about the order of their nearness.
+        """
+        high, wide = self._shape
+        columns, rows = points[:, :2].astype(np.int32).T
+        points = points[inside := (columns >= 0) & (columns < wide) & (rows >= 0) & (rows < high)]
+        pixels = (rows * wide + columns)[inside]
+        seen = points[:, 2] >= self._nearness[pixels]
+        pixels, points = pixels[seen], points[seen]
+        self._nearness[pixels], self._light[pixels] = points[:, 2], points[:, 3:]
+
+
+def _points_of(triangles: Floats) -> Iterator[Floats]:
+    """Yield points [N, 6] of triangles [F, 3, 6], some at a time, that leave out no pixel."""
+    sides = triangles[:, [1, 2, 0], :2] - triangles[..., :2]
+    longest = np.linalg.norm(sides, axis=2).max(axis=1, initial=0.0)
+    steps = np.ceil(longest / _APART_PIXELS).astype(np.int64) + 1
+    triangles = triangles[nearest_last := np.argsort(triangles[..., 2].sum(axis=1))]
+    steps = steps[nearest_last]
+    for count in np.unique(steps):
+        row, column = np.tril_indices(count + 1)
+        weights = (np.stack([count - row, row - column, column], axis=1) / count).astype(np.float32)
+        alike = triangles[steps == count]
+        together = max(1, _MOST_POINTS // len(weights))
+        for first in range(0, len(alike), together):
+            yield (weights @ alike[first : first + together]).reshape(-1, 6)

@@ -42,18 +42,14 @@ def draw_mesh(title: str, mesh: Mesh, path: Path) -> None:
         OSError: it cannot be written.
     """
     used = mesh.vertices[np.unique(mesh.faces)]
-    view = view_along(used, mesh.vertices[mesh.faces])
     heights = HeightScale.around(used[:, 2])
-    picture = Picture(view)
+    picture = Picture(view_along(used, mesh.vertices[mesh.faces]))
     picture.add_mesh(mesh.vertices, mesh.faces, heights.colours(mesh.vertices[:, 2]))
     least_m, most_m = float(used[:, 2].min()), float(used[:, 2].max())
     legend = Legend(
         title,
         Scale("height z in m", HEIGHTS, heights.low_m, heights.high_m),
         beyond=(least_m < heights.low_m, most_m > heights.high_m),
-        notes=[
-            f"{len(mesh.faces):,} faces, from z = {least_m:.2f} to {most_m:.2f} m",
-            view.outside(mesh.vertices[mesh.faces].mean(axis=1)),
-        ],
+        notes=[f"{len(mesh.faces):,} faces, from z = {least_m:.2f} to {most_m:.2f} m"],
     )
-    save_mesh_sheet(path, picture.pixels(), view, legend)
+    save_mesh_sheet(path, picture, legend)

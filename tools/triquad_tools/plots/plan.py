@@ -125,34 +125,21 @@ def save_sheet(path: Path, title: str, grid: PlanGrid, plans: Sequence[Plan]) ->
     """
     wide = grid.columns > _WIDE * grid.rows
     inches = (_LONGEST_IN if wide else _LONGEST_ASIDE_IN) / max(grid.columns, grid.rows)
-    shape = (len(plans), 1) if wide else (1, len(plans))
-    width = shape[1] * (inches * grid.columns + _ROOM_IN[0])
-    height = shape[0] * (inches * grid.rows + _ROOM_IN[1])
+    rows, columns = (len(plans), 1) if wide else (1, len(plans))
+    width = columns * (inches * grid.columns + _ROOM_IN[0])
+    height = rows * (inches * grid.rows + _ROOM_IN[1])
     with rc_context({"font.size": _LETTERS_PT}):
         figure = Figure((width, height), dpi=110, layout="constrained")
         figure.suptitle(title, x=0.01, ha="left", parse_math=False)
-        drawn = []
-        for plan, part in zip(plans, figure.subfigures(*shape, squeeze=False).flat, strict=True):
-            drawn.append(axes := part.subplots())
+        places = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+        for plan, axes in zip(plans, places.flat, strict=True):
             axes.set_title(plan.heading, loc="left")
             axes.set_facecolor(UNKNOWN)
             axes.set(xlabel=f"x in m\n{plan.note}".rstrip(), ylabel="y in m", aspect="equal")
             axes.set_xlim(grid.low_m[0], grid.high_m[0])
             axes.set_ylim(grid.low_m[1], grid.high_m[1])
             plan.draw(axes)
-        _align(figure, drawn)
         figure.savefig(path)
-
-
-def _align(figure: Figure, drawn: Sequence[Axes]) -> None:
-    """Give all plans the same place and size within their parts: then they can be compared."""
-    figure.draw_without_rendering()
-    figure.set_layout_engine("none")
-    boxes = [axes.get_position() for axes in drawn]
-    width, height = (min(getattr(box, side) for box in boxes) for side in ("width", "height"))
-    left, low, top = max(b.x0 for b in boxes), max(b.y0 for b in boxes), min(b.y1 for b in boxes)
-    for axes in drawn:
-        axes.set_position((left, low, width * (top - low) / height, top - low))
 
 
 def extend(below: bool, above: bool) -> Literal["neither", "min", "max", "both"]:
@@ -177,7 +164,9 @@ def draw_layers(axes: Axes, layers: Sequence[Layer]) -> None:
     named = [(layer.colour, layer.label) for layer in layers]
     named.append((UNKNOWN, "nothing was seen (UNKNOWN)"))
     handles = [Patch(facecolor=colour, edgecolor="black", label=label) for colour, label in named]
-    axes.figure.legend(handles=handles, loc="outside lower left", frameon=False, ncols=2)
+    axes.legend(
+        handles=handles, loc="upper left", bbox_to_anchor=(0.0, -0.15), frameon=False, ncols=2
+    )
 
 
 def _draw_cells(axes: Axes, values: Values, **colours: Any) -> AxesImage:

@@ -1,7 +1,6 @@
 """The attachments of rmw_zenoh to messages, whose numbers show how many never arrived."""
 
 import struct
-from collections import OrderedDict
 
 ATTACHMENT = struct.Struct("<qqB16s")
 """The attachment: number, time, length of the identity, identity of the publisher."""
@@ -11,10 +10,10 @@ _MAX_MISSED = 2**20  # a larger step is of a publisher that was started again, o
 
 
 class SequenceGaps:
-    """The last number of each publisher; the oldest are removed."""
+    """The last number of each publisher."""
 
     def __init__(self) -> None:
-        self._last: OrderedDict[bytes, int] = OrderedDict()
+        self._last: dict[bytes, int] = {}
 
     def missed(self, attachment: bytes) -> int:
         """Return how many messages of its publisher are missing before one with this attachment.
@@ -26,9 +25,9 @@ class SequenceGaps:
             return 0
         number: int
         number, _, _, publisher = ATTACHMENT.unpack(attachment)
-        last = self._last.pop(publisher, number - 1)
-        self._last[publisher] = number
         if len(self._last) > _MAX_PUBLISHERS:
-            self._last.popitem(last=False)
+            self._last.clear()
+        last = self._last.get(publisher, number - 1)
+        self._last[publisher] = number
         missed = number - last - 1
         return missed if 0 <= missed <= _MAX_MISSED and last >= 0 else 0

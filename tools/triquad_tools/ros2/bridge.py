@@ -11,6 +11,7 @@ from triquad_tools.ros2.intake.intake import Intake
 from triquad_tools.ros2.node import Node
 from triquad_tools.ros2.options import BridgeOptions
 from triquad_tools.ros2.output.grid_publisher import GridPublisher
+from triquad_tools.ros2.output.map_thread import MapThread
 from triquad_tools.ros2.output.mesh_publisher import MeshPublisher
 from triquad_tools.ros2.output.topic_publisher import TopicPublisher
 from triquad_tools.ros2.topics import Delivery, Topic
@@ -37,12 +38,12 @@ class Bridge:
             topic = partial(TopicPublisher, session, node, domain=topics.domain)
             markers = topic(Topic(topics.mesh, MARKER), delivery=_MESH_DELIVERY)
             parts.enter_context(closing(markers))
-            mesh = MeshPublisher(markers, client, options.mesh, lambda: intake.place)
-            parts.enter_context(closing(mesh))
             slices = topic(Topic(topics.grid, OCCUPANCY_GRID), delivery=_GRID_DELIVERY)
             parts.enter_context(closing(slices))
-            grid = GridPublisher(slices, client, options.grid, lambda: intake.place)
-            parts.enter_context(closing(grid))
+            mesh = MeshPublisher(markers, client, options.mesh)
+            parts.enter_context(closing(mesh))
+            grid = GridPublisher(slices, client, options.grid)
+            parts.enter_context(closing(MapThread((mesh, grid), lambda: intake.place)))
             self._parts = parts.pop_all()
 
     def __enter__(self) -> "Bridge":

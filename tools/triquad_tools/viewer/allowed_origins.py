@@ -7,7 +7,6 @@ A browser lets any page send requests to this machine. Its ``Origin`` says whose
 import http
 import ipaddress
 import socket
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -17,45 +16,36 @@ import websockets.asyncio.server
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-_Answer = Callable[[Any, Request], Any]
 
-_patching = threading.Lock()
+def refusal(headers: Headers, allowed_hosts: Sequence[str]) -> str | None:
+    """Return why a request is not answered, or ``None``.
 
-
-class AllowedOrigins:
-    """Decides which requests are answered."""
-
-    def __init__(self, allowed_hosts: Sequence[str] = ()) -> None:
-        """``allowed_hosts`` are names of this machine beyond its addresses and its host name."""
-        self._given = frozenset(host.lower() for host in allowed_hosts)
-        name = socket.gethostname().lower()
-        self._own = self._given | {"localhost", name, f"{name}.local"}
-
-    def refusal(self, headers: Headers) -> str | None:
-        """Return why a request is not answered, or ``None``."""
-        hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
-        name = _name(hosts[0]) if len(hosts) == 1 else ""
-        # Addresses cannot be made to point here by others.
-        if name not in self._own and not _is_address(name):
-            return "this page is not served under that name: triquad-view --allow-host NAME"
-        for origin in origins:
-            place = urlsplit(origin).netloc.lower()
-            if place != hosts[0].lower() and _name(place) not in self._given:
-                return "another page may not use this one: triquad-view --allow-host its NAME"
-        return None
+    ``allowed_hosts`` are names of this machine beyond its addresses and its host name.
+    """
+    given, here = {host.lower() for host in allowed_hosts}, socket.gethostname().lower()
+    hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
+    name = _name(hosts[0]) if len(hosts) == 1 else ""
+    # Addresses cannot be made to point here by others.
+    if name not in given | {"localhost", here, f"{here}.local"} and not _is_address(name):
+        return "this page is not served under that name: triquad-view --allow-host NAME"
+    for origin in origins:
+        place = urlsplit(origin).netloc.lower()
+        if place != hosts[0].lower() and _name(place) not in given:
+            return "another page may not use this one: triquad-view --allow-host its NAME"
+    return None
 
 
 @contextmanager
-def serving_only(allowed: AllowedOrigins) -> Iterator[None]:
-    """Let servers of websockets that are started meanwhile answer only what is allowed.
+def serving_only(allowed_hosts: Sequence[str]) -> Iterator[None]:
+    """Let servers of websockets that are started meanwhile refuse what :func:`refusal` names.
 
     The viewer's library starts its server where no option reaches it.
     """
     serve = websockets.asyncio.server.serve
 
-    def guarded(*arguments: Any, process_request: _Answer, **options: Any) -> Any:
+    def guarded(*arguments: Any, process_request: Callable[..., Any], **options: Any) -> Any:
         def answer_allowed(connection: Any, request: Request) -> Any:
-            reason = allowed.refusal(request.headers)
+            reason = refusal(request.headers, allowed_hosts)
             if reason is None:
                 return process_request(connection, request)
             forbidden, body = http.HTTPStatus.FORBIDDEN, f"{reason}\n".encode()
@@ -64,12 +54,11 @@ def serving_only(allowed: AllowedOrigins) -> Iterator[None]:
 
         return serve(*arguments, process_request=answer_allowed, **options)
 
-    with _patching:
-        websockets.asyncio.server.serve = guarded  # type: ignore[assignment, misc]
-        try:
-            yield
-        finally:
-            websockets.asyncio.server.serve = serve  # type: ignore[misc]
+    websockets.asyncio.server.serve = guarded  # type: ignore[assignment, misc]
+    try:
+        yield
+    finally:
+        websockets.asyncio.server.serve = serve  # type: ignore[misc]
 
 
 def _name(host: str) -> str:

@@ -5,18 +5,16 @@ from contextlib import ExitStack
 import viser
 from triquad_format.errors import TriquadError
 
-from triquad_tools.viewer.asking.click_layer import ClickLayer
-from triquad_tools.viewer.asking.slice_layer import SliceLayer
-from triquad_tools.viewer.asking.unknown_layer import UnknownLayer
-from triquad_tools.viewer.changes_panel import ChangesPanel
 from triquad_tools.viewer.mesh.mesh_layer import MeshLayer
 from triquad_tools.viewer.page.legends import problem_html, text_html
 from triquad_tools.viewer.page.page import Page
-from triquad_tools.viewer.screenshot_button import ScreenshotButton
+from triquad_tools.viewer.questions.changes import Changes
+from triquad_tools.viewer.questions.clicks import Clicks
+from triquad_tools.viewer.questions.slice import SliceQuestion
+from triquad_tools.viewer.questions.unknown_space import UnknownSpace
 from triquad_tools.viewer.sources.history import History
 from triquad_tools.viewer.sources.live_source import LiveSource
 from triquad_tools.viewer.sources.map_source import MapSource
-from triquad_tools.viewer.sources.stored_source import StoredSource
 from triquad_tools.viewer.status_panel import StatusPanel
 from triquad_tools.viewer.time_panel import TimePanel
 from triquad_tools.viewer.trail_layer import TrailLayer
@@ -46,21 +44,17 @@ class BrowserSession:
 
     def _show(self, shown: MapSource | History) -> None:
         """Build the page; of a history, each browser chooses its own moment."""
-        source: MapSource
-        if isinstance(shown, History):
-            source = stored = StoredSource(shown.newest(), str(shown.folder))
-        else:
-            source = shown
+        source = shown.newest() if isinstance(shown, History) else shown
         self._title.content = text_html(source.title)
         page = Page(self._client, source, self._tell)
         if isinstance(shown, History):
-            self._parts.callback(TimePanel(shown, stored, page).close)
-            self._parts.callback(ChangesPanel(shown, stored, page).close)
-        for part in (MeshLayer, SliceLayer, UnknownLayer, ClickLayer, ScreenshotButton):
+            self._parts.callback(TimePanel(page, shown).close)
+            self._parts.callback(Changes(page, shown).close)
+        for part in (MeshLayer, SliceQuestion, UnknownSpace, Clicks):
             self._parts.callback(part(page).close)
         if isinstance(source, LiveSource):
-            self._parts.callback(StatusPanel(source, page).close)
-            self._parts.callback(TrailLayer(source, page).close)
+            self._parts.callback(StatusPanel(page, source.client).close)
+            self._parts.callback(TrailLayer(page, source.client).close)
 
     def _tell(self, part: str, problem: str) -> None:
         """Show the problem of a part; with an empty text it has none any more."""

@@ -2,13 +2,13 @@
 
 import time
 
+from triquad_client import Client
 from triquad_format.wire.messages import ServerStatus
 
 from triquad_tools.console.amounts import duration
 from triquad_tools.viewer.page.layer import Layer
 from triquad_tools.viewer.page.legends import problem_html, table_html
 from triquad_tools.viewer.page.page import Page
-from triquad_tools.viewer.sources.live_source import LiveSource
 
 _PERIOD_S = 1.0
 
@@ -16,10 +16,9 @@ _PERIOD_S = 1.0
 class StatusPanel(Layer):
     """Shows what the server is doing, and how far away it is."""
 
-    def __init__(self, source: LiveSource, page: Page) -> None:
+    def __init__(self, page: Page, client: Client) -> None:
         super().__init__(page, "Server", _PERIOD_S)
-        self._client = source.client
-        self._before: ServerStatus | None = None
+        self._client = client
         with self.folder:
             self._figures = page.gui.add_html("")
             self._warnings = page.gui.add_html("")
@@ -30,21 +29,15 @@ class StatusPanel(Layer):
         asked_s = time.perf_counter()
         status = self._client.status()
         answered_ms = 1e3 * (time.perf_counter() - asked_s)
-        rows = _rows(status, _samples_per_s(self._before, status), answered_ms)
-        self._before = status
-        self._figures.content = table_html(rows)
+        self._figures.content = table_html(_rows(status, answered_ms))
         problems = [text for text in (status.store_error, status.warnings) if text]
         self._warnings.content = "".join(map(problem_html, problems))
 
 
-def _rows(
-    status: ServerStatus, samples_per_s: float | None, answered_ms: float
-) -> list[tuple[str, str]]:
+def _rows(status: ServerStatus, answered_ms: float) -> list[tuple[str, str]]:
     dropped, lost = sum(status.scans_dropped.values()), sum(status.scans_lost.values())
     regions = "1 region" if status.regions == 1 else f"{status.regions} regions"
     learning = f"{status.samples_left / 1e6:.1f} M samples left"
-    if samples_per_s is not None:
-        learning = f"{samples_per_s / 1e6:.2f} M samples/s, {learning}"
     last, checkpoint = status.last_checkpoint, "none yet"
     if last is not None:
         age = duration(max(0.0, time.time() - last.stamp_ns / 1e9))
@@ -59,11 +52,3 @@ def _rows(
         ("last checkpoint", checkpoint),
         ("link", f"answers in {answered_ms:.1f} ms"),
     ]
-
-
-def _samples_per_s(before: ServerStatus | None, now: ServerStatus) -> float | None:
-    """Return how fast the server learns; ``None`` where it was restarted since."""
-    if before is None or before.server != now.server or now.uptime_s <= before.uptime_s:
-        return None
-    trained = now.samples_trained - before.samples_trained
-    return max(0.0, trained / (now.uptime_s - before.uptime_s))

@@ -3,13 +3,13 @@
 import numpy as np
 import viser
 from matplotlib.colors import to_rgb
+from triquad_client import Client
 from triquad_client.calls.sources import ScanSource, SourceReport
 from triquad_format.records.arrays import Doubles
 
 from triquad_tools.viewer.page.layer import Layer
 from triquad_tools.viewer.page.legends import text_html
 from triquad_tools.viewer.page.page import Page
-from triquad_tools.viewer.sources.live_source import LiveSource
 
 _PERIOD_S = 0.5
 _SCAN_POINTS = 4000
@@ -22,9 +22,9 @@ _POINT_M, _LINE_PIXELS = 0.08, 3.0
 class TrailLayer(Layer):
     """Draws trails and newest scans, and keeps them up to date."""
 
-    def __init__(self, source: LiveSource, page: Page) -> None:
+    def __init__(self, page: Page, client: Client) -> None:
         super().__init__(page, "Robot", _PERIOD_S)
-        self._client = source.client
+        self._client = client
         self._report: SourceReport | None = None
         self._shown: tuple[object, ...] = ()
         with self.folder:

@@ -10,7 +10,7 @@ from contextlib import redirect_stdout
 import viser
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.viewer.allowed_origins import AllowedOrigins, serving_only
+from triquad_tools.viewer.allowed_origins import serving_only
 from triquad_tools.viewer.browser_session import BrowserSession
 from triquad_tools.viewer.sources.history import History
 from triquad_tools.viewer.sources.map_source import MapSource
@@ -57,7 +57,7 @@ class Viewer:
         for message in _OF_ONE_WHO_LEFT:
             warnings.filterwarnings("ignore", message, UserWarning)
         # The library has announcements of its own.
-        with redirect_stdout(io.StringIO()), serving_only(AllowedOrigins(allowed_hosts)):
+        with redirect_stdout(io.StringIO()), serving_only(allowed_hosts):
             self._server = _OwnServer(host, port, label="triquad", verbose=False)
         self._server.on_client_connect(self._enter)
         self._server.on_client_disconnect(self._leave)

@@ -5,7 +5,6 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
 
 _log = logging.getLogger("triquad_ros2")
 
@@ -29,14 +28,6 @@ REMEDIES = {
 }
 
 
-@dataclass
-class _Kind:
-    """One reason for which messages of one topic are dropped."""
-
-    logged_s: float
-    since: int = 0  # dropped since it was logged
-
-
 class DropLog:
     """Counts by reason; the log has the first of each topic and reason, then one line a while."""
 
@@ -45,7 +36,8 @@ class DropLog:
         self._clock = clock
         self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
-        self._kinds: dict[tuple[str, str], _Kind] = {}
+        self._logged_s: dict[tuple[str, str], float] = {}  # by topic and reason
+        self._since: Counter[tuple[str, str]] = Counter()  # dropped since it was logged
 
     def counts(self) -> dict[str, int]:
         """Return how many messages were dropped so far, by reason."""
@@ -56,28 +48,23 @@ class DropLog:
         """Count messages that are dropped, and why."""
         with self._lock:
             self._counts[reason] += count
-            since = self._due(topic_name, reason, count)
-        if since is not None:
+        if since := self._due(topic_name, reason, count):
             remedy = f" ({REMEDIES[reason]})" if reason in REMEDIES else ""
             _log.warning("%s: %d dropped, %s: %s%s", topic_name, since, reason, text, remedy)
 
     def remark(self, topic_name: str, text: str) -> None:
         """Log something that drops nothing by itself, as often as a drop; a text is one reason."""
-        with self._lock:
-            since = self._due(topic_name, text, 1)
-        if since is not None:
+        if self._due(topic_name, text, 1):
             _log.warning("%s: %s", topic_name, text)
 
-    def _due(self, topic_name: str, reason: str, count: int) -> int | None:
-        """Return how many to report in the log, if it is time for that."""
-        now_s = self._clock()
-        kind = self._kinds.get((topic_name, reason))
-        if kind is None:
-            if len(self._kinds) >= _MAX_REMEMBERED:
-                return None
-            kind = self._kinds[topic_name, reason] = _Kind(now_s - LOG_PERIOD_S)
-        kind.since += count
-        if now_s - kind.logged_s < LOG_PERIOD_S:
-            return None
-        since, kind.logged_s, kind.since = kind.since, now_s, 0
-        return since
+    def _due(self, topic_name: str, reason: str, count: int) -> int:
+        """Return how many to report in the log; 0: it is not time for that."""
+        kind, now_s = (topic_name, reason), self._clock()
+        with self._lock:
+            if kind not in self._logged_s and len(self._logged_s) >= _MAX_REMEMBERED:
+                return 0
+            self._since[kind] += count
+            if now_s - self._logged_s.get(kind, -LOG_PERIOD_S) < LOG_PERIOD_S:
+                return 0
+            self._logged_s[kind] = now_s
+            return self._since.pop(kind)

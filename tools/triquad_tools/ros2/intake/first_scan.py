@@ -11,6 +11,7 @@ _log = logging.getLogger("triquad_ros2")
 
 AFTER_S = 10.0
 _MOST_LISTED = 20
+_USABLE = (POINT_CLOUD, IMAGE)
 
 
 class FirstScan:
@@ -28,22 +29,20 @@ class FirstScan:
 
     def check(self, found: Iterable[Topic], now_s: float) -> None:
         """Log what there is, once it is time; ``found`` are all published topics."""
-        if self._due_s is not None and now_s >= self._due_s:
-            self._due_s = None
-            _log.warning("no cloud came in %.0f s; %s", AFTER_S, self._what_there_is(found))
-
-    def _what_there_is(self, found: Iterable[Topic]) -> str:
-        choice, topics = self._choice, sorted(found, key=lambda topic: topic.name)
+        if self._due_s is None or now_s < self._due_s:
+            return
+        self._due_s = None
+        choice, topics = self._choice, list(found)
+        usable = sorted(f"{t.name} ({t.type_name})" for t in topics if t.type_name in _USABLE)
+        wanted = ", ".join((*choice.clouds, *choice.depth)) or f"all clouds below {choice.prefix}/"
+        what = (
+            f"wanted are {wanted}, and there are "
+            f"{', '.join(usable[:_MOST_LISTED]) or 'no clouds or images'} among {len(topics)} "
+            "topics: see --clouds, --depth and --namespace"
+        )
         if not topics:
-            return (
+            what = (
                 f"nobody publishes anything in domain {choice.domain}: do the robot's nodes or its "
                 "zenoh-bridge-ros2dds use the same router, and is --domain their ROS_DOMAIN_ID?"
             )
-        usable = [each for each in topics if each.type_name in (POINT_CLOUD, IMAGE)]
-        listed = ", ".join(f"{each.name} ({each.type_name})" for each in usable[:_MOST_LISTED])
-        below = f" below {choice.prefix}" if choice.prefix else ""
-        wanted = ", ".join((*choice.clouds, *choice.depth)) or f"all clouds{below}"
-        return (
-            f"wanted are {wanted}, and there are {listed or 'no clouds or images'} among "
-            f"{len(topics)} topics: see --clouds, --depth and --namespace"
-        )
+        _log.warning("no cloud came in %.0f s; %s", AFTER_S, what)

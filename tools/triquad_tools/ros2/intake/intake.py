@@ -14,10 +14,10 @@ from triquad_format.errors import TriquadError
 from triquad_tools.ros2.attachment import SequenceGaps
 from triquad_tools.ros2.intake.drop_log import DropLog
 from triquad_tools.ros2.intake.first_scan import FirstScan
-from triquad_tools.ros2.intake.message_queue import Arrival, MessageQueue, WaitLimit
+from triquad_tools.ros2.intake.message_queue import Arrival, MessageQueue
 from triquad_tools.ros2.intake.message_reader import MAX_POINTS, MessageReader
 from triquad_tools.ros2.intake.motion import Motion
-from triquad_tools.ros2.intake.placement import Placement
+from triquad_tools.ros2.intake.placement import Placed, Placement
 from triquad_tools.ros2.intake.scan_publisher import Place, ScanPublisher
 from triquad_tools.ros2.intake.topic_listener import TopicListener
 from triquad_tools.ros2.node import Node
@@ -29,10 +29,8 @@ _log = logging.getLogger("triquad_ros2")
 
 _OTHER_BYTES = 1_000_000  # of a message of transforms, and of a cloud without its points
 _SCAN_BYTES = 64 * MAX_POINTS + _OTHER_BYTES  # drivers write up to 64 bytes for each point
-_SCANS_WAITING = WaitLimit(messages=16, bytes=256_000_000)
-_OTHERS_WAITING = WaitLimit(messages=4096, bytes=16_000_000)
-SWEEPS_WAITING = WaitLimit(messages=32, bytes=512_000_000)
-"""The sweeps that may wait for their transforms."""
+_SCANS_UNREAD, _UNREAD_BYTES = 16, 256_000_000
+_WAITING_BYTES = 512_000_000  # of sweeps that wait for their transforms
 _TICK_S = 0.2
 
 
@@ -50,9 +48,9 @@ class Intake:
         self._motion = Motion(from_topic=options.topics.poses is not None)
         self._reader = MessageReader(options.scans)
         self._placement = Placement(
-            self._motion, map_frame=frame, limit=SWEEPS_WAITING, timeout_s=options.scans.wait_s
+            self._motion, map_frame=frame, max_bytes=_WAITING_BYTES, timeout_s=options.scans.wait_s
         )
-        self._queue = MessageQueue(_SCANS_WAITING, _OTHERS_WAITING, self._pushed_out)
+        self._queue = MessageQueue(_SCANS_UNREAD, _UNREAD_BYTES, self._pushed_out)
         self._gaps = SequenceGaps()
         self._gaps_lock = threading.Lock()
         self._first_scan = FirstScan(options.topics, time.monotonic())
@@ -98,8 +96,14 @@ class Intake:
             if arrival is not None:
                 self._guard(arrival.topic_name, partial(self._read, arrival))
             for placed in self._placement.settle(time.monotonic()):
-                self._guard(placed.topic_name, partial(self.scans.publish, placed))
+                self._guard(placed.topic_name, partial(self._publish, placed))
             self._first_scan.check(self._listener.found, time.monotonic())
+
+    def _publish(self, placed: Placed) -> None:
+        if isinstance(placed.outcome, NoScanError):
+            raise placed.outcome
+        stamp_ns = placed.sweep.stamp_ns
+        self.scans.publish(placed.topic_name, placed.outcome, stamp_ns, placed.map_frame)
 
     def _guard(self, topic_name: str, step: Callable[[], None]) -> None:
         """Do something with a message; no bytes may stop the intake."""
@@ -127,7 +131,7 @@ class Intake:
     def _read_sweep(self, arrival: Arrival) -> None:
         self._first_scan.came(arrival.topic_name)
         sweep = self._reader.sweep(arrival)
-        if self.scans.time_went_back(arrival.topic_name, sweep):
+        if self.scans.time_went_back(arrival.topic_name, sweep.stamp_ns):
             self.drops.remark(arrival.topic_name, "time went back, it starts again")
             self._placement.give_up_after(arrival.topic_name, sweep.stamp_ns)
             self._motion.forget_after(sweep.stamp_ns)

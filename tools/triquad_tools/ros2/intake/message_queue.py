@@ -10,7 +10,7 @@ import zenoh
 from triquad_tools.ros2.topic_choice import Role
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Arrival:
     """A message as it arrived."""
 
@@ -20,56 +20,37 @@ class Arrival:
     arrived_ns: int  # nanoseconds since 1970, by this machine's clock
     attachment: bytes = b""
 
-
-@dataclass(frozen=True)
-class WaitLimit:
-    """The limits of what may be pending."""
-
-    messages: int
-    bytes: int
-
-
-class _Waiting:
-    """Messages in the order in which they came; the oldest are dropped where there are too many."""
-
-    def __init__(self, limit: WaitLimit) -> None:
-        self._limit = limit
-        self._bytes = 0
-        self.messages: deque[Arrival] = deque()
-
-    def put(self, arrival: Arrival) -> list[Arrival]:
-        """Add a message; return those that are dropped for it."""
-        self.messages.append(arrival)
-        self._bytes += len(arrival.payload)
-        dropped = []
-        while len(self.messages) > self._limit.messages or self._bytes > self._limit.bytes:
-            dropped.append(self.take())
-        return dropped
-
-    def take(self) -> Arrival:
-        """Return the oldest message."""
-        arrival = self.messages.popleft()
-        self._bytes -= len(arrival.payload)
-        return arrival
+    @property
+    def nbytes(self) -> int:
+        """About the memory that it takes."""
+        return len(self.payload) + 1000
 
 
 class MessageQueue:
-    """A queue in which messages about scans come before the scans."""
+    """Messages in the order in which they came; where they are too many, the oldest scan goes."""
 
-    def __init__(
-        self, scans: WaitLimit, others: WaitLimit, dropped: Callable[[Arrival], None]
-    ) -> None:
+    def __init__(self, scans: int, max_bytes: int, dropped: Callable[[Arrival], None]) -> None:
         """``dropped`` is called with each message that nobody will read."""
-        self._changed = threading.Condition()
-        self._scans = _Waiting(scans)
-        self._others = _Waiting(others)
+        self._max_scans = scans
+        self._max_bytes = max_bytes
         self._dropped = dropped
+        self._changed = threading.Condition()
+        self._messages: deque[Arrival] = deque()
+        self._scans = self._bytes = 0  # of these
         self._closed = False
 
     def put(self, arrival: Arrival) -> None:
         """Add a message; never waits."""
+        dropped = []
         with self._changed:
-            dropped = (self._scans if arrival.role.brings_scans else self._others).put(arrival)
+            self._messages.append(arrival)
+            self._count(arrival, 1)
+            while self._scans > self._max_scans or self._bytes > self._max_bytes:
+                scans = (each for each in self._messages if each.role.brings_scans)
+                oldest = next(scans, self._messages[0])
+                self._messages.remove(oldest)
+                self._count(oldest, -1)
+                dropped.append(oldest)
             self._changed.notify()
         for each in dropped:
             self._dropped(each)
@@ -77,8 +58,12 @@ class MessageQueue:
     def take(self, timeout_s: float) -> Arrival | None:
         """Return the message to read next; None if none comes in time, or the queue is closed."""
         with self._changed:
-            self._changed.wait_for(lambda: self._closed or self._first is not None, timeout_s)
-            return None if self._closed or self._first is None else self._first.take()
+            self._changed.wait_for(lambda: self._closed or self._messages, timeout_s)
+            if self._closed or not self._messages:
+                return None
+            arrival = self._messages.popleft()
+            self._count(arrival, -1)
+            return arrival
 
     def close(self) -> None:
         """Give out no more messages."""
@@ -86,7 +71,6 @@ class MessageQueue:
             self._closed = True
             self._changed.notify()
 
-    @property
-    def _first(self) -> _Waiting | None:
-        """Return the queue of the next message."""
-        return next((each for each in (self._others, self._scans) if each.messages), None)
+    def _count(self, arrival: Arrival, sign: int) -> None:
+        self._scans += sign * arrival.role.brings_scans
+        self._bytes += sign * arrival.nbytes

@@ -34,9 +34,7 @@ class MessageReader:
     """Reads messages; remembers the cameras, which depth images need."""
 
     def __init__(self, options: ScanOptions) -> None:
-        self._depth_stride = options.depth_stride
-        self._body_frame = options.body_frame
-        self._by_arrival = options.by_arrival
+        self._options = options
         self._cameras: dict[str, Any] = {}  # CameraInfo by its topic
 
     def sweep(self, arrival: Arrival) -> Sweep:
@@ -46,9 +44,13 @@ class MessageReader:
             NoScanError: it is none, or has too many points, or its camera is not known.
         """
         payload = arrival.payload.to_bytes()
-        read = self._cloud if arrival.role is Role.CLOUD else self._depth_image
-        sweep = read(payload, arrival.topic_name)
-        return replace(sweep, stamp_ns=arrival.arrived_ns) if self._by_arrival else sweep
+        if arrival.role is Role.CLOUD:
+            message = decode_cdr(payload, POINT_CLOUD)
+            _check_count(message.width * message.height)
+            sweep = sweep_of_cloud(message)
+        else:
+            sweep = self._of_depth(decode_cdr(payload, IMAGE), camera_topic(arrival.topic_name))
+        return replace(sweep, stamp_ns=arrival.arrived_ns) if self._options.by_arrival else sweep
 
     def transforms(self, arrival: Arrival) -> list[Transform]:
         """Return the transforms of a message of transforms or of a pose.
@@ -62,7 +64,7 @@ class MessageReader:
         else:
             static = arrival.role is Role.TF_STATIC
             found = transforms_of_tf(decode_cdr(payload, TF), static=static)
-        if not self._by_arrival:
+        if not self._options.by_arrival:
             return found
         return [
             each if each.stamp_ns is STATIC else replace(each, stamp_ns=arrival.arrived_ns)
@@ -77,31 +79,25 @@ class MessageReader:
         """
         self._cameras[arrival.topic_name] = decode_cdr(arrival.payload.to_bytes(), CAMERA_INFO)
 
-    def _cloud(self, payload: bytes, _topic_name: str) -> Sweep:
-        message = decode_cdr(payload, POINT_CLOUD)
-        _check_count(message.width * message.height)
-        return sweep_of_cloud(message)
-
-    def _depth_image(self, payload: bytes, topic_name: str) -> Sweep:
-        message = decode_cdr(payload, IMAGE)
-        stride = self._depth_stride
+    def _of_depth(self, message: Any, info_topic: str) -> Sweep:
+        stride = self._options.depth_stride
         _check_count(-(-message.width // stride) * -(-message.height // stride))
-        camera = self._cameras.get(camera_topic(topic_name))
-        if camera is None:
+        if info_topic not in self._cameras:
             raise NoScanError(
                 "no_camera_info",
-                f"nothing came on {camera_topic(topic_name)} yet, which tells how the camera "
-                "sees: it has to publish there",
+                f"nothing came on {info_topic} yet, which tells how the camera sees: it has to "
+                "publish there",
             )
-        return sweep_of_depth(message, camera, stride)
+        return sweep_of_depth(message, self._cameras[info_topic], stride)
 
     def _pose(self, payload: bytes) -> Transform:
         """Return the pose of either type: the bytes of one cannot be read as the other."""
+        body = self._options.body_frame
         try:
             found = transform_of_odometry(decode_cdr(payload, ODOMETRY))
         except NoScanError:
-            return transform_of_pose(decode_cdr(payload, POSE), self._body_frame)
-        return found if found.child else replace(found, child=self._body_frame)
+            return transform_of_pose(decode_cdr(payload, POSE), body)
+        return found if found.child else replace(found, child=body)
 
 
 def _check_count(points: int) -> None:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from triquad_tools.ros2.intake.message_queue import WaitLimit
 from triquad_tools.ros2.intake.motion import Motion
 from triquad_tools.sensors.errors import NoScanError, NoTransformError
 from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES
@@ -42,17 +41,15 @@ class _Waiting:
 class Placement:
     """Places sweeps in the map frame, those of each topic in the order in which they came."""
 
-    def __init__(
-        self, motion: Motion, *, map_frame: str, limit: WaitLimit, timeout_s: float
-    ) -> None:
+    def __init__(self, motion: Motion, *, map_frame: str, max_bytes: int, timeout_s: float) -> None:
         """``motion`` is extended by others meanwhile, on the same thread.
 
-        Without a ``map_frame`` it is chosen, once, as the transforms come. Sweeps wait within the
-        ``limit``, for ``timeout_s`` each.
+        Without a ``map_frame`` it is chosen, once, as the transforms come. Sweeps wait for
+        ``timeout_s`` each, and no more than ``max_bytes`` together.
         """
         self.map_frame = map_frame
         self._motion = motion
-        self._limit = limit
+        self._max_bytes = max_bytes
         self._timeout_s = timeout_s
         self._waiting: dict[str, deque[_Waiting]] = {}
         self._warned = bool(map_frame)  # that there is a better frame; not where it was chosen
@@ -79,16 +76,14 @@ class Placement:
                 del self._waiting[topic_name]
 
     def _keep_within_limit(self, now_s: float) -> None:
-        """Drop the oldest sweeps, so that no more than the limit are pending."""
+        """Give up the oldest sweeps where all together are too large."""
         entries = [entry for entries in self._waiting.values() for entry in entries]
-        messages = len(entries)
-        taken_bytes = sum(entry.sweep.memory_bytes for entry in entries)
+        excess = sum(entry.sweep.memory_bytes for entry in entries) - self._max_bytes
         for entry in sorted(entries, key=lambda entry: entry.give_up_s):
-            if messages <= self._limit.messages and taken_bytes <= self._limit.bytes:
+            if excess <= 0:
                 return
             entry.give_up_s = min(entry.give_up_s, now_s)
-            messages -= 1
-            taken_bytes -= entry.sweep.memory_bytes
+            excess -= entry.sweep.memory_bytes
 
     def _try(self, entry: _Waiting, now_s: float) -> Placed | None:
         """Return the outcome of a sweep; None while it is pending."""

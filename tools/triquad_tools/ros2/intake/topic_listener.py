@@ -27,10 +27,7 @@ from triquad_tools.ros2.topics import (
 
 _log = logging.getLogger("triquad_ros2")
 
-MAX_TOPICS = 64
-"""Topics that are subscribed to at most, of those that are found."""
-
-_MAX_FOUND = 1000  # that are remembered, whether they are wanted or not
+_MAX_FOUND = 1000  # topics that are remembered, whether they are wanted or not
 _ASK_S = 2.0
 _SUBSCRIPTION = Delivery(reliable=False)  # which suits every publisher
 # Static transforms are published once: who publishes them keeps them for those that come later.
@@ -104,9 +101,6 @@ class TopicListener:
                 return
             self._found.add(announcement)
         if role is None:
-            return
-        if len(self._subscribers) >= MAX_TOPICS:
-            _log.warning("%s is left out: more than %d topics", topic.name, MAX_TOPICS)
             return
         _log.info("found %s (%s)", topic.name, topic.type_name)
         if announcement.type_hash == ANY_HASH:

@@ -1,25 +1,18 @@
 """A slice of the map as ``nav_msgs/OccupancyGrid``, around where the robot is."""
 
-import logging
-import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from triquad_client import Client, Grid, Status
-from triquad_format.errors import TriquadError
 
 from triquad_tools.ros2.intake.scan_publisher import Place
 from triquad_tools.ros2.options import SliceShape
 from triquad_tools.ros2.output.topic_publisher import TopicPublisher
 from triquad_tools.sensors.ros.cdr import CdrWriter
 
-_log = logging.getLogger("triquad_ros2")
-
-_TICK_S = 0.2
 _PERIOD_S = 1.0  # between two slices
-_RETRY_S = 5.0  # after an error
 _MAX_SHARE = 4  # the server works on slices for at most one part in four of the time
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
@@ -27,59 +20,31 @@ FREE, OCCUPIED, UNKNOWN = 0, 100, -1
 
 
 class GridPublisher:
-    """Publishes slices of the map while they have subscribers, on a thread of its own."""
+    """Publishes slices of the map while they have subscribers."""
 
-    def __init__(
-        self,
-        publisher: TopicPublisher,
-        client: Client,
-        shape: SliceShape,
-        place: Callable[[], Place | None],
-    ) -> None:
-        """``place`` returns where the robot is, None before that is known."""
+    def __init__(self, publisher: TopicPublisher, client: Client, shape: SliceShape) -> None:
         self._publisher = publisher
         self._client = client
         self._shape = shape
-        self._place = place
         self._shown: tuple[int, Sequence[float]] | None = None  # epoch and corner of the last slice
         self._due_s = 0.0  # monotonic
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="ros2-grid")
-        self._thread.start()
 
-    def close(self) -> None:
-        """Publish no more."""
-        self._stopping.set()
-        self._thread.join()
-
-    def _run(self) -> None:
-        while not self._stopping.wait(_TICK_S):
-            if self._publisher.has_newcomers():
-                self._shown = None
-            started, place = time.monotonic(), self._place()
-            if place is None or started < self._due_s or not self._publisher.is_followed:
-                continue
-            try:
-                self._publish(place)
-                pause_s = max(_PERIOD_S, _MAX_SHARE * (time.monotonic() - started))
-            except TriquadError as error:
-                _log.warning("the slice cannot be made now: %s", error)
-                pause_s = _RETRY_S
-            except Exception:
-                _log.exception("the slice could not be published")
-                pause_s = _RETRY_S
-            self._due_s = started + pause_s
-
-    def _publish(self, place: Place) -> None:
+    def publish(self, place: Place) -> None:
         """Publish a slice where the map or the place changed since the last."""
+        followed, started_s = self._publisher.is_followed, time.monotonic()
+        if self._publisher.has_newcomers() or not followed:
+            self._shown = None
+        if started_s < self._due_s or not followed:
+            return
         bounds = self._shape.around(place.position_m)
-        state = (self._client.status().epoch, bounds[0])
-        if state == self._shown:
+        if (self._client.status().epoch, bounds[0]) == self._shown:
             return
         cell_m = self._shape.cell_m
         found = self._client.query_grid(bounds, cell_m, max_distance_m=cell_m)
         self._publisher.put(grid_message(found, place))
         self._shown = (found.epoch, bounds[0])
+        took_s = time.monotonic() - started_s
+        self._due_s = started_s + max(_PERIOD_S, _MAX_SHARE * took_s)
 
 
 def occupancy(found: Grid) -> NDArray[np.int8]:

@@ -28,7 +28,6 @@ class _Key:
     """One key under which the topic is published."""
 
     publisher: zenoh.Publisher
-    listener: "zenoh.MatchingListener[None]"
     identity: bytes | None  # that messages of rmw_zenoh carry
 
     @property
@@ -37,10 +36,7 @@ class _Key:
 
 
 class TopicPublisher:
-    """Publishes to all subscribers, and notices new ones: they lack past messages.
-
-    Nodes and bridges are distinguished by their tokens; of others the first is noticed.
-    """
+    """Publishes to all subscribers; notices new ones by their tokens: they lack what was sent."""
 
     def __init__(
         self,
@@ -68,7 +64,6 @@ class TopicPublisher:
         """Publish no more."""
         self._watch.close()
         for key in self._keys.values():
-            key.listener.undeclare()
             key.publisher.undeclare()
 
     @property
@@ -103,10 +98,6 @@ class TopicPublisher:
             self._open_rmw(NO_HASH)
         self._came.set()
 
-    def _matched(self, status: zenoh.MatchingStatus) -> None:
-        if status.matching:
-            self._came.set()
-
     def _open_rmw(self, type_hash: str) -> None:
         key = rmw_key(self._domain, self._topic, type_hash)
         if self._open(key, hashlib.blake2b(key.encode(), digest_size=16).digest()):
@@ -130,6 +121,5 @@ class TopicPublisher:
                 congestion_control=zenoh.CongestionControl.BLOCK,
                 priority=zenoh.Priority.BACKGROUND,
             )
-            listener = publisher.declare_matching_listener(self._matched)
-            self._keys[key] = _Key(publisher, listener, identity)
+            self._keys[key] = _Key(publisher, identity)
             return True

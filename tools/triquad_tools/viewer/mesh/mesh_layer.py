@@ -1,6 +1,6 @@
 """The mesh in a scene: coarse everywhere, finer where the camera is near."""
 
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable, Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +18,6 @@ from triquad_tools.viewer.mesh.tile_colours import (
 )
 from triquad_tools.viewer.mesh.tiles_in_view import TileName, TilesInView
 from triquad_tools.viewer.page.layer import Layer
-from triquad_tools.viewer.page.legends import Legend
 from triquad_tools.viewer.page.page import Page
 
 _PERIOD_S = 0.5
@@ -42,6 +41,7 @@ class MeshLayer(Layer):
         self._camera = OverviewCamera(page)
         self._framed = False
         self._tiles = TilesInView(page.source)
+        self._replacing = False  # tiles of the map that was shown before are drawn
         self._shown: dict[TileName, _DrawnTile] = {}
         self._replaced: list[viser.GlbHandle] = []  # they go a round later: nothing flickers
         with self.folder:
@@ -54,29 +54,37 @@ class MeshLayer(Layer):
     def close(self) -> None:
         """Draw no more; remove what was drawn and the folder."""
         super().close()
+        for handle in (*self._replaced, *(drawn.handle for drawn in self._shown.values())):
+            handle.remove()
         self._tiles.close()
-
-    def erase(self) -> None:
-        """Remove all tiles."""
-        self._replaced += [drawn.handle for drawn in self._shown.values()]
-        self._shown.clear()
-        self._remove_replaced()
-        super().erase()
 
     def refresh(self) -> None:
         """Draw what came since the last round, and remove what it replaces."""
-        self._remove_replaced()
+        for handle in self._replaced:
+            handle.remove()
+        self._replaced.clear()
+        if self._tiles.source is not self.page.source:
+            self._tiles.close()
+            self._tiles = TilesInView(self.page.source)
+            self._replacing = True
         camera = self.page.client.camera
         pixel_m = camera.fov / max(camera.image_height, 1)  # at a distance of one metre
         wanted = self._tiles.refresh(self.page.eye, self._pixels.value * pixel_m)
-        if not wanted:  # there is no map yet, or it was reset
-            self.erase()
-            return
+        self._replacing &= not self._tiles.loaded
+        if not self._tiles.loaded:
+            self.wake()
+        if not self._replacing:
+            self._draw(wanted)
+
+    def _draw(self, wanted: Mapping[TileName, MeshTile]) -> None:
+        """Draw these tiles alone; those that they replace go a round later."""
         points = _some_vertices(self._tiles.roots.values())
         if self.page.source.grows or not self._framed:
             self._camera.follow(points)
             self._framed = self._tiles.loaded
         colours = self._colours(points)
+        if self._text.content != colours.scale.html:
+            self._text.content = colours.scale.html
         for name, tile in wanted.items():
             appearance = (colours.scale.label, tile.version, colours.key(tile))
             drawn = self._shown.get(name)
@@ -85,20 +93,12 @@ class MeshLayer(Layer):
                 self._replaced += [drawn.handle] if drawn else []
         for name in self._shown.keys() - wanted.keys():
             self._replaced.append(self._shown.pop(name).handle)
-        if not self._tiles.loaded:
-            self.wake()
 
     def _colours(self, points: Doubles) -> TileColours:
-        """Return the chosen colours, for a mesh with some ``points`` [N, 3], and their legend."""
+        """Return the chosen colours, for a mesh with some ``points`` [N, 3]."""
         if self._by.value == _CONFIDENCE:
-            colours = confidence_colours(self.page.source.queries)
-        else:
-            colours = height_colours(points[:, 2])
-        legend = Legend(colours.scale)
-        self.page.legends[self.name] = legend
-        if self._text.content != legend.html:
-            self._text.content = legend.html
-        return colours
+            return confidence_colours(self.page.source.queries)
+        return height_colours(points[:, 2])
 
     def _add(self, tile: MeshTile, colours: TileColours) -> viser.GlbHandle:
         mesh = GlbMesh("tile", tile.vertices, tile.faces, lit_colours(colours, tile))
@@ -106,11 +106,6 @@ class MeshLayer(Layer):
             self.node("tile"), glb_bytes([mesh]), position=self.page.in_scene(tile.origin),
             cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
-
-    def _remove_replaced(self) -> None:
-        for handle in self._replaced:
-            handle.remove()
-        self._replaced.clear()
 
 
 def _some_vertices(tiles: Iterable[MeshTile]) -> Doubles:

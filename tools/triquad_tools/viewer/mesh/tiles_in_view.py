@@ -1,5 +1,6 @@
 """The mesh tiles of a scene: coarse ones everywhere, finer ones where the camera is near."""
 
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
@@ -8,6 +9,8 @@ from triquad_client.mesh.followed_mesh import MeshTile, TileIndex
 from triquad_format.records.arrays import Doubles
 
 from triquad_tools.viewer.sources.map_source import COARSEST, MapSource, TileFollower
+
+_PERIOD_S = 1.0  # between questions what changed: more often, and a robot's planner would notice
 
 
 @dataclass(frozen=True)
@@ -34,12 +37,15 @@ class NearTiles:
         """Whether all that is followed was complete once."""
         return self._roots <= self.ready
 
-    def refresh(self, roots: list[TileIndex]) -> None:
-        """Fetch some of the tiles within ``roots``, of the coarsest level; none: as before."""
+    def refresh(self, roots: list[TileIndex], *, changes: bool = True) -> None:
+        """Fetch some of the tiles within ``roots``, of the coarsest level; none: as before.
+
+        Where all were complete once, only if ``changes`` are wanted.
+        """
         if roots:
             self._follow(roots)
-        if self._follower is not None:
-            self._follower.refresh()
+        if self._follower is not None and (changes or not self.loaded):
+            self._follower.next(0.0)
             if self._follower.complete:
                 self.ready = self._roots
 
@@ -68,10 +74,10 @@ class NearTiles:
         sizes = self._source.sizes
         side_m, inwards_m = sizes.side_of(COARSEST), 0.5 * sizes.side_of(self.level)
         ends = (low * side_m + inwards_m).tolist(), ((high + 1) * side_m - inwards_m).tolist()
-        if self._follower is None:
-            self._follower = self._source.follow(self.level, ends)
-        else:
-            self._follower = self._follower.moved(ends)
+        before = self._follower
+        self._follower = self._source.follow(self.level, ends, before)
+        if before is not None:
+            before.close()
         self._roots, self.ready = around, self.ready & around
 
 
@@ -79,9 +85,10 @@ class TilesInView:
     """Follows the tiles of a map. Not for several threads."""
 
     def __init__(self, source: MapSource) -> None:
-        self._sizes = source.sizes
+        self.source = source
         self._whole = source.follow(COARSEST)
         self._whole_loaded = False
+        self._due_s = 0.0  # monotonic: when changes are asked for
         self._near = [NearTiles(source, level) for level in range(COARSEST)]
 
     @property
@@ -101,14 +108,19 @@ class TilesInView:
             eye: [3] metres, map frame.
             coarsest_m: side that a cell may have at a distance of one metre.
         """
-        self._whole.refresh()
-        self._whole_loaded |= self._whole.complete
+        now_s = time.monotonic()
+        changes = now_s >= self._due_s
+        if changes:
+            self._due_s = now_s + _PERIOD_S
+        if changes or not self._whole_loaded:
+            self._whole.next(0.0)
+            self._whole_loaded |= self._whole.complete
         roots = list(self.roots)
         parts = {root: {TileName(COARSEST, root): tile} for root, tile in self.roots.items()}
         for near in reversed(self._near):  # finer ones replace coarser ones
-            reach_m = self._sizes.cell_of(near.level + 1) / coarsest_m
-            chosen = near_columns(roots, self._sizes.side_of(COARSEST), eye, reach_m)
-            near.refresh(chosen)
+            reach_m = self.source.sizes.cell_of(near.level + 1) / coarsest_m
+            chosen = near_columns(roots, self.source.sizes.side_of(COARSEST), eye, reach_m)
+            near.refresh(chosen, changes=changes)
             for root in near.ready.intersection(chosen):
                 parts[root] = dict(near.within(root))
         return {name: tile for tiles in parts.values() for name, tile in tiles.items()}

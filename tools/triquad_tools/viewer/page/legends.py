@@ -3,10 +3,9 @@
 Texts from the network are shown as they are.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from html import escape
-from typing import Literal, NamedTuple
 
 import numpy as np
 from matplotlib.colors import Colormap, to_hex
@@ -28,48 +27,27 @@ class ColourScale:
     open_above: bool = False
 
     @property
-    def ticks(self) -> list[str]:
-        """Return the labels at equal steps from the lower to the upper end."""
+    def html(self) -> str:
+        """The scale for the panel, with labels at equal steps."""
+        stops = ", ".join(to_hex(colour) for colour in self.colours(np.linspace(0.0, 1.0, 17)))
         texts = [f"{value:.3g}" for value in np.linspace(self.low, self.high, _TICKS)]
         texts[0] = f"≤ {texts[0]}" if self.open_below else texts[0]
         texts[-1] = f"≥ {texts[-1]}" if self.open_above else texts[-1]
-        return texts
-
-
-class LineMeaning(NamedTuple):
-    """The meaning of lines that look alike."""
-
-    colour: str  # as in #rrggbb
-    text: str
-    style: Literal["solid", "dashed"] = "solid"
-
-
-@dataclass(frozen=True)
-class Legend:
-    """The legend of one part of a page."""
-
-    scale: ColourScale | None = None
-    lines: Sequence[LineMeaning] = ()
-
-    @property
-    def html(self) -> str:
-        """The legend for the panel."""
-        scale = "" if self.scale is None else _scale_html(self.scale)
-        return scale + "".join(
-            f'<div style="padding: 0 1.3em; font-size: 0.8em"><span style="display: inline-block; '
-            "width: 2.5em; vertical-align: middle; margin-right: 0.6em; "
-            f'border-top: 3px {line.style} {line.colour}"></span>{line.text}</div>'
-            for line in self.lines
+        ticks = "".join(f"<span>{text}</span>" for text in texts)
+        return (
+            f'<div style="padding: 0.2em 1em; font-size: 0.8em"><div>{self.label}</div>'
+            f'<div style="height: 0.8em; background: linear-gradient(to right, {stops})"></div>'
+            f'<div style="display: flex; justify-content: space-between">{ticks}</div></div>'
         )
 
 
-def _scale_html(scale: ColourScale) -> str:
-    stops = ", ".join(to_hex(colour) for colour in scale.colours(np.linspace(0.0, 1.0, 17)))
-    ticks = "".join(f"<span>{text}</span>" for text in scale.ticks)
-    return (
-        f'<div style="padding: 0.2em 1em; font-size: 0.8em"><div>{scale.label}</div>'
-        f'<div style="height: 0.8em; background: linear-gradient(to right, {stops})"></div>'
-        f'<div style="display: flex; justify-content: space-between">{ticks}</div></div>'
+def lines_html(*lines: tuple[str, str]) -> str:
+    """Return colours, as in #rrggbb, and the meaning of lines that have them."""
+    return "".join(
+        f'<div style="padding: 0 1.3em; font-size: 0.8em"><span style="display: inline-block; '
+        "width: 2.5em; vertical-align: middle; margin-right: 0.6em; "
+        f'border-top: 3px solid {colour}"></span>{text}</div>'
+        for colour, text in lines
     )
 
 

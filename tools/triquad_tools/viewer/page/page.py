@@ -10,7 +10,6 @@ import viser
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles, Floats
 
-from triquad_tools.viewer.page.legends import Legend
 from triquad_tools.viewer.sources.map_source import MapSource
 
 _GRID_M = 100.0
@@ -34,9 +33,8 @@ class Page:
         self.client = client
         self.scene = client.scene
         self.gui = client.gui
-        self.source = source
+        self.source = source  # which a part may replace: all others go on with the new one
         self.failed = failed
-        self.legends: dict[str, Legend] = {}  # of what is drawn now, by part
         # [3] metres, map frame: the zero of the scene, near the first point that is drawn, since a
         # browser computes in single precision: half a metre in coordinates as large as UTM's
         self._origin: Doubles | None = None
@@ -65,8 +63,7 @@ class Page:
         """The point that the camera is turned about."""
         camera = self.client.camera
         middle = self.in_map(camera.look_at)
-        aspect = camera.image_width / max(camera.image_height, 1)
         away_m = float(np.linalg.norm(middle - self.eye))
-        seen_m = 2.0 * away_m * math.tan(0.5 * camera.fov) * max(aspect, 1.0)
+        seen_m = 2.0 * away_m * math.tan(0.5 * camera.fov) * max(camera.aspect, 1.0)
         side_m = 2.0 ** round(math.log2(max(seen_m, _LEAST_SIDE_M)))
         return Focus(middle, min(side_m, _MOST_SIDE_M))

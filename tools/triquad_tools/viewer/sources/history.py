@@ -17,7 +17,7 @@ from triquad_format.mapfile.checkpoint_folder import (
 from triquad_format.mapfile.metadata import utc_time
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.viewer.sources.stored_source import StoredMap
+from triquad_tools.viewer.sources.stored_map import StoredMap
 
 _MAX_OPEN = 4  # maps that stay in memory beyond those that pages show
 
@@ -49,25 +49,24 @@ class History:
             OSError: the folder cannot be read.
         """
         self.folder = map_folder(store)
-        self._moments: dict[CheckpointFile, Moment] = {}
-        self._damaged: dict[CheckpointFile, str] = {}
-        self._reading = threading.Lock()
+        # What is known of each file: its moment, or why it cannot be shown.
+        self._known: dict[CheckpointFile, Moment | str] = {}
         self._opening = threading.Lock()  # one at a time: it takes all cores
-        self._opened = lru_cache(_MAX_OPEN)(StoredMap)
+        self._open = lru_cache(_MAX_OPEN)(lambda path: StoredMap(path, str(self.folder)))
         self.refresh()
 
     @property
     def moments(self) -> tuple[Moment, ...]:
         """The checkpoints that can be shown as far as is known, the oldest first."""
-        with self._reading:
-            files = sorted(self._moments.keys() - self._damaged.keys(), reverse=True)
-            return tuple(self._moments[file] for file in sorted(newest_of_each(files)))
+        known = self._known
+        files = sorted((f for f, what in known.items() if isinstance(what, Moment)), reverse=True)
+        newest = sorted(newest_of_each(files))
+        return tuple(what for file in newest if isinstance(what := known[file], Moment))
 
     @property
     def damaged(self) -> tuple[str, ...]:
         """The errors of those that cannot be shown, the oldest first."""
-        with self._reading:
-            return tuple(problem for _, problem in sorted(self._damaged.items()))
+        return tuple(what for _, what in sorted(self._known.items()) if isinstance(what, str))
 
     def refresh(self) -> None:
         """Update from what a server wrote or deleted meanwhile.
@@ -75,17 +74,12 @@ class History:
         Raises:
             ToolError: the folder cannot be read.
         """
+        known = self._known  # which others may replace, but nobody changes
         try:
             found = checkpoint_files(self.folder)
         except OSError as error:
             raise ToolError(f"{self.folder} cannot be read: {error.strerror}") from error
-        with self._reading:
-            for file in found:
-                if file not in self._moments and file not in self._damaged:
-                    self._read(file)
-            for known in (self._moments, self._damaged):
-                for file in known.keys() - set(found):
-                    known.pop(file)
+        self._known = {file: known.get(file) or _read(file) for file in found}
 
     def opened(self, moment: Moment) -> StoredMap:
         """Return the map as it was.
@@ -95,12 +89,11 @@ class History:
         """
         try:
             with self._opening:
-                return self._opened(moment.path)
+                return self._open(moment.path)
         except (FormatError, OSError) as error:
             problem = f"{moment.path.name} is left out: {error}"
-            with self._reading:
-                for file in [file for file in self._moments if file.path == moment.path]:
-                    self._damaged[file] = problem
+            known = self._known.items()
+            self._known = {f: problem if f.path == moment.path else what for f, what in known}
             raise DamagedError(problem) from error
 
     def newest(self) -> StoredMap:
@@ -117,11 +110,11 @@ class History:
             "intact"
         )
 
-    def _read(self, file: CheckpointFile) -> None:
-        try:
-            stamp_ns = open_manifest(file).stamp_ns
-        except (FormatError, OSError) as error:
-            self._damaged[file] = f"{file.path.name} is left out: {error}"
-            return
-        stamp = utc_time(stamp_ns) if stamp_ns else ""
-        self._moments[file] = Moment(file.epoch, stamp, file.path)
+
+def _read(file: CheckpointFile) -> Moment | str:
+    """Return the moment of a file, or why it cannot be shown."""
+    try:
+        stamp_ns = open_manifest(file).stamp_ns
+    except (FormatError, OSError) as error:
+        return f"{file.path.name} is left out: {error}"
+    return Moment(file.epoch, utc_time(stamp_ns) if stamp_ns else "", file.path)

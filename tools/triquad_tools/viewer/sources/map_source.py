@@ -14,25 +14,22 @@ COARSEST = LEVELS - 1
 
 
 class TileFollower(Protocol):
-    """The mesh tiles of a level within a box, kept up to date by :meth:`refresh`."""
+    """The mesh tiles of a level within a box; ``MeshWatch`` is one."""
 
     @property
     def tiles(self) -> Mapping[TileIndex, MeshTile]:
-        """The tiles as of the last refresh, by their indices."""
+        """The tiles as of the last :meth:`next`, by their indices."""
 
     @property
     def complete(self) -> bool:
-        """Whether the last refresh left nothing pending."""
+        """Whether it left nothing pending."""
 
-    def refresh(self) -> None:
+    def next(self, timeout_s: float) -> object:
         """Fetch some of what changed; return soon, also if there is more.
 
         Raises:
             TriquadError: it cannot be had now; the tiles stay.
         """
-
-    def moved(self, bounds: Bounds) -> "TileFollower":
-        """Follow another box instead, and go on with the tiles that both have."""
 
     def close(self) -> None:
         """Stop following."""
@@ -54,15 +51,6 @@ class TileSizes:
         return self.tile_side_m * (1 << level)
 
 
-@dataclass(frozen=True)
-class MapState:
-    """The map that a page shows, and its state."""
-
-    map_name: str
-    epoch: int  # number of a published state of the map
-    time: str  # when that was, UTC as in RFC 3339; empty: it is not known
-
-
 class MapSource(Protocol):
     """A map to show."""
 
@@ -82,12 +70,10 @@ class MapSource(Protocol):
     def grows(self) -> bool:
         """Whether more of it may become known while it is shown."""
 
-    def state(self) -> MapState:
-        """Return what is shown now.
+    def follow(
+        self, level: int, bounds: Bounds | None = None, before: TileFollower | None = None
+    ) -> TileFollower:
+        """Follow the tiles of a level that meet ``bounds``, metres, map frame; ``None``: all.
 
-        Raises:
-            TriquadError: the server does not answer.
+        Tiles of a follower ``before``, of the same level and source, need not be fetched again.
         """
-
-    def follow(self, level: int, bounds: Bounds | None = None) -> TileFollower:
-        """Follow the tiles of a level that meet ``bounds``, metres, map frame; ``None``: all."""

@@ -6,58 +6,53 @@ from triquad_client.calls.queries import MapQueries
 from triquad_format.records.arrays import Bytes, Floats, Ints
 from triquad_format.records.status import Status
 
-from triquad_tools.viewer.asking.cell_box import CellBox
-from triquad_tools.viewer.page.layer import Layer
-from triquad_tools.viewer.page.legends import Legend, LineMeaning, text_html
+from triquad_tools.viewer.page.legends import lines_html, text_html
 from triquad_tools.viewer.page.page import Page
+from triquad_tools.viewer.questions.cell_box import CellBox
+from triquad_tools.viewer.questions.question import Answer, Question
 
-_PERIOD_S = 1.0
 _COUNTS = (64, 64, 24)  # cells: they bound how much is asked
 _MOST_CELL_M = 0.75
 _VOXEL_CELLS = 2  # a cell of the mesh is half a voxel, as fine as the status is known
 _NO_DISTANCE_M = 0.01  # status is what is asked for; searching far costs most
 _COLOUR, _OPACITY = "#cc79a7", 0.4
-_LEGEND = Legend(lines=(LineMeaning(_COLOUR, "between free and unknown space"),))
+_LEGEND = lines_html((_COLOUR, "between free and unknown space"))
 
 
-class UnknownLayer(Layer):
-    """Draws the boundary of free against unknown space around the camera's target."""
+class UnknownSpace(Question[CellBox]):
+    """Shows the boundary of free against unknown space around the camera's target."""
 
     def __init__(self, page: Page) -> None:
-        super().__init__(page, "Unknown space", _PERIOD_S)
+        super().__init__(page, "Unknown space")
         with self.folder:
             self._on = page.gui.add_checkbox("Show border", False)
-            self._text = page.gui.add_html("", visible=False)
+            self.add_text()
         self.start(self._on)
 
-    def refresh(self) -> None:
-        """Ask if the camera's target or the map has changed."""
-        self._text.visible = self._on.value
+    def wanted(self) -> CellBox | None:
+        """Return the cells around the camera's target."""
         if not self._on.value:
-            self.erase()
-            return
-        source, focus = self.page.source, self.page.focus
-        least_m = _VOXEL_CELLS * source.sizes.cell_m
+            return None
+        focus, least_m = self.page.focus, _VOXEL_CELLS * self.page.source.sizes.cell_m
         cell_m = max(min(focus.side_m / _COUNTS[0], _MOST_CELL_M), least_m)
-        box = CellBox.around(focus.middle, cell_m, _COUNTS)
-        if not self.outdated(box):
-            return
-        cells, steps, epoch = ask_boundary(source.queries, box)
-        self.answered(box, epoch)
+        return CellBox.around(focus.middle, cell_m, _COUNTS)
+
+    def ask(self, wanted: CellBox) -> Answer:
+        """Ask for the status of all cells."""
+        cells, steps, epoch = ask_boundary(self.page.source.queries, wanted)
         marks = []
         if len(cells):
             surface = self.page.scene.add_mesh_simple(
                 self.node("border"), *face_triangles(cells, steps), color=np.array(to_rgb(_COLOUR)),
-                opacity=_OPACITY, flat_shading=True, side="double", scale=cell_m,
+                opacity=_OPACITY, flat_shading=True, side="double", scale=wanted.cell_m,
                 cast_shadow=False, receive_shadow=False,
-                position=self.page.in_scene(np.array(box.corner)),
+                position=self.page.in_scene(np.array(wanted.corner)),
             )  # fmt: skip
             marks.append(surface)
-        self.draw(marks, _LEGEND)
-        wide, _, high = box.size_m
+        wide, _, high = wanted.size_m
         extent = f"{wide:.3g} x {wide:.3g} x {high:.3g} m around the middle of the view"
-        told = f"{extent}, in cells of {cell_m:.2g} m; epoch {epoch}"
-        self._text.content = _LEGEND.html + text_html(told)
+        told = f"{extent}, in cells of {wanted.cell_m:.2g} m; epoch {epoch}"
+        return Answer(_LEGEND + text_html(told), epoch, marks)
 
 
 def ask_boundary(queries: MapQueries, box: CellBox) -> tuple[Ints, Ints, int]:

@@ -9,18 +9,18 @@ from hypothesis import strategies as st
 from matplotlib.colors import to_rgb
 from support.exact_maps import SEEN_M, exact_map, flat, table
 from triquad_client import OfflineMap, Status
+from triquad_format.records.arrays import Bytes
 from triquad_tools.plots.plan import UNKNOWN
-from triquad_tools.viewer.asking.cell_box import CellBox
-from triquad_tools.viewer.asking.path import ask_path, path_html, path_legs
-from triquad_tools.viewer.asking.slices import (
-    ask_slice,
-    line_distances,
-    picture,
-    slice_axes,
-    slice_box,
-)
-from triquad_tools.viewer.asking.unknown_layer import ask_boundary, border_faces, face_triangles
 from triquad_tools.viewer.page.page import Focus
+from triquad_tools.viewer.questions.cell_box import CellBox
+from triquad_tools.viewer.questions.path import Path
+from triquad_tools.viewer.questions.slice import Slice
+from triquad_tools.viewer.questions.slice_picture import line_distances, slice_picture
+from triquad_tools.viewer.questions.unknown_space import (
+    ask_boundary,
+    border_faces,
+    face_triangles,
+)
 
 GROUND_M = 0.1  # in the middle of a voxel
 FOCUS = Focus(np.array([0.3, -0.4, 1.2]), 16.0)
@@ -34,27 +34,26 @@ def ground() -> Iterator[OfflineMap]:
         yield opened
 
 
+def pictured(ground: OfflineMap, cut: Slice) -> Bytes:
+    found = cut.box.ask(ground, cut.most_m)
+    distance_m, status = (np.take(v, 0, cut.axis).T for v in (found.distance_m, found.status))
+    return slice_picture(distance_m, status != Status.UNKNOWN, cut.most_m)
+
+
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_slice_has_what_the_map_answers_there(ground: OfflineMap, axis: int) -> None:
-    box = slice_box(FOCUS, axis, 0.9)
-    answer = ask_slice(ground, box, axis, 3.0)
-    rng = np.random.default_rng(axis)
-    cells = rng.integers(0, box.counts, (50, 3))
+def test_a_slice_is_asked_and_drawn_where_it_is(ground: OfflineMap, axis: int) -> None:
+    cut = Slice.around(FOCUS, axis, 0.9, 3.0)
+    box = cut.box
+    cells = np.random.default_rng(axis).integers(0, box.counts, (50, 3))
     places = box.places(cells + 0.5)
     np.testing.assert_allclose(places[:, axis], 0.9)
-    rows, columns = np.delete(cells, axis, axis=1)[:, ::-1].T
-    asked = ground.query_distance(places, 3.0)
+    found, asked = box.ask(ground, 3.0), ground.query_distance(places, 3.0)
     # Points travel in single precision, from another origin.
-    np.testing.assert_allclose(answer.distance_m[rows, columns], asked.distance_m, atol=1e-4)
-    np.testing.assert_array_equal(answer.known[rows, columns], asked.status != Status.UNKNOWN)
-
-
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_slice_is_drawn_where_it_is(axis: int) -> None:
-    box, axes = slice_box(FOCUS, axis, 0.9), slice_axes(axis)
-    assert np.linalg.det(axes) == pytest.approx(1.0)
+    np.testing.assert_allclose(found.distance_m[tuple(cells.T)], asked.distance_m, atol=1e-4)
+    assert np.linalg.det(cut.turn) == pytest.approx(1.0)
     across, up = np.delete(box.size_m, axis)
-    corner = box.middle + axes @ [-0.5 * across, -0.5 * up, 0.0]
+    middle = box.places(0.5 * np.array(box.counts))
+    corner = middle + cut.turn @ [-0.5 * across, -0.5 * up, 0.0]
     expected = np.array(box.corner)
     expected[axis] = 0.9
     np.testing.assert_allclose(corner, expected, atol=1e-9)
@@ -62,9 +61,9 @@ def test_a_slice_is_drawn_where_it_is(axis: int) -> None:
 
 def test_lines_lie_at_their_distances(ground: OfflineMap) -> None:
     """An upright slice through level ground: lines are level."""
-    box = slice_box(FOCUS, 1, 0.0)
-    drawn = picture(ask_slice(ground, box, 1, 3.0), 3.0).astype(int)
-    heights_m = box.corner[2] + (np.arange(len(drawn)) + 0.5) * box.size_m[2] / len(drawn)
+    cut = Slice.around(FOCUS, 1, 0.0, 3.0)
+    drawn = pictured(ground, cut).astype(int)
+    heights_m = cut.box.corner[2] + (np.arange(len(drawn)) + 0.5) * cut.box.size_m[2] / len(drawn)
     inside = drawn[:, drawn.shape[1] // 2 - 50 : drawn.shape[1] // 2 + 50]
     for level_m in line_distances(3.0)[:4]:
         colour = 0 if level_m == 0 else 255
@@ -75,9 +74,7 @@ def test_lines_lie_at_their_distances(ground: OfflineMap) -> None:
 
 
 def test_unknown_space_has_no_line_and_is_grey(ground: OfflineMap) -> None:
-    answer = ask_slice(ground, slice_box(FOCUS, 2, 5.0), 2, 3.0)
-    assert not answer.known.any()
-    assert (picture(answer, 3.0) == GREY).all()
+    assert (pictured(ground, Slice.around(FOCUS, 2, 5.0, 3.0)) == GREY).all()
 
 
 @given(st.floats(0.2, 50.0))
@@ -125,13 +122,18 @@ def test_ground_is_no_border_of_unknown_space_however_coarse_the_cells(ground: O
     assert (steps[inside] == [0, 0, 1]).all()
 
 
+def path(ground: OfflineMap, radius_m: float, *points: tuple[float, float, float]) -> Path:
+    return Path(ground, np.array(points), radius_m)
+
+
 def test_a_path_is_blocked_where_the_map_says(ground: OfflineMap) -> None:
-    points = [np.array(point) for point in ([-3.0, 0.0, 1.0], [3.0, 0.0, 1.0], [3.0, 3.0, -1.0])]
-    answer = ask_path(ground, points, 0.25)
+    points = [(-3.0, 0.0, 1.0), (3.0, 0.0, 1.0), (3.0, 3.0, -1.0)]
+    laid = path(ground, 0.25, *points)
+    answer = laid.answer
     assert answer == ground.query_polyline(np.array(points), 0.25, 1.0)
     assert answer.blocked
-    assert f"at {answer.contact_m:.2f} m" in path_html(3, 0.25, answer)
-    (passed, free), (touching, blocked) = path_legs(points, answer)
+    assert f"at {answer.contact_m:.2f} m" in laid.html()
+    (passed, free), (touching, blocked) = laid.legs()
     assert passed != touching
     np.testing.assert_allclose(blocked[0], free[-1])
     np.testing.assert_allclose(blocked[0][2], GROUND_M + 0.25, atol=0.1)
@@ -139,27 +141,21 @@ def test_a_path_is_blocked_where_the_map_says(ground: OfflineMap) -> None:
     assert lengths[0] == pytest.approx(answer.contact_m, abs=1e-4)
     assert sum(lengths) == pytest.approx(answer.length_m, abs=1e-4)
     assert any(np.allclose(place, points[1]) for place in free), "corners are kept"
-
-
-def test_large_robots_are_answered_for(ground: OfflineMap) -> None:
-    points = [np.array([-1.0, 0.0, 1.0]), np.array([1.0, 0.0, 1.0])]
-    assert ask_path(ground, points, radius_m=50.0).blocked
+    assert path(ground, 50.0, (-1.0, 0.0, 1.0), (1.0, 0.0, 1.0)).answer.blocked, "a large robot"
 
 
 def test_unknown_space_on_a_path_is_grey_and_named(ground: OfflineMap) -> None:
-    points = [np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 4.0])]
-    answer = ask_path(ground, points, 0.1)
-    assert not answer.blocked
-    assert f"from {answer.unknown_contact_m:.2f} m" in path_html(2, 0.1, answer)
-    (first, _), (second, unknown) = path_legs(points, answer)
+    laid = path(ground, 0.1, (0.0, 0.0, 1.0), (0.0, 0.0, 4.0))
+    assert not laid.answer.blocked
+    assert f"from {laid.answer.unknown_contact_m:.2f} m" in laid.html()
+    (first, _), (second, unknown) = laid.legs()
     assert (first != UNKNOWN, second) == (True, UNKNOWN)
-    assert unknown[0][2] == pytest.approx(1.0 + answer.unknown_contact_m, abs=1e-4)
+    assert unknown[0][2] == pytest.approx(1.0 + laid.answer.unknown_contact_m, abs=1e-4)
 
 
 def test_a_path_over_a_table_is_free() -> None:
     with OfflineMap(exact_map(table(0.1, 0.7))) as opened:
-        points = [np.array([-4.0, 0.0, 1.3]), np.array([4.0, 0.0, 1.3])]
-        answer = ask_path(opened, points, 0.3)
-    assert "all along, with radius 0.3 m" in path_html(2, 0.3, answer)
-    assert answer.clearance_m == pytest.approx(0.6, abs=0.05)
-    assert len(path_legs(points, answer)) == 1
+        laid = path(opened, 0.3, (-4.0, 0.0, 1.3), (4.0, 0.0, 1.3))
+    assert "all along, with radius 0.3 m" in laid.html()
+    assert laid.answer.clearance_m == pytest.approx(0.6, abs=0.05)
+    assert len(laid.legs()) == 1

@@ -1,0 +1,59 @@
+"""The thread on which the map is published."""
+
+import logging
+import threading
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+from triquad_format.errors import TriquadError
+
+from triquad_tools.ros2.intake.scan_publisher import Place
+
+_log = logging.getLogger("triquad_ros2")
+
+PERIOD_S = 0.5  # between two rounds
+_RETRY_S = 5.0  # after an error
+
+
+class MapOutput(Protocol):
+    """Something of the map that is published while it has subscribers."""
+
+    def publish(self, place: Place) -> None:
+        """Publish what changed, for the robot at a place; return soon, also if there is more.
+
+        Raises:
+            TriquadError: the map server does not answer.
+        """
+
+
+class MapThread:
+    """Has outputs published in turn, until it is closed."""
+
+    def __init__(self, outputs: Sequence[MapOutput], place: Callable[[], Place | None]) -> None:
+        """``place`` returns where the robot is, None before that is known."""
+        self._outputs = outputs
+        self._place = place
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="ros2-map")
+        self._thread.start()
+
+    def close(self) -> None:
+        """Publish no more."""
+        self._stopping.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        pause_s = PERIOD_S
+        while not self._stopping.wait(pause_s):
+            place, pause_s = self._place(), PERIOD_S
+            if place is None:
+                continue
+            for output in self._outputs:
+                try:
+                    output.publish(place)
+                except TriquadError as error:
+                    _log.warning("the map cannot be published now: %s", error)
+                    pause_s = _RETRY_S
+                except Exception:
+                    _log.exception("the map could not be published")
+                    pause_s = _RETRY_S

@@ -1,1 +1,0 @@
-"""Layers for queries by people: slices, unknown space, points and paths."""

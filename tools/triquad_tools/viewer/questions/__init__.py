@@ -1,0 +1,1 @@
+"""Questions to a map: slices, unknown space, points, paths, and what changed."""

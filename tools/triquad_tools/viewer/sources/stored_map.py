@@ -1,0 +1,107 @@
+"""The map of a file, shown without a server."""
+
+import threading
+import time
+from collections.abc import Mapping
+from functools import cache, lru_cache
+from pathlib import Path
+
+import numpy as np
+from triquad_client import open_map
+from triquad_client.checks import Bounds
+from triquad_client.mesh.followed_mesh import MeshTile, TileIndex
+from triquad_client.offline.map_mesh import TILE_CELLS, MapTiles
+
+from triquad_tools.viewer.sources.map_source import TileFollower, TileSizes
+
+_CELL_LEAVES = 0.5  # of a cell of level 0, as in a server's mesh
+_MAX_TILES = 500  # that are kept of an open map: some 50 to 200 MB
+_WAIT_S = 0.1  # how long one refresh makes tiles
+
+
+class StoredMap:
+    """A map file in memory, with mesh tiles that are made once wanted; for several threads.
+
+    It is closed once it is garbage.
+    """
+
+    grows = False
+
+    def __init__(self, path: Path, place: str) -> None:
+        """Read it; ``place`` shows people where the map is from.
+
+        Raises:
+            MapFileError: it is no map file, is damaged, or needs a newer reader.
+            OSError: it cannot be read.
+        """
+        self.path = path
+        self.queries = open_map(path)
+        self.title = f"{self.queries.name} in {place}"
+        cell_m = _CELL_LEAVES * self.queries.leaf_m
+        self.sizes = TileSizes(cell_m, TILE_CELLS * cell_m)
+        self._listing = threading.Lock()
+        self._listed_tiles = cache(self._listed)
+        self.tile = lru_cache(_MAX_TILES)(self._made)
+        """The tile of a level and an index, one of :meth:`indices`."""
+
+    def follow(
+        self, level: int, bounds: Bounds | None = None, before: TileFollower | None = None
+    ) -> "StoredTiles":
+        """Make the mesh tiles of a level that meet ``bounds``."""
+        return StoredTiles(self, level, bounds, {} if before is None else before.tiles)
+
+    def indices(self, level: int, bounds: Bounds | None) -> list[TileIndex]:
+        """Return the tiles that meet a box and may have faces."""
+        with self._listing:
+            listed = self._listed_tiles(level).indices
+        if bounds is None:
+            return listed
+        (low, high), side_m = np.asarray(bounds, np.float64), self.sizes.side_of(level)
+        tiles = np.array(listed, np.int64).reshape(-1, 3)
+        meets = ((tiles * side_m <= high) & ((tiles + 1) * side_m >= low)).all(axis=1)
+        return [index for index, is_met in zip(listed, meets, strict=True) if is_met]
+
+    def _listed(self, level: int) -> MapTiles:
+        return self.queries.mesh_tiles(self.sizes.cell_of(level))
+
+    def _made(self, level: int, index: TileIndex) -> MeshTile:
+        mesh = self._listed_tiles(level).mesh(index)
+        origin = np.array(index) * self.sizes.side_of(level)
+        vertices = (mesh.vertices - origin).astype(np.float32)
+        return MeshTile(
+            index, self.queries.epoch, "", 0, origin=origin, vertices=vertices, faces=mesh.faces
+        )
+
+
+class StoredTiles:
+    """Mesh tiles of a map file within a box, which are made bit by bit."""
+
+    def __init__(
+        self,
+        stored: StoredMap,
+        level: int,
+        bounds: Bounds | None,
+        known: Mapping[TileIndex, MeshTile],
+    ) -> None:
+        self._stored = stored
+        self._level = level
+        wanted = stored.indices(level, bounds)
+        self._waiting = [index for index in wanted if index not in known]  # the next one last
+        self.tiles = {index: known[index] for index in wanted if index in known}
+        """The tiles with faces that are made, by their indices."""
+
+    @property
+    def complete(self) -> bool:
+        """Whether all tiles are made."""
+        return not self._waiting
+
+    def next(self, timeout_s: float) -> None:
+        """Make tiles for as long, and no less than a tenth of a second."""
+        ends_s = time.monotonic() + max(timeout_s, _WAIT_S)
+        while self._waiting and time.monotonic() < ends_s:
+            tile = self._stored.tile(self._level, self._waiting.pop())
+            if len(tile.faces):
+                self.tiles[tile.index] = tile
+
+    def close(self) -> None:
+        """Do nothing: there is nothing to release."""
