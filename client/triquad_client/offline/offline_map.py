@@ -14,7 +14,6 @@ from triquad_format.records.arrays import Bools, Doubles
 from triquad_format.records.region import MapRecord
 from triquad_format.records.seen_space import surface_voxels
 from triquad_format.wire.limits import MAX_FILL_M
-from triquad_map.composition.composed_view import ComposedView
 from triquad_map.questions.answers import Answers, QuestionLimits
 from triquad_map.record_view import open_view
 from triquad_map.view import MapView
@@ -27,6 +26,8 @@ from triquad_client.mesh.mesh import Mesh
 from triquad_client.net.connection import PARTS_IN_FLIGHT, Answering, Ask, ReplyT
 
 if TYPE_CHECKING:
+    from triquad_map.composition.composed_view import ComposedView
+
     from triquad_client.offline.map_mesh import MapTiles, Report
 
 CELL_RANGE_M = (0.005, 10.0)
@@ -181,7 +182,7 @@ class OfflineMap(MapQueries):
         view = self._view()
         return view.near_ends(checks.query_points(points), _REACH_LEAVES * self.leaf_m)
 
-    def _view(self) -> ComposedView:
+    def _view(self) -> "ComposedView":
         if self._map is None:
             raise ClosedError("the map is closed")
         return self._map.view

@@ -1,4 +1,4 @@
-"""Objects that appeared, vanished and moved between checkpoints: boxes in the scene."""
+"""Objects that appeared or vanished between checkpoints: boxes in the scene."""
 
 from collections.abc import Iterator
 
@@ -22,7 +22,7 @@ _BEFORE = "the checkpoint before"
 _NOTHING = "There is no checkpoint before this one: choose another to compare with."
 
 # Okabe and Ito's colours, which all can distinguish, that stand out on mesh and background.
-APPEARED, VANISHED, MOVED = "#56b4e9", "#d55e00", "#cc79a7"
+APPEARED, VANISHED = "#56b4e9", "#d55e00"
 _MOST = 50  # of each kind are drawn
 _ASIDE_M = 0.1  # outlines lie this far outside of what they surround
 _LINE_PX = 3.0
@@ -68,25 +68,21 @@ class Changes(Question[Pair]):
         self.tell(text_html(f"comparing epochs {before.epoch} and {after.epoch} …"))
         old, new = (self._history.opened(moment).queries for moment in wanted)
         found = object_changes(compare(old, new))
-        moved, small = len(found.moved), found.small.appeared + found.small.vanished
         html = lines_html(
             (APPEARED, f"{len(found.appeared)} appeared (A): free space in epoch {before.epoch}"),
             (VANISHED, f"{len(found.vanished)} vanished (V): free space in epoch {after.epoch}"),
-            (MOVED, f"{moved} moved (M): from where to where"),
         ) + text_html(
             f"From {before}\nto {after}.\nnewly seen: {len(found.newly_seen)}, no longer known: "
             f"{len(found.no_longer_known)} (not drawn: one of the two has never been there)\n"
-            f"{small} things of fewer than {LEAST_POINTS} voxels are left out"
+            f"What has fewer than {LEAST_POINTS} voxels is left out."
         )
         return Answer(html, newest_epoch(self.page.source.queries), list(self._marks_of(found)))
 
     def _marks_of(self, found: ObjectChanges) -> Iterator[viser.SceneNodeHandle]:
-        """Draw boxes with names, and lines from where to where things moved."""
+        """Draw boxes with names."""
         kinds = (
             ("A{}", APPEARED, found.appeared),
             ("V{}", VANISHED, found.vanished),
-            ("M{} before", VANISHED, [move.before for move in found.moved]),
-            ("M{}", APPEARED, [move.after for move in found.moved]),
         )
         for name, colour, clusters in kinds:
             for number, cluster in enumerate(clusters[:_MOST], start=1):
@@ -98,8 +94,6 @@ class Changes(Question[Pair]):
                 yield self.page.scene.add_label(
                     self.node("name"), text, position=self.page.in_scene(top)
                 )
-        for move in found.moved[:_MOST]:
-            yield self._lines(np.array([(move.before.middle_m, move.after.middle_m)]), MOVED)
 
     def _lines(self, lines: Doubles, colour: str) -> viser.SceneNodeHandle:
         """Draw lines [L, 2, 3], metres, map frame."""
