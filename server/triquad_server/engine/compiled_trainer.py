@@ -41,7 +41,6 @@ EPSILON = 1e-10
 _NEGLIGIBLE = 1e-8
 _MAX_CORRECTED = 1 << 20
 _AHEAD = 12  # rows that are fetched into the cache in advance
-_NONE_FIXED = np.zeros(0, np.bool_)
 
 
 class ParameterRows(NamedTuple):
@@ -275,7 +274,7 @@ class CompiledTrainer:
         fixed = self._field.fixed
         if fixed is None:
             self._step_mlp(mlp_sums, compiled)
-            fixed = _NONE_FIXED
+            fixed = np.zeros(0, np.bool_)
         sums, features = self._sums, _parameter_rows(self._field.features)
 
         def work(part: int) -> None:

@@ -3,7 +3,8 @@
 from contextlib import closing
 
 import numpy as np
-from triquad_format.records.region import MapRecord
+from triquad_format.records.arrays import Floats
+from triquad_format.records.region import MapRecord, Region
 from triquad_format.records.replay_rays import are_held_out
 from triquad_map.field_fit import MapFit, PlaceFits, Places, in_cube, map_fit
 from triquad_map.record_view import NoCompiledCodeError, open_view
@@ -14,20 +15,27 @@ def recorded_fit(record: MapRecord) -> MapFit | None:
 
     ``None``: it has no held-out rays, which are training state, or numba is missing.
     """
-    settings = record.settings
+    ends = {number: _held_out_ends(region, record) for number, region in enumerate(record.regions)}
+    ends = {number: points for number, points in ends.items() if len(points)}
+    if not ends:
+        return None
     try:
         view = open_view(record)
     except NoCompiledCodeError:
         return None
     fits = []
     with closing(view):
-        for region, seen in zip(record.regions, view.region_views, strict=True):
-            if region.training is None:
-                continue
-            rays = region.training.rays
-            ends = rays.ends_m(settings)[are_held_out(rays.ends)].astype(np.float32)
-            ends = ends[in_cube(ends, settings)]
-            if len(ends):
-                sdf = seen.engine.evaluate(ends, gradient=False).sdf
-                fits.append((seen.centre, PlaceFits.of(Places.of(ends, settings), sdf)))
+        for number, points in ends.items():
+            region = view.region_views[number]
+            sdf = region.engine.evaluate(points, gradient=False).sdf
+            fits.append((region.centre, PlaceFits.of(Places.of(points, record.settings), sdf)))
     return map_fit(fits)
+
+
+def _held_out_ends(region: Region, record: MapRecord) -> Floats:
+    """Return where a region's held-out rays end in its cube [N, 3], metres from its centre."""
+    if region.training is None:
+        return np.zeros((0, 3), np.float32)
+    rays = region.training.rays
+    ends = rays.ends_m(record.settings)[are_held_out(rays.ends)].astype(np.float32)
+    return ends[in_cube(ends, record.settings)]
