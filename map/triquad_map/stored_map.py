@@ -1,4 +1,4 @@
-"""A map file that answers without being read whole: parts are read when a point needs them."""
+"""A map file, or a checkpoint, that answers unread: parts are read when a point needs them."""
 
 import dataclasses
 from collections.abc import Iterable, Mapping
@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from triquad_format.mapfile.checkpoint import open_index
 from triquad_format.mapfile.container import RandomAccess
-from triquad_format.mapfile.index import FileBytes, MapIndex, OpenFile, files_in, named
+from triquad_format.mapfile.index import FileBytes, named
 from triquad_format.mapfile.manifest import Entry, Manifest
 from triquad_format.mapfile.parts.part import (
     EVIDENCE,
@@ -38,13 +39,13 @@ from triquad_map.view import FieldAnswer
 
 
 class StoredMap:
-    """A map file, open for reading. One thread at a time may use it."""
+    """A map file or checkpoint, open for reading. One thread at a time may use it."""
 
-    def __init__(self, source: RandomAccess, open_file: OpenFile | None = None) -> None:
-        """Read the manifest; arguments and errors are those of :class:`MapIndex`."""
+    def __init__(self, source: RandomAccess) -> None:
+        """Read the manifest; errors are those of :func:`open_index`."""
         self.name = source.name
         with named(self.name):
-            self._index = MapIndex(source, open_file)
+            self._index = open_index(source)
         self._settings = self.manifest.facts.settings
         self._loaded: set[PartKey] = set()
         self._by_key = {entry.key: entry for entry in self.manifest.entries}
@@ -54,7 +55,7 @@ class StoredMap:
 
     @classmethod
     def open(cls, path: Path | str) -> "StoredMap":
-        """Return the map in a file; other files that it needs lie in the same folder.
+        """Return the map in a file, or of a checkpoint in its store.
 
         Raises:
             MapFileError: it is not a map file, is damaged, or needs a newer reader.
@@ -62,7 +63,7 @@ class StoredMap:
         """
         source = FileBytes(Path(path))
         try:
-            return cls(source, files_in(Path(path).parent))
+            return cls(source)
         except BaseException:
             source.close()
             raise
@@ -79,7 +80,7 @@ class StoredMap:
         return self._index.manifest
 
     def close(self) -> None:
-        """Close all files."""
+        """Close the file."""
         self._index.close()
 
     def query(self, points: NDArray[np.floating], gradient: bool = False) -> FieldAnswer:
@@ -136,7 +137,7 @@ class StoredMap:
         """Return the payload of a part that the manifest lists, as it is written.
 
         Raises:
-            MapFileError: the part is damaged, or the file that contains it is missing or another.
+            MapFileError: the part is missing or damaged.
         """
         with named(self.name):
             return self._index.payload(entry)

@@ -236,8 +236,8 @@ class ClientOperations(QueryOperations):
     def reset(self, bounds: Bounds | None = None) -> Call[ResetReply]:
         """Forget what was learnt within ``bounds``.
 
-        A server with a store first writes the map as it is to a checkpoint, which stays for its
-        setting ``store.protect_h``, whatever else happens.
+        A server with a store first writes the map as it is to a checkpoint, which stays until so
+        many more resets as its setting ``store.keep_resets`` says.
 
         Args:
             bounds: corners of a box, metres, map frame; ``None``: everything is forgotten.

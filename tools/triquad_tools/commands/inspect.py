@@ -21,7 +21,6 @@ from triquad_tools.mapfiles.diff import compare, difference, print_diff
 from triquad_tools.mapfiles.object_changes import object_changes, print_objects
 from triquad_tools.mapfiles.source import (
     Access,
-    MissingFilesError,
     chosen_file,
     is_endpoint,
     map_file,
@@ -31,7 +30,7 @@ from triquad_tools.mapfiles.store_log import print_log, read_log
 from triquad_tools.mapfiles.summary import print_summary, summarise
 
 _COMMAND = "triquad-inspect"
-_DAMAGE = (DamagedMapFileError, FailedCheckError, MissingFilesError)
+_DAMAGE = (DamagedMapFileError, FailedCheckError)
 _TILE_M = 6.4
 _LEAST_TILE_M = 0.1
 _ROWS = 20

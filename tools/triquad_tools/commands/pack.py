@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from triquad_format.errors import DamagedMapFileError
+from triquad_format.mapfile.checkpoint import read_checkpoint
 from triquad_format.mapfile.checkpoint_folder import checkpoint_file, checkpoint_files, set_aside
 from triquad_format.mapfile.parts.part import EVIDENCE, REGION, TRAINING, VERTICES
 from triquad_format.records.field_settings import check_range
@@ -184,9 +185,16 @@ def _pack_map(options: argparse.Namespace, path: Path) -> int:
     precision = chosen_precision(options.precision, options.max_error)
     training = not options.no_training and precision.max_error_m is None
     source, complete = _source(options, path, box=_box(options.crop), training=training)
-    written = pack_map(source, precision, options.output, bytes_before=path.stat().st_size)
+    written = pack_map(source, precision, options.output, bytes_before=_bytes_of(path))
     print_line(f"{options.output}: {written}")
     return OK if complete else FAILED
+
+
+def _bytes_of(path: Path) -> int:
+    """Return the bytes of a map file, or of a checkpoint with its parts."""
+    checkpoint = read_checkpoint(path)
+    parts = 0 if checkpoint is None else checkpoint.manifest.stored_bytes
+    return path.stat().st_size + parts
 
 
 def _export(options: argparse.Namespace, path: Path) -> int:

@@ -1,14 +1,13 @@
-"""Sources of maps: a file with those it needs, a folder of checkpoints, a server."""
+"""Sources of maps: a file, a folder of checkpoints, a server."""
 
 import re
 import tempfile
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from triquad_format.mapfile.checkpoint_folder import checkpoint_at, checkpoint_files, map_folder
-from triquad_format.mapfile.index import FileBytes, MapIndex, file_in, named
 from triquad_format.mapfile.parts.part import TRAINING_TOPICS
 from triquad_format.mapfile.reader import MapFile, read_map_file
 from triquad_format.records.arrays import Doubles
@@ -32,10 +31,6 @@ class Access:
 
     map_name: str
     config: Path | None = None  # of Zenoh, with credentials
-
-
-class MissingFilesError(ToolError):
-    """A map file whose parts lie in files that are not there."""
 
 
 class NothingLeftError(ToolError):
@@ -105,18 +100,12 @@ def read_whole(path: Path) -> MapFile:
     """Return the map in a file, checked.
 
     Raises:
-        MissingFilesError: it needs other files that are not in its folder; the text names them.
         ToolError: it is a folder.
         MapFileError: it is not a map file, is damaged, or needs a newer reader.
         OSError: it cannot be read.
     """
     if path.is_dir():
         raise ToolError(f"{path} is a folder: --log lists the checkpoints in it")
-    missing = [name for name in _needed_files(path) if not file_in(path.parent, name).exists()]
-    if missing:
-        raise MissingFilesError(
-            f"{path} needs {', '.join(missing)}: not in its folder, copy what is missing there"
-        )
     return read_map_file(path)
 
 
@@ -128,7 +117,6 @@ def read_source(path: Path, box: Box | None, training: bool) -> SourceMap:
     Raises:
         NothingLeftError: no region lies in the box.
         FormatError: the box is empty, or the file cannot be read.
-        ToolError: it needs other files, which are missing.
         OSError: it cannot be read.
     """
     source = None if box is None else _box(path, box, training)
@@ -155,8 +143,3 @@ def _box(path: Path, box: Box, training: bool) -> SourceMap | None:
         if training and topics & set(TRAINING_TOPICS):
             return None
         return SourceMap(stored.box(box[0], box[1]), stored.manifest.stamp_ns or None)
-
-
-def _needed_files(path: Path) -> list[str]:
-    with closing(FileBytes(path)) as source, named(str(path)):
-        return list(MapIndex(source).manifest.files)

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from triquad_format.mapfile.manifest import Entry
 from triquad_format.mapfile.parts.part import TRAINING_TOPICS
 from triquad_format.mapfile.reader import MapFile
 from triquad_format.records.arrays import Bytes, Doubles
@@ -23,10 +24,9 @@ from triquad_tools.mapfiles.recorded_fit import recorded_fit
 class TopicSummary:
     """The parts of one topic, without the manifest."""
 
-    parts: int  # of the map, wherever they lie
+    parts: int
     bytes: int  # of these, unpacked
-    stored_parts: int  # of these in this file
-    stored_bytes: int  # that these take in this file
+    stored_bytes: int  # that these take where they are stored
 
 
 @dataclass(frozen=True)
@@ -57,12 +57,10 @@ class MapSummary:
     metadata: dict[str, str]
     map: str
     epoch: int
-    other_files: tuple[str, ...]  # of the same folder, that hold parts of this map
     settings: FieldSettings
     vertices: int
     parameters: int
-    # of the file without training state; None: not all parameters are in this file, or none is
-    bytes_per_parameter: float | None
+    bytes_per_parameter: float | None  # of the file without training state; None: there are none
     surface_m3: float
     free_m3: float
     progress: MapProgress
@@ -79,19 +77,16 @@ def summarise(file: MapFile) -> MapSummary:
     regions = tuple(_summarise_region(record, region) for region in record.regions)
     parts = _summarise_parts(file)
     parameters = sum(region.parameters for region in regions)
-    other_files = file.manifest.files
     training_bytes = sum(parts[t].stored_bytes for t in TRAINING_TOPICS if t in parts)
-    whole = parameters > 0 and not other_files
     return MapSummary(
         bytes=file.size,
         metadata=file.metadata,
         map=record.name,
         epoch=record.epoch,
-        other_files=other_files,
         settings=record.settings,
         vertices=sum(sum(region.vertices.values()) for region in regions),
         parameters=parameters,
-        bytes_per_parameter=(file.size - training_bytes) / parameters if whole else None,
+        bytes_per_parameter=(file.size - training_bytes) / parameters if parameters else None,
         surface_m3=sum(region.surface_m3 for region in regions),
         free_m3=sum(region.free_m3 for region in regions),
         progress=record.progress,
@@ -110,10 +105,10 @@ def print_summary(name: str, summary: MapSummary) -> None:
         title = f"region {region.index} at {list(region.centre_m)} m"
         print_rows(title, list(_region_facts(region)), align="left")
     rows = [
-        (topic, f"{p.parts:,}", f"{p.bytes:,}", f"{p.stored_parts:,}", f"{p.stored_bytes:,}")
+        (topic, f"{p.parts:,}", f"{p.bytes:,}", f"{p.stored_bytes:,}")
         for topic, p in summary.parts.items()
     ]
-    print_columns(("part", "count", "bytes", "in this file", "bytes stored"), rows)
+    print_columns(("part", "count", "bytes", "bytes stored"), rows)
     for check in summary.checks:
         print_line(f"  ok: {check}")
 
@@ -121,8 +116,6 @@ def print_summary(name: str, summary: MapSummary) -> None:
 def _facts(summary: MapSummary) -> Iterator[Row]:
     for key in ("format_version", "producer", "created"):
         yield Row(key.replace("_", " "), summary.metadata.get(key, "not given"))
-    files = ", ".join(summary.other_files)
-    yield Row("other files", f"{files}: needed, and there" if files else "none needed")
     yield Row("regions", str(len(summary.regions)))
     yield Row("vertices", f"{summary.vertices:,}")
     share = summary.bytes_per_parameter
@@ -213,14 +206,11 @@ def _rounded(place: Doubles) -> tuple[float, ...]:
 
 
 def _summarise_parts(file: MapFile) -> dict[str, TopicSummary]:
-    """Return the parts by topic, those in other files included."""
-    sizes: dict[str, list[int]] = {}
-    stored: dict[str, list[int]] = {}
+    """Return the parts by topic."""
+    by_topic: dict[str, list[Entry]] = {}
     for entry in file.manifest.entries:
-        sizes.setdefault(entry.key.topic, []).append(entry.size)
-        if entry.file is None:
-            stored.setdefault(entry.key.topic, []).append(entry.stored)
+        by_topic.setdefault(entry.key.topic, []).append(entry)
     return {
-        topic: TopicSummary(len(own), sum(own), len(here := stored.get(topic, [])), sum(here))
-        for topic, own in sizes.items()
+        topic: TopicSummary(len(own), sum(e.size for e in own), sum(e.stored for e in own))
+        for topic, own in by_topic.items()
     }

@@ -11,7 +11,6 @@ from triquad_format.mapfile.checkpoint_folder import (
     CheckpointFile,
     checkpoint_files,
     map_folder,
-    newest_of_each,
     open_manifest,
 )
 from triquad_format.mapfile.metadata import utc_time
@@ -60,8 +59,8 @@ class History:
     def moments(self) -> tuple[Moment, ...]:
         """The checkpoints that can be shown as far as is known, the oldest first."""
         with self._reading:
-            files = sorted(self._moments.keys() - self._damaged.keys(), reverse=True)
-            return tuple(self._moments[file] for file in sorted(newest_of_each(files)))
+            files = self._moments.keys() - self._damaged.keys()
+            return tuple(self._moments[file] for file in sorted(files))
 
     @property
     def damaged(self) -> tuple[str, ...]:
