@@ -22,7 +22,7 @@ from triquad_format.mapfile.manifest import (
     manifest_body,
     manifest_in,
 )
-from triquad_format.mapfile.metadata import FORMAT_VERSION, utc_time
+from triquad_format.mapfile.metadata import FORMAT_VERSION, PRODUCER, utc_time
 from triquad_format.mapfile.part_files import PartFiles
 from triquad_format.mapfile.parts.body import PartBody, unpack_body
 from triquad_format.mapfile.parts.pack import pack_part
@@ -60,7 +60,11 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> MapFileInfo:
         FormatError: it lists more than it may.
         OSError: it cannot be written.
     """
-    body = {**manifest_body(checkpoint.manifest), "undoes": checkpoint.undoes}
+    body = {
+        **manifest_body(checkpoint.manifest),
+        "producer": PRODUCER,
+        "undoes": checkpoint.undoes,
+    }
     if checkpoint.restored is not None:
         body["restored"] = vars(checkpoint.restored)
     payload = pack_part(PartKey(MANIFEST), body).payload
@@ -105,8 +109,10 @@ class CheckpointIndex:
         self.manifest.check_total(self.manifest.stored_bytes)
         self.checkpoint = _checkpoint(self.manifest, body)
         self.size = source.size + self.manifest.stored_bytes  # bytes, with all parts
-        facts = self.manifest.facts
-        self.metadata = {"format_version": f"{FORMAT_VERSION}", "map": facts.name}
+        self.metadata = {
+            "format_version": f"{FORMAT_VERSION}",
+            "producer": body.value("producer", str),
+        }
         if self.manifest.stamp_ns:
             self.metadata["created"] = utc_time(self.manifest.stamp_ns)
 

@@ -84,7 +84,7 @@ def read_log(store: Path) -> StoreLog:
 def print_log(log: StoreLog) -> None:
     """Print a table of the checkpoints, and what is wrong with those that do not open."""
     print_line(f"{log.folder}: {len(log.checkpoints)} checkpoints, {log.bytes:,} bytes")
-    titles = ("epoch", "time", "bytes", "changed", "parts", "changed", "regions changed", "opens")
+    titles = ("epoch", "time", "bytes", "new bytes", "parts", "new", "regions changed", "opens")
     print_columns(titles, [_row(checkpoint) for checkpoint in log.checkpoints])
     for checkpoint in log.checkpoints:
         if checkpoint.problem is not None:
