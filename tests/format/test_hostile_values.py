@@ -328,7 +328,6 @@ def column(name: str, number: int, value: int) -> Edit:
 
 HOSTILE_MANIFESTS: dict[str, Edit] = {
     "topic": column("topic", 1, 200),
-    "file": column("file", 1, 1),
     "plane": column("plane", 2, 3),
     "cell": column("cell", 2, -1),
     "a cell that is not there": column("cell", 2, 2**60),
@@ -336,7 +335,6 @@ HOSTILE_MANIFESTS: dict[str, Edit] = {
     "a size less": column("bytes", 1, 100),
     "digest": column("sha256", 1, 0),
     "epoch": column("epoch", 1, -1),
-    "time": column("stamp_ns", 1, -1),
     "a place before the file": column("offset", 1, -1),
     "a place behind the file": column("offset", 1, 2**62),
     "a place within another part": column("offset", 1, 200),

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from fuzz.choices import Mutation
-from fuzz.damage import DAMAGE, add_bombs
+from fuzz.damage import DAMAGE, add_bombs, cut, flip_bits
 from fuzz.forgery import FORGERY, forge_bombs
 from fuzz.valid_maps import READERS, ValidMap, valid_maps
 from hypothesis import HealthCheck, Phase, given, seed, settings
@@ -115,7 +115,7 @@ def _outcome(maps: list[ValidMap], data: st.DataObject) -> tuple[str, str]:
     name = data.draw(st.sampled_from(sorted(valid.files)))
     # Those of a store have other checksums: a forgery would be damage.
     in_store = not name.endswith(".triquad")
-    mutation: Mutation = data.draw(st.sampled_from(DAMAGE if in_store else _MUTATIONS))
+    mutation: Mutation = data.draw(st.sampled_from((flip_bits, cut) if in_store else _MUTATIONS))
     mutant = mutation(data.draw, valid.files[name])
     forged = mutation in FORGERY or mutation is forge_bombs
     file = valid.path.parent / name
