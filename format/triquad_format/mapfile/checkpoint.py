@@ -27,7 +27,7 @@ from triquad_format.mapfile.part_files import PartFiles
 from triquad_format.mapfile.parts.body import PartBody, unpack_body
 from triquad_format.mapfile.parts.pack import pack_part
 from triquad_format.mapfile.parts.part import MANIFEST, MAX_PART_BYTES, PartKey
-from triquad_format.mapfile.writer import MapFileInfo
+from triquad_format.mapfile.writer import MapFileInfo, check_totals
 
 MAGIC = b"triquad checkpoint\n"
 
@@ -57,9 +57,11 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> MapFileInfo:
     """Write a checkpoint whose parts are there, all of it or nothing; return size and digest.
 
     Raises:
-        FormatError: it lists more than it may.
+        FormatError: it lists more than it may, or the map is too large to be read.
         OSError: it cannot be written.
     """
+    entries = checkpoint.manifest.entries
+    check_totals(sum(entry.size for entry in entries), checkpoint.manifest.stored_bytes)
     body = {
         **manifest_body(checkpoint.manifest),
         "producer": PRODUCER,

@@ -17,7 +17,7 @@ from triquad_format.mapfile.durable_file import naming, sync_folder
 from triquad_format.mapfile.index import FileBytes
 from triquad_format.mapfile.manifest import Entry
 from triquad_format.mapfile.parts.part import MAX_PART_BYTES, Part
-from triquad_format.mapfile.writer import compressed
+from triquad_format.mapfile.writer import check_part, compressed
 
 PARTS_NAME = "parts"
 """The folder of the parts, in the folder of the checkpoints."""
@@ -93,13 +93,16 @@ class NewParts:
         ``known`` is what the key had in an earlier checkpoint, which is returned where it is equal.
 
         Raises:
+            FormatError: it is too large to be read.
             OSError: it cannot be written.
         """
+        check_part(part)
         digest = hashlib.sha256(part.payload)
         if known is not None and known.sha256 == digest.digest():
             return known
         path = self._files.folder / digest.hexdigest()
-        with contextlib.suppress(DamagedMapFileError):
+        # One that cannot be read is as good as one that is damaged.
+        with contextlib.suppress(DamagedMapFileError, OSError):
             return self._entry(part, digest.digest(), stored=self._files.check(path.name))
         frame = compressed(part)
         temporary = path.with_name(f".{path.name}.tmp")

@@ -171,12 +171,7 @@ class _PartsWriter:
         self._mcap.add_metadata(METADATA_NAME, metadata)
         self._mcap.finish()  # type: ignore[no-untyped-call]
         size = self._stream.size
-        _check_total(size)
-        if self._total > total_limit(size):
-            raise FormatError(
-                f"the map's parts shrink from {self._total} to {size} bytes: readers take that "
-                "for an attack"
-            )
+        check_totals(self._total, size)
         return MapFileInfo(size, self._stream.digest.hexdigest(), self._facts.epoch)
 
     def _stored(self, part: Part) -> Entry:
@@ -194,11 +189,7 @@ class _PartsWriter:
     def _put(self, part: Part) -> tuple[int, int]:
         """Write a part; return where its chunk begins, and bytes up to the next."""
         topic = part.key.topic
-        if len(part.payload) > MAX_PART_BYTES:
-            raise FormatError(
-                f"the part {topic} has {len(part.payload)} bytes; "
-                f"a map file holds parts of at most {MAX_PART_BYTES}",
-            )
+        check_part(part)
         self._total += len(part.payload)
         _check_total(self._total)
         data = part.payload
@@ -221,6 +212,25 @@ class _PartsWriter:
                 encoding = PREVIEW_ENCODING
             self._channels[topic] = self._mcap.register_channel(topic, encoding, schema)
         return self._channels[topic]
+
+
+def check_part(part: Part) -> None:
+    """Raise :class:`FormatError` for a part that is too large to be read."""
+    if len(part.payload) > MAX_PART_BYTES:
+        raise FormatError(
+            f"the part {part.key.topic} has {len(part.payload)} bytes; "
+            f"a map file holds parts of at most {MAX_PART_BYTES}",
+        )
+
+
+def check_totals(unpacked: int, stored: int) -> None:
+    """Raise :class:`FormatError` unless parts of so many bytes together can be read."""
+    _check_total(max(unpacked, stored))
+    if unpacked > total_limit(stored):
+        raise FormatError(
+            f"the map's parts shrink from {unpacked} to {stored} bytes: readers take that "
+            "for an attack"
+        )
 
 
 def _check_total(size: int) -> None:

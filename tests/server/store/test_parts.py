@@ -249,6 +249,16 @@ def test_on_a_full_disk_nothing_is_lost_and_nothing_is_left(store, monkeypatch):
     store.write(changes(grown(3, 3)))
 
 
+@pytest.mark.parametrize("limit", ["writer.MAX_PART_BYTES", "writer.MAX_MAP_BYTES"])
+def test_what_could_not_be_read_again_is_not_written(store, monkeypatch, limit):
+    drive(store, 1)
+    before = sorted(store.folder.rglob("*"))
+    monkeypatch.setattr(f"triquad_format.mapfile.{limit}", 200)
+    with pytest.raises(StoreError, match="000000003.checkpoint cannot be written: .* at most 200"):
+        store.write(changes(grown(3, 3)))
+    assert sorted(store.folder.rglob("*")) == before
+
+
 def test_parts_stay_where_a_checkpoint_needs_a_newer_release(store, monkeypatch, caplog):
     """Which parts it names is not known."""
     drive(store, 2)
