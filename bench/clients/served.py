@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 from triquad_client import Client, connect
-from triquad_format.mapfile.checkpoint_folder import checkpoint_name
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.region import MapRecord
@@ -66,7 +65,7 @@ def served(record: MapRecord | None = None, arguments: Sequence[str] = ()) -> It
         if record is not None:
             store = folder / "store" / MAP
             store.mkdir(parents=True)
-            write_map(record, store / checkpoint_name(record.epoch, complete=True))
+            write_map(record, store / f"epoch-{record.epoch:09d}.triquad")
         with (
             DemoServer(folder, MAP, arguments) as server,
             connect(server.endpoint, MAP, timeout_s=_TIMEOUT_S) as client,

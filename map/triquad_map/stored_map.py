@@ -1,12 +1,13 @@
-"""A map file that is read part by part, as far as it is needed."""
+"""A map file, or a checkpoint, that is read part by part, as far as it is needed."""
 
 import dataclasses
 from collections.abc import Iterable
 from pathlib import Path
 
 from numpy.typing import ArrayLike
+from triquad_format.mapfile.checkpoint import open_index
 from triquad_format.mapfile.container import RandomAccess
-from triquad_format.mapfile.index import FileBytes, MapIndex, OpenFile, files_in, named
+from triquad_format.mapfile.index import FileBytes, named
 from triquad_format.mapfile.manifest import Entry, Manifest
 from triquad_format.mapfile.parts.part import (
     FIELD_TOPICS,
@@ -24,19 +25,19 @@ from triquad_format.records.region import MapRecord
 
 
 class StoredMap:
-    """A map file, open for reading. One thread at a time may use it."""
+    """A map file or checkpoint, open for reading. One thread at a time may use it."""
 
-    def __init__(self, source: RandomAccess, open_file: OpenFile | None = None) -> None:
-        """Read the manifest; arguments and errors are those of :class:`MapIndex`."""
+    def __init__(self, source: RandomAccess) -> None:
+        """Read the manifest; errors are those of :func:`open_index`."""
         self.name = source.name
         with named(self.name):
-            self._index = MapIndex(source, open_file)
+            self._index = open_index(source)
         self._settings = self.manifest.facts.settings
         self._indices = [e.key.region for e in self.manifest.entries if e.key.topic == REGION]
 
     @classmethod
     def open(cls, path: Path | str) -> "StoredMap":
-        """Return the map in a file; other files that it needs lie in the same folder.
+        """Return the map in a file, or of a checkpoint in its store.
 
         Raises:
             MapFileError: it is not a map file, is damaged, or needs a newer reader.
@@ -44,7 +45,7 @@ class StoredMap:
         """
         source = FileBytes(Path(path))
         try:
-            return cls(source, files_in(Path(path).parent))
+            return cls(source)
         except BaseException:
             source.close()
             raise
@@ -61,7 +62,7 @@ class StoredMap:
         return self._index.manifest
 
     def close(self) -> None:
-        """Close all files."""
+        """Close the file."""
         self._index.close()
 
     def record(self, training: bool = True) -> MapRecord:
@@ -107,7 +108,7 @@ class StoredMap:
         """Return the payload of a part that the manifest lists, as it is written.
 
         Raises:
-            MapFileError: the part is damaged, or the file that contains it is missing or another.
+            MapFileError: the part is missing or damaged.
         """
         with named(self.name):
             return self._index.payload(entry)

@@ -15,10 +15,6 @@ class StoreError(ServerError):
     """Checkpoints cannot be read or written."""
 
 
-class StoreBaseError(StoreError):
-    """Files with parts of the newest checkpoint are damaged: a complete one must be written."""
-
-
 class LastCheckpointError(StoreError):
     """The server stops, and what was mapped since its last checkpoint is lost."""
 

@@ -191,8 +191,7 @@ class Service:
         resets = Resets(
             self._mapper,
             checkpoints,
-            self._served.store,
-            protect_h=self._settings.store.protect_h,
+            keep_resets=self._settings.store.keep_resets,
             trails=self._trails,
         )
         self._operations.serve(

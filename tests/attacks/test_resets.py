@@ -1,5 +1,6 @@
 """Whoever may reset the map, on purpose or by mistake, does not destroy it."""
 
+import resource
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -93,14 +94,16 @@ def test_what_was_learnt_while_the_map_is_being_kept_is_kept_too(tmp_path: Path)
 
 
 def test_a_reset_is_refused_where_the_map_cannot_be_kept(tmp_path: Path) -> None:
-    with served(tmp_path, "--set", "store.protect_bytes=30000") as (server, client):
+    with served(tmp_path) as (server, client):
         servers.learn(client)
-        kept = client.reset().kept_epoch
-        servers.learn(client)
-        with pytest.raises(RefusedError, match="nothing was reset.*store.protect_bytes = 30,000"):
+        _, hard = resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE)
+        resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE, (1000, hard))
+        with pytest.raises(RefusedError, match="nothing was reset.*File too large"):
             client.reset()
         assert client.status().regions == 1
-        assert kept is not None
+        resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE, (hard, hard))
+        kept = client.reset().kept_epoch
+        assert client.status().regions == 0
         stop(server)
     (folder,) = (tmp_path / "store").iterdir()
     (file,) = (file for file in checkpoint_files(folder) if file.epoch == kept)

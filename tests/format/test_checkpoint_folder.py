@@ -1,11 +1,16 @@
 """A folder of checkpoints: which there are, and the one of an epoch or a time."""
 
+import hashlib
+import os
 from pathlib import Path
 
+import msgpack
 import pytest
+import zstandard
+from support.checkpoint_folder import write_record
 from support.map_records import random_record
-from support.mapfile_edit import write_record
-from triquad_format.errors import DamagedMapFileError, MapFileError
+from triquad_format.errors import DamagedMapFileError, MapFileError, UnsupportedMapFileError
+from triquad_format.mapfile.checkpoint import MAGIC, read_checkpoint
 from triquad_format.mapfile.checkpoint_folder import (
     CheckpointFile,
     checkpoint_at,
@@ -13,63 +18,54 @@ from triquad_format.mapfile.checkpoint_folder import (
     checkpoint_files,
     checkpoint_name,
     map_folder,
-    newest_of_each,
     open_manifest,
 )
 from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.writer import write_map
+from triquad_format.recovery.recovered_map import recover
+from triquad_map.stored_map import StoredMap
 
 NOON_NS = 1_767_268_800 * 10**9  # 2026-01-01T12:00:00Z
 HOUR_NS = 3600 * 10**9
 
 
-def write_checkpoint(
-    folder: Path, epoch: int, complete: bool = True, hours: int | None = 0
-) -> Path:
+def write_checkpoint(folder: Path, epoch: int, hours: int | None = 0) -> Path:
     """A checkpoint of so many hours after noon; ``None``: its writer was not given the time."""
-    path = folder / checkpoint_name(epoch, complete)
-    stamp_ns = None if hours is None else NOON_NS + hours * HOUR_NS
-    write_record(path, random_record(1, points=3, epoch=epoch), stamp_ns=stamp_ns)
-    return path
+    stamp_ns = 0 if hours is None else NOON_NS + hours * HOUR_NS
+    return write_record(folder, random_record(1, points=3, epoch=epoch), stamp_ns)
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Epochs 3, 5 and 8, an hour between them; 5 is there twice; and what is no checkpoint."""
+    """Epochs 3, 5 and 8, an hour between them, the second as a map file; and other files."""
     folder = tmp_path / "default"
     folder.mkdir()
-    for epoch, complete, hours in ((3, True, 0), (5, False, 1), (5, True, 1), (8, False, 2)):
-        write_checkpoint(folder, epoch, complete, hours)
-    for other in (".epoch-000000009.triquad.1a2b3c4d.tmp", "epoch-9.triquad", "notes.txt"):
+    write_checkpoint(folder, 3)
+    backup = folder / "epoch-000000005.triquad"
+    write_map(random_record(1, points=3, epoch=5), backup, stamp_ns=NOON_NS + HOUR_NS)
+    write_checkpoint(folder, 8, hours=2)
+    for other in (".epoch-000000009.checkpoint.1a2b3c4d.tmp", "epoch-9.checkpoint", "notes.txt"):
         (folder / other).write_bytes(b"")
     return folder
 
 
 def test_names() -> None:
-    assert checkpoint_name(7, True) == "epoch-000000007.triquad"
-    assert checkpoint_name(7, False) == "epoch-000000007.delta.triquad"
+    assert checkpoint_name(7) == "epoch-000000007.checkpoint"
     for epoch in (0, 7, 10**9, 2**63 - 1):
-        for complete in (True, False):
-            path = Path("maps") / checkpoint_name(epoch, complete)
-            assert checkpoint_file(path) == CheckpointFile(epoch, complete, path)
+        path = Path("maps") / checkpoint_name(epoch)
+        assert checkpoint_file(path) == CheckpointFile(epoch, path)
     for other in ("epoch-7.triquad", "epoch-000000007.triquad.tmp", "epoch-00000000٧.triquad"):
         assert checkpoint_file(Path(other)) is None
 
 
 def test_listing_is_newest_first(folder: Path) -> None:
-    files = checkpoint_files(folder)
-    assert [(f.epoch, f.complete) for f in files] == [(8, False), (5, True), (5, False), (3, True)]
-    assert [(f.epoch, f.complete) for f in newest_of_each(files)] == [
-        (8, False),
-        (5, True),
-        (3, True),
-    ]
+    assert [file.epoch for file in checkpoint_files(folder)] == [8, 5, 3]
 
 
 @pytest.mark.parametrize(("when", "epoch"), [("3", 3), ("4", 3), ("5", 5), ("7", 5), ("8", 8)])
 def test_by_epoch(folder: Path, when: str, epoch: int) -> None:
     file = checkpoint_at(folder, when)
     assert file.epoch == epoch
-    assert file.complete == (epoch != 8)
     assert read_map(file.path).epoch == epoch
 
 
@@ -113,7 +109,7 @@ def test_an_empty_folder(tmp_path: Path) -> None:
 
 
 def test_by_time_damaged_and_unstamped_files_are_passed_over(folder: Path) -> None:
-    (folder / checkpoint_name(8, False)).write_bytes(b"damaged")
+    (folder / checkpoint_name(8)).write_bytes(b"damaged")
     assert checkpoint_at(folder, "2030-01-01T00:00:00Z").epoch == 5
     write_checkpoint(folder, 42, hours=None)
     assert checkpoint_at(folder, "2030-01-01T00:00:00Z").epoch == 5
@@ -124,7 +120,7 @@ def test_open_manifest(folder: Path) -> None:
     manifest = open_manifest(checkpoint_at(folder, "5"))
     assert manifest.facts.epoch == 5
     assert manifest.stamp_ns == NOON_NS + HOUR_NS
-    broken = folder / checkpoint_name(3, True)
+    broken = folder / checkpoint_name(3)
     broken.write_bytes(broken.read_bytes()[:-50])
     with pytest.raises(DamagedMapFileError, match=broken.name):
         open_manifest(checkpoint_at(folder, "3"))
@@ -148,3 +144,62 @@ def test_a_store_of_several_maps(folder: Path) -> None:
 def make(folder: Path) -> Path:
     folder.mkdir()
     return folder
+
+
+# What a checkpoint's file may hold
+
+
+@pytest.mark.parametrize("cut", [0, 10, 30, 60, 500, -1])
+def test_a_checkpoint_that_is_cut_is_refused(folder: Path, cut: int) -> None:
+    path = folder / checkpoint_name(8)
+    path.write_bytes(path.read_bytes()[:cut])
+    with pytest.raises(MapFileError, match=path.name):
+        open_manifest(CheckpointFile(8, path))
+
+
+def test_every_byte_of_a_checkpoint_is_checked(folder: Path) -> None:
+    path = folder / checkpoint_name(8)
+    data = path.read_bytes()
+    for at in range(0, len(data), 7):
+        path.write_bytes(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :])
+        with pytest.raises(MapFileError):
+            open_manifest(CheckpointFile(8, path))
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "text"),
+    [
+        ({"min_reader_version": 2}, UnsupportedMapFileError, "version 2"),
+        ({"undoes": 5}, DamagedMapFileError, "undoes"),
+        ({"restored": [1, 2]}, DamagedMapFileError, "restored"),
+        ({"restored": {"epoch": -1, "as_epoch": 2}}, DamagedMapFileError, "epoch = -1"),
+        ({"parts": {}}, DamagedMapFileError, "topic"),
+        ({"topics": []}, DamagedMapFileError, "topic"),
+    ],
+)
+def test_hostile_values_are_refused(
+    folder: Path, changes: dict[str, object], error: type[MapFileError], text: str
+) -> None:
+    path = folder / checkpoint_name(8)
+    body = msgpack.unpackb(zstandard.decompress(path.read_bytes()[51:]))
+    frame = zstandard.compress(msgpack.packb({**body, **changes}))
+    path.write_bytes(MAGIC + hashlib.sha256(frame).digest() + frame)
+    with pytest.raises(error, match=text):
+        read_checkpoint(path)
+
+
+def test_a_part_that_unpacks_to_more_than_is_listed_is_refused(folder: Path) -> None:
+    path = folder / checkpoint_name(8)
+    entry = open_manifest(CheckpointFile(8, path)).entries[0]
+    bomb = zstandard.compress(bytes(30 * 2**20))
+    (folder / "parts" / entry.name).write_bytes(bomb + bytes(max(entry.stored - len(bomb), 0)))
+    with pytest.raises(DamagedMapFileError, match=f"parts/{entry.name}"):
+        read_map(path)
+
+
+def test_a_pipe_keeps_no_reader_waiting(tmp_path: Path) -> None:
+    pipe = tmp_path / "map.triquad"
+    os.mkfifo(pipe)
+    for read in (read_map, StoredMap.open, recover):
+        with pytest.raises(MapFileError, match="is not a regular file"):
+            read(pipe)

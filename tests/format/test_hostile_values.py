@@ -240,7 +240,7 @@ HOSTILE_MANIFESTS: dict[str, Edit] = {
     "another region": column("region", 2, 9),
     "a column less": lambda b: b["parts"].pop("cell"),
     "a shorter column": lambda b: b["parts"].update(plane=b["parts"]["plane"] | {"shape": [1]}),
-    "a file twice": set_field("files", ["a", "a"]),
+    "a topic that is no text": lambda b: b["topics"].__setitem__(0, 5),
     "time of creation": set_field("created_ns", -1),
     "another topic": set_field("topic", MAP),
 }
@@ -251,21 +251,13 @@ def test_hostile_manifests(case: str) -> None:
     assert_refused(edited(DATA, MANIFEST, HOSTILE_MANIFESTS[case]))
 
 
-@pytest.mark.parametrize(
-    "name", ["", ".", "..", "../a.triquad", "/etc/passwd", "a\\b", "a\0b", "x" * 256]
-)
-def test_manifests_name_files_not_paths(name: str) -> None:
-    mutant = edited(DATA, MANIFEST, set_field("files", [name]))
-    assert_refused(mutant, "not the name of a file")
-
-
 def test_parts_of_a_region_without_a_head() -> None:
     """Queries, boxes and whole reads must all mind that the region is not there."""
 
     def elsewhere(manifest: Manifest) -> Manifest:
-        entry = manifest.own[2]
+        entry = manifest.entries[2]
         key = dataclasses.replace(entry.key, region=(9, 9, 9))
-        moved = dataclasses.replace(entry, key=key, file="other.triquad")
+        moved = dataclasses.replace(entry, key=key)
         return dataclasses.replace(manifest, entries=(*manifest.entries, moved))
 
     mutant = rewritten(DATA, manifest=elsewhere)
@@ -279,7 +271,7 @@ def test_parts_that_are_not_listed(topic: str) -> None:
     at = [part.topic for part in parts_of(DATA)].index(topic)
 
     def fewer(manifest: Manifest) -> Manifest:
-        own = manifest.own
+        own = manifest.entries
         return dataclasses.replace(manifest, entries=(*own[:at], *own[at + 1 :]))
 
     assert_refused(rewritten(DATA, manifest=fewer))

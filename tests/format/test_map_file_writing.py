@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from support.map_records import SMALL, assert_same, random_record, with_integers
-from support.mapfile_edit import write_pair, write_record
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
@@ -101,12 +100,17 @@ def test_total_limit_holds_while_writing(monkeypatch: pytest.MonkeyPatch, tmp_pa
     assert len(list(tmp_path.iterdir())) == 1
 
 
-@pytest.mark.parametrize("limit", ["MAX_ENTRIES", "MAX_FILES"])
-def test_manifest_limits(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, limit: str) -> None:
-    monkeypatch.setattr(f"triquad_format.mapfile.manifest.{limit}", 0)
+def test_part_limit(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("triquad_format.mapfile.writer.MAX_PART_BYTES", 200)
+    with pytest.raises(FormatError, match="at most 200"):
+        write_map(random_record(17), tmp_path / "map.triquad")
+
+
+def test_manifest_limit(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("triquad_format.mapfile.manifest.MAX_ENTRIES", 0)
     with pytest.raises(FormatError, match="at most"):
-        write_pair(tmp_path, random_record(17), random_record(17, epoch=8))
-    assert not (tmp_path / "next.triquad").exists()
+        write_map(random_record(17), tmp_path / "map.triquad")
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("step", ["write", "fsync", "replace"])
@@ -144,31 +148,6 @@ def test_file_is_synced_before_and_folder_after_the_rename(
     )
     write_map(random_record(20), tmp_path / "map.triquad")
     assert calls == ["fsync", "replace", "fsync"]
-
-
-def test_an_unchanged_part_keeps_its_epoch_and_time(tmp_path: Path) -> None:
-    """Also in a complete file, which stores it anew."""
-    base = random_record(21, indices=((0, 0, 0), (1, 0, 0)), epoch=3)
-    one, other = base.regions
-    tables = [np.negative(table.features) for table in other.tables]
-    changed = dataclasses.replace(
-        other,
-        tables=tuple(
-            dataclasses.replace(table, features=features)
-            for table, features in zip(other.tables, tables, strict=True)
-        ),
-    )
-    record = dataclasses.replace(base, epoch=5, regions=(one, changed))
-    first = write_record(tmp_path / "first.triquad", base, stamp_ns=10**9)
-    known = {entry.key: entry for entry in first.manifest.entries}
-    written = write_record(tmp_path / "second.triquad", record, stamp_ns=2 * 10**9, known=known)
-    assert_same(read_map(tmp_path / "second.triquad"), record)
-    assert not written.manifest.files
-    for entry in written.manifest.entries:
-        is_new = entry.key.topic == "/triquad/map" or (
-            entry.key.topic == "/triquad/vertices" and entry.key.region == (1, 0, 0)
-        )
-        assert (entry.epoch, entry.stamp_ns) == ((5, 2 * 10**9) if is_new else (3, 10**9))
 
 
 def test_what_shrinks_to_a_thousandth_is_read(tmp_path: Path) -> None:

@@ -1,13 +1,13 @@
 """docs/map-file.md is complete: a reader written from it alone answers as the project's does."""
 
 import dataclasses
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support import golden, map_records, spec_reader
+from support.checkpoint_folder import write_record
 from support.file_damage import flipped
 from support.map_records import SMALL
 from support.mapfile_edit import rewritten
@@ -126,7 +126,7 @@ def write_variant(path: Path, name: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("name", [golden.TRAINED, golden.NEXT, golden.PLAIN])
+@pytest.mark.parametrize("name", [golden.TRAINED, golden.PLAIN])
 def test_the_samples(name: str) -> None:
     answers = spec_reader.load(golden.FOLDER / name)
     points = probes(answers)
@@ -195,14 +195,6 @@ def test_one_place_is_read_by_the_index(tmp_path: Path) -> None:
         assert file.file.bytes_read < path.stat().st_size / 4
 
 
-def test_one_place_of_a_map_in_two_files() -> None:
-    path = golden.FOLDER / golden.NEXT
-    points = probes(spec_reader.load(path), 500)
-    file, parts = spec_reader.read_near(path, points)
-    assert file.bases[1].bytes_read > 0
-    assert_agree(Map(file.values, parts), read_map(path), points)
-
-
 def test_a_damaged_part_is_refused_by_the_index(tmp_path: Path) -> None:
     path = write_variant(tmp_path / "map.triquad", "a training state")
     file = spec_reader.MapFile(path)
@@ -213,6 +205,25 @@ def test_a_damaged_part_is_refused_by_the_index(tmp_path: Path) -> None:
         spec_reader.MapFile(path).read(row)
 
 
+# Section 10
+
+
+def test_a_checkpoint_is_read(tmp_path: Path) -> None:
+    record = golden.golden_records()[golden.TRAINED]
+    path = write_record(tmp_path, record)
+    answers = spec_reader.load_checkpoint(path)
+    assert_agree(answers, read_map(path), probes(answers))
+
+
+@pytest.mark.parametrize("file", ["epoch-*.checkpoint", "parts/*"])
+def test_a_damaged_checkpoint_is_refused(tmp_path: Path, file: str) -> None:
+    path = write_record(tmp_path, VARIANTS["support"])
+    damaged = sorted(tmp_path.glob(file))[0]
+    damaged.write_bytes(flipped(damaged.read_bytes(), damaged.stat().st_size // 2))
+    with pytest.raises((RefusedError, spec_reader.zstandard.ZstdError)):
+        spec_reader.load_checkpoint(path)
+
+
 # What must be refused
 
 
@@ -221,13 +232,6 @@ def test_a_flipped_bit_of_data_or_summary_is_refused(tmp_path: Path, at: int) ->
     path = tmp_path / "map.triquad"
     path.write_bytes(flipped((golden.FOLDER / golden.TRAINED).read_bytes(), at))
     assert_refused(path)
-
-
-def test_a_file_without_its_base_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "next.triquad"
-    shutil.copyfile(golden.FOLDER / golden.NEXT, path)
-    with pytest.raises(FileNotFoundError):
-        spec_reader.load(path)
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,12 @@
 """Small valid map files of every kind, from which mutants are made."""
 
-import dataclasses
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from support import golden
+from support.checkpoint_folder import write_record
 from support.map_records import (
     random_record,
     with_integers,
@@ -14,7 +14,6 @@ from support.map_records import (
     with_rays,
     with_support,
 )
-from support.mapfile_edit import write_pair
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.field_settings import FieldSettings
@@ -48,10 +47,10 @@ READERS: tuple[Reader, ...] = (read_whole, read_indexed)
 
 @dataclass(frozen=True)
 class ValidMap:
-    """A map file and those that it needs, in a folder of their own."""
+    """A map file, or a checkpoint with its parts, in a folder of its own."""
 
     path: Path  # of the file that is opened
-    files: dict[str, bytes]  # of the folder, by their names
+    files: dict[str, bytes]  # of the folder, by their paths in it
     results: tuple[Results, ...]  # of each reader
 
     def __repr__(self) -> str:
@@ -68,8 +67,8 @@ def valid_maps(folder: Path) -> list[ValidMap]:
         "integers": with_integers(plain),
     }
     maps = [_written(folder / kind, record) for kind, record in complete.items()]
-    maps.append(_written_pair(folder / "delta", plain))
-    maps.append(_copied(folder / "golden", golden.NEXT, golden.TRAINED))
+    maps.append(_stored(folder / "store", with_integers(plain)))
+    maps.append(_copied(folder / "golden", golden.TRAINED))
     return maps
 
 
@@ -80,20 +79,18 @@ def _written(folder: Path, record: MapRecord) -> ValidMap:
     return _found(folder / "map.triquad")
 
 
-def _written_pair(folder: Path, base: MapRecord) -> ValidMap:
+def _stored(folder: Path, record: MapRecord) -> ValidMap:
     folder.mkdir()
-    later = dataclasses.replace(with_integers(base), epoch=base.epoch + 1)
-    write_pair(folder, base, later, stamps=(10**9, 2 * 10**9))
-    return _found(folder / "next.triquad")
+    return _found(write_record(folder, record, stamp_ns=10**9))
 
 
-def _copied(folder: Path, *names: str) -> ValidMap:
+def _copied(folder: Path, name: str) -> ValidMap:
     folder.mkdir()
-    for name in names:
-        shutil.copy(golden.FOLDER / name, folder)
-    return _found(folder / names[0])
+    return _found(Path(shutil.copy(golden.FOLDER / name, folder)))
 
 
 def _found(path: Path) -> ValidMap:
-    files = {file.name: file.read_bytes() for file in path.parent.iterdir()}
+    folder = path.parent
+    found = (file for file in folder.rglob("*") if file.is_file())
+    files = {str(file.relative_to(folder)): file.read_bytes() for file in found}
     return ValidMap(path, files, tuple(read(path) for read in READERS))

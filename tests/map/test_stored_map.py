@@ -4,8 +4,9 @@ import os
 
 import numpy as np
 import pytest
-from support.map_records import SMALL, assert_same, random_record, with_integers
-from support.mapfile_edit import edited, file_bytes, set_array, stored, write_pair, write_record
+from support import checkpoint_folder
+from support.map_records import SMALL, assert_same, random_record
+from support.mapfile_edit import edited, file_bytes, set_array, stored, write_record
 from triquad_format.errors import DamagedMapFileError, FormatError, MapFileError
 from triquad_format.mapfile.index import FileBytes
 from triquad_format.mapfile.reader import read_map
@@ -115,16 +116,21 @@ def test_a_file_cut_meanwhile_is_named(tmp_path):
         assert_same(map_file.box(*NEAR), near)
 
 
-def test_a_base_deleted_before_it_is_needed(tmp_path):
-    base = random_record(48, indices=((0, 0, 0), (3, 0, 0)))
-    one, other = base.regions
-    (changed,) = with_integers(dataclasses.replace(base, regions=(one,))).regions
-    record = dataclasses.replace(base, epoch=8, regions=(changed, other))
-    write_pair(tmp_path, base, without_training(record))
-    with StoredMap.open(tmp_path / "next.triquad") as map_file:
-        (tmp_path / "base.triquad").unlink()
+def test_a_checkpoint_holds_what_the_map_in_one_file_does(tmp_path):
+    record = random_record(48, indices=((0, 0, 0), (3, 0, 0)))
+    path = checkpoint_folder.write_record(tmp_path, record)
+    with StoredMap.open(path) as map_file, stored(file_bytes(record)) as whole:
+        assert_same(map_file.box(*FAR), whole.box(*FAR))
+        assert_same(map_file.record(), record)
+
+
+def test_a_part_deleted_before_it_is_needed(tmp_path):
+    path = checkpoint_folder.write_record(tmp_path, random_record(48, indices=((3, 0, 0),)))
+    with StoredMap.open(path) as map_file:
+        for part in (tmp_path / "parts").iterdir():
+            part.unlink()
         for _ in range(2):
-            with pytest.raises(DamagedMapFileError, match=r"base.triquad, .*, is missing"):
+            with pytest.raises(DamagedMapFileError, match=r"checkpoint .*parts/.* is missing"):
                 map_file.box(*FAR)
 
 

@@ -6,13 +6,13 @@ import msgpack
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.checkpoint_folder import write_record
 from support.map_records import SMALL, assert_same, evidence_of, random_record, with_support
 from support.mapfile_edit import (
     file_bytes,
     parts_of,
     read_bytes,
     stored,
-    write_pair,
 )
 from triquad_format.mapfile.parts.part import EVIDENCE
 from triquad_format.mapfile.reader import read_map
@@ -171,7 +171,7 @@ def test_what_a_region_owns_keeps_its_levels():
     assert_part_of(owned, region.evidence)
 
 
-def test_a_delta_holds_the_cubes_whose_levels_changed(tmp_path):
+def test_a_checkpoint_writes_the_cubes_whose_levels_changed(tmp_path):
     first, second = RECORD.regions
     levels = first.evidence.levels.copy()
     levels[0] ^= 1
@@ -179,10 +179,11 @@ def test_a_delta_holds_the_cubes_whose_levels_changed(tmp_path):
         first, evidence=dataclasses.replace(first.evidence, levels=levels)
     )
     following = dataclasses.replace(RECORD, epoch=8, regions=(changed, second))
-    write_pair(tmp_path, RECORD, following)
-    data = (tmp_path / "next.triquad").read_bytes()
-    assert [p.topic for p in parts_of(data)] == ["/triquad/map", EVIDENCE, "/triquad/manifest"]
-    assert_same(read_map(tmp_path / "next.triquad"), following)
+    known = {}
+    write_record(tmp_path, RECORD, known=known)
+    path = write_record(tmp_path, following, known=known)
+    assert [entry.key.topic for entry in known.values() if entry.epoch == 8] == [EVIDENCE]
+    assert_same(read_map(path), following)
 
 
 def test_what_is_recovered_has_its_levels(tmp_path):

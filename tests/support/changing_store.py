@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from support.exact_maps import Height, exact_map, flat
-from triquad_format.mapfile.checkpoint_folder import checkpoint_name
 from triquad_format.mapfile.writer import write_map
 
 START_NS = 1_769_860_800 * 10**9  # 2026-01-31T12:00:00Z
@@ -24,8 +23,8 @@ def box_at(x_m: float, y_m: float) -> Height:
 
 
 def write_checkpoint(folder: Path, epoch: int, height: Height) -> Path:
-    """A complete checkpoint, written ``epoch`` hours after the start; its file."""
+    """A map file as a checkpoint, written ``epoch`` hours after the start; its path."""
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / checkpoint_name(epoch, complete=True)
+    path = folder / f"epoch-{epoch:09d}.triquad"
     write_map(exact_map(height, epoch), path, stamp_ns=START_NS + epoch * HOUR_NS)
     return path

@@ -4,12 +4,13 @@ import dataclasses
 from pathlib import Path
 
 from support.map_records import random_record
+from triquad_format.mapfile.checkpoint import Checkpoint, write_checkpoint
 from triquad_format.mapfile.checkpoint_folder import checkpoint_name
-from triquad_format.mapfile.manifest import Entry
+from triquad_format.mapfile.manifest import Entry, Manifest
 from triquad_format.mapfile.metadata import MapFacts
+from triquad_format.mapfile.part_files import NewParts
 from triquad_format.mapfile.parts.pack import pack_record
 from triquad_format.mapfile.parts.part import PartKey
-from triquad_format.mapfile.writer import write_parts
 from triquad_format.records.region import MapRecord
 
 START_NS = 1_769_860_800 * 10**9  # 2026-01-31T12:00:00Z
@@ -25,16 +26,28 @@ def map_at(epoch: int) -> MapRecord:
 
 
 def write_checkpoints(folder: Path, epochs: tuple[int, ...]) -> list[Path]:
-    """A complete checkpoint, then deltas, an hour apart; their files."""
+    """Checkpoints, an hour apart; their files."""
     known: dict[PartKey, Entry] = {}
     paths = []
     for hours, epoch in enumerate(epochs):
-        record = map_at(epoch)
-        stamp_ns = START_NS + hours * HOUR_NS
-        path = folder / checkpoint_name(epoch, complete=not known)
-        facts = MapFacts.of(record)
-        parts = pack_record(record, "<f2", {})
-        written = write_parts(path, facts, parts, stamp_ns=stamp_ns, known=known)
-        known = written.manifest.elsewhere(path.name)
-        paths.append(path)
+        paths.append(write_record(folder, map_at(epoch), START_NS + hours * HOUR_NS, known))
     return paths
+
+
+def write_record(
+    folder: Path,
+    record: MapRecord,
+    stamp_ns: int = START_NS,
+    known: dict[PartKey, Entry] | None = None,
+    undoes: str = "",
+) -> Path:
+    """A checkpoint of a map; its file. ``known`` are the parts of the one before, and of this."""
+    known = {} if known is None else known
+    new = NewParts(folder, record.epoch)
+    entries = [new.add(part, known.get(part.key)) for part in pack_record(record, "<f2", {})]
+    new.commit()
+    known.update({entry.key: entry for entry in entries})
+    path = folder / checkpoint_name(record.epoch)
+    manifest = Manifest(MapFacts.of(record), stamp_ns, tuple(entries))
+    write_checkpoint(path, Checkpoint(manifest, undoes))
+    return path

@@ -21,7 +21,7 @@ class Chunk:
 
 def chunks(data: bytes) -> list[Chunk]:
     """The chunks of a file, one to a part, in their order; that of the manifest is the last."""
-    own = [(e.key.topic, e.offset, e.offset + e.stored) for e in manifest_of(data).own]
+    own = [(e.key.topic, e.offset, e.offset + e.stored) for e in manifest_of(data).entries]
     start, size = map(int, metadata_of(data)["manifest"].split())
     return [Chunk(*place) for place in (*own, ("/triquad/manifest", start, start + size))]
 

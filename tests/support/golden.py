@@ -1,4 +1,4 @@
-"""The golden map files: one that can be trained on, a delta of it, and one of the other kind.
+"""The golden map files: one that can be trained on, and one that cannot.
 
 ``python -m support.golden`` in the folder of the tests writes them anew: only where the format
 changes, and then in one commit with ``docs/map-file.md``.
@@ -10,23 +10,21 @@ from pathlib import Path
 from support.map_records import (
     SMALL,
     random_record,
-    with_integers,
     with_progress,
     with_rays,
     with_support,
 )
-from support.mapfile_edit import write_pair
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.map_progress import MapProgress
 from triquad_format.records.region import MapRecord
 
 FOLDER = Path(__file__).parents[1] / "golden"
-TRAINED, NEXT, PLAIN = "map_v1.triquad", "map_v1_next.triquad", "map_v1_plain.triquad"
+TRAINED, PLAIN = "map_v1.triquad", "map_v1_plain.triquad"
 PRODUCER = "triquad 0.1.0"
 ZSTD = (1, 5, 7)
 """The release of zstd that compressed the files: others may give other bytes."""
 
-_STAMPS = (1_700_000_000 * 10**9, 1_700_000_060 * 10**9)
+_STAMP_NS = 1_700_000_000 * 10**9
 
 
 def golden_records() -> dict[str, MapRecord]:
@@ -35,13 +33,10 @@ def golden_records() -> dict[str, MapRecord]:
     record = random_record(2024, indices=indices, points=12, name="golden", epoch=42)
     record = with_rays(with_support(record), 40)
     record = with_progress(record, MapProgress(60, 116_000_000, 0.25))
-    one, other = record.regions
-    (changed,) = with_integers(dataclasses.replace(record, regions=(other,)), 300).regions
     wide = dataclasses.replace(SMALL, depth=9)
     plain = random_record(2025, settings=wide, training=False, name="golden", epoch=44)
     return {
         TRAINED: record,
-        NEXT: dataclasses.replace(record, epoch=43, regions=(one, changed)),
         PLAIN: with_support(plain),
     }
 
@@ -49,9 +44,8 @@ def golden_records() -> dict[str, MapRecord]:
 def write_golden(folder: Path) -> None:
     """Write the files; none has a preview."""
     folder.mkdir(exist_ok=True)
-    records = golden_records()
-    write_pair(folder, records[TRAINED], records[NEXT], names=(TRAINED, NEXT), stamps=_STAMPS)
-    write_map(records[PLAIN], folder / PLAIN, stamp_ns=_STAMPS[0])
+    for name, record in golden_records().items():
+        write_map(record, folder / name, stamp_ns=_STAMP_NS)
 
 
 if __name__ == "__main__":

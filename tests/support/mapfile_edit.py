@@ -23,7 +23,7 @@ from triquad_format.mapfile.metadata import MapFacts
 from triquad_format.mapfile.parts.pack import pack_record
 from triquad_format.mapfile.parts.part import MANIFEST
 from triquad_format.mapfile.reader import read_map
-from triquad_format.mapfile.writer import WrittenMap, write_map, write_parts
+from triquad_format.mapfile.writer import MapFileInfo, write_map, write_parts
 from triquad_format.records.region import MapRecord
 from triquad_format.wire.codec import pack_array, unpack_array
 from triquad_map.preview import previews_of
@@ -133,8 +133,8 @@ def rewritten(
         return start, stream.tell() - start
 
     whole = manifest_of(data)
-    entries = [entry for entry in whole.entries if entry.file is not None]
-    for number, (entry, part) in enumerate(zip(whole.own, parts_of(data)[:-1], strict=True)):
+    entries = []
+    for number, (entry, part) in enumerate(zip(whole.entries, parts_of(data)[:-1], strict=True)):
         payload = payloads.get(number, part.payload)
         offset, size = put(part.topic, payload)
         entry = dataclasses.replace(entry, offset=offset, stored=size)
@@ -205,20 +205,6 @@ def in_level(number: int, edit: Edit) -> Edit:
     return lambda body: edit(body["levels"][number])
 
 
-def write_pair(
-    folder: Path,
-    base: MapRecord,
-    record: MapRecord,
-    *,
-    names: tuple[str, str] = ("base.triquad", "next.triquad"),
-    stamps: tuple[int | None, int | None] = (None, None),
-) -> tuple[WrittenMap, WrittenMap]:
-    """A complete file of ``base``, and one of what ``record`` changes of it."""
-    first = write_record(folder / names[0], base, stamp_ns=stamps[0])
-    known = first.manifest.elsewhere(names[0])
-    return first, write_record(folder / names[1], record, stamp_ns=stamps[1], known=known)
-
-
-def write_record(path: Path, record: MapRecord, **options: Any) -> WrittenMap:
+def write_record(path: Path, record: MapRecord, **options: Any) -> MapFileInfo:
     """A file of all parts of a record; options are those of ``write_parts``."""
     return write_parts(path, MapFacts.of(record), pack_record(record, "<f2", {}), **options)

@@ -8,7 +8,7 @@ import hashlib
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -130,13 +130,11 @@ class Row:
     key: Key
     size: int
     digest: bytes
-    file: int
     offset: int
     stored: int
 
-    def read(self, file: OpenFile) -> bytes:
-        """The payload of the part."""
-        payload = unpacked(self.key[0], message_in(file.at(self.offset, self.stored)))
+    def checked(self, payload: bytes) -> bytes:
+        """The payload of the part, which has this digest."""
         same = len(payload) == self.size and hashlib.sha256(payload).digest() == self.digest
         check(same, f"another part for {self.key}")
         if self.key[0] in TOPICS:
@@ -150,41 +148,43 @@ def topic_of(payload: bytes) -> str:
     return str(value)
 
 
-@dataclass
+def rows_of(values: dict[str, Any]) -> list[Row]:
+    """The parts that a manifest lists."""
+    column = {name: plain(array).tolist() for name, array in values["parts"].items()}
+    topics = [values["topics"][i] for i in column["topic"]]
+    regions = [tuple(index) for index in column["region"]]
+    keys = list(zip(topics, regions, column["plane"], column["cell"], strict=True))
+    check(len(set(keys)) == len(keys), "a key twice")
+    rest = [column[name] for name in ("offset", "stored")]
+    columns = (keys, column["bytes"], map(bytes, column["sha256"]), *rest)
+    return [Row(*row) for row in zip(*columns, strict=True)]
+
+
+def manifest_in(payload: bytes) -> dict[str, Any]:
+    """The values of a manifest."""
+    check(topic_of(payload) == "/triquad/manifest", "no manifest")
+    values: dict[str, Any] = msgpack.unpackb(payload)
+    check(values["min_reader_version"] <= 1, "a newer version")
+    return values
+
+
 class MapFile:
     """A map file: its manifest, and what else is asked for."""
 
-    path: Path
-    bases: dict[int, OpenFile] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        self.file = OpenFile(self.path)
+    def __init__(self, path: Path) -> None:
+        self.file = OpenFile(path)
         metadata = self.file.metadata()
         check(int(metadata["min_reader_version"]) <= 1, "a newer version")
         place = map(int, metadata["manifest"].split(" "))
-        payload = unpacked("/triquad/manifest", message_in(self.file.at(*place)))
-        check(topic_of(payload) == "/triquad/manifest", "no manifest")
-        self.values: dict[str, Any] = msgpack.unpackb(payload)
-        check(self.values["min_reader_version"] <= 1, "a newer version")
+        self.values = manifest_in(unpacked("/triquad/manifest", message_in(self.file.at(*place))))
         pairs = (("map", "name"), ("epoch", "epoch"), ("frame_id", "frame_id"), ("units", "units"))
         check(all(metadata[a] == str(self.values[b]) for a, b in pairs), "metadata")
-        column = {name: plain(array).tolist() for name, array in self.values["parts"].items()}
-        topics = [self.values["topics"][i] for i in column["topic"]]
-        regions = [tuple(index) for index in column["region"]]
-        keys = list(zip(topics, regions, column["plane"], column["cell"], strict=True))
-        check(len(set(keys)) == len(keys), "a key twice")
-        rest = [column[name] for name in ("file", "offset", "stored")]
-        columns = (keys, column["bytes"], map(bytes, column["sha256"]), *rest)
-        self.rows = [Row(*values) for values in zip(*columns, strict=True)]
+        self.rows = rows_of(self.values)
 
     def read(self, row: Row) -> bytes:
-        """The payload of a part, in whichever file it lies."""
-        if row.file == 0:
-            return row.read(self.file)
-        if row.file not in self.bases:
-            name = self.values["files"][row.file - 1]
-            self.bases[row.file] = OpenFile(self.path.parent / name)
-        return row.read(self.bases[row.file])
+        """The payload of a part."""
+        place = self.file.at(row.offset, row.stored)
+        return row.checked(unpacked(row.key[0], message_in(place)))
 
 
 def read_whole(path: Path) -> tuple[MapFile, dict[Key, bytes]]:
@@ -221,3 +221,20 @@ def load_rays(path: Path, settings: Settings) -> Array:
             training = msgpack.unpackb(parts["/triquad/training", index, 0, 0])
             found.append(rays_of(msgpack.unpackb(payload), cell, training, settings))
     return np.concatenate(found)
+
+
+# Section 10
+
+
+def load_checkpoint(path: Path) -> Map:
+    """The map of a checkpoint in its folder."""
+    line, digest, frame = (path.read_bytes()[slice(*at)] for at in ((19,), (19, 51), (51, None)))
+    check(line == b"triquad checkpoint\n", "no checkpoint")
+    check(hashlib.sha256(frame).digest() == digest, "another list of parts")
+    values = manifest_in(unpacked("/triquad/manifest", frame))
+    parts = {}
+    for row in rows_of(values):
+        stored = (path.parent / "parts" / row.digest.hex()).read_bytes()
+        check(len(stored) == row.stored, f"another size of {row.key}")
+        parts[row.key] = row.checked(unpacked(row.key[0], stored))
+    return Map(values, parts)

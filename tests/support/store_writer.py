@@ -18,9 +18,9 @@ KEPT = 6
 
 
 def changed_last(epoch: int, place: int) -> int:
-    """The last epoch up to ``epoch`` in which a region changed: each in turn, and the first ever.
+    """The last epoch up to ``epoch`` in which a region changed: each in turn, the first ever.
 
-    Every seventh epoch changes all, so that complete checkpoints are among those written.
+    Every seventh epoch changes all.
     """
     whole = epoch - epoch % 7
     turns = [e for e in range(whole + 1, epoch + 1) if place in (0, e % len(ROW))]
@@ -57,4 +57,3 @@ def write_for_ever(root: Path, acknowledged: Connection) -> None:
             )
             store.write(MapChanges(dataclasses.replace(record, regions=regions), ROW, asked))
             acknowledged.send(epoch)
-            store.fold(lambda: False)

@@ -196,8 +196,7 @@ def open_map(path: str | Path) -> OfflineMap:
     street.
 
     Args:
-        path: a map file, next to which the other files lie that contain parts of it; or a server's
-            store, of which the newest checkpoint is read.
+        path: a map file, or a server's store, of which the newest checkpoint is read.
 
     Raises:
         MapFileError: it is no map file, is damaged, or needs a newer reader.

@@ -1,20 +1,21 @@
 """A folder of checkpoints: the epochs of a map that can be read back.
 
-A checkpoint is complete, or contains what changed and names the files that contain the rest.
+A server writes ``epoch-<number>.checkpoint``, which lists parts. A whole map file that is put there
+as ``epoch-<number>.triquad``, such as a backup, counts as a checkpoint, too.
 """
 
 import re
-from collections.abc import Iterable
 from contextlib import closing
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
 from triquad_format.errors import MapFileError
-from triquad_format.mapfile.index import DAMAGED_SUFFIX, FileBytes, MapIndex, named
+from triquad_format.mapfile.checkpoint import open_index
+from triquad_format.mapfile.index import DAMAGED_SUFFIX, FileBytes, named
 from triquad_format.mapfile.manifest import Manifest
 
-_NAME = re.compile(r"epoch-([0-9]{9,19})(\.delta)?\.triquad")
+_NAME = re.compile(r"epoch-([0-9]{9,19})\.(checkpoint|triquad)")
 
 _LISTED = 40  # epochs in the text of an error
 
@@ -24,13 +25,12 @@ class CheckpointFile:
     """A checkpoint, by its name."""
 
     epoch: int
-    complete: bool  # whether it needs no other file
     path: Path
 
 
-def checkpoint_name(epoch: int, complete: bool) -> str:
+def checkpoint_name(epoch: int) -> str:
     """Return the name of a checkpoint's file."""
-    return f"epoch-{epoch:09d}{'' if complete else '.delta'}.triquad"
+    return f"epoch-{epoch:09d}.checkpoint"
 
 
 def checkpoint_file(path: Path) -> CheckpointFile | None:
@@ -38,11 +38,11 @@ def checkpoint_file(path: Path) -> CheckpointFile | None:
     match = _NAME.fullmatch(path.name)
     if match is None or int(match[1]) >= 2**63:
         return None
-    return CheckpointFile(int(match[1]), not match[2], path)
+    return CheckpointFile(int(match[1]), path)
 
 
 def checkpoint_files(folder: Path) -> list[CheckpointFile]:
-    """Return the checkpoints in a folder, newest first; a complete one before a delta.
+    """Return the checkpoints in a folder, newest first.
 
     What is no file, or a link to none, is left out.
 
@@ -63,14 +63,6 @@ def set_aside(folder: Path) -> list[Path]:
     return sorted(path for path in ended if checkpoint_file(path.with_suffix("")) is not None)
 
 
-def newest_of_each(files: Iterable[CheckpointFile]) -> list[CheckpointFile]:
-    """Return one file for each epoch: the complete one where there are two."""
-    by_epoch: dict[int, CheckpointFile] = {}
-    for file in files:
-        by_epoch.setdefault(file.epoch, file)
-    return list(by_epoch.values())
-
-
 def map_folder(store: Path) -> Path:
     """Return the folder of checkpoints that ``store`` is, or the only one that it contains.
 
@@ -88,24 +80,24 @@ def map_folder(store: Path) -> Path:
 
 
 def open_manifest(file: CheckpointFile) -> Manifest:
-    """Return the manifest of a checkpoint, found by the file's index.
+    """Return the manifest of a checkpoint; no part is read.
 
     Raises:
         MapFileError: the file is damaged, or needs a newer reader.
         OSError: it cannot be read.
     """
     with closing(FileBytes(file.path)) as source, named(str(file.path)):
-        return MapIndex(source).manifest
+        return open_index(source).manifest
 
 
 def checkpoint_of(folder: Path, epoch: int) -> CheckpointFile:
-    """Return the checkpoint of an epoch; the complete one where there are two.
+    """Return the checkpoint of an epoch.
 
     Raises:
         MapFileError: there is none; the text says which there are.
         OSError: the folder cannot be read.
     """
-    files = newest_of_each(checkpoint_files(folder))
+    files = checkpoint_files(folder)
     for file in files:
         if file.epoch == epoch:
             return file
@@ -126,7 +118,7 @@ def checkpoint_at(folder: Path, when: str) -> CheckpointFile:
             there are.
         OSError: the folder or a file cannot be read.
     """
-    files = newest_of_each(checkpoint_files(folder))
+    files = checkpoint_files(folder)
     found = [file for file in files if _is_by(file, when)]
     epochs = f"epochs {files[-1].epoch} to {files[0].epoch}" if files else "nothing"
     if not found:

@@ -17,21 +17,39 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     """
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
-        with temporary.open("xb") as stream:
-            yield stream
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(temporary, path)
-    except BaseException as error:
+        with naming(path):
+            with temporary.open("xb") as stream:
+                yield stream
+                stream.flush()
+                os.fsync(stream.fileno())
+            os.replace(temporary, path)
+    except BaseException:
         temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.errno and error.filename is None:
+        raise
+    sync_folder(path.parent)
+
+
+@contextlib.contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Have errors of the system name a file, where they name none.
+
+    Raises:
+        OSError: what is raised within, with a name.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno and error.filename is None:
             raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
         raise
-    _sync_folder(path.parent)
 
 
-def _sync_folder(folder: Path) -> None:
-    """Make renames in a folder durable, where the system lets folders be synced."""
+def sync_folder(folder: Path) -> None:
+    """Make renames in a folder durable, where the system lets folders be synced.
+
+    Raises:
+        OSError: the folder cannot be synced.
+    """
     if os.name != "posix":
         return
     descriptor = os.open(folder, os.O_RDONLY)

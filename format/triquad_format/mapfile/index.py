@@ -4,7 +4,8 @@ import contextlib
 import io
 import os
 import stat
-from collections.abc import Callable, Iterator
+import zlib
+from collections.abc import Iterator
 from pathlib import Path
 
 from triquad_format.errors import (
@@ -21,15 +22,13 @@ from triquad_format.mapfile.metadata import (
     check_readable,
     manifest_place,
 )
-from triquad_format.mapfile.parts.part import MAP, PREFIX, PartKey
+from triquad_format.mapfile.parts.part import MAP, PREFIX, REGION_TOPICS, PartKey
 
 DAMAGED_SUFFIX = ".damaged"
 """Added to the names of files that are set aside."""
 
 _REMEDY = "triquad-pack --recover saves what is intact; an older checkpoint may be intact"
-
-OpenFile = Callable[[str], RandomAccess]
-"""Opens another file of the same folder by its name."""
+_BLOCK_BYTES = 1 << 20
 
 
 @contextlib.contextmanager
@@ -117,71 +116,6 @@ def check_range(offset: int, length: int, size: int) -> None:
         )
 
 
-def files_in(folder: Path) -> OpenFile:
-    """Opens the other files that contain parts of a map, in the folder of the map file.
-
-    One that was set aside as damaged is opened, too: its parts are checked one by one.
-    """
-
-    return lambda name: FileBytes(file_in(folder, name))
-
-
-def file_in(folder: Path, name: str) -> Path:
-    """Return the file of this name; where it was set aside as damaged, under its new name."""
-    aside = folder / (name + DAMAGED_SUFFIX)
-    return aside if aside.exists() and not (folder / name).exists() else folder / name
-
-
-def _payload(source: RandomAccess, entry: Entry) -> bytes:
-    """Return the payload of a part in the file that contains it.
-
-    Raises:
-        DamagedMapFileError: it is not there, or not the part that is listed.
-    """
-    try:
-        data = read_message(source, entry.offset, entry.stored)
-        if entry.key.topic.startswith(PREFIX):
-            data = decompress(data, entry.size)
-        entry.check(data)
-    except DamagedMapFileError as error:
-        raise DamagedMapFileError(f"{entry.key.topic:.80}: {error}") from error
-    return data
-
-
-class OtherFiles:
-    """The other files that contain parts of a map; each is opened when it is needed."""
-
-    def __init__(self, open_file: OpenFile | None) -> None:
-        self._open_file = open_file
-        self._open: dict[str, RandomAccess] = {}
-
-    def payload(self, entry: Entry) -> bytes:
-        """Return the payload of a part that another file contains.
-
-        Raises:
-            MapFileError: that file is missing, damaged or another.
-            OSError: the system refuses to read it.
-        """
-        assert entry.file is not None
-        if self._open_file is None:
-            raise MapFileError(f"parts lie in {entry.file}, which cannot be reached from here")
-        try:
-            if entry.file not in self._open:
-                self._open[entry.file] = self._open_file(entry.file)
-            return _payload(self._open[entry.file], entry)
-        except FileNotFoundError as error:
-            raise DamagedMapFileError(
-                f"{entry.file}, which holds parts, is missing; copy it into the folder of this file"
-            ) from error
-        except FormatError as error:
-            raise DamagedMapFileError(f"{entry.file}, which holds parts: {error}") from error
-
-    def close(self) -> None:
-        """Close those that were opened."""
-        for source in self._open.values():
-            source.close()
-
-
 class MapIndex:
     """The manifest of a map file, and its parts by random access.
 
@@ -189,39 +123,61 @@ class MapIndex:
     part by its digest. What is not read is not.
     """
 
-    def __init__(self, source: RandomAccess, open_file: OpenFile | None = None) -> None:
-        """Read metadata and manifest.
-
-        Args:
-            source: the file; it is closed with this index.
-            open_file: opens the other files that contain parts; needed where there are any.
+    def __init__(self, source: RandomAccess) -> None:
+        """Read metadata and manifest of the file, which is closed with this index.
 
         Raises:
             MapFileError: it is not a map file, is damaged, or needs a newer reader.
         """
         self._source = source
-        self._others = OtherFiles(open_file)
-        self.end = read_end(source)
-        check_readable(self.end.metadata)
+        self.size = source.size  # bytes
+        self._end = read_end(source)
+        self.metadata = self._end.metadata  # of the record "triquad"
+        check_readable(self.metadata)
         try:
-            packed = decompress(read_message(source, *manifest_place(self.end.metadata)))
+            packed = decompress(read_message(source, *manifest_place(self.metadata)))
             self.manifest = unpack_manifest(packed, source.size)
+            self.manifest.check_total(source.size)
         except DamagedMapFileError as error:
             raise DamagedMapFileError(f"{error} (or another program rewrote it)") from error
-        check_agreement(self.end.metadata, self.manifest.facts)
-        stated = next(entry for entry in self.manifest.own if entry.key == PartKey(MAP))
-        check_map_part(self.payload(stated), self.manifest.facts)
+        check_agreement(self.metadata, self.manifest.facts)
+        stated = [entry for entry in self.manifest.entries if entry.key == PartKey(MAP)]
+        if not stated:
+            raise DamagedMapFileError(f"its manifest does not list the part {MAP}")
+        check_map_part(self.payload(stated[0]), self.manifest.facts)
 
     def close(self) -> None:
-        """Close this file and the others that were opened."""
+        """Close the file."""
         self._source.close()
-        self._others.close()
+
+    def check_unread(self) -> None:
+        """Check what no reader of the map uses: bytes between the parts, and parts of other topics.
+
+        Raises:
+            DamagedMapFileError: something of it is damaged.
+        """
+        crc = 0
+        for first in range(0, self._end.data_bytes, _BLOCK_BYTES):
+            size = min(_BLOCK_BYTES, self._end.data_bytes - first)
+            crc = zlib.crc32(self._source.read(first, size), crc)
+        if crc != self._end.data_crc:
+            raise DamagedMapFileError("the data section fails its checksum")
+        for entry in self.manifest.entries:
+            if entry.key.topic not in (MAP, *REGION_TOPICS):
+                self.payload(entry)
 
     def payload(self, entry: Entry) -> bytes:
         """Return the payload of a part that the manifest lists.
 
         Raises:
-            MapFileError: the part is damaged, or the file that contains it is missing or another.
-            OSError: a file cannot be read.
+            DamagedMapFileError: it is not there, or not the part that is listed.
+            OSError: the file cannot be read.
         """
-        return _payload(self._source, entry) if entry.file is None else self._others.payload(entry)
+        try:
+            data = read_message(self._source, entry.offset, entry.stored)
+            if entry.key.topic.startswith(PREFIX):
+                data = decompress(data, entry.size)
+            entry.check(data)
+        except DamagedMapFileError as error:
+            raise DamagedMapFileError(f"{entry.key.topic:.80}: {error}") from error
+        return data

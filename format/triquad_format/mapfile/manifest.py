@@ -1,6 +1,5 @@
-"""The manifest: the list of all parts of a map, and the files that contain them."""
+"""The manifest: the list of all parts of a map at one epoch."""
 
-import dataclasses
 import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -26,11 +25,9 @@ from triquad_format.mapfile.parts.part import (
 from triquad_format.wire.codec import pack_array
 
 MAX_ENTRIES = 1 << 20
-MAX_FILES = 4096
 DIGEST_BYTES = 32
 """Bytes of a SHA-256."""
 
-_MAX_FILE_NAME = 255
 _COLUMNS = {
     "topic": ("|u1", ()),
     "region": ("<i4", (3,)),
@@ -39,8 +36,6 @@ _COLUMNS = {
     "bytes": ("<i8", ()),
     "sha256": ("|u1", (DIGEST_BYTES,)),
     "epoch": ("<i8", ()),
-    "stamp_ns": ("<i8", ()),
-    "file": ("<u2", ()),
     "offset": ("<i8", ()),
     "stored": ("<i8", ()),
 }
@@ -58,15 +53,18 @@ class Entry:
     size: int  # bytes of its payload
     sha256: bytes  # of its payload
     epoch: int  # in which it last changed
-    stamp_ns: int  # time of that epoch, nanoseconds since 1970; 0 if not known
-    file: str | None = None  # name of the file of the same folder that contains it; None: this one
-    offset: int = 0  # where its chunk record begins in that file, bytes
-    stored: int = 0  # bytes of that record, and of the message index after it
+    offset: int = 0  # where its chunk record begins in a map file, bytes; 0 in a checkpoint
+    stored: int = 0  # bytes of that record and of the message index after it, or of the part's file
 
     def check(self, data: bytes) -> None:
         """Raise :class:`DamagedMapFileError` unless ``data`` is the payload of this part."""
         if len(data) != self.size or hashlib.sha256(data).digest() != self.sha256:
             raise DamagedMapFileError(f"what lies at byte {self.offset} is not the part listed")
+
+    @property
+    def name(self) -> str:
+        """Return the digest as text, which is the name of the part's file in a store."""
+        return self.sha256.hex()
 
 
 @dataclass(frozen=True)
@@ -75,38 +73,37 @@ class Manifest:
 
     facts: MapFacts
     stamp_ns: int  # when the epoch was written, nanoseconds since 1970; 0 if not known
-    entries: tuple[Entry, ...]  # those of this file in the order of the file
+    entries: tuple[Entry, ...]  # in the order of the file
 
     @property
-    def files(self) -> tuple[str, ...]:
-        """Names of the other files that are needed."""
-        return tuple(dict.fromkeys(e.file for e in self.entries if e.file is not None))
+    def stored_bytes(self) -> int:
+        """Return the bytes that all parts take where they are stored."""
+        return sum(entry.stored for entry in self.entries)
 
-    @property
-    def own(self) -> tuple[Entry, ...]:
-        """The parts in the manifest's own file, in their order."""
-        return tuple(entry for entry in self.entries if entry.file is None)
-
-    def elsewhere(self, own: str) -> dict[PartKey, Entry]:
-        """Return the parts as another file lists them; ``own`` names the manifest's own file."""
-        return {e.key: dataclasses.replace(e, file=e.file or own) for e in self.entries}
+    def check_total(self, stored_bytes: int) -> None:
+        """Raise :class:`DamagedMapFileError` where so few stored bytes unpack to too much."""
+        total = sum(entry.size for entry in self.entries)
+        if total > total_limit(stored_bytes):
+            raise DamagedMapFileError(
+                f"{MANIFEST}: parts of {total} bytes in a file of {stored_bytes}"
+            )
 
 
 def pack_manifest(manifest: Manifest) -> Part:
-    """Return the manifest as the last part of its file.
+    """Return the manifest as the last part of its file; errors are those of manifest_body."""
+    return pack_part(PartKey(MANIFEST), manifest_body(manifest))
+
+
+def manifest_body(manifest: Manifest) -> dict[str, object]:
+    """Return the manifest as a msgpack map.
 
     Raises:
         FormatError: it lists more than a manifest may.
     """
     entries = manifest.entries
-    files = manifest.files
-    if len(entries) > MAX_ENTRIES or len(files) > MAX_FILES:
-        raise FormatError(
-            f"{len(entries)} parts in {len(files)} other files; a manifest lists at most "
-            f"{MAX_ENTRIES} in {MAX_FILES}"
-        )
+    if len(entries) > MAX_ENTRIES:
+        raise FormatError(f"{len(entries)} parts; a manifest lists at most {MAX_ENTRIES}")
     topics = sorted({entry.key.topic for entry in entries})
-    numbers: dict[str | None, int] = {None: 0, **{f: i + 1 for i, f in enumerate(files)}}
     columns: dict[str, Any] = {
         "topic": [topics.index(entry.key.topic) for entry in entries],
         "region": [entry.key.region for entry in entries],
@@ -115,37 +112,36 @@ def pack_manifest(manifest: Manifest) -> Part:
         "bytes": [entry.size for entry in entries],
         "sha256": [np.frombuffer(entry.sha256, np.uint8) for entry in entries],
         "epoch": [entry.epoch for entry in entries],
-        "stamp_ns": [entry.stamp_ns for entry in entries],
-        "file": [numbers[entry.file] for entry in entries],
         "offset": [entry.offset for entry in entries],
         "stored": [entry.stored for entry in entries],
     }
-    body: dict[str, object] = {
+    return {
         **pack_facts(manifest.facts),
         "created_ns": manifest.stamp_ns,
-        "files": list(files),
         "topics": topics,
         "parts": {
             name: pack_array(np.array(columns[name], dtype).reshape(-1, *row))
             for name, (dtype, row) in _COLUMNS.items()
         },
     }
-    return pack_part(PartKey(MANIFEST), body)
 
 
 def unpack_manifest(payload: bytes, file_bytes: int) -> Manifest:
-    """Return the manifest in a payload.
+    """Return the manifest in a payload; arguments and errors are those of manifest_in."""
+    return manifest_in(unpack_body(MANIFEST, payload), file_bytes)
+
+
+def manifest_in(body: PartBody, file_bytes: int) -> Manifest:
+    """Return the manifest in the body of a part.
 
     Args:
-        payload: that of the part ``/triquad/manifest``.
+        body: that of the part ``/triquad/manifest``.
         file_bytes: size of its file, which bounds how many parts it can list.
 
     Raises:
         FormatError: it is malformed, lists a part twice, or parts of a region that it lacks.
     """
-    body = unpack_body(MANIFEST, payload, max_items=MAX_FILES)
     facts = unpack_facts(body)
-    files = [None, *_files(body.texts("files"))]
     topics = body.texts("topics")
     packed = PartBody(MANIFEST, body.mapping("parts"))
     columns = {
@@ -156,31 +152,21 @@ def unpack_manifest(payload: bytes, file_bytes: int) -> Manifest:
     most = min(MAX_ENTRIES, file_bytes // DIGEST_BYTES)
     if any(len(column) != count for column in columns.values()) or count > most:
         raise DamagedMapFileError(f"{MANIFEST}: its columns differ in length, or are too long")
-    _check_columns(columns, len(topics), len(files))
-    entries = tuple(_entries(columns, topics, files))
+    _check_columns(columns, len(topics))
+    entries = tuple(_entries(columns, topics))
     if len({entry.key for entry in entries}) != count:
         raise DamagedMapFileError(f"{MANIFEST}: it lists a part twice")
     _check_keys([entry.key for entry in entries])
-    _check_sizes(entries, file_bytes)
+    _check_sizes(entries)
     return Manifest(facts, body.count("created_ns"), entries)
 
 
-def _files(names: list[str]) -> list[str]:
-    for name in names:
-        # A name, not a path: a manifest must not lead a reader to other folders.
-        if name in ("", ".", "..") or len(name) > _MAX_FILE_NAME or set(name) & set("/\\\0"):
-            raise DamagedMapFileError(f"{MANIFEST}: {name!r:.80} is not the name of a file")
-    if len(set(names)) != len(names):
-        raise DamagedMapFileError(f"{MANIFEST}: it names a file twice")
-    return names
-
-
-def _check_columns(columns: Mapping[str, NDArray[Any]], topics: int, files: int) -> None:
-    limits = {"topic": topics, "file": files, "plane": 3}
+def _check_columns(columns: Mapping[str, NDArray[Any]], topics: int) -> None:
+    limits = {"topic": topics, "plane": 3}
     for name, limit in limits.items():
         if (columns[name] >= limit).any():
             raise DamagedMapFileError(f"{MANIFEST}: a number in {name!r} is out of range")
-    for name in ("cell", "bytes", "epoch", "stamp_ns", "offset", "stored"):
+    for name in ("cell", "bytes", "epoch", "offset", "stored"):
         if (columns[name] < 0).any():
             raise DamagedMapFileError(f"{MANIFEST}: a number in {name!r} is negative")
 
@@ -196,18 +182,12 @@ def _check_keys(keys: list[PartKey]) -> None:
             raise DamagedMapFileError(f"the part {REGION} of {key.region} is missing")
 
 
-def _check_sizes(entries: tuple[Entry, ...], file_bytes: int) -> None:
-    """Refuse a file that unpacks to too much, or does not contain its first part itself."""
-    own = [entry for entry in entries if entry.file is None]
-    if PartKey(MAP) not in {entry.key for entry in own}:
-        raise DamagedMapFileError(f"{MANIFEST}: it does not list the part {MAP}")
+def _check_sizes(entries: tuple[Entry, ...]) -> None:
     for entry in entries:
         if entry.size > MAX_PART_BYTES:
             raise DamagedMapFileError(
                 f"{MANIFEST}: a part {entry.key.topic:.80} exceeds {MAX_PART_BYTES} bytes"
             )
-    if (total := sum(entry.size for entry in own)) > total_limit(file_bytes):
-        raise DamagedMapFileError(f"{MANIFEST}: parts of {total} bytes in a file of {file_bytes}")
 
 
 def total_limit(file_bytes: int) -> int:
@@ -215,20 +195,16 @@ def total_limit(file_bytes: int) -> int:
     return _FREE_TOTAL_BYTES + _MAX_TOTAL_RATIO * file_bytes
 
 
-def _entries(
-    columns: Mapping[str, NDArray[Any]], topics: list[str], files: list[str | None]
-) -> Iterable[Entry]:
+def _entries(columns: Mapping[str, NDArray[Any]], topics: list[str]) -> Iterable[Entry]:
     digests = [digest.tobytes() for digest in columns["sha256"]]
     others = [columns[name].tolist() for name in _COLUMNS if name != "sha256"]
     for digest, row in zip(digests, zip(*others, strict=True), strict=True):
-        topic, region, plane, cell, size, epoch, stamp_ns, file, offset, stored = row
+        topic, region, plane, cell, size, epoch, offset, stored = row
         yield Entry(
             PartKey(topics[topic], tuple(region), plane=plane, cell=cell),
             size=size,
             sha256=digest,
             epoch=epoch,
-            stamp_ns=stamp_ns,
-            file=files[file],
             offset=offset,
             stored=stored,
         )

@@ -1,18 +1,18 @@
 """Reading map files whole: nothing of a file is used before it is checked."""
 
-import zlib
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from triquad_format.errors import DamagedMapFileError, TooLargeMapFileError
+from triquad_format.errors import TooLargeMapFileError
+from triquad_format.mapfile.checkpoint import CheckpointIndex, open_index
 from triquad_format.mapfile.container import RandomAccess
-from triquad_format.mapfile.index import FileBytes, MapIndex, MemoryBytes, files_in, named
+from triquad_format.mapfile.index import FileBytes, MapIndex, MemoryBytes, named
 from triquad_format.mapfile.manifest import Entry, Manifest
 from triquad_format.mapfile.metadata import MAX_MAP_BYTES
-from triquad_format.mapfile.parts.part import MAP, REGION, REGION_TOPICS
+from triquad_format.mapfile.parts.part import REGION, REGION_TOPICS
 from triquad_format.mapfile.parts.region_parts import RegionParts
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.record_check import check_record
@@ -23,11 +23,11 @@ _BLOCK_BYTES = 1 << 20
 
 @dataclass(frozen=True)
 class MapFile:
-    """A map file that has passed every check."""
+    """A map file, or a checkpoint, that has passed every check."""
 
     record: MapRecord
     metadata: dict[str, str]  # of the record "triquad"
-    size: int  # bytes
+    size: int  # bytes; of a checkpoint, with all its parts
     manifest: Manifest
 
 
@@ -40,8 +40,8 @@ def read_map_file(source: Path | str | BinaryIO, *, max_bytes: int = MAX_MAP_BYT
     """Read a map file and check all of it. Arrays may be read-only.
 
     Args:
-        source: a path, or a binary stream, which is read to its end. Parts in other files are
-            searched for in the folder of the path.
+        source: a path, or a binary stream, which is read to its end. The path may be that of a
+            checkpoint, whose parts lie in its store.
         max_bytes: limit on the file's size and, decompressed, on its parts together.
 
     Raises:
@@ -53,14 +53,13 @@ def read_map_file(source: Path | str | BinaryIO, *, max_bytes: int = MAX_MAP_BYT
     """
     file: RandomAccess
     if isinstance(source, (str, Path)):
-        file, open_file = FileBytes(Path(source)), files_in(Path(source).parent)
+        file = FileBytes(Path(source))
     else:
-        file, open_file = _in_memory(source, max_bytes), None
+        file = _in_memory(source, max_bytes)
     with closing(file), named(file.name):
         if file.size > max_bytes:
             raise TooLargeMapFileError(f"it is larger than the limit of {max_bytes} bytes")
-        with closing(MapIndex(file, open_file)) as index:
-            return _read(file, index, max_bytes)
+        return _read(open_index(file), max_bytes)
 
 
 def _in_memory(stream: BinaryIO, max_bytes: int) -> MemoryBytes:
@@ -72,21 +71,14 @@ def _in_memory(stream: BinaryIO, max_bytes: int) -> MemoryBytes:
     return MemoryBytes(b"".join(blocks), str(getattr(stream, "name", "map file")))
 
 
-def _read(file: RandomAccess, index: MapIndex, max_bytes: int) -> MapFile:
-    manifest, end = index.manifest, index.end
-    crc = 0
-    for first in range(0, end.data_bytes, _BLOCK_BYTES):
-        crc = zlib.crc32(file.read(first, min(_BLOCK_BYTES, end.data_bytes - first)), crc)
-    if crc != end.data_crc:
-        raise DamagedMapFileError("the data section fails its checksum")
+def _read(index: MapIndex | CheckpointIndex, max_bytes: int) -> MapFile:
+    manifest = index.manifest
     if sum(entry.size for entry in manifest.entries) > max_bytes:
         raise TooLargeMapFileError(f"its parts exceed the limit of {max_bytes} bytes together")
-    for entry in manifest.own:
-        if entry.key.topic not in (MAP, *REGION_TOPICS):
-            index.payload(entry)  # nothing of it is used; its digest is checked all the same
+    index.check_unread()
     record = assemble(manifest, index.payload)
     check_record(record)
-    return MapFile(record, end.metadata, file.size, manifest)
+    return MapFile(record, index.metadata, index.size, manifest)
 
 
 def assemble(manifest: Manifest, payload_of: Callable[[Entry], bytes]) -> MapRecord:

@@ -1,12 +1,10 @@
 """Writing map files: the same record gives the same bytes, and a path gets all of them or none."""
 
 import contextlib
-import dataclasses
 import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import BinaryIO, cast
 
 from mcap.writer import Writer
@@ -33,11 +31,6 @@ from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.record_check import check_record
 from triquad_format.records.region import FLOATS, MapRecord
 
-# Levels of zstd: features and moments are noise but for their high bytes, on which level 1 is as
-# good as level 19 and better than level 3; masks and codes shrink by a fifth to level 12.
-_LEVELS = {EVIDENCE: 12, REGION: 3}
-_USUAL_LEVEL = 1
-
 
 @dataclass(frozen=True)
 class Previews:
@@ -56,14 +49,6 @@ class MapFileInfo:
     epoch: int
 
 
-@dataclass(frozen=True)
-class WrittenMap:
-    """A file that was written, and what its manifest lists."""
-
-    info: MapFileInfo
-    manifest: Manifest
-
-
 def write_map(
     record: MapRecord,
     file: BinaryIO | Path | str,
@@ -72,7 +57,7 @@ def write_map(
     stamp_ns: int | None = None,
     previews: Previews | None = None,
 ) -> MapFileInfo:
-    """Write a map file that needs no other.
+    """Write a map file.
 
     A path is written under a temporary name (``.<name>.<random>.tmp``) in the same folder, synced
     and renamed, so that the final name never has half a file.
@@ -96,28 +81,24 @@ def write_map(
     facts = MapFacts.of(record)
     parts = pack_record(record, feature_dtype, {} if previews is None else previews.parts)
     schema = None if previews is None else previews.schema
-    return write_parts(file, facts, parts, stamp_ns=stamp_ns, preview_schema=schema).info
+    return write_parts(file, facts, parts, stamp_ns=stamp_ns, preview_schema=schema)
 
 
 def write_parts(
     file: BinaryIO | Path | str,
     facts: MapFacts,
-    parts: Iterable[Part | Entry],
+    parts: Iterable[Part],
     *,
     stamp_ns: int | None = None,
-    known: Mapping[PartKey, Entry] = MappingProxyType({}),
     preview_schema: bytes | None = None,
-) -> WrittenMap:
+) -> MapFileInfo:
     """Write a map file from parts.
 
     Args:
         file: as in :func:`write_map`.
         facts: what the file says of the whole map.
-        parts: what the map consists of. An entry stands for a part that lies in another file,
-            and is one of ``known``.
+        parts: what the map consists of.
         stamp_ns: time of its epoch, nanoseconds since 1970; left out, the file has no time.
-        known: parts of earlier epochs: an equal one keeps its epoch and time, and is not stored
-            again where the entry names a file.
         preview_schema: that of :class:`Previews`; needed where there are previews among ``parts``.
 
     Raises:
@@ -128,8 +109,18 @@ def write_parts(
         replacing(Path(file)) if isinstance(file, (str, Path)) else contextlib.nullcontext(file)
     )
     with opened as stream:
-        writer = _PartsWriter(stream, facts, stamp_ns or 0, known, preview_schema)
+        writer = _PartsWriter(stream, facts, stamp_ns or 0, preview_schema)
         return writer.write(parts, stamp_ns)
+
+
+def compressed(part: Part) -> bytes:
+    """Return a part's payload as the zstd frame that files hold.
+
+    Features and moments are noise but for their high bytes, on which level 1 is as good as level 19
+    and better than level 3; masks and codes shrink by a fifth to level 12.
+    """
+    level = {EVIDENCE: 12, REGION: 3}.get(part.key.topic, 1)
+    return compress(part.payload, seams(part), level)
 
 
 class _Counted:
@@ -157,7 +148,6 @@ class _PartsWriter:
         stream: BinaryIO,
         facts: MapFacts,
         stamp_ns: int,
-        known: Mapping[PartKey, Entry],
         preview_schema: bytes | None,
     ) -> None:
         self._stream = _Counted(stream)
@@ -166,64 +156,47 @@ class _PartsWriter:
         self._mcap = Writer(cast(BinaryIO, self._stream), chunk_size=0, enable_data_crcs=True)
         self._facts = facts
         self._stamp_ns = stamp_ns
-        self._known = known
         self._preview_schema = preview_schema
         self._channels: dict[str, int] = {}
         self._total = 0
 
-    def write(self, parts: Iterable[Part | Entry], stamp_ns: int | None) -> WrittenMap:
+    def write(self, parts: Iterable[Part], stamp_ns: int | None) -> MapFileInfo:
         """Write the file; the metadata has the time ``stamp_ns``, if it is given."""
         self._mcap.start(library="triquad")
         entries = [self._stored(pack_part(PartKey(MAP), pack_facts(self._facts)))]
-        for part in parts:
-            entries.append(part if isinstance(part, Entry) else self._stored(part))
+        entries.extend(self._stored(part) for part in parts)
         manifest = Manifest(self._facts, self._stamp_ns, tuple(entries))
-        offset, stored = self._put(pack_manifest(manifest), self._stamp_ns)
+        offset, stored = self._put(pack_manifest(manifest))
         metadata = pack_metadata(self._facts, stamp_ns=stamp_ns, offset=offset, stored=stored)
         self._mcap.add_metadata(METADATA_NAME, metadata)
         self._mcap.finish()  # type: ignore[no-untyped-call]
         size = self._stream.size
-        _check_total(size)
-        if self._total > total_limit(size):
-            raise FormatError(
-                f"the map's parts shrink from {self._total} to {size} bytes: readers take that "
-                "for an attack"
-            )
-        info = MapFileInfo(size, self._stream.digest.hexdigest(), self._facts.epoch)
-        return WrittenMap(info, manifest)
+        check_totals(self._total, size)
+        return MapFileInfo(size, self._stream.digest.hexdigest(), self._facts.epoch)
 
     def _stored(self, part: Part) -> Entry:
-        """Return the entry of a part, which is written unless another file has it."""
-        entry = Entry(
+        """Write a part; return its entry."""
+        offset, stored = self._put(part)
+        return Entry(
             part.key,
             size=len(part.payload),
             sha256=hashlib.sha256(part.payload).digest(),
             epoch=self._facts.epoch,
-            stamp_ns=self._stamp_ns,
+            offset=offset,
+            stored=stored,
         )
-        known = self._known.get(part.key)
-        if known is not None and known.sha256 == entry.sha256:
-            entry = known
-        if entry.file is not None:
-            return entry
-        offset, stored = self._put(part, entry.stamp_ns)
-        return dataclasses.replace(entry, offset=offset, stored=stored)
 
-    def _put(self, part: Part, stamp_ns: int) -> tuple[int, int]:
+    def _put(self, part: Part) -> tuple[int, int]:
         """Write a part; return where its chunk begins, and bytes up to the next."""
         topic = part.key.topic
-        if len(part.payload) > MAX_PART_BYTES:
-            raise FormatError(
-                f"the part {topic} has {len(part.payload)} bytes; "
-                f"a map file holds parts of at most {MAX_PART_BYTES}",
-            )
+        check_part(part)
         self._total += len(part.payload)
         _check_total(self._total)
         data = part.payload
         if topic != PREVIEW:
-            data = compress(data, seams(part), _LEVELS.get(topic, _USUAL_LEVEL))
+            data = compressed(part)
         start = self._stream.size
-        self._mcap.add_message(self._channel(topic), stamp_ns, data, stamp_ns)
+        self._mcap.add_message(self._channel(topic), self._stamp_ns, data, self._stamp_ns)
         return start, self._stream.size - start
 
     def _channel(self, topic: str) -> int:
@@ -239,6 +212,25 @@ class _PartsWriter:
                 encoding = PREVIEW_ENCODING
             self._channels[topic] = self._mcap.register_channel(topic, encoding, schema)
         return self._channels[topic]
+
+
+def check_part(part: Part) -> None:
+    """Raise :class:`FormatError` for a part that is too large to be read."""
+    if len(part.payload) > MAX_PART_BYTES:
+        raise FormatError(
+            f"the part {part.key.topic} has {len(part.payload)} bytes; "
+            f"a map file holds parts of at most {MAX_PART_BYTES}",
+        )
+
+
+def check_totals(unpacked: int, stored: int) -> None:
+    """Raise :class:`FormatError` unless parts of so many bytes together can be read."""
+    _check_total(max(unpacked, stored))
+    if unpacked > total_limit(stored):
+        raise FormatError(
+            f"the map's parts shrink from {unpacked} to {stored} bytes: readers take that "
+            "for an attack"
+        )
 
 
 def _check_total(size: int) -> None:

@@ -1,12 +1,12 @@
-"""The intact parts of a damaged map file, and of the other files that it needs.
+"""The intact parts of a damaged map file, or of a checkpoint.
 
-Nothing in a file says where a chunk is: each is found by how it begins, and checked by
+Nothing in a map file says where a chunk is: each is found by how it begins, and checked by
 its checksum. So nothing that is damaged hides what lies behind it.
 """
 
 import hashlib
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,9 +17,10 @@ from triquad_format.errors import (
     TooLargeMapFileError,
     UnsupportedMapFileError,
 )
+from triquad_format.mapfile.checkpoint import CheckpointIndex, is_checkpoint
 from triquad_format.mapfile.container import chunk_messages, decompress
-from triquad_format.mapfile.index import FileBytes, file_in
-from triquad_format.mapfile.manifest import Manifest, total_limit, unpack_manifest
+from triquad_format.mapfile.index import FileBytes
+from triquad_format.mapfile.manifest import Entry, Manifest, total_limit, unpack_manifest
 from triquad_format.mapfile.metadata import MAX_MAP_BYTES, MapFacts, unpack_facts
 from triquad_format.mapfile.parts.body import part_topic, unpack_body
 from triquad_format.mapfile.parts.part import (
@@ -69,11 +70,11 @@ class IntactParts:
 
 
 def intact_parts(path: Path, max_bytes: int) -> IntactParts:
-    """Return the intact parts of a file, and of those in its folder that it needs.
+    """Return the intact parts of a map file, or of a checkpoint with what its store has of it.
 
     Args:
         path: the file.
-        max_bytes: limit on each file's size and, decompressed, on its parts together.
+        max_bytes: limit on the file's size and, decompressed, on its parts together.
 
     Raises:
         UnsupportedMapFileError: the file needs a newer reader.
@@ -81,10 +82,14 @@ def intact_parts(path: Path, max_bytes: int) -> IntactParts:
         MapFileError: nothing says what map this is.
         OSError: it cannot be read.
     """
+    with closing(FileBytes(path)) as file:
+        if is_checkpoint(file):
+            return _checkpoint_parts(CheckpointIndex(file), max_bytes)
     payloads = list(_payloads(path, max_bytes))
     manifest = _manifest(payloads)
     if manifest is not None:
-        return _listed_parts(manifest, payloads, path.parent, max_bytes)
+        by_digest = {hashlib.sha256(payload).digest(): payload for payload in payloads}
+        return _listed_parts(manifest, lambda entry: by_digest.get(entry.sha256))
     for payload in payloads:
         if part_topic(payload) == MAP:
             facts = unpack_facts(unpack_body(MAP, payload))
@@ -106,28 +111,30 @@ def _manifest(payloads: list[bytes]) -> Manifest | None:
     return None
 
 
-def _listed_parts(
-    manifest: Manifest, payloads: list[bytes], folder: Path, max_bytes: int
-) -> IntactParts:
-    """Return the parts that a manifest lists, known by their digests."""
-    entries = [entry for entry in manifest.entries if entry.key.topic in REGION_TOPICS]
-    wanted = {entry.sha256 for entry in entries}
-    found = _by_digest(payloads, wanted)
-    for name in manifest.files:
+def _checkpoint_parts(index: CheckpointIndex, max_bytes: int) -> IntactParts:
+    if sum(entry.size for entry in index.manifest.entries) > max_bytes:
+        raise TooLargeMapFileError(f"its parts exceed the limit of {max_bytes} bytes together")
+
+    def intact(entry: Entry) -> bytes | None:
         with suppress(FormatError, OSError):
-            found |= _by_digest(_payloads(file_in(folder, name), max_bytes), wanted)
+            return index.payload(entry)
+        return None
+
+    return _listed_parts(index.manifest, intact)
+
+
+def _listed_parts(manifest: Manifest, payload_of: Callable[[Entry], bytes | None]) -> IntactParts:
+    """Return the parts of regions that a manifest lists; those without a payload are missing."""
+    entries = [entry for entry in manifest.entries if entry.key.topic in REGION_TOPICS]
+    tried = {entry.key: payload_of(entry) for entry in entries}
+    found = {key: payload for key, payload in tried.items() if payload is not None}
     return IntactParts(
         manifest.facts,
-        {entry.key: found[entry.sha256] for entry in entries if entry.sha256 in found},
-        missing=frozenset(entry.key for entry in entries if entry.sha256 not in found),
+        found,
+        missing=frozenset(tried.keys() - found.keys()),
         parts_listed=len(entries),
         stamp_ns=manifest.stamp_ns,
     )
-
-
-def _by_digest(payloads: Iterator[bytes] | list[bytes], wanted: set[bytes]) -> dict[bytes, bytes]:
-    digests = ((hashlib.sha256(payload).digest(), payload) for payload in payloads)
-    return {digest: payload for digest, payload in digests if digest in wanted}
 
 
 def _own_key(payload: bytes) -> PartKey | None:

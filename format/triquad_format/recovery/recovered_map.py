@@ -70,7 +70,7 @@ class RecoveredMap:
 
 
 def recover(path: Path, *, max_bytes: int = MAX_MAP_BYTES) -> RecoveredMap:
-    """Return all that is intact in a map file, and in the files of its folder that it needs.
+    """Return all that is intact in a map file, or of a checkpoint in its store.
 
     The result is valid. It answers as the whole map did wherever no loss reaches. Where vertices
     are lost, evidence goes with them: so nothing there passes for known. Training state stays
@@ -78,7 +78,7 @@ def recover(path: Path, *, max_bytes: int = MAX_MAP_BYTES) -> RecoveredMap:
 
     Args:
         path: the file, truncated or damaged in any way.
-        max_bytes: limit on each file's size and, decompressed, on its parts together.
+        max_bytes: limit on the file's size and, decompressed, on its parts together.
 
     Raises:
         MapFileError: nothing could be saved, or the file needs a newer reader.

@@ -189,19 +189,11 @@ class StoreSettings(BaseModel):
     keep: Annotated[int, Field(ge=2, le=1_000_000)] = 20
     """Newest checkpoints that stay on disk; two always do."""
 
-    keep_age_s: Annotated[float, Field(ge=0, le=1e10)] = 0.0
-    """Older checkpoints are deleted; 0: of any age stay."""
+    keep_resets: Annotated[int, Field(ge=0, le=1000)] = 10
+    """Of so many resets the map just before stays as well; 0: a reset keeps nothing."""
 
     keep_bytes: Annotated[int, Field(ge=0, le=2**60)] = 4_000_000_000
-    """The oldest checkpoints are deleted while all take more; 0: no limit."""
-
-    protect_h: Annotated[float, Field(ge=0, le=1e6)] = 24.0
-    """Hours for which the map as it was before a reset stays on disk, whatever the limits above
-    say; 0: a reset keeps nothing."""
-
-    protect_bytes: Annotated[int, Field(ge=0, le=2**60)] = 4_000_000_000
-    """Bytes of all checkpoints that are kept for that. A reset that would need more is refused: so
-    nothing pushes out what is kept already; 0: no limit."""
+    """The oldest checkpoints are deleted while all take more, but for two; 0: no limit."""
 
     scrub_h: Annotated[float, Field(ge=0, le=1e6)] = 24.0
     """Hours between checks of all checkpoints on disk, which find what rots there; 0: none."""

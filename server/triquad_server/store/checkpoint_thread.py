@@ -1,26 +1,20 @@
 """Writes checkpoints from time to time, on request, and at the end."""
 
 import logging
-import queue
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import CheckpointInfo, CheckpointRequest
 from triquad_format.wire.metrics_messages import CheckpointMetrics
 from triquad_map.compiled.team import lower_priority
 
-from triquad_server.errors import (
-    LastCheckpointError,
-    MapperStoppedError,
-    StoreBaseError,
-    StoreError,
-)
-from triquad_server.mapping.map_snapshot import MapChanges, MapSnapshot
+from triquad_server.errors import LastCheckpointError, MapperStoppedError, StoreError
+from triquad_server.mapping.map_snapshot import MapSnapshot
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.process.threads import NICENESS
 from triquad_server.store.store import Store
@@ -30,14 +24,6 @@ _log = logging.getLogger(__name__)
 _NO_STORE = "the server was started without a store: the map is not kept"
 
 ResultT = TypeVar("ResultT")
-
-
-@dataclass(frozen=True)
-class _Job:
-    """A job to run on the thread, and the future that its caller waits for."""
-
-    run: Callable[[], Any]
-    result: Future[Any]
 
 
 @dataclass(frozen=True)
@@ -67,23 +53,27 @@ class CheckpointThread:
         self._mapper = mapper
         self._store = store
         self._period_s = period_s
-        self._asked: queue.SimpleQueue[_Job] = queue.SimpleQueue()
+        self._jobs = ThreadPoolExecutor(1, "checkpoints", lower_priority, (2 * NICENESS,))
         self._stopping = threading.Event()
-        self._wake = threading.Event()
         self.last = last
         self._counts = _Counts()
         self.error = None if store else _NO_STORE
-        self._thread = threading.Thread(target=self._run, name="checkpoints")
+        self._timer = threading.Thread(target=self._write_regularly, name="checkpoint-timer")
 
     @property
     def has_store(self) -> bool:
         """Return whether there is a store to write checkpoints to."""
         return self._store is not None
 
+    @property
+    def base_epoch(self) -> int | None:
+        """As of :class:`Store`; only for jobs on this thread."""
+        return self._opened.base_epoch
+
     def start(self) -> None:
         """Begin to write checkpoints, while the map changes and on request."""
-        if self._store is not None:
-            self._thread.start()
+        if self._store is not None and self._period_s > 0:
+            self._timer.start()
 
     def metrics(self) -> CheckpointMetrics:
         """Return how many checkpoints were written, and how long the last took."""
@@ -98,16 +88,17 @@ class CheckpointThread:
             LastCheckpointError: it cannot be written.
         """
         self._stopping.set()
-        self._wake.set()
-        if self._thread.ident is not None:
-            self._thread.join()
+        if self._timer.ident is not None:
+            self._timer.join()
+        self._jobs.shutdown()
         if self._store is None:
             return
         try:
             info = self.write()
         except (StoreError, MapperStoppedError) as error:
+            since = "the server started" if self.last is None else f"epoch {self.last.epoch}"
             raise LastCheckpointError(
-                f"the last checkpoint was not written, and what was mapped since {self._kept()} "
+                f"the last checkpoint was not written, and what was mapped since {since} "
                 f"is lost: {error}"
             ) from error
         _log.info("the map is in %s, as of epoch %d", info.path, info.epoch)
@@ -131,51 +122,11 @@ class CheckpointThread:
         """
         if self._store is None:
             raise StoreError(_NO_STORE)
-        result: Future[ResultT] = Future()
-        self._asked.put(_Job(job, result))
-        self._wake.set()
-        return result.result()
+        return self._jobs.submit(job).result()
 
     def found_damaged(self, name: str) -> None:
         """Have all of the map written again, if the newest checkpoint needs the file ``name``."""
-        self._asked.put(_Job(lambda: self._write_anew(name), Future()))
-        self._wake.set()
-
-    def _write_anew(self, name: str) -> None:
-        assert self._store is not None
-        if self._store.forget_base(name):
-            _log.warning("the newest checkpoint needs %s: all of the map is written anew", name)
-            self.last = None
-            self._write_if_changed()
-
-    def _run(self) -> None:
-        lower_priority(2 * NICENESS)  # mapping has priority, too
-        due = time.monotonic() + self._period_s
-        while not self._stopping.is_set():
-            self._wake.wait(due - time.monotonic() if self._period_s > 0 else None)
-            self._wake.clear()
-            self._run_jobs()
-            if self._period_s > 0 and time.monotonic() >= due:
-                self._write_if_changed()
-                due = time.monotonic() + self._period_s
-            self._fold()
-
-    def _run_jobs(self) -> None:
-        while not self._asked.empty():
-            asked = self._asked.get()
-            try:
-                asked.result.set_result(asked.run())
-            except Exception as error:
-                asked.result.set_exception(error)
-
-    def _write_if_changed(self) -> None:
-        try:
-            self.write()
-        except StoreError:
-            return  # the status and the log report it
-        except Exception:
-            self.error = "an internal error of the server; its log has the details"
-            _log.exception("a checkpoint met an internal error")
+        self._jobs.submit(self._write_whole, name)
 
     def write(self) -> CheckpointInfo:
         """Write what changed, as :meth:`answer` does; only for jobs on this thread.
@@ -183,9 +134,8 @@ class CheckpointThread:
         Raises:
             StoreError: it cannot be written.
         """
-        assert self._store is not None
-        base = self._store.base_epoch
-        return self.write_changes(self._snapshot_since(base))
+        base = self.base_epoch
+        return self.write_changes(self._mapper.call(lambda mapper: mapper.snapshot_since(base)))
 
     def write_changes(self, snapshot: MapSnapshot) -> CheckpointInfo:
         """Write what changed since the last checkpoint; only for jobs on this thread.
@@ -193,16 +143,15 @@ class CheckpointThread:
         Raises:
             StoreError: it cannot be written.
         """
-        assert self._store is not None
         last = self.last
-        # The base is the last checkpoint, as long as its files are as they were written.
-        if last is not None and last.epoch == snapshot.epoch.number == self._store.base_epoch:
+        # The base is the last checkpoint, as long as its file and parts are there.
+        if last is not None and last.epoch == snapshot.epoch.number == self.base_epoch:
             return last
         started = time.monotonic()
         try:
             changes = snapshot.changes()
             del snapshot  # the records have all of it, and memory is shortest now
-            info = self._write_changes(self._store, changes)
+            info = self._opened.write(changes)
         except Exception as error:
             self._counts = replace(self._counts, failed=self._counts.failed + 1)
             if isinstance(error, StoreError):
@@ -220,44 +169,34 @@ class CheckpointThread:
         _log.info("checkpoint %s: epoch %d, %d bytes", info.path, info.epoch, info.bytes)
         return info
 
-    def _write_changes(self, store: Store, changes: MapChanges) -> CheckpointInfo:
-        """Write the changes, or all of the map if earlier checkpoints were damaged since."""
-        try:
-            return store.write(changes)
-        except StoreBaseError as error:
-            _log.warning("%s; all of the map is written instead", error)
-            return store.write(self._snapshot_since(None).changes())
+    def mark_newest(self, undoes: str) -> int:
+        """Have the newest checkpoint stay, and return its epoch; only for jobs on this thread.
 
-    def _snapshot_since(self, base: int | None) -> MapSnapshot:
-        """Return what a checkpoint that follows the epoch ``base`` needs."""
-        return self._mapper.call(lambda mapper: mapper.snapshot_since(base))
+        Raises:
+            StoreError: as of :meth:`Store.mark_newest`.
+        """
+        self.last = self._opened.mark_newest(undoes)
+        return self.last.epoch
 
-    def _fold(self) -> None:
-        """Fold old checkpoints together, if there are many."""
-        assert self._store is not None
+    @property
+    def _opened(self) -> Store:
+        assert self._store is not None, "jobs run where there is a store"
+        return self._store
+
+    def _write_regularly(self) -> None:
+        while not self._stopping.wait(self._period_s):
+            self._jobs.submit(self._write_if_changed).result()
+
+    def _write_if_changed(self) -> None:
         try:
-            info = self._store.fold(self._interrupted)
-        except StoreBaseError as error:
-            _log.warning("%s; all of the map is written instead", error)
-            self.last = None
-            self._write_if_changed()
-            return
-        except StoreError as error:
-            self.error = str(error)
-            _log.error("%s", error)
-            return
+            self.write()
+        except StoreError:
+            return  # the status and the log report it
         except Exception:
-            _log.exception("folding checkpoints met an internal error")
-            return
-        if info is None:
-            return
-        _log.info("folded %s: epoch %d, %d bytes", info.path, info.epoch, info.bytes)
-        if self.last is not None and self.last.epoch == info.epoch:
-            self.last = info
+            self.error = "an internal error of the server; its log has the details"
+            _log.exception("a checkpoint met an internal error")
 
-    def _kept(self) -> str:
-        return "the server started" if self.last is None else f"epoch {self.last.epoch}"
-
-    def _interrupted(self) -> bool:
-        """Return whether something is more urgent than folding, which can be begun again."""
-        return self._stopping.is_set() or not self._asked.empty()
+    def _write_whole(self, name: str) -> None:
+        if self._opened.forget_base(name):
+            _log.warning("the newest checkpoint needs %s: all of the map is written again", name)
+            self._write_if_changed()

@@ -12,33 +12,30 @@ from triquad_server.mapping.map_snapshot import MapSnapshot
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.store.checkpoint_thread import CheckpointThread
-from triquad_server.store.store import Store
 
 _log = logging.getLogger(__name__)
 
-_WHY = "before a reset"
+_UNDOES = "a reset"
 
 
 class Resets:
-    """Answers reset requests: each first has a checkpoint written that retention must keep."""
+    """Answers reset requests: each first has the map written to a checkpoint that stays."""
 
     def __init__(
         self,
         mapper: MapperThread,
         checkpoints: CheckpointThread,
-        store: Store | None,
-        protect_h: float,
+        keep_resets: int,
         trails: SourceTrails,
     ) -> None:
-        """Make the handler; without a ``store``, or with ``protect_h`` = 0, nothing is kept.
+        """Make the handler; without a store, or with ``keep_resets`` = 0, nothing is kept.
 
         Where sources have been in the box is removed from ``trails``.
         """
         self._mapper = mapper
         self._trails = trails
         self._checkpoints = checkpoints
-        self._store = store
-        self._protect_h = protect_h
+        self._keep_resets = keep_resets
 
     def answer(self, request: ResetRequest) -> ResetReply:
         """Forget what lies in the request's box, and reply once an epoch shows it.
@@ -47,11 +44,10 @@ class Resets:
             RefusedError: it is not a box; or the map as it is could not be kept, and was not reset.
         """
         check_box(request.minimum, request.maximum)
-        store = self._store
-        if store is None or self._protect_h == 0:
-            return self._unkept(request, store)
+        if not self._checkpoints.has_store or self._keep_resets == 0:
+            return self._unkept(request)
         try:
-            reply = self._checkpoints.call(lambda: self._keep_and_reset(store, request))
+            reply = self._checkpoints.call(lambda: self._keep_and_reset(request))
         except StoreError as error:
             raise RefusedError(
                 "store", f"nothing was reset, for the map as it is could not be kept: {error}"
@@ -60,9 +56,10 @@ class Resets:
             _log.warning("the map was reset as of epoch %d: %s", reply.epoch, reply.undo)
         return reply
 
-    def _unkept(self, request: ResetRequest, store: Store | None) -> ResetReply:
+    def _unkept(self, request: ResetRequest) -> ResetReply:
         epoch = self._mapper.call(lambda mapper: self._forget(mapper, request))
-        why = "the server has no store" if store is None else "store.protect_h = 0"
+        has_store = self._checkpoints.has_store
+        why = "store.keep_resets = 0" if has_store else "the server has no store"
         undo = f"the map before was not kept: {why}"
         _log.warning("the map was reset as of epoch %d: %s", epoch, undo)
         return ResetReply(epoch, undo=undo)
@@ -73,37 +70,32 @@ class Resets:
         self._trails.forget(request.minimum, request.maximum)
         return mapper.publish().number
 
-    def _keep_and_reset(self, store: Store, request: ResetRequest) -> ResetReply:
-        kept = None
+    def _keep_and_reset(self, request: ResetRequest) -> ResetReply:
+        """Write the map, forget what lies in the box, and write what was learnt meanwhile, too."""
+        checkpoints = self._checkpoints
+        kept = 0
         if self._mapper.call(lambda mapper: len(mapper.regions)) > 0:
-            kept = self._checkpoints.write().epoch
-            store.protect(kept, _WHY)
-        base = store.base_epoch
+            kept = checkpoints.write().epoch
+        base = checkpoints.base_epoch
 
         def forget(mapper: Mapper) -> tuple[MapSnapshot, int]:
             """Forget it, and return the map just before: no scan comes in between."""
             return mapper.snapshot_since(base), self._forget(mapper, request)
 
         before, epoch = self._mapper.call(forget)
-        kept = self._keep_the_rest(store, before, kept)
-        if kept is None:
+        if not before.regions:
             return ResetReply(epoch, undo="the map was empty before")
+        try:
+            checkpoints.write_changes(before)
+            kept = checkpoints.mark_newest(_UNDOES)
+        except StoreError as error:
+            _log.error(
+                "epoch %d, the map before a reset, stays no longer than any other, and what was "
+                "learnt while it was written is lost: %s",
+                *(kept, error),
+            )
         undo = (
-            f"epoch {kept}, the map before, is kept for {self._protect_h:g} h; to go back to it, "
-            f"stop the server and start it with --restore {kept}"
+            f"epoch {kept}, the map before, is kept; to go back to it, stop the server and start "
+            f"it with --restore {kept}"
         )
         return ResetReply(epoch, kept, undo)
-
-    def _keep_the_rest(self, store: Store, before: MapSnapshot, kept: int | None) -> int | None:
-        """Keep what was learnt while the checkpoint was written, too; return the epoch kept."""
-        if not before.regions or before.epoch.number == kept:
-            return kept
-        try:
-            written = self._checkpoints.write_changes(before).epoch
-            if written != before.epoch.number:  # all of it was needed, and is no longer there
-                return kept
-            store.protect(written, _WHY, instead_of=kept)
-            return written
-        except StoreError as error:
-            _log.error("what was learnt while the map was being kept is lost: %s", error)
-            return kept

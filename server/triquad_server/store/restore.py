@@ -1,18 +1,17 @@
 """Reads the newest valid checkpoint of a folder."""
 
 import hashlib
-import itertools
 import logging
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from triquad_format.errors import MapFileError, TooLargeMapFileError, UnsupportedMapFileError
-from triquad_format.mapfile.checkpoint_folder import (
-    CheckpointFile,
-    checkpoint_files,
-    checkpoint_name,
+from triquad_format.errors import (
+    MapFileError,
+    TooLargeMapFileError,
+    UnsupportedMapFileError,
 )
+from triquad_format.mapfile.checkpoint import Checkpoint, read_checkpoint
+from triquad_format.mapfile.checkpoint_folder import CheckpointFile, checkpoint_files
 from triquad_format.mapfile.index import DAMAGED_SUFFIX
 from triquad_format.mapfile.reader import MapFile, read_map_file
 from triquad_format.records.region import MapRecord
@@ -35,6 +34,7 @@ class ValidCheckpoint:
 
     path: Path
     file: MapFile
+    checkpoint: Checkpoint | None  # None: it is a map file, such as a backup
     info: CheckpointInfo
 
     @property
@@ -66,7 +66,7 @@ def newest_valid(folder: Path) -> ValidCheckpoint | None:
         _set_aside(damaged)
         if damaged:
             _log.warning("the older checkpoint %s is used instead", checkpoint.path)
-        return ValidCheckpoint(checkpoint.path, file, _info(checkpoint))
+        return _valid(checkpoint.path, file)
     if damaged:
         raise StoreError(
             f"all {len(damaged)} checkpoints in {folder} are damaged; move them away to "
@@ -87,7 +87,7 @@ def valid_checkpoint(checkpoint: CheckpointFile) -> ValidCheckpoint:
             f"checkpoint {checkpoint.path} is damaged: choose another; triquad-pack --recover "
             "saves what is intact"
         )
-    return ValidCheckpoint(checkpoint.path, file, _info(checkpoint))
+    return _valid(checkpoint.path, file)
 
 
 def check_countable(path: Path, epoch: int) -> None:
@@ -120,10 +120,8 @@ def _read(checkpoint: CheckpointFile) -> MapFile | None:
     epoch = file.record.epoch
     if epoch != checkpoint.epoch:
         _log.warning(
-            "checkpoint %s holds epoch %d and is left out; name it %s to use it",
-            path,
-            epoch,
-            checkpoint_name(epoch, checkpoint.complete),
+            "checkpoint %s holds epoch %d and is left out; name it epoch-%09d%s to use it",
+            *(path, epoch, epoch, path.suffix),
         )
         return None
     check_countable(path, epoch)
@@ -134,25 +132,22 @@ def _set_aside(damaged: list[Path]) -> None:
     try:
         for path in damaged:
             aside = path.with_name(path.name + DAMAGED_SUFFIX)
-            for number in itertools.count(2):
-                if not os.path.lexists(aside):
-                    break
-                aside = path.with_name(f"{path.name}.{number}{DAMAGED_SUFFIX}")
             path.rename(aside)
             _log.warning("%s is now called %s", path, aside.name)
     except OSError as error:
         raise StoreError(f"the damaged {path} cannot be renamed: {error}") from error
 
 
-def _info(checkpoint: CheckpointFile) -> CheckpointInfo:
+def _valid(path: Path, file: MapFile) -> ValidCheckpoint:
     digest = hashlib.sha256()
-    with checkpoint.path.open("rb") as file:
-        while block := file.read(_READ_BYTES):
+    with path.open("rb") as source:
+        while block := source.read(_READ_BYTES):
             digest.update(block)
-        return CheckpointInfo(
-            path=str(checkpoint.path),
-            bytes=file.tell(),
-            epoch=checkpoint.epoch,
-            sha256=digest.hexdigest(),
-            stamp_ns=os.fstat(file.fileno()).st_mtime_ns,
-        )
+    info = CheckpointInfo(
+        path=str(path),
+        bytes=file.size,
+        epoch=file.record.epoch,
+        sha256=digest.hexdigest(),
+        stamp_ns=file.manifest.stamp_ns,
+    )
+    return ValidCheckpoint(path, file, read_checkpoint(path), info)

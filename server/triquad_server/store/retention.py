@@ -1,6 +1,6 @@
-"""Chooses the checkpoints that stay, without access to files or clocks."""
+"""Chooses the checkpoints that stay, without access to files."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from triquad_server.settings import StoreSettings
@@ -10,46 +10,36 @@ _MIN_KEPT = 2
 
 
 @dataclass(frozen=True)
-class KeptCheckpoint:
+class StoredCheckpoint:
     """The properties of a checkpoint that decide whether it stays."""
 
-    epoch: int
-    stamp_ns: int  # when it was written, nanoseconds since 1970
-    files: frozenset[str]  # names of its files
+    files: Mapping[str, int]  # bytes of each of its parts and of its own file, by name
+    undoes: str = ""  # what going back to it undoes, such as a reset; empty: nothing
 
 
-def needed_files(
-    checkpoints: Sequence[KeptCheckpoint],
-    sizes: Mapping[str, int],
-    settings: StoreSettings,
-    *,
-    protected: Collection[int],
-    now_ns: int,
-) -> frozenset[str]:
-    """Return the names of the files that are needed by checkpoints that stay.
+def staying(
+    checkpoints: Sequence[StoredCheckpoint], settings: StoreSettings
+) -> list[StoredCheckpoint]:
+    """Return those of all checkpoints, the newest first, that stay.
 
-    Args:
-        checkpoints: all there are, the newest first.
-        sizes: bytes of each file; a file that several checkpoints need counts once.
-        settings: how many stay, of what age, and of how many bytes.
-        protected: epochs that stay in addition to all these.
-        now_ns: the time, nanoseconds since 1970.
+    These are the two newest and, as long as ``keep_bytes`` suffice, first the newest
+    ``keep_resets`` that undo something, then the newest ``keep`` of all.
     """
-    needed: set[str] = set()
-    for number, checkpoint in enumerate(checkpoints):
-        together = needed | checkpoint.files
-        too_many = settings.keep <= number
-        too_old = 0 < settings.keep_age_s * 1e9 < now_ns - checkpoint.stamp_ns
-        too_large = 0 < settings.keep_bytes < bytes_of(together, sizes)
-        if number >= _MIN_KEPT and (too_many or too_old or too_large):
+    undoing = [one for one in checkpoints if one.undoes][: settings.keep_resets]
+    files: dict[str, int] = {}
+    stay: list[StoredCheckpoint] = []
+    candidates = [*checkpoints[:_MIN_KEPT], *undoing, *checkpoints[: settings.keep]]
+    for number, one in enumerate(candidates):
+        files |= one.files
+        if number >= _MIN_KEPT and 0 < settings.keep_bytes < sum(files.values()):
             break
-        needed = together
+        stay.append(one)
+    return stay
+
+
+def files_of(checkpoints: Iterable[StoredCheckpoint]) -> dict[str, int]:
+    """Return the bytes of all files that checkpoints need; what they share is there once."""
+    files: dict[str, int] = {}
     for checkpoint in checkpoints:
-        if checkpoint.epoch in protected:
-            needed |= checkpoint.files
-    return frozenset(needed)
-
-
-def bytes_of(files: Collection[str], sizes: Mapping[str, int]) -> int:
-    """Return the bytes that files take on disk; deleted ones take nothing."""
-    return sum(sizes.get(name, 0) for name in files)
+        files |= checkpoint.files
+    return files

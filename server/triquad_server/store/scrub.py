@@ -8,8 +8,10 @@ from contextlib import closing
 from pathlib import Path
 
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.checkpoint_folder import CheckpointFile, checkpoint_files
-from triquad_format.mapfile.index import FileBytes, MapIndex, named
+from triquad_format.mapfile.checkpoint import open_index
+from triquad_format.mapfile.checkpoint_folder import checkpoint_files
+from triquad_format.mapfile.index import FileBytes, named
+from triquad_format.mapfile.part_files import PartFiles
 from triquad_map.compiled.team import lower_priority
 
 from triquad_server.process.threads import NICENESS
@@ -22,7 +24,7 @@ _BYTES_PER_S = 8e6
 
 
 class Scrubber:
-    """Reads all checkpoints of a folder again and again, on a thread of its own."""
+    """Reads all checkpoints and parts of a folder again and again, on a thread of its own."""
 
     def __init__(self, folder: Path, period_h: float, damaged: Callable[[str], None]) -> None:
         """Begin; ``damaged`` is called with the name of each file that is found damaged.
@@ -30,9 +32,9 @@ class Scrubber:
         ``period_h`` goes by between the end of one check and the next, and before the first.
         """
         self._folder = folder
+        self._parts = PartFiles(folder)
         self._period_s = period_h * _HOUR_S
         self._damaged = damaged
-        self._found: set[tuple[str, int]] = set()  # damaged, by name and time of change
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="scrubber")
         self._thread.start()
@@ -47,45 +49,34 @@ class Scrubber:
         while not self._stopping.wait(self._period_s):
             started_s = time.monotonic()
             try:
-                files = checkpoint_files(self._folder)
+                checkpoints = [file.path for file in checkpoint_files(self._folder)]
+                parts = [self._parts.folder / name for name in self._parts.names()]
             except OSError as error:
                 _log.warning("store %s cannot be checked: %s", self._folder, error)
                 continue
-            for file in files:
-                self._check(file)
+            for path in (*checkpoints, *parts):
+                self._check(path)
             if not self._stopping.is_set():
                 took_s = time.monotonic() - started_s
-                _log.info("checked %d checkpoints on disk in %.0f s", len(files), took_s)
+                _log.info("checked %d checkpoints on disk in %.0f s", len(checkpoints), took_s)
 
-    def _check(self, file: CheckpointFile) -> None:
-        """Read a file's own parts; those that lie in other files are checked there."""
-        name = file.path.name
+    def _check(self, path: Path) -> None:
+        """Check a file, and wait for as long as so many bytes may take."""
         if self._stopping.is_set():
             return
         try:
-            version = (name, file.path.stat().st_mtime_ns)
-            if version not in self._found:
-                self._read(file.path)
+            with closing(FileBytes(path)) as file, named(str(path)):
+                file.drop_cached()
+                if path.parent == self._parts.folder:
+                    self._parts.check(path.name)
+                else:
+                    open_index(file).check_unread()
+                self._stopping.wait(file.size / _BYTES_PER_S)
         except FileNotFoundError:
-            return  # deleted meanwhile, as old checkpoints are
+            return  # deleted meanwhile, as what is not needed any more is
         except OSError as error:
-            _log.warning("%s cannot be checked: %s", file.path, error)
+            _log.warning("%s cannot be checked: %s", path, error)
         except FormatError as error:
-            _log.error("bit rot: %s", error)
-            self._found.add(version)
-            self._damaged(name)
-
-    def _read(self, path: Path) -> None:
-        """Read and check all of a file.
-
-        Raises:
-            FormatError: it is damaged.
-            OSError: it cannot be read.
-        """
-        with closing(FileBytes(path)) as file, named(str(path)):
-            file.drop_cached()
-            index = MapIndex(file)
-            for entry in index.manifest.own:
-                index.payload(entry)
-                if self._stopping.wait(entry.size / _BYTES_PER_S):
-                    return
+            if path.exists():
+                _log.error("bit rot: %s", error)
+                self._damaged(path.name)

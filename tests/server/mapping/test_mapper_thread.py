@@ -191,7 +191,7 @@ def test_who_reset_the_map_finds_the_epoch_that_shows_it() -> None:
     box = np.full(3, -np.inf), np.full(3, np.inf)
     with running(learning_mapper()) as mapping:
         checkpoints = CheckpointThread(mapping.thread, None, 0.0, None)
-        resets = Resets(mapping.thread, checkpoints, None, 0.0, SourceTrails(0.2))
+        resets = Resets(mapping.thread, checkpoints, 0, SourceTrails(0.2))
         reply = resets.answer(ResetRequest(*box))
         assert mapping.epochs.newest.number >= reply.epoch
         assert mapping.epochs.get(reply.epoch).regions == 0

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from support import servers
 from support.mapfile_edit import write_record
-from triquad_format.mapfile.checkpoint_folder import checkpoint_name
 from triquad_format.records.region import MapRecord
 from triquad_server.errors import StoreError
 from triquad_server.settings import StoreSettings
@@ -19,7 +18,7 @@ def write_checkpoint(store: Path, epoch: int) -> None:
     folder = store / servers.MAP
     folder.mkdir(parents=True)
     record = MapRecord(servers.MAP, epoch, servers.SMALL.field, ())
-    write_record(folder / checkpoint_name(epoch, complete=True), record)
+    write_record(folder / f"epoch-{epoch:09d}.triquad", record)
 
 
 @pytest.mark.parametrize("epoch", [2**31 - 1, MAX_EPOCH - 1])

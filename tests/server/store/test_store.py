@@ -30,7 +30,8 @@ def store(tmp_path):
 
 
 def names(store):
-    return sorted(path.name for path in store.folder.iterdir() if path.name != "lock")
+    others = ("lock", "parts")
+    return sorted(path.name for path in store.folder.iterdir() if path.name not in others)
 
 
 def test_an_empty_store_has_nothing(store):
@@ -40,23 +41,23 @@ def test_an_empty_store_has_nothing(store):
 def test_the_newest_checkpoints_are_kept_and_described(store):
     for epoch in (1, 2, 10):
         info = store.write(record(epoch))
-    assert names(store) == ["epoch-000000002.triquad", "epoch-000000010.triquad"]
+    assert names(store) == ["epoch-000000002.checkpoint", "epoch-000000010.checkpoint"]
     restored = store.newest()
     assert restored.record.epoch == restored.info.epoch == 10
     assert restored.info == info
-    assert info.bytes == (store.folder / "epoch-000000010.triquad").stat().st_size
+    assert info.bytes == (store.folder / "epoch-000000010.checkpoint").stat().st_size  # no parts
     assert len(info.sha256) == 64
 
 
 def test_a_damaged_checkpoint_is_left_out_by_name_and_kept_aside(store, caplog):
     store.write(record(1))
-    bad = store.folder / "epoch-000000002.triquad"
+    bad = store.folder / "epoch-000000002.checkpoint"
     bad.write_bytes(b"not a map")
     with caplog.at_level(logging.WARNING):
         assert store.newest().record.epoch == 1
-    assert "epoch-000000002.triquad is damaged" in caplog.text
-    assert "epoch-000000001.triquad is used instead" in caplog.text
-    assert names(store) == ["epoch-000000001.triquad", "epoch-000000002.triquad.damaged"]
+    assert "epoch-000000002.checkpoint is damaged" in caplog.text
+    assert "epoch-000000001.checkpoint is used instead" in caplog.text
+    assert names(store) == ["epoch-000000001.checkpoint", "epoch-000000002.checkpoint.damaged"]
     store.write(record(2))
     store.write(record(3))
     assert store.newest().record.epoch == 3
@@ -64,7 +65,7 @@ def test_a_damaged_checkpoint_is_left_out_by_name_and_kept_aside(store, caplog):
 
 def test_a_truncated_checkpoint_is_damaged(store):
     store.write(record(1))
-    path = store.folder / "epoch-000000002.triquad"
+    path = store.folder / "epoch-000000002.checkpoint"
     store.write(record(2))
     path.write_bytes(path.read_bytes()[:-10])
     with pytest.raises(MapFileError):
@@ -90,7 +91,7 @@ def test_a_valid_checkpoint_that_cannot_be_read_now_is_not_demoted(store, monkey
         raise error
 
     monkeypatch.setattr(restore, "read_map_file", fail)
-    with pytest.raises(StoreError, match="000000002.triquad cannot be read"):
+    with pytest.raises(StoreError, match="000000002.checkpoint cannot be read"):
         store.newest()
     assert names(store) == before
 
@@ -107,7 +108,7 @@ def test_what_keeps_a_checkpoint_from_being_written_is_an_error_of_the_store(sto
     def fail(*_, **__):
         raise OSError(errno.ENOSPC, "No space left")
 
-    monkeypatch.setattr(store_module, "write_parts", fail)
+    monkeypatch.setattr(store_module, "write_checkpoint", fail)
     with pytest.raises(StoreError, match="cannot be written"):
         store.write(record(1))
 
@@ -115,17 +116,17 @@ def test_what_keeps_a_checkpoint_from_being_written_is_an_error_of_the_store(sto
 def test_a_damaged_file_of_a_higher_number_does_not_push_out_a_valid_one(store):
     store.write(record(1))
     for epoch in (8, 9):
-        (store.folder / f"epoch-00000000{epoch}.triquad").write_bytes(b"damaged")
+        (store.folder / f"epoch-00000000{epoch}.checkpoint").write_bytes(b"damaged")
     store.write(record(2))
-    assert names(store)[:2] == ["epoch-000000001.triquad", "epoch-000000002.triquad"]
+    assert names(store)[:2] == ["epoch-000000001.checkpoint", "epoch-000000002.checkpoint"]
     store.write(record(3))
-    assert names(store)[:2] == ["epoch-000000002.triquad", "epoch-000000003.triquad"]
+    assert names(store)[:2] == ["epoch-000000002.checkpoint", "epoch-000000003.checkpoint"]
     assert store.newest().record.epoch == 3
 
 
 def test_it_does_not_start_empty_where_all_checkpoints_are_damaged(store):
     for epoch in (1, 2):
-        (store.folder / f"epoch-00000000{epoch}.triquad").write_bytes(b"")
+        (store.folder / f"epoch-00000000{epoch}.checkpoint").write_bytes(b"")
     with pytest.raises(StoreError, match="all 2 checkpoints"):
         store.newest()
     assert len(names(store)) == 2
@@ -154,18 +155,18 @@ def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
 def test_what_a_killed_server_left_unfinished_goes(store, tmp_path):
     store.write(record(1))
     store.close()
-    (store.folder / ".epoch-000000002.triquad.0a1b2c3d.tmp").write_bytes(b"half")
+    (store.folder / ".epoch-000000002.checkpoint.0a1b2c3d.tmp").write_bytes(b"half")
     with closing(Store(tmp_path, "lab", StoreSettings(keep=2))) as again:
-        assert names(again) == ["epoch-000000001.triquad"]
+        assert names(again) == ["epoch-000000001.checkpoint"]
         assert again.newest().record.epoch == 1
 
 
 def test_a_failed_write_leaves_the_older_checkpoints(store):
     store.write(record(1))
-    (store.folder / "epoch-000000002.triquad").mkdir()
+    (store.folder / "epoch-000000002.checkpoint").mkdir()
     with pytest.raises(StoreError, match="epoch-000000002"):
         store.write(record(2))
-    (store.folder / "epoch-000000002.triquad").rmdir()
+    (store.folder / "epoch-000000002.checkpoint").rmdir()
     assert store.newest().record.epoch == 1
 
 
@@ -182,18 +183,18 @@ def test_an_epoch_of_another_map_is_told_with_the_maps_there_are(store, tmp_path
 
 def test_a_checkpoint_under_a_wrong_number_does_not_pass_for_a_later_one(store, caplog):
     store.write(record(3))
-    valid = store.folder / "epoch-000000003.triquad"
-    (store.folder / "epoch-000000009.triquad").write_bytes(valid.read_bytes())
+    valid = store.folder / "epoch-000000003.checkpoint"
+    (store.folder / "epoch-000000009.checkpoint").write_bytes(valid.read_bytes())
     with caplog.at_level(logging.WARNING):
         restored = store.newest()
     assert restored.info.epoch == restored.record.epoch == 3
-    assert "epoch-000000009.triquad holds epoch 3" in caplog.text
+    assert "epoch-000000009.checkpoint holds epoch 3" in caplog.text
     store.write(record(4))
     assert store.newest().record.epoch == 4
 
 
 def test_a_number_of_more_than_64_bits_is_not_a_checkpoint(store):
     store.write(record(3))
-    valid = store.folder / "epoch-000000003.triquad"
-    (store.folder / "epoch-9999999999999999999.triquad").write_bytes(valid.read_bytes())
+    valid = store.folder / "epoch-000000003.checkpoint"
+    (store.folder / "epoch-9999999999999999999.checkpoint").write_bytes(valid.read_bytes())
     assert store.newest().info.epoch == 3

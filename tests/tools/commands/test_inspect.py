@@ -23,7 +23,7 @@ def map_file(tmp_path):
 
 
 @pytest.fixture
-def delta(tmp_path):
+def checkpoint(tmp_path):
     return write_checkpoints(tmp_path, (9, 12))[1]
 
 
@@ -38,7 +38,6 @@ def test_text(map_file, capsys):
     for text in (
         "epoch 7",
         "format version  1",
-        "other files     none needed",
         "/triquad/vertices",
         "(float16)",
         "leaf_m 0.25",
@@ -60,9 +59,7 @@ def test_json(map_file, capsys):
     assert report["settings"]["depth"] == 6
     assert report["regions"][1]["index"] == [-1, 0, 0]
     assert report["regions"][1]["centre_m"] == [-12.0, 0.0, 0.0]
-    assert report["other_files"] == []
-    parts = report["parts"]
-    assert parts["/triquad/vertices"]["parts"] == parts["/triquad/vertices"]["stored_parts"] == 6
+    assert report["parts"]["/triquad/vertices"]["parts"] == 6
 
 
 def ground_with_rays():
@@ -133,25 +130,24 @@ def test_volume_is_that_of_the_voxels_that_a_region_answers_for(tmp_path, capsys
     assert voxels == pytest.approx(2 * 4000 * (48 / 64) ** 3, rel=0.1)
 
 
-def test_a_delta_names_the_files_it_needs(delta, capsys):
-    assert main([str(delta)]) == 0
-    assert "other files     epoch-000000009.triquad: needed, and there" in capsys.readouterr().out
-    report = summary_of(delta, capsys)
-    assert report["other_files"] == ["epoch-000000009.triquad"]
+def test_a_checkpoint_is_shown_with_all_its_parts(checkpoint, capsys):
+    report = summary_of(checkpoint, capsys)
     assert report["epoch"] == 12
-    evidence = report["parts"]["/triquad/evidence"]
-    assert (evidence["parts"], evidence["stored_parts"]) == (2, 1)
-    assert evidence["bytes"] > evidence["stored_bytes"]
+    assert report["metadata"]["created"] == "2026-01-31T13:00:00Z"
+    assert report["parts"]["/triquad/evidence"]["parts"] == 2
+    stored = sum(part["stored_bytes"] for part in report["parts"].values())
+    assert report["bytes"] == checkpoint.stat().st_size + stored
 
 
-def test_a_delta_without_its_base_is_damaged(delta, capsys):
-    (delta.parent / "epoch-000000009.triquad").unlink()
-    for options in ([], ["--diff", str(delta)]):
-        assert main([str(delta), *options]) == 1
+def test_a_checkpoint_without_a_part_is_damaged(checkpoint, capsys):
+    for part in (checkpoint.parent / "parts").iterdir():
+        part.unlink()
+    for options in ([], ["--diff", str(checkpoint)]):
+        assert main([str(checkpoint), *options]) == 1
         captured = capsys.readouterr()
         assert captured.out == ""
         assert captured.err.count("\n") == 1
-        assert "epoch-000000009.triquad, which holds parts, is missing; copy it" in captured.err
+        assert "parts/" in captured.err
 
 
 def test_map_without_regions(tmp_path, capsys):

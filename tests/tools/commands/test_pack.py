@@ -5,9 +5,10 @@ import itertools
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from support.checkpoint_folder import HOUR_NS, START_NS, map_at, write_checkpoints
+from support.checkpoint_folder import FIRST, HOUR_NS, START_NS, map_at, write_checkpoints
 from support.map_records import SMALL, assert_same, random_record, with_progress
 from support.mapfile_edit import file_bytes, rewritten
+from triquad_format.mapfile.parts.part import REGION, PartKey
 from triquad_format.mapfile.reader import read_map, read_map_file
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.crop import crop_record, without_training
@@ -124,12 +125,14 @@ def test_tool_takes_an_epoch_of_a_store(tmp_path, capsys):
     assert "no checkpoint of 2 or before" in capsys.readouterr().err
     assert main([str(out), str(tmp_path / "o.triquad"), "--at", "2"]) == 2
     assert "--at asks for a folder" in capsys.readouterr().err
-    newest = store / "street" / "epoch-000000009.delta.triquad"
+    newest = store / "street" / "epoch-000000009.triquad"
     assert main([str(store), str(newest), "--force"]) == 2
     assert "would pass for a checkpoint" in capsys.readouterr().err
-    (store / "street" / "epoch-000000003.triquad").unlink()
+    newest = read_map_file(store / "street" / "epoch-000000009.checkpoint")
+    lost = next(e for e in newest.manifest.entries if e.key == PartKey(REGION, FIRST))
+    (store / "street" / "parts" / lost.name).unlink()
     assert main([str(store), str(out), "--force"]) == 1
-    assert "epoch-000000003.triquad" in capsys.readouterr().err
+    assert f"parts/{lost.name} is missing" in capsys.readouterr().err
     assert main([str(store), str(out), "--force", "--recover"]) == 1
     assert_same(read_map(out).regions, map_at(9).regions[1:])
 

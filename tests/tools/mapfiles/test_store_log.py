@@ -1,11 +1,11 @@
 import json
 
 import pytest
-from support.checkpoint_folder import FIRST, SECOND, write_checkpoints
+from support.checkpoint_folder import map_at, write_checkpoints, write_record
 from support.map_records import random_record
 from support.mapfile_edit import file_bytes
-from triquad_format.mapfile.protections import Protection, Protections, write_protections
 from triquad_format.mapfile.reader import read_map_file
+from triquad_format.mapfile.writer import write_map
 from triquad_tools.commands.inspect import main
 from triquad_tools.commands.pack import main as pack
 
@@ -29,13 +29,13 @@ def log_of(folder, capsys):
 def test_table(folder, capsys):
     assert main([str(folder), "--log"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    size = sum(path.stat().st_size for path in folder.glob("*.triquad"))
+    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     assert lines[0] == f"{folder}: 3 checkpoints, {size:,} bytes"
     rows = [line.split() for line in lines[2:]]
-    assert [row[:3] for row in rows] == [
-        ["15", "2026-01-31T14:00:00Z", "delta"],
-        ["12", "2026-01-31T13:00:00Z", "delta"],
-        ["9", "2026-01-31T12:00:00Z", "complete"],
+    assert [row[:2] for row in rows] == [
+        ["15", "2026-01-31T14:00:00Z"],
+        ["12", "2026-01-31T13:00:00Z"],
+        ["9", "2026-01-31T12:00:00Z"],
     ]
     assert [row[-1] for row in rows] == ["yes"] * 3
 
@@ -43,40 +43,40 @@ def test_table(folder, capsys):
 def test_figures_are_those_of_the_files(folder, capsys):
     status, log = log_of(folder, capsys)
     assert status == 0
-    assert log["bytes"] == sum(found["bytes"] for found in log["checkpoints"])
     for found in log["checkpoints"]:
         file = read_map_file(folder / found["file"])
-        assert (found["bytes"], found["epoch"]) == (file.size, file.record.epoch)
+        assert found["epoch"] == file.record.epoch
+        assert found["bytes"] == sum(entry.stored for entry in file.manifest.entries)
         assert found["problem"] is None
-    assert [found["complete"] for found in log["checkpoints"]] == [False, False, True]
+    newest, _, oldest = log["checkpoints"]
+    assert 0 < newest["new_bytes"] < newest["bytes"]
+    assert oldest["new_bytes"] == oldest["bytes"]
 
 
 def test_a_store_of_one_map_will_do(folder, capsys):
     assert log_of(folder.parent, capsys) == log_of(folder, capsys)
 
 
-def test_what_lacks_its_base_does_not_open(folder, capsys):
-    (folder / "epoch-000000009.triquad").unlink()
+def test_a_backup_among_checkpoints_is_listed(folder, capsys):
+    write_map(map_at(20), folder / "epoch-000000020.triquad")
+    status, log = log_of(folder, capsys)
+    assert status == 0
+    assert [found["epoch"] for found in log["checkpoints"]] == [20, 15, 12, 9]
+
+
+def test_what_lacks_parts_is_told(folder, capsys):
+    newest = read_map_file(folder / "epoch-000000015.checkpoint").manifest
+    lost = next(entry for entry in newest.entries if entry.epoch == 15)
+    (folder / "parts" / lost.name).unlink()
     assert main([str(folder), "--log"]) == 1
     captured = capsys.readouterr()
-    assert "epoch-000000015.delta.triquad: it needs epoch-000000009.triquad, which is missing" in (
-        captured.out
-    )
-    assert captured.err == "triquad-inspect: 2 of 2 do not open\n"
-
-
-def test_another_file_in_place_of_the_base_does_not_open(folder, capsys):
-    other = random_record(5, indices=(FIRST, SECOND), epoch=9)
-    (folder / "epoch-000000009.triquad").write_bytes(file_bytes(other))
-    status, log = log_of(folder, capsys)
-    assert status == 1
-    problems = [found["problem"] for found in log["checkpoints"]]
-    assert problems[2] is None
-    assert all("not the file that now has this name" in problem for problem in problems[:2])
+    total = len(newest.entries)
+    assert f"epoch-000000015.checkpoint: 1 of its {total} parts are missing" in captured.out
+    assert captured.err == "triquad-inspect: 1 of 3 do not open\n"
 
 
 def test_damaged_ones_are_listed_beside_sound_ones(folder, capsys):
-    newest = folder / "epoch-000000015.delta.triquad"
+    newest = folder / "epoch-000000015.checkpoint"
     newest.write_bytes(newest.read_bytes()[:-100])
     status, log = log_of(folder, capsys)
     assert status == 1
@@ -98,7 +98,7 @@ def test_what_is_no_folder_of_checkpoints_is_one_line(tmp_path, name, capsys):
 
 
 def test_what_was_set_aside_is_named(folder, tmp_path, capsys):
-    newest = folder / "epoch-000000015.delta.triquad"
+    newest = folder / "epoch-000000015.checkpoint"
     damaged = newest.with_name(newest.name + ".damaged")
     newest.rename(damaged)
     assert main([str(folder), "--log"]) == 0
@@ -109,12 +109,11 @@ def test_what_was_set_aside_is_named(folder, tmp_path, capsys):
     assert read_map_file(tmp_path / "saved.triquad").record.epoch == 15
 
 
-def test_what_is_protected_is_named_with_the_reason(folder, capsys):
-    protected = Protections(checkpoints=(Protection(12, 5.0, "before\x1b a reset"),))
-    write_protections(folder, protected)
+def test_what_is_kept_to_undo_something_is_told(folder, capsys):
+    write_record(folder, map_at(20), undoes="a\x1b reset")
     assert main([str(folder), "--log"]) == 0
     out = capsys.readouterr().out
-    assert "  epoch-000000012.delta.triquad: protected, before" in out
+    assert "  epoch-000000020.checkpoint: kept, to undo a" in out
     assert "\x1b" not in out
     _, log = log_of(folder, capsys)
-    assert [one["protected"] is not None for one in log["checkpoints"]] == [False, True, False]
+    assert [one["parts"]["undoes"] for one in log["checkpoints"][1:]] == ["", "", ""]

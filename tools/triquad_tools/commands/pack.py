@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from triquad_format.errors import DamagedMapFileError
+from triquad_format.mapfile.checkpoint import read_checkpoint
 from triquad_format.mapfile.checkpoint_folder import checkpoint_file, checkpoint_files, set_aside
 from triquad_format.mapfile.parts.part import EVIDENCE, REGION, TRAINING, VERTICES
 from triquad_format.records.field_settings import check_range
@@ -164,10 +165,17 @@ def _pack_map(options: argparse.Namespace, path: Path) -> int:
         options.output,
         precision=options.precision,
         max_error_m=options.max_error,
-        bytes_before=path.stat().st_size,
+        bytes_before=_bytes_of(path),
     )
     print_line(f"{options.output}: {written}")
     return OK if complete else FAILED
+
+
+def _bytes_of(path: Path) -> int:
+    """Return the bytes of a map file, or of a checkpoint with its parts."""
+    checkpoint = read_checkpoint(path)
+    parts = 0 if checkpoint is None else checkpoint.manifest.stored_bytes
+    return path.stat().st_size + parts
 
 
 def _export(options: argparse.Namespace, path: Path) -> int:

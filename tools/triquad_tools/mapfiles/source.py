@@ -1,4 +1,4 @@
-"""Sources of maps: a file with those it needs, a folder of checkpoints, a server."""
+"""Sources of maps: a file, a folder of checkpoints, a server."""
 
 import re
 import tempfile
@@ -134,7 +134,7 @@ def read_source(path: Path, box: Box | None, training: bool) -> SourceMap:
 
     Raises:
         NothingLeftError: no region lies in the box.
-        FormatError: the box is empty, or the file, or one that it needs, cannot be read.
+        FormatError: the box is empty, or the file cannot be read.
         OSError: it cannot be read.
     """
     source = None if box is None else _box(path, box, training)

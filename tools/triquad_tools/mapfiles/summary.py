@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from triquad_format.mapfile.manifest import Entry
 from triquad_format.mapfile.reader import MapFile
 from triquad_format.records.arrays import Bytes, Doubles
 from triquad_format.records.field_settings import FieldSettings
@@ -21,10 +22,9 @@ from triquad_tools.mapfiles.recorded_fit import recorded_fit
 class TopicSummary:
     """The parts of one topic, without the manifest."""
 
-    parts: int  # of the map, wherever they lie
+    parts: int
     bytes: int  # of these, unpacked
-    stored_parts: int  # of these in this file
-    stored_bytes: int  # that these take in this file
+    stored_bytes: int  # that these take where they are stored
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,6 @@ class MapSummary:
     metadata: dict[str, str]
     map: str
     epoch: int
-    other_files: tuple[str, ...]  # of the same folder, that hold parts of this map
     settings: FieldSettings
     vertices: int
     parameters: int
@@ -71,7 +70,6 @@ def summarise(file: MapFile) -> MapSummary:
         metadata=file.metadata,
         map=record.name,
         epoch=record.epoch,
-        other_files=file.manifest.files,
         settings=record.settings,
         vertices=sum(region.vertices for region in regions),
         parameters=sum(region.parameters for region in regions),
@@ -102,17 +100,15 @@ def print_summary(name: str, summary: MapSummary) -> None:
         title = f"region {region.index} at {list(region.centre_m)} m"
         print_rows(title, facts, align="left")
     rows = [
-        (topic, f"{p.parts:,}", f"{p.bytes:,}", f"{p.stored_parts:,}", f"{p.stored_bytes:,}")
+        (topic, f"{p.parts:,}", f"{p.bytes:,}", f"{p.stored_bytes:,}")
         for topic, p in summary.parts.items()
     ]
-    print_columns(("part", "count", "bytes", "in this file", "bytes stored"), rows)
+    print_columns(("part", "count", "bytes", "bytes stored"), rows)
 
 
 def _facts(summary: MapSummary) -> Iterator[Row]:
     for key in ("format_version", "producer", "created"):
         yield Row(key.replace("_", " "), summary.metadata.get(key, "not given"))
-    files = ", ".join(summary.other_files)
-    yield Row("other files", f"{files}: needed, and there" if files else "none needed")
     yield Row("regions", str(len(summary.regions)))
     yield Row("vertices", f"{summary.vertices:,}")
     yield Row("parameters", f"{summary.parameters:,}")
@@ -160,12 +156,11 @@ def _rounded(place: Doubles) -> tuple[float, ...]:
 
 
 def _summarise_parts(file: MapFile) -> dict[str, TopicSummary]:
-    """Return the parts by topic, those in other files included."""
-    entries = file.manifest.entries
-    topics = dict.fromkeys(entry.key.topic for entry in entries)
-    found: dict[str, TopicSummary] = {}
-    for topic in topics:
-        sizes = [entry.size for entry in entries if entry.key.topic == topic]
-        stored = [e.stored for e in entries if e.key.topic == topic and e.file is None]
-        found[topic] = TopicSummary(len(sizes), sum(sizes), len(stored), sum(stored))
-    return found
+    """Return the parts by topic."""
+    by_topic: dict[str, list[Entry]] = {}
+    for entry in file.manifest.entries:
+        by_topic.setdefault(entry.key.topic, []).append(entry)
+    return {
+        topic: TopicSummary(len(own), sum(e.size for e in own), sum(e.stored for e in own))
+        for topic, own in by_topic.items()
+    }

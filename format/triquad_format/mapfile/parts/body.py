@@ -25,19 +25,18 @@ from triquad_format.wire.structure import MAX_OBJECTS, check_structure
 
 _MAX_REGION_INDEX = 2**31 - 1
 _MAX_ITEMS = 64
-_OBJECTS_PER_ITEM = 8  # of a manifest's longest list
 _MAX_STRING_BYTES = 4096
 _TOPIC = re.compile(rb"[\x80-\x8f]\xa5topic[\xa0-\xbf](/triquad/[a-z]+)")
 """The beginning of a part: a short msgpack map, whose first key is ``topic``."""
 
 
-def unpack_body(topic: str, payload: bytes, max_items: int = _MAX_ITEMS) -> "PartBody":
-    """Return the body of a part, whose lists have at most ``max_items`` items.
+def unpack_body(topic: str, payload: bytes) -> "PartBody":
+    """Return the body of a part.
 
     Raises:
         DamagedMapFileError: it is not a msgpack map, exceeds a limit, or is of another topic.
     """
-    part = PartBody(topic, _unpacked(topic, payload, max_items))
+    part = PartBody(topic, _unpacked(topic, payload))
     part.expect("topic", topic)
     return part
 
@@ -48,13 +47,13 @@ def part_topic(payload: bytes) -> str | None:
     return None if match is None else match[1].decode()
 
 
-def _unpacked(topic: str, payload: bytes, max_items: int) -> object:
+def _unpacked(topic: str, payload: bytes) -> object:
     try:
-        check_structure(payload, max(MAX_OBJECTS, _OBJECTS_PER_ITEM * max_items))
+        check_structure(payload, MAX_OBJECTS)
         return msgpack.unpackb(
             payload,
             max_str_len=_MAX_STRING_BYTES,
-            max_array_len=max_items,
+            max_array_len=_MAX_ITEMS,
             max_map_len=_MAX_ITEMS,
             max_ext_len=0,
         )

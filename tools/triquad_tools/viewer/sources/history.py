@@ -11,7 +11,6 @@ from triquad_format.mapfile.checkpoint_folder import (
     CheckpointFile,
     checkpoint_files,
     map_folder,
-    newest_of_each,
     open_manifest,
 )
 from triquad_format.mapfile.metadata import utc_time
@@ -58,10 +57,7 @@ class History:
     @property
     def moments(self) -> tuple[Moment, ...]:
         """The checkpoints that can be shown as far as is known, the oldest first."""
-        known = self._known
-        files = sorted((f for f, what in known.items() if isinstance(what, Moment)), reverse=True)
-        newest = sorted(newest_of_each(files))
-        return tuple(what for file in newest if isinstance(what := known[file], Moment))
+        return tuple(what for _, what in sorted(self._known.items()) if isinstance(what, Moment))
 
     @property
     def damaged(self) -> tuple[str, ...]:
