@@ -14,7 +14,7 @@ POSE = np.eye(4)
 def client():
     """Of a server that has seen a sphere from its middle, and learnt all of it."""
     with servers.service_and_client() as client:
-        for turn in range(2):
+        for turn in range(3):
             client.publish_scan(even_sphere(60_000, turn), POSE, stamp_s=1.7e9)
         client.flush(servers.WAIT_S)
         client.settle(servers.WAIT_S)
