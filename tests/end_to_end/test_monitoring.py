@@ -12,7 +12,7 @@ import sys
 import urllib.error
 import urllib.request
 from collections.abc import Callable
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,6 +23,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from support import servers
 from triquad_client import RefusedError
 from triquad_format.errors import SettingsError
+from triquad_format.mapfile.checkpoint_folder import checkpoint_files
+from triquad_format.mapfile.reader import read_map
 from triquad_format.printable import printable
 from triquad_server.errors import ListenError
 from triquad_server.monitoring.prometheus import FAMILIES
@@ -174,7 +176,8 @@ def test_a_probe_may_ask_for_the_head_alone(port):
         assert int(reply.headers["Content-Length"]) > 0
 
 
-def test_connections_that_stall_or_trickle_take_some_threads_for_some_seconds(port):
+def test_connections_that_stall_or_trickle_take_some_threads_for_some_seconds(port, monkeypatch):
+    monkeypatch.setattr("triquad_server.monitoring.http_server._TIMEOUT_S", 1.0)
     with ExitStack() as stack:
         opened = [
             stack.enter_context(socket.create_connection(("127.0.0.1", port))) for _ in range(20)
@@ -182,9 +185,9 @@ def test_connections_that_stall_or_trickle_take_some_threads_for_some_seconds(po
         opened[-1].settimeout(servers.WAIT_S)
         assert opened[-1].recv(1) == b""  # closed at once, while the first ones are waited for
         for connection in opened:
-            connection.settimeout(0.1)
+            connection.settimeout(0.01)
         trickling = opened
-        while trickling:  # a byte each second or so: never silent for long
+        while trickling:  # a byte each tenth of a second or so: never silent for long
             trickling = [connection for connection in trickling if stays_open(connection)]
     until(lambda: is_healthy(port))
 
@@ -243,26 +246,49 @@ def test_a_process_is_watched_from_its_start_to_its_end(arguments):
     assert "Traceback" not in server.log
 
 
-def test_a_store_that_cannot_be_written_is_a_problem_until_it_can(arguments):
+@contextmanager
+def no_space(pid):
+    """Every file that the process writes ends after 10 kB, as on a disk that is full."""
+    _, hard = resource.prlimit(pid, resource.RLIMIT_FSIZE)
+    resource.prlimit(pid, resource.RLIMIT_FSIZE, (10_000, hard))
+    yield
+    resource.prlimit(pid, resource.RLIMIT_FSIZE, (hard, hard))
+
+
+def test_while_the_disk_is_full_it_goes_on_mapping_and_says_so(tmp_path, arguments):
     port = free_port()
     with (
         servers.server_process([*arguments, "--set", f"metrics.port={port}"]) as server,
         triquad_client.connect(server.endpoint) as client,
     ):
         servers.learn(client)
-        _, hard = resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE)
-        resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE, (10_000, hard))
-        with pytest.raises(RefusedError, match="cannot be written"):
-            client.checkpoint()
-        code, report = health(port)
-        assert code == 503
-        assert "cannot be written" in report["problem"]
-        assert samples(port)["triquad_healthy", ()] == 0
-        assert samples(port)["triquad_checkpoints_total", (("outcome", "failed"),)] == 1
-        assert client.metrics().problem == report["problem"]
-        resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE, (hard, hard))
-        client.checkpoint()
+        client.settle(servers.WAIT_S)
+        kept = client.checkpoint()
+        with no_space(server.process.pid):
+            servers.learn(client, 1)
+            with pytest.raises(RefusedError, match="cannot be written: .*too large"):
+                client.checkpoint()
+            code, report = health(port)
+            assert code == 503
+            assert "cannot be written" in report["problem"]
+            assert samples(port)["triquad_healthy", ()] == 0
+            assert samples(port)["triquad_checkpoints_total", (("outcome", "failed"),)] == 1
+            assert client.metrics().problem == report["problem"]
+            status = client.status()
+            assert "cannot be written" in status.store_error
+            assert status.last_checkpoint == kept
+            assert status.epoch > kept.epoch
+            assert read_map(kept.path).epoch == kept.epoch
+            assert [file.epoch for file in checkpoint_files(Path(kept.path).parent)] == [kept.epoch]
+            assert servers.learn(client, 1).taken == 4
+        later = client.checkpoint()
         assert health(port)[0] == 200
+        assert client.status().store_error is None
+        assert read_map(later.path).epoch == later.epoch == client.status().epoch
+        server.process.send_signal(signal.SIGTERM)
+        assert server.wait() == 0
+    assert not list((tmp_path / "store").rglob("*.tmp"))
+    assert "Traceback" not in server.log
 
 
 def test_a_port_that_is_taken_ends_the_server_at_once(arguments):
