@@ -29,13 +29,6 @@ def _compiled() -> None:
     servers.compiled()
 
 
-@pytest.fixture
-def settings(tmp_path: Path) -> Path:
-    path = tmp_path / "server.toml"
-    path.write_text(servers.SMALL_TOML)
-    return path
-
-
 def statuses(store: Path, x_m: float = 0.0) -> set[int]:
     """What a stored map says of the sphere that was seen from so far along x."""
     with triquad_client.open_map(store / servers.MAP) as offline:

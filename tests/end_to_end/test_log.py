@@ -75,9 +75,7 @@ def test_the_same_as_text() -> None:
     assert FOREIGN in lines
 
 
-def test_a_server_logs_in_json_from_its_start_to_its_end(tmp_path, monkeypatch) -> None:
-    settings = tmp_path / "server.toml"
-    settings.write_text(servers.SMALL_TOML)
+def test_a_server_logs_in_json_from_its_start_to_its_end(settings, monkeypatch) -> None:
     monkeypatch.setenv("TRIQUAD_LOG_FORMAT", "json")
     arguments = ["--settings", settings, "--log-level", "debug", "--map", "lab"]
     with servers.server_process(arguments) as server:

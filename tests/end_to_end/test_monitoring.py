@@ -215,13 +215,6 @@ def until(is_so: Callable[[], bool]) -> None:
     assert any(is_so() for _ in range(1000))
 
 
-@pytest.fixture
-def arguments(tmp_path):
-    path = tmp_path / "server.toml"
-    path.write_text(servers.SMALL_TOML)
-    return ["--settings", path, "--store", tmp_path / "store"]
-
-
 def test_a_process_is_watched_from_its_start_to_its_end(arguments):
     port = free_port()
     process = servers.server_process([*arguments, "--metrics-port", str(port)], ready=False)

@@ -19,20 +19,8 @@ POSE = np.eye(4)
 
 
 @pytest.fixture
-def settings(tmp_path):
-    path = tmp_path / "server.toml"
-    path.write_text(servers.SMALL_TOML)
-    return path
-
-
-@pytest.fixture
 def store(tmp_path):
     return tmp_path / "store"
-
-
-@pytest.fixture
-def arguments(settings, store):
-    return ["--settings", settings, "--store", store]
 
 
 def newest_checkpoint(store):

@@ -47,13 +47,6 @@ sys.exit(main())
 
 
 @pytest.fixture
-def arguments(tmp_path):
-    settings = tmp_path / "server.toml"
-    settings.write_text(servers.SMALL_TOML)
-    return ["--settings", str(settings), "--store", str(tmp_path / "store")]
-
-
-@pytest.fixture
 def manager(tmp_path, monkeypatch) -> Iterator[Manager]:
     with service_manager(str(tmp_path / "notify")) as manager:
         monkeypatch.setenv("NOTIFY_SOCKET", manager.address)
