@@ -22,14 +22,12 @@ import triquad_server
 from prometheus_client.parser import text_string_to_metric_families
 from support import servers
 from triquad_client import RefusedError
-from triquad_format.errors import SettingsError
 from triquad_format.mapfile.checkpoint_folder import checkpoint_files
 from triquad_format.mapfile.reader import read_map
 from triquad_format.printable import printable
 from triquad_server.errors import ListenError
 from triquad_server.monitoring.prometheus import FAMILIES
 from triquad_server.settings import MetricsSettings
-from triquad_server.settings.loading import load_settings
 from triquad_tools.demo.server import free_port
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -323,9 +321,3 @@ def test_a_server_within_a_program_closes_its_port():
 def test_prometheus_client_is_imported_only_where_it_is_wanted():
     script = "import sys, triquad_server.launch; sys.exit('prometheus_client' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
-
-
-@pytest.mark.parametrize("port", ["-1", "65536", "http"])
-def test_ports_that_are_none_are_refused(port):
-    with pytest.raises(SettingsError, match=r"metrics\.port"):
-        load_settings(None, [f"metrics.port={port}"])
