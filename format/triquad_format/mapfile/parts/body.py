@@ -123,7 +123,7 @@ class PartBody:
         name = f"{self.topic}: {key}"
         array = unpack_array(name, self._body.get(key))
         ArraySpec(dtype, shape).check(name, array)
-        return array.copy()
+        return np.array(array)
 
     def arrays(self, key: str, count: int) -> tuple[NDArray[Any], ...]:
         """Return ``count`` arrays of ``<f4``, each of any shape, as :meth:`array` does."""
@@ -132,7 +132,7 @@ class PartBody:
             name = f"{self.topic}: {key}[{i}]"
             array = unpack_array(name, item)
             ArraySpec("<f4", (None,) * array.ndim).check(name, array)
-            arrays.append(array.copy())
+            arrays.append(np.array(array))
         return tuple(arrays)
 
     def mapping(self, key: str) -> Mapping[str, object]:
