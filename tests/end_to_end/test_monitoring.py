@@ -272,6 +272,7 @@ def test_while_the_disk_is_full_it_goes_on_mapping_and_says_so(tmp_path, argumen
             assert read_map(kept.path).epoch == kept.epoch
             assert [file.epoch for file in checkpoint_files(Path(kept.path).parent)] == [kept.epoch]
             assert servers.learn(client, 1).taken == 4
+        client.settle(servers.WAIT_S)
         later = client.checkpoint()
         assert health(port)[0] == 200
         assert client.status().store_error is None

@@ -145,6 +145,7 @@ def test_the_field_learns_that_it_is_free_there(gone: Course) -> None:
     assert np.median(gone.later.query(free).sdf) > 0.1
 
 
+@pytest.mark.long
 def test_a_settled_map_that_is_seen_anew_in_part_unlearns_what_went() -> None:
     chosen = settings(samples_per_ray=30.0)
     watched = Watched(chosen.model_copy(update={"field": Settings().field}))
@@ -186,6 +187,7 @@ def test_what_stands_keeps_its_surface(gone: Course) -> None:
     assert now.evidence.ended_in(voxels[standing & away]).mean() > 0.997
 
 
+@pytest.mark.long
 def test_it_returns_and_leaves_again() -> None:
     watched = Watched()
     for _ in range(3):
