@@ -1,6 +1,6 @@
 """What every run of the tests does: long modules come first, and what each took is kept.
 
-``tests/durations.json`` holds the seconds of each file in a run on two quiet cores. The newest run
+``tests/durations.json`` holds the seconds that a core takes for each file. The newest run
 is kept in ``test-durations.json`` next to the project's configuration, and the files that grew most
 are listed at the end. So are the tests that compiled kernels: ``triquad_server.warm_up`` compiles
 what most tests need, and each kernel beyond takes seconds to a minute.
