@@ -1,12 +1,15 @@
 """What every run of the tests does: long modules come first, and what each took is kept.
 
-``tests/durations.json`` holds the seconds of each file in a run on two quiet cores. The newest run
+``tests/durations.json`` holds the seconds that a core takes for each file. The newest run
 is kept in ``test-durations.json`` next to the project's configuration, and the files that grew most
-are listed at the end.
+are listed at the end. So are the tests that compiled kernels: ``triquad_server.warm_up`` compiles
+what most tests need, and each kernel beyond takes seconds to a minute.
 """
 
 import json
+import sys
 from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,6 +17,7 @@ import pytest
 _KNOWN = Path(__file__).with_name("durations.json")
 _GREW_S = 5.0  # the least growth of a file that is listed
 _LISTED = 5  # files, at most
+_COMPILED = "compiled kernels"
 
 
 class Durations:
@@ -22,13 +26,19 @@ class Durations:
     def __init__(self, config: pytest.Config) -> None:
         self._config = config
         self._seconds: dict[str, float] = defaultdict(float)
+        self._compiled: dict[str, int] = defaultdict(int)  # kernels, by test
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         self._seconds[report.nodeid.partition("::")[0]] += report.duration
+        for name, value in report.user_properties:
+            if name == _COMPILED:
+                self._compiled[report.nodeid] += int(str(value))
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
         if not self._seconds:
             return
+        for test, kernels in self._compiled.items():
+            terminalreporter.write_line(f"{test} compiled {kernels} kernels")
         took = {name: round(seconds, 1) for name, seconds in sorted(self._seconds.items())}
         newest = self._config.rootpath / "test-durations.json"
         earlier = _read(newest)  # of files that did not run this time
@@ -51,8 +61,26 @@ def _read(path: Path) -> dict[str, float]:
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    config.pluginmanager.register(Kernels())
     if not hasattr(config, "workerinput"):  # the process that hears of all workers
         config.pluginmanager.register(Durations(config))
+
+
+class Kernels:
+    """Notes which tests, with what they set up, compile kernels in this process."""
+
+    def __init__(self) -> None:
+        self._before = 0
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_makereport(self) -> Iterator[pytest.TestReport]:
+        report: pytest.TestReport = yield
+        module = sys.modules.get("triquad_map.compiled.kernel")
+        count = module.count_compiled() if module else 0
+        if count > self._before:
+            report.user_properties.append((_COMPILED, count - self._before))
+            self._before = count
+        return report
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

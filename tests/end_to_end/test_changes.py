@@ -1,11 +1,9 @@
 """What changed since an epoch, asked by the real client over the loopback."""
 
-import asyncio
 import math
 
 import numpy as np
 import pytest
-import triquad_client
 from support import servers
 from triquad_client import ChangeKind, ChangeReport, InvalidInputError, RefusedError
 from triquad_format.wire import keys
@@ -138,14 +136,3 @@ def test_what_changed_before_a_restart_is_not_known(tmp_path):
         assert f"is {now.epoch}" in caught.value.message
         client.reset(WEST)
         assert kinds(client.changes(since=now)) == {ChangeKind.VANISHED}
-
-
-def test_it_can_be_awaited(endpoint):
-    async def use():
-        async with triquad_client.connect_async(endpoint) as client:
-            start = await client.changes()
-            await client.publish_scan(servers.sphere(), POSE)
-            await client.flush(servers.WAIT_S)
-            return await client.changes(since=start, bounds=EAST)
-
-    assert kinds(asyncio.run(use())) == {ChangeKind.APPEARED}

@@ -82,6 +82,7 @@ def image(tmp_path_factory: pytest.TempPathFactory) -> Image:
     return image
 
 
+@pytest.mark.long
 def test_a_container_starts_with_compiled_code_tells_its_health_and_keeps_its_map(image) -> None:
     assert image.final.one("STOPSIGNAL") == "SIGTERM"
     assert image.final.one("VOLUME") == STORE
@@ -117,7 +118,7 @@ def test_a_container_starts_with_compiled_code_tells_its_health_and_keeps_its_ma
     assert COMPILING not in server.log
     messages = [json.loads(line)["message"] for line in server.lines]
     assert messages[-1] == "stopped"
-    (checkpoint,) = (image.folder / "store" / "default").glob("*.triquad")
+    (checkpoint,) = (image.folder / "store" / "default").glob("*.checkpoint")
     assert read_map(checkpoint).regions
 
 

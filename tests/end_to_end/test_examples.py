@@ -25,7 +25,7 @@ DOCS = Path(__file__).parents[2] / "docs"
 EXAMPLES = DOCS / "examples"
 SETTINGS = "[training]\nbatch = 4096\nsamples_per_ray = 8.0\n"
 SCENE = street(1)  # of triquad-demo, which the guides begin with
-DRIVE = SimulatedDrive(SCENE, Lidar(columns=720), drive(SCENE, 20, 1.5), seed=1)
+DRIVE = SimulatedDrive(SCENE, Lidar(columns=360), drive(SCENE, 20, 1.5), seed=1)
 RADIUS_M = 0.4  # of what the planners move
 TRUE_POSE = np.eye(4)
 TRUE_POSE[:3, 3] = 12.0, -1.6, 1.8

@@ -6,7 +6,6 @@ import subprocess
 import sys
 from typing import Any
 
-import pytest
 import triquad_client
 from support import servers
 from triquad_format.wire import codec, keys
@@ -76,19 +75,12 @@ def test_the_same_as_text() -> None:
     assert FOREIGN in lines
 
 
-@pytest.mark.parametrize("by_environment", [False, True])
-def test_a_server_logs_in_json_from_its_start_to_its_end(
-    tmp_path, monkeypatch, by_environment
-) -> None:
-    settings = tmp_path / "server.toml"
-    settings.write_text(servers.SMALL_TOML)
+def test_a_server_logs_in_json_from_its_start_to_its_end(settings, monkeypatch) -> None:
+    monkeypatch.setenv("TRIQUAD_LOG_FORMAT", "json")
     arguments = ["--settings", settings, "--log-level", "debug", "--map", "lab"]
-    if by_environment:
-        monkeypatch.setenv("TRIQUAD_LOG_FORMAT", "json")
-    else:
-        arguments += ["--log-format", "json"]
     with servers.server_process(arguments) as server:
         with triquad_client.connect(server.endpoint, "lab") as client:
+            assert client.maps() == ["lab"]
             servers.learn(client)
         with servers.raw_session("client", connect=server.endpoint) as session:
             peer = servers.RawPeer(session, "lab")
@@ -100,32 +92,18 @@ def test_a_server_logs_in_json_from_its_start_to_its_end(
     log = records(server.lines)
     messages = [fields["message"] for fields in log]
     assert any(message.startswith("ready: map 'lab'") for message in messages)
+    assert any("the map is not kept when the server stops" in message for message in messages)
     assert messages[-1] == "stopped"
     assert all(fields["logger"].startswith("triquad") for fields in log)
     assert "forged\x1b" not in messages
 
 
-@pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        (["--settings", "bad.toml"], "unknown setting service.scan_que"),
-        (["--config", "missing.json5"], "Zenoh configuration"),
-    ],
-)
-def test_what_is_wrong_at_the_start_is_json(tmp_path, monkeypatch, arguments, text) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "bad.toml").write_text("[service]\nscan_que = 3\n")
-    with servers.server_process([*arguments, "--log-format", "json"], ready=False) as server:
+def test_what_is_wrong_at_the_start_is_json() -> None:
+    arguments = ["--set", "service.scan_que=3", "--log-format", "json"]
+    with servers.server_process(arguments, ready=False) as server:
         assert server.wait() == 2
-    assert any(text in fields["message"] for fields in records(server.lines))
-
-
-def test_a_signal_before_anything_is_open_is_told_in_json() -> None:
-    with servers.server_process(["--log-format", "json"], ready=False) as server:
-        server.wait_for("preparing compiled code")
-        server.process.send_signal(signal.SIGINT)
-        assert server.wait() == 0
-    assert records(server.lines)[-1]["message"] == "stopped"
+    (fields,) = records(server.lines)
+    assert "unknown setting service.scan_que" in fields["message"]
 
 
 def test_a_format_that_there_is_not_is_wrong_usage(monkeypatch) -> None:

@@ -1,6 +1,5 @@
 """The figures of a server with a real map, asked by the real client over the loopback."""
 
-import asyncio
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -151,11 +150,3 @@ def test_checkpoints_are_counted_and_timed(tmp_path):
         assert (now.written, now.failed) == (1, 0)
         assert now.last_duration_s > 0
         assert now.age_s >= 0
-
-
-def test_event_loops_get_the_same_figures(endpoint):
-    async def ask():
-        async with triquad_client.connect_async(endpoint) as client:
-            return await client.metrics()
-
-    assert set(asyncio.run(ask()).memory_bytes) == PARTS

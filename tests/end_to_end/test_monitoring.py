@@ -12,7 +12,7 @@ import sys
 import urllib.error
 import urllib.request
 from collections.abc import Callable
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,12 +22,12 @@ import triquad_server
 from prometheus_client.parser import text_string_to_metric_families
 from support import servers
 from triquad_client import RefusedError
-from triquad_format.errors import SettingsError
+from triquad_format.mapfile.checkpoint_folder import checkpoint_files
+from triquad_format.mapfile.reader import read_map
 from triquad_format.printable import printable
 from triquad_server.errors import ListenError
 from triquad_server.monitoring.prometheus import FAMILIES
 from triquad_server.settings import MetricsSettings
-from triquad_server.settings.loading import load_settings
 from triquad_tools.demo.server import free_port
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -174,7 +174,8 @@ def test_a_probe_may_ask_for_the_head_alone(port):
         assert int(reply.headers["Content-Length"]) > 0
 
 
-def test_connections_that_stall_or_trickle_take_some_threads_for_some_seconds(port):
+def test_connections_that_stall_or_trickle_take_some_threads_for_some_seconds(port, monkeypatch):
+    monkeypatch.setattr("triquad_server.monitoring.http_server._TIMEOUT_S", 1.0)
     with ExitStack() as stack:
         opened = [
             stack.enter_context(socket.create_connection(("127.0.0.1", port))) for _ in range(20)
@@ -182,9 +183,9 @@ def test_connections_that_stall_or_trickle_take_some_threads_for_some_seconds(po
         opened[-1].settimeout(servers.WAIT_S)
         assert opened[-1].recv(1) == b""  # closed at once, while the first ones are waited for
         for connection in opened:
-            connection.settimeout(0.1)
+            connection.settimeout(0.01)
         trickling = opened
-        while trickling:  # a byte each second or so: never silent for long
+        while trickling:  # a byte each tenth of a second or so: never silent for long
             trickling = [connection for connection in trickling if stays_open(connection)]
     until(lambda: is_healthy(port))
 
@@ -212,13 +213,6 @@ def until(is_so: Callable[[], bool]) -> None:
     assert any(is_so() for _ in range(1000))
 
 
-@pytest.fixture
-def arguments(tmp_path):
-    path = tmp_path / "server.toml"
-    path.write_text(servers.SMALL_TOML)
-    return ["--settings", path, "--store", tmp_path / "store"]
-
-
 def test_a_process_is_watched_from_its_start_to_its_end(arguments):
     port = free_port()
     process = servers.server_process([*arguments, "--metrics-port", str(port)], ready=False)
@@ -243,26 +237,50 @@ def test_a_process_is_watched_from_its_start_to_its_end(arguments):
     assert "Traceback" not in server.log
 
 
-def test_a_store_that_cannot_be_written_is_a_problem_until_it_can(arguments):
+@contextmanager
+def no_space(pid):
+    """Every file that the process writes ends after 10 kB, as on a disk that is full."""
+    _, hard = resource.prlimit(pid, resource.RLIMIT_FSIZE)
+    resource.prlimit(pid, resource.RLIMIT_FSIZE, (10_000, hard))
+    yield
+    resource.prlimit(pid, resource.RLIMIT_FSIZE, (hard, hard))
+
+
+def test_while_the_disk_is_full_it_goes_on_mapping_and_says_so(tmp_path, arguments):
     port = free_port()
     with (
         servers.server_process([*arguments, "--set", f"metrics.port={port}"]) as server,
         triquad_client.connect(server.endpoint) as client,
     ):
         servers.learn(client)
-        _, hard = resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE)
-        resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE, (10_000, hard))
-        with pytest.raises(RefusedError, match="cannot be written"):
-            client.checkpoint()
-        code, report = health(port)
-        assert code == 503
-        assert "cannot be written" in report["problem"]
-        assert samples(port)["triquad_healthy", ()] == 0
-        assert samples(port)["triquad_checkpoints_total", (("outcome", "failed"),)] == 1
-        assert client.metrics().problem == report["problem"]
-        resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE, (hard, hard))
-        client.checkpoint()
+        client.settle(servers.WAIT_S)
+        kept = client.checkpoint()
+        with no_space(server.process.pid):
+            servers.learn(client, 1)
+            with pytest.raises(RefusedError, match="cannot be written: .*too large"):
+                client.checkpoint()
+            code, report = health(port)
+            assert code == 503
+            assert "cannot be written" in report["problem"]
+            assert samples(port)["triquad_healthy", ()] == 0
+            assert samples(port)["triquad_checkpoints_total", (("outcome", "failed"),)] == 1
+            assert client.metrics().problem == report["problem"]
+            status = client.status()
+            assert "cannot be written" in status.store_error
+            assert status.last_checkpoint == kept
+            assert status.epoch > kept.epoch
+            assert read_map(kept.path).epoch == kept.epoch
+            assert [file.epoch for file in checkpoint_files(Path(kept.path).parent)] == [kept.epoch]
+            assert servers.learn(client, 1).taken == 4
+        client.settle(servers.WAIT_S)
+        later = client.checkpoint()
         assert health(port)[0] == 200
+        assert client.status().store_error is None
+        assert read_map(later.path).epoch == later.epoch == client.status().epoch
+        server.process.send_signal(signal.SIGTERM)
+        assert server.wait() == 0
+    assert not list((tmp_path / "store").rglob("*.tmp"))
+    assert "Traceback" not in server.log
 
 
 def test_a_port_that_is_taken_ends_the_server_at_once(arguments):
@@ -304,9 +322,3 @@ def test_a_server_within_a_program_closes_its_port():
 def test_prometheus_client_is_imported_only_where_it_is_wanted():
     script = "import sys, triquad_server.launch; sys.exit('prometheus_client' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
-
-
-@pytest.mark.parametrize("port", ["-1", "65536", "http"])
-def test_ports_that_are_none_are_refused(port):
-    with pytest.raises(SettingsError, match=r"metrics\.port"):
-        load_settings(None, [f"metrics.port={port}"])

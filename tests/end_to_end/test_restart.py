@@ -37,7 +37,7 @@ def restart(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Restart]:
         before = client.settle(servers.WAIT_S)
     checkpoint = store.with_name("copy")
     checkpoint.mkdir()
-    for path in (store / servers.MAP).glob("*.triquad"):
+    for path in (store / servers.MAP).glob("*.checkpoint"):
         (checkpoint / path.name).write_bytes(path.read_bytes())
     with servers.service_and_client(store=store) as client:
         after, metrics = client.status(), client.metrics()

@@ -1,15 +1,11 @@
 """What goes wrong with scans reaches the server's log and who publishes them."""
 
-import dataclasses
 import logging
 
-import msgpack
 import numpy as np
 import pytest
 from support import servers
 from triquad_client import FlushReport
-from triquad_format.wire import codec
-from triquad_format.wire.messages import FlushReply, ServerStatus
 from triquad_server.settings import SourceSettings
 
 POSE = np.eye(4)
@@ -45,14 +41,3 @@ def test_a_range_that_fits_the_source_ends_the_warning() -> None:
             client.publish_scan(half_near() * np.float32(1.5), POSE, source="cam")
         assert client.flush(servers.WAIT_S).warnings == ()
         assert client.status().warnings is None
-
-
-def test_replies_of_servers_that_know_no_warnings_are_read_and_theirs_by_older_clients() -> None:
-    reply = FlushReply(1, 2, 3, None, warnings="source 'cam': text")
-    body = msgpack.unpackb(codec.encode(reply))
-    assert body.pop("warnings") == "source 'cam': text"
-    older = codec.decode(FlushReply, msgpack.packb(body))
-    assert older == dataclasses.replace(reply, warnings=None)
-    # What a reader does not know it ignores; the field has to have a default for the other way.
-    default = {part.name: part.default for part in dataclasses.fields(ServerStatus)}
-    assert default["warnings"] is None

@@ -60,7 +60,7 @@ def test_a_settled_map_has_learnt_the_surface(client):
 
 def test_settling_begins_with_what_was_just_published(client):
     large = servers.sphere(400_000)  # long on its way
-    for count in range(1, 7):
+    for count in range(1, 4):
         client.publish_scan(large, np.eye(4))
         assert client.settle(servers.WAIT_S).scans_taken == count
 
@@ -129,7 +129,6 @@ def test_large_queries_are_answered_from_one_epoch_while_the_map_changes(client,
 
 def test_many_threads_may_ask_at_once(client):
     servers.learn(client)
-    expected = client.query_sdf(PROBES, gradient=True)
     epoch = client.settle(servers.WAIT_S).epoch
     expected = client.query_sdf(PROBES, gradient=True)
     with ThreadPoolExecutor(8) as pool:

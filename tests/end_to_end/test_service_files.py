@@ -1,6 +1,7 @@
 """The map of a service as a file: downloaded, and written to a store."""
 
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,12 @@ from triquad_format.wire.messages import MapChunk, MapChunkRequest, ResetRequest
 from triquad_server.store.store import Store
 
 PROBES = np.concatenate([servers.sphere(50, radius) for radius in (2.0, 3.9, 4.0, 4.1)])
+
+
+def assert_same_map(before, after):
+    assert after.epoch >= before.epoch
+    assert np.array_equal(after.status, before.status)
+    assert np.allclose(after.sdf, before.sdf, rtol=0, atol=2e-3)  # features in half precision
 
 
 def test_a_downloaded_map_is_the_map(client, tmp_path):
@@ -61,11 +68,8 @@ def test_a_checkpoint_restores_the_same_answers(tmp_path):
         assert client.status().last_checkpoint == info
         before = client.query_sdf(PROBES, gradient=True)
     with servers.service_and_client(store=tmp_path) as client:
-        after = client.query_sdf(PROBES, gradient=True)
-        assert client.status().last_checkpoint.epoch == info.epoch
-    assert after.epoch == before.epoch
-    assert np.array_equal(after.status, before.status)
-    assert np.allclose(after.sdf, before.sdf, rtol=0, atol=2e-3)  # features are half precision
+        assert_same_map(before, client.query_sdf(PROBES, gradient=True))
+        assert client.status().last_checkpoint.epoch == before.epoch == info.epoch
 
 
 def test_a_reset_while_the_last_checkpoint_is_written_is_not_acknowledged(tmp_path, monkeypatch):
@@ -98,3 +102,61 @@ def test_a_store_that_fails_does_not_stop_the_map(tmp_path):
         (tmp_path / servers.MAP).mkdir()
         assert client.checkpoint().epoch > 0
         assert client.status().store_error is None
+
+
+def stored_bytes(folder):
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def test_a_checkpoint_while_it_learns_writes_what_changed(tmp_path):
+    far = np.eye(4)
+    far[0, 3] = 75.0
+    probes = np.concatenate([servers.sphere(200), servers.sphere(200) + far[:3, 3]])
+    with servers.service_and_client(store=tmp_path) as client:
+        for place in range(4):
+            pose = np.eye(4)
+            pose[0, 3] = 25.0 * place
+            client.publish_scan(servers.sphere(), pose)
+        client.settle(servers.WAIT_S)
+        whole = client.checkpoint()
+        before_bytes = stored_bytes(tmp_path)
+        client.publish_scan(servers.sphere(3000), far)
+        client.settle(servers.WAIT_S)
+        part = client.checkpoint()
+        assert part.bytes > whole.bytes / 2
+        assert stored_bytes(tmp_path) - before_bytes < whole.bytes / 2
+        before = client.query_sdf(probes)
+    with servers.service_and_client(store=tmp_path) as client:
+        assert client.status().last_checkpoint.epoch == part.epoch
+        assert_same_map(before, client.query_sdf(probes))
+
+
+def test_a_checkpoint_that_was_spoilt_is_written_again_when_asked_for(tmp_path):
+    with servers.service_and_client(store=tmp_path) as client:
+        servers.learn(client)
+        client.settle(servers.WAIT_S)
+        path = Path(client.checkpoint().path)
+        path.write_bytes(path.read_bytes()[:1000])
+        again = client.checkpoint()
+        assert again.epoch == client.status().epoch
+        assert read_map(again.path).epoch == again.epoch
+    with servers.service_and_client(store=tmp_path) as client:
+        assert client.status().regions == 1
+
+
+def test_a_damaged_checkpoint_falls_back_to_the_one_before_and_says_so(tmp_path, caplog):
+    with servers.service_and_client(store=tmp_path) as client:
+        servers.learn(client)
+        client.settle(servers.WAIT_S)
+        before = client.query_sdf(PROBES, gradient=True)
+        good = client.checkpoint().path
+        client.publish_scan(servers.sphere(2000, 6.0), np.eye(4))
+        client.settle(servers.WAIT_S)
+        bad = Path(client.checkpoint().path)
+    payload = bytearray(bad.read_bytes())
+    payload[len(payload) // 2] ^= 0xFF
+    bad.write_bytes(payload)
+    with servers.service_and_client(store=tmp_path) as client:
+        assert f"checkpoint {bad} is damaged" in caplog.text
+        assert f"the older checkpoint {good} is used instead" in caplog.text
+        assert_same_map(before, client.query_sdf(PROBES, gradient=True))

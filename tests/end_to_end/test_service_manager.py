@@ -7,35 +7,43 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import numpy as np
 import pytest
 import triquad_client
-from support import servers, stopped_threads
+from support import servers
 from support.servers import ServerProcess
 from support.service_manager import Manager, service_manager
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import ServerStatus, StatusRequest
+from triquad_server.process.service_manager import ServiceManager
 
 WATCHDOG_S = 2
 
-TELLS_ITS_THREADS = """
+HANGS_WHEN_TOLD = """
 import sys, threading
+from triquad_map.questions.answers import Answers
 from triquad_server.cli import main
+from triquad_server.mapping.mapper import Mapper
 
-def tell():
-    for name in sys.stdin:
-        names = [t.native_id for t in threading.enumerate() if t.name.startswith(name.strip())]
-        print(*names, flush=True)
+may_go_on = threading.Event()
+may_go_on.set()
 
-threading.Thread(target=tell, daemon=True).start()
+def hanging(work):
+    def wait_and_work(*arguments, **named):
+        may_go_on.wait()
+        return work(*arguments, **named)
+    return wait_and_work
+
+def listen():
+    for line in sys.stdin:
+        (may_go_on.clear if line == "hang\\n" else may_go_on.set)()
+        print(line, end="", flush=True)
+
+owner, method = {"mapper": (Mapper, "ingest"), "workers": (Answers, "answer")}[sys.argv.pop(1)]
+setattr(owner, method, hanging(getattr(owner, method)))
+threading.Thread(target=listen, daemon=True).start()
 sys.exit(main())
 """
-
-
-@pytest.fixture
-def arguments(tmp_path):
-    settings = tmp_path / "server.toml"
-    settings.write_text(servers.SMALL_TOML)
-    return ["--settings", str(settings), "--store", str(tmp_path / "store")]
 
 
 @pytest.fixture
@@ -47,9 +55,10 @@ def manager(tmp_path, monkeypatch) -> Iterator[Manager]:
 
 
 @contextmanager
-def server_whose_threads_are_known(arguments: list[str]) -> Iterator[ServerProcess]:
+def server_that_hangs_when_told(part: str, arguments: list[str]) -> Iterator[ServerProcess]:
+    """A server whose mapper or workers hang as soon as they have something to do."""
     endpoint = servers.free_endpoint()
-    command = [sys.executable, "-c", TELLS_ITS_THREADS, "--listen", endpoint]
+    command = [sys.executable, "-c", HANGS_WHEN_TOLD, part, "--listen", endpoint]
     command += ["--no-multicast-scouting", "--device", "cpu", *arguments]
     pipe = subprocess.PIPE
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
@@ -62,13 +71,13 @@ def server_whose_threads_are_known(arguments: list[str]) -> Iterator[ServerProce
             server.wait()
 
 
-def threads_of(server: ServerProcess, name: str) -> list[int]:
-    """Ids of the threads whose names begin with ``name``."""
+def tell(server: ServerProcess, word: str) -> None:
+    """Tell a server to "hang" or to "go on"; it has heard it once this returns."""
     assert server.process.stdin is not None
     assert server.process.stdout is not None
-    server.process.stdin.write(f"{name}\n")
+    server.process.stdin.write(f"{word}\n")
     server.process.stdin.flush()
-    return [int(number) for number in server.process.stdout.readline().split()]
+    assert server.process.stdout.readline().strip() == word
 
 
 def assert_answers_at_once(endpoint: str) -> None:
@@ -105,15 +114,13 @@ def test_it_is_ready_once_it_answers_and_says_when_it_stops(manager, arguments) 
     assert [line for lines in manager.heard for line in lines].count("READY=1") == 1
 
 
-def test_an_abstract_socket_will_do(tmp_path, monkeypatch, arguments) -> None:
+def test_an_abstract_socket_will_do(tmp_path, monkeypatch) -> None:
     with service_manager(f"@triquad-{tmp_path.name}-{id(tmp_path)}") as manager:
         monkeypatch.setenv("NOTIFY_SOCKET", manager.address)
-        with servers.server_process(arguments, ready=False) as server:
-            manager.wait_for("READY=1")
-            server.process.send_signal(signal.SIGTERM)
-            manager.wait_for("STOPPING=1")
-            assert server.wait() == 0
-    assert told(manager, "WATCHDOG") == []  # it did not ask
+        ours = ServiceManager()
+        ours.tell("READY=1", status="serving")
+        assert manager.wait_for("READY=1") == ["READY=1", "STATUS=serving"]
+    assert ours.watchdog_s is None  # the manager did not ask
 
 
 def test_asked_to_stop_while_it_starts_it_says_that_it_stops(manager, arguments) -> None:
@@ -128,7 +135,7 @@ def test_asked_to_stop_while_it_starts_it_says_that_it_stops(manager, arguments)
 def assert_nothing_more_is_well(manager: Manager, server: ServerProcess, why: str) -> None:
     server.wait_for(f"gets no more signs that all is well: {why}")
     before = len(manager.heard)
-    for _ in range(12):  # more than a period of the watchdog has
+    for _ in range(4):  # with each of which all would be well, if it were
         manager.wait_for("STATUS=")
     assert not any("WATCHDOG=1" in lines for lines in manager.heard[before:])
 
@@ -136,20 +143,24 @@ def assert_nothing_more_is_well(manager: Manager, server: ServerProcess, why: st
 def test_while_the_mapper_hangs_the_watchdog_is_not_told_that_all_is_well(
     manager, arguments
 ) -> None:
-    with server_whose_threads_are_known(arguments) as server:
+    with server_that_hangs_when_told("mapper", arguments) as server:
         manager.wait_for("WATCHDOG=1")
-        (mapper,) = threads_of(server, "mapper")
-        with stopped_threads.stopped([mapper]):
-            assert_nothing_more_is_well(manager, server, "mapping makes no progress")
+        tell(server, "hang")
+        with triquad_client.connect(server.endpoint) as client:
+            client.publish_scan(servers.sphere(), np.eye(4))
+            assert_nothing_more_is_well(manager, server, "mapping makes no progress: it is at scan")
             assert_answers_at_once(server.endpoint)  # all else goes on
-        manager.wait_for("WATCHDOG=1")  # and so does the mapper, once it can
+            tell(server, "go on")
+            assert client.flush(servers.WAIT_S).taken == 1
+        manager.wait_for("WATCHDOG=1")
 
 
 def test_while_nobody_answers_the_watchdog_is_not_told_that_all_is_well(manager, arguments) -> None:
-    with server_whose_threads_are_known(arguments) as server:
+    with server_that_hangs_when_told("workers", arguments) as server:
         manager.wait_for("WATCHDOG=1")
-        with stopped_threads.stopped(threads_of(server, "worker")):
-            assert_nothing_more_is_well(manager, server, "a question that the server asked itself")
+        tell(server, "hang")
+        assert_nothing_more_is_well(manager, server, "a question that the server asked itself")
+        tell(server, "go on")
         manager.wait_for("WATCHDOG=1")
 
 
@@ -170,11 +181,8 @@ def test_given_up_by_the_watchdog_it_leaves_the_stacks_of_its_threads(manager, a
 
 
 @pytest.mark.parametrize("address", ["vsock:2:1234", "/nowhere/at/all"])
-def test_a_manager_that_cannot_be_told_stops_nothing(manager, monkeypatch, arguments, address):
+def test_a_manager_that_cannot_be_told_stops_nothing(manager, monkeypatch, address, caplog):
     monkeypatch.setenv("NOTIFY_SOCKET", address)
-    with servers.server_process(arguments) as server:
-        assert_answers_at_once(server.endpoint)
-        server.process.send_signal(signal.SIGTERM)
-        assert server.wait() == 0
-    assert "the service manager could not be notified" in server.log
+    ServiceManager().notify("READY=1")
+    assert "the service manager could not be notified of READY=1" in caplog.text
     assert manager.heard == []

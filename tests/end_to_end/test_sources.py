@@ -1,7 +1,5 @@
 """Where sources have been and what they see, asked by the real client over the loopback."""
 
-import asyncio
-
 import numpy as np
 import pytest
 import triquad_client
@@ -280,16 +278,3 @@ def test_replies_that_do_not_fit_together_are_named(state, words):
         pytest.raises(BadReplyError, match=words),
     ):
         client.sources()
-
-
-def test_it_can_be_awaited(endpoint):
-    async def use():
-        async with triquad_client.connect_async(endpoint) as client:
-            start = await client.sources()
-            await client.publish_scan(servers.sphere(), pose(1), source="lidar")
-            await client.flush(servers.WAIT_S)
-            return await client.sources(since=start, max_points=10)
-
-    report = asyncio.run(use())
-    assert trail(report) == [1]
-    assert len(report.sources["lidar"].newest.points) == 10

@@ -50,6 +50,16 @@ def assert_read_back(record: MapRecord, data: bytes | None = None) -> None:
     assert_same(stored_record(data), record)
 
 
+def test_what_is_read_has_the_types_for_which_kernels_are_compiled() -> None:
+    """Arrays that can be written to: for others each kernel would be compiled once more."""
+    (region, *_) = read_bytes(file_bytes(random_record(1))).regions
+    evidence, mlp = region.evidence, region.mlp
+    seen = (evidence.surface, evidence.free, evidence.levels, evidence.margins)
+    for array in (*seen, *mlp.weights, *mlp.biases):
+        assert array.flags.writeable
+        assert array.flags.c_contiguous
+
+
 @pytest.mark.parametrize("training", [True, False])
 @pytest.mark.parametrize("dtype", ["<f2", "<f4"])
 def test_round_trip(tmp_path: Path, training: bool, dtype: str) -> None:

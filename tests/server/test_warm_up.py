@@ -36,8 +36,15 @@ def step(tmp_path, monkeypatch):
     return run
 
 
-@pytest.mark.parametrize("suffix", ["nbi", "nbc"])
-@pytest.mark.parametrize("left", [0, 100])
+@pytest.mark.parametrize(
+    ("suffix", "left"),
+    [
+        ("nbi", 0),
+        ("nbc", 100),
+        pytest.param("nbi", 100, marks=pytest.mark.long),
+        pytest.param("nbc", 0, marks=pytest.mark.long),
+    ],
+)
 def test_compiled_code_that_is_damaged_is_compiled_again(tmp_path, step, suffix, left):
     assert step().stdout.split() == ["42", "0"]
     for file in (tmp_path / "cache").rglob(f"*.{suffix}"):

@@ -99,7 +99,8 @@ def _seen_voxels(view: ComposedView, low: Doubles, high: Doubles, margin: int) -
     first = np.floor(low / view.voxel_m).astype(np.int64) - margin
     last = np.floor(high / view.voxel_m).astype(np.int64) + margin
     middles = _middles(first[:, None] + np.arange((last - first).max() + 1)) * view.voxel_m
-    return np.asarray(np.argwhere(view.surface_in_grid(middles, 0.0)) + first)
+    seen = np.argwhere(view.surface_in_grid(middles, 0.0)) + first
+    return np.ascontiguousarray(seen)  # as kernels are compiled for
 
 
 def _field_in_voxels(view: ComposedView) -> SampleField:

@@ -16,7 +16,9 @@ RATES = Rates(learning_rate=0.01, young_rate=0.01)
 RADIUS = 9.0  # of the ball that is learnt, leaves
 
 
-@pytest.mark.parametrize("leaf_m", [0.01, 0.05, 0.2])
+@pytest.mark.parametrize(
+    "leaf_m", [*(pytest.param(leaf_m, marks=pytest.mark.long) for leaf_m in (0.01, 0.05)), 0.2]
+)
 def test_a_new_region_learns_quicker_than_one_that_begins_at_random(leaf_m: float) -> None:
     settings = replace(DEFAULT, leaf_m=leaf_m)
     pretrained = [error_leaves(initial_field(settings, ARRAYS, seed)) for seed in range(6)]

@@ -128,7 +128,10 @@ def test_an_epoch_takes_little_more_than_its_numbers(memory: Memory) -> None:
         assert used <= taken <= 1.25 * used + 64
 
 
-@pytest.mark.parametrize(("device", "other"), [("cpu", IN_TENSORS), (IN_TENSORS, "cpu")])
+@pytest.mark.parametrize(
+    ("device", "other"),
+    [("cpu", IN_TENSORS), pytest.param(IN_TENSORS, "cpu", marks=pytest.mark.long)],
+)
 def test_a_map_is_learnt_in_either_and_goes_on_in_the_other(device: str, other: str) -> None:
     world, settings = small_world.world(3), small_world.settings()
     mapper = small_world.settled_mapper(settings, world, device)

@@ -114,6 +114,7 @@ def test_a_place_left_behind_is_not_forgotten() -> None:
     assert surface_error(mapper.publish(), here) < before + 0.004
 
 
+@pytest.mark.long
 def test_what_is_new_is_learnt_as_well_where_much_has_settled(driven: Mapper) -> None:
     scan = world(30, 1.5).scans[-1]
     there = World(world().scene, (scan,))

@@ -187,6 +187,7 @@ def test_what_stands_keeps_its_surface(gone: Course) -> None:
     assert now.evidence.ended_in(voxels[standing & away]).mean() > 0.997
 
 
+@pytest.mark.long
 def test_it_returns_and_leaves_again() -> None:
     watched = Watched()
     for _ in range(2):

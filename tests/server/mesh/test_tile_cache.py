@@ -153,7 +153,9 @@ def seen_in_strips() -> tuple[Epoch, ...]:
     return tuple(epochs)
 
 
-@pytest.mark.parametrize("level", [0, LEVELS - 1])
+@pytest.mark.parametrize(
+    "level", [0, *(pytest.param(level, marks=pytest.mark.long) for level in range(1, LEVELS))]
+)
 def test_tiles_made_at_different_times_are_one_mesh(level: int) -> None:
     """After partial updates, all tiles have the triangles that meshing in one piece gives."""
     chosen = MeshSettings(tile_cells=16, cell_m=0.1 / 2**level, tolerance_m=0.03)

@@ -116,20 +116,23 @@ class PartBody:
         return (value[0], value[1], value[2])
 
     def array(self, key: str, dtype: str, shape: tuple[int | None, ...]) -> NDArray[Any]:
-        """Return an array of this dtype and shape; a size that is ``None`` may be any."""
+        """Return an array of this dtype and shape; a size that is ``None`` may be any.
+
+        It can be written to: kernels are compiled for such arrays, and would be again for others.
+        """
         name = f"{self.topic}: {key}"
         array = unpack_array(name, self._body.get(key))
         ArraySpec(dtype, shape).check(name, array)
-        return array
+        return np.array(array)
 
     def arrays(self, key: str, count: int) -> tuple[NDArray[Any], ...]:
-        """Return ``count`` arrays of ``<f4``, each of any shape."""
+        """Return ``count`` arrays of ``<f4``, each of any shape, as :meth:`array` does."""
         arrays = []
         for i, item in enumerate(self._items(key, count)):
             name = f"{self.topic}: {key}[{i}]"
             array = unpack_array(name, item)
             ArraySpec("<f4", (None,) * array.ndim).check(name, array)
-            arrays.append(array)
+            arrays.append(np.array(array))
         return tuple(arrays)
 
     def mapping(self, key: str) -> Mapping[str, object]:
