@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import triquad_client
 from support import servers
-from support.attacked import attacked_server, operation, points
+from support.attackers.attacked import attacked_server, operation, points
 from triquad_format.wire import keys
 
 from bench.clients.noisy_neighbours import neighbour

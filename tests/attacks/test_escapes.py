@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 import triquad_client
-from support.hostile_server import HostileServer, hostile_server, told
-from support.map_records import random_record
-from support.mapfile_edit import file_bytes, rewritten
+from support.attackers.hostile_server import HostileServer, hostile_server, told
+from support.files.mapfile_edit import file_bytes, rewritten
+from support.maps.map_records import random_record
 from triquad_format.errors import MapFileError
 from triquad_format.wire import codec, keys
 from triquad_tools.commands import inspect, pack, replay, top

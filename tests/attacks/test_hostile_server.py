@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import triquad_client
-from support.hostile_server import HostileServer, hostile_server, packed, told
-from support.lies import COUNT, LIES, QUESTIONS, TILE, Ask, Lie
+from support.attackers.hostile_server import HostileServer, hostile_server, packed, told
+from support.attackers.lies import COUNT, LIES, QUESTIONS, TILE, Ask, Lie
 from triquad_client import Client, Mesh
 from triquad_client.errors import BadReplyError, DownloadError
 from triquad_format.errors import TriquadError

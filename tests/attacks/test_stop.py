@@ -5,7 +5,7 @@ import time
 
 import triquad_client
 from support import servers
-from support.attacked import attacked_server, operation
+from support.attackers.attacked import attacked_server, operation
 from triquad_format.mapfile.checkpoint_folder import checkpoint_files
 from triquad_format.wire import keys
 

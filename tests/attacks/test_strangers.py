@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import triquad_client
 import zenoh
-from support.beyond import from_beyond
-from support.hostile_links import half_open
+from support.attackers.beyond import from_beyond
+from support.attackers.hostile_links import half_open
 from support.operations import OPERATIONS
 from support.servers import (
     MAP,

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support.kitti_folder import write_folder
+from support.recordings.kitti_folder import write_folder
 from triquad_server.settings import ChangeSettings, Settings
 from triquad_tools.simulation.lidar import Lidar
 

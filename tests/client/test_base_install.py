@@ -2,8 +2,8 @@ import subprocess
 import sys
 
 import pytest
-from support.map_records import random_record
-from support.mapfile_edit import file_bytes, parts_of
+from support.files.mapfile_edit import file_bytes, parts_of
+from support.maps.map_records import random_record
 from triquad_format.mapfile.reader import read_map
 from triquad_tools.commands import pack
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import triquad_client
 from support import servers
-from support.role_files import free_tls_endpoint, opened
+from support.attackers.role_files import free_tls_endpoint, opened
 from triquad_client.errors import ConnectError
 from triquad_format.wire.roles import SERVER, Holder, Role
 from triquad_tools.credentials.key_folder import KeyFolder

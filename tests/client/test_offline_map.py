@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 from support import servers
-from support.checkpoint_folder import map_at, write_checkpoints
-from support.exact_maps import exact_map, flat
+from support.files.checkpoint_folder import map_at, write_checkpoints
+from support.maps.exact_maps import exact_map, flat
 from triquad_client import (
     Client,
     ClosedError,

@@ -1,6 +1,7 @@
 """A server that is restarted tells of its map what it told before, and so does its checkpoint."""
 
 import json
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -36,9 +37,7 @@ def restart(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Restart]:
         servers.learn(client, SCANS - 1)
         before = client.settle(servers.WAIT_S)
     checkpoint = store.with_name("copy")
-    checkpoint.mkdir()
-    for path in (store / servers.MAP).glob("*.checkpoint"):
-        (checkpoint / path.name).write_bytes(path.read_bytes())
+    shutil.copytree(store / servers.MAP, checkpoint)
     with servers.service_and_client(store=store) as client:
         after, metrics = client.status(), client.metrics()
         servers.learn(client, 1)

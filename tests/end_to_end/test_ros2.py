@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 import triquad_client
 from support import servers
-from support.beyond import from_beyond
-from support.ros_bridge import AT, MAST, Bridged, bridging, stand
-from support.ros_messages import CLOUD
-from support.ros_robot import T0, robot, shifted
+from support.attackers.beyond import from_beyond
+from support.ros.ros_bridge import AT, MAST, Bridged, bridging, stand
+from support.ros.ros_messages import CLOUD
+from support.ros.ros_robot import T0, robot, shifted
 from triquad_client import Client, NoReplyError, Status
 from triquad_server.settings import SourceSettings
 from triquad_tools.ros2.intake import first_scan

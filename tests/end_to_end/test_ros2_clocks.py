@@ -5,8 +5,8 @@ from collections.abc import Iterator
 
 import pytest
 from support import servers
-from support.ros_bridge import bridging, stand
-from support.ros_robot import robot
+from support.ros.ros_bridge import bridging, stand
+from support.ros.ros_robot import robot
 
 
 @pytest.fixture(scope="module")

@@ -7,9 +7,9 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 from support import servers
-from support.ros_bridge import bridging
-from support.ros_listener import GRID, MARKER, Listener, ShownMarkers, listening
-from support.ros_robot import robot, shifted
+from support.ros.ros_bridge import bridging
+from support.ros.ros_listener import GRID, MARKER, Listener, ShownMarkers, listening
+from support.ros.ros_robot import robot, shifted
 from triquad_client import Client, Status
 from triquad_server.settings import MeshSettings
 from triquad_tools.ros2.topics import End, read_token

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support import servers
-from support.ros_bridge import Bridged, bridging
-from support.ros_robot import SECOND, T0, robot
+from support.ros.ros_bridge import Bridged, bridging
+from support.ros.ros_robot import SECOND, T0, robot
 from triquad_client.calls.sources import ScanSource
 from triquad_tools.recordings.folders.kitti import read_kitti_folder
 

@@ -9,8 +9,7 @@ import msgpack
 import numpy as np
 import pytest
 import zstandard
-from support.map_records import random_record, with_rays, with_support
-from support.mapfile_edit import (
+from support.files.mapfile_edit import (
     Edit,
     edited,
     file_bytes,
@@ -20,6 +19,7 @@ from support.mapfile_edit import (
     set_array,
     stored_record,
 )
+from support.maps.map_records import random_record, with_rays, with_support
 from triquad_format.errors import (
     DamagedMapFileError,
     MapFileError,
@@ -44,8 +44,8 @@ def first_level(edit: Edit) -> Edit:
 
 
 def many_entries(manifest: Manifest) -> Manifest:
-    """More parts than the file has room to list, all of them in another file."""
-    entry = dataclasses.replace(manifest.own[1], sha256=bytes(32), file="other.triquad")
+    """More parts than the file has room to list."""
+    entry = dataclasses.replace(manifest.entries[1], sha256=bytes(32))
     more = tuple(
         dataclasses.replace(entry, key=PartKey("/triquad/x", (0, 0, 0), 0, cell))
         for cell in range(50_000)
@@ -55,7 +55,7 @@ def many_entries(manifest: Manifest) -> Manifest:
 
 def one_place(manifest: Manifest) -> Manifest:
     """All parts of this size at one place."""
-    own = [dataclasses.replace(entry, size=30 * 2**20) for entry in manifest.own]
+    own = [dataclasses.replace(entry, size=30 * 2**20) for entry in manifest.entries]
     return dataclasses.replace(manifest, entries=tuple(own))
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import msgpack
 import pytest
 import zstandard
-from support.checkpoint_folder import write_record
-from support.map_records import random_record
+from support.files.checkpoint_folder import write_record
+from support.maps.map_records import random_record
 from triquad_format.errors import DamagedMapFileError, MapFileError, UnsupportedMapFileError
 from triquad_format.mapfile.checkpoint import MAGIC, read_checkpoint
 from triquad_format.mapfile.checkpoint_folder import (

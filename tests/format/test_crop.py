@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from support.map_records import SMALL, assert_same, random_record, with_rays
+from support.maps.map_records import SMALL, assert_same, random_record, with_rays
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map

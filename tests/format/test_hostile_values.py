@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.map_records import random_record, with_integers, with_rays, with_support
-from support.mapfile_edit import (
+from support.files.mapfile_edit import (
     Edit,
     all_of,
     assert_refused,
@@ -22,6 +21,7 @@ from support.mapfile_edit import (
     shorten,
     stored,
 )
+from support.maps.map_records import random_record, with_integers, with_rays, with_support
 from triquad_format.errors import (
     DamagedMapFileError,
     FormatError,

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.map_records import SMALL, assert_same, random_record, with_integers
+from support.maps.map_records import SMALL, assert_same, random_record, with_integers
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map

@@ -12,17 +12,8 @@ import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
-from support import golden
-from support.map_records import (
-    SMALL,
-    assert_same,
-    random_record,
-    with_integers,
-    with_progress,
-    with_rays,
-    with_support,
-)
-from support.mapfile_edit import (
+from support.files import golden
+from support.files.mapfile_edit import (
     edited,
     file_bytes,
     manifest_of,
@@ -30,6 +21,15 @@ from support.mapfile_edit import (
     parts_of,
     read_bytes,
     stored_record,
+)
+from support.maps.map_records import (
+    SMALL,
+    assert_same,
+    random_record,
+    with_integers,
+    with_progress,
+    with_rays,
+    with_support,
 )
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.metadata import MapFacts

@@ -11,10 +11,17 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
-from support.checkpoint_folder import FIRST, SECOND, map_at, write_checkpoints
-from support.file_damage import chunks, first_chunk, flipped, zeroed
-from support.map_records import SMALL, assert_same, random_record, with_rays, with_support
-from support.mapfile_edit import edited, file_bytes, manifest_of, metadata_of, read_bytes, set_field
+from support.files.checkpoint_folder import FIRST, SECOND, map_at, write_checkpoints
+from support.files.file_damage import chunks, first_chunk, flipped, zeroed
+from support.files.mapfile_edit import (
+    edited,
+    file_bytes,
+    manifest_of,
+    metadata_of,
+    read_bytes,
+    set_field,
+)
+from support.maps.map_records import SMALL, assert_same, random_record, with_rays, with_support
 from triquad_format.errors import DamagedMapFileError, MapFileError, UnsupportedMapFileError
 from triquad_format.mapfile.parts.part import (
     EVIDENCE,

@@ -6,12 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support import golden, map_records, spec_reader
-from support.checkpoint_folder import write_record
-from support.file_damage import flipped
-from support.map_records import SMALL
-from support.mapfile_edit import rewritten
-from support.spec_parts import Map, RefusedError, Region, Settings, is_held_out
+from support.files import golden, spec_reader
+from support.files.checkpoint_folder import write_record
+from support.files.file_damage import flipped
+from support.files.mapfile_edit import rewritten
+from support.files.spec_parts import Map, RefusedError, Region, Settings, is_held_out
+from support.maps import map_records
+from support.maps.map_records import SMALL
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records import morton

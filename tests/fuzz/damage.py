@@ -3,7 +3,7 @@
 import numpy as np
 from fuzz.choices import Draw, Mutation, flipped, number, place, shuffle
 from hypothesis import strategies as st
-from support.mapfile_edit import parts_of, rewritten, with_fitting_crcs
+from support.files.mapfile_edit import parts_of, rewritten, with_fitting_crcs
 
 
 def flip_bits(draw: Draw, data: bytes) -> bytes:

@@ -11,7 +11,7 @@ import msgpack
 import numpy as np
 from fuzz.choices import NUMBERS, Draw, Mutation, bomb_bytes, chance, flipped, place, shuffle
 from hypothesis import strategies as st
-from support.mapfile_edit import parts_of, rewritten
+from support.files.mapfile_edit import parts_of, rewritten
 
 VALUES: tuple[Any, ...] = (
     *NUMBERS, -1, -(2**31), -(2**63), 0.5, -1.0, 1e300, math.nan, math.inf, True, None, "", "x",

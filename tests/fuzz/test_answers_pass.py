@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support import small_world
+from support.maps import small_world
 from triquad_format.wire import codec
 from triquad_format.wire.messages import SdfRequest
 from triquad_format.wire.query_messages import (

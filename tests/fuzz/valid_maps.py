@@ -5,9 +5,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from support import golden
-from support.checkpoint_folder import write_record
-from support.map_records import (
+from support.files import golden
+from support.files.checkpoint_folder import write_record
+from support.maps.map_records import (
     random_record,
     with_integers,
     with_progress,

@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from support.alignments import Offset, attempts, displaced, recorded
-from support.exact_view import ExactView
-from support.small_world import settled_epoch, world
+from support.maps.alignments import Offset, attempts, displaced, recorded
+from support.maps.exact_view import ExactView
+from support.maps.small_world import settled_epoch, world
 from triquad_format.records.status import Status
 from triquad_map.questions.align import Alignment, AlignOptions, align, thinned
 from triquad_server.settings import Settings, TrainingSettings

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from support.map_records import evidence_of, random_record, with_support
+from support.maps.map_records import evidence_of, random_record, with_support
 from triquad_format.records import morton
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.region import BLOCK_BYTES, MapRecord

@@ -5,9 +5,18 @@ import asyncio
 import numpy as np
 import pytest
 import triquad_client
-from support import ground_scenes, servers
-from support.ground_scenes import HOLE_M, KERB_M, RAMP_DEG, STEP_M, TABLE_M, TABLE_THICK_M, TREAD_M
-from support.small_world import settings, settle
+from support import servers
+from support.maps import ground_scenes
+from support.maps.ground_scenes import (
+    HOLE_M,
+    KERB_M,
+    RAMP_DEG,
+    STEP_M,
+    TABLE_M,
+    TABLE_THICK_M,
+    TREAD_M,
+)
+from support.maps.small_world import settings, settle
 from triquad_client import Status
 from triquad_map.questions.ground import ground
 from triquad_server.mapping.mapper import Mapper

@@ -11,10 +11,10 @@ from mcap_protobuf.decoder import DecoderFactory
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
-from support.map_records import SMALL, evidence_of, random_record, surface_evidence
-from support.mapfile_edit import file_bytes, parts_of, read_bytes, rewritten
-from support.other_field import OtherField
-from support.small_world import settings, settled_mapper, world
+from support.files.mapfile_edit import file_bytes, parts_of, read_bytes, rewritten
+from support.maps.map_records import SMALL, evidence_of, random_record, surface_evidence
+from support.maps.other_field import OtherField
+from support.maps.small_world import settings, settled_mapper, world
 from triquad_client import Mesh, OfflineMap
 from triquad_format.errors import DamagedMapFileError
 from triquad_format.mapfile.writer import write_map

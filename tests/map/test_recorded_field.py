@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from support.map_records import SMALL, evidence_of, random_record
+from support.maps.map_records import SMALL, evidence_of, random_record
 from triquad_format.records import morton
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES, MapRecord, VertexTable

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.exact_maps import exact_map, flat
-from support.map_records import SMALL
+from support.maps.exact_maps import exact_map, flat
+from support.maps.map_records import SMALL
 from triquad_format.records.region import MapRecord
 from triquad_map.compiled.evidence.live_evidence import LiveEvidence
 from triquad_map.compiled.surfels.surfel_map import surfel_places

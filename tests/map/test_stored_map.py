@@ -4,9 +4,9 @@ import os
 
 import numpy as np
 import pytest
-from support import checkpoint_folder
-from support.map_records import SMALL, assert_same, random_record
-from support.mapfile_edit import edited, file_bytes, set_array, stored, write_record
+from support.files import checkpoint_folder
+from support.files.mapfile_edit import edited, file_bytes, set_array, stored, write_record
+from support.maps.map_records import SMALL, assert_same, random_record
 from triquad_format.errors import DamagedMapFileError, FormatError, MapFileError
 from triquad_format.mapfile.index import FileBytes
 from triquad_format.mapfile.reader import read_map

@@ -4,7 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from support import small_world
+from support.maps import small_world
 from triquad_map.compiled.evidence.live_evidence import LiveEvidence
 from triquad_map.compiled.evidence.observed import Sighting
 from triquad_map.compiled.field.frozen_field import field_samples

@@ -6,7 +6,7 @@ from contextlib import closing, contextmanager
 from threading import Event, Thread
 
 from support import servers
-from support.small_world import settings, world
+from support.maps.small_world import settings, world
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.health import ENDLESS_S, STUCK_S, Health
 from triquad_server.intake.scan_queue import ScanQueue

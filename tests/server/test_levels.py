@@ -6,14 +6,14 @@ import msgpack
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.checkpoint_folder import write_record
-from support.map_records import SMALL, assert_same, evidence_of, random_record, with_support
-from support.mapfile_edit import (
+from support.files.checkpoint_folder import write_record
+from support.files.mapfile_edit import (
     file_bytes,
     parts_of,
     read_bytes,
     stored,
 )
+from support.maps.map_records import SMALL, assert_same, evidence_of, random_record, with_support
 from triquad_format.mapfile.parts.part import EVIDENCE
 from triquad_format.mapfile.reader import read_map
 from triquad_format.records.crop import crop_record

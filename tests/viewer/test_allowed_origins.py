@@ -8,7 +8,7 @@ from contextlib import closing
 import pytest
 import viser
 import websockets.asyncio.client
-from support.changing_store import EMPTY, write_checkpoint
+from support.files.changing_store import EMPTY, write_checkpoint
 from triquad_tools.viewer.allowed_origins import refusal
 from triquad_tools.viewer.sources.stored_map import StoredMap
 from triquad_tools.viewer.viewer import Viewer

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser
-from support.changing_store import EMPTY, write_checkpoint
+from support.files.changing_store import EMPTY, write_checkpoint
 from triquad_client.checks import Bounds
 from triquad_tools.viewer.sources.map_source import TileFollower
 from triquad_tools.viewer.sources.stored_map import StoredMap, StoredTiles

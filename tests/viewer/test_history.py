@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.changing_store import EMPTY, box_at, write_checkpoint
+from support.files.changing_store import EMPTY, box_at, write_checkpoint
 from triquad_tools.console.command import ToolError
 from triquad_tools.viewer.sources.history import DamagedError, History
 from triquad_tools.viewer.sources.map_source import COARSEST

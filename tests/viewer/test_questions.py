@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.colors import to_rgb
-from support.exact_maps import SEEN_M, exact_map, flat, table
+from support.maps.exact_maps import SEEN_M, exact_map, flat, table
 from triquad_client import OfflineMap, Status
 from triquad_format.records.arrays import Bytes
 from triquad_tools.plots.plan import UNKNOWN

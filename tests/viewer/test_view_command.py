@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from support.changing_store import EMPTY, write_checkpoint
+from support.files.changing_store import EMPTY, write_checkpoint
 from triquad_tools.commands.view import main
 
 

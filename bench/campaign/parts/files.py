@@ -18,7 +18,7 @@ from fuzz.forgery import FORGERY, forge_bombs
 from fuzz.valid_maps import READERS, ValidMap, valid_maps
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
-from support.map_records import assert_same
+from support.maps.map_records import assert_same
 from triquad_format.errors import FormatError
 from triquad_format.records.record_check import check_record
 from triquad_format.records.region import MapRecord

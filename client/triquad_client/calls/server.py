@@ -52,8 +52,8 @@ class ServerCalls:
     def reset(self, bounds: Bounds | None = None) -> ResetReply:
         """Forget what was learnt within ``bounds``.
 
-        A server with a store first writes the map as it is to a checkpoint, which stays for its
-        setting ``store.protect_h``, whatever else happens.
+        A server with a store first writes the map as it is to a checkpoint, which stays until
+        its setting ``store.keep_resets`` has been exceeded by later resets.
 
         Args:
             bounds: corners of a box, metres, map frame; ``None``: everything is forgotten.

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from support.exact_maps import SETTINGS, Height, exact_map, flat
-from support.small_world import settled_epoch, world
+from support.maps.exact_maps import SETTINGS, Height, exact_map, flat
+from support.maps.small_world import settled_epoch, world
 from triquad_client import InvalidInputError, Mesh, OfflineMap
 from triquad_format.records import morton
 from triquad_format.records.field_settings import BLOCK_VOXELS

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from support.exact_maps import SEEN_M, exact_map, flat, table
-from support.map_records import with_support
+from support.maps.exact_maps import SEEN_M, exact_map, flat, table
+from support.maps.map_records import with_support
 from triquad_client import ClosedError, InvalidInputError, Mesh, OfflineMap, open_map
 from triquad_client.offline import map_mesh
 from triquad_format.mapfile.writer import write_map

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 
 import zenoh
-from support.beyond import from_beyond
+from support.attackers.beyond import from_beyond
 from support.servers import free_endpoint, raw_session
 from triquad_format.wire import keys
 from triquad_format.wire.access_control import (

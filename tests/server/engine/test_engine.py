@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from support import small_world
+from support.maps import small_world
 from triquad_format.records.field_settings import FieldSettings
 from triquad_map.compiled.field.encoding import load, locate, new_batch
 from triquad_map.compiled.field.field import make_field

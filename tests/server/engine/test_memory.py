@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support import small_world
+from support.maps import small_world
 from triquad_format.records.field_settings import FieldSettings
 from triquad_server.engine.gradient_sums import GradientSums
 from triquad_server.engine.live_field import Batch, LiveField, Parameter, Rates, initial_field

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from support.small_world import settings, world
+from support.maps.small_world import settings, world
 from triquad_server.epochs.array_memory import buffers_of, bytes_by_part
 from triquad_server.mapping.mapper import Mapper
 

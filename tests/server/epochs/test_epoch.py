@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from support.small_world import settings, settled_mapper, world
+from support.maps.small_world import settings, settled_mapper, world
 from triquad_format.records.status import Status
 from triquad_map.composition.recorded_view import RecordedView
 from triquad_server.epochs.epoch import Epoch

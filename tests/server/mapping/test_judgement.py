@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support.small_world import (
+from support.maps.small_world import (
     damage,
     settings,
     settle,

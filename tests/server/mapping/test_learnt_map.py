@@ -4,7 +4,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from support.small_world import (
+from support.maps.small_world import (
     World,
     mapper_of,
     settings,

@@ -4,7 +4,7 @@ from functools import partial
 from itertools import count
 
 import numpy as np
-from support.small_world import WALLED, WALLED_BOUNDS, settle
+from support.maps.small_world import WALLED, WALLED_BOUNDS, settle
 from triquad_format.records.arrays import Bools, Doubles, Floats
 from triquad_format.records.field_settings import FieldSettings
 from triquad_server.mapping.mapper import Mapper

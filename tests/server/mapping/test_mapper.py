@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.map_records import assert_same
-from support.small_world import (
+from support.maps.map_records import assert_same
+from support.maps.small_world import (
     mapper_of,
     settings,
     settle,

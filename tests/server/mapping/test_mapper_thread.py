@@ -12,7 +12,7 @@ from threading import Event
 import numpy as np
 import pytest
 from support import servers
-from support.small_world import settings, world
+from support.maps.small_world import settings, world
 from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import CheckpointRequest, ResetRequest
 from triquad_server.epochs.history import EpochHistory

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from support.maps.small_world import settings
 from support.servers import sphere
-from support.small_world import settings
 from triquad_server.errors import ScanRefusedError
 from triquad_server.intake.rays import usable_rays
 from triquad_server.mapping.mapper import Mapper

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from support.mapfile_edit import file_bytes, read_bytes
-from support.small_world import WALLED, WALLED_BOUNDS, settings, settle
+from support.files.mapfile_edit import file_bytes, read_bytes
+from support.maps.small_world import WALLED, WALLED_BOUNDS, settings, settle
 from triquad_client import Mesh
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.region import Region

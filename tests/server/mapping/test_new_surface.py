@@ -4,7 +4,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from support.small_world import WALLED, WALLED_BOUNDS, settings, settle
+from support.maps.small_world import WALLED, WALLED_BOUNDS, settings, settle
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.region import MapRecord
 from triquad_format.records.status import Status

@@ -2,7 +2,15 @@
 
 import numpy as np
 import pytest
-from support.small_world import World, mapper_of, settings, settle, surface_error, take_in, world
+from support.maps.small_world import (
+    World,
+    mapper_of,
+    settings,
+    settle,
+    surface_error,
+    take_in,
+    world,
+)
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.status import Status
 from triquad_server.engine.gradient_sums import GradientSums

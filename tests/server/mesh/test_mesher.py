@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from support.small_world import settings, settled_epoch, world
+from support.maps.small_world import settings, settled_epoch, world
 from triquad_client import OfflineMap
 from triquad_format.records.status import Status
 from triquad_map.mesh.mesher import TileMesh, mesh_tile

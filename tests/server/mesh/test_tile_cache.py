@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.exact_maps import SETTINGS, exact_map, flat, table
-from support.small_world import settings, settle, world
+from support.maps.exact_maps import SETTINGS, exact_map, flat, table
+from support.maps.small_world import settings, settle, world
 from triquad_format.records.region import seen_voxels
 from triquad_format.wire.limits import LEVELS
 from triquad_format.wire.tile_codec import TileSurface, decode_tile

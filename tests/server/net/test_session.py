@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from support import servers
-from support.role_files import free_tls_endpoint
+from support.attackers.role_files import free_tls_endpoint
 from triquad_server.errors import ListenError
 from triquad_server.net.configuration import NetworkDefaults, NetworkOptions, configuration
 from triquad_server.net.session import open_session

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support import servers
-from support.mapfile_edit import write_record
+from support.files.mapfile_edit import write_record
 from triquad_format.records.region import MapRecord
 from triquad_server.errors import StoreError
 from triquad_server.settings import StoreSettings

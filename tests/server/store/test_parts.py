@@ -8,7 +8,7 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from support.map_records import assert_same, random_record
+from support.maps.map_records import assert_same, random_record
 from triquad_format.errors import DamagedMapFileError
 from triquad_format.mapfile.checkpoint_folder import checkpoint_files
 from triquad_format.mapfile.part_files import PartFiles

@@ -3,8 +3,8 @@ import os
 import random
 from contextlib import closing, suppress
 
-from support.map_records import assert_same
-from support.store_writer import KEPT, record_at, write_for_ever
+from support.files.store_writer import KEPT, record_at, write_for_ever
+from support.maps.map_records import assert_same
 from triquad_format.mapfile.checkpoint_folder import checkpoint_files, open_manifest
 from triquad_format.mapfile.part_files import PartFiles
 from triquad_format.mapfile.reader import read_map

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import triquad_client
 from support import servers
-from support.kitti_folder import write_folder
+from support.recordings.kitti_folder import write_folder
 from triquad_tools.commands import evaluate, replay
 from triquad_tools.simulation.street import street_drive
 

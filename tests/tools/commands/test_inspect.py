@@ -6,9 +6,9 @@ import sys
 
 import numpy as np
 import pytest
-from support.checkpoint_folder import write_checkpoints
-from support.exact_maps import SEEN_M, exact_map, flat
-from support.map_records import random_record
+from support.files.checkpoint_folder import write_checkpoints
+from support.maps.exact_maps import SEEN_M, exact_map, flat
+from support.maps.map_records import random_record
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records import morton
 from triquad_format.records.replay_rays import STEPS, ReplayRays, are_held_out

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 from support import servers
-from support.bags import drive, messages_for, write_bag
-from support.kitti_folder import write_folder
+from support.recordings.bags import drive, messages_for, write_bag
+from support.recordings.kitti_folder import write_folder
 from triquad_client import Status, open_map
 from triquad_format.mapfile.reader import read_map
 from triquad_tools.commands.map_recording import main

@@ -5,9 +5,9 @@ import itertools
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from support.checkpoint_folder import FIRST, HOUR_NS, START_NS, map_at, write_checkpoints
-from support.map_records import SMALL, assert_same, random_record, with_progress
-from support.mapfile_edit import file_bytes, rewritten
+from support.files.checkpoint_folder import FIRST, HOUR_NS, START_NS, map_at, write_checkpoints
+from support.files.mapfile_edit import file_bytes, rewritten
+from support.maps.map_records import SMALL, assert_same, random_record, with_progress
 from triquad_format.mapfile.parts.part import REGION, PartKey
 from triquad_format.mapfile.reader import read_map, read_map_file
 from triquad_format.mapfile.writer import write_map

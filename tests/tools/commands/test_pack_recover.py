@@ -2,9 +2,9 @@
 
 import dataclasses
 
-from support.file_damage import first_chunk, flipped
-from support.map_records import SMALL, assert_same, random_record
-from support.mapfile_edit import file_bytes
+from support.files.file_damage import first_chunk, flipped
+from support.files.mapfile_edit import file_bytes
+from support.maps.map_records import SMALL, assert_same, random_record
 from triquad_format.mapfile.parts.part import VERTICES
 from triquad_format.mapfile.reader import read_map
 from triquad_format.recovery.recovered_map import recover

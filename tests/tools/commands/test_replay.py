@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import triquad_client
 from support import servers
-from support.bags import drive, messages_for, write_bag
-from support.kitti_folder import write_folder
+from support.recordings.bags import drive, messages_for, write_bag
+from support.recordings.kitti_folder import write_folder
 from triquad_tools.commands.replay import due_times, main
 
 ROS2 = messages_for("mcap")

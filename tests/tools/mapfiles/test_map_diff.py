@@ -3,9 +3,9 @@ import math
 
 import numpy as np
 import pytest
-from support.exact_maps import exact_map, flat, table
-from support.map_records import random_record
-from support.small_world import settings, settled_epoch, settled_mapper, world
+from support.maps.exact_maps import exact_map, flat, table
+from support.maps.map_records import random_record
+from support.maps.small_world import settings, settled_epoch, settled_mapper, world
 from triquad_client import OfflineMap
 from triquad_format.mapfile.writer import write_map
 from triquad_map.composition.recorded_view import RecordedView

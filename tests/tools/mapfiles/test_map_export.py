@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial import cKDTree
-from support.map_records import random_record
-from support.mapfile_edit import file_bytes
-from support.small_world import settings, settled_epoch
+from support.files.mapfile_edit import file_bytes
+from support.maps.map_records import random_record
+from support.maps.small_world import settings, settled_epoch
 from triquad_client import Mesh
 from triquad_format.mapfile.reader import read_map
 from triquad_format.records.crop import crop_record

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 from matplotlib.image import imread
-from support.small_world import settings, settle
+from support.maps.small_world import settings, settle
 from triquad_client import OfflineMap
 from triquad_format.mapfile.writer import write_map
 from triquad_server.mapping.mapper import Mapper

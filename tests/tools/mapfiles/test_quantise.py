@@ -4,9 +4,9 @@ import dataclasses
 
 import numpy as np
 import pytest
-from support.map_records import assert_same, random_record
-from support.mapfile_edit import file_bytes, read_bytes
-from support.small_world import settings, settled_mapper, world
+from support.files.mapfile_edit import file_bytes, read_bytes
+from support.maps.map_records import assert_same, random_record
+from support.maps.small_world import settings, settled_mapper, world
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.reader import read_map
 from triquad_format.records.crop import crop_record

@@ -1,9 +1,9 @@
 import json
 
 import pytest
-from support.checkpoint_folder import map_at, write_checkpoints, write_record
-from support.map_records import random_record
-from support.mapfile_edit import file_bytes
+from support.files.checkpoint_folder import map_at, write_checkpoints, write_record
+from support.files.mapfile_edit import file_bytes
+from support.maps.map_records import random_record
 from triquad_format.mapfile.reader import read_map_file
 from triquad_format.mapfile.writer import write_map
 from triquad_tools.commands.inspect import main
@@ -116,4 +116,4 @@ def test_what_is_kept_to_undo_something_is_told(folder, capsys):
     assert "  epoch-000000020.checkpoint: kept, to undo a" in out
     assert "\x1b" not in out
     _, log = log_of(folder, capsys)
-    assert [one["parts"]["undoes"] for one in log["checkpoints"][1:]] == ["", "", ""]
+    assert [one["undoes"] for one in log["checkpoints"][1:]] == ["", "", ""]

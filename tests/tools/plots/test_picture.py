@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 from PIL import Image
-from support.exact_maps import exact_map, table
-from support.map_records import random_record
+from support.maps.exact_maps import exact_map, table
+from support.maps.map_records import random_record
 from triquad_client import Mesh
 from triquad_format.mapfile.writer import write_map
 from triquad_map.height_scale import HEIGHT_STOPS

@@ -6,9 +6,9 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from support import servers
-from support.checkpoint_folder import write_checkpoints
-from support.exact_maps import SEEN_M, exact_map, flat, table
-from support.map_records import random_record
+from support.files.checkpoint_folder import write_checkpoints
+from support.maps.exact_maps import SEEN_M, exact_map, flat, table
+from support.maps.map_records import random_record
 from triquad_format.mapfile.writer import write_map
 from triquad_map.height_scale import HEIGHT_STOPS
 from triquad_tools.commands.inspect import main
@@ -146,7 +146,7 @@ def test_a_folder_of_checkpoints_is_drawn_at_its_newest(tmp_path, capsys):
     assert main([str(tmp_path), "--at", "3"]) == 2
     assert main([str(tmp_path), "--log", "--at", "13"]) == 2
     assert "--at is for one map" in capsys.readouterr().err
-    file = next(tmp_path.glob("*.triquad"))
+    file = next(tmp_path.glob("*.checkpoint"))
     assert main([str(file), "--at", "13"]) == 2
     assert "is one map file: --at asks for a folder" in capsys.readouterr().err
 

@@ -3,8 +3,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.point_files import columns, write_las, write_pcd, write_ply
-from support.trajectories import drive, matrices, write_log, write_tum
+from support.recordings.point_files import columns, write_las, write_pcd, write_ply
+from support.recordings.trajectories import drive, matrices, write_log, write_tum
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.folders import cloud_folder
 from triquad_tools.recordings.folders.cloud_folder import is_cloud_folder

@@ -6,9 +6,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from support import depth_images
-from support.depth_images import CAMERA, HALF_ROOM_M, room_depth, write_depth, write_intrinsics
-from support.trajectories import drive, matrices, write_log, write_tum
+from support.recordings import depth_images
+from support.recordings.depth_images import (
+    CAMERA,
+    HALF_ROOM_M,
+    room_depth,
+    write_depth,
+    write_intrinsics,
+)
+from support.recordings.trajectories import drive, matrices, write_log, write_tum
 from triquad_client.depth_image import Intrinsics
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.folders import depth_folder

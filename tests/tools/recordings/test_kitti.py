@@ -2,7 +2,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.kitti_folder import write_folder
+from support.recordings.kitti_folder import write_folder
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.cloud import world_points
 from triquad_tools.recordings.folders.kitti import is_kitti_folder, read_kitti_folder

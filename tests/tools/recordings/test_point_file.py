@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from support.point_files import (
+from support.recordings.point_files import (
     PCD_FORMATS,
     PLY_FORMATS,
     columns,

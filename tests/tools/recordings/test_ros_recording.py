@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.bags import KINDS, BagKind, Recorded, drive, messages_for, write_bag
-from support.ros_messages import CAMERA_INFO, CLOUD, IMAGE, ODOMETRY, POSE, TF
+from support.recordings.bags import KINDS, BagKind, Recorded, drive, messages_for, write_bag
+from support.ros.ros_messages import CAMERA_INFO, CLOUD, IMAGE, ODOMETRY, POSE, TF
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.arguments import transform
 from triquad_tools.recordings.opening import open_recording

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.trajectories import drive, matrices, write_log, write_tum
+from support.recordings.trajectories import drive, matrices, write_log, write_tum
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.folders.file_names import in_order, stamps_of_names
 from triquad_tools.recordings.folders.trajectory import read_trajectory

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from support import servers
-from support.ros_bridge import bridging
-from support.ros_messages import CAMERA_INFO, CLOUD, IMAGE, ODOMETRY, TF, RosMessages
-from support.ros_robot import robot, shifted
+from support.ros.ros_bridge import bridging
+from support.ros.ros_messages import CAMERA_INFO, CLOUD, IMAGE, ODOMETRY, TF, RosMessages
+from support.ros.ros_robot import robot, shifted
 
 MESSAGES = RosMessages()
 

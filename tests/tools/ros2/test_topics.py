@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support.ros_messages import RosMessages
+from support.ros.ros_messages import RosMessages
 from triquad_tools.commands.ros2 import bridge_options, parsed
 from triquad_tools.ros2.attachment import ATTACHMENT, SequenceGaps
 from triquad_tools.ros2.output.markers import Action, Marker

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support.ros_messages import IMAGE, RosMessages
+from support.ros.ros_messages import IMAGE, RosMessages
 from triquad_tools.sensors.errors import NoScanError
 from triquad_tools.sensors.ros.depth_camera import sweep_of_depth
 from triquad_tools.sensors.ros.type_store import decode_cdr

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.ros_messages import CLOUD, RosMessages
+from support.ros.ros_messages import CLOUD, RosMessages
 from triquad_tools.sensors.errors import NoScanError
 from triquad_tools.sensors.ros.point_cloud import sweep_of_cloud
 from triquad_tools.sensors.ros.type_store import decode_cdr

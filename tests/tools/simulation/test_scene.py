@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from support.surface_samples import surface_samples
+from support.maps.surface_samples import surface_samples
 from triquad_tools.simulation.scene import Scene
 from triquad_tools.simulation.solids import box, cylinder, gable, sphere
 from triquad_tools.simulation.street import street

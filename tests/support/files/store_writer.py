@@ -5,7 +5,7 @@ from contextlib import closing
 from multiprocessing.connection import Connection
 from pathlib import Path
 
-from support.map_records import random_record
+from support.maps.map_records import random_record
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.region import MapRecord, Region
 from triquad_server.mapping.map_snapshot import MapChanges

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from support.exact_maps import Height, exact_map, flat
+from support.maps.exact_maps import Height, exact_map, flat
 from triquad_format.mapfile.writer import write_map
 
 START_NS = 1_769_860_800 * 10**9  # 2026-01-31T12:00:00Z

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from support.hostile_server import Body, packed
+from support.attackers.hostile_server import Body, packed
 from triquad_client import Client
 from triquad_format.wire import keys
 from triquad_format.wire.tile_codec import TileSurface, encode_tile

@@ -3,7 +3,7 @@
 import dataclasses
 from pathlib import Path
 
-from support.map_records import random_record
+from support.maps.map_records import random_record
 from triquad_format.mapfile.checkpoint import Checkpoint, write_checkpoint
 from triquad_format.mapfile.checkpoint_folder import checkpoint_name
 from triquad_format.mapfile.manifest import Entry, Manifest

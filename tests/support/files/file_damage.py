@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from support.mapfile_edit import manifest_of, metadata_of
+from support.files.mapfile_edit import manifest_of, metadata_of
 
 
 @dataclass(frozen=True)

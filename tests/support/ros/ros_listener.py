@@ -10,7 +10,7 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from support.ros_messages import RosMessages
+from support.ros.ros_messages import RosMessages
 from support.servers import WAIT_S, raw_session
 from triquad_client import MeshWatch
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import triquad_client
 from support import servers
-from support.ros_robot import Robot, shifted
+from support.ros.ros_robot import Robot, shifted
 from triquad_client import Client, ServerStatus
 from triquad_tools.commands import ros2
 from triquad_tools.commands.ros2 import bridge_options

@@ -1,13 +1,13 @@
 """The golden map files: one that can be trained on, and one that cannot.
 
-``python -m support.golden`` in the folder of the tests writes them anew: only where the format
-changes, and then in one commit with ``docs/map-file.md``.
+``python -m support.files.golden`` in the folder of the tests writes them again: only where the
+format changes, and then in one commit with ``docs/map-file.md``.
 """
 
 import dataclasses
 from pathlib import Path
 
-from support.map_records import (
+from support.maps.map_records import (
     SMALL,
     random_record,
     with_progress,
@@ -18,7 +18,7 @@ from triquad_format.mapfile.writer import write_map
 from triquad_format.records.map_progress import MapProgress
 from triquad_format.records.region import MapRecord
 
-FOLDER = Path(__file__).parents[1] / "golden"
+FOLDER = Path(__file__).parents[2] / "golden"
 TRAINED, PLAIN = "map_v1.triquad", "map_v1_plain.triquad"
 PRODUCER = "triquad 0.1.0"
 ZSTD = (1, 5, 7)

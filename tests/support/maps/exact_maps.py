@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
-from support.map_records import evidence_of
+from support.maps.map_records import evidence_of
 from triquad_format.records import morton
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
 from triquad_format.records.region import (
