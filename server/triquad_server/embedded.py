@@ -14,9 +14,9 @@ from triquad_format.errors import SettingsError
 from triquad_format.wire.endpoints import full_endpoint
 
 from triquad_server.errors import ServerError
-from triquad_server.phases import Phases
 from triquad_server.process.installed import require_libraries
 from triquad_server.process.stop import Stop, Stops
+from triquad_server.supervision import Phases
 
 if TYPE_CHECKING:
     from triquad_client import Client

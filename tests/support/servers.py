@@ -25,7 +25,8 @@ from triquad_server.mapping.mapper import Mapper
 from triquad_server.net.configuration import NetworkOptions, configuration
 from triquad_server.net.session import open_session
 from triquad_server.network_defaults import network_defaults
-from triquad_server.service import ServedMap, Service
+from triquad_server.served_map import ServedMap
+from triquad_server.service import Service
 from triquad_server.settings import Settings, TrainingSettings
 from triquad_server.store.restore import ValidCheckpoint
 from triquad_server.store.store import Store

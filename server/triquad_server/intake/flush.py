@@ -15,6 +15,7 @@ from triquad_format.wire.metrics_messages import QueueMetrics
 from triquad_server.fair_queue import first_to_go
 from triquad_server.intake.source_ledger import MAX_SEQUENCE, SourceLedger
 from triquad_server.process.threads import submit
+from triquad_server.serving.operations import Lane, Operations
 from triquad_server.serving.request import Request
 
 ARRIVAL_GRACE_S = 2.0
@@ -85,6 +86,11 @@ class FlushHandler:
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="flush")
         self._thread.start()
+
+    def serve_on(self, operations: Operations) -> None:
+        """Take the requests of clients from now on."""
+        operations.serve(keys.FLUSH, self.add, Lane.ADMINISTRATION)
+        operations.queues["flushes"] = lambda: self.queue
 
     @property
     def queue(self) -> QueueMetrics:

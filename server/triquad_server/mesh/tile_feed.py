@@ -6,6 +6,8 @@ import threading
 import time
 
 from triquad_format.errors import RefusedError
+from triquad_format.wire import keys
+from triquad_format.wire.limits import MAX_KNOWN_TILES
 from triquad_format.wire.mesh_messages import TileUpdatesRequest
 from triquad_format.wire.metrics_messages import QueueMetrics
 from triquad_map.compiled.team import lower_priority
@@ -25,10 +27,12 @@ from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_level import CachedTile, TileDelta
 from triquad_server.mesh.tile_senders import TileSenders
 from triquad_server.process.threads import NICENESS
+from triquad_server.serving.operations import Lane, Operations
 
 _log = logging.getLogger(__name__)
 
 _STOPPING = "the server is stopping"
+_MAX_BYTES = 20 * MAX_KNOWN_TILES + 16_384  # of a request: 20 bytes of each known tile
 _REPLY_BYTES = 1_000_000  # bytes of the tiles of one reply; a single tile may be larger
 _KEPT_S = 5.0
 """The seconds for which an epoch is kept for making tiles after the last follower."""
@@ -70,6 +74,11 @@ class TileFeed:
         epochs.listen(self._wake)
         self._thread = threading.Thread(target=self._run, name="meshing")
         self._thread.start()
+
+    def serve_on(self, operations: Operations) -> None:
+        """Take the requests of clients from now on."""
+        operations.serve(keys.TILE_UPDATES, self.add, Lane.ADMINISTRATION, max_bytes=_MAX_BYTES)
+        operations.queues["mesh_followers"] = lambda: self.queue
 
     @property
     def queue(self) -> QueueMetrics:

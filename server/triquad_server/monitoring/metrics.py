@@ -5,7 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import zenoh
-from triquad_format.wire.metrics_messages import QueueMetrics, ServerMetrics
+from triquad_format.wire import keys
+from triquad_format.wire.messages import StatusRequest
+from triquad_format.wire.metrics_messages import MetricsRequest, QueueMetrics, ServerMetrics
 
 from triquad_server.epochs.array_memory import bytes_by_part
 from triquad_server.epochs.epoch import Epoch
@@ -14,7 +16,7 @@ from triquad_server.health import Health
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.process.memory import resident_bytes
 from triquad_server.serving.operation_counts import BOUNDS_S
-from triquad_server.serving.operations import ReadQueue
+from triquad_server.serving.operations import Lane, Operations, ReadQueue, answering
 from triquad_server.store.download import MapDownloads
 
 _MAX_SESSIONS = 1024  # that are listed
@@ -30,6 +32,14 @@ class Metrics:
     tiles: TileCache
     downloads: MapDownloads
     queues: dict[str, ReadQueue]  # of requests, by name
+
+    def serve_on(self, operations: Operations) -> None:
+        """Answer the requests of clients, for these figures and for the status, from now on."""
+        for name, handler in {
+            keys.STATUS: answering(StatusRequest, lambda _: self.health.status()),
+            keys.METRICS: answering(MetricsRequest, lambda _: self.now()),
+        }.items():
+            operations.serve(name, handler, Lane.ADMINISTRATION)
 
     def now(self) -> ServerMetrics:
         """Return the figures as they are now."""
