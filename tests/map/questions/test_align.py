@@ -17,7 +17,7 @@ from triquad_tools.simulation.lidar import Lidar
 from triquad_tools.simulation.scene import Scene
 from triquad_tools.simulation.solids import Solid, box, cylinder, half_space
 
-SEOSAN = Path(__file__).resolve().parents[3] / "shared" / "data" / "seosan01"
+SEOSAN = Path(__file__).resolve().parents[4] / "shared" / "data" / "seosan01"
 LIDAR = Lidar(beams=32, columns=360)
 FAR = np.full(3, 1e4)
 OPTIONS = AlignOptions()

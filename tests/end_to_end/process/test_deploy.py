@@ -21,7 +21,7 @@ from support import servers
 from support.dockerfile import Stage, stages
 from triquad_format.mapfile.reader import read_map
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 DEPLOY = ROOT / "docs" / "deploy"
 INSTALLED, STORE = "/opt/triquad", "/var/lib/triquad"  # in the image
 COMPILING = "compiling, step"

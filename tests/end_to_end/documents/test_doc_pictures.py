@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from PIL import Image
 
-DOCS = Path(__file__).parents[2] / "docs"
+DOCS = Path(__file__).parents[3] / "docs"
 IMAGES = DOCS / "images"
 PAGES = [DOCS.parent / "README.md", *sorted(DOCS.rglob("*.md"))]
 MOST_BYTES, MOST_OF_FILM = 1_500_000, 3_000_000

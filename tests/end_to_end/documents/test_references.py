@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 PACKAGES = ("format", "map", "client", "server", "tools")
 SOURCES = [
     (ROOT / package, path) for package in PACKAGES for path in (ROOT / package).rglob("*.py")

@@ -21,7 +21,7 @@ from triquad_tools.plots.slice_plan import SURFACE
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.street import street
 
-DOCS = Path(__file__).parents[2] / "docs"
+DOCS = Path(__file__).parents[3] / "docs"
 EXAMPLES = DOCS / "examples"
 SETTINGS = "[training]\nbatch = 4096\nsamples_per_ray = 8.0\n"
 SCENE = street(1)  # of triquad-demo, which the guides begin with

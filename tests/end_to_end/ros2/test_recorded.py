@@ -10,7 +10,7 @@ from support.ros.ros_robot import SECOND, T0, robot
 from triquad_client.calls.sources import ScanSource
 from triquad_tools.recordings.folders.kitti import read_kitti_folder
 
-SEOSAN = Path(__file__).resolve().parents[3] / "shared" / "data" / "seosan01"
+SEOSAN = Path(__file__).resolve().parents[4] / "shared" / "data" / "seosan01"
 SCANS = 3
 MOST_POINTS = 10_000  # that a server tells of a scan
 
