@@ -75,3 +75,7 @@ class TooLargeMapFileError(MapFileError):
 
 class SettingsError(FormatError):
     """A setting that is unknown or out of range."""
+
+
+class NoCompiledCodeError(TriquadError):
+    """Compiled code answers for maps, and numba, which compiles it, cannot be imported."""

@@ -2,15 +2,11 @@
 
 from typing import TYPE_CHECKING
 
-from triquad_format.errors import TriquadError
+from triquad_format.errors import NoCompiledCodeError
 from triquad_format.records.region import MapRecord
 
 if TYPE_CHECKING:
     from triquad_map.composition.recorded_view import RecordedView
-
-
-class NoCompiledCodeError(TriquadError):
-    """Compiled code answers for maps, and numba, which compiles it, cannot be imported."""
 
 
 def open_view(record: MapRecord) -> "RecordedView":

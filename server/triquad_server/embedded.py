@@ -15,8 +15,8 @@ from triquad_format.wire.endpoints import full_endpoint
 
 from triquad_server.errors import ServerError
 from triquad_server.process.installed import require_libraries
+from triquad_server.process.phases import Phases
 from triquad_server.process.stop import Stop, Stops
-from triquad_server.supervision import Phases
 
 if TYPE_CHECKING:
     from triquad_client import Client

@@ -18,6 +18,7 @@ from triquad_server.net.session import open_session
 from triquad_server.network_defaults import network_defaults
 from triquad_server.process.memory import give_back_early
 from triquad_server.process.open_files import allow_open_files
+from triquad_server.process.phases import Phases
 from triquad_server.process.service_manager import ServiceManager
 from triquad_server.process.stop import Stop, Stops, wait_for_stop
 from triquad_server.process.threads import Teams
@@ -27,7 +28,7 @@ from triquad_server.service import Service
 from triquad_server.settings import Settings
 from triquad_server.store.restore import ValidCheckpoint
 from triquad_server.store.store import Store
-from triquad_server.supervision import Phases, Supervision
+from triquad_server.supervision import Supervision
 from triquad_server.warm_up import warm_up
 
 if TYPE_CHECKING:

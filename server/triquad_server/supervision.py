@@ -4,6 +4,7 @@ import logging
 import threading
 
 from triquad_server.health import STUCK_S, Health
+from triquad_server.process.phases import Phases
 from triquad_server.process.service_manager import ServiceManager
 from triquad_server.self_question import SelfQuestion
 
@@ -11,19 +12,6 @@ _log = logging.getLogger(__name__)
 
 _STATUS_PERIOD_S = 10.0  # where the manager does not set how often to report
 _SOONER = 10  # factor by which a server that was not well is checked again sooner
-
-
-class Phases:
-    """Receives the phases of a server's run; this one does nothing about them."""
-
-    def starting(self, stage: str) -> None:
-        """Report the next stage of the start; called before each."""
-
-    def serving(self, health: Health, question: SelfQuestion) -> None:
-        """Report that the server serves, until :meth:`stopping`; both arguments give its state."""
-
-    def stopping(self) -> None:
-        """Report that the server was asked to stop, and finishes its work."""
 
 
 class Supervision(Phases):

@@ -118,7 +118,7 @@ def test_an_abstract_socket_will_do(tmp_path, monkeypatch) -> None:
     with service_manager(f"@triquad-{tmp_path.name}-{id(tmp_path)}") as manager:
         monkeypatch.setenv("NOTIFY_SOCKET", manager.address)
         ours = ServiceManager()
-        ours.tell("READY=1", status="serving")
+        ours.notify("READY=1", status="serving")
         assert manager.wait_for("READY=1") == ["READY=1", "STATUS=serving"]
     assert ours.watchdog_s is None  # the manager did not ask
 

@@ -4,8 +4,7 @@ import os
 import sys
 from collections.abc import Callable, Mapping
 
-from triquad_format.errors import FormatError, TriquadError
-from triquad_map.record_view import NoCompiledCodeError
+from triquad_format.errors import FormatError, NoCompiledCodeError, TriquadError
 
 from triquad_tools.console.interrupts import INTERRUPTED, interruptible
 from triquad_tools.console.lines import print_remark

@@ -3,11 +3,12 @@
 from contextlib import closing
 
 import numpy as np
+from triquad_format.errors import NoCompiledCodeError
 from triquad_format.records.arrays import Floats
 from triquad_format.records.region import MapRecord, Region
 from triquad_format.records.replay_rays import are_held_out
 from triquad_map.field_fit import MapFit, PlaceFits, Places, in_cube, map_fit
-from triquad_map.record_view import NoCompiledCodeError, open_view
+from triquad_map.record_view import open_view
 
 
 def recorded_fit(record: MapRecord) -> MapFit | None:
