@@ -1,1 +1,1 @@
-"""A map answered by compiled code."""
+"""What is compiled: the evidence, field and surfels of a region, learnt and queried."""

@@ -145,8 +145,12 @@ class FlushHandler:
         stopping = False
         while not stopping:
             with self._ledger.changed:
-                while not self._stopping and not (decided := self._decided()):
-                    self._ledger.changed.wait(self._time_left_s())
+                while not self._stopping:
+                    now = time.monotonic()
+                    decided = self._decided(now)
+                    if decided:
+                        break
+                    self._ledger.changed.wait(self._time_left_s(now))
                 stopping = self._stopping
                 if stopping:
                     why = RefusedError("timeout", _STOPPING)
@@ -162,9 +166,8 @@ class FlushHandler:
             with self._ledger.changed:
                 self._sending -= 1
 
-    def _decided(self) -> list[tuple[_Pending, Outcome]]:
+    def _decided(self, now: float) -> list[tuple[_Pending, Outcome]]:
         """Return the requests that can be answered now, and how; they are no longer pending."""
-        now = time.monotonic()
         busy = RefusedError("busy", f"{self._limit} flush requests are pending already; try later")
         refused: list[tuple[_Pending, Outcome]] = [(entry, busy) for entry in self._excess]
         self._excess = []
@@ -185,8 +188,7 @@ class FlushHandler:
             f"scan {asks.sequence} of {asks.source} is not in the map after {asks.timeout_s} s",
         )
 
-    def _time_left_s(self) -> float | None:
+    def _time_left_s(self, now: float) -> float | None:
         """Return how long until time alone decides on a request; ``None``: it never does."""
-        now = time.monotonic()
         times = [at for entry in self._pending for at in (entry.overdue_at, entry.deadline)]
         return min((at - now for at in times if at > now), default=None)

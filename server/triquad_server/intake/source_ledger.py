@@ -208,7 +208,8 @@ class SourceLedger:
     def _session(self, scan: Scan) -> _Session:
         """Return the session of a scan, now the most recent one."""
         key = (scan.source, scan.session)
-        session = self._sessions.setdefault(key, _Session())
+        counts = ScanCounts(heard_s=time.monotonic())
+        session = self._sessions.setdefault(key, _Session(counts))
         self._sessions.move_to_end(key)
         if len(self._sessions) > MAX_SESSIONS:
             _, forgotten = self._sessions.popitem(last=False)

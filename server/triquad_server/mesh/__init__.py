@@ -1,1 +1,1 @@
-"""Mesh tiles: meshing, cache and change feed."""
+"""Mesh tiles: which there are, those that are kept, and the feed of what changed."""

@@ -1,1 +1,1 @@
-"""The Zenoh session, and requests on it."""
+"""The Zenoh session, and its configuration."""

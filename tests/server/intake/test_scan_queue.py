@@ -114,6 +114,17 @@ def test_sessions_remembered_are_bounded_and_losses_are_not_forgotten(monkeypatc
     assert ledger.outcome("lidar", 0, 1) is None
 
 
+def test_a_scan_of_a_session_that_was_forgotten_while_it_waited_has_an_age(monkeypatch):
+    monkeypatch.setattr(source_ledger, "MAX_SESSIONS", 2)
+    ledger = SourceLedger()
+    waiting = servers.scan(0, session=0)
+    for session in range(4):
+        ledger.arrive(servers.scan(0, session=session))
+    ledger.take(waiting)
+    (metrics,) = ledger.metrics().values()
+    assert 0 <= metrics.age_s < 60
+
+
 def test_losses_of_a_hostile_publisher_still_fit_a_message():
     ledger = SourceLedger()
     for session in range(40_000):
