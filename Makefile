@@ -27,17 +27,17 @@ INSTALLED = $(VENV)/.installed
 demo: $(INSTALLED_DEMO)
 	$(BIN)/triquad-demo --out demo-out
 
-# Kernels are compiled once, not by every process that tests. Where several do, torch's threads
-# would wait for each other: seven times as long.
+# Kernels are compiled once, not by every process that tests. Three of these keep two cores busy, as
+# tests wait for servers; with threads of torch's own they would wait for each other.
 test: $(INSTALLED)
 	$(MAKE) -j2 check kernels
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --maxprocesses 4 -m "not long" --durations=10
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 3 -m "not long" --durations=10
 
 kernels: $(INSTALLED)
 	$(BIN)/python -m triquad_server.warm_up
 
 test-long: kernels
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --maxprocesses 4 -m long --durations=10
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 3 -m long --durations=10
 
 docs: $(INSTALLED)
 	$(BIN)/python docs/settings_tables.py
