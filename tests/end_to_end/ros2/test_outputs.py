@@ -1,18 +1,31 @@
 """What RViz, Nav2 and others get of a map: markers and occupancy grids."""
 
+import queue
 import struct
-from collections.abc import Iterator
-from contextlib import contextmanager
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 
 import numpy as np
 import pytest
+import triquad_client
+import zenoh
 from support import servers
 from support.ros.ros_bridge import bridging
 from support.ros.ros_listener import GRID, MARKER, Listener, ShownMarkers, listening
 from support.ros.ros_robot import robot, shifted
 from triquad_client import Client, Status
 from triquad_server.settings import MeshSettings
-from triquad_tools.ros2.topics import End, read_token
+from triquad_tools.commands import ros2
+from triquad_tools.commands.ros2 import bridge_options
+from triquad_tools.ros2.bridge import Bridge
+from triquad_tools.ros2.intake.scan_publisher import Place
+from triquad_tools.ros2.node import Node
+from triquad_tools.ros2.options import MeshOptions
+from triquad_tools.ros2.output.map_thread import PERIOD_S
+from triquad_tools.ros2.output.mesh_publisher import MeshPublisher
+from triquad_tools.ros2.output.topic_publisher import TopicPublisher
+from triquad_tools.ros2.topics import Delivery, End, Topic, read_token
 
 HEIGHT_M = 0.7
 SOME_POINTS = 300  # of a tile that holds more than a corner of the surface
@@ -35,6 +48,18 @@ def shown(server: str) -> Iterator[Client]:
         servers.learn(bridged.client)
         bridged.client.settle(servers.WAIT_S)
         yield bridged.client
+
+
+@contextmanager
+def subscribed(
+    session: zenoh.Session, key: str, take: Callable[[zenoh.Sample], object]
+) -> Iterator[None]:
+    """Have what is put in the same session taken before the put returns."""
+    subscriber = session.declare_subscriber(key, zenoh.handlers.Callback(take, indirect=False))
+    try:
+        yield
+    finally:
+        subscriber.undeclare()
 
 
 def shown_once_complete(listener: Listener, client: Client) -> ShownMarkers:
@@ -128,6 +153,41 @@ def test_grids_go_with_the_robot(server: str) -> None:
         r2.cloud(0, servers.sphere())
         while (origin := nav2.message().info.origin.position.x) != pytest.approx(24.0):
             assert origin == pytest.approx(-6.0)
+
+
+def test_a_mesh_that_nobody_takes_does_not_hold_up_grids(server: str) -> None:
+    taken = threading.Event()
+    grids: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
+    options = bridge_options(ros2.parsed(["--map-frame", "world"]))
+    with (
+        triquad_client.connect(server) as client,
+        servers.raw_session(connect=server) as session,
+        # In the session of the bridge, so that what it puts waits for the subscriber.
+        subscribed(session, "triquad/mesh", lambda _: taken.wait()),
+        subscribed(session, "triquad/grid", grids.put),
+        Bridge(session, client, options),
+    ):
+        try:
+            assert grids.get(timeout=servers.WAIT_S)
+        finally:
+            taken.set()
+
+
+def test_markers_keep_to_their_rate_also_where_they_are_larger_than_a_round(server: str) -> None:
+    sizes: list[int] = []
+    rounds = 0
+    with (
+        shown(server) as client,
+        servers.raw_session(connect=server) as session,
+        subscribed(session, "mesh", lambda sample: sizes.append(len(sample.payload))),
+        closing(Node(session, domain=0)) as node,
+        closing(TopicPublisher(session, node, Topic("/mesh", MARKER), 0, Delivery())) as publisher,
+        closing(MeshPublisher(publisher, client, MeshOptions(0, bytes_per_s=1000))) as mesh,
+    ):
+        while len(sizes) < 5:
+            mesh.publish(Place("world", np.zeros(3), stamp_ns=0))
+            rounds += len(sizes) > 1  # the first marker deletes all
+    assert sum(sizes[1:-1]) <= rounds * 1000 * PERIOD_S
 
 
 def test_nodes_and_bridges_find_the_topics_and_their_types(server: str) -> None:

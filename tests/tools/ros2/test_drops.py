@@ -3,7 +3,7 @@
 import pytest
 import zenoh
 from triquad_tools.ros2.intake.drop_log import LOG_PERIOD_S, DropLog
-from triquad_tools.ros2.intake.message_queue import Arrival, MessageQueue
+from triquad_tools.ros2.intake.message_queue import Arrival, MessageQueue, QueueLimits
 from triquad_tools.ros2.topic_choice import Role
 
 
@@ -38,17 +38,33 @@ def arrival(name: str, role: Role = Role.CLOUD, size: int = 10) -> Arrival:
     return Arrival(role, name, zenoh.ZBytes(bytes(size)), 0)
 
 
-def test_the_newest_messages_wait_within_limits_and_transforms_stay() -> None:
+def taken(messages: MessageQueue) -> list[str]:
+    return [each.topic_name for each in iter(lambda: messages.take(0.0), None)]
+
+
+def test_the_newest_messages_wait_within_limits() -> None:
     dropped: list[str] = []
-    messages = MessageQueue(3, 10_100, lambda message: dropped.append(message.topic_name))
-    messages.put(arrival("tf", Role.TF))
+    limits = QueueLimits(3, 10_000), QueueLimits(2, 5_000)
+    messages = MessageQueue(*limits, lambda message: dropped.append(message.topic_name))
     for name in "abcd":
         messages.put(arrival(name))
     assert dropped == ["a"], "more scans than may wait"
     messages.put(arrival("large", size=7_000))
     assert dropped == ["a", "b", "c"], "more bytes than may wait"
-    taken = [messages.take(0.0) for _ in range(4)]
-    assert [each and each.topic_name for each in taken] == ["tf", "d", "large", None]
+    assert taken(messages) == ["d", "large"]
     messages.put(arrival("late"))
     messages.close()
     assert messages.take(10.0) is None
+
+
+def test_transforms_go_before_scans_and_push_out_none() -> None:
+    dropped: list[str] = []
+    limits = QueueLimits(3, 10_000), QueueLimits(2, 5_000)
+    messages = MessageQueue(*limits, lambda message: dropped.append(message.topic_name))
+    messages.put(arrival("cloud", size=8_000))
+    for name in ("tf1", "tf2", "tf3"):
+        messages.put(arrival(name, Role.TF))
+    assert dropped == ["tf1"], "more messages than may wait"
+    messages.put(arrival("tf4", Role.TF, size=3_900))
+    assert dropped == ["tf1", "tf2", "tf3"], "more bytes than may wait"
+    assert taken(messages) == ["tf4", "cloud"]

@@ -43,7 +43,8 @@ class Bridge:
             mesh = MeshPublisher(markers, client, options.mesh)
             parts.enter_context(closing(mesh))
             grid = GridPublisher(slices, client, options.grid)
-            parts.enter_context(closing(MapThread((mesh, grid), lambda: intake.place)))
+            for output in (mesh, grid):
+                parts.enter_context(closing(MapThread(output, lambda: intake.place)))
             self._parts = parts.pop_all()
 
     def __enter__(self) -> "Bridge":

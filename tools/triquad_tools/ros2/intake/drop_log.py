@@ -20,7 +20,7 @@ REMEDIES = {
     "pose_gap": "poses came too seldom or not at all for a while",
     "not_received": "the network or the publisher drops them: publish fewer or smaller clouds, or "
     "with RELIABLE delivery",
-    "pushed_out": "clouds come faster than they are read: choose fewer topics with --clouds",
+    "pushed_out": "messages come faster than they are read: choose fewer topics with --clouds",
     "too_large": "publish smaller clouds, or with fewer fields",
     "decode": "is it another type, or was it cut off? --clouds leaves the topic out",
     "time_backwards": "messages of a topic have to come in the order of their stamps",

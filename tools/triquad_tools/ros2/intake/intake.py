@@ -14,7 +14,7 @@ from triquad_format.errors import TriquadError
 from triquad_tools.ros2.attachment import SequenceGaps
 from triquad_tools.ros2.intake.drop_log import DropLog
 from triquad_tools.ros2.intake.first_scan import FirstScan
-from triquad_tools.ros2.intake.message_queue import Arrival, MessageQueue
+from triquad_tools.ros2.intake.message_queue import Arrival, MessageQueue, QueueLimits
 from triquad_tools.ros2.intake.message_reader import MAX_POINTS, MessageReader
 from triquad_tools.ros2.intake.motion import Motion
 from triquad_tools.ros2.intake.placement import Placed, Placement
@@ -29,7 +29,8 @@ _log = logging.getLogger("triquad_ros2")
 
 _OTHER_BYTES = 1_000_000  # of a message of transforms, and of a cloud without its points
 _SCAN_BYTES = 64 * MAX_POINTS + _OTHER_BYTES  # drivers write up to 64 bytes for each point
-_SCANS_UNREAD, _UNREAD_BYTES = 16, 256_000_000
+_SCANS_UNREAD = QueueLimits(16, 256_000_000)
+_OTHERS_UNREAD = QueueLimits(4096, 16_000_000)  # 4 s of transforms at 1 kHz
 _WAITING_BYTES = 512_000_000  # of sweeps that wait for their transforms
 _TICK_S = 0.2
 
@@ -50,7 +51,7 @@ class Intake:
         self._placement = Placement(
             self._motion, map_frame=frame, max_bytes=_WAITING_BYTES, timeout_s=options.scans.wait_s
         )
-        self._queue = MessageQueue(_SCANS_UNREAD, _UNREAD_BYTES, self._pushed_out)
+        self._queue = MessageQueue(_SCANS_UNREAD, _OTHERS_UNREAD, self._pushed_out)
         self._gaps = SequenceGaps()
         self._gaps_lock = threading.Lock()
         self._first_scan = FirstScan(options.topics, time.monotonic())

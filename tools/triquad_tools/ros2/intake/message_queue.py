@@ -26,31 +26,58 @@ class Arrival:
         return len(self.payload) + 1000
 
 
-class MessageQueue:
-    """Messages in the order in which they came; where they are too many, the oldest scan goes."""
+@dataclass(frozen=True)
+class QueueLimits:
+    """The most that may wait."""
 
-    def __init__(self, scans: int, max_bytes: int, dropped: Callable[[Arrival], None]) -> None:
+    messages: int
+    nbytes: int
+
+
+class _Line:
+    """Messages in the order in which they came; where they are too many, the oldest go."""
+
+    def __init__(self, limits: QueueLimits) -> None:
+        self._limits = limits
+        self._messages: deque[Arrival] = deque()
+        self._bytes = 0  # of these
+
+    def __len__(self) -> int:
+        return len(self._messages)
+
+    def put(self, arrival: Arrival) -> list[Arrival]:
+        """Add a message; return those that go for it."""
+        self._messages.append(arrival)
+        self._bytes += arrival.nbytes
+        gone = []
+        while len(self) > self._limits.messages or self._bytes > self._limits.nbytes:
+            gone.append(self.take())
+        return gone
+
+    def take(self) -> Arrival:
+        """Remove the oldest message and return it."""
+        arrival = self._messages.popleft()
+        self._bytes -= arrival.nbytes
+        return arrival
+
+
+class MessageQueue:
+    """Scans, and other messages, which go first: transforms must not wait behind large clouds."""
+
+    def __init__(
+        self, scans: QueueLimits, others: QueueLimits, dropped: Callable[[Arrival], None]
+    ) -> None:
         """``dropped`` is called with each message that nobody will read."""
-        self._max_scans = scans
-        self._max_bytes = max_bytes
+        self._scans = _Line(scans)
+        self._others = _Line(others)
         self._dropped = dropped
         self._changed = threading.Condition()
-        self._messages: deque[Arrival] = deque()
-        self._scans = self._bytes = 0  # of these
         self._closed = False
 
     def put(self, arrival: Arrival) -> None:
         """Add a message; never waits."""
-        dropped = []
         with self._changed:
-            self._messages.append(arrival)
-            self._count(arrival, 1)
-            while self._scans > self._max_scans or self._bytes > self._max_bytes:
-                scans = (each for each in self._messages if each.role.brings_scans)
-                oldest = next(scans, self._messages[0])
-                self._messages.remove(oldest)
-                self._count(oldest, -1)
-                dropped.append(oldest)
+            dropped = (self._scans if arrival.role.brings_scans else self._others).put(arrival)
             self._changed.notify()
         for each in dropped:
             self._dropped(each)
@@ -58,19 +85,12 @@ class MessageQueue:
     def take(self, timeout_s: float) -> Arrival | None:
         """Return the message to read next; None if none comes in time, or the queue is closed."""
         with self._changed:
-            self._changed.wait_for(lambda: self._closed or self._messages, timeout_s)
-            if self._closed or not self._messages:
-                return None
-            arrival = self._messages.popleft()
-            self._count(arrival, -1)
-            return arrival
+            self._changed.wait_for(lambda: self._closed or self._others or self._scans, timeout_s)
+            line = self._others or self._scans
+            return None if self._closed or not line else line.take()
 
     def close(self) -> None:
         """Give out no more messages."""
         with self._changed:
             self._closed = True
             self._changed.notify()
-
-    def _count(self, arrival: Arrival, sign: int) -> None:
-        self._scans += sign * arrival.role.brings_scans
-        self._bytes += sign * arrival.nbytes

@@ -1,8 +1,8 @@
-"""The thread on which the map is published."""
+"""The thread on which an output of the map is published."""
 
 import logging
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Protocol
 
 from triquad_format.errors import TriquadError
@@ -27,11 +27,11 @@ class MapOutput(Protocol):
 
 
 class MapThread:
-    """Has outputs published in turn, until it is closed."""
+    """Has an output published again and again, until it is closed; it holds up no other."""
 
-    def __init__(self, outputs: Sequence[MapOutput], place: Callable[[], Place | None]) -> None:
+    def __init__(self, output: MapOutput, place: Callable[[], Place | None]) -> None:
         """``place`` returns where the robot is, None before that is known."""
-        self._outputs = outputs
+        self._output = output
         self._place = place
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="ros2-map")
@@ -48,12 +48,11 @@ class MapThread:
             place, pause_s = self._place(), PERIOD_S
             if place is None:
                 continue
-            for output in self._outputs:
-                try:
-                    output.publish(place)
-                except TriquadError as error:
-                    _log.warning("the map cannot be published now: %s", error)
-                    pause_s = _RETRY_S
-                except Exception:
-                    _log.exception("the map could not be published")
-                    pause_s = _RETRY_S
+            try:
+                self._output.publish(place)
+            except TriquadError as error:
+                _log.warning("the map cannot be published now: %s", error)
+                pause_s = _RETRY_S
+            except Exception:
+                _log.exception("the map could not be published")
+                pause_s = _RETRY_S

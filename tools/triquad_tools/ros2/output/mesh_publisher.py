@@ -22,9 +22,11 @@ class MeshPublisher:
         self._numbers: dict[TileIndex, int] = {}  # of the markers of tiles
         self._watch: MeshWatch | None = None  # while there are subscribers
         self._pending: dict[TileIndex, None] = {}  # whose markers are to be sent, in this order
+        self._left_bytes = 0.0  # that may be sent; below 0 after a marker that was larger
 
     def publish(self, place: Place) -> None:
         """Send markers of what changed, as many as may be sent at a time."""
+        self._left_bytes = min(self._left_bytes, 0) + PERIOD_S * self._options.bytes_per_s
         if not self._publisher.is_followed:
             self.close()
             return
@@ -34,8 +36,7 @@ class MeshPublisher:
             self._publisher.put(Marker(place.map_frame, 0, Action.DELETE_ALL).payload())
         if self._publisher.has_newcomers():
             self._pending.update(dict.fromkeys(self._watch.tiles))
-        left_bytes = PERIOD_S * self._options.bytes_per_s
-        while left_bytes > 0:
+        while self._left_bytes > 0:
             if not self._pending:
                 update = self._watch.next(timeout_s=0.0)
                 if update is None:
@@ -45,7 +46,7 @@ class MeshPublisher:
             del self._pending[index]
             payload = self._marker(index, self._watch.tiles.get(index), place.map_frame).payload()
             self._publisher.put(payload)
-            left_bytes -= len(payload)
+            self._left_bytes -= len(payload)
 
     def close(self) -> None:
         """Follow the mesh no more."""
