@@ -11,7 +11,7 @@ from pathlib import Path
 
 import zstandard
 
-from triquad_format.errors import DamagedMapFileError
+from triquad_format.errors import DamagedMapFileError, MapFileError
 from triquad_format.mapfile.container import RandomAccess, decompress
 from triquad_format.mapfile.durable_file import replacing
 from triquad_format.mapfile.index import FileBytes, MapIndex, named
@@ -126,8 +126,19 @@ class CheckpointIndex:
         """Do nothing: readers of the map use all of it."""
 
     def payload(self, entry: Entry) -> bytes:
-        """Return the payload of a part; errors are those of :meth:`PartFiles.payload`."""
-        return self._parts.payload(entry)
+        """Return the payload of a part; errors are those of :meth:`PartFiles.payload`.
+
+        Raises:
+            MapFileError: the checkpoint was deleted since it was opened, and the part with it.
+        """
+        try:
+            return self._parts.payload(entry)
+        except DamagedMapFileError as error:
+            if Path(self._source.name).exists():
+                raise
+            raise MapFileError(
+                "the server deleted this checkpoint while it was read: open a newer one"
+            ) from error
 
     def missing(self) -> list[Entry]:
         """Return the parts that are not there, or not in their size."""

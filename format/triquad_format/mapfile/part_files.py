@@ -90,7 +90,8 @@ class NewParts:
     def add(self, part: Part, known: Entry | None = None) -> Entry:
         """Return the entry of a part, whose file is written unless an intact one is there.
 
-        ``known`` is what the key had in an earlier checkpoint, which is returned where it is equal.
+        ``known`` is what the key had in an earlier checkpoint, which is returned where it is equal
+        and its file is there in its size.
 
         Raises:
             FormatError: it is too large to be read.
@@ -98,7 +99,7 @@ class NewParts:
         """
         check_part(part)
         digest = hashlib.sha256(part.payload)
-        if known is not None and known.sha256 == digest.digest():
+        if known is not None and known.sha256 == digest.digest() and self._files.has(known):
             return known
         path = self._files.folder / digest.hexdigest()
         # One that cannot be read is as good as one that is damaged.

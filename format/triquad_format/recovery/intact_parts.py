@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from triquad_format.errors import (
+    DamagedMapFileError,
     FormatError,
     MapFileError,
     TooLargeMapFileError,
@@ -79,7 +80,7 @@ def intact_parts(path: Path, max_bytes: int) -> IntactParts:
     Raises:
         UnsupportedMapFileError: the file needs a newer reader.
         TooLargeMapFileError: it exceeds ``max_bytes``.
-        MapFileError: nothing says what map this is.
+        MapFileError: nothing says what map this is, or its server deleted it meanwhile.
         OSError: it cannot be read.
     """
     with closing(FileBytes(path)) as file:
@@ -116,7 +117,7 @@ def _checkpoint_parts(index: CheckpointIndex, max_bytes: int) -> IntactParts:
         raise TooLargeMapFileError(f"its parts exceed the limit of {max_bytes} bytes together")
 
     def intact(entry: Entry) -> bytes | None:
-        with suppress(FormatError, OSError):
+        with suppress(DamagedMapFileError, OSError):
             return index.payload(entry)
         return None
 

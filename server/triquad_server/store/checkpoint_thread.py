@@ -176,13 +176,15 @@ class CheckpointThread:
         _log.info("checkpoint %s: epoch %d, %d bytes", info.path, info.epoch, info.bytes)
         return info
 
-    def mark_newest(self, undoes: str) -> int:
+    def mark_newest(self, undoes: str, instead_of: int | None = None) -> int:
         """Have the newest checkpoint stay, and return its epoch; only for jobs on this thread.
+
+        Arguments are those of :meth:`Store.mark_newest`.
 
         Raises:
             StoreError: as of :meth:`Store.mark_newest`.
         """
-        self.last = self._opened.mark_newest(undoes)
+        self.last = self._opened.mark_newest(undoes, instead_of)
         return self.last.epoch
 
     @property

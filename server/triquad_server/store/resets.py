@@ -79,9 +79,10 @@ class Resets:
     def _keep_and_reset(self, request: ResetRequest) -> ResetReply:
         """Write the map, forget what lies in the box, and write what was learnt meanwhile, too."""
         checkpoints = self._checkpoints
-        kept = 0
+        kept: int | None = None
         if self._mapper.call(lambda mapper: len(mapper.regions)) > 0:
-            kept = checkpoints.write().epoch
+            checkpoints.write()
+            kept = checkpoints.mark_newest(_UNDOES)
         base = checkpoints.base_epoch
 
         def forget(mapper: Mapper) -> tuple[MapSnapshot, int]:
@@ -91,17 +92,17 @@ class Resets:
         before, epoch = self._mapper.call(forget)
         if not before.regions:
             return ResetReply(epoch, undo="the map was empty before")
+        lost = ""
         try:
-            checkpoints.write_changes(before)
-            kept = checkpoints.mark_newest(_UNDOES)
+            if checkpoints.write_changes(before).epoch != kept:
+                kept = checkpoints.mark_newest(_UNDOES, instead_of=kept)
         except StoreError as error:
-            _log.error(
-                "epoch %d, the map before a reset, stays no longer than any other, and what was "
-                "learnt while it was written is lost: %s",
-                *(kept, error),
-            )
+            _log.error("what was learnt while the map before a reset was kept is lost: %s", error)
+            if kept is None:
+                return ResetReply(epoch, undo="what was learnt just before could not be kept")
+            lost = " (without what was learnt while it was written, which could not be kept)"
         undo = (
-            f"epoch {kept}, the map before, is kept; to go back to it, stop the server and start "
-            f"it with --restore {kept}"
+            f"epoch {kept}, the map before{lost}, is kept; to go back to it, stop the server and "
+            f"start it with --restore {kept}"
         )
         return ResetReply(epoch, kept, undo)

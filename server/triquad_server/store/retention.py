@@ -15,6 +15,7 @@ class StoredCheckpoint:
 
     files: Mapping[str, int]  # bytes of each of its parts and of its own file, by name
     undoes: str = ""  # what going back to it undoes, such as a reset; empty: nothing
+    restored_as: str = ""  # file of the checkpoint that a restored map went on from; empty: none
 
 
 def staying(
@@ -23,12 +24,14 @@ def staying(
     """Return those of all checkpoints, the newest first, that stay.
 
     These are the two newest and, as long as ``keep_bytes`` suffice, first the newest
-    ``keep_resets`` that undo something, then the newest ``keep`` of all.
+    ``keep_resets`` before them that undo something, then the one that the map was last restored as,
+    then the newest ``keep`` of all.
     """
-    undoing = [one for one in checkpoints if one.undoes][: settings.keep_resets]
+    undoing = [one for one in checkpoints[_MIN_KEPT:] if one.undoes][: settings.keep_resets]
+    restored = [one for one in checkpoints if checkpoints[0].restored_as in one.files]
     files: dict[str, int] = {}
     stay: list[StoredCheckpoint] = []
-    candidates = [*checkpoints[:_MIN_KEPT], *undoing, *checkpoints[: settings.keep]]
+    candidates = [*checkpoints[:_MIN_KEPT], *undoing, *restored, *checkpoints[: settings.keep]]
     for number, one in enumerate(candidates):
         files |= one.files
         if number >= _MIN_KEPT and 0 < settings.keep_bytes < sum(files.values()):

@@ -140,15 +140,24 @@ class Store:
         self._newest = None
         return True
 
-    def mark_newest(self, undoes: str) -> CheckpointInfo:
+    def mark_newest(self, undoes: str, instead_of: int | None = None) -> CheckpointInfo:
         """Have the newest checkpoint stay as one that undoes something; its file is written again.
+
+        One that was marked before, of the epoch ``instead_of``, stays no longer than others.
 
         Raises:
             StoreError: it cannot be written.
         """
         assert self._newest is not None, "mark_newest() comes after write()"
         with self._writing(f"{self._newest.info.path} cannot be written"):
-            return self._write(self._newest.manifest, undoes)
+            info = self._write(self._newest.manifest, undoes)
+        if instead_of is not None:
+            path = self.folder / checkpoint_name(instead_of)
+            # Else it stays longer than it need, which harms nobody.
+            with suppress(FormatError, OSError):
+                if (marked := read_checkpoint(path)) is not None:
+                    write_checkpoint(path, dataclasses.replace(marked, undoes=""))
+        return info
 
     def restore(self, epoch: int) -> None:
         """Restore the map to an older checkpoint, which is written again as the newest.

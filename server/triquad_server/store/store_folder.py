@@ -6,7 +6,7 @@ from pathlib import Path
 
 from triquad_format.errors import FormatError, TooLargeMapFileError, UnsupportedMapFileError
 from triquad_format.mapfile.checkpoint import read_checkpoint
-from triquad_format.mapfile.checkpoint_folder import checkpoint_files, set_aside
+from triquad_format.mapfile.checkpoint_folder import checkpoint_files, checkpoint_name, set_aside
 from triquad_format.mapfile.durable_file import sync_folder
 from triquad_format.mapfile.part_files import PartFiles
 
@@ -27,7 +27,7 @@ class StoreFolder:
         self.path = path
         self.parts = PartFiles(path)
         self._retention = retention
-        self._read: dict[Path, tuple[int, StoredCheckpoint]] = {}  # with their times of change
+        self._read: dict[Path, tuple[tuple[int, ...], StoredCheckpoint]] = {}  # as of a status
 
     def retain(self, newest: int) -> None:
         """Delete the checkpoints that need not stay, and what they alone need.
@@ -71,8 +71,10 @@ class StoreFolder:
             OSError: it cannot be read.
         """
         status = path.stat()
-        if path not in self._read or self._read[path][0] != status.st_mtime_ns:
-            self._read[path] = (status.st_mtime_ns, _read(path, status.st_size))
+        # Two files that follow each other at once have the same time of change.
+        version = (status.st_mtime_ns, status.st_ino, status.st_size)
+        if path not in self._read or self._read[path][0] != version:
+            self._read[path] = (version, _read(path, status.st_size))
         return self._read[path][1]
 
 
@@ -87,7 +89,9 @@ def _read(path: Path, size: int) -> StoredCheckpoint:
     if checkpoint is None:
         return StoredCheckpoint({path.name: size})
     parts = {entry.name: entry.stored for entry in checkpoint.manifest.entries}
-    return StoredCheckpoint({path.name: size, **parts}, checkpoint.undoes)
+    restored = checkpoint.restored
+    restored_as = "" if restored is None else checkpoint_name(restored.as_epoch)
+    return StoredCheckpoint({path.name: size, **parts}, checkpoint.undoes, restored_as)
 
 
 def _delete(paths: Iterable[Path]) -> None:

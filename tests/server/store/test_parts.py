@@ -9,13 +9,15 @@ from pathlib import Path
 
 import pytest
 from support.maps.map_records import assert_same, random_record
-from triquad_format.errors import DamagedMapFileError
+from triquad_format.errors import DamagedMapFileError, MapFileError
+from triquad_format.mapfile.checkpoint import read_checkpoint, write_checkpoint
 from triquad_format.mapfile.checkpoint_folder import checkpoint_files
 from triquad_format.mapfile.part_files import PartFiles
 from triquad_format.mapfile.reader import read_map, read_map_file
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.recovery.recovered_map import recover
+from triquad_map.stored_map import StoredMap
 from triquad_server.errors import StoreError
 from triquad_server.mapping.map_snapshot import MapChanges
 from triquad_server.mapping.mapper import Mapper
@@ -158,18 +160,42 @@ def test_a_backup_is_restored_and_gone_on_from(store):
 # Damage, and what others do to the folder
 
 
+@pytest.mark.parametrize("same", [False, True], ids=["another map", "the same map"])
 @pytest.mark.parametrize("harm", ["delete", "cut", "delete the checkpoint", "cut the checkpoint"])
-def test_where_something_is_gone_all_is_written_again(store, harm):
-    drive(store, 1)
+def test_where_something_is_gone_all_is_written_again(store, harm, same):
+    records = drive(store, 1)
     path = paths(store)[2] if "checkpoint" in harm else part_of(paths(store)[2], ROW[0])
     if "delete" in harm:
         path.unlink()
     else:
         path.write_bytes(path.read_bytes()[:-1])
     assert store.base_epoch is None
-    third = grown(3, 3)
+    third = dataclasses.replace(records[2], epoch=3) if same else grown(3, 3)
     store.write(changes(third))
     assert_same(read_map(paths(store)[3]), third)
+    assert store.base_epoch == 3, "later ones are of what changed"
+    fourth = grown(4, 4, third, ROW[:1])
+    store.write(changes(fourth, ROW[:1]))
+    assert_same(read_map(paths(store)[4]), fourth)
+
+
+@pytest.mark.parametrize("read", [read_map, recover, lambda path: StoredMap.open(path).record()])
+def test_a_checkpoint_that_is_deleted_while_it_is_read_is_not_called_damaged(
+    store, read, monkeypatch
+):
+    drive(store, 0)
+    path = paths(store)[1]
+    payload = PartFiles.payload
+
+    def deleting(self, entry):
+        path.unlink(missing_ok=True)
+        (self.folder / entry.name).unlink(missing_ok=True)
+        return payload(self, entry)
+
+    monkeypatch.setattr(PartFiles, "payload", deleting)
+    with pytest.raises(MapFileError, match="deleted this checkpoint.*open a newer one") as caught:
+        read(path)
+    assert "recover" not in str(caught.value)
 
 
 def test_a_damaged_part_is_written_again_for_all_that_need_it(store):
@@ -340,6 +366,42 @@ def test_what_undoes_something_stays_until_enough_others_do(tmp_path):
                 assert store.base_epoch == info.epoch == epoch
         assert sorted(paths(store)) == [4, 6, 8, 9]
         assert_same(read_map(paths(store)[4]), grown(4, 4))
+
+
+def test_a_mark_that_moves_to_a_later_checkpoint_counts_once(tmp_path):
+    """As of a reset during which scans arrive: the map is written before and after them."""
+    with closing(Store(tmp_path, "lab", StoreSettings(keep=2, keep_resets=2))) as store:
+        for epoch in range(1, 12):
+            store.write(changes(grown(epoch, epoch)))
+            if epoch in (2, 5, 8):
+                store.mark_newest("a reset")
+            if epoch in (3, 6, 9):
+                store.mark_newest("a reset", instead_of=epoch - 1)
+        assert sorted(paths(store)) == [6, 9, 10, 11]
+
+
+def test_a_checkpoint_that_is_replaced_within_a_tick_of_the_clock_is_read_again(tmp_path):
+    with closing(Store(tmp_path, "lab", StoreSettings(keep=2))) as store:
+        store.write(changes(grown(1, 1)))
+        path = paths(store)[1]
+        before = path.stat()
+        write_checkpoint(path, dataclasses.replace(read_checkpoint(path), undoes="a reset"))
+        os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+        for epoch in range(2, 5):
+            store.write(changes(grown(epoch, epoch)))
+        assert sorted(paths(store)) == [1, 3, 4]
+
+
+def test_a_map_that_was_restored_can_be_restored_once_more(tmp_path, caplog):
+    with closing(Store(tmp_path, "lab", StoreSettings(keep=2))) as store:
+        records = drive(store, 1)
+        store.restore(1)
+        for epoch in range(4, 8):
+            store.write(changes(grown(epoch, epoch)))
+        store.restore(1)
+        assert "to go back there again, use --restore 3" in caplog.text
+        store.restore(3)
+        assert_same(store.newest().record, dataclasses.replace(records[1], epoch=8))
 
 
 def test_a_map_that_was_restored_can_be_restored_back(store):

@@ -1,5 +1,7 @@
 """Which checkpoints stay."""
 
+import dataclasses
+
 from triquad_server.settings import StoreSettings
 from triquad_server.store.retention import StoredCheckpoint, staying
 
@@ -48,3 +50,10 @@ def test_what_undoes_resets_comes_before_others_where_bytes_are_scarce() -> None
     found = checkpoints("f", "e", "d", "c!", "b", "a!")
     assert left(found, keep_bytes=40) == "acef"
     assert left(found, keep_bytes=30) == "cef"
+
+
+def test_what_a_restored_map_went_on_from_stays() -> None:
+    found = checkpoints("f", "e", "d", "c!", "b", "a!")
+    found[0] = dataclasses.replace(found[0], restored_as="b")
+    assert left(found, keep=2) == "abcef"
+    assert left(found, keep=2, keep_bytes=40) == "acef"
