@@ -248,7 +248,7 @@ def test_what_is_under_way_when_the_client_is_closed_says_so(tmp_path: Path) -> 
 def test_a_cancelled_scan_that_the_network_holds_up_is_not_waited_for(tmp_path: Path) -> None:
     """It is sent all the same, in its place."""
     patient = tmp_path / "patient.json5"  # or the link would be given up after 5 s
-    block = f"{{ wait_before_close: {int(servers.WAIT_S * 1e6)} }}"
+    block = f"{{ wait_before_close: {int(2e6 * servers.WAIT_S)} }}"
     queue = f"{{ queue: {{ congestion_control: {{ block: {block} }} }} }}"
     patient.write_text(f"{{ transport: {{ link: {{ tx: {queue} }} }} }}")
     endpoint, cloud = servers.free_endpoint(), servers.sphere(100_000)
@@ -265,8 +265,8 @@ def test_a_cancelled_scan_that_the_network_holds_up_is_not_waited_for(tmp_path: 
             await asyncio.sleep(0)
             for task in (behind, held_up):
                 task.cancel()
-                with pytest.raises(asyncio.CancelledError):
-                    await task
+                await asyncio.wait({task}, timeout=servers.WAIT_S)
+                assert task.cancelled()
             last = asyncio.ensure_future(client.publish_scan(cloud, POSE))
             samples = [await asyncio.to_thread(subscriber.recv) for _ in range(sent + 1)]
             await last
@@ -278,7 +278,7 @@ def test_a_cancelled_scan_that_the_network_holds_up_is_not_waited_for(tmp_path: 
         # Its queue is full soon, and nobody reads it at first.
         key = keys.scan_key(servers.MAP, "default")
         subscriber = router.declare_subscriber(key, zenoh.handlers.FifoChannel(1))
-        asyncio.run(asyncio.wait_for(use(subscriber), servers.WAIT_S))
+        asyncio.run(use(subscriber))
         token.undeclare()
 
 
