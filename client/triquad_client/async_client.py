@@ -12,7 +12,7 @@ from triquad_client.client import MAX_DOWNLOAD_BYTES, Client
 from triquad_client.mesh.followed_mesh import FollowedMesh, KnownTiles, MeshUpdate
 from triquad_client.mesh.mesh_watch import MeshWatch, WatchedTiles
 from triquad_client.net.connection import Connection
-from triquad_client.net.in_threads import InThreads, Threads, awaited
+from triquad_client.net.in_threads import InThreads, Threads, awaited, in_thread
 from triquad_client.net.opening import open_connection
 from triquad_client.offline.synced_map import SyncedMap, SyncReport
 
@@ -137,7 +137,7 @@ class AsyncClient(AsyncMapQueries):
 
     async def close(self) -> None:
         """End the connection. Scans that were published may still be on their way: flush first."""
-        await self._threads.close(self._blocking.close)
+        await in_thread(self._blocking.close)
 
     async def pinned(self) -> AsyncPinnedMap:
         """Return the map as it is now, for queries that belong together."""
@@ -162,7 +162,7 @@ class AsyncClient(AsyncMapQueries):
         synced = await self._threads.run(
             "sync", lambda: self._blocking.sync(bounds, path, accept_emptier)
         )
-        return AsyncSyncedMap(synced, Threads())  # its own: it answers when the client is closed
+        return AsyncSyncedMap(synced, Threads())  # its own: it need not wait for the link
 
 
 class Connecting:

@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from triquad_format.errors import RefusedError
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import (
     MapInfo,
+    Scan,
     SdfReply,
     SdfRequest,
     ServerStatus,
@@ -243,6 +245,64 @@ def test_what_is_under_way_when_the_client_is_closed_says_so(tmp_path: Path) -> 
         held_files.drop()
 
 
+def test_a_cancelled_scan_that_the_network_holds_up_is_not_waited_for(tmp_path: Path) -> None:
+    """It is sent all the same, in its place."""
+    patient = tmp_path / "patient.json5"  # or the link would be given up after 5 s
+    block = f"{{ wait_before_close: {int(2e6 * servers.WAIT_S)} }}"
+    queue = f"{{ queue: {{ congestion_control: {{ block: {block} }} }} }}"
+    patient.write_text(f"{{ transport: {{ link: {{ tx: {queue} }} }} }}")
+    endpoint, cloud = servers.free_endpoint(), servers.sphere(100_000)
+
+    async def use(subscriber: "zenoh.Subscriber[Any]") -> None:
+        async with triquad_client.connect_async(endpoint, config=patient) as client:
+            sent, held_up = 0, None
+            while held_up is None:
+                sending = asyncio.ensure_future(client.publish_scan(cloud, POSE))
+                _, waiting = await asyncio.wait({sending}, timeout=0.5)
+                held_up = sending if waiting else None
+                sent += 1
+            behind = asyncio.ensure_future(client.publish_scan(cloud, POSE))
+            await asyncio.sleep(0)
+            for task in (behind, held_up):
+                task.cancel()
+                await asyncio.wait({task}, timeout=servers.WAIT_S)
+                assert task.cancelled()
+            last = asyncio.ensure_future(client.publish_scan(cloud, POSE))
+            samples = [await asyncio.to_thread(subscriber.recv) for _ in range(sent + 1)]
+            await last
+            scans = [codec.decode(Scan, sample.payload.to_bytes()) for sample in samples]
+            assert [scan.sequence for scan in scans] == list(range(sent + 1))
+
+    with servers.raw_session("router", listen=endpoint) as router:
+        token = router.liveliness().declare_token(keys.alive_key(servers.MAP, "x"))
+        # Its queue is full soon, and nobody reads it at first.
+        key = keys.scan_key(servers.MAP, "default")
+        subscriber = router.declare_subscriber(key, zenoh.handlers.FifoChannel(1))
+        asyncio.run(use(subscriber))
+        token.undeclare()
+
+
+def test_a_lack_of_threads_is_called_so() -> None:
+    held = Held()
+
+    async def use(client: AsyncClient) -> None:
+        before = threading.stack_size(2**46)  # more than there is: no thread can be started
+        try:
+            watches = [client.watch_mesh() for _ in range(300)]
+            tasks = [asyncio.ensure_future(watch.next()) for watch in watches]
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
+        finally:
+            threading.stack_size(before)
+        with pytest.raises(RuntimeError, match="can't start new thread"):
+            await done.pop()
+        await client.close()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    with servers.answering({keys.TILE_UPDATES: held}) as endpoint:
+        connected(endpoint, use)
+        held.drop()
+
+
 def test_a_connection_that_is_cancelled_while_it_opens_is_closed() -> None:
     endpoint = servers.free_endpoint()
 
@@ -279,14 +339,23 @@ async def main(endpoint, forgotten):
     if forgotten == "flush":
         asyncio.ensure_future(client.settle())
         await asyncio.sleep(0.01)
+    if forgotten == "watch":
+        watch = client.watch_mesh(((50, 50, 50), (51, 51, 51)))
+        await watch.next(0.0)
+        asyncio.ensure_future(watch.next())
+        await client.status()  # by then it waits at the server
     if forgotten == "error":
         raise SystemExit(3)
 
-asyncio.run(main(*sys.argv[1:]))
+if sys.argv[2] == "watch":  # and its task is not even cancelled
+    loop = asyncio.new_event_loop()
+    loop.run_until_complete(main(*sys.argv[1:]))
+else:
+    asyncio.run(main(*sys.argv[1:]))
 """
 
 
-@pytest.mark.parametrize("forgotten", ["nothing else", "query", "flush", "error"])
+@pytest.mark.parametrize("forgotten", ["nothing else", "query", "flush", "watch", "error"])
 def test_a_program_that_forgets_to_close_its_client_ends(endpoint: str, forgotten: str) -> None:
     command = [sys.executable, "-c", FORGETFUL, endpoint, forgotten]
     done = subprocess.run(command, capture_output=True, text=True, timeout=servers.WAIT_S)

@@ -2,35 +2,81 @@
 
 import asyncio
 import functools
+import threading
+import weakref
 from collections import defaultdict
 from collections.abc import Callable, Coroutine
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, wait
+from queue import Empty, SimpleQueue
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import zenoh
 
-from triquad_client.net.connection import cancellable, closed_error
+from triquad_client.net.connection import cancellable
 
 _CALLS_AT_ONCE = 32
 """Calls of one kind that go on at the same time; others wait for their turn. Servers refuse what
 exceeds their queue (64 requests, where it is not set otherwise) as ``busy``."""
 
-_MOST_THREADS = 1_000
-"""More than calls of all kinds may go on."""
+_WAITING = {"next", "catch_up", "flush", "settle"}
+"""Methods that mostly wait for the server to learn: any number goes on at the same time."""
 
 _IN_ORDER = {"publish_scan", "publish_depth", "restart_source"}
-"""Methods whose effects are in the order of their calls: one thread runs them all."""
+"""Methods whose effects are in the order of their calls: one goes on at a time."""
+
+_IDLE_S = 10.0  # until a thread without calls ends
+_END_S = 1.0  # for what still runs when the program ends, and its connection was closed
 
 ArgumentsP = ParamSpec("ArgumentsP")
 ResultT = TypeVar("ResultT")
+
+_calls: SimpleQueue[Callable[[], None]] = SimpleQueue()
+_idle = threading.Semaphore(0)  # counts threads that wait for calls
+_running: set[Future[Any]] = set()
+
+
+def in_thread(call: Callable[[], ResultT]) -> asyncio.Future[ResultT]:
+    """Start ``call`` in a thread of its own, for which the end of the program need not wait.
+
+    Raises:
+        RuntimeError: the system has no thread left.
+    """
+    result: Future[ResultT] = Future()
+    result.set_running_or_notify_cancel()  # it cannot be cancelled
+
+    def run() -> None:
+        try:
+            result.set_result(call())
+        except BaseException as error:
+            result.set_exception(error)
+
+    if not _idle.acquire(blocking=False):
+        threading.Thread(target=_run_calls, name="triquad-call", daemon=True).start()
+    _running.add(result)
+    result.add_done_callback(_running.discard)
+    _calls.put(run)
+    return asyncio.wrap_future(result)
+
+
+def _run_calls() -> None:
+    """Run calls until there are none for a while: starting a thread takes longer than many do."""
+    while True:
+        try:
+            run = _calls.get(timeout=_IDLE_S)
+        except Empty:
+            if _idle.acquire(blocking=False):
+                return
+            continue  # a call is on its way
+        run()
+        del run  # and what it refers to
+        _idle.release()
 
 
 class Threads:
     """The threads of a client for an event loop."""
 
     def __init__(self) -> None:
-        self._workers = ThreadPoolExecutor(_MOST_THREADS, "triquad-call")  # made as they are needed
-        self._sender = ThreadPoolExecutor(1, "triquad-sender")
+        self._order = asyncio.Semaphore(1)
         self._slots: defaultdict[str, asyncio.Semaphore] = defaultdict(
             lambda: asyncio.Semaphore(_CALLS_AT_ONCE)
         )
@@ -38,37 +84,36 @@ class Threads:
     async def run(self, name: str, call: Callable[[], ResultT]) -> ResultT:
         """Return what ``call``, of the method called ``name``, returns.
 
-        Where the task is cancelled, so are the call's requests; it has ended then.
+        Where the task is cancelled, so are the call's requests; it has ended then, unless it sends
+        a scan, which is sent all the same.
         """
-        if name in _IN_ORDER:
-            return await self._run(self._sender, call)
-        async with self._slots[name]:
-            return await self._run(self._workers, call)
-
-    async def close(self, close: Callable[[], None]) -> None:
-        """Call ``close``, which ends what goes on, in a thread; no call may follow."""
-        try:
-            await asyncio.wrap_future(self._workers.submit(close))
-        except RuntimeError:  # they were shut down: it is closed
-            return
-        self._sender.shutdown(wait=False)
-        self._workers.shutdown(wait=False)
-
-    async def _run(self, threads: ThreadPoolExecutor, call: Callable[[], ResultT]) -> ResultT:
         token = zenoh.CancellationToken()
+        turns = self._turns(name)
+        await turns.acquire()
         try:
-            submitted = threads.submit(_cancelled_by, token, call)
-        except RuntimeError as error:  # they were shut down
-            raise closed_error() from error
-        running = asyncio.wrap_future(submitted)
+            running = in_thread(functools.partial(_cancelled_by, token, call))
+        except BaseException:
+            turns.release()
+            raise
+
+        def ended(running: asyncio.Future[ResultT]) -> None:
+            turns.release()
+            running.exception()  # of a cancelled task nobody wants to know it
+
+        running.add_done_callback(ended)
         try:
-            return await asyncio.shield(running)
+            await asyncio.wait({running})
         except asyncio.CancelledError:
             token.cancel()
-            submitted.cancel()  # where it has not begun
-            await asyncio.wait({running})  # until it has cleared up
-            running.cancelled() or running.exception()  # of which nobody wants to know
+            if name not in _IN_ORDER:
+                await asyncio.wait({running})  # until it has cleared up
             raise
+        return running.result()
+
+    def _turns(self, name: str) -> asyncio.Semaphore:
+        if name in _WAITING:
+            return asyncio.Semaphore()  # of this call alone
+        return self._order if name in _IN_ORDER else self._slots[name]
 
 
 class InThreads:
@@ -99,3 +144,12 @@ def awaited(
 def _cancelled_by(token: zenoh.CancellationToken, call: Callable[[], ResultT]) -> ResultT:
     with cancellable(token):
         return call()
+
+
+def _wait_for_calls() -> None:
+    wait(tuple(_running), _END_S)
+
+
+# Finalizers run newest first: by then those of all connections, made later, have ended the calls.
+# A thread that is within Zenoh must not come back into an interpreter that is no longer there.
+weakref.finalize(Threads, _wait_for_calls)

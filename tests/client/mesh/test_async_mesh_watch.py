@@ -1,6 +1,7 @@
 """The mesh followed in an event loop: as by the blocking watch, cancelled and closed meanwhile."""
 
 import asyncio
+import queue
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
@@ -80,6 +81,23 @@ def test_an_old_reply_does_not_undo_what_a_later_one_told(endpoint: str) -> None
                 assert set(watch.tiles) == {(0, 0, 0)}
 
         connected(endpoint, use)
+
+
+def test_any_number_of_watches_wait_at_a_time_until_they_are_closed() -> None:
+    count, queries = 100, queue.SimpleQueue[zenoh.Query]()
+
+    async def use(client: AsyncClient) -> None:
+        watches = [client.watch_mesh() for _ in range(count)]
+        tasks = [asyncio.ensure_future(watch.next()) for watch in watches]
+        held = [await asyncio.to_thread(queries.get, timeout=servers.WAIT_S) for _ in tasks]
+        for watch in watches:
+            await watch.close()
+        assert await asyncio.gather(*tasks) == [None] * count
+        for query in held:
+            query.drop()
+
+    with servers.answering({keys.TILE_UPDATES: lambda query, _: queries.put(query)}) as endpoint:
+        connected(endpoint, use, timeout_s=servers.WAIT_S)
 
 
 def test_iteration_ends_with_the_watch(endpoint: str) -> None:
