@@ -8,7 +8,6 @@ from contextlib import ExitStack, closing
 from typing import TYPE_CHECKING
 
 from triquad_format.errors import SettingsError
-from triquad_format.records.region import MapRecord
 
 from triquad_server.device import choose_device
 from triquad_server.launch_options import LaunchOptions
@@ -107,7 +106,7 @@ def _open(options: LaunchOptions, stops: Stops, phases: Phases, stack: ExitStack
     store = _open_store(options, phases, stack)
     restored = None if store is None else _restored(store, options, phases)
     if restored is not None:
-        settings = _settings_of(restored.record, settings)
+        settings = _settings_of(restored, settings)
     teams = stack.enter_context(closing(Teams()))
     warm_up(settings, device, teams, _before_each_step(stops, phases))
     phases.starting("opening the map")
@@ -172,12 +171,13 @@ def _restored(store: Store, options: LaunchOptions, phases: Phases) -> ValidChec
     return restored
 
 
-def _settings_of(record: MapRecord, settings: Settings) -> Settings:
+def _settings_of(restored: ValidCheckpoint, settings: Settings) -> Settings:
     """Return the settings for a restored map, which keeps its own field.
 
     Raises:
         SettingsError: lengths that are given do not agree with it.
     """
+    record = restored.record
     if record.settings == settings.field:
         return settings
     _log.warning("the restored map keeps its own [field] settings: %s", record.settings)
