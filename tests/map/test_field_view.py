@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.status import Status
-from triquad_map.compiled.field.frozen_field import FieldValues
+from triquad_map.compiled.field.frozen_field import FieldValues, in_grid
 from triquad_map.composition.field_view import FieldView
 
 FIELD = FieldSettings(depth=8)
@@ -27,6 +27,9 @@ class NumberedRegion:
     def evaluate(self, points: np.ndarray, gradient: bool) -> FieldValues:
         slopes = np.zeros((len(points) if gradient else 0, 3), np.float32)
         return FieldValues(np.full(len(points), self.number, np.float32), slopes)
+
+    def evaluate_in_grid(self, axes: np.ndarray, points: np.ndarray) -> np.ndarray:
+        return self.evaluate(in_grid(axes, points), gradient=False).sdf
 
     def status(self, voxels: np.ndarray, reach: float) -> np.ndarray:
         return np.full(len(voxels), self.number, np.uint8)
@@ -68,6 +71,16 @@ def random_axes(rng: np.random.Generator, spread: float) -> np.ndarray:
     """The coordinates of a grid, which lies in one region or in several."""
     low = rng.uniform(-PITCH_M, 3 * PITCH_M, 3)
     return low[:, None] + np.arange(6) * rng.uniform(0.1, 1.0) * spread * PITCH_M
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(0.001, 1.0))
+def test_the_field_in_a_grid_is_that_at_its_points(seed: int, spread: float) -> None:
+    rng = np.random.default_rng(seed)
+    axes, points = random_axes(rng, spread), rng.integers(0, 6, (50, 3))
+    view = view_of(REGIONS)
+    found = view.distances_in_grid(axes, points)
+    np.testing.assert_allclose(found, view.distances(in_grid(axes, points)))
 
 
 @settings(max_examples=20, deadline=None)

@@ -12,12 +12,12 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats
+from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.status import Status
 
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
-from triquad_map.compiled.field.frozen_field import FieldEngine, FieldValues
+from triquad_map.compiled.field.frozen_field import FieldEngine, FieldValues, in_grid
 from triquad_map.compiled.surfels.surfel_map import SurfelMap
 from triquad_map.compiled.team import Split, in_one
 from triquad_map.view import FieldAnswer
@@ -118,6 +118,25 @@ class FieldView:
         def work(first: int, last: int) -> None:
             part = points[first:last]
             distances[first:last] = self._values(part, self._owners(part), False).sdf
+
+        self._split(len(points), work)
+        return distances
+
+    def distances_in_grid(self, axes: Doubles, points: Longs) -> Floats:
+        """Do as :meth:`distances`, but for rounding, at points of a grid: in half the time.
+
+        Args:
+            axes: [3, S] its coordinates on each axis, metres, map frame.
+            points: [N, 3] the points, by their numbers on the axes.
+        """
+        region = self._only_region(axes.min(axis=1), axes.max(axis=1))
+        if region is None:
+            return self.distances(in_grid(axes, points))
+        local = (axes - region.centre[:, None]).astype(np.float32)
+        distances = np.empty(len(points), np.float32)
+
+        def work(first: int, last: int) -> None:
+            distances[first:last] = region.engine.evaluate_in_grid(local, points[first:last])
 
         self._split(len(points), work)
         return distances

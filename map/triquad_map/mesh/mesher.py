@@ -178,5 +178,6 @@ def _lattice_values(
     if around is not None:
         around.put(volume)
         asked = points[np.isnan(volume[tuple(points.T)])]
-    _enter(view.distances((first + asked) * np.float64(lattice.cell_m)), asked, volume)
+    axes = (first[:, None] + np.arange(lattice.cells + 1)) * np.float64(lattice.cell_m)
+    _enter(view.distances_in_grid(axes, asked), asked, volume)
     return volume, points

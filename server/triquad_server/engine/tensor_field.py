@@ -13,11 +13,11 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from triquad_format.records.arrays import Floats
+from triquad_format.records.arrays import Floats, Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES
 from triquad_map.compiled.field.field import FieldArrays
-from triquad_map.compiled.field.frozen_field import FieldValues
+from triquad_map.compiled.field.frozen_field import FieldValues, in_grid
 from triquad_map.compiled.field.quadtree import (
     PLANE_BITS,
     FrozenQuadtree,
@@ -158,6 +158,10 @@ class TensorField:
             np.concatenate([part.sdf for part in parts]),
             np.concatenate([part.gradient for part in parts]),
         )
+
+    def evaluate_in_grid(self, axes: Floats, points: Longs) -> Floats:
+        """Evaluate distances in a grid; see :class:`FieldEngine`."""
+        return self.evaluate(in_grid(axes, points), gradient=False).sdf
 
     def sdf(self, points: Tensor) -> Tensor:
         """Return the signed distance [N] in metres; differentiable in the points."""

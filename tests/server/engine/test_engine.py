@@ -7,6 +7,7 @@ from support.maps import small_world
 from triquad_format.records.field_settings import FieldSettings
 from triquad_map.compiled.field.encoding import load, locate, new_batch
 from triquad_map.compiled.field.field import make_field
+from triquad_map.compiled.field.frozen_field import in_grid
 from triquad_server.engine.compiled_trainer import CompiledTrainer
 from triquad_server.engine.gradient_sums import GradientSums
 from triquad_server.engine.live_field import Batch, LiveField, Parameter, Rates, initial_field
@@ -183,6 +184,30 @@ def test_no_points_give_no_values() -> None:
     field = trained(CASES[0])
     none = np.zeros((0, 3), np.float32)
     assert field.freeze().evaluate(none, gradient=True).gradient.shape == (0, 3)
+    axes = np.zeros((3, 1), np.float32)
+    assert field.freeze().evaluate_in_grid(axes, none.astype(np.int64)).shape == (0,)
+
+
+@pytest.mark.parametrize("settings", CASES)
+def test_in_a_grid_distances_are_those_of_its_points(settings: FieldSettings) -> None:
+    field = trained(settings)
+    rng = np.random.default_rng(0)
+    half = settings.region_side_m / 2  # beyond the cube, too
+    axes = np.sort(rng.uniform(-1.1 * half, 1.1 * half, (3, 70))).astype(np.float32)
+    axes[:, 5:40] = np.linspace(-8, 8, 35, dtype=np.float32)
+    points = rng.integers(0, 70, (3000, 3))
+    points[:2000] = rng.integers(5, 40, (2000, 3))
+    frozen = field.freeze()
+    found = frozen.evaluate_in_grid(axes, points)
+    expected = frozen.evaluate(in_grid(axes, points), gradient=False).sdf
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+    slow = in_tensors(field).evaluate_in_grid(axes, points)
+    np.testing.assert_allclose(found, slow, atol=1e-5)
+    some = rng.permutation(3000)[:100]
+    shifted = np.concatenate([axes[:, 7:], axes[:, :7]], axis=1)
+    np.testing.assert_array_equal(
+        frozen.evaluate_in_grid(shifted, (points[some] - 7) % 70), found[some]
+    )
 
 
 def test_a_step_over_all_rows_is_that_of_the_chosen() -> None:

@@ -74,11 +74,13 @@ class Patchwork:
     epochs: dict[TileIndex, Epoch]
     borders: dict[tuple[int, int, int], float]
 
-    def distances(self, points: NDArray[np.float64]) -> NDArray[np.float32]:
-        steps = np.rint(points / self.lattice.cell_m).astype(np.int64)
+    def distances_in_grid(
+        self, axes: NDArray[np.float64], points: NDArray[np.int64]
+    ) -> NDArray[np.float32]:
+        steps = np.rint(axes / self.lattice.cell_m).astype(np.int64)[:, 0] + points
         values = np.ones(len(points), np.float32)
         for index, rows in self._owned(steps).items():
-            values[rows] = self.epochs[index].distances(points[rows])
+            values[rows] = self.epochs[index].distances_in_grid(axes, points[rows])
         for row in np.flatnonzero((steps % self.lattice.cells == 0).any(axis=1)):
             values[row] = self.borders.get(tuple(steps[row].tolist()), 1.0)
         return values

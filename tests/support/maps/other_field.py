@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.region import MapRecord
+from triquad_map.compiled.field.frozen_field import in_grid
 from triquad_map.composition.recorded_view import RecordedView
 
 Sdf = Callable[[NDArray[np.float64]], NDArray[np.float64]]
@@ -18,5 +19,7 @@ class OtherField(RecordedView):
         super().__init__(record)
         self._sdf = sdf
 
-    def distances(self, points: NDArray[np.float64]) -> NDArray[np.float32]:
-        return self._sdf(points).astype(np.float32)
+    def distances_in_grid(
+        self, axes: NDArray[np.float64], points: NDArray[np.int64]
+    ) -> NDArray[np.float32]:
+        return self._sdf(in_grid(axes, points)).astype(np.float32)

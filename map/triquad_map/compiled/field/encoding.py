@@ -183,6 +183,26 @@ def interpolate(batch: PointBatch, levels: int, features: Floats) -> None:
 
 
 @inner_kernel(fastmath=True)
+def interpolate_plane(
+    batch: PointBatch, plane: int, geometry: Geometry, vertices: Vertices, features: Floats
+) -> None:
+    """Do as :func:`locate` and :func:`interpolate`, with the features of one plane alone."""
+    size = features.shape[1]
+    _find_blocks(batch, plane, geometry, vertices)
+    _find_cells(batch, plane, geometry)
+    batch.features[:] = 0
+    for t in range(BATCH):
+        block = vertices.rows[batch.blocks[plane, t]]
+        for h in range(geometry.levels):
+            at = plane * geometry.levels + h
+            below = batch.corners[at, t]
+            above = below + (1 << h) + 1
+            rows = (block[below], block[above], block[below + 1], block[above + 1])
+            add_rows(batch.features, t, h * size, features, rows, _weights(batch, at, t))
+    _transpose_features(batch, geometry.levels * size)
+
+
+@inner_kernel(fastmath=True)
 def _transpose_features(batch: PointBatch, count: int) -> None:
     """Compute the first ``count`` inputs of the MLP, from the features of each point."""
     for k in range(count):

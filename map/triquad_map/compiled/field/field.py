@@ -59,7 +59,7 @@ class FieldArrays(NamedTuple):
 
 
 @inner_kernel(fastmath=True)
-def _add_product(weights: Floats, x: Floats, out: Floats) -> None:
+def add_product(weights: Floats, x: Floats, out: Floats) -> None:
     """``out += weights.T @ x`` for weights [K, J], x [K, T], out [J, T]."""
     inputs, outputs = weights.shape
     k = 0
@@ -141,7 +141,7 @@ def _layer(weights: Floats, biases: Floats, x: Floats, out: Floats) -> None:
     for j in range(len(biases)):
         for t in range(BATCH):
             out[j, t] = biases[j]
-    _add_product(weights, x, out)
+    add_product(weights, x, out)
     for j in range(len(biases)):
         for t in range(BATCH):
             out[j, t] = max(out[j, t], _ZERO)
@@ -151,6 +151,12 @@ def _layer(weights: Floats, biases: Floats, x: Floats, out: Floats) -> None:
 def _decode(batch: PointBatch, mlp: Mlp) -> None:
     """Compute both hidden layers and the logits of the batch's inputs."""
     _layer(mlp.w1, mlp.b1, batch.x, batch.h1)
+    decode_rest(batch, mlp)
+
+
+@inner_kernel(fastmath=True)
+def decode_rest(batch: PointBatch, mlp: Mlp) -> None:
+    """Compute the second hidden layer and the logits, from the first."""
     _layer(mlp.w2, mlp.b2, batch.h1, batch.h2)
     for t in range(BATCH):
         batch.logits[t] = mlp.b3[0]
@@ -175,13 +181,13 @@ def backward(batch: PointBatch, mlp: Mlp, w1_transposed: Floats, w2_transposed: 
         for t in range(BATCH):
             batch.g2[j, t] = batch.slopes[t] * mlp.w3[j] if batch.h2[j, t] > 0 else _ZERO
     batch.g1[:] = 0
-    _add_product(w2_transposed, batch.g2, batch.g1)
+    add_product(w2_transposed, batch.g2, batch.g1)
     for j in range(len(mlp.b1)):
         for t in range(BATCH):
             batch.g1[j, t] = batch.g1[j, t] if batch.h1[j, t] > 0 else _ZERO
     gx = batch.gx[: w1_transposed.shape[1]]
     gx[:] = 0
-    _add_product(w1_transposed, batch.g1, gx)
+    add_product(w1_transposed, batch.g1, gx)
 
 
 @inner_kernel(fastmath=True)

@@ -1,17 +1,21 @@
 """A field that answers from arrays which do not change, such as those of an epoch or of a file."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
-from triquad_format.records.arrays import Doubles, Floats
+from numpy.typing import NDArray
+from triquad_format.records.arrays import Doubles, Floats, Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import Region
 
 from triquad_map.compiled.field.field import FieldArrays, evaluate, make_field
+from triquad_map.compiled.field.grid import evaluate_in_grid
 from triquad_map.compiled.field.quadtree import FrozenQuadtree, LiveQuadtree
 from triquad_map.compiled.team import Split
 from triquad_map.surface import FieldSample, SampleField
+
+_Float = TypeVar("_Float", np.float32, np.float64)
 
 
 @dataclass(frozen=True)
@@ -27,6 +31,13 @@ class FieldEngine(Protocol):
 
     def evaluate(self, points: Floats, gradient: bool) -> FieldValues:
         """Return the field at points [N, 3], metres from the region's centre."""
+
+    def evaluate_in_grid(self, axes: Floats, points: Longs) -> Floats:
+        """Return distances [N] at ``points`` [N, 3] of a grid, by their numbers on its ``axes``.
+
+        ``axes`` [3, S] are metres from the region's centre. Those of a point do not depend on which
+        others are asked for.
+        """
 
 
 class FrozenCompiledField:
@@ -45,6 +56,19 @@ class FrozenCompiledField:
         evaluate(points, self._field, logits, gradients)
         scale = np.float32(self.settings.logit_scale_m)
         return FieldValues(logits * scale, gradients * scale)
+
+    def evaluate_in_grid(self, axes: Floats, points: Longs) -> Floats:
+        """Return distances in a grid; see :class:`FieldEngine`. On the caller's thread."""
+        logits = np.empty(len(points), np.float32)
+        evaluate_in_grid(axes, points, self._field, logits)
+        distances: Floats = logits * np.float32(self.settings.logit_scale_m)
+        return distances
+
+
+def in_grid(axes: NDArray[_Float], points: Longs) -> NDArray[_Float]:
+    """Return points [N, 3] of a grid with coordinates ``axes`` [3, S], by their numbers there."""
+    places = [axis[numbers] for axis, numbers in zip(axes, points.T, strict=True)]
+    return np.stack(places, axis=1)
 
 
 def recorded_field(settings: FieldSettings, region: Region) -> FrozenCompiledField:
