@@ -50,7 +50,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--minutes", type=float, default=5.0, help="how long (default: 5)")
     add("--lanes", type=int, default=2, help="turns at a time (default: 2)")
     add("--out", type=Path, default=Path("campaign-out"), help="default: campaign-out")
-    add("--afresh", action="store_true", help="forget what is in --out, and begin anew")
+    add("--afresh", action="store_true", help="forget what is in --out, and begin again")
     add("--most", type=int, help="of --seed: things to do, at most")
     add("--result", type=Path, help=argparse.SUPPRESS)
     return parser

@@ -83,7 +83,7 @@ def _costs(record: MapRecord, made: BenchStreet) -> list[Figure]:
 class _Cost:
     """The cost of a checkpoint."""
 
-    bytes: int  # by which the store grew
+    bytes: int  # growth of the store
     seconds: float
 
 

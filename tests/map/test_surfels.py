@@ -1,4 +1,4 @@
-"""Surfels follow the field and the evidence, as if they were always made anew."""
+"""Surfels follow the field and the evidence, as if they were always made again."""
 
 from functools import partial
 

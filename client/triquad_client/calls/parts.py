@@ -81,7 +81,7 @@ class Asking:
     """Asks about a map: of its newest epoch, or always of the same one."""
 
     _server: Answering
-    """Whoever answers all of one question."""
+    """What answers all of one question."""
 
     _epoch: int | None = None
     """The epoch that is asked where a question names none; ``None``: the newest."""

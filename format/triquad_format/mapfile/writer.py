@@ -224,7 +224,7 @@ def check_part(part: Part) -> None:
 
 
 def check_totals(unpacked: int, stored: int) -> None:
-    """Raise :class:`FormatError` unless parts of so many bytes together can be read."""
+    """Raise :class:`FormatError` unless parts that take these bytes together can be read."""
     _check_total(max(unpacked, stored))
     if unpacked > total_limit(stored):
         raise FormatError(

@@ -190,7 +190,7 @@ class StoreSettings(BaseModel):
     """Newest checkpoints that stay on disk; two always do."""
 
     keep_resets: Annotated[int, Field(ge=0, le=1000)] = 10
-    """Of so many resets the map just before stays as well; 0: a reset keeps nothing."""
+    """Newest resets of which the map just before stays as well; 0: a reset keeps nothing."""
 
     keep_bytes: Annotated[int, Field(ge=0, le=2**60)] = 4_000_000_000
     """The oldest checkpoints are deleted while all take more, but for two; 0: no limit."""

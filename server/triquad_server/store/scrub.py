@@ -61,7 +61,7 @@ class Scrubber:
                 _log.info("checked %d checkpoints on disk in %.0f s", len(checkpoints), took_s)
 
     def _check(self, path: Path) -> None:
-        """Check a file, and wait for as long as so many bytes may take."""
+        """Check a file, and wait for as long as its bytes may take."""
         if self._stopping.is_set():
             return
         try:

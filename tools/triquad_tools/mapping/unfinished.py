@@ -81,7 +81,7 @@ class UnfinishedMap:
             if epoch not in self._taken_by:
                 raise ToolError(
                     f"{self.folder}: {_POSITIONS} says nothing of epoch {epoch}; delete the folder "
-                    "to begin anew"
+                    "to begin again"
                 )
             self.scans_taken = self._taken_by[epoch]
         record = None if newest is None else newest.record
@@ -124,9 +124,9 @@ class UnfinishedMap:
             read = json.loads(path.read_text())
             key, self._taken_by = read["key"], dict(read["scans_taken"])
         except (ValueError, KeyError, TypeError, RecursionError) as error:
-            raise ToolError(f"{path} is damaged; delete {self.folder} to begin anew") from error
+            raise ToolError(f"{path} is damaged; delete {self.folder} to begin again") from error
         if key != self._key:
             raise ToolError(
                 f"{self.folder} holds an unfinished map of another recording, or with other "
-                "flags or settings: give the same to go on with it, or delete it to begin anew"
+                "flags or settings: give the same to go on with it, or delete it to begin again"
             )

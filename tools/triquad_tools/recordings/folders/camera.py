@@ -46,7 +46,7 @@ def choose_camera(folder: Path, given: Intrinsics | None) -> Camera:
 
 
 def check_fits(camera: Camera, shape: tuple[int, ...], path: Path) -> None:
-    """Check that an image of so many rows and columns fits a camera.
+    """Check that an image of these rows and columns fits a camera.
 
     Raises:
         ToolError: it has another size, or the centre of the camera lies outside of it.
