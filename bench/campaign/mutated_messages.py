@@ -67,7 +67,7 @@ def good_requests() -> dict[str, list[Message]]:
         keys.SOURCES: [SourcesRequest("", 0, 10)],
         keys.TILE_LIST: [TileListRequest(*_BOX, 0)],
         keys.MESH: [MeshRequest(tiles, 0, level) for level in (0, 1, 2)],
-        keys.TILE_UPDATES: [TileUpdatesRequest(*_BOX, 0, "", 0, *known, 100_000, 0.2, "c", 0)],
+        keys.TILE_UPDATES: [TileUpdatesRequest(*_BOX, 0, "", 0, *known, 100_000)],
         keys.STATUS: [StatusRequest()],
         keys.METRICS: [MetricsRequest()],
         keys.FLUSH: [FlushRequest("lidar", 7, 0, 0.2)],

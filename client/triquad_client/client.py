@@ -68,7 +68,7 @@ class Client(
         Args:
             bounds: corners of a box, metres, map frame; ``None``: everywhere.
             level: of detail: 0, 1 or 2, each with cells twice as large as the one before.
-            max_bytes_per_s: what this watch may take of the network; the server may allow less.
+            max_bytes_per_s: what the tiles of this watch may take of the network.
             known: tiles of an earlier watch, which are not fetched again.
 
         Raises:
@@ -76,7 +76,7 @@ class Client(
         """
         most = self._connection.max_download_bytes
         followed = FollowedMesh.initial(bounds, level, max_bytes_per_s, known, max_bytes=most)
-        return MeshWatch(self._connection, followed)
+        return MeshWatch(self._connection, followed, max_bytes_per_s)
 
     def sync(self, bounds: Bounds, path: str | Path, accept_emptier: bool = False) -> SyncedMap:
         """Keep a copy of what the map needs to answer within ``bounds``, and ask that.

@@ -1,7 +1,7 @@
 """A bounded queue of items of many owners, who are served in turn."""
 
-from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator
 from typing import Generic, NamedTuple, TypeVar
 
 ItemT = TypeVar("ItemT")
@@ -12,24 +12,6 @@ class Owner(NamedTuple):
 
     group: str
     name: str = ""
-
-
-def first_to_go(items: Sequence[tuple[Owner, int]]) -> int:
-    """Return which of the items with their sizes, oldest first, is removed if they are too many.
-
-    It is the newest of the owner who has most.
-    """
-    groups: Counter[str] = Counter()
-    names: Counter[Owner] = Counter()
-    for owner, size in items:
-        groups[owner.group] += size
-        names[owner] += size
-
-    def share(number: int) -> tuple[int, int, int]:
-        owner, _ = items[number]
-        return groups[owner.group], names[owner], number
-
-    return max(range(len(items)), key=share)
 
 
 class FairQueue(Generic[ItemT]):

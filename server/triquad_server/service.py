@@ -10,15 +10,15 @@ from triquad_format.wire import keys
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.epochs.surface_history import CHANGES_KEPT, SurfaceHistory
 from triquad_server.health import Health, Heartbeat
-from triquad_server.intake.flush import FlushHandler
+from triquad_server.intake.flush import FlushQueries
 from triquad_server.intake.scan import ScanIntake
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.intake.source_trails import SourceTrails
 from triquad_server.mapping.mapper_thread import MapListeners, MapperThread
 from triquad_server.mesh.tile_cache import TileCache
-from triquad_server.mesh.tile_feed import TileFeed
 from triquad_server.mesh.tile_queries import TileQueries
+from triquad_server.mesh.update_queries import UpdateQueries
 from triquad_server.monitoring.metrics import Metrics
 from triquad_server.queries.client_queries import serve_queries
 from triquad_server.served_map import ServedMap
@@ -103,7 +103,9 @@ class Service:
             map_max_bytes=self._settings.memory.max_bytes,
         )
         serve_queries(self._operations, self._epochs, self._surface, self._trails, health.server)
-        tiles = self._serve_mesh(health.server)
+        tiles = TileCache(self._settings.mesh, self._served.teams.meshing)
+        TileQueries(self._epochs, tiles).serve_on(self._operations)
+        UpdateQueries(self._epochs, tiles, health.server).serve_on(self._operations)
         downloads = MapDownloads(self._mapper, self._epochs, health.server)
         downloads.serve_on(self._operations)
         self.metrics = Metrics(
@@ -112,10 +114,11 @@ class Service:
             self._surface,
             tiles=tiles,
             downloads=downloads,
-            queues=self._operations.queues,
+            operations=self._operations,
         )
-        self.metrics.serve_on(self._operations)
-        self._serve_flush()
+        self.metrics.serve()
+        flush = FlushQueries(self._scans.ledger, self._mapper.publish_soon, self._warnings.of)
+        flush.serve_on(self._operations)
         self._open_checkpoints(checkpoints)
         # Closed before the last checkpoint is written: it contains every reset that was answered.
         self._parts.callback(self._operations.close)
@@ -176,28 +179,3 @@ class Service:
             arrived=self._mapper.wake,
         )
         self._parts.callback(intake.close)
-
-    def _serve_mesh(self, server: str) -> TileCache:
-        """Serve queries of mesh tiles, and requests that follow them; return the cache."""
-        cache = TileCache(self._settings.mesh, self._served.teams.meshing)
-        feed = TileFeed(
-            cache,
-            self._epochs,
-            server=server,
-            limit=self._settings.service.request_queue,
-        )
-        self._parts.callback(feed.close)
-        feed.serve_on(self._operations)
-        TileQueries(self._epochs, cache).serve_on(self._operations)
-        return cache
-
-    def _serve_flush(self) -> None:
-        """Answer whether scans are in the map."""
-        flush = FlushHandler(
-            self._scans.ledger,
-            self._mapper.publish_soon,
-            limit=self._settings.service.request_queue,
-            warnings=self._warnings.of,
-        )
-        self._parts.callback(flush.close)
-        flush.serve_on(self._operations)

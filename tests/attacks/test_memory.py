@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import triquad_client
 from support import servers
-from support.requests import held_tile_updates
+from support.requests import tile_updates
 from support.servers import RawPeer, ServerProcess
 from triquad_format.wire import codec, keys
 
@@ -16,7 +16,6 @@ MAP_BYTES = 400_000_000
 EPOCHS_BYTES = 100_000_000
 BESIDE = 250_000_000  # for code that is compiled late, replay samples and what is in between
 SPHERES, POINTS, RADIUS_M = 8, 60_000, 48.0
-HELD_S = 20.0
 
 
 def resident(server: ServerProcess) -> int:
@@ -56,8 +55,8 @@ def test_spheres_all_around_fill_the_map_and_no_more(server: ServerProcess) -> N
         assert client.flush(servers.WAIT_S).taken >= 1, "what is small still finds room"
 
 
-def test_junk_in_a_request_that_is_held_is_refused(server: ServerProcess) -> None:
-    body = codec.encode(held_tile_updates(0, timeout_s=HELD_S))
+def test_junk_in_a_request_for_tiles_is_refused(server: ServerProcess) -> None:
+    body = codec.encode(tile_updates())
     assert body[0] == 0xDE or body[0] & 0xF0 == 0x80
     junk = b"\xa1j\xc6" + (12_000_000).to_bytes(4, "big") + bytes(12_000_000)
     fields = body[0] & 0x0F
@@ -66,10 +65,12 @@ def test_junk_in_a_request_that_is_held_is_refused(server: ServerProcess) -> Non
         assert RawPeer(session).refusal(keys.TILE_UPDATES, payload) == "too_large"
 
 
-def test_followers_that_are_held_take_little(server: ServerProcess) -> None:
-    """Each of 64 names as many tiles as it may, and waits."""
+def test_followers_that_ask_at_once_take_little(server: ServerProcess) -> None:
+    """Each of 64 names as many tiles as it may."""
     before = resident(server)
-    payload = codec.encode(held_tile_updates(100_000, timeout_s=HELD_S))
+    known = np.arange(300_000, dtype=np.int32).reshape(-1, 3)
+    versions = np.ones(len(known), np.int64)
+    payload = codec.encode(tile_updates(known=known, known_versions=versions))
     with servers.raw_session(connect=server.endpoint) as session:
         done = threading.Semaphore(0)
         key = keys.operation_key(servers.MAP, keys.TILE_UPDATES)

@@ -1,6 +1,5 @@
 """The figures of a server with a real map, asked by the real client over the loopback."""
 
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -59,19 +58,6 @@ def test_refusals_are_counted_by_operation(client):
     assert now.operations["query/sdf"].refused == {"epoch_gone": 1}
     assert now.operations["query/sdf"].answered == 0
     assert client.status().requests_refused == {"epoch_gone": 1}
-
-
-def test_what_is_held_counts_as_pending(client):
-    servers.learn(client)
-    client.settle(servers.WAIT_S)
-    with client.watch_mesh() as watch, ThreadPoolExecutor(1) as thread:
-        watch.catch_up(servers.WAIT_S)
-        update = thread.submit(watch.next, servers.WAIT_S)
-        held = figures(client, lambda m: m.queues["mesh_followers"].waiting == 1)
-        assert held.operations["query/tile_updates"].pending == 1
-        client.publish_scan(0.5 * servers.sphere(), np.eye(4))
-        assert update.result().changed
-    assert held.queues["mesh_followers"].limit == ServiceSettings().request_queue
 
 
 def test_scans_are_counted_by_source(client):

@@ -5,6 +5,7 @@ import queue
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
@@ -186,10 +187,17 @@ class RawPeer:
         return answer.code
 
     def flush(self, scan: Scan) -> FlushReply:
-        request = FlushRequest(scan.source, scan.session, scan.sequence, WAIT_S)
-        answer = self.ask(keys.FLUSH, codec.encode(request))
-        assert isinstance(answer, bytes), answer
-        return codec.decode(FlushReply, answer)
+        started = time.monotonic()
+        while True:
+            waited_s = time.monotonic() - started
+            assert waited_s < WAIT_S
+            request = FlushRequest(scan.source, scan.session, scan.sequence, waited_s)
+            answer = self.ask(keys.FLUSH, codec.encode(request))
+            assert isinstance(answer, bytes), answer
+            reply = codec.decode(FlushReply, answer)
+            if reply.done:
+                return reply
+            time.sleep(0.02)
 
 
 def scan(sequence: int = 0, **changes: object) -> Scan:

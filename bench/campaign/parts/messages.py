@@ -1,7 +1,6 @@
 """Mutated messages on all keys of a real server."""
 
 import threading
-import time
 from concurrent.futures import ThreadPoolExecutor
 
 import triquad_client
@@ -24,8 +23,6 @@ from bench.campaign.turn import Turn
 _SENDERS = 8
 _REPLY_S = 30.0
 _WARM_SHARE = 5  # memory is compared with that after one part in N
-_MAY_WAIT = (keys.FLUSH, keys.TILE_UPDATES)  # as long as their mutants ask for
-_WAIT_S = 1.3  # the timeout of such a request: many ask for a second
 
 
 def run(turn: Turn) -> None:
@@ -71,26 +68,19 @@ class _Sender:
                 self._count(self._outcome(operation, payload))
 
     def _outcome(self, operation: str, payload: bytes) -> str:
-        waits = operation in _MAY_WAIT
         key = keys.operation_key(self._peer.map_name, operation)
-        timeout_s = _WAIT_S if waits else _REPLY_S
-        started = time.monotonic()
-        for reply in self._peer.session.get(key, payload=payload, timeout=timeout_s):
+        for reply in self._peer.session.get(key, payload=payload, timeout=_REPLY_S):
             if reply.ok is not None:
                 return "answered"
             data = reply.err.payload.to_bytes()
             try:
                 code = codec.decode(ErrorReply, data).code
             except FormatError:
-                if waits:
-                    return "still waiting"
-                self._broke(operation, payload, f"no reply within {timeout_s} s ({data!r:.40})")
+                self._broke(operation, payload, f"no reply within {_REPLY_S} s ({data!r:.40})")
                 return "without reply"
             if code == "internal" or code not in ERROR_CODES:
                 self._broke(operation, payload, code)
             return "refused"
-        if waits and time.monotonic() > started + 0.9 * timeout_s:
-            return "still waiting"  # Zenoh does not always say that the time is over
         self._broke(operation, payload, "no reply at all")
         return "without reply"
 

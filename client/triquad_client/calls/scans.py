@@ -5,7 +5,7 @@ import secrets
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,8 +24,8 @@ from triquad_client.pose import PoseLike, rigid_pose
 
 _log = logging.getLogger("triquad_client")
 
-_REPLY_MARGIN_S = 5.0
-"""The delay that the server's answer that the time is over may have."""
+_FLUSH_PAUSES_S = 0.01, 0.1
+"""The pause until a server is asked again whether scans are in the map: it doubles, up to this."""
 
 _SETTLE_FLUSH_S = 5.0
 _SETTLE_PAUSE_S = 0.2
@@ -150,12 +150,11 @@ class ScanCalls:
         wait_s = checks.within("timeout_s", timeout_s, checks.LONGEST_S, least=0.0)
         if pending < 0:
             raise InvalidInputError(f"pending = {pending!r}: use 0 or more")
-        requests = list(self._requests(wait_s, pending))
-        # All at once: each waits for its source, and they share the time.
-        replies = list(self._connection.replies(map(_ask_flush, requests), at_once=len(requests)))
+        done = self._all_done(list(self._requests(pending)), wait_s)
+        replies = done.values()
         refusals = [
-            f"source {request.source!r}: {reply.last_refusal}"
-            for request, reply in zip(requests, replies, strict=True)
+            f"source {source!r}: {reply.last_refusal}"
+            for source, reply in done.items()
             if reply.last_refusal is not None
         ]
         warnings = tuple(line for reply in replies for line in (reply.warnings or "").splitlines())
@@ -221,7 +220,7 @@ class ScanCalls:
             _log.warning("%s", printable(text))
 
     def _dealt_with_by(self, deadline: float) -> bool:
-        """Return whether the scans are, after some waiting: servers bound the time of a request."""
+        """Return whether the scans are, after some waiting."""
         wait_s = min(max(deadline - time.monotonic(), 0.0), _SETTLE_FLUSH_S)
         try:
             self.flush(wait_s)
@@ -231,7 +230,39 @@ class ScanCalls:
             return False
         return True
 
-    def _requests(self, timeout_s: float, pending: int) -> Iterator[FlushRequest]:
+    def _all_done(self, requests: list[FlushRequest], timeout_s: float) -> dict[str, FlushReply]:
+        """Return the last reply about each source, once all their scans are dealt with.
+
+        Raises:
+            RefusedError: ``timeout``: some are not, after ``timeout_s``.
+        """
+        started = time.monotonic()
+        pause_s, longest_s = _FLUSH_PAUSES_S
+        done: dict[str, FlushReply] = {}
+        while True:
+            waited_s = time.monotonic() - started
+            asks = [
+                Ask(keys.FLUSH, replace(request, waited_s=waited_s), FlushReply)
+                for request in requests
+            ]
+            replies = list(self._connection.replies(asks, at_once=len(asks)))
+            for request, reply in zip(requests, replies, strict=True):
+                if reply.done:
+                    done[request.source] = reply
+            requests = [request for request in requests if request.source not in done]
+            if not requests:
+                return done
+            if waited_s >= timeout_s:
+                first = requests[0]
+                raise RefusedError(
+                    "timeout",
+                    f"scan {first.sequence} of source {first.source!r} is not in the map after "
+                    f"{timeout_s:g} s",
+                )
+            time.sleep(min(pause_s, max(0.0, timeout_s - waited_s)))
+            pause_s = min(2 * pause_s, longest_s)
+
+    def _requests(self, pending: int) -> Iterator[FlushRequest]:
         """Yield one request per source; the scans that may be pending are shared out among them."""
         with self._lock:
             states = dict(self._sources)
@@ -242,13 +273,8 @@ class ScanCalls:
                     source=source,
                     session=state.session,
                     sequence=target,
-                    timeout_s=timeout_s,
+                    waited_s=0.0,
                 )
-
-
-def _ask_flush(request: FlushRequest) -> Ask[FlushReply]:
-    wait_s = request.timeout_s + _REPLY_MARGIN_S
-    return Ask(keys.FLUSH, request, FlushReply, min_timeout_s=wait_s)
 
 
 def _check_time(deadline: float, timeout_s: float) -> None:

@@ -2,7 +2,6 @@
 
 import hashlib
 import math
-import secrets
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -76,8 +75,7 @@ class FollowedMesh:
     minimum: Doubles  # [3] metres, map frame
     maximum: Doubles  # [3]
     level: int
-    max_bytes_per_s: int  # 0: whatever the server allows
-    name: str  # on which the server counts these bytes
+    reply_bytes: int  # of the tiles of one reply, at most
     max_bytes: int  # of memory, for all tiles
     server: str = ""  # which reported all below
     tile_side_m: float = math.nan
@@ -86,7 +84,7 @@ class FollowedMesh:
     stale: frozenset[TileIndex] = frozenset()  # tiles of a server that is no more
     revision: int = 0
     epoch: int = 0
-    complete: bool = False  # the last reply left nothing waiting
+    complete: bool = False  # the last reply left nothing to come
 
     @classmethod
     def initial(
@@ -106,7 +104,7 @@ class FollowedMesh:
         minimum, maximum = checks.box(bounds)
         checks.level_of_detail(level)
         rate = checks.bytes_per_second(max_bytes_per_s)
-        empty = cls(minimum, maximum, level, rate, secrets.token_hex(8), max_bytes)
+        empty = cls(minimum, maximum, level, min(rate or _REPLY_BYTES, _REPLY_BYTES), max_bytes)
         if known is None:
             return empty
         if not isinstance(known, KnownTiles):
@@ -123,8 +121,8 @@ class FollowedMesh:
         }
         return replace(empty, server=known.server, tile_side_m=side_m, tiles=tiles)
 
-    def request(self, wait_s: float) -> TileUpdatesRequest:
-        """Return what to ask; the server answers once something changed, or after ``wait_s``."""
+    def request(self) -> TileUpdatesRequest:
+        """Return what to ask."""
         # Until all is known, the server has to know which tiles are; then the revision says it.
         # Of more than may be named, the rest travels again.
         known = [] if self.complete else list(self.known_tiles().tiles.values())[:MAX_KNOWN_TILES]
@@ -136,10 +134,7 @@ class FollowedMesh:
             revision=self.revision,
             known=np.array([tile.index for tile in known], np.int32).reshape(-1, 3),
             known_versions=np.array([tile.version for tile in known], np.int64),
-            max_bytes=_REPLY_BYTES,
-            timeout_s=wait_s,
-            client=self.name,
-            max_bytes_per_s=self.max_bytes_per_s,
+            max_bytes=self.reply_bytes,
         )
 
     def after(self, reply: TileUpdates) -> "FollowedMesh":

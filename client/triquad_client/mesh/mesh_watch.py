@@ -25,7 +25,7 @@ from triquad_client.mesh.followed_mesh import (
 from triquad_client.mesh.mesh import Mesh
 from triquad_client.net.connection import Answering, Ask, cancellable
 
-_LONGEST_WAIT_S = 20.0  # of one request; then it is sent again
+_PAUSE_S = 0.25  # where nothing is new, until the server is asked again
 
 
 class _WatchClosedError(ClosedError):
@@ -80,12 +80,16 @@ class MeshWatch(WatchedTiles):
     old ones stay until then. Several threads may use it: each change is reported to one of them.
     """
 
-    def __init__(self, server: Answering, followed: FollowedMesh) -> None:
+    def __init__(
+        self, server: Answering, followed: FollowedMesh, max_bytes_per_s: int | None
+    ) -> None:
         """Use :meth:`Client.watch_mesh`."""
         self._server = server
         self._followed = followed
+        self._max_bytes_per_s = max_bytes_per_s or math.inf
+        self._ready_s = 0.0  # monotonic: until then, the bandwidth is used up
         self._changing = threading.Lock()
-        self._closed = False
+        self._closed = threading.Event()
         self._asking: list[zenoh.CancellationToken] = []
 
     def __enter__(self) -> "MeshWatch":
@@ -113,13 +117,14 @@ class MeshWatch(WatchedTiles):
         """
         ends = math.inf if timeout_s is None else checks.deadline(timeout_s)
         with suppress(_WatchClosedError), self._cancelled_by_close():
-            while True:
-                left_s = max(0.0, ends - time.monotonic())
-                update = self._update(min(left_s, _LONGEST_WAIT_S))
+            self._wait_until(min(self._ready_s, ends))
+            while time.monotonic() >= self._ready_s:
+                update = self._update()
                 if update.changed or update.removed:
                     return update
                 if time.monotonic() >= ends:
                     break
+                self._wait_until(min(max(self._ready_s, time.monotonic() + _PAUSE_S), ends))
         return None
 
     def catch_up(self, timeout_s: float = 60.0) -> None:
@@ -130,13 +135,14 @@ class MeshWatch(WatchedTiles):
             ClosedError: the watch was closed.
         """
         ends = checks.deadline(timeout_s)
-        wait_s = 0.0
         with self._cancelled_by_close():
-            while not (update := self._update(wait_s)).complete:
+            self._wait_until(min(self._ready_s, ends))
+            while not (update := self._update()).complete:
                 if time.monotonic() > ends:
                     raise RequestTimeoutError(f"the mesh is not complete after {timeout_s:g} s")
-                # Nothing came although there is something: the bandwidth is used up for a while.
-                wait_s = 0.0 if update.changed else 1.0
+                # Nothing came although there is something: the server is making it.
+                pause_s = 0.0 if update.changed else _PAUSE_S
+                self._wait_until(max(self._ready_s, time.monotonic() + pause_s))
 
     def mesh(self) -> Mesh:
         """Return the tiles as one mesh, faces by their centroids within the bounds."""
@@ -145,22 +151,30 @@ class MeshWatch(WatchedTiles):
     def close(self) -> None:
         """End: :meth:`next` returns ``None``, and iteration ends, also in other threads."""
         with self._changing:
-            self._closed = True
+            self._closed.set()
             for token in self._asking:
                 token.cancel()
 
     def _now(self) -> FollowedMesh:
         return self._followed
 
-    def _update(self, wait_s: float) -> MeshUpdate:
+    def _wait_until(self, time_s: float) -> None:
+        """Wait until a monotonic time, or until the watch is closed.
+
+        Raises:
+            ClosedError: it was closed.
+        """
+        if self._closed.wait(max(0.0, min(time_s - time.monotonic(), threading.TIMEOUT_MAX))):
+            raise _WatchClosedError
+
+    def _update(self) -> MeshUpdate:
         """Return what one reply changed: nothing where that of another call came first."""
         before = self._followed
-        request = before.request(wait_s)
-        reply = self._server.ask(
-            Ask(keys.TILE_UPDATES, request, TileUpdates, background=True, server_wait_s=wait_s)
-        )
+        ask = Ask(keys.TILE_UPDATES, before.request(), TileUpdates, background=True)
+        reply = self._server.ask(ask)
         after = before.after(reply)
         with self._changing:
+            self._ready_s = time.monotonic() + len(reply.data) / self._max_bytes_per_s
             now = self._followed
             if now is not before:  # by what is known now, the reply may be old
                 return MeshUpdate((), (), now.epoch, complete=now.complete, size_bytes=0)
@@ -179,13 +193,13 @@ class MeshWatch(WatchedTiles):
         """Let closing end what is asked meanwhile, with an error that says so."""
         with cancellable() as token:
             with self._changing:
-                if self._closed:
+                if self._closed.is_set():
                     raise _WatchClosedError
                 self._asking.append(token)
             try:
                 yield
             except TriquadError as error:
-                if self._closed:
+                if self._closed.is_set():
                     raise _WatchClosedError from error
                 raise
             finally:

@@ -57,7 +57,6 @@ class Ask(Generic[ReplyT]):
     kind: type[ReplyT]  # of the reply
     background: bool = False
     min_timeout_s: float = 0.0  # waits that long for the reply, where the connection would not
-    server_wait_s: float = 0.0  # and that much longer: the server may answer as late as that
 
 
 class Answering(ABC):
@@ -223,7 +222,7 @@ class Connection(Answering):
         return keys.operation_key(self.map_name, ask.operation)
 
     def _timeout_s(self, ask: Ask[Any]) -> float:
-        return max(self.timeout_s, ask.min_timeout_s) + ask.server_wait_s
+        return max(self.timeout_s, ask.min_timeout_s)
 
     def _broken(self, error: Exception) -> Exception:
         if self.is_closed:

@@ -1,10 +1,7 @@
 """Limits of requests that clients check before they send, and servers before they answer."""
 
 MAX_WAIT_S = 60.0
-"""The longest time that a request may wait for its answer, or for a change of the mesh."""
-
-MAX_FLUSH_S = 600.0
-"""The longest time that a client may wait for its scans to be in the map."""
+"""The longest time that a request may wait for its answer."""
 
 MIN_LENGTH_M = 1e-6
 """The least distance, range or grid cell: what is smaller is a mistake."""

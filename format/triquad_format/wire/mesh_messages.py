@@ -66,7 +66,7 @@ class MeshReply(MapReply):
 
 @dataclass(frozen=True)
 class TileUpdatesRequest(Message):
-    """Ask which mesh tiles in a box changed; answered once something did, or in time."""
+    """Ask which mesh tiles in a box changed; answered at once."""
 
     minimum: Point
     maximum: Point  # of the box, map frame; an open side is infinite
@@ -76,9 +76,6 @@ class TileUpdatesRequest(Message):
     known: TileIndices  # [H, 3] tiles that are known whatever the revision
     known_versions: Integers  # [H]
     max_bytes: int  # of the reply's tiles; a single tile may have more
-    timeout_s: float
-    client: str  # a name, on which max_bytes_per_s is counted
-    max_bytes_per_s: int  # 0: whatever the server allows
 
 
 @dataclass(frozen=True)
@@ -88,7 +85,7 @@ class TileUpdates(Message):
     server: Name
     revision: Count  # for the next request
     epoch: Epoch  # the tiles show this epoch, where complete
-    complete: bool  # nothing more waits
+    complete: bool  # nothing more is to come
     restart: bool  # the request spoke of another server: what was known of it is void
     tile_side_m: Annotated[float, Within(MIN_LENGTH_M, MAX_TILE_M)]
     cell_m: Annotated[float, Within(MIN_LENGTH_M, MAX_CELL_M)]

@@ -171,18 +171,19 @@ class ServerStatus(Message):
 
 @dataclass(frozen=True)
 class FlushRequest(Message):
-    """Wait until the scan ``sequence`` of this source and session has been dealt with."""
+    """Ask whether the scan ``sequence`` of this source and session has been dealt with."""
 
     source: str
     session: int
     sequence: int
-    timeout_s: float
+    waited_s: float  # how long ago this was first asked
 
 
 @dataclass(frozen=True)
 class FlushReply(Message):
     """Answer to :class:`FlushRequest`, with the counts of this source and session."""
 
+    done: bool  # the scan and those before it are dealt with, and the newest epoch shows them
     taken: Count
     refused: Count
     lost: Count

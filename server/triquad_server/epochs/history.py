@@ -55,14 +55,6 @@ class EpochHistory:
         self._epochs = {first.number: first}  # oldest first
         self._pins: dict[int, float] = {}  # when an epoch was last requested, in that order
         self._viewed: Counter[int] = Counter()  # requests that are handled with an epoch, by number
-        self._listeners: list[Callable[[], None]] = []
-
-    def listen(self, listener: Callable[[], None]) -> None:
-        """Call ``listener``, which must be quick, after each new epoch, in the mapper's thread.
-
-        Call this before any epoch but the first is added.
-        """
-        self._listeners.append(listener)
 
     def add(self, epoch: Epoch) -> None:
         """Make ``epoch`` the newest; older ones may be removed."""
@@ -71,8 +63,6 @@ class EpochHistory:
             self._published_s = self._clock()
             self._epochs[epoch.number] = epoch
             self._tidy()
-        for listener in self._listeners:
-            listener()
 
     def remove_expired(self) -> None:
         """Remove the epochs that have expired.

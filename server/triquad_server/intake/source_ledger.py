@@ -24,6 +24,8 @@ FORGOTTEN = "*"
 
 _MAX_COUNT = 2**63 - 1
 
+_NOTHING_YET = FlushReply(done=False, taken=0, refused=0, lost=0, last_refusal=None)
+
 
 @dataclass
 class ScanCounts:
@@ -87,13 +89,13 @@ class SourceLedger:
     """
 
     def __init__(self) -> None:
-        self.changed = threading.Condition()  # notified when the outcome of a scan may be known
+        self._lock = threading.Lock()
         self._sessions: OrderedDict[tuple[str, int], _Session] = OrderedDict()
         self._forgotten = ScanCounts(sessions=0)
 
     def arrive(self, scan: Scan) -> str | None:
         """Record a scan's arrival; return the reason if its sequence or stamp refuses it."""
-        with self.changed:
+        with self._lock:
             if not 0 <= scan.sequence < MAX_SEQUENCE:
                 return "bad_sequence"
             session = self._session(scan)
@@ -110,14 +112,13 @@ class SourceLedger:
                     f"scan {scan.sequence}: its stamp {scan.stamp_ns} ns lies before the "
                     f"{before_ns} ns of the scan before; stamp scans in order"
                 )
-                self.changed.notify_all()
                 return "time_backwards"
             session.waiting.append(scan.sequence)
             return None
 
     def take(self, scan: Scan) -> None:
         """Record that a scan went into the map."""
-        with self.changed:
+        with self._lock:
             session = self._leave_queue(scan)
             session.counts.taken += 1
             if session.unpublished is None:
@@ -125,48 +126,47 @@ class SourceLedger:
 
     def refuse(self, scan: Scan, text: str) -> None:
         """Record that a scan was refused: by the map, or before it was queued."""
-        with self.changed:
+        with self._lock:
             self._leave_queue(scan).refuse(f"scan {scan.sequence}: {text}")
 
     def push_out(self, scan: Scan) -> None:
         """Record that a scan was pushed out of the full queue."""
-        with self.changed:
+        with self._lock:
             self._leave_queue(scan).counts.pushed_out += 1
 
     def publish(self) -> None:
         """Record that an epoch shows all scans that were taken so far."""
-        with self.changed:
+        with self._lock:
             for session in self._sessions.values():
                 session.unpublished = None
-            self.changed.notify_all()
 
     def is_settled(self, source: str, session: int, sequence: int) -> bool:
         """Return whether a scan was taken, refused or lost."""
-        with self.changed:
+        with self._lock:
             known = self._sessions.get((source, session))
             return known is not None and known.is_settled(sequence)
 
     def outcome(
         self, source: str, session: int, sequence: int, *, overdue: bool = False
-    ) -> FlushReply | None:
-        """Return a session's counts, once the scan is settled and an epoch shows it if taken.
+    ) -> FlushReply:
+        """Return a session's counts; done once a scan is settled and an epoch shows it if taken.
 
         Scans that are ``overdue`` and did not arrive are answered as lost. That is not recorded:
         they may still come, and requests must neither push out nor delay sources of scans.
         """
-        with self.changed:
+        with self._lock:
             known = self._sessions.get((source, session))
             if known is None:
-                return _of_stranger(source, sequence) if overdue else None
-            missing = max(0, sequence - known.arrived)
-            newest = min(sequence, known.arrived)
-            if missing and not overdue:
-                return None
-            if not known.is_settled(newest) or not known.is_shown(newest):
-                return None
-            counts = known.counts
-            lost = min(_MAX_COUNT, counts.lost + missing)
-            return FlushReply(counts.taken, counts.refused, lost, counts.last_refusal)
+                return _of_stranger(source, sequence) if overdue else _NOTHING_YET
+            missing = max(0, sequence - known.arrived) if overdue else 0
+            newest = min(sequence, known.arrived) if overdue else sequence
+            return FlushReply(
+                done=known.is_settled(newest) and known.is_shown(newest),
+                taken=known.counts.taken,
+                refused=known.counts.refused,
+                lost=min(_MAX_COUNT, known.counts.lost + missing),
+                last_refusal=known.counts.last_refusal,
+            )
 
     def lost(self) -> dict[str, int]:
         """Return the number of lost scans, by source."""
@@ -174,7 +174,7 @@ class SourceLedger:
 
     def by_source(self) -> dict[str, ScanCounts]:
         """Return what became of the scans of each source, the one heard of last first."""
-        with self.changed:
+        with self._lock:
             found: dict[str, ScanCounts] = {}
             for (source, _), session in reversed(self._sessions.items()):
                 known = found.get(source, ScanCounts(sessions=0))
@@ -202,7 +202,6 @@ class SourceLedger:
         # One that was forgotten meanwhile knows of no scan.
         if scan.sequence in session.waiting:
             session.waiting.remove(scan.sequence)
-        self.changed.notify_all()
         return session
 
     def _session(self, scan: Scan) -> _Session:
@@ -220,6 +219,7 @@ class SourceLedger:
 def _of_stranger(source: str, sequence: int) -> FlushReply:
     """Return the reply about a session of which nothing is known."""
     return FlushReply(
+        done=True,
         taken=0,
         refused=0,
         lost=sequence + 1,

@@ -46,14 +46,7 @@ class TileCache:
         self.epoch = -1  # number of the epoch of the last refresh
         self._view: ComposedView | None = None  # epoch from which tiles are made
         self.revision = 0  # number of times that bytes of any tile came to differ
-        self.tiles_made = 0  # so far
         self._bytes = TileBytes(settings.cache_bytes)
-
-    @property
-    def made_from(self) -> int:
-        """Return the number of the epoch from which tiles are made; -1 after :meth:`release`."""
-        view = self._view
-        return -1 if view is None else view.epoch
 
     @property
     def nbytes(self) -> int:
@@ -64,22 +57,15 @@ class TileCache:
         """Return where the tiles of a level lie."""
         return self._levels[level].lattice
 
-    def refresh(self, epoch: Epoch, *, to_make: bool = True) -> None:
-        """Find what changed until ``epoch``; one older than the last changes nothing.
+    def refresh(self, epoch: Epoch) -> None:
+        """Find what changed until ``epoch``, of which tiles are made from now on.
 
-        Tiles are made from it from now on, unless none are made and none are to be
-        (``to_make``).
+        One older than the last changes nothing.
         """
         with self._lock:
             if epoch.number > self.epoch:
                 self._record_changes(epoch)
-            if epoch.number == self.epoch and (to_make or self._view is not None):
                 self._view = epoch.with_split()
-
-    def release(self) -> None:
-        """Keep no epoch for making tiles until the next refresh, since it takes memory."""
-        with self._lock:
-            self._view = None
 
     def changed(self, level: int, indices: NDArray[np.integer]) -> Longs:
         """Return the epochs [T] when the surface of tiles [T, 3] last changed; 0: none was seen."""
@@ -132,7 +118,6 @@ class TileCache:
         data = encode_tile(mesh.surface)
         digest = hashlib.sha256(data).digest()
         with self._lock:
-            self.tiles_made += 1
             old = tiles.tiles.get(index)
             if old is not None and old.digest == digest:
                 version, revision = old.version, old.revision

@@ -15,7 +15,7 @@ from triquad_map.questions.checks import check_box
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.mesh.tile_cache import TileCache
-from triquad_server.serving.operations import Operations, answering
+from triquad_server.serving.operations import Operations
 
 MAX_TILES = 1_000_000
 """The most tiles of one list."""
@@ -31,8 +31,8 @@ class TileQueries:
 
     def serve_on(self, operations: Operations) -> None:
         """Answer the requests of clients from now on."""
-        operations.serve(keys.TILE_LIST, answering(TileListRequest, self.tiles))
-        operations.serve(keys.MESH, answering(MeshRequest, self.mesh))
+        operations.serve(keys.TILE_LIST, TileListRequest, self.tiles)
+        operations.serve(keys.MESH, MeshRequest, self.mesh)
 
     def tiles(self, request: TileListRequest) -> TileList:
         """Return the tiles that meet the request's box.
@@ -49,7 +49,7 @@ class TileQueries:
         tiles = tiles[lattice.meets(tiles, request.minimum, request.maximum)]
         if len(tiles) > MAX_TILES:
             raise RefusedError("too_large", f"{len(tiles)} tiles: ask for a smaller box")
-        self._cache.refresh(epoch, to_make=False)
+        self._cache.refresh(epoch)
         changed = self._cache.changed(request.level, tiles)
         return TileList(
             epoch=epoch.number,

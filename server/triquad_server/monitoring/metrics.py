@@ -16,7 +16,7 @@ from triquad_server.health import Health
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.process.memory import resident_bytes
 from triquad_server.serving.operation_counts import BOUNDS_S
-from triquad_server.serving.operations import Lane, Operations, ReadQueue, answering
+from triquad_server.serving.operations import Lane, Operations
 from triquad_server.store.download import MapDownloads
 
 _MAX_SESSIONS = 1024  # that are listed
@@ -31,21 +31,18 @@ class Metrics:
     surface: SurfaceHistory
     tiles: TileCache
     downloads: MapDownloads
-    queues: dict[str, ReadQueue]  # of requests, by name
+    operations: Operations
 
-    def serve_on(self, operations: Operations) -> None:
+    def serve(self) -> None:
         """Answer the requests of clients, for these figures and for the status, from now on."""
-        for name, handler in {
-            keys.STATUS: answering(StatusRequest, lambda _: self.health.status()),
-            keys.METRICS: answering(MetricsRequest, lambda _: self.now()),
-        }.items():
-            operations.serve(name, handler, Lane.ADMINISTRATION)
+        lane = Lane.ADMINISTRATION
+        self.operations.serve(keys.STATUS, StatusRequest, lambda _: self.health.status(), lane)
+        self.operations.serve(keys.METRICS, MetricsRequest, lambda _: self.now(), lane)
 
     def now(self) -> ServerMetrics:
         """Return the figures as they are now."""
         health, mapper, scans = self.health, self.health.mapper, self.health.scans
         kept = health.epochs.kept()
-        queues = {name: read() for name, read in self.queues.copy().items()}
         transports = self.session.info.transports()[:_MAX_SESSIONS]
         return ServerMetrics(
             server=health.server,
@@ -57,7 +54,10 @@ class Metrics:
             epochs_pinned=kept.pinned,
             bounds_s=np.array(BOUNDS_S),
             operations={name: one.metrics() for name, one in health.operations.copy().items()},
-            queues={"scans": QueueMetrics(len(scans), scans.limit), **queues},
+            queues={
+                "scans": QueueMetrics(len(scans), scans.limit),
+                **self.operations.queue_metrics,
+            },
             sources=scans.ledger.metrics(),
             scan_bytes_received=scans.received_bytes,
             memory_bytes=self._memory_bytes(kept.epochs),

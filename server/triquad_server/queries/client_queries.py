@@ -22,7 +22,7 @@ from triquad_server.epochs.surface_history import SurfaceHistory
 from triquad_server.intake.source_trails import SourceTrails
 from triquad_server.queries.change_queries import ChangeQueries
 from triquad_server.queries.source_queries import SourceQueries
-from triquad_server.serving.operations import Operations, answering
+from triquad_server.serving.operations import Operations
 
 _REQUESTS: dict[str, type[Message]] = {
     keys.SDF: SdfRequest,
@@ -47,7 +47,7 @@ def serve_queries(
     """Answer queries from now on, each from one epoch; ``server`` is the name in replies."""
     answers = Answers(epochs.view, QuestionLimits())
     for name, kind in _REQUESTS.items():
-        operations.serve(name, answering(kind, answers.answer), max_bytes=_MAX_BYTES)
+        operations.serve(name, kind, answers.answer, max_bytes=_MAX_BYTES)
     changes, sources = ChangeQueries(epochs, surface, server), SourceQueries(trails, server)
-    operations.serve(keys.CHANGES, answering(ChangesRequest, changes.changes))
-    operations.serve(keys.SOURCES, answering(SourcesRequest, sources.sources))
+    operations.serve(keys.CHANGES, ChangesRequest, changes.changes)
+    operations.serve(keys.SOURCES, SourcesRequest, sources.sources)

@@ -1,4 +1,4 @@
-"""The operations that a server answers: each has a key, and all share two queues."""
+"""The operations that a server answers: each has a key, and a lane with a queue and workers."""
 
 import logging
 import time
@@ -15,62 +15,47 @@ from triquad_format.wire import keys
 from triquad_format.wire.codec import Message
 from triquad_format.wire.limits import MAX_WAIT_S
 from triquad_format.wire.metrics_messages import QueueMetrics
-from triquad_map.compiled.team import THREADS
+from triquad_map.compiled.team import THREADS, lower_priority
 
-from triquad_server.fair_queue import Owner
-from triquad_server.process.threads import submit
+from triquad_server.process.threads import NICENESS, submit
 from triquad_server.serving.client_sessions import ClientSessions
 from triquad_server.serving.operation_counts import OperationCounts
-from triquad_server.serving.refusals import Refusals
+from triquad_server.serving.refusal_sender import RefusalSender
 from triquad_server.serving.request import Request, RequestT
 from triquad_server.serving.request_queue import MOST_SENDING, QueueLimits, RequestQueue
 from triquad_server.settings import ServiceSettings
 
 _log = logging.getLogger(__name__)
 
-_WORKERS = max(2, THREADS)  # for queries: one per core
-_ADMINISTRATION_WORKERS = 2
-_QUEUE_BYTES = 64_000_000  # of the requests of all clients that wait
+_QUEUE_BYTES = 64_000_000  # of the requests of all clients that wait in a lane
 _PLAIN_BYTES = 16_384  # of a request that holds neither points nor tiles
-_SLOW = "slow"
-"""The group of all requests that may take seconds: one of all clients is handled at a time."""
-
 _STOPPING = "the server is stopping"
-
-Handler = Callable[[Request], None]
-"""Reads the request and answers it, or raises :class:`RefusedError`."""
-
-ReadQueue = Callable[[], QueueMetrics]
-"""Returns the state of a queue now."""
 
 
 class Lane(Enum):
-    """The queue in which the requests of an operation wait."""
+    """The operations that share a queue and its workers."""
 
     QUESTIONS = "questions"
     ADMINISTRATION = "administration"
     """The lane of what takes no time: it is answered however many queries wait."""
 
-    SLOW = "slow"
-    """The lane of administration that may take seconds, one after the other."""
+    MESH = "mesh"
+    """The lane of the updates of those who follow the mesh; tiles are made one after the other."""
+
+    FILES = "files"
+    """The lane of checkpoints and map files, which take seconds, one after the other."""
+
+
+_WORKERS = {Lane.QUESTIONS: max(2, THREADS), Lane.ADMINISTRATION: 2, Lane.MESH: 1, Lane.FILES: 1}
+"""The threads of each lane; for questions there is one for each core."""
 
 
 @dataclass(frozen=True)
 class _Operation:
-    handle: Handler
+    answer: Callable[[Request], None]  # or it raises RefusedError
     counts: OperationCounts
     lane: Lane
-    queue: RequestQueue[Request]
     max_bytes: int
-
-
-def answering(kind: type[RequestT], answer: Callable[[RequestT], Message]) -> Handler:
-    """Return a handler that decodes a ``kind`` and replies with the result of ``answer``."""
-
-    def handle(request: Request) -> None:
-        request.answer(answer(request.read(kind)))
-
-    return handle
 
 
 class Operations:
@@ -88,37 +73,42 @@ class Operations:
         self._map_name = map_name
         self._give_way = give_way
         self._sessions = ClientSessions(session)
-        self._refusals = Refusals()
+        self._refusals = RefusalSender()
         self._operations: dict[str, _Operation] = {}  # by key
         self._queryables: list[zenoh.Queryable[Any]] = []
         self._pools: list[ThreadPoolExecutor] = []
         limits = QueueLimits(settings.request_queue, _QUEUE_BYTES)
-        self._questions = self._queue("worker", _WORKERS, limits)
-        self._administration = self._queue("administration", _ADMINISTRATION_WORKERS, limits)
+        self._queues = {lane: self._queue(lane, limits) for lane in Lane}
         self._stopping = self._closed = False
         self.counts: dict[str, OperationCounts] = {}  # by operation, such as "query/sdf"
-        self.queues: dict[str, ReadQueue] = {  # by name
-            "questions": lambda: self._questions.metrics,
-            "administration": lambda: self._administration.metrics,
-        }
 
     @property
     def own_name(self) -> str:
         """The name of the server in a request to itself, to have turns of its own."""
         return self._sessions.own_name
 
+    @property
+    def queue_metrics(self) -> dict[str, QueueMetrics]:
+        """The state of each queue, by its name."""
+        return {lane.value: queue.metrics for lane, queue in self._queues.items()}
+
     def serve(
         self,
         name: str,
-        handle: Handler,
+        kind: type[RequestT],
+        answer: Callable[[RequestT], Message],
         lane: Lane = Lane.QUESTIONS,
         max_bytes: int = _PLAIN_BYTES,
     ) -> None:
-        """Answer an operation from now on; requests larger than ``max_bytes`` are refused."""
+        """Answer an operation from now on; ``answer`` returns the reply to a ``kind``, or refuses.
+
+        Requests larger than ``max_bytes`` are refused.
+        """
         key = keys.operation_key(self._map_name, name)
         counts = self.counts[name] = OperationCounts()
-        queue = self._questions if lane is Lane.QUESTIONS else self._administration
-        self._operations[key] = _Operation(handle, counts, lane, queue, max_bytes)
+        self._operations[key] = _Operation(
+            lambda request: request.answer(answer(request.read(kind))), counts, lane, max_bytes
+        )
         # This runs in the network's own threads, so it only queues requests.
         receive = zenoh.handlers.Callback(partial(self._receive, key), indirect=False)
         self._queryables.append(self._session.declare_queryable(key, receive, complete=True))
@@ -126,9 +116,9 @@ class Operations:
     def stop(self) -> None:
         """Refuse all waiting and new requests."""
         self._stopping = True
-        for queue in (self._questions, self._administration):
+        for queue in self._queues.values():
             for request in queue.clear():
-                self._refusals.add(request, "busy", _STOPPING)
+                self._refusals.send(request, "busy", _STOPPING)
 
     def close(self) -> None:
         """Do as :meth:`stop`; return once all work is answered. Closing twice does no harm."""
@@ -144,9 +134,11 @@ class Operations:
         self._refusals.close()
         self._sessions.close()
 
-    def _queue(self, name: str, workers: int, limits: QueueLimits) -> RequestQueue[Request]:
+    def _queue(self, lane: Lane, limits: QueueLimits) -> RequestQueue[Request]:
         """Return a queue with workers, whose threads are started when they are needed."""
-        pool = ThreadPoolExecutor(workers + MOST_SENDING, name)
+        workers = _WORKERS[lane]
+        nice = NICENESS if lane is Lane.MESH else 0
+        pool = ThreadPoolExecutor(workers + MOST_SENDING, lane.value, lower_priority, (nice,))
         self._pools.append(pool)
         return RequestQueue(
             lambda request: submit(pool, self._work, request), workers=workers, limits=limits
@@ -164,22 +156,18 @@ class Operations:
     def _take(self, key: str, query: zenoh.Query) -> None:
         """Queue a request, or refuse it."""
         operation = self._operations[key]
+        queue = self._queues[operation.lane]
         source = self._sessions.source(query, MAX_WAIT_S)
-        owner = source.owner
-        if operation.lane is Lane.SLOW:
-            owner = Owner(_SLOW, owner.name)
-        request = Request(
-            query, key, operation.counts, owner, source.deadline_s, operation.queue.send
-        )
+        request = Request(query, key, operation.counts, source.owner, source.deadline_s, queue.send)
         if request.size > operation.max_bytes:
             text = f"{request.size} bytes exceed the limit of {operation.max_bytes}: split it"
-            self._refusals.add(request, "too_large", text)
+            self._refusals.send(request, "too_large", text)
         elif self._stopping:
-            self._refusals.add(request, "busy", _STOPPING)
+            self._refusals.send(request, "busy", _STOPPING)
         else:
-            for excess in operation.queue.put(request, request.size):
+            for excess in queue.put(request, request.size):
                 text = "too many requests wait already, most of them of this client; try later"
-                self._refusals.add(excess, "busy", text)
+                self._refusals.send(excess, "busy", text)
 
     def _work(self, request: Request) -> None:
         operation = self._operations[request.key]
@@ -188,13 +176,13 @@ class Operations:
             if operation.lane is Lane.QUESTIONS:
                 self._give_way()
             self._check(request)
-            operation.handle(request)
+            operation.answer(request)
         except RefusedError as error:
             request.refuse(error.code, error.message)
         except Exception as error:
             request.fail(error)
         finally:
-            operation.queue.finish(request)
+            self._queues[operation.lane].finish(request)
 
     def _check(self, request: Request) -> None:
         """Refuse a request whose client no longer waits."""

@@ -102,7 +102,7 @@ class RequestQueue(Generic[RequestT]):
             return True
 
     def finish(self, request: RequestT) -> None:
-        """End a request: its reply is sent, or another thread will answer it later."""
+        """End a request: its reply is sent."""
         with self._lock:
             self._working.discard(request)
             self._sending.pop(request, None)

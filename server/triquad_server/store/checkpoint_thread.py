@@ -18,7 +18,7 @@ from triquad_server.errors import LastCheckpointError, MapperStoppedError, Store
 from triquad_server.mapping.map_snapshot import MapSnapshot
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.process.threads import NICENESS
-from triquad_server.serving.operations import Lane, Operations, answering
+from triquad_server.serving.operations import Lane, Operations
 from triquad_server.store.store import Store
 
 _log = logging.getLogger(__name__)
@@ -107,8 +107,7 @@ class CheckpointThread:
 
     def serve_on(self, operations: Operations) -> None:
         """Answer the requests of clients from now on."""
-        handler = answering(CheckpointRequest, self.answer)
-        operations.serve(keys.CHECKPOINT, handler, Lane.SLOW)
+        operations.serve(keys.CHECKPOINT, CheckpointRequest, self.answer, Lane.FILES)
 
     def answer(self, _request: CheckpointRequest) -> CheckpointInfo:
         """Write a checkpoint of the map as it is now; return the last one if nothing changed.

@@ -13,7 +13,7 @@ from triquad_map.preview import previews_of
 
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.mapping.mapper_thread import MapperThread
-from triquad_server.serving.operations import Lane, Operations, answering
+from triquad_server.serving.operations import Lane, Operations
 from triquad_server.store.store import stamp_now_ns
 
 CHUNK_BYTES = 2**20
@@ -42,8 +42,8 @@ class MapDownloads:
 
     def serve_on(self, operations: Operations) -> None:
         """Answer the requests of clients from now on."""
-        operations.serve(keys.MAP_INFO, answering(MapInfoRequest, self.info), Lane.SLOW)
-        operations.serve(keys.MAP_CHUNK, answering(MapChunkRequest, self.chunk))
+        operations.serve(keys.MAP_INFO, MapInfoRequest, self.info, Lane.FILES)
+        operations.serve(keys.MAP_CHUNK, MapChunkRequest, self.chunk)
 
     @property
     def nbytes(self) -> int:

@@ -12,7 +12,7 @@ from triquad_server.intake.source_trails import SourceTrails
 from triquad_server.mapping.map_snapshot import MapSnapshot
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
-from triquad_server.serving.operations import Lane, Operations, answering
+from triquad_server.serving.operations import Lane, Operations
 from triquad_server.store.checkpoint_thread import CheckpointThread
 
 _log = logging.getLogger(__name__)
@@ -41,7 +41,7 @@ class Resets:
 
     def serve_on(self, operations: Operations) -> None:
         """Answer the requests of clients from now on."""
-        operations.serve(keys.RESET, answering(ResetRequest, self.answer), Lane.SLOW)
+        operations.serve(keys.RESET, ResetRequest, self.answer, Lane.FILES)
 
     def answer(self, request: ResetRequest) -> ResetReply:
         """Forget what lies in the request's box, and reply once an epoch shows it.

@@ -211,7 +211,7 @@ from triquad_format.wire.mesh_messages import TileUpdatesRequest, TileUpdates
 everywhere = np.full(3, np.inf)
 with triquad_client.connect(sys.argv[1]) as client:
     asks = TileUpdatesRequest(-everywhere, everywhere, 0, "", 0, np.zeros((0, 3), np.int32),
-        np.zeros(0, np.int64), 100_000_000, 60.0, "frozen", 0)
+        np.zeros(0, np.int64), 100_000_000)
     ask = Ask(keys.TILE_UPDATES, asks, TileUpdates, background=True)
     pending = [client._connection._send(ask) for _ in range(24)]
     print(len(client._connection._read(ask, next(iter(pending[0]))).data), flush=True)

@@ -1,8 +1,6 @@
 """Tiles that are made where the surface changed, and that meet whenever they were made."""
 
 import functools
-import gc
-import weakref
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
@@ -392,25 +390,3 @@ def test_when_tiles_changed_is_told_for_any_of_them() -> None:
     cache.refresh(first)  # an older one tells nothing
     asked = np.array([[2, 2, 0], [-2, -2, 0], [900, 0, 0]])
     assert cache.changed(0, asked).tolist() == [second.number, first.number, 0]
-
-
-def test_no_epoch_is_kept_for_tiles_that_nobody_wants() -> None:
-    cache = TileCache(MESH, TEAM)
-    first, second = ground(flat(0.3)), ground(flat(0.4))
-    cache.refresh(first)
-    made = make_all(cache, 0)
-    cache.refresh(second, to_make=False)  # somebody asked for a list
-    assert cache.made_from == second.number, "tiles that changed are not made of what was before"
-    surfels = [weakref.ref(region.surfels) for region in first.frozen_regions]
-    cache.release()
-    del first
-    gc.collect()
-    assert [kept() for kept in surfels] == [None] * len(surfels)
-    third = ground(flat(0.5))
-    cache.refresh(third, to_make=False)
-    assert cache.made_from == -1
-    cache.refresh(second)  # which it is too late for
-    assert cache.made_from == -1
-    cache.refresh(third)
-    assert cache.made_from == third.number
-    assert {index[:2] for index in make_all(cache, 0)} == {index[:2] for index in made}

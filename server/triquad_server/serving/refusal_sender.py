@@ -1,4 +1,4 @@
-"""Refuses requests before any worker begins with them."""
+"""Sends the refusals of requests with which no worker begins."""
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -15,15 +15,15 @@ network's thread, so that their sender waits for it and they take no memory."""
 _LARGE_BYTES = 65_536
 
 
-class Refusals:
-    """Refuses requests in threads of its own: a client may delay the reply for seconds."""
+class RefusalSender:
+    """Sends refusals in threads of its own: a client may delay the reply for seconds."""
 
     def __init__(self) -> None:
         self._threads = ThreadPoolExecutor(_THREADS, "refusals")
         self._lock = threading.Lock()
         self._waiting_bytes = 0
 
-    def add(self, request: Request, code: str, text: str) -> None:
+    def send(self, request: Request, code: str, text: str) -> None:
         """Refuse a request; ``code`` is one of ``ERROR_CODES``."""
         size = request.size
         with self._lock:

@@ -3,8 +3,8 @@
 import threading
 
 from support.servers import WAIT_S
-from triquad_server.serving import refusals as module
-from triquad_server.serving.refusals import Refusals
+from triquad_server.serving import refusal_sender as module
+from triquad_server.serving.refusal_sender import RefusalSender
 
 
 class Request:
@@ -23,13 +23,13 @@ class Request:
 def test_large_requests_that_are_refused_do_not_pile_up_behind_who_reads_nothing():
     reads, at_once = threading.Event(), threading.Event()
     at_once.set()
-    refusals = Refusals()
+    sender = RefusalSender()
     stuck = [Request(100, reads) for _ in range(module._THREADS)]
     large = [Request(module._MOST_BYTES // 2 + 1, at_once) for _ in range(10)]
     for request in (*stuck, *large):
-        refusals.add(request, "too_large", "")
+        sender.send(request, "too_large", "")
     assert sum(request.refused_by is None for request in large) == 1
     assert large[-1].refused_by is threading.current_thread()
     reads.set()
-    refusals.close()
+    sender.close()
     assert all(request.refused_by for request in (*stuck, *large))
