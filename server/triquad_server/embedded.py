@@ -15,15 +15,12 @@ from triquad_format.wire.endpoints import full_endpoint
 
 from triquad_server.errors import ServerError
 from triquad_server.process.installed import require_libraries
-from triquad_server.process.phases import Phases
-from triquad_server.process.stop import Stop, Stops
+from triquad_server.process.stop import Stop, Stops, wait_for_stop
 
 if TYPE_CHECKING:
     from triquad_client import Client
 
-    from triquad_server.health import Health
     from triquad_server.launch_options import LaunchOptions
-    from triquad_server.self_question import SelfQuestion
     from triquad_server.settings import Settings
 
 _log = logging.getLogger("triquad_server")
@@ -31,7 +28,7 @@ _log = logging.getLogger("triquad_server")
 _WAKE_S = 0.2  # for when two threads wait for the end
 
 
-class _Run(Phases):
+class _Run:
     """Runs a server on a thread of its own, where no Ctrl-C interrupts an import or a checkpoint.
 
     Other threads wait for it by what C code alone locks: the locks of Python's own conditions and
@@ -41,7 +38,6 @@ class _Run(Phases):
     def __init__(self) -> None:
         self.stops: Stops = queue.SimpleQueue()
         self.has_ended = False
-        self._is_started = False
         self._started: queue.SimpleQueue[BaseException | None] = queue.SimpleQueue()
         self._why = Stop.ASKED
         self._error: BaseException | None = None
@@ -50,23 +46,22 @@ class _Run(Phases):
 
     def serve(self, options: "LaunchOptions") -> None:
         """Serve until asked to stop; runs on the thread."""
+        is_started = False
         try:
-            from triquad_server.launch import serve_until_stopped  # takes seconds
+            from triquad_server.launch import opened  # takes seconds
 
-            self._why = serve_until_stopped(options, self.stops, self)
+            with opened(options, self.stops):
+                is_started = True
+                self._started.put(None)
+                self._why = wait_for_stop(self.stops)
         except BaseException as error:
             self._error = error
-            if self._is_started:
+            if is_started:
                 _log.error("the server ended with an error: %s", error)  # maybe nobody closes it
             self._started.put(error)
         finally:
             self.has_ended = True
             self._running.release()
-
-    def serving(self, health: "Health", question: "SelfQuestion") -> None:  # noqa: ARG002
-        """Report that the server has started."""
-        self._is_started = True
-        self._started.put(None)
 
     def wait_for_start(self) -> None:
         """Wait until it serves; raises the error that keeps it from serving."""

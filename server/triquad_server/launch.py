@@ -3,8 +3,8 @@
 import logging
 import sys
 import threading
-from collections.abc import Callable
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
 from typing import TYPE_CHECKING
 
 from triquad_format.errors import SettingsError
@@ -14,16 +14,12 @@ from triquad_server.launch_options import LaunchOptions
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.net.configuration import Configuration, configuration
 from triquad_server.net.session import open_session
-from triquad_server.network_defaults import network_defaults
 from triquad_server.process.memory import give_back_early
 from triquad_server.process.open_files import allow_open_files
-from triquad_server.process.phases import Phases
 from triquad_server.process.service_manager import ServiceManager
 from triquad_server.process.stop import Stop, Stops, wait_for_stop
 from triquad_server.process.threads import Teams
-from triquad_server.self_question import SelfQuestion
-from triquad_server.served_map import ServedMap
-from triquad_server.service import Service
+from triquad_server.service import ServedMap, Service
 from triquad_server.settings import Settings
 from triquad_server.store.restore import ValidCheckpoint
 from triquad_server.store.store import Store
@@ -40,7 +36,11 @@ _SWITCH_INTERVAL_S = 0.0005
 answered in a few milliseconds, which is Python's default for a single turn."""
 
 
-class _StoppedEarlyError(Exception):
+Report = Callable[[str], None]
+"""Receives the name of each stage of the start before it begins."""
+
+
+class StoppedEarlyError(Exception):
     """The server was asked to stop before it had started."""
 
 
@@ -57,7 +57,16 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
     if options.store is None:
         _log.warning("no --store: the map is not kept when the server stops")
     with closing(Supervision(ServiceManager())) as supervision:
-        return serve_until_stopped(options, stops, supervision)
+        try:
+            with opened(options, stops, supervision.starting) as service:
+                supervision.serving(service)
+                why = wait_for_stop(stops)
+                _log.info("stopping, %s", why.value)
+                supervision.stopping()
+        except StoppedEarlyError:
+            why = stops.get()
+        _log.info("stopped")
+        return why
 
 
 def _stop_where_a_thread_ends(stops: Stops) -> None:
@@ -71,45 +80,40 @@ def _stop_where_a_thread_ends(stops: Stops) -> None:
     threading.excepthook = tell_and_stop
 
 
-def serve_until_stopped(options: LaunchOptions, stops: Stops, phases: Phases) -> Stop:
-    """Serve until something is put into ``stops``, write a last checkpoint, and return it.
+@contextmanager
+def opened(
+    options: LaunchOptions, stops: Stops, starting: Report = lambda _: None
+) -> Iterator[Service]:
+    """Yield a server; after the context, it has written a last checkpoint and is closed.
 
     Signals, and what else belongs to the process as a whole, are left as they are.
 
     Args:
         options: what the server is started with.
-        stops: where it is asked to stop; before it has started, too.
-        phases: receives the steps of the run.
+        stops: where it may be asked to stop before it has started.
+        starting: is told the stages of the start.
 
     Raises:
         ServerError: the server cannot start; its subclasses name the cause.
+        StoppedEarlyError: it was asked to stop before it had started.
     """
-    try:
-        with ExitStack() as stack:
-            _open(options, stops, phases, stack)
-            why = wait_for_stop(stops)
-            _log.info("stopping, %s", why.value)
-            phases.stopping()
-    except _StoppedEarlyError:
-        why = stops.get()
-        phases.stopping()
-    _log.info("stopped")
-    return why
+    with ExitStack() as stack:
+        yield _open(options, stops, starting, stack)
 
 
-def _open(options: LaunchOptions, stops: Stops, phases: Phases, stack: ExitStack) -> None:
+def _open(options: LaunchOptions, stops: Stops, starting: Report, stack: ExitStack) -> Service:
     """Open all parts of a server, to be closed by ``stack``."""
     device = choose_device(options.device)
     settings = options.settings
-    network = configuration(options.network, network_defaults(options.map_name, settings))
+    network = configuration(options.network, options.map_name, settings)
     monitoring = _open_monitoring(settings, stack)
-    store = _open_store(options, phases, stack)
-    restored = None if store is None else _restored(store, options, phases)
+    store = _open_store(options, starting, stack)
+    restored = None if store is None else _restored(store, options, starting)
     if restored is not None:
         settings = _settings_of(restored, settings)
     teams = stack.enter_context(closing(Teams()))
-    warm_up(settings, device, teams, _before_each_step(stops, phases))
-    phases.starting("opening the map")
+    warm_up(settings, device, teams, _before_each_step(stops, starting))
+    starting("opening the map")
     mapper = Mapper(
         options.map_name,
         settings,
@@ -132,8 +136,7 @@ def _open(options: LaunchOptions, stops: Stops, phases: Phases, stack: ExitStack
         stack.enter_context(monitoring.showing(service.metrics))
     _log_who_gets_in(network)
     _log_ready(options, network, service.epoch, device)
-    question = SelfQuestion(session, options.map_name, service.own_name)
-    phases.serving(service.health, question)
+    return service
 
 
 def _open_monitoring(settings: Settings, stack: ExitStack) -> "MonitoringServer | None":
@@ -146,21 +149,21 @@ def _open_monitoring(settings: Settings, stack: ExitStack) -> "MonitoringServer 
     return stack.enter_context(closing(MonitoringServer(settings.metrics)))
 
 
-def _open_store(options: LaunchOptions, phases: Phases, stack: ExitStack) -> Store | None:
+def _open_store(options: LaunchOptions, starting: Report, stack: ExitStack) -> Store | None:
     """Open the store, if there is one, restored to an older checkpoint if one is asked for."""
     if options.store is None:
         return None
     store = Store(options.store, options.map_name, options.settings.store)
     stack.enter_context(closing(store))
     if options.restore is not None:
-        phases.starting(f"taking the map back to epoch {options.restore}")
+        starting(f"taking the map back to epoch {options.restore}")
         store.restore(options.restore)
     return store
 
 
-def _restored(store: Store, options: LaunchOptions, phases: Phases) -> ValidCheckpoint | None:
+def _restored(store: Store, options: LaunchOptions, starting: Report) -> ValidCheckpoint | None:
     """Return the checkpoint from which the map goes on, if there is one."""
-    phases.starting("restoring the newest checkpoint")
+    starting("restoring the newest checkpoint")
     restored = store.newest()
     if restored is None:
         return None
@@ -194,13 +197,13 @@ def _settings_of(restored: ValidCheckpoint, settings: Settings) -> Settings:
     return kept
 
 
-def _before_each_step(stops: Stops, phases: Phases) -> Callable[[str], None]:
+def _before_each_step(stops: Stops, starting: Report) -> Report:
     """Report a step of the warm-up, and end the start if the server is asked to stop."""
 
     def begin(step: str) -> None:
         if not stops.empty():
-            raise _StoppedEarlyError
-        phases.starting(f"preparing compiled code: {step}")
+            raise StoppedEarlyError
+        starting(f"preparing compiled code: {step}")
 
     return begin
 

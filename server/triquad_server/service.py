@@ -3,9 +3,11 @@
 import secrets
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import dataclass, field
 
 import zenoh
 from triquad_format.wire import keys
+from triquad_format.wire.messages import CheckpointInfo
 
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.epochs.surface_history import CHANGES_KEPT, SurfaceHistory
@@ -15,19 +17,33 @@ from triquad_server.intake.scan import ScanIntake
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.intake.source_trails import SourceTrails
+from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapListeners, MapperThread
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_queries import TileQueries
 from triquad_server.mesh.update_queries import UpdateQueries
 from triquad_server.monitoring.metrics import Metrics
+from triquad_server.process.threads import Teams
 from triquad_server.queries.client_queries import serve_queries
-from triquad_server.served_map import ServedMap
 from triquad_server.serving.operations import Operations
 from triquad_server.settings import Settings
 from triquad_server.store.checkpoint_thread import CheckpointThread
 from triquad_server.store.download import MapDownloads
 from triquad_server.store.resets import Resets
 from triquad_server.store.scrub import Scrubber
+from triquad_server.store.store import Store
+
+
+@dataclass(frozen=True)
+class ServedMap:
+    """A map that is handed over to a service; nothing else may use it from then on."""
+
+    name: str
+    mapper: Mapper
+    device: str  # device of the mapper
+    store: Store | None = None  # store of its checkpoints
+    restored: CheckpointInfo | None = None  # checkpoint that it was restored from
+    teams: Teams = field(default_factory=Teams)  # teams that make mesh tiles
 
 
 class Service:
@@ -41,7 +57,7 @@ class Service:
         failed: Callable[[], None] = lambda: None,
     ) -> None:
         """Begin to serve; ``failed`` is called if mapping stops by an internal error."""
-        self._session = session
+        self.session = session
         self._served = served
         self._settings = settings
         self._scans = ScanQueue(settings.service.scan_queue)
@@ -110,7 +126,7 @@ class Service:
         downloads.serve_on(self._operations)
         self.metrics = Metrics(
             health,
-            self._session,
+            self.session,
             self._surface,
             tiles=tiles,
             downloads=downloads,
@@ -146,9 +162,9 @@ class Service:
 
     def _announce(self, health: Health) -> None:
         """Say that the server is there, until it closes."""
-        self._parts.callback(Heartbeat(self._session, health).close)
+        self._parts.callback(Heartbeat(self.session, health).close)
         alive = keys.alive_key(health.map_name, health.server)
-        self._parts.callback(self._session.liveliness().declare_token(alive).undeclare)
+        self._parts.callback(self.session.liveliness().declare_token(alive).undeclare)
 
     def _open_mapper(self, failed: Callable[[], None]) -> MapperThread:
         warnings, trails = self._warnings, self._trails
@@ -172,7 +188,7 @@ class Service:
 
     def _open_intake(self) -> None:
         intake = ScanIntake(
-            self._session,
+            self.session,
             self._served.name,
             self._scans,
             max_points=self._settings.scan.max_points,

@@ -3,10 +3,15 @@
 import logging
 import threading
 
-from triquad_server.health import STUCK_S, Health
-from triquad_server.process.phases import Phases
+import numpy as np
+import zenoh
+from triquad_format.errors import WireError
+from triquad_format.wire import codec, keys
+from triquad_format.wire.messages import ErrorReply, RequestOrigin, SdfRequest
+
+from triquad_server.health import STUCK_S
 from triquad_server.process.service_manager import ServiceManager
-from triquad_server.self_question import SelfQuestion
+from triquad_server.service import Service
 
 _log = logging.getLogger(__name__)
 
@@ -14,7 +19,7 @@ _STATUS_PERIOD_S = 10.0  # where the manager does not set how often to report
 _SOONER = 10  # factor by which a server that was not well is checked again sooner
 
 
-class Supervision(Phases):
+class Supervision:
     """Notifies the service manager of a server that is a process of its own.
 
     It reports that the server is alive as long as maps are learnt and queries are answered: once
@@ -33,13 +38,11 @@ class Supervision(Phases):
         """Report which stage of the start begins."""
         self._manager.starting(stage)
 
-    def serving(self, health: Health, question: SelfQuestion) -> None:
+    def serving(self, service: Service) -> None:
         """Report that the server serves, and from now on its state."""
-        self._manager.notify("READY=1", status=health.summary())
+        self._manager.notify("READY=1", status=service.health.summary())
         if self._manager.listens:
-            self._thread = threading.Thread(
-                target=self._run, args=(health, question), name="supervision"
-            )
+            self._thread = threading.Thread(target=self._run, args=(service,), name="supervision")
             self._thread.start()
 
     def stopping(self) -> None:
@@ -55,16 +58,16 @@ class Supervision(Phases):
         if self._thread is not None:
             self._thread.join()
 
-    def _run(self, health: Health, question: SelfQuestion) -> None:
+    def _run(self, service: Service) -> None:
         watchdog_s = self._manager.watchdog_s
         period_s = _STATUS_PERIOD_S if watchdog_s is None else watchdog_s / 2
         while not self._closing.wait(period_s if self._was_well else period_s / _SOONER):
             problem = None
             if watchdog_s is not None and not self._stopping.is_set():
-                problem = _problem(health, question, watchdog_s)
+                problem = _problem(service, watchdog_s)
             self._report(None if self._stopping.is_set() else problem)
             if not self._stopping.is_set():
-                self._manager.notify(status=health.summary())
+                self._manager.notify(status=service.health.summary())
 
     def _report(self, problem: str | None) -> None:
         """Report that the server is alive, or log why not."""
@@ -75,7 +78,35 @@ class Supervision(Phases):
         self._was_well = problem is None
 
 
-def _problem(health: Health, question: SelfQuestion, watchdog_s: float) -> str | None:
+def _problem(service: Service, watchdog_s: float) -> str | None:
     """Return why the server does not map, or does not answer; ``None`` if it does both."""
-    mapping = health.mapping_problem(min(STUCK_S, watchdog_s))
-    return mapping or question.problem(timeout_s=watchdog_s / 2)
+    mapping = service.health.mapping_problem(min(STUCK_S, watchdog_s))
+    return mapping or _question_problem(service, timeout_s=watchdog_s / 2)
+
+
+def _question_problem(service: Service, timeout_s: float) -> str | None:
+    """Query the field at one point, as clients do; return an error if no answer came in time.
+
+    A refusal, where too many requests wait, is an answer. The server has turns of its own, as any
+    client.
+    """
+    request = SdfRequest(np.zeros(3), np.zeros((1, 3), np.float32), gradient=False, epoch=0)
+    replies = service.session.get(
+        keys.operation_key(service.health.map_name, keys.SDF),
+        payload=codec.encode(request),
+        attachment=codec.encode(RequestOrigin(service.own_name, timeout_s)),
+        timeout=timeout_s,
+        allowed_destination=zenoh.Locality.SESSION_LOCAL,
+    )
+    if any(reply.err is None or _is_ours(reply.err) for reply in replies):
+        return None
+    return f"a question that the server asked itself got no answer within {timeout_s:g} s"
+
+
+def _is_ours(error: zenoh.ReplyError) -> bool:
+    """Return whether an error comes from the server, not from Zenoh, whose wait has ended."""
+    try:
+        codec.decode(ErrorReply, error.payload.to_bytes())
+    except WireError:
+        return False
+    return True

@@ -1,6 +1,5 @@
 """The figures of a server with a real map, asked by the real client over the loopback."""
 
-
 import numpy as np
 import pytest
 import triquad_client

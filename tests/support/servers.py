@@ -25,9 +25,7 @@ from triquad_format.wire.zenoh_config import QUIET, put
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.net.configuration import NetworkOptions, configuration
 from triquad_server.net.session import open_session
-from triquad_server.network_defaults import network_defaults
-from triquad_server.served_map import ServedMap
-from triquad_server.service import Service
+from triquad_server.service import ServedMap, Service
 from triquad_server.settings import Settings, TrainingSettings
 from triquad_server.store.restore import ValidCheckpoint
 from triquad_server.store.store import Store
@@ -77,9 +75,7 @@ def running_service(
     """A service in this process; yields its endpoint, a free one unless it is given."""
     compiled()
     endpoint = endpoint or free_endpoint()
-    network = configuration(
-        NetworkOptions((endpoint,), connect), network_defaults(map_name, settings)
-    )
+    network = configuration(NetworkOptions((endpoint,), connect), map_name, settings)
     opened = Store(store, map_name, settings.store) if store else None
     restored: ValidCheckpoint | None = opened.newest() if opened else None
     mapper = Mapper(map_name, settings, "cpu", restored.record if restored else None)

@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import zenoh
-from triquad_format.wire.access_control import Grant, access_control
+from triquad_format.wire.access_control import access_control, without_credentials
 from triquad_format.wire.endpoints import DEFAULT_ENDPOINT, is_of_this_machine
+from triquad_format.wire.limits import MAX_QUERY_POINTS, payload_limit
 from triquad_format.wire.zenoh_config import QUIET, fill, is_set, put
 
 from triquad_server.errors import ServerError
+from triquad_server.settings import Settings
 
 _CONNECT_MS = 5000  # a router that was started together with the server may need a moment
 
@@ -21,6 +23,10 @@ _LINKS: Mapping[str, Any] = {
     "transport/unicast/accept_pending": 1000,
     "transport/unicast/max_sessions": 500,
 }
+
+_SENSOR_POINT_BYTES = 64
+"""The bytes of a point with all fields of lidar drivers, in messages for which a server is only the
+router."""
 
 _NO_SCOUTING = {"scouting/delay": 1}
 """How long a router waits for others as it starts [ms], 500 by default; without scouting, none
@@ -36,14 +42,6 @@ class NetworkOptions:
     mode: str | None = None
     config_file: Path | None = None
     multicast_scouting: bool | None = None
-
-
-@dataclass(frozen=True)
-class NetworkDefaults:
-    """The network defaults of a server, where a file does not set others."""
-
-    grants: tuple[Grant, ...]  # who may do what
-    max_message_bytes: int
 
 
 @dataclass(frozen=True)
@@ -81,8 +79,8 @@ class Configuration:
         return tuple(endpoints)
 
 
-def configuration(options: NetworkOptions, defaults: NetworkDefaults) -> Configuration:
-    """Return the configuration of a server.
+def configuration(options: NetworkOptions, map_name: str, settings: Settings) -> Configuration:
+    """Return the configuration of the server of a map.
 
     What the options leave out is as the file has it; what both leave out is safe: a router
     that only this machine reaches, that neither looks for others nor is found, and that takes no
@@ -92,20 +90,20 @@ def configuration(options: NetworkOptions, defaults: NetworkDefaults) -> Configu
         ServerError: the file cannot be read, or a value is not valid.
     """
     try:
-        return _configuration(options, defaults)
+        return _configuration(options, _safe(map_name, settings))
     except (zenoh.ZError, ValueError, OSError) as error:
         file = "" if options.config_file is None else f" {options.config_file}"
         raise ServerError(f"Zenoh configuration{file}: {first_line(error)}") from error
 
 
-def _configuration(options: NetworkOptions, defaults: NetworkDefaults) -> Configuration:
+def _configuration(options: NetworkOptions, safe: dict[str, Any]) -> Configuration:
     unset = zenoh.Config()
     file = options.config_file
     config = zenoh.Config() if file is None else zenoh.Config.from_file(str(file))
     put(config, _of_options(options))
     fill(config, {"mode": "router"}, unset)
     is_own = not is_set(config, "access_control", unset)
-    fill(config, _safe(defaults), unset)
+    fill(config, safe, unset)
     if not json.loads(config.get_json("scouting/multicast/enabled")):
         fill(config, _NO_SCOUTING, unset)
     found = Configuration(config, own_access_control=is_own)
@@ -131,13 +129,24 @@ def _of_options(options: NetworkOptions) -> dict[str, Any]:
     return given
 
 
-def _safe(defaults: NetworkDefaults) -> dict[str, Any]:
+def _safe(map_name: str, settings: Settings) -> dict[str, Any]:
+    """Return what holds where neither options nor a file set something else."""
     return {
         **QUIET,
         **_LINKS,
-        "transport/link/rx/max_message_size": defaults.max_message_bytes,
-        "access_control": access_control(defaults.grants),
+        "transport/link/rx/max_message_size": _max_message_bytes(settings.scan.max_points),
+        "access_control": access_control(without_credentials(map_name)),
     }
+
+
+def _max_message_bytes(scan_points: int) -> int:
+    """Return the largest message that is received at all.
+
+    It is twice the largest that is answered: what is somewhat too large is refused with the reason,
+    and only what is far beyond gets no answer.
+    """
+    largest = 2 * payload_limit(max(MAX_QUERY_POINTS, scan_points))
+    return max(largest, payload_limit(0) + scan_points * _SENSOR_POINT_BYTES)
 
 
 def first_line(error: Exception) -> str:

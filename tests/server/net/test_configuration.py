@@ -9,7 +9,6 @@ import triquad_server.net.configuration as network
 from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
 from triquad_server.errors import ServerError
 from triquad_server.net.configuration import Configuration, NetworkOptions
-from triquad_server.network_defaults import network_defaults
 from triquad_server.settings import Settings
 
 SAFE = {
@@ -30,9 +29,7 @@ SAFE = {
 def of_file(folder: Path, text: str, **options: Any) -> Configuration:
     file = folder / "zenoh.json5"
     file.write_text(text)
-    return network.configuration(
-        NetworkOptions(config_file=file, **options), network_defaults("lab", Settings())
-    )
+    return network.configuration(NetworkOptions(config_file=file, **options), "lab", Settings())
 
 
 def values(config: Configuration) -> dict[str, Any]:
@@ -40,7 +37,7 @@ def values(config: Configuration) -> dict[str, Any]:
 
 
 def test_what_is_not_set_is_safe(tmp_path):
-    plain = network.configuration(NetworkOptions(), network_defaults("lab", Settings()))
+    plain = network.configuration(NetworkOptions(), "lab", Settings())
     assert values(plain) == SAFE
     assert not plain.listens_beyond
     assert values(of_file(tmp_path, "{ timestamping: { enabled: true } }")) == SAFE
