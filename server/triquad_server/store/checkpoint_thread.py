@@ -143,21 +143,27 @@ class CheckpointThread:
         base = self.base_epoch
         return self.write_changes(self._mapper.call(lambda mapper: mapper.snapshot_since(base)))
 
-    def write_changes(self, snapshot: MapSnapshot) -> CheckpointInfo:
-        """Write what changed since the last checkpoint; only for jobs on this thread.
+    def write_changes(self, snapshot: MapSnapshot, undoes: str = "") -> CheckpointInfo:
+        """Write what changed since the last checkpoint, while a job on this thread waits for it.
+
+        A checkpoint that ``undoes`` something is written even if nothing changed.
 
         Raises:
             StoreError: it cannot be written.
         """
         last = self.last
         # The base is the last checkpoint, as long as its file and parts are there.
-        if last is not None and last.epoch == snapshot.epoch.number == self.base_epoch:
+        if (
+            not undoes
+            and last is not None
+            and last.epoch == snapshot.epoch.number == self.base_epoch
+        ):
             return last
         started = time.monotonic()
         try:
             changes = snapshot.changes()
             del snapshot  # the records have all of it, and memory is shortest now
-            info = self._opened.write(changes)
+            info = self._opened.write(changes, undoes)
         except Exception as error:
             self._counts = replace(self._counts, failed=self._counts.failed + 1)
             if isinstance(error, StoreError):
@@ -174,17 +180,6 @@ class CheckpointThread:
         )
         _log.info("checkpoint %s: epoch %d, %d bytes", info.path, info.epoch, info.bytes)
         return info
-
-    def mark_newest(self, undoes: str, instead_of: int | None = None) -> int:
-        """Have the newest checkpoint stay, and return its epoch; only for jobs on this thread.
-
-        Arguments are those of :meth:`Store.mark_newest`.
-
-        Raises:
-            StoreError: as of :meth:`Store.mark_newest`.
-        """
-        self.last = self._opened.mark_newest(undoes, instead_of)
-        return self.last.epoch
 
     @property
     def _opened(self) -> Store:

@@ -9,7 +9,6 @@ from triquad_map.questions.checks import check_box
 
 from triquad_server.errors import StoreError
 from triquad_server.intake.source_trails import SourceTrails
-from triquad_server.mapping.map_snapshot import MapSnapshot
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.serving.operations import Lane, Operations
@@ -77,32 +76,21 @@ class Resets:
         return mapper.publish().number
 
     def _keep_and_reset(self, request: ResetRequest) -> ResetReply:
-        """Write the map, forget what lies in the box, and write what was learnt meanwhile, too."""
+        """Write the map, and what was learnt meanwhile; then forget what lies in the box."""
         checkpoints = self._checkpoints
-        kept: int | None = None
         if self._mapper.call(lambda mapper: len(mapper.regions)) > 0:
-            checkpoints.write()
-            kept = checkpoints.mark_newest(_UNDOES)
+            checkpoints.write()  # nearly all of it, while mapping goes on
         base = checkpoints.base_epoch
 
-        def forget(mapper: Mapper) -> tuple[MapSnapshot, int]:
-            """Forget it, and return the map just before: no scan comes in between."""
-            return mapper.snapshot_since(base), self._forget(mapper, request)
+        def keep_and_forget(mapper: Mapper) -> ResetReply:
+            """Do so on the mapper's thread: no scan comes in between."""
+            if not mapper.regions:
+                return ResetReply(self._forget(mapper, request), undo="the map was empty before")
+            kept = checkpoints.write_changes(mapper.snapshot_since(base), _UNDOES).epoch
+            undo = (
+                f"epoch {kept}, the map before, is kept; to go back to it, stop the server and "
+                f"start it with --restore {kept}"
+            )
+            return ResetReply(self._forget(mapper, request), kept, undo)
 
-        before, epoch = self._mapper.call(forget)
-        if not before.regions:
-            return ResetReply(epoch, undo="the map was empty before")
-        lost = ""
-        try:
-            if checkpoints.write_changes(before).epoch != kept:
-                kept = checkpoints.mark_newest(_UNDOES, instead_of=kept)
-        except StoreError as error:
-            _log.error("what was learnt while the map before a reset was kept is lost: %s", error)
-            if kept is None:
-                return ResetReply(epoch, undo="what was learnt just before could not be kept")
-            lost = " (without what was learnt while it was written, which could not be kept)"
-        undo = (
-            f"epoch {kept}, the map before{lost}, is kept; to go back to it, stop the server and "
-            f"start it with --restore {kept}"
-        )
-        return ResetReply(epoch, kept, undo)
+        return self._mapper.call(keep_and_forget)

@@ -1,9 +1,22 @@
-"""Chooses the checkpoints that stay, without access to files."""
+"""Chooses the checkpoints of a map's folder that stay, and deletes the files of all others."""
 
+import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+
+from triquad_format.errors import FormatError, TooLargeMapFileError, UnsupportedMapFileError
+from triquad_format.mapfile.checkpoint import read_checkpoint
+from triquad_format.mapfile.checkpoint_folder import checkpoint_files, checkpoint_name, set_aside
+from triquad_format.mapfile.durable_file import sync_folder
+from triquad_format.mapfile.part_files import PartFiles
 
 from triquad_server.settings import StoreSettings
+
+_log = logging.getLogger(__name__)
+
+_UNFINISHED = ".*.tmp"
+"""The files left by a server that was killed, or whose disk was full, while it wrote."""
 
 _MIN_KEPT = 2
 """The number of newest checkpoints that always stay: should one be damaged, there is another."""
@@ -46,3 +59,61 @@ def files_of(checkpoints: Iterable[StoredCheckpoint]) -> dict[str, int]:
     for checkpoint in checkpoints:
         files |= checkpoint.files
     return files
+
+
+def delete_unneeded(folder: Path, settings: StoreSettings, newest: int | None = None) -> None:
+    """Delete unfinished files, checkpoints that need not stay, and parts that none names any more.
+
+    Without ``newest`` all checkpoints stay. Else those up to this epoch are counted and deleted: a
+    file with a higher number is damaged, or not this server's, and must not push out a valid
+    checkpoint. One that was set aside as damaged names its parts, too: the others can be saved.
+    """
+    parts = PartFiles(folder)
+    _delete([*folder.glob(_UNFINISHED), *parts.folder.glob(_UNFINISHED)])
+    try:
+        stored = {file: _read(file.path) for file in checkpoint_files(folder)}
+        aside = [_read(path) for path in set_aside(folder)]
+        if newest is not None:
+            counted = [file for file in stored if file.epoch <= newest]
+            names = files_of(staying([stored[file] for file in counted], settings))
+            unneeded = [file for file in counted if file.path.name not in names]
+            _delete(file.path for file in unneeded)
+            stored = {file: one for file, one in stored.items() if file not in unneeded}
+            # Else a power cut could leave a checkpoint whose parts are deleted.
+            sync_folder(folder)
+        needed = files_of([*stored.values(), *aside])
+        unneeded_parts = parts.names() - needed.keys()
+    except (FormatError, OSError) as error:
+        _log.warning("checkpoints and parts in %s stay, needed or not: %s", folder, error)
+        return
+    _delete(parts.folder / name for name in unneeded_parts)
+
+
+def _read(path: Path) -> StoredCheckpoint:
+    """Return what is needed of the file of a checkpoint; one that is damaged names no parts.
+
+    Raises:
+        FormatError: it may be valid, but cannot be read by this release, or now.
+        OSError: it cannot be read.
+    """
+    own = {path.name: path.stat().st_size}
+    try:
+        checkpoint = read_checkpoint(path)
+    except (UnsupportedMapFileError, TooLargeMapFileError):
+        raise
+    except FormatError:
+        return StoredCheckpoint(own)
+    if checkpoint is None:
+        return StoredCheckpoint(own)
+    parts = {entry.name: entry.stored for entry in checkpoint.manifest.entries}
+    restored = checkpoint.restored
+    restored_as = "" if restored is None else checkpoint_name(restored.as_epoch)
+    return StoredCheckpoint(own | parts, checkpoint.undoes, restored_as)
+
+
+def _delete(paths: Iterable[Path]) -> None:
+    for path in paths:
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            _log.warning("%s is not needed, but cannot be deleted: %s", path, error)

@@ -27,7 +27,7 @@ from triquad_format.mapfile.checkpoint_folder import (
 )
 from triquad_format.mapfile.manifest import Entry, Manifest
 from triquad_format.mapfile.metadata import MapFacts
-from triquad_format.mapfile.part_files import NewParts
+from triquad_format.mapfile.part_files import NewParts, PartFiles
 from triquad_format.mapfile.parts.pack import pack_region
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.record_check import check_record
@@ -43,7 +43,7 @@ from triquad_server.store.restore import (
     newest_valid,
     valid_checkpoint,
 )
-from triquad_server.store.store_folder import StoreFolder
+from triquad_server.store.retention import delete_unneeded
 from triquad_server.store.store_lock import StoreLock
 
 _log = logging.getLogger(__name__)
@@ -72,7 +72,7 @@ class Store:
         self.folder = root / map_name
         self._newest: _Newest | None = None
         self._restored: Restored | None = None  # the last time that the map was restored
-        self._files = StoreFolder(self.folder, settings)
+        self._settings = settings
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             self._lock = StoreLock(self.folder)
@@ -81,7 +81,7 @@ class Store:
                 f"store {self.folder} cannot be written to: {error.strerror or error}; choose "
                 "another --store, or let this user write there"
             ) from error
-        self._files.sweep()
+        delete_unneeded(self.folder, self._settings)
 
     def close(self) -> None:
         """Release the folder."""
@@ -102,7 +102,7 @@ class Store:
         except OSError:
             return None
         unchanged = hashlib.sha256(data).hexdigest() == newest.info.sha256
-        has_parts = all(map(self._files.parts.has, newest.manifest.entries))
+        has_parts = all(map(PartFiles(self.folder).has, newest.manifest.entries))
         return newest.info.epoch if unchanged and has_parts else None
 
     def newest(self) -> ValidCheckpoint | None:
@@ -117,8 +117,10 @@ class Store:
             self._restored = newest.checkpoint.restored
         return newest
 
-    def write(self, changes: MapChanges) -> CheckpointInfo:
+    def write(self, changes: MapChanges, undoes: str = "") -> CheckpointInfo:
         """Write a checkpoint of what changed since :attr:`base_epoch`; delete what need not stay.
+
+        One that ``undoes`` something, such as a reset, stays for longer.
 
         Raises:
             StoreError: it could not be written; the older ones are untouched.
@@ -127,7 +129,7 @@ class Store:
         path = self.folder / checkpoint_name(record.epoch)
         with self._writing(f"checkpoint {path} cannot be written"):
             check_record(record)
-            return self._write(self._manifest(record, changes.regions))
+            return self._write(self._manifest(record, changes.regions), undoes)
 
     def forget_base(self, name: str) -> bool:
         """Write all of the map next time, if the newest checkpoint needs the file ``name``."""
@@ -139,25 +141,6 @@ class Store:
             return False
         self._newest = None
         return True
-
-    def mark_newest(self, undoes: str, instead_of: int | None = None) -> CheckpointInfo:
-        """Have the newest checkpoint stay as one that undoes something; its file is written again.
-
-        One that was marked before, of the epoch ``instead_of``, stays no longer than others.
-
-        Raises:
-            StoreError: it cannot be written.
-        """
-        assert self._newest is not None, "mark_newest() comes after write()"
-        with self._writing(f"{self._newest.info.path} cannot be written"):
-            info = self._write(self._newest.manifest, undoes)
-        if instead_of is not None:
-            path = self.folder / checkpoint_name(instead_of)
-            # Else it stays longer than it need, which harms nobody.
-            with suppress(FormatError, OSError):
-                if (marked := read_checkpoint(path)) is not None:
-                    write_checkpoint(path, dataclasses.replace(marked, undoes=""))
-        return info
 
     def restore(self, epoch: int) -> None:
         """Restore the map to an older checkpoint, which is written again as the newest.
@@ -237,7 +220,7 @@ class Store:
             stamp_ns=manifest.stamp_ns,
         )
         self._newest = _Newest(manifest, info)
-        self._files.retain(info.epoch)
+        delete_unneeded(self.folder, self._settings, info.epoch)
         return info
 
     @contextmanager
@@ -251,7 +234,7 @@ class Store:
             self._lock.renew()
             yield
         except (FormatError, OSError) as error:
-            self._files.sweep()
+            delete_unneeded(self.folder, self._settings)
             raise StoreError(f"{failure}: {error}{hint()}") from error
 
     def _maps_beside(self) -> str:

@@ -360,24 +360,12 @@ def test_retention_by_bytes_counts_shared_parts_once(tmp_path):
 def test_what_undoes_something_stays_until_enough_others_do(tmp_path):
     with closing(Store(tmp_path, "lab", StoreSettings(keep=2, keep_resets=2))) as store:
         for epoch in range(1, 10):
-            store.write(changes(grown(epoch, epoch)))
-            if epoch in (2, 4, 6):
-                info = store.mark_newest("a reset")
-                assert store.base_epoch == info.epoch == epoch
+            info = store.write(
+                changes(grown(epoch, epoch)), "a reset" if epoch in (2, 4, 6) else ""
+            )
+            assert store.base_epoch == info.epoch == epoch
         assert sorted(paths(store)) == [4, 6, 8, 9]
         assert_same(read_map(paths(store)[4]), grown(4, 4))
-
-
-def test_a_mark_that_moves_to_a_later_checkpoint_counts_once(tmp_path):
-    """As of a reset during which scans arrive: the map is written before and after them."""
-    with closing(Store(tmp_path, "lab", StoreSettings(keep=2, keep_resets=2))) as store:
-        for epoch in range(1, 12):
-            store.write(changes(grown(epoch, epoch)))
-            if epoch in (2, 5, 8):
-                store.mark_newest("a reset")
-            if epoch in (3, 6, 9):
-                store.mark_newest("a reset", instead_of=epoch - 1)
-        assert sorted(paths(store)) == [6, 9, 10, 11]
 
 
 def test_a_checkpoint_that_is_replaced_within_a_tick_of_the_clock_is_read_again(tmp_path):
