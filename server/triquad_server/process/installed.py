@@ -4,7 +4,7 @@ import importlib.util
 
 from triquad_server.errors import ServerError
 
-_NEEDED = ("numba", "pydantic_settings")
+_NEEDED = ("numba", "pydantic")
 
 
 def require_libraries() -> None:

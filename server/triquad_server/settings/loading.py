@@ -4,18 +4,13 @@ import difflib
 import json
 import os
 import reprlib
-from collections.abc import Iterable
+import sys
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pydantic import Json, TypeAdapter, ValidationError
+from pydantic import ValidationError
 from pydantic_core import ErrorDetails
-from pydantic_settings import (
-    BaseSettings,
-    EnvSettingsSource,
-    SettingsConfigDict,
-    TomlConfigSettingsSource,
-)
 from triquad_format.errors import SettingsError
 
 from triquad_server.settings.leaf_lengths import follows_leaf
@@ -26,6 +21,11 @@ from triquad_server.settings.settings import (
     setting_schemas,
 )
 
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
 _PREFIX, _DELIMITER = "TRIQUAD_", "__"
 
 _PRESET_FOLDER = Path(__file__).with_name("presets")
@@ -34,22 +34,6 @@ PRESETS = ("street", "indoor", "tabletop", "long-range")
 """Settings that fit a kind of place and sensor; each is a file in the folder ``presets``."""
 
 _FILE = 1  # its place among the origins
-
-_READERS: dict[str, TypeAdapter[Any]] = {
-    "integer": TypeAdapter(int),
-    "number": TypeAdapter(float),
-    "boolean": TypeAdapter(bool),
-    "array": TypeAdapter(Json[list[Any]]),
-}
-"""What reads text, by the type in a setting's schema."""
-
-
-class _NamedSettings(Settings, BaseSettings):
-    """Settings with the names that they have in the environment."""
-
-    model_config = SettingsConfigDict(
-        env_prefix=_PREFIX, env_nested_delimiter=_DELIMITER, enable_decoding=False
-    )
 
 
 class _Origin(NamedTuple):
@@ -88,8 +72,8 @@ def load_settings(
     origins = [
         _Origin(f"preset {preset}", {} if preset is None else _read_preset(preset)),
         _Origin(f"settings file {file}", {} if file is None else _read_file(file)),
-        _Origin("environment", _as_in_a_file(_read_environment())),
-        _Origin("--set", _as_in_a_file(_parse_assignments(assignments))),
+        _Origin("environment", _read_environment()),
+        _Origin("--set", _parse_assignments(assignments)),
     ]
     merged: dict[str, Any] = {}
     for _, tables in origins:
@@ -106,18 +90,13 @@ def settings_toml(settings: Settings) -> str:
     tables = settings.model_dump(exclude_none=True)
     # A name in quotes may hold points.
     tables |= {f'sources."{name}"': table for name, table in tables.pop("sources").items()}
-    followers = {
-        (section, key)
-        for section in ("scan", "mesh")
-        for key in tables[section]
-        if follows_leaf(getattr(settings, section), key)
-    }
     lines: list[str] = []
     for section, table in tables.items():
         lines.append(f"[{section}]")
         for key, value in table.items():
-            follows = "  # follows field.leaf_m" if (section, key) in followers else ""
-            lines.append(f"{key} = {json.dumps(value)}{follows}")
+            follows = section in ("scan", "mesh") and follows_leaf(getattr(settings, section), key)
+            comment = "  # follows field.leaf_m" if follows else ""
+            lines.append(f"{key} = {json.dumps(value)}{comment}")
         lines.append("")
     return "\n".join(lines)
 
@@ -139,9 +118,7 @@ def _read_preset(name: str) -> dict[str, Any]:
 
 def _read_file(file: Path) -> dict[str, Any]:
     try:
-        file.open("rb").close()  # what is missing, or a folder, would count as empty
-        # As it is written: a call would take [Scan] for [scan], and of both drop one.
-        return TomlConfigSettingsSource(_NamedSettings, file).toml_data
+        return tomllib.loads(file.read_text(encoding="utf-8"))
     except OSError as error:
         raise SettingsError(f"settings file {file}: {error.strerror or error}") from error
     except (ValueError, RecursionError) as error:
@@ -149,60 +126,46 @@ def _read_file(file: Path) -> dict[str, Any]:
 
 
 def _read_environment() -> dict[str, Any]:
-    for variable in os.environ:
-        section, delimiter, key = variable.removeprefix(_PREFIX).lower().partition(_DELIMITER)
-        if variable.startswith(_PREFIX) and delimiter and section not in Settings.model_fields:
-            raise SettingsError(f"environment: {variable}: {_unknown((section, key))}")
-    return EnvSettingsSource(_NamedSettings)()
+    tables: dict[str, Any] = {}
+    for variable in sorted(os.environ):
+        names = variable.removeprefix(_PREFIX).lower().split(_DELIMITER)
+        is_setting = len(names) > 1 or names[0] in Settings.model_fields
+        if variable.startswith(_PREFIX) and is_setting:
+            _put(tables, names, os.environ[variable])
+    return tables
 
 
 def _parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
     tables: dict[str, Any] = {}
     for assignment in assignments:
-        name, equals, value = assignment.partition("=")
-        section, dot, key = name.partition(".")
-        table = tables.setdefault(section, {})
-        if section == "sources":
-            source, dot, key = key.rpartition(".")
-            table = table.setdefault(source, {})
-        if not (equals and dot):
+        name, equals, text = assignment.partition("=")
+        section, *names = name.split(".")
+        if section == "sources":  # the name of a source may have points in it
+            names = [".".join(names[:-1]), names[-1]] if len(names) > 1 else []
+        if not (equals and names):
             form = "sources.NAME" if section == "sources" else "SECTION"
             raise SettingsError(f"--set {assignment}: write {form}.KEY=VALUE")
-        table[key] = value
+        _put(tables, [section, *names], text)
     return tables
 
 
-def _as_in_a_file(tables: dict[str, Any]) -> dict[str, Any]:
-    """Tables of texts as a file would have them: what stands for another value is read."""
-    schemas = setting_schemas()
-
-    def read(section: str, key: str, text: str) -> Any:
-        reader = _READERS.get(schemas.get(section, {}).get(key, {}).get("type", "string"))
-        try:
-            return reader.validate_python(text) if reader else text
-        except ValidationError:
-            return text
-
-    def read_all(section: str, table: Any) -> Any:
-        if section == "sources":
-            return _with_values(table)
+def _put(tables: dict[str, Any], names: Sequence[str], text: str) -> None:
+    """Put what a text stands for into nested tables; a value in place of a table stays."""
+    *sections, key = names
+    table: Any = tables
+    for section in sections:
+        table = table.setdefault(section, {})
         if not isinstance(table, dict):
-            return table
-        return {key: read(section, key, text) for key, text in table.items()}
-
-    return {section: read_all(section, table) for section, table in tables.items()}
+            return
+    table[key] = _value(text)
 
 
-def _with_values(table: Any) -> Any:
-    """Nested tables of texts, with what each text stands for: a number, true or false, a list."""
-    if isinstance(table, dict):
-        return {key: _with_values(entry) for key, entry in table.items()}
-    if not isinstance(table, str):
-        return table
+def _value(text: str) -> Any:
+    """Return the value that a text would be in a file; without quotes, it may be text itself."""
     try:
-        return json.loads(table)
+        return tomllib.loads(f"value = {text}")["value"]
     except (ValueError, RecursionError):
-        return table
+        return text
 
 
 def _explain(details: ErrorDetails, origins: list[_Origin]) -> str:
@@ -239,10 +202,6 @@ def _problem(details: ErrorDetails, name: str) -> str:
             return f"{name} = {value}: write two corners, [[x, y, z], [x, y, z]]"
         case "greater_than_equal" | "less_than_equal" | "finite_number":
             return f"{name} = {value} is out of range: use {_allowed(location)}"
-        case "list_type":
-            return f'{name} = {value}: write a list, such as ["/points"]'
-        case "string_pattern_mismatch":
-            return f"{name} = {value} is no topic: use names of letters, digits and _ behind /"
         case "int_type" | "float_type":
             return f"{name} = {value} is of another type: use {_allowed(location)}"
         case _:

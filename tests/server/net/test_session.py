@@ -9,16 +9,15 @@ import pytest
 from support import servers
 from support.attackers.role_files import free_tls_endpoint
 from triquad_server.errors import ListenError
-from triquad_server.net.configuration import NetworkDefaults, NetworkOptions, configuration
+from triquad_server.net.configuration import NetworkOptions, configuration
 from triquad_server.net.session import open_session
+from triquad_server.settings import Settings
 from triquad_tools.credentials.key_folder import KeyFolder
-
-DEFAULTS = NetworkDefaults(grants=(), max_message_bytes=1_000_000)
 
 
 def failure(**options: Any) -> str:
     with pytest.raises(ListenError) as caught:
-        open_session(configuration(NetworkOptions(**options), DEFAULTS))
+        open_session(configuration(NetworkOptions(**options), "lab", Settings()))
     return str(caught.value)
 
 
