@@ -45,9 +45,8 @@ _log = logging.getLogger("triquad_server")
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the server until SIGINT or SIGTERM, and return the exit code."""
     _on_signals(_leave)
-    log_options = _log_options()
-    start_log(log_options.parse_known_args(argv)[0].log_format)
-    options = _parser(log_options).parse_args(argv)
+    options = _parser().parse_args(argv)
+    start_log(options.log_format)
     logging.getLogger().setLevel(options.log_level.upper())
     return _exit_code(options)
 
@@ -128,20 +127,6 @@ def _implied(options: argparse.Namespace) -> list[str]:
     return [] if options.metrics_port is None else [f"metrics.port={options.metrics_port}"]
 
 
-def _log_options() -> argparse.ArgumentParser:
-    """Return the parser of the options of the log, which are needed before anything can fail."""
-    parser = argparse.ArgumentParser(prog=_PROGRAM, add_help=False)
-    parser.add_argument(
-        "--log-format",
-        type=_log_format,
-        default=os.environ.get(_LOG_FORMAT_VARIABLE) or TEXT,
-        metavar="FORMAT",
-        help="text, or json: an object per line, for what collects logs (default: "
-        f"{_LOG_FORMAT_VARIABLE} of the environment, or text)",
-    )
-    return parser
-
-
 def _log_format(name: str) -> str:
     if name not in LOG_FORMATS:
         formats = " or ".join(LOG_FORMATS)
@@ -159,10 +144,9 @@ def _epoch(text: str) -> int:
     return int(text)
 
 
-def _parser(log_options: argparse.ArgumentParser) -> argparse.ArgumentParser:
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=_PROGRAM,
-        parents=[log_options],
         description="A long-running map server: learns a signed-distance field from scans that "
         "arrive over Zenoh, and answers queries.",
         epilog=_EPILOG,
@@ -186,6 +170,14 @@ def _parser(log_options: argparse.ArgumentParser) -> argparse.ArgumentParser:
     add("--device", choices=("auto", "cpu", "cuda"), default="auto", help="default: auto")
     _add_settings(parser.add_argument_group("settings (docs/settings.md)"))
     _add_network(parser.add_argument_group("network"))
+    add(
+        "--log-format",
+        type=_log_format,
+        default=os.environ.get(_LOG_FORMAT_VARIABLE) or TEXT,
+        metavar="FORMAT",
+        help="text, or json: an object per line, for what collects logs (default: "
+        f"{_LOG_FORMAT_VARIABLE} of the environment, or text)",
+    )
     add(
         "--log-level",
         choices=("debug", "info", "warning", "error"),

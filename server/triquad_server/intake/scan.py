@@ -3,7 +3,6 @@
 import logging
 import threading
 from collections.abc import Callable
-from contextlib import suppress
 
 import zenoh
 from triquad_format.errors import FormatError, ProtocolVersionError, WireError
@@ -45,38 +44,38 @@ class ScanIntake:
         self._inbox: FairQueue[zenoh.Sample] = FairQueue(
             _INBOX, queue.limit_bytes, _INBOX, newest_go=False
         )
-        # A ring, since a full channel of another kind would stall the network's threads.
-        self._subscriber = session.declare_subscriber(
-            keys.all_scans_key(map_name), zenoh.handlers.RingChannel(_INBOX)
-        )
+        self._changed = threading.Condition()  # the inbox, or whether to stop
+        self._stopping = False
+        # This runs in the network's own threads, so it only queues scans.
+        keep = zenoh.handlers.Callback(self._keep, indirect=False)
+        self._subscriber = session.declare_subscriber(keys.all_scans_key(map_name), keep)
         self._thread = threading.Thread(target=self._run, name="scan-intake")
         self._thread.start()
 
     def close(self) -> None:
         """Take no more scans."""
         self._subscriber.undeclare()
+        with self._changed:
+            self._stopping = True
+            self._changed.notify_all()
         self._thread.join()
 
     def _run(self) -> None:
-        for sample in self._subscriber:
-            self._keep(sample)
-            while (oldest := self._inbox.take()) is not None:
-                self._receive_safely(oldest)
-                self._empty_ring()
+        while (sample := self._next()) is not None:
+            self._receive_safely(sample)
 
-    def _empty_ring(self) -> None:
-        """Queue what has come meanwhile: in a full ring, one source pushes out others' scans."""
-        with suppress(zenoh.ZError):  # it is closing
-            for _ in range(_INBOX):
-                sample = self._subscriber.try_recv()
-                if sample is None:
-                    return
-                self._keep(sample)
+    def _next(self) -> zenoh.Sample | None:
+        """Return the next scan; ``None`` where no more will come."""
+        with self._changed:
+            self._changed.wait_for(lambda: len(self._inbox) or self._stopping)
+            return self._inbox.take()
 
     def _keep(self, sample: zenoh.Sample) -> None:
-        self._queue.received_bytes += len(sample.payload)
-        # What is removed for it is a gap in the sequence, and counted as that.
-        self._inbox.put(Owner(str(sample.key_expr)), sample, len(sample.payload))
+        with self._changed:
+            self._queue.received_bytes += len(sample.payload)
+            # What is removed for it is a gap in the sequence, and counted as that.
+            self._inbox.put(Owner(str(sample.key_expr)), sample, len(sample.payload))
+            self._changed.notify_all()
 
     def _receive_safely(self, sample: zenoh.Sample) -> None:
         """Do as :meth:`_receive`; an internal error must not stop the intake of other scans."""

@@ -118,11 +118,12 @@ def _read_preset(name: str) -> dict[str, Any]:
 
 def _read_file(file: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(file.read_text(encoding="utf-8"))
+        tables: dict[str, Any] = tomllib.loads(file.read_text(encoding="utf-8"))
     except OSError as error:
         raise SettingsError(f"settings file {file}: {error.strerror or error}") from error
     except (ValueError, RecursionError) as error:
         raise SettingsError(f"settings file {file}: {error}") from error
+    return tables
 
 
 def _read_environment() -> dict[str, Any]:

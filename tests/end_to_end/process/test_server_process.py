@@ -187,15 +187,15 @@ def test_all_checkpoints_damaged_is_no_reason_to_start_empty(store, arguments):
 A_THREAD_ENDS = """
 from triquad_server.intake.scan import ScanIntake
 
-keep, kept = ScanIntake._keep, []
+receive, kept = ScanIntake._receive_safely, []
 
-def keep_two(intake, sample):
+def receive_two(intake, sample):
     if len(kept) == 2:
         raise RuntimeError("a defect")
     kept.append(sample)
-    keep(intake, sample)
+    receive(intake, sample)
 
-ScanIntake._keep = keep_two
+ScanIntake._receive_safely = receive_two
 """
 
 
