@@ -17,7 +17,7 @@ from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.process.memory import resident_bytes
 from triquad_server.serving.operation_counts import OperationCounts
-from triquad_server.store.checkpoint_thread import CheckpointThread
+from triquad_server.store.checkpoint_writer import CheckpointWriter
 
 _log = logging.getLogger(__name__)
 
@@ -40,7 +40,7 @@ class Health:
     warnings: ScanWarnings
     mapper: MapperThread
     epochs: EpochHistory
-    checkpoints: CheckpointThread
+    checkpoints: CheckpointWriter
     map_max_bytes: int  # memory limit of the map
     started_s: float = field(default_factory=time.monotonic)  # monotonic
 
@@ -59,10 +59,10 @@ class Health:
             epoch=epoch.number,
             settled=progress.settled and len(self.scans) == 0,
             scans_taken=progress.map.scans_taken,
-            scans_dropped=self.scans.dropped.counts(),
+            scans_dropped=dict(self.scans.dropped),
             scans_lost=self.scans.ledger.lost(),
             scans_waiting=len(self.scans),
-            points_dropped=self.scans.points_dropped.counts(),
+            points_dropped=dict(self.scans.points_dropped),
             requests_refused=dict(refused),
             samples_trained=progress.map.samples_trained,
             rays_kept=progress.map.rays_kept,

@@ -27,7 +27,7 @@ from triquad_server.process.threads import Teams
 from triquad_server.queries.client_queries import serve_queries
 from triquad_server.serving.operations import Operations
 from triquad_server.settings import Settings
-from triquad_server.store.checkpoint_thread import CheckpointThread
+from triquad_server.store.checkpoint_writer import CheckpointWriter
 from triquad_server.store.download import MapDownloads
 from triquad_server.store.resets import Resets
 from triquad_server.store.scrub import Scrubber
@@ -100,7 +100,7 @@ class Service:
         """Open the parts, in the reverse of the order in which they have to be closed."""
         self._parts.callback(self._operations.close)
         self._mapper = self._open_mapper(failed)
-        checkpoints = CheckpointThread(
+        checkpoints = CheckpointWriter(
             self._mapper,
             self._served.store,
             period_s=self._settings.store.period_s,
@@ -143,7 +143,7 @@ class Service:
         self._announce(health)
         self._parts.callback(self._operations.stop)  # before anything is waited for
 
-    def _open_checkpoints(self, checkpoints: CheckpointThread) -> None:
+    def _open_checkpoints(self, checkpoints: CheckpointWriter) -> None:
         """Begin to write and check checkpoints, and serve what clients may ask of them."""
         checkpoints.start()
         self._parts.callback(checkpoints.close)

@@ -15,7 +15,7 @@ from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.mapping.thread_time import ThreadTime
 from triquad_server.settings import ServiceSettings, Settings
-from triquad_server.store.checkpoint_thread import CheckpointThread
+from triquad_server.store.checkpoint_writer import CheckpointWriter
 
 COMPUTED_S = 0.5
 
@@ -47,7 +47,7 @@ def running(
         warnings=ScanWarnings(scans, Settings()),
         mapper=thread,
         epochs=epochs,
-        checkpoints=CheckpointThread(thread, None, period_s=0, last=None),
+        checkpoints=CheckpointWriter(thread, None, period_s=0, last=None),
         map_max_bytes=10**9,
     )
     with closing(thread):

@@ -1,11 +1,11 @@
 """The queue of scans that wait for the mapper."""
 
 import threading
+from collections import Counter
 from collections.abc import Collection
 
 from triquad_format.wire.messages import Scan
 
-from triquad_server.counter import Counter
 from triquad_server.fair_queue import FairQueue, Owner
 from triquad_server.intake.rays import ScanRays
 from triquad_server.intake.source_ledger import SourceLedger
@@ -39,10 +39,9 @@ class ScanQueue:
     def __init__(self, limit: int, limit_bytes: int = _MAX_BYTES) -> None:
         """Let at most ``limit`` scans of each source wait, and ``limit_bytes`` of all together."""
         self.limit = limit
-        self.limit_bytes = limit_bytes
         self.ledger = SourceLedger()
-        self.dropped = Counter()  # scans that are not in the map, by reason
-        self.points_dropped = Counter()  # of scans that are in the map, by reason
+        self.dropped: Counter[str] = Counter()  # scans that are not in the map, by reason
+        self.points_dropped: Counter[str] = Counter()  # of scans that are in the map, by reason
         self.received_bytes = 0  # of all messages of scans that arrived
         self._taken = threading.Condition()
         self._scans: FairQueue[Scan] = FairQueue(
@@ -63,7 +62,7 @@ class ScanQueue:
         with self._taken:
             reason = self.ledger.arrive(scan)
             if reason is not None:
-                self.dropped.add(reason)
+                self.dropped[reason] += 1
                 return
             for pushed_out in self._scans.put(Owner(scan.source), scan, _bytes_of(scan)):
                 self.ledger.push_out(pushed_out)
@@ -74,7 +73,17 @@ class ScanQueue:
             backwards = self.ledger.arrive(scan)
             if backwards is None:
                 self.ledger.refuse(scan, text)
-            self.dropped.add(backwards or reason)
+            self.dropped[backwards or reason] += 1
+
+    def receive(self, nbytes: int) -> None:
+        """Count the bytes of a message that arrived."""
+        with self._taken:
+            self.received_bytes += nbytes
+
+    def drop(self, reason: str) -> None:
+        """Count a scan that is not in the map; reasons are words of the program."""
+        with self._taken:
+            self.dropped[reason] += 1
 
     def take(self, passed_over: Collection[str] = ()) -> Scan | None:
         """Return the oldest scan of the next source, not of one that is ``passed_over``.
@@ -92,13 +101,13 @@ class ScanQueue:
 
     def taken(self, scan: Scan, rays: ScanRays) -> None:
         """Record that a scan is in the map; ``rays`` are what of it is used."""
-        for reason, count in rays.points_dropped.items():
-            self.points_dropped.add(reason, count)
+        with self._taken:
+            self.points_dropped.update(rays.points_dropped)
         self.ledger.take(scan)
 
     def reject(self, scan: Scan, reason: str, text: str) -> None:
         """Record that the map refused a scan that was taken."""
-        self.dropped.add(reason)
+        self.drop(reason)
         self.ledger.refuse(scan, text)
 
     def give_way(self) -> None:

@@ -12,7 +12,7 @@ from triquad_server.intake.source_trails import SourceTrails
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.serving.operations import Lane, Operations
-from triquad_server.store.checkpoint_thread import CheckpointThread
+from triquad_server.store.checkpoint_writer import CheckpointWriter
 
 _log = logging.getLogger(__name__)
 
@@ -25,7 +25,7 @@ class Resets:
     def __init__(
         self,
         mapper: MapperThread,
-        checkpoints: CheckpointThread,
+        checkpoints: CheckpointWriter,
         keep_resets: int,
         trails: SourceTrails,
     ) -> None:
@@ -52,7 +52,8 @@ class Resets:
         if not self._checkpoints.has_store or self._keep_resets == 0:
             return self._unkept(request)
         try:
-            reply = self._checkpoints.call(lambda: self._keep_and_reset(request))
+            with self._checkpoints.writing:
+                reply = self._keep_and_reset(request)
         except StoreError as error:
             raise RefusedError(
                 "store", f"nothing was reset, for the map as it is could not be kept: {error}"

@@ -185,17 +185,13 @@ def test_all_checkpoints_damaged_is_no_reason_to_start_empty(store, arguments):
 
 
 A_THREAD_ENDS = """
-from triquad_server.intake.scan import ScanIntake
+from triquad_server.health import Heartbeat
 
-receive, kept = ScanIntake._receive_safely, []
-
-def receive_two(intake, sample):
-    if len(kept) == 2:
+def fail_later(heartbeat, status):
+    if status.scans_taken > 2:
         raise RuntimeError("a defect")
-    kept.append(sample)
-    receive(intake, sample)
 
-ScanIntake._receive_safely = receive_two
+Heartbeat._log_progress = fail_later
 """
 
 

@@ -26,7 +26,7 @@ from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.mapping.thread_time import Activity, Current, ThreadTime
 from triquad_server.settings import ServiceSettings, StoreSettings
-from triquad_server.store.checkpoint_thread import CheckpointThread
+from triquad_server.store.checkpoint_writer import CheckpointWriter
 from triquad_server.store.resets import Resets
 from triquad_server.store.store import Store
 
@@ -160,7 +160,7 @@ def test_a_scan_that_cannot_be_read_for_a_defect_is_refused_and_mapping_goes_on(
                 while not (reply := mapping.scans.ledger.outcome("lidar", 7, 0)):
                     mapping.scans.ledger.changed.wait(servers.WAIT_S)
         assert (reply.taken, reply.refused) == (0, 1)
-        assert mapping.scans.dropped.counts() == {"internal": 1}
+        assert mapping.scans.dropped == {"internal": 1}
         mapping.scans.put(servers.scan(1))
         mapping.thread.wake()
         while mapping.thread.call(lambda mapper: mapper.scans_taken) == 0:
@@ -190,7 +190,7 @@ def test_pending_commands_fail_when_the_thread_will_not_come_to_them() -> None:
 def test_who_reset_the_map_finds_the_epoch_that_shows_it() -> None:
     box = np.full(3, -np.inf), np.full(3, np.inf)
     with running(learning_mapper()) as mapping:
-        checkpoints = CheckpointThread(mapping.thread, None, 0.0, None)
+        checkpoints = CheckpointWriter(mapping.thread, None, 0.0, None)
         resets = Resets(mapping.thread, checkpoints, 0, SourceTrails(0.2))
         reply = resets.answer(ResetRequest(*box))
         assert mapping.epochs.newest.number >= reply.epoch
@@ -201,7 +201,7 @@ def test_a_checkpoint_takes_one_epoch_however_fast_the_map_changes(tmp_path: Pat
     store = Store(tmp_path, "test", StoreSettings())
     with closing(store), running(learning_mapper()) as mapping:
         thread = mapping.thread
-        checkpoints = CheckpointThread(thread, store, 0.0, None)
+        checkpoints = CheckpointWriter(thread, store, 0.0, None)
         checkpoints.start()
         with closing(checkpoints):
             for _ in range(5):

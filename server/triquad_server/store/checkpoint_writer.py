@@ -3,10 +3,7 @@
 import logging
 import threading
 import time
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 from triquad_format.errors import RefusedError
 from triquad_format.wire import keys
@@ -25,8 +22,6 @@ _log = logging.getLogger(__name__)
 
 _NO_STORE = "the server was started without a store: the map is not kept"
 
-ResultT = TypeVar("ResultT")
-
 
 @dataclass(frozen=True)
 class _Counts:
@@ -38,8 +33,8 @@ class _Counts:
     ended_s: float | None = None  # when the last was written, monotonic
 
 
-class CheckpointThread:
-    """Writes the map to its store, on a thread of its own that gives way to queries.
+class CheckpointWriter:
+    """Writes the map to its store, from time to time on a thread of its own.
 
     A store that fails never stops the mapping.
     """
@@ -51,16 +46,16 @@ class CheckpointThread:
         period_s: float,
         last: CheckpointInfo | None,
     ) -> None:
-        """Make the thread; ``last`` is the checkpoint that the map was restored from."""
+        """Make the writer; ``last`` is the checkpoint that the map was restored from."""
         self._mapper = mapper
         self._store = store
         self._period_s = period_s
-        self._jobs = ThreadPoolExecutor(1, "checkpoints", lower_priority, (2 * NICENESS,))
         self._stopping = threading.Event()
-        self.last = last
         self._counts = _Counts()
+        self._timer = threading.Thread(target=self._write_regularly, name="checkpoints")
+        self.writing = threading.RLock()  # locked while anything is written
+        self.last = last
         self.error = None if store else _NO_STORE
-        self._timer = threading.Thread(target=self._write_regularly, name="checkpoint-timer")
 
     @property
     def has_store(self) -> bool:
@@ -69,7 +64,7 @@ class CheckpointThread:
 
     @property
     def base_epoch(self) -> int | None:
-        """As of :class:`Store`; only for jobs on this thread."""
+        """As of :class:`Store`; only for who has locked :attr:`writing`."""
         return self._opened.base_epoch
 
     def start(self) -> None:
@@ -92,7 +87,6 @@ class CheckpointThread:
         self._stopping.set()
         if self._timer.ident is not None:
             self._timer.join()
-        self._jobs.shutdown()
         if self._store is None:
             return
         try:
@@ -116,35 +110,33 @@ class CheckpointThread:
             RefusedError: there is no store, or it cannot be written.
         """
         try:
-            return self.call(self.write)
+            return self.write()
         except StoreError as error:
             raise RefusedError("store", str(error)) from error
 
-    def call(self, job: Callable[[], ResultT]) -> ResultT:
-        """Run ``job`` on this thread and return its result: nothing else is written meanwhile.
+    def found_damaged(self, name: str) -> None:
+        """Write all of the map again, if the newest checkpoint needs the file ``name``."""
+        with self.writing:
+            if self._opened.forget_base(name):
+                _log.warning(
+                    "the newest checkpoint needs %s: all of the map is written again", name
+                )
+                self._write_if_changed()
+
+    def write(self) -> CheckpointInfo:
+        """Write what changed, as :meth:`answer` does.
 
         Raises:
-            StoreError: there is no store.
+            StoreError: it cannot be written, or there is no store.
         """
         if self._store is None:
             raise StoreError(_NO_STORE)
-        return self._jobs.submit(job).result()
-
-    def found_damaged(self, name: str) -> None:
-        """Have all of the map written again, if the newest checkpoint needs the file ``name``."""
-        self._jobs.submit(self._write_whole, name)
-
-    def write(self) -> CheckpointInfo:
-        """Write what changed, as :meth:`answer` does; only for jobs on this thread.
-
-        Raises:
-            StoreError: it cannot be written.
-        """
-        base = self.base_epoch
-        return self.write_changes(self._mapper.call(lambda mapper: mapper.snapshot_since(base)))
+        with self.writing:
+            base = self.base_epoch
+            return self.write_changes(self._mapper.call(lambda mapper: mapper.snapshot_since(base)))
 
     def write_changes(self, snapshot: MapSnapshot, undoes: str = "") -> CheckpointInfo:
-        """Write what changed since the last checkpoint, while a job on this thread waits for it.
+        """Write what changed since the last checkpoint, for who has locked :attr:`writing`.
 
         A checkpoint that ``undoes`` something is written even if nothing changed.
 
@@ -183,12 +175,13 @@ class CheckpointThread:
 
     @property
     def _opened(self) -> Store:
-        assert self._store is not None, "jobs run where there is a store"
+        assert self._store is not None, "nothing is written where there is no store"
         return self._store
 
     def _write_regularly(self) -> None:
+        lower_priority(2 * NICENESS)
         while not self._stopping.wait(self._period_s):
-            self._jobs.submit(self._write_if_changed).result()
+            self._write_if_changed()
 
     def _write_if_changed(self) -> None:
         try:
@@ -198,8 +191,3 @@ class CheckpointThread:
         except Exception:
             self.error = "an internal error of the server; its log has the details"
             _log.exception("a checkpoint met an internal error")
-
-    def _write_whole(self, name: str) -> None:
-        if self._opened.forget_base(name):
-            _log.warning("the newest checkpoint needs %s: all of the map is written again", name)
-            self._write_if_changed()
