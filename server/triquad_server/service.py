@@ -7,7 +7,19 @@ from dataclasses import dataclass, field
 
 import zenoh
 from triquad_format.wire import keys
-from triquad_format.wire.messages import CheckpointInfo
+from triquad_format.wire.mesh_messages import MeshRequest, TileListRequest, TileUpdatesRequest
+from triquad_format.wire.messages import (
+    CheckpointInfo,
+    CheckpointRequest,
+    FlushRequest,
+    MapChunkRequest,
+    MapInfoRequest,
+    ResetRequest,
+    StatusRequest,
+)
+from triquad_format.wire.metrics_messages import MetricsRequest
+from triquad_format.wire.query_messages import ChangesRequest, SourcesRequest
+from triquad_map.questions.answers import Answers, QuestionLimits
 
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.epochs.surface_history import CHANGES_KEPT, SurfaceHistory
@@ -21,11 +33,13 @@ from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapListeners, MapperThread
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_queries import TileQueries
-from triquad_server.mesh.update_queries import UpdateQueries
+from triquad_server.mesh.update_queries import MAX_REQUEST_BYTES, UpdateQueries
 from triquad_server.monitoring.metrics import Metrics
 from triquad_server.process.threads import Teams
-from triquad_server.queries.client_queries import serve_queries
-from triquad_server.serving.operations import Operations
+from triquad_server.queries.change_queries import ChangeQueries
+from triquad_server.queries.client_queries import MAX_QUESTION_BYTES, QUESTIONS
+from triquad_server.queries.source_queries import SourceQueries
+from triquad_server.serving.operations import Lane, Operations
 from triquad_server.settings import Settings
 from triquad_server.store.checkpoint_writer import CheckpointWriter
 from triquad_server.store.download import MapDownloads
@@ -118,12 +132,8 @@ class Service:
             checkpoints=checkpoints,
             map_max_bytes=self._settings.memory.max_bytes,
         )
-        serve_queries(self._operations, self._epochs, self._surface, self._trails, health.server)
         tiles = TileCache(self._settings.mesh, self._served.teams.meshing)
-        TileQueries(self._epochs, tiles).serve_on(self._operations)
-        UpdateQueries(self._epochs, tiles, health.server).serve_on(self._operations)
         downloads = MapDownloads(self._mapper, self._epochs, health.server)
-        downloads.serve_on(self._operations)
         self.metrics = Metrics(
             health,
             self.session,
@@ -132,10 +142,8 @@ class Service:
             downloads=downloads,
             operations=self._operations,
         )
-        self.metrics.serve()
-        flush = FlushQueries(self._scans.ledger, self._mapper.publish_soon, self._warnings.of)
-        flush.serve_on(self._operations)
         self._open_checkpoints(checkpoints)
+        self._serve(tiles, downloads)
         # Closed before the last checkpoint is written: it contains every reset that was answered.
         self._parts.callback(self._operations.close)
         self._parts.callback(self._mapper.pause)
@@ -144,21 +152,43 @@ class Service:
         self._parts.callback(self._operations.stop)  # before anything is waited for
 
     def _open_checkpoints(self, checkpoints: CheckpointWriter) -> None:
-        """Begin to write and check checkpoints, and serve what clients may ask of them."""
+        """Begin to write and check checkpoints."""
         checkpoints.start()
         self._parts.callback(checkpoints.close)
         store, scrub_h = self._served.store, self._settings.store.scrub_h
         if store is not None and scrub_h > 0:
             scrubber = Scrubber(store.folder, scrub_h, damaged=checkpoints.found_damaged)
             self._parts.callback(scrubber.close)
-        resets = Resets(
-            self._mapper,
-            checkpoints,
-            keep_resets=self._settings.store.keep_resets,
-            trails=self._trails,
-        )
-        checkpoints.serve_on(self._operations)
-        resets.serve_on(self._operations)
+
+    def _serve(self, tiles: TileCache, downloads: MapDownloads) -> None:
+        """Answer the requests of clients from now on."""
+        serve, health = self._operations.serve, self.health
+        answers = Answers(self._epochs.view, QuestionLimits())
+        for name, kind in QUESTIONS.items():
+            serve(name, kind, answers.answer, max_bytes=MAX_QUESTION_BYTES)
+        changes = ChangeQueries(self._epochs, self._surface, health.server)
+        sources = SourceQueries(self._trails, health.server)
+        mesh = TileQueries(self._epochs, tiles)
+        serve(keys.CHANGES, ChangesRequest, changes.changes)
+        serve(keys.SOURCES, SourcesRequest, sources.sources)
+        serve(keys.TILE_LIST, TileListRequest, mesh.tiles)
+        serve(keys.MESH, MeshRequest, mesh.mesh)
+        serve(keys.MAP_CHUNK, MapChunkRequest, downloads.chunk)
+
+        updates = UpdateQueries(self._epochs, tiles, health.server)
+        serve(keys.TILE_UPDATES, TileUpdatesRequest, updates.updates, Lane.MESH, MAX_REQUEST_BYTES)
+
+        flush = FlushQueries(self._scans.ledger, self._mapper.publish_soon, self._warnings.of)
+        lane = Lane.ADMINISTRATION
+        serve(keys.STATUS, StatusRequest, lambda _: health.status(), lane)
+        serve(keys.METRICS, MetricsRequest, lambda _: self.metrics.now(), lane)
+        serve(keys.FLUSH, FlushRequest, flush.answer, lane)
+
+        keep_resets = self._settings.store.keep_resets
+        resets = Resets(self._mapper, health.checkpoints, keep_resets, self._trails)
+        serve(keys.CHECKPOINT, CheckpointRequest, health.checkpoints.answer, Lane.FILES)
+        serve(keys.RESET, ResetRequest, resets.answer, Lane.FILES)
+        serve(keys.MAP_INFO, MapInfoRequest, downloads.info, Lane.FILES)
 
     def _announce(self, health: Health) -> None:
         """Say that the server is there, until it closes."""

@@ -8,7 +8,6 @@ from triquad_format.wire import keys
 from triquad_format.wire.messages import FlushReply, FlushRequest
 
 from triquad_server.intake.source_ledger import MAX_SEQUENCE, SourceLedger
-from triquad_server.serving.operations import Lane, Operations
 
 ARRIVAL_GRACE_S = 2.0
 """A scan that has not arrived this many seconds after the first flush request, which travels the
@@ -31,10 +30,6 @@ class FlushQueries:
         self._ledger = ledger
         self._publish_soon = publish_soon
         self._warnings = warnings
-
-    def serve_on(self, operations: Operations) -> None:
-        """Answer the requests of clients from now on."""
-        operations.serve(keys.FLUSH, FlushRequest, self.answer, Lane.ADMINISTRATION)
 
     def answer(self, request: FlushRequest) -> FlushReply:
         """Return what became of the scans of a session.

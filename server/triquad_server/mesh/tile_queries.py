@@ -4,7 +4,6 @@ import numpy as np
 from triquad_format.errors import RefusedError
 from triquad_format.records.arrays import Ints
 from triquad_format.records.field_settings import BLOCK_VOXELS
-from triquad_format.wire import keys
 from triquad_format.wire.limits import MAX_FILL_M, MAX_TILES_ASKED, TILE_INDEX_LIMIT
 from triquad_format.wire.mesh_messages import MeshReply, MeshRequest, TileList, TileListRequest
 from triquad_format.wire.tile_codec import encode_tile
@@ -15,7 +14,6 @@ from triquad_map.questions.checks import check_box
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.mesh.tile_cache import TileCache
-from triquad_server.serving.operations import Operations
 
 MAX_TILES = 1_000_000
 """The most tiles of one list."""
@@ -28,11 +26,6 @@ class TileQueries:
         """Make the handler; ``cache`` knows when tiles changed."""
         self._epochs = epochs
         self._cache = cache
-
-    def serve_on(self, operations: Operations) -> None:
-        """Answer the requests of clients from now on."""
-        operations.serve(keys.TILE_LIST, TileListRequest, self.tiles)
-        operations.serve(keys.MESH, MeshRequest, self.mesh)
 
     def tiles(self, request: TileListRequest) -> TileList:
         """Return the tiles that meet the request's box.

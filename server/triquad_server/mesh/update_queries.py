@@ -1,24 +1,21 @@
 """Answers queries of which mesh tiles changed, and makes those that are out of date."""
 
 import time
-from dataclasses import dataclass, field
 
 import numpy as np
 from triquad_format.errors import RefusedError
 from triquad_format.records.arrays import Ints
-from triquad_format.wire import keys
 from triquad_format.wire.limits import MAX_KNOWN_TILES
 from triquad_format.wire.mesh_messages import TileUpdates, TileUpdatesRequest
-from triquad_map.mesh.tile_lattice import TileIndex, TileLattice, check_level
+from triquad_map.mesh.tile_lattice import TileIndex, check_level
 from triquad_map.questions.checks import check_box
 
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_level import CachedTile, TileDelta
-from triquad_server.serving.operations import Lane, Operations
 
-_MAX_BYTES = 20 * MAX_KNOWN_TILES + 16_384  # of a request: 20 bytes of each known tile
+MAX_REQUEST_BYTES = 20 * MAX_KNOWN_TILES + 16_384  # of a request: 20 bytes of each known tile
 _REPLY_BYTES = 1_000_000  # bytes of the tiles of one reply; a single tile may be larger
 _SLICE_S = 0.2  # time for which tiles are made for one request, then for the next
 _GIVE_WAY_S = 0.1  # seconds that the making of tiles waits for queries before each, at most
@@ -40,12 +37,6 @@ class UpdateQueries:
         self._server = server
         self._next_refresh_s = 0.0  # monotonic
 
-    def serve_on(self, operations: Operations) -> None:
-        """Answer the requests of clients from now on."""
-        operations.serve(
-            keys.TILE_UPDATES, TileUpdatesRequest, self.updates, Lane.MESH, max_bytes=_MAX_BYTES
-        )
-
     def updates(self, request: TileUpdatesRequest) -> TileUpdates:
         """Return what is new to a client, as much of it as fits.
 
@@ -61,14 +52,7 @@ class UpdateQueries:
             self._epochs.give_way(_GIVE_WAY_S)
             self._cache.make_some(request.level, delta.missing or delta.outdated)
             delta = self._delta(request)
-        reply = self._filled(request, delta)
-        reply.complete &= self._cache.epoch >= newest.number
-        return reply.message(
-            server=self._server,
-            epoch=self._cache.epoch,
-            restart=self._restarts(request),
-            lattice=self._cache.lattice(request.level),
-        )
+        return self._reply(request, delta, is_current=self._cache.epoch >= newest.number)
 
     def _restarts(self, request: TileUpdatesRequest) -> bool:
         """Return whether what the client has is of another server, and void."""
@@ -93,27 +77,43 @@ class UpdateQueries:
             request.level, request.minimum, request.maximum, known_to=known_to, known=known
         )
 
-    def _filled(self, request: TileUpdatesRequest, delta: TileDelta) -> "TileReply":
+    def _reply(
+        self, request: TileUpdatesRequest, delta: TileDelta, *, is_current: bool
+    ) -> TileUpdates:
         """Return a reply with as many of the tiles as it may have, at least one."""
-        known_to = 0 if self._restarts(request) else request.revision
-        reply = TileReply(
-            complete=not delta.to_make,
-            revision=known_to,
-            max_bytes=min(request.max_bytes, _REPLY_BYTES),
-            removed=delta.removed,
-        )
+        limit, size = min(request.max_bytes, _REPLY_BYTES), 0
+        tiles: list[CachedTile] = []
+        data: list[bytes] = []
+        removed = list(delta.removed)
+        restart = self._restarts(request)
+        complete, revision = not delta.to_make, 0 if restart else request.revision
         for tile in delta.ready:
-            data = b"" if tile.empty else self._encoded(request.level, tile)
-            if data is None:  # its bytes differ now: a later delta has it
-                reply.complete = False
-            elif not reply.fits(data):
-                reply.complete = False
+            encoded = b"" if tile.empty else self._encoded(request.level, tile)
+            if encoded is None or (data and encoded and size + len(encoded) > limit):
+                complete = False
                 break
+            revision = tile.revision
+            if tile.empty:
+                removed.append(tile.index)
             else:
-                reply.add(tile, data)
-        if reply.complete:
-            reply.revision = delta.revision
-        return reply
+                size += len(encoded)
+                tiles.append(tile)
+                data.append(encoded)
+        lattice = self._cache.lattice(request.level)
+        return TileUpdates(
+            server=self._server,
+            revision=delta.revision if complete else revision,
+            epoch=self._cache.epoch,
+            complete=complete and is_current,
+            restart=restart,
+            tile_side_m=lattice.tile_side_m,
+            cell_m=lattice.cell_m,
+            tiles=_indices([tile.index for tile in tiles]),
+            versions=np.array([tile.version for tile in tiles], np.int64),
+            sizes=np.array([len(part) for part in data], np.int64),
+            data=b"".join(data),
+            removed=_indices(removed),
+        )
 
     def _encoded(self, level: int, tile: CachedTile) -> bytes | None:
         """Return the bytes of a tile; None if they were dropped and the tile has others now."""
@@ -148,50 +148,6 @@ class UpdateQueries:
                 f"revision = {request.revision} was never given by server {request.server!r}: "
                 "use that of the reply before, or 0",
             )
-
-
-@dataclass
-class TileReply:
-    """Collects tiles for a reply."""
-
-    complete: bool  # nothing more is to come
-    revision: int  # revision up to which the client knows everything once it has the reply
-    max_bytes: int  # of all tiles; a single one may have more
-    removed: list[TileIndex] = field(default_factory=list)
-    tiles: list[CachedTile] = field(default_factory=list)
-    data: list[bytes] = field(default_factory=list)  # bytes of each tile
-
-    def fits(self, data: bytes) -> bool:
-        """Return whether a tile may be added: the first always may."""
-        return not data or not self.data or sum(map(len, self.data)) + len(data) <= self.max_bytes
-
-    def add(self, tile: CachedTile, data: bytes) -> None:
-        """Add a tile with its bytes; one without faces is to be removed."""
-        self.revision = tile.revision
-        if tile.empty:
-            self.removed.append(tile.index)
-        else:
-            self.tiles.append(tile)
-            self.data.append(data)
-
-    def message(
-        self, *, server: str, epoch: int, restart: bool, lattice: TileLattice
-    ) -> TileUpdates:
-        """Return the message of the reply."""
-        return TileUpdates(
-            server=server,
-            revision=self.revision,
-            epoch=epoch,
-            complete=self.complete,
-            restart=restart,
-            tile_side_m=lattice.tile_side_m,
-            cell_m=lattice.cell_m,
-            tiles=_indices([tile.index for tile in self.tiles]),
-            versions=np.array([tile.version for tile in self.tiles], np.int64),
-            sizes=np.array([len(data) for data in self.data], np.int64),
-            data=b"".join(self.data),
-            removed=_indices(self.removed),
-        )
 
 
 def _indices(tiles: list[TileIndex]) -> Ints:

@@ -5,9 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import zenoh
-from triquad_format.wire import keys
-from triquad_format.wire.messages import StatusRequest
-from triquad_format.wire.metrics_messages import MetricsRequest, QueueMetrics, ServerMetrics
+from triquad_format.wire.metrics_messages import QueueMetrics, ServerMetrics
 
 from triquad_server.epochs.array_memory import bytes_by_part
 from triquad_server.epochs.epoch import Epoch
@@ -16,7 +14,7 @@ from triquad_server.health import Health
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.process.memory import resident_bytes
 from triquad_server.serving.operation_counts import BOUNDS_S
-from triquad_server.serving.operations import Lane, Operations
+from triquad_server.serving.operations import Operations
 from triquad_server.store.download import MapDownloads
 
 _MAX_SESSIONS = 1024  # that are listed
@@ -32,12 +30,6 @@ class Metrics:
     tiles: TileCache
     downloads: MapDownloads
     operations: Operations
-
-    def serve(self) -> None:
-        """Answer the requests of clients, for these figures and for the status, from now on."""
-        lane = Lane.ADMINISTRATION
-        self.operations.serve(keys.STATUS, StatusRequest, lambda _: self.health.status(), lane)
-        self.operations.serve(keys.METRICS, MetricsRequest, lambda _: self.now(), lane)
 
     def now(self) -> ServerMetrics:
         """Return the figures as they are now."""

@@ -6,7 +6,6 @@ import time
 from dataclasses import dataclass, replace
 
 from triquad_format.errors import RefusedError
-from triquad_format.wire import keys
 from triquad_format.wire.messages import CheckpointInfo, CheckpointRequest
 from triquad_format.wire.metrics_messages import CheckpointMetrics
 from triquad_map.compiled.team import lower_priority
@@ -15,7 +14,6 @@ from triquad_server.errors import LastCheckpointError, MapperStoppedError, Store
 from triquad_server.mapping.map_snapshot import MapSnapshot
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.process.threads import NICENESS
-from triquad_server.serving.operations import Lane, Operations
 from triquad_server.store.store import Store
 
 _log = logging.getLogger(__name__)
@@ -98,10 +96,6 @@ class CheckpointWriter:
                 f"is lost: {error}"
             ) from error
         _log.info("the map is in %s, as of epoch %d", info.path, info.epoch)
-
-    def serve_on(self, operations: Operations) -> None:
-        """Answer the requests of clients from now on."""
-        operations.serve(keys.CHECKPOINT, CheckpointRequest, self.answer, Lane.FILES)
 
     def answer(self, _request: CheckpointRequest) -> CheckpointInfo:
         """Write a checkpoint of the map as it is now; return the last one if nothing changed.

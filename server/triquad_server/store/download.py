@@ -7,13 +7,11 @@ from dataclasses import dataclass
 
 from triquad_format.errors import RefusedError
 from triquad_format.mapfile.writer import write_map
-from triquad_format.wire import keys
 from triquad_format.wire.messages import MapChunk, MapChunkRequest, MapInfo, MapInfoRequest
 from triquad_map.preview import previews_of
 
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.mapping.mapper_thread import MapperThread
-from triquad_server.serving.operations import Lane, Operations
 from triquad_server.store.store import stamp_now_ns
 
 CHUNK_BYTES = 2**20
@@ -39,11 +37,6 @@ class MapDownloads:
         self._mapper = mapper
         self._lock = threading.Lock()
         self._files: OrderedDict[str, _MapBytes] = OrderedDict()
-
-    def serve_on(self, operations: Operations) -> None:
-        """Answer the requests of clients from now on."""
-        operations.serve(keys.MAP_INFO, MapInfoRequest, self.info, Lane.FILES)
-        operations.serve(keys.MAP_CHUNK, MapChunkRequest, self.chunk)
 
     @property
     def nbytes(self) -> int:

@@ -3,7 +3,6 @@
 import logging
 
 from triquad_format.errors import RefusedError
-from triquad_format.wire import keys
 from triquad_format.wire.messages import ResetReply, ResetRequest
 from triquad_map.questions.checks import check_box
 
@@ -11,7 +10,6 @@ from triquad_server.errors import StoreError
 from triquad_server.intake.source_trails import SourceTrails
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
-from triquad_server.serving.operations import Lane, Operations
 from triquad_server.store.checkpoint_writer import CheckpointWriter
 
 _log = logging.getLogger(__name__)
@@ -37,10 +35,6 @@ class Resets:
         self._trails = trails
         self._checkpoints = checkpoints
         self._keep_resets = keep_resets
-
-    def serve_on(self, operations: Operations) -> None:
-        """Answer the requests of clients from now on."""
-        operations.serve(keys.RESET, ResetRequest, self.answer, Lane.FILES)
 
     def answer(self, request: ResetRequest) -> ResetReply:
         """Forget what lies in the request's box, and reply once an epoch shows it.

@@ -17,6 +17,7 @@ from triquad_map.mesh.tile_lattice import TileIndex, TileLattice
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.tile_cache import TileCache, tile_lattice
+from triquad_server.mesh.tile_level import TileBytes
 from triquad_server.process.threads import Teams
 from triquad_server.settings import MeshSettings, Settings
 from triquad_tools.simulation.lidar import SimulatedScan
@@ -390,3 +391,15 @@ def test_when_tiles_changed_is_told_for_any_of_them() -> None:
     cache.refresh(first)  # an older one tells nothing
     asked = np.array([[2, 2, 0], [-2, -2, 0], [900, 0, 0]])
     assert cache.changed(0, asked).tolist() == [second.number, first.number, 0]
+
+
+def test_bytes_that_are_unused_for_longest_are_dropped() -> None:
+    kept = TileBytes(limit=10)
+    kept.put((0, (1, 0, 0)), bytes(4))
+    kept.put((0, (2, 0, 0)), bytes(4))
+    assert kept.get((0, (1, 0, 0))) == bytes(4)
+    kept.put((0, (3, 0, 0)), bytes(4))
+    assert kept.get((0, (2, 0, 0))) is None
+    assert kept.size == 8
+    kept.put((0, (1, 0, 0)), bytes(50))
+    assert (kept.get((0, (1, 0, 0))), kept.size) == (bytes(50), 50), "one may be larger"
