@@ -46,11 +46,9 @@ class UpdateQueries:
         self._check(request)
         newest = self._epochs.newest
         self._refresh(newest)
-        ends_s = time.monotonic() + _SLICE_S
         delta = self._delta(request)
-        while delta.to_make and not delta.ready and time.monotonic() < ends_s:
-            self._epochs.give_way(_GIVE_WAY_S)
-            self._cache.make_some(request.level, delta.missing or delta.outdated)
+        if delta.to_make and not delta.ready:
+            self._make(request.level, delta.missing or delta.outdated)
             delta = self._delta(request)
         return self._reply(request, delta, is_current=self._cache.epoch >= newest.number)
 
@@ -65,6 +63,15 @@ class UpdateQueries:
             self._cache.refresh(newest)
             now = time.monotonic()
             self._next_refresh_s = now + _MAX_REFRESH_SHARE * (now - started)
+
+    def _make(self, level: int, indices: list[TileIndex]) -> None:
+        """Make tiles for a moment; queries come first."""
+        ends_s = time.monotonic() + _SLICE_S
+        left = dict.fromkeys(indices)
+        while left and time.monotonic() < ends_s:
+            self._epochs.give_way(_GIVE_WAY_S)
+            for index in self._cache.make_some(level, left):
+                del left[index]
 
     def _delta(self, request: TileUpdatesRequest) -> TileDelta:
         """Return what is new to the client."""
