@@ -85,14 +85,11 @@ def _exit_code(options: argparse.Namespace) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     require_libraries()
-    from triquad_format.wire.keys import check_name
-
     from triquad_server.launch_options import LaunchOptions
     from triquad_server.net.configuration import NetworkOptions
     from triquad_server.process.stop import Stop, Stops
     from triquad_server.settings.loading import load_settings, settings_toml
 
-    check_name("map", options.map)
     assignments = [*options.set, *_implied(options)]
     settings = load_settings(options.settings, assignments, preset=options.preset)
     if options.print_settings:

@@ -186,12 +186,9 @@ def serve(
         FormatError: a setting, the name of the map or the endpoint cannot be used.
     """
     require_libraries()
-    from triquad_format.wire.keys import check_name
-
     from triquad_server.launch_options import LaunchOptions
     from triquad_server.net.configuration import NetworkOptions
 
-    check_name("map", map)
     loaded = _loaded(settings)
     folder = None if store is None else Path(store)
     with _free_endpoint() if listen is None else nullcontext(full_endpoint(listen)) as endpoint:

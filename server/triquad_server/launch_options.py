@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from triquad_format.wire.keys import check_name
+
 from triquad_server.errors import ServerError
 from triquad_server.net.configuration import NetworkOptions
 from triquad_server.settings import Settings
@@ -20,10 +22,12 @@ class LaunchOptions:
     restore: int | None = None  # the epoch that the map is restored to; None: the newest
 
     def __post_init__(self) -> None:
-        """Refuse to restore without a store.
+        """Refuse a bad name, and to restore without a store.
 
         Raises:
+            FormatError: the map cannot have this name.
             ServerError: there is no store.
         """
+        check_name("map", self.map_name)
         if self.restore is not None and self.store is None:
             raise ServerError("--restore needs the --store that the map is taken from")

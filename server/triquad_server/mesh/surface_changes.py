@@ -1,6 +1,6 @@
 """Finds where the surface of a map changed, so that mesh tiles can be updated."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,9 +50,7 @@ class _Recorded:
     engine: FrozenField
     evidence: FrozenEvidence
     voxels: _Voxels
-    offsets: Floats | None
-    """[V] metres from each voxel's centre to the surface; None: to be computed by the engine."""
-
+    offsets: Floats  # [V] metres from each voxel's centre to the surface
     margins: NDArray[np.int8]  # [V, 6] of the voxels
 
 
@@ -84,37 +82,32 @@ class SurfaceChanges:
         found = [Changes(nothing, nothing)]
         for region in regions:
             old = before.pop(region.index, None)
-            if old is None:
-                new = self._seen(region, None)
-                found.append(Changes(self._centres(region.centre, new.voxels.keys), nothing))
-            elif old.engine is region.engine and old.evidence is region.evidence:
-                new = old
+            if old and old.engine is region.engine and old.evidence is region.evidence:
+                self._recorded[region.index] = old
             else:
-                new, changes = self._compare(old, self._seen(region, old))
+                self._recorded[region.index], changes = self._compare(old, region)
                 found.append(changes)
-            self._recorded[region.index] = new
-        found += [
-            Changes(self._centres(gone.centre, gone.voxels.keys), nothing)
-            for gone in before.values()
-        ]
+        for gone in before.values():
+            found.append(Changes(self._centres(gone.centre, gone.voxels.keys), nothing))
         return Changes(
             np.concatenate([changes.places for changes in found]),
             np.concatenate([changes.drifted for changes in found]),
         )
 
-    def _compare(self, old: _Recorded, new: _Recorded) -> tuple[_Recorded, Changes]:
-        """Return what is to be recorded, and what changed."""
-        voxels = new.voxels
-        now, last = self._offsets(new), self._offsets(old)
-        before, margins = last, old.margins
-        gone = np.zeros(0, np.int64)
-        if voxels is not old.voxels:
-            before = np.full(len(voxels.keys), np.nan, np.float32)
-            margins = voxels.margins.copy()
+    def _compare(self, old: _Recorded | None, region: FrozenRegion) -> tuple[_Recorded, Changes]:
+        """Return what is to be recorded, and what changed; without ``old``, all is new."""
+        if old is not None and old.evidence is region.evidence:
+            voxels = old.voxels
+        else:
+            voxels = self._voxels(region)
+        now = self._offsets(region, voxels.keys)
+        before = np.full(len(voxels.keys), np.nan, np.float32)
+        margins, gone = voxels.margins.copy(), np.zeros(0, np.int64)
+        if old is not None:
             _, rows, old_rows = np.intersect1d(
                 voxels.keys, old.voxels.keys, assume_unique=True, return_indices=True
             )
-            before[rows], margins[rows] = last[old_rows], old.margins[old_rows]
+            before[rows], margins[rows] = old.offsets[old_rows], old.margins[old_rows]
             gone = np.delete(old.voxels.keys, old_rows)
         moved = np.abs(now - before)
         is_new = np.isnan(before)
@@ -133,24 +126,15 @@ class SurfaceChanges:
         margins = np.where(is_reported[:, None], voxels.margins, margins)
         places = is_new | (left & many_left[voxels.group])
         keys = np.concatenate([gone, voxels.keys[places]])
-        return replace(new, offsets=offsets, margins=margins), Changes(
-            self._centres(new.centre, keys), voxels.groups[drifted]
-        )
-
-    def _seen(self, region: FrozenRegion, old: _Recorded | None) -> _Recorded:
-        """Return a region without offsets, which the first list of tiles does not need."""
-        if old is not None and old.evidence is region.evidence:
-            voxels = old.voxels
-        else:
-            voxels = self._voxels(region)
-        return _Recorded(
+        recorded = _Recorded(
             region.centre,
             region.engine,
             region.evidence,
             voxels,
-            offsets=None,
-            margins=voxels.margins,
+            offsets=offsets,
+            margins=margins,
         )
+        return recorded, Changes(self._centres(region.centre, keys), voxels.groups[drifted])
 
     def _voxels(self, region: FrozenRegion) -> _Voxels:
         evidence = region.evidence
@@ -170,21 +154,19 @@ class SurfaceChanges:
         corner = centre - self._settings.region_side_m / 2
         return corner + (_cells(keys) + 0.5) * self._settings.leaf_m
 
-    def _offsets(self, recorded: _Recorded) -> Floats:
+    def _offsets(self, region: FrozenRegion, keys: Longs) -> Floats:
         """Return the distance [V] from voxel centres to the surface, a voxel at most.
 
         Farther surfaces are in other voxels.
         """
-        if recorded.offsets is not None:
-            return recorded.offsets
-        centres = self._centres(recorded.centre, recorded.voxels.keys)
+        centres = self._centres(region.centre, keys)
         offsets = np.empty(len(centres), np.float32)
         leaf_m = self._settings.leaf_m
 
         def work(first: int, last: int) -> None:
             part = slice(first, last)
-            local = (centres[part] - recorded.centre).astype(np.float32)
-            values = recorded.engine.evaluate(local, True)
+            local = (centres[part] - region.centre).astype(np.float32)
+            values = region.engine.evaluate(local, True)
             slope = np.maximum(np.linalg.norm(values.gradient, axis=1), 0.1)
             offsets[part] = np.clip(values.sdf / slope, -leaf_m, leaf_m)
 

@@ -3,7 +3,7 @@
 import logging
 import threading
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import CheckpointInfo, CheckpointRequest
@@ -19,16 +19,6 @@ from triquad_server.store.store import Store
 _log = logging.getLogger(__name__)
 
 _NO_STORE = "the server was started without a store: the map is not kept"
-
-
-@dataclass(frozen=True)
-class _Counts:
-    """Counters of checkpoints so far."""
-
-    written: int = 0
-    failed: int = 0
-    duration_s: float | None = None  # seconds of writing the last
-    ended_s: float | None = None  # when the last was written, monotonic
 
 
 class CheckpointWriter:
@@ -49,7 +39,8 @@ class CheckpointWriter:
         self._store = store
         self._period_s = period_s
         self._stopping = threading.Event()
-        self._counts = _Counts()
+        self._metrics = CheckpointMetrics(0, 0, None, None)
+        self._ended_s: float | None = None  # when the last was written, monotonic
         self._timer = threading.Thread(target=self._write_regularly, name="checkpoints")
         self.writing = threading.RLock()  # locked while anything is written
         self.last = last
@@ -72,9 +63,8 @@ class CheckpointWriter:
 
     def metrics(self) -> CheckpointMetrics:
         """Return how many checkpoints were written, and how long the last took."""
-        counts = self._counts
-        age_s = None if counts.ended_s is None else time.monotonic() - counts.ended_s
-        return CheckpointMetrics(counts.written, counts.failed, counts.duration_s, age_s)
+        age_s = None if self._ended_s is None else time.monotonic() - self._ended_s
+        return replace(self._metrics, age_s=age_s)
 
     def close(self) -> None:
         """Write a last checkpoint, if the map changed since the one before.
@@ -151,18 +141,17 @@ class CheckpointWriter:
             del snapshot  # the records have all of it, and memory is shortest now
             info = self._opened.write(changes, undoes)
         except Exception as error:
-            self._counts = replace(self._counts, failed=self._counts.failed + 1)
+            self._metrics = replace(self._metrics, failed=self._metrics.failed + 1)
             if isinstance(error, StoreError):
                 self.error = str(error)
                 _log.error("%s", error)
             raise
         self.last, self.error = info, None
-        now = time.monotonic()
-        self._counts = replace(
-            self._counts,
-            written=self._counts.written + 1,
-            duration_s=now - started,
-            ended_s=now,
+        self._ended_s = time.monotonic()
+        self._metrics = replace(
+            self._metrics,
+            written=self._metrics.written + 1,
+            last_duration_s=self._ended_s - started,
         )
         _log.info("checkpoint %s: epoch %d, %d bytes", info.path, info.epoch, info.bytes)
         return info
