@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from triquad_format.records.arrays import Bools, Doubles, Longs
+from triquad_format.records.arrays import Bools, Doubles
 from triquad_format.wire.limits import MAX_SAMPLE_POINTS
 from triquad_format.wire.messages import Scan
+from triquad_format.wire.query_messages import ScanSample, SourceState
 
 from triquad_server.intake.rays import ScanRays
 
@@ -43,16 +44,14 @@ class TakenScan:
         """Return where the sensor was: [3] metres, map frame."""
         return self.world_from_sensor[:3, 3]
 
-
-@dataclass(frozen=True)
-class SourceDelta:
-    """The changes of a source since a revision."""
-
-    scans: int
-    whole: bool  # what was sent before is void
-    trail: Doubles  # [N, 3] metres, map frame
-    pieces: Longs  # [N] rise where the sensor jumped
-    newest: TakenScan | None  # where the new positions begin
+    def sample(self, max_points: int) -> ScanSample:
+        """Return the scan as it is sent, with at most ``max_points``."""
+        return ScanSample(
+            stamp_ns=self.stamp_ns,
+            world_from_sensor=self.world_from_sensor,
+            points=(evenly(self.points, max_points) - self.position).astype(np.float32),
+            points_used=self.points_used,
+        )
 
 
 class _Place(NamedTuple):
@@ -116,19 +115,22 @@ class _Source:
             ]
             self.rewritten = revision
 
-    def delta(self, revision: int) -> SourceDelta:
-        """Return the changes since a revision."""
+    def newer(self, revision: int) -> TakenScan | None:
+        """Return the newest scan, if it is not known since a revision."""
+        is_known = self.newest and self.newest.revision <= revision and self.rewritten <= revision
+        return None if is_known else self.newest
+
+    def delta(self, revision: int, max_points: int) -> SourceState:
+        """Return the changes since a revision, with at most ``max_points`` of the newest scan."""
         whole = self.rewritten > revision
         new = [place for place in self.trail if whole or place.revision > revision]
-        newest = self.newest
-        if newest is not None and not whole and newest.revision <= revision:
-            newest = None
-        return SourceDelta(
+        newest = self.newer(revision)
+        return SourceState(
             self.scans,
             whole,
             trail=_positions(new),
             pieces=np.array([place.piece for place in new], np.int64),
-            newest=newest,
+            newest=None if newest is None else newest.sample(max_points),
         )
 
 
@@ -172,11 +174,18 @@ class SourceTrails:
                 if source.newest is None and not source.trail:
                     del self._sources[name]
 
-    def since(self, revision: int) -> tuple[int, dict[str, SourceDelta]]:
-        """Return the revision now, and the changes of every source since an earlier one."""
+    def since(
+        self, revision: int, max_points: int = 0, max_points_in_all: int = 0
+    ) -> tuple[int, dict[str, SourceState]]:
+        """Return the revision now, and the changes of every source since an earlier one.
+
+        Newest scans have at most ``max_points`` each, and all together ``max_points_in_all``.
+        """
         with self._lock:
-            deltas = {name: source.delta(revision) for name, source in self._sources.items()}
-            return self._revision, deltas
+            new = sum(source.newer(revision) is not None for source in self._sources.values())
+            most = min(max_points, max_points_in_all // max(1, new))
+            states = {name: one.delta(revision, most) for name, one in self._sources.items()}
+            return self._revision, states
 
 
 def evenly(points: Doubles, count: int) -> Doubles:

@@ -1,16 +1,10 @@
 """Answers queries of where the sources of scans have been, and what they see."""
 
-import numpy as np
 from triquad_format.errors import RefusedError
 from triquad_format.wire.limits import MAX_SAMPLE_POINTS
-from triquad_format.wire.query_messages import (
-    ScanSample,
-    SourcesReply,
-    SourcesRequest,
-    SourceState,
-)
+from triquad_format.wire.query_messages import SourcesReply, SourcesRequest
 
-from triquad_server.intake.source_trails import SourceDelta, SourceTrails, TakenScan, evenly
+from triquad_server.intake.source_trails import SourceTrails
 
 MOST_POINTS = 100_000
 """The points of the newest scans of all sources together, at most, in one reply."""
@@ -36,34 +30,11 @@ class SourceQueries:
             )
         # The revision of another run of the server is ignored.
         known = request.revision if request.server == self._server else 0
-        revision, deltas = self._trails.since(known)
+        revision, sources = self._trails.since(known, request.max_points, MOST_POINTS)
         if request.revision < 0 or known > revision:
             raise RefusedError(
                 "bad_request",
                 f"revision = {request.revision} is not one that this server gave: use that of the "
                 "reply before, or 0",
             )
-        new = sum(source.newest is not None for source in deltas.values())
-        most = min(request.max_points, MOST_POINTS // max(1, new))
-        sources = {name: _state(source, most) for name, source in deltas.items()}
         return SourcesReply(self._server, revision, sources)
-
-
-def _state(delta: SourceDelta, max_points: int) -> SourceState:
-    return SourceState(
-        scans=delta.scans,
-        whole=delta.whole,
-        trail=delta.trail,
-        pieces=delta.pieces,
-        newest=None if delta.newest is None else _sample(delta.newest, max_points),
-    )
-
-
-def _sample(taken: TakenScan, max_points: int) -> ScanSample:
-    points = evenly(taken.points, max_points) - taken.position
-    return ScanSample(
-        stamp_ns=taken.stamp_ns,
-        world_from_sensor=taken.world_from_sensor,
-        points=points.astype(np.float32),
-        points_used=taken.points_used,
-    )
