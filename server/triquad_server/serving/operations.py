@@ -49,9 +49,6 @@ class Lane(Enum):
 _WORKERS = {Lane.QUESTIONS: max(2, THREADS), Lane.ADMINISTRATION: 2, Lane.MESH: 1, Lane.FILES: 1}
 """The threads of each lane; for questions there is one for each core."""
 
-_NICENESS = {Lane.MESH: NICENESS, Lane.FILES: 2 * NICENESS}
-"""The niceness of lanes whose work is long; questions come first."""
-
 
 @dataclass(frozen=True)
 class _Operation:
@@ -140,7 +137,7 @@ class Operations:
     def _queue(self, lane: Lane, limits: QueueLimits) -> RequestQueue[Request]:
         """Return a queue with workers, whose threads are started when they are needed."""
         workers = _WORKERS[lane]
-        nice = _NICENESS.get(lane, 0)
+        nice = NICENESS if lane in (Lane.MESH, Lane.FILES) else 0  # their work is long
         pool = ThreadPoolExecutor(workers + MOST_SENDING, lane.value, lower_priority, (nice,))
         self._pools.append(pool)
         return RequestQueue(
