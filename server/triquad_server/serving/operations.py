@@ -22,7 +22,7 @@ from triquad_server.serving.client_sessions import ClientSessions
 from triquad_server.serving.operation_counts import OperationCounts
 from triquad_server.serving.refusal_sender import RefusalSender
 from triquad_server.serving.request import Request, RequestT
-from triquad_server.serving.request_queue import MOST_SENDING, QueueLimits, RequestQueue
+from triquad_server.serving.request_queue import MOST_SENDING, RequestQueue
 from triquad_server.settings import ServiceSettings
 
 _log = logging.getLogger(__name__)
@@ -77,8 +77,7 @@ class Operations:
         self._operations: dict[str, _Operation] = {}  # by key
         self._queryables: list[zenoh.Queryable[Any]] = []
         self._pools: list[ThreadPoolExecutor] = []
-        limits = QueueLimits(settings.request_queue, _QUEUE_BYTES)
-        self._queues = {lane: self._queue(lane, limits) for lane in Lane}
+        self._queues = {lane: self._queue(lane, settings.request_queue) for lane in Lane}
         self._stopping = self._closed = False
         self.counts: dict[str, OperationCounts] = {}  # by operation, such as "query/sdf"
 
@@ -134,14 +133,17 @@ class Operations:
         self._refusals.close()
         self._sessions.close()
 
-    def _queue(self, lane: Lane, limits: QueueLimits) -> RequestQueue[Request]:
+    def _queue(self, lane: Lane, requests_each: int) -> RequestQueue[Request]:
         """Return a queue with workers, whose threads are started when they are needed."""
         workers = _WORKERS[lane]
         nice = NICENESS if lane in (Lane.MESH, Lane.FILES) else 0  # their work is long
         pool = ThreadPoolExecutor(workers + MOST_SENDING, lane.value, lower_priority, (nice,))
         self._pools.append(pool)
         return RequestQueue(
-            lambda request: submit(pool, self._work, request), workers=workers, limits=limits
+            lambda request: submit(pool, self._work, request),
+            workers=workers,
+            requests_each=requests_each,
+            nbytes=_QUEUE_BYTES,
         )
 
     def _receive(self, key: str, query: zenoh.Query) -> None:

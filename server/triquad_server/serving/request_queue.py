@@ -2,7 +2,6 @@
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
 from triquad_format.wire.metrics_messages import QueueMetrics
@@ -35,14 +34,6 @@ class Owned(Protocol):
 RequestT = TypeVar("RequestT", bound=Owned)
 
 
-@dataclass(frozen=True)
-class QueueLimits:
-    """The limits of what waits."""
-
-    requests_each: int  # requests of one client session
-    nbytes: int  # of the payloads of all
-
-
 class RequestQueue(Generic[RequestT]):
     """A bounded queue of requests, each handled by one of some workers; safe for any thread.
 
@@ -51,17 +42,20 @@ class RequestQueue(Generic[RequestT]):
     """
 
     def __init__(
-        self, begin: Callable[[RequestT], None], *, workers: int, limits: QueueLimits
+        self, begin: Callable[[RequestT], None], *, workers: int, requests_each: int, nbytes: int
     ) -> None:
-        """Begin with no requests; ``begin`` has a thread handle a request, and returns at once."""
+        """Begin with no requests; ``begin`` has a thread handle a request, and returns at once.
+
+        At most ``requests_each`` of one client session wait, and ``nbytes`` of all together.
+        """
         self._begin = begin
         self._workers = workers
         self._most_each = max(1, workers // 2)
         self._lock = threading.Lock()
         self._waiting: FairQueue[RequestT] = FairQueue(
-            limits.requests_each * _SESSIONS_WAITING,
-            limits.nbytes,
-            limits.requests_each,
+            requests_each * _SESSIONS_WAITING,
+            nbytes,
+            requests_each,
             newest_go=True,
         )
         self._working: set[RequestT] = set()

@@ -14,7 +14,6 @@ from triquad_server.serving.request_queue import (
     _SENDING_EACH,
     _SMALL_REPLY_BYTES,
     MOST_SENDING,
-    QueueLimits,
     RequestQueue,
 )
 
@@ -32,8 +31,9 @@ class Work:
 
     def __init__(self, workers=2, each=10, nbytes=1000):
         self.begun = []
-        limits = QueueLimits(requests_each=each, nbytes=nbytes)
-        self.queue = RequestQueue(self.begun.append, workers=workers, limits=limits)
+        self.queue = RequestQueue(
+            self.begun.append, workers=workers, requests_each=each, nbytes=nbytes
+        )
 
     def put(self, group, *numbers, name="", nbytes=1):
         """Returns the numbers of those that are refused."""
@@ -157,9 +157,11 @@ def test_every_request_ends_once_whatever_happens(seed):
                 end(excess)
             time.sleep(0.001 * chance.random())
 
-    limits = QueueLimits(requests_each=chance.choice([5, 100]), nbytes=10**6)
     queue = RequestQueue(
-        lambda request: pool.submit(answer, request), workers=chance.choice([1, 4]), limits=limits
+        lambda request: pool.submit(answer, request),
+        workers=chance.choice([1, 4]),
+        requests_each=chance.choice([5, 100]),
+        nbytes=10**6,
     )
     clients = [threading.Thread(target=ask, args=(f"client-{n}",)) for n in range(4)]
     for client in clients:
