@@ -65,6 +65,7 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
                 supervision.stopping()
         except StoppedEarlyError:
             why = stops.get()
+            supervision.stopping()
         _log.info("stopped")
         return why
 

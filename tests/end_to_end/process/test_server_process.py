@@ -203,6 +203,7 @@ def test_a_thread_that_ends_by_a_defect_stops_the_server_after_a_last_checkpoint
         before = learn(server.endpoint)
         with triquad_client.connect(server.endpoint) as client:
             client.publish_scan(servers.sphere(), POSE)
+            client.flush(servers.WAIT_S)
         assert server.wait() == 1
     assert "RuntimeError: a defect" in server.log
     assert "stopping, by an internal error" in server.log
