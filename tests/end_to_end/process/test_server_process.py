@@ -185,10 +185,11 @@ def test_all_checkpoints_damaged_is_no_reason_to_start_empty(store, arguments):
 
 
 A_THREAD_ENDS = """
+from pathlib import Path
 from triquad_server.health import Heartbeat
 
 def fail_later(heartbeat, status):
-    if status.scans_taken > 2:
+    if Path(__file__).with_name("fail").exists():
         raise RuntimeError("a defect")
 
 Heartbeat._log_progress = fail_later
@@ -201,9 +202,7 @@ def test_a_thread_that_ends_by_a_defect_stops_the_server_after_a_last_checkpoint
     (tmp_path / "sitecustomize.py").write_text(A_THREAD_ENDS)
     with servers.server_process(arguments, environment={"PYTHONPATH": str(tmp_path)}) as server:
         before = learn(server.endpoint)
-        with triquad_client.connect(server.endpoint) as client:
-            client.publish_scan(servers.sphere(), POSE)
-            client.flush(servers.WAIT_S)
+        (tmp_path / "fail").touch()
         assert server.wait() == 1
     assert "RuntimeError: a defect" in server.log
     assert "stopping, by an internal error" in server.log
