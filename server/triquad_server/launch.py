@@ -61,12 +61,10 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
             with opened(options, stops, supervision.starting) as service:
                 supervision.serving(service)
                 why = wait_for_stop(stops)
-                _log.info("stopping, %s", why.value)
                 supervision.stopping()
         except StoppedEarlyError:
             why = stops.get()
             supervision.stopping()
-        _log.info("stopped")
         return why
 
 
@@ -98,8 +96,13 @@ def opened(
         ServerError: the server cannot start; its subclasses name the cause.
         StoppedEarlyError: it was asked to stop before it had started.
     """
-    with ExitStack() as stack:
-        yield _open(options, stops, starting, stack)
+    try:
+        with ExitStack() as stack:
+            yield _open(options, stops, starting, stack)
+    except StoppedEarlyError:
+        _log.info("stopped")
+        raise
+    _log.info("stopped")
 
 
 def _open(options: LaunchOptions, stops: Stops, starting: Report, stack: ExitStack) -> Service:

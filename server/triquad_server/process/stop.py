@@ -1,9 +1,12 @@
 """The reasons for which a server stops; quick to import, so that signals are handled early."""
 
+import logging
 import queue
 import threading
 from contextlib import suppress
 from enum import Enum
+
+_log = logging.getLogger("triquad_server")
 
 
 class Stop(Enum):
@@ -25,7 +28,10 @@ def wait_for_stop(stops: Stops) -> Stop:
     The system may deliver a signal to any thread, a library's too, and its Python handler runs once
     the main thread does: so that thread must not block for good.
     """
-    while threading.main_thread().is_alive():
+    why: Stop | None = None
+    while why is None and threading.main_thread().is_alive():
         with suppress(queue.Empty):
-            return stops.get(timeout=_WAKE_S)
-    return Stop.ASKED
+            why = stops.get(timeout=_WAKE_S)
+    why = why or Stop.ASKED
+    _log.info("stopping, %s", why.value)
+    return why
