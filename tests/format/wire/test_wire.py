@@ -29,7 +29,7 @@ EXAMPLES = [
     TileList(2, 6.4, np.array([[-1, 0, 1]], np.int32), np.array([7], np.int64)),
     StatusRequest(),
     STATUS,
-    FlushReply(1, 2, 3, None),
+    FlushReply(True, 1, 2, 3, None),
     MapChunk(0, b"\x00\xff"),
 ]
 
