@@ -53,7 +53,7 @@ class CheckpointWriter:
 
     @property
     def base_epoch(self) -> int | None:
-        """As of :class:`Store`; only for who has locked :attr:`writing`."""
+        """As of :class:`Store`; only for who has locked ``writing``."""
         return self._opened.base_epoch
 
     def start(self) -> None:
@@ -120,7 +120,7 @@ class CheckpointWriter:
             return self.write_changes(self._mapper.call(lambda mapper: mapper.snapshot_since(base)))
 
     def write_changes(self, snapshot: MapSnapshot, undoes: str = "") -> CheckpointInfo:
-        """Write what changed since the last checkpoint, for who has locked :attr:`writing`.
+        """Write what changed since the last checkpoint, for who has locked ``writing``.
 
         A checkpoint that ``undoes`` something is written even if nothing changed.
 
