@@ -8,7 +8,6 @@ from triquad_format.errors import TriquadError
 from triquad_tools.viewer.mesh.mesh_layer import MeshLayer
 from triquad_tools.viewer.page.legends import problem_html, text_html
 from triquad_tools.viewer.page.page import Page
-from triquad_tools.viewer.questions.changes import Changes
 from triquad_tools.viewer.questions.clicks import Clicks
 from triquad_tools.viewer.questions.slice import SliceQuestion
 from triquad_tools.viewer.questions.unknown_space import UnknownSpace
@@ -49,7 +48,6 @@ class BrowserSession:
         page = Page(self._client, source, self._tell)
         if isinstance(shown, History):
             self._parts.callback(TimePanel(page, shown).close)
-            self._parts.callback(Changes(page, shown).close)
         for part in (MeshLayer, SliceQuestion, UnknownSpace, Clicks):
             self._parts.callback(part(page).close)
         if isinstance(source, LiveSource):
