@@ -5,11 +5,16 @@ import pytest
 from support.recordings.kitti_folder import write_folder
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.cloud import world_points
-from triquad_tools.recordings.folders.kitti import is_kitti_folder, read_kitti_folder
+from triquad_tools.recordings.folders.cloud_folder import is_cloud_folder, read_cloud_folder
 from triquad_tools.recordings.folders.scan_folder import ScanFolder
+from triquad_tools.recordings.options import ReadingOptions
 
 DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
 IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0"
+
+
+def read_kitti_folder(folder: Path) -> ScanFolder:
+    return read_cloud_folder(folder, ReadingOptions())
 
 
 def _turn(angle: float, translation: tuple[float, float, float]) -> np.ndarray:
@@ -106,7 +111,7 @@ def test_calibration_without_tr_is_refused(tmp_path: Path) -> None:
 def test_scan_of_a_broken_size_is_refused_before_any_is_read(tmp_path: Path) -> None:
     folder = read_kitti_folder(_folder(tmp_path, f"{IDENTITY}\n" * 3, 3))
     folder.files[2].path.write_bytes(b"x" * 33)
-    words = r"000002.bin: 33 bytes are not whole points of 16"
+    words = r"000002.bin: cannot be read: 33 bytes are not whole points of 16"
     with pytest.raises(ToolError, match=words):
         read_kitti_folder(tmp_path)
     with pytest.raises(ToolError, match=words):
@@ -115,15 +120,15 @@ def test_scan_of_a_broken_size_is_refused_before_any_is_read(tmp_path: Path) -> 
 
 def test_a_folder_is_a_recording(tmp_path: Path) -> None:
     recording = read_kitti_folder(_folder(tmp_path, f"{IDENTITY}\n" * 3, 3))
-    assert is_kitti_folder(tmp_path)
-    assert not is_kitti_folder(tmp_path / "scans" / "none")
+    assert is_cloud_folder(tmp_path)
+    assert not is_cloud_folder(tmp_path / "scans" / "none")
     assert {entry.source for entry in recording.entries} == {"default"}
     assert [stream.name for stream in recording.streams] == ["scans/*.bin", "poses.txt"]
     assert not recording.remarks
 
 
 def test_counts_that_differ_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ToolError, match=r"poses.txt: 1 poses for 3 scans"):
+    with pytest.raises(ToolError, match=r"3 files such as 000000.bin, and 1 poses in .*poses.txt"):
         read_kitti_folder(_folder(tmp_path, scans=3))
     (_folder(tmp_path / "b") / "times.txt").write_text("1.0\n2.0\n")
     with pytest.raises(ToolError, match=r"times.txt: 2 times for 1 scans"):
@@ -133,9 +138,9 @@ def test_counts_that_differ_are_refused(tmp_path: Path) -> None:
 def test_missing_parts_are_named(tmp_path: Path) -> None:
     with pytest.raises(ToolError, match="nowhere: no such folder"):
         read_kitti_folder(tmp_path / "nowhere")
-    with pytest.raises(ToolError, match=r"holds no poses.txt"):
+    with pytest.raises(ToolError, match=r"holds no .ply, .*nor does a folder"):
         read_kitti_folder(tmp_path)
-    with pytest.raises(ToolError, match=r"holds no \*.bin"):
+    with pytest.raises(ToolError, match=r"holds no .ply, .*.bin, nor"):
         read_kitti_folder(_folder(tmp_path, scans=0))
 
 
