@@ -54,8 +54,9 @@ def place_files(
         if placed.files:
             return placed
     if len(paths) == len(trajectory.poses):
-        untimed = stamps is not None and trajectory.frames is None
-        when = stamps if untimed else trajectory.stamps_ns.tolist()
+        when = trajectory.stamps_ns.tolist()
+        if stamps is not None and not timed:
+            when = list(stamps)
         poses = zip(paths, when, trajectory.poses, strict=True)
         if timed:
             remarks.append(

@@ -15,7 +15,6 @@ from triquad_format.records.arrays import Doubles
 from triquad_tools.console.command import ToolError
 from triquad_tools.sensors.point_times import TIME_FIELDS
 
-
 _BIN_BYTES = 16  # of a point
 
 
