@@ -7,12 +7,12 @@ from matplotlib import rc_context
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from triquad_client import Mesh, OfflineMap
+from triquad_client import Mesh
 from triquad_format.mapfile.durable_file import replacing
 from triquad_format.mapfile.metadata import utc_time
 from triquad_map.height_scale import HeightScale
 
-from triquad_tools.console.progress import progress
+from triquad_tools.mapfiles.meshfile import meshed
 from triquad_tools.mapfiles.source import Box, NothingLeftError, SourceMap
 from triquad_tools.plots.mesh_view import BACKGROUND, HEIGHT, WIDTH, draw_faces, view_along
 from triquad_tools.plots.plan import HEIGHTS, extend
@@ -32,9 +32,7 @@ def export_picture(source: SourceMap, box: Box | None, cell_m: float | None, pat
         NothingLeftError: no surface was seen.
         OSError: it cannot be written.
     """
-    bounds = None if box is None else (box[0].tolist(), box[1].tolist())
-    with OfflineMap(source.record) as opened, progress("meshing", 1.0) as report:
-        mesh = opened.mesh(bounds, cell_m, lambda done, of: report(done / of, f"{done} blocks"))
+    mesh = meshed(source.record, box, cell_m)
     if not len(mesh.faces):
         where = "" if box is None else " in the box of --crop"
         raise NothingLeftError(f"{path} is not written: no surface was seen{where}")
