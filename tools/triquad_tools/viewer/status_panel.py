@@ -20,8 +20,7 @@ class StatusPanel(Layer):
         super().__init__(page, "Server", _PERIOD_S)
         self._client = client
         with self.folder:
-            self._figures = page.gui.add_html("")
-            self._warnings = page.gui.add_html("")
+            self.add_text()
         self.start()
 
     def refresh(self) -> None:
@@ -29,9 +28,8 @@ class StatusPanel(Layer):
         asked_s = time.perf_counter()
         status = self._client.status()
         answered_ms = 1e3 * (time.perf_counter() - asked_s)
-        self._figures.content = table_html(_rows(status, answered_ms))
-        problems = [text for text in (status.store_error, status.warnings) if text]
-        self._warnings.content = "".join(map(problem_html, problems))
+        problems = (problem_html(text or "") for text in (status.store_error, status.warnings))
+        self.tell(table_html(_rows(status, answered_ms)) + "".join(problems))
 
 
 def _rows(status: ServerStatus, answered_ms: float) -> list[tuple[str, str]]:

@@ -21,7 +21,7 @@ class TimePanel(Layer):
         with self.folder:
             self._slider = page.gui.add_slider("Checkpoint", 1, 1, 1, 1)
             self._buttons = page.gui.add_button_group("", (_PREVIOUS, _NEXT))
-            self._text = page.gui.add_html("")
+            self.add_text()
         self._buttons.on_click(
             lambda _: self._slide_to(self._slider.value + (-1, 1)[self._buttons.value == _NEXT])
         )
@@ -43,13 +43,13 @@ class TimePanel(Layer):
         told = f"{wanted}\n{self._slider.value} of {len(moments)}"
         try:
             if wanted.epoch != shown:
-                self._tell(f"opening {wanted} …")
+                self._say(f"opening {wanted} …")
                 self.page.source = self._history.opened(wanted)
         except ToolError:
             self._slide_to(place)
             raise
         finally:
-            self._tell(told)
+            self._say(told)
 
     def _slide_to(self, number: int) -> None:
         """Choose the moment of this number, counted from 1."""
@@ -57,7 +57,5 @@ class TimePanel(Layer):
         self._slider.value = chosen  # type: ignore[misc] # viser has a setter that mypy overlooks
         self.wake()
 
-    def _tell(self, text: str) -> None:
-        content = text_html(text) + problem_html("\n".join(self._history.damaged))
-        if self._text.content != content:
-            self._text.content = content
+    def _say(self, text: str) -> None:
+        self.tell(text_html(text) + problem_html("\n".join(self._history.damaged)))

@@ -5,7 +5,6 @@ import viser
 from matplotlib.colors import to_rgb
 from triquad_client import Client
 from triquad_client.calls.sources import ScanSource, SourceReport
-from triquad_format.records.arrays import Doubles
 
 from triquad_tools.viewer.page.layer import Layer
 from triquad_tools.viewer.page.legends import text_html
@@ -30,7 +29,7 @@ class TrailLayer(Layer):
         with self.folder:
             self._trails = page.gui.add_checkbox("Trail", True)
             self._scans = page.gui.add_checkbox("Newest scan", True)
-            self._list = page.gui.add_html(text_html("No scan has come yet."))
+            self.add_text(text_html("No scan has come yet."))
         self.start(self._trails, self._scans)
 
     def refresh(self) -> None:
@@ -41,28 +40,23 @@ class TrailLayer(Layer):
             return
         marks: list[viser.SceneNodeHandle] = []
         for number, source in enumerate(report.sources.values()):
-            marks += self._marks_of(source, np.array(to_rgb(_COLOURS[number % len(_COLOURS)])))
+            marks += self._marks_of(source, _COLOURS[number % len(_COLOURS)])
         self.draw(marks)
         self._shown = wanted
         if report.sources:
-            self._list.content = text_html("\n".join(map(_line, report.sources.values())))
+            self.tell(text_html("\n".join(map(_line, report.sources.values()))))
 
-    def _marks_of(self, source: ScanSource, colour: Doubles) -> list[viser.SceneNodeHandle]:
+    def _marks_of(self, source: ScanSource, colour: str) -> list[viser.SceneNodeHandle]:
         """Return the trail of a source, and points of its newest scan."""
-        scene, in_scene = self.page.scene, self.page.in_scene
         marks: list[viser.SceneNodeHandle] = []
         lines = [line for line in source.lines() if len(line) > 1] if self._trails.value else []
         if lines:
             pieces = np.concatenate([np.stack([line[:-1], line[1:]], axis=1) for line in lines])
-            trail = scene.add_line_segments(
-                self.node("trail"), in_scene(pieces), colour,
-                thickness=_LINE_PIXELS, thickness_units="screen",
-            )  # fmt: skip
-            marks.append(trail)
+            marks.append(self.lines(pieces, colour, _LINE_PIXELS, "screen"))
         if source.newest is not None and self._scans.value:
-            points = in_scene(source.newest.points)
-            cloud = scene.add_point_cloud(
-                self.node("scan"), points, colour, point_size=_POINT_M, precision="float32"
+            points, light = self.page.in_scene(source.newest.points), np.array(to_rgb(colour))
+            cloud = self.page.scene.add_point_cloud(
+                self.node("scan"), points, light, point_size=_POINT_M, precision="float32"
             )
             marks.append(cloud)
         return marks
