@@ -10,11 +10,10 @@ from triquad_format.errors import DamagedMapFileError
 from triquad_format.mapfile.checkpoint import read_checkpoint
 from triquad_format.mapfile.checkpoint_folder import checkpoint_file, checkpoint_files, set_aside
 from triquad_format.mapfile.parts.part import EVIDENCE, REGION, TRAINING, VERTICES
-from triquad_format.records.field_settings import check_range
 from triquad_format.recovery.recovered_map import Loss, RecoveredMap, recover
 from triquad_format.wire.limits import MAX_FILL_M
 
-from triquad_tools.console.arguments import add_version, error_limit, not_negative, positive
+from triquad_tools.console.arguments import add_version, error_limit, within
 from triquad_tools.console.command import FAILED, OK, ToolError, refuse, run
 from triquad_tools.console.lines import print_line
 from triquad_tools.mapfiles.packing import DTYPES, pack_map
@@ -85,12 +84,12 @@ def _add_content(add: _Add) -> None:
 
 def _add_target(add: _Add) -> None:
     cell = "side of cells of a mesh or a picture (default: half a leaf)"
-    add("--cell", type=positive, metavar="M", help=cell)
+    add("--cell", type=partial(within, *_CELL_RANGE_M), metavar="M", help=cell)
     fill = (
         "of a mesh: continue surface into unknown space, where the field does, up to so far from "
     )
     fill += f"what was seen, at most {MAX_FILL_M:g} m; those faces are marked"
-    add("--fill", type=not_negative, default=0.0, metavar="M", help=fill)
+    add("--fill", type=partial(within, 0.0, MAX_FILL_M), default=0.0, metavar="M", help=fill)
     add("--force", action="store_true", help="replace OUT where it exists")
 
 
@@ -169,10 +168,6 @@ def _bytes_of(path: Path) -> int:
 
 def _export(options: argparse.Namespace, path: Path) -> int:
     box, output = _box(options.crop), options.output
-    if options.cell is not None:
-        check_range("--cell", options.cell, *_CELL_RANGE_M)
-    if options.fill:
-        check_range("--fill", options.fill, 0.0, MAX_FILL_M)
     margin_m = max(_MARGIN_M, _MARGIN_CELLS * (options.cell or 0.0)) + options.fill
     needed = None if box is None else box + [[-margin_m], [margin_m]]
     source, complete = _source(options, path, needed, training=False)

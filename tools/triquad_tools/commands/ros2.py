@@ -23,7 +23,6 @@ from triquad_tools.ros2.bridge import Bridge
 from triquad_tools.ros2.options import (
     MAX_GRID_CELLS,
     BridgeOptions,
-    MeshOptions,
     ScanOptions,
     SliceShape,
 )
@@ -152,8 +151,9 @@ def bridge_options(options: argparse.Namespace) -> BridgeOptions:
             by_arrival=options.clock == "arrival",
             wait_s=options.wait_s,
         ),
-        MeshOptions(options.mesh_level, options.mesh_bytes_per_s),
         grid,
+        options.mesh_level,
+        options.mesh_bytes_per_s,
     )
 
 

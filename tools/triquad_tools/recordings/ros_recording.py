@@ -14,7 +14,7 @@ from triquad_tools.sensors.errors import NoScanError
 from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES
 from triquad_tools.sensors.motion.placing import place
 from triquad_tools.sensors.ros import type_store
-from triquad_tools.sensors.ros.topic import source_of_topic
+from triquad_tools.sensors.ros.header import source_of_topic
 from triquad_tools.sensors.sweep import PosedScan
 
 _CLOCKS = (

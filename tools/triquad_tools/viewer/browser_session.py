@@ -14,7 +14,6 @@ from triquad_tools.viewer.questions.unknown_space import UnknownSpace
 from triquad_tools.viewer.sources.history import History
 from triquad_tools.viewer.sources.live_source import LiveSource
 from triquad_tools.viewer.sources.map_source import MapSource
-from triquad_tools.viewer.status_panel import StatusPanel
 from triquad_tools.viewer.time_panel import TimePanel
 from triquad_tools.viewer.trail_layer import TrailLayer
 
@@ -51,7 +50,6 @@ class BrowserSession:
         for part in (MeshLayer, SliceQuestion, UnknownSpace, Clicks):
             self._parts.callback(part(page).close)
         if isinstance(source, LiveSource):
-            self._parts.callback(StatusPanel(page, source.client).close)
             self._parts.callback(TrailLayer(page, source.client).close)
 
     def _tell(self, part: str, problem: str) -> None:
