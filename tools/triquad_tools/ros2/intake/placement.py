@@ -1,7 +1,6 @@
 """Pending sweeps, until it is known where they were taken."""
 
 import logging
-import math
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -36,6 +35,7 @@ class _Waiting:
     sweep: Sweep
     needs_ns: tuple[int, int]  # first and last time at which the sensor's pose is needed
     give_up_s: float  # monotonic
+    is_over: bool = False  # time went back before its stamp, so its transforms come no more
 
 
 class Placement:
@@ -62,10 +62,9 @@ class Placement:
         self._keep_within_limit(now_s)
 
     def give_up_after(self, topic_name: str, stamp_ns: int) -> None:
-        """Wait no more for sweeps of a topic that lie after a time to which it went back."""
+        """Drop pending sweeps of a topic that lie after a time to which it went back."""
         for entry in self._waiting.get(topic_name, ()):
-            if entry.sweep.stamp_ns > stamp_ns:
-                entry.give_up_s = -math.inf
+            entry.is_over = entry.is_over or entry.sweep.stamp_ns > stamp_ns
 
     def settle(self, now_s: float) -> Iterator[Placed]:
         """Return the sweeps that are no longer pending, with their outcome."""
@@ -91,9 +90,13 @@ class Placement:
         try:
             outcome: PosedScan | NoScanError = self._scan(entry, now_s)
         except NoTransformError as error:
-            if error.late and now_s < entry.give_up_s:
+            if error.late and entry.is_over:
+                text = "time went back before its transforms came, or its stamp was wrong"
+                outcome = NoScanError("restarted", text)
+            elif error.late and now_s < entry.give_up_s:
                 return None
-            outcome = error
+            else:
+                outcome = error
         except NoScanError as error:
             outcome = error
         except Exception as error:  # whatever numbers came must not stop the others
