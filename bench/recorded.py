@@ -6,7 +6,6 @@ from pathlib import Path
 from triquad_tools.console.lines import print_remark
 from triquad_tools.recordings.cloud import is_withheld, points_in_range
 from triquad_tools.recordings.folders.cloud_folder import read_cloud_folder
-from triquad_tools.recordings.options import ReadingOptions
 from triquad_tools.sensors.sweep import PosedScan
 
 _SKIP_EVERY = 7
@@ -30,7 +29,7 @@ def check_recorded(part: str, folder: Path | None) -> None:
     if folder is None:
         print_remark(f"{part}: recorded scans are left out: give --recorded FOLDER")
     else:
-        read_cloud_folder(folder, ReadingOptions())
+        read_cloud_folder(folder)
 
 
 def recorded_scans(path: Path, scans: int | None = None) -> RecordedScans:
@@ -39,7 +38,7 @@ def recorded_scans(path: Path, scans: int | None = None) -> RecordedScans:
     Raises:
         ToolError: the folder cannot be read.
     """
-    folder = read_cloud_folder(path, ReadingOptions())
+    folder = read_cloud_folder(path)
     mapped: list[PosedScan] = []
     withheld: list[PosedScan] = []
     indices = range(len(folder))[:scans]

@@ -27,7 +27,6 @@ from triquad_tools.mapfiles.meshfile import read_mesh
 from triquad_tools.mapfiles.source import Access, open_map
 from triquad_tools.recordings.cloud import is_withheld, merged, world_points
 from triquad_tools.recordings.folders.cloud_folder import read_cloud_folder
-from triquad_tools.recordings.options import ReadingOptions
 from triquad_tools.simulation.street import street_drive
 
 _COMMAND = "triquad-eval"
@@ -82,7 +81,7 @@ def _on_street(options: argparse.Namespace) -> Results:
 
 
 def _at_withheld(options: argparse.Namespace) -> Results:
-    folder = read_cloud_folder(options.withheld, ReadingOptions())
+    folder = read_cloud_folder(options.withheld)
     every = options.skip_every
     indices = [i for i in range(len(folder)) if every == 0 or is_withheld(i, every)]
     if not indices:
@@ -99,7 +98,7 @@ def _at_withheld(options: argparse.Namespace) -> Results:
 def _reference(path: Path, voxel_m: float, range_min_m: float) -> Doubles:
     """Return the points ``[N, 3]`` of a cloud, or of all scans of a folder in the world frame."""
     if path.is_dir():
-        folder = read_cloud_folder(path, ReadingOptions())
+        folder = read_cloud_folder(path)
         clouds = (world_points(scan, range_min_m) for scan in folder.read(range(len(folder))))
         points = merged(clouds, voxel_m)
     else:

@@ -33,13 +33,14 @@ def is_cloud_folder(folder: Path) -> bool:
     return folder.is_dir() and bool(_folders_of_clouds(folder))
 
 
-def read_cloud_folder(folder: Path, options: ReadingOptions) -> ScanFolder:
+def read_cloud_folder(folder: Path, options: ReadingOptions | None = None) -> ScanFolder:
     """Return the clouds of a folder, or of the one folder in it that has some, with their poses.
 
     Raises:
         ToolError: there are no clouds, no trajectory or no common times, a file is damaged, or
             the clouds seem to be in another frame than it is said.
     """
+    options = options or ReadingOptions()
     paths = _cloud_paths(folder)
     placed = place_files(folder, options.trajectory, paths, read_times(folder, len(paths)))
     if not sum(check_all(paths, check_points)):
