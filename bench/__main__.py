@@ -151,7 +151,7 @@ def _parser() -> argparse.ArgumentParser:
         "--recorded",
         type=Path,
         metavar="FOLDER",
-        help="KITTI-style scans that part moving maps twice over, too",
+        help="a folder of scans that part moving maps twice over, too",
     )
     add(
         "--results",

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from triquad_tools.console.lines import print_remark
 from triquad_tools.recordings.cloud import is_withheld, points_in_range
-from triquad_tools.recordings.folders.kitti import read_kitti_folder
+from triquad_tools.recordings.folders.cloud_folder import read_cloud_folder
 from triquad_tools.sensors.sweep import PosedScan
 
 _SKIP_EVERY = 7
@@ -29,7 +29,7 @@ def check_recorded(part: str, folder: Path | None) -> None:
     if folder is None:
         print_remark(f"{part}: recorded scans are left out: give --recorded FOLDER")
     else:
-        read_kitti_folder(folder)
+        read_cloud_folder(folder)
 
 
 def recorded_scans(path: Path, scans: int | None = None) -> RecordedScans:
@@ -38,7 +38,7 @@ def recorded_scans(path: Path, scans: int | None = None) -> RecordedScans:
     Raises:
         ToolError: the folder cannot be read.
     """
-    folder = read_kitti_folder(path)
+    folder = read_cloud_folder(path)
     mapped: list[PosedScan] = []
     withheld: list[PosedScan] = []
     indices = range(len(folder))[:scans]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.files.changing_store import EMPTY, box_at, write_checkpoint
 from triquad_tools.console.command import ToolError
-from triquad_tools.viewer.sources.history import DamagedError, History
+from triquad_tools.viewer.sources.history import DamagedError, History, moment
 from triquad_tools.viewer.sources.map_source import COARSEST
 from triquad_tools.viewer.sources.stored_map import StoredMap, StoredTiles
 
@@ -22,16 +22,21 @@ def completed(follower: StoredTiles) -> StoredTiles:
     return follower
 
 
+def epochs(history: History) -> list[int]:
+    return [file.epoch for file in history.files()]
+
+
 def test_few_maps_stay_open_but_those_that_are_shown_do(tmp_path: Path) -> None:
     for epoch in range(1, 7):
         write_checkpoint(tmp_path, epoch, EMPTY)
     history = History(tmp_path)
-    shown = history.opened(history.moments[0])
-    others = [weakref.ref(history.opened(moment)) for moment in history.moments[1:]]
+    first, *rest = history.files()
+    shown = history.opened(first)
+    others = [weakref.ref(history.opened(file)) for file in rest]
     gc.collect()
     assert [other() is None for other in others] == [True, False, False, False, False]
     shown.queries.query_sdf(ORIGIN)
-    assert history.opened(history.moments[5]) is others[4](), "the last one is open still"
+    assert history.opened(rest[-1]) is others[4](), "the last one is open still"
 
 
 def test_tiles_of_a_file_are_its_mesh(tmp_path: Path) -> None:
@@ -58,13 +63,10 @@ def test_checkpoints_come_and_go(tmp_path: Path) -> None:
     first = write_checkpoint(tmp_path, 1, EMPTY)
     history = History(tmp_path)
     write_checkpoint(tmp_path, 2, EMPTY)
-    assert [moment.epoch for moment in history.moments] == [1]
-    history.refresh()
-    assert [moment.epoch for moment in history.moments] == [1, 2]
+    assert epochs(history) == [1, 2]
     first.unlink()
-    history.refresh()
-    assert [str(moment) for moment in history.moments] == ["epoch 2, 2026-01-31T14:00:00Z"]
-    assert history.damaged == ()
+    assert [moment(file) for file in history.files()] == ["epoch 2, 2026-01-31T14:00:00Z"]
+    assert history.damaged() == []
 
 
 def flip(path: Path) -> None:
@@ -86,8 +88,8 @@ def test_damaged_checkpoints_are_named_and_left_out(
     damage(write_checkpoint(tmp_path, 2, EMPTY))
     history = History(tmp_path)
     assert history.newest().queries.epoch == 1
-    assert [moment.epoch for moment in history.moments] == [1]
-    (problem,) = history.damaged
+    assert epochs(history) == [1]
+    (problem,) = history.damaged()
     assert problem.startswith("epoch-000000002.triquad is left out: ")
 
 
@@ -98,8 +100,8 @@ def test_a_moment_that_cannot_be_shown_is_none_any_more(tmp_path: Path) -> None:
     history = History(tmp_path)
     assert history.newest().queries.epoch == 3
     with pytest.raises(DamagedError, match="epoch-000000002"):
-        history.opened(history.moments[1])
-    assert [moment.epoch for moment in history.moments] == [1, 3]
+        history.opened(history.files()[1])
+    assert epochs(history) == [1, 3]
 
 
 def test_a_store_of_which_nothing_is_left(tmp_path: Path) -> None:

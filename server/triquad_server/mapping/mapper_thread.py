@@ -135,6 +135,7 @@ class MapperThread:
             else_s = 0.0
             while not self._stopping.is_set():
                 else_s = self._turn(else_s)
+                self._wake.clear()  # before what it told of is looked at, the end among it
             self._run_commands()
             self._publish()
         except Exception as error:
@@ -152,7 +153,6 @@ class MapperThread:
 
         ``else_s`` is the time of all but scans in the last round; return the same of this one.
         """
-        self._wake.clear()
         self._epochs.remove_expired()
         self._run_commands()
         if self._paused.is_set():

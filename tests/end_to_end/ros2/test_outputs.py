@@ -21,7 +21,6 @@ from triquad_tools.commands.ros2 import bridge_options
 from triquad_tools.ros2.bridge import Bridge
 from triquad_tools.ros2.intake.scan_publisher import Place
 from triquad_tools.ros2.node import Node
-from triquad_tools.ros2.options import MeshOptions
 from triquad_tools.ros2.output.map_thread import PERIOD_S
 from triquad_tools.ros2.output.mesh_publisher import MeshPublisher
 from triquad_tools.ros2.output.topic_publisher import TopicPublisher
@@ -182,7 +181,7 @@ def test_markers_keep_to_their_rate_also_where_they_are_larger_than_a_round(serv
         subscribed(session, "mesh", lambda sample: sizes.append(len(sample.payload))),
         closing(Node(session, domain=0)) as node,
         closing(TopicPublisher(session, node, Topic("/mesh", MARKER), 0, Delivery())) as publisher,
-        closing(MeshPublisher(publisher, client, MeshOptions(0, bytes_per_s=1000))) as mesh,
+        closing(MeshPublisher(publisher, client, level=0, bytes_per_s=1000)) as mesh,
     ):
         while len(sizes) < 5:
             mesh.publish(Place("world", np.zeros(3), stamp_ns=0))

@@ -8,7 +8,7 @@ from support import servers
 from support.ros.ros_bridge import Bridged, bridging
 from support.ros.ros_robot import SECOND, T0, robot
 from triquad_client.calls.sources import ScanSource
-from triquad_tools.recordings.folders.kitti import read_kitti_folder
+from triquad_tools.recordings.folders.cloud_folder import read_cloud_folder
 
 SEOSAN = Path(__file__).resolve().parents[4] / "shared" / "data" / "seosan01"
 SCANS = 3
@@ -25,7 +25,7 @@ def told(bridged: Bridged) -> ScanSource:
 def test_scans_of_a_robot_are_those_of_the_client() -> None:
     if not SEOSAN.is_dir():
         pytest.skip("real scans seosan01 are not in ../shared/data")
-    folder = read_kitti_folder(SEOSAN)
+    folder = read_cloud_folder(SEOSAN)
     with servers.running_service() as endpoint:
         with bridging(endpoint) as bridged:
             for index in range(SCANS):

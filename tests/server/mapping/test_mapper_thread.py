@@ -105,6 +105,30 @@ def test_a_command_returns_its_result_or_raises_its_error() -> None:
         assert "internal error" in mapping.ended(), "what else it left undone, nobody knows"
 
 
+def test_an_end_that_comes_as_a_turn_begins_is_not_slept_through(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    turn, asked, begun = MapperThread._turn, Event(), Event()
+
+    def held_turn(self: MapperThread, else_s: float) -> float:
+        begun.set()
+        asked.wait(servers.WAIT_S)
+        return turn(self, else_s)
+
+    monkeypatch.setattr(MapperThread, "_turn", held_turn)
+    with running(Mapper("test", settings(), "cpu")) as mapping:
+        assert begun.wait(servers.WAIT_S)
+        mapping.thread.pause()
+        closing_thread = threading.Thread(target=mapping.thread.close, daemon=True)
+        closing_thread.start()
+        while not mapping.thread._stopping.is_set():
+            time.sleep(0.01)
+        time.sleep(0.1)
+        asked.set()
+        closing_thread.join(10.0)
+        assert not closing_thread.is_alive()
+
+
 def test_commands_of_a_thread_that_ended_are_refused() -> None:
     with running(Mapper("test", settings(), "cpu")) as mapping:
         pass

@@ -13,7 +13,7 @@ def write_folder(
     poses: NDArray[np.float64],
     stamps_ns: Sequence[int] | NDArray[np.int64],
 ) -> None:
-    """Write scans as a folder that ``triquad_tools.recordings.folders.kitti`` reads back unchanged.
+    """Write scans as a folder of KITTI, which a recording is read back from unchanged.
 
     Args:
         folder: made where it is missing.

@@ -119,9 +119,9 @@ def test_a_map_of_a_street_is_scored_against_it(capsys, tmp_path):
 def test_input_that_cannot_be_used_is_refused(tmp_path, capsys, sphere_folder):
     def refusal(*arguments):
         assert evaluate.main([str(argument) for argument in arguments]) == 2
-        error = capsys.readouterr().err
+        *before, error = capsys.readouterr().err.splitlines()
+        assert all("looking through" in line for line in before)
         assert error.startswith("triquad-eval: ")
-        assert error.count("\n") == 1
         return error
 
     mesh = _plate(tmp_path / "plate.ply", (0, 1), (0, 1), 0.0)
@@ -130,7 +130,7 @@ def test_input_that_cannot_be_used_is_refused(tmp_path, capsys, sphere_folder):
     assert "no such file" in refusal("mesh", tmp_path / "no.ply", "--street", 1)
     assert "has no faces" in refusal("mesh", cloud, "--reference", cloud)
     assert "no.ply" in refusal("mesh", mesh, "--reference", tmp_path / "no.ply")
-    assert "holds no poses.txt" in refusal("mesh", mesh, "--reference", tmp_path)
+    assert "holds no trajectory" in refusal("mesh", mesh, "--reference", tmp_path)
     assert "no such file" in refusal("map", tmp_path / "no.triquad", "--street", 1, "--scans", 1)
     assert "plate.ply" in refusal("map", mesh, "--withheld", sphere_folder)
     far_apart = ("map", mesh, "--withheld", sphere_folder, "--skip-every", SCANS + 1)

@@ -199,7 +199,7 @@ def test_input_that_cannot_be_used_is_refused(tmp_path: Path, recording: str, ca
         ((recording, other, "--set", "scan.range=5"), "unknown setting"),
         ((recording, other, "--start", "99"), "no scan is left"),
         ((recording, other, "--stride", "2"), "for which --stride means nothing"),
-        ((recording, other, "--no-deskew"), "for which --no-deskew means nothing"),
+        ((recording, other, "--transform", "a b 0 0 0 0 0 0 1"), "for which --transform means"),
     ):
         assert main(list(map(str, arguments))) == 2
         assert words in capsys.readouterr().err

@@ -171,7 +171,7 @@ def test_what_is_missing_or_too_much_is_named(tmp_path):
     with pytest.raises(ToolError, match="nowhere: no such folder"):
         read_cloud_folder(tmp_path / "nowhere")
     assert not is_cloud_folder(tmp_path)
-    with pytest.raises(ToolError, match=r"holds no .ply, .pcd, .las, .laz, nor does a folder"):
+    with pytest.raises(ToolError, match=r"holds no .ply, .pcd, .las, .laz, .bin, nor does"):
         read_cloud_folder(tmp_path)
     _counted(tmp_path, 3)
     with pytest.raises(ToolError, match=r"holds no trajectory, trajectory.txt, .*--trajectory"):

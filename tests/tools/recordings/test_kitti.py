@@ -5,7 +5,7 @@ import pytest
 from support.recordings.kitti_folder import write_folder
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.cloud import world_points
-from triquad_tools.recordings.folders.kitti import is_kitti_folder, read_kitti_folder
+from triquad_tools.recordings.folders.cloud_folder import is_cloud_folder, read_cloud_folder
 from triquad_tools.recordings.folders.scan_folder import ScanFolder
 
 DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
@@ -47,7 +47,7 @@ def test_folder_round_trip(tmp_path: Path) -> None:
     poses = np.array([_turn(0.1 * i, (i / 3.0, 1e5 + 0.1, -2.0)) for i in range(3)])
     stamps = [1624254615786958123, 1624254615886958123, 1624254616000000007]
     write_folder(tmp_path / "made", scans, poses, stamps)
-    read = read_kitti_folder(tmp_path / "made")
+    read = read_cloud_folder(tmp_path / "made")
     assert len(read) == 3
     assert _stamps(read) == stamps
     np.testing.assert_allclose(_poses(read), poses, rtol=0.0, atol=1e-12)
@@ -58,7 +58,7 @@ def test_folder_round_trip(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("under", [".", "scans", "velodyne", "velodyne_points/data"])
 def test_scans_are_found_in_each_layout(tmp_path: Path, under: str) -> None:
-    folder = read_kitti_folder(_folder(tmp_path, f"{IDENTITY}\n{IDENTITY}\n", 2, under))
+    folder = read_cloud_folder(_folder(tmp_path, f"{IDENTITY}\n{IDENTITY}\n", 2, under))
     assert [file.path.name for file in folder.files] == ["000000.bin", "000001.bin"]
     assert np.all(_points(folder, 1) == 1.0)
     assert _stamps(folder) == [0, 100_000_000]
@@ -69,7 +69,7 @@ def test_scans_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     for name in ("10.bin", "2.bin"):
         np.zeros((1, 4), "<f4").tofile(folder / name)
     (folder / "._2.bin").write_bytes(b"of macOS")
-    assert [file.path.name for file in read_kitti_folder(folder).files] == ["2.bin", "10.bin"]
+    assert [file.path.name for file in read_cloud_folder(folder).files] == ["2.bin", "10.bin"]
 
 
 def test_calibration_turns_rotations_too(tmp_path: Path) -> None:
@@ -77,7 +77,7 @@ def test_calibration_turns_rotations_too(tmp_path: Path) -> None:
     # 0.5 m behind the camera, swings around it.
     folder = _folder(tmp_path, "0 0 1 0 0 1 0 0 -1 0 0 0")
     (folder / "calib.txt").write_text("Tr: 0 -1 0 0  0 0 -1 0  1 0 0 -0.5\n")
-    pose = _poses(read_kitti_folder(folder))[0]
+    pose = _poses(read_cloud_folder(folder))[0]
     np.testing.assert_allclose(pose[:3, 0], [0.0, -1.0, 0.0], atol=1e-12)  # now looks right
     np.testing.assert_allclose(pose[:3, 3], [0.5, 0.5, 0.0], atol=1e-12)
 
@@ -94,49 +94,49 @@ def test_calibration_turns_rotations_too(tmp_path: Path) -> None:
 )
 def test_bad_pose_is_refused_with_its_place(tmp_path: Path, line: str, words: str) -> None:
     with pytest.raises(ToolError, match=words):
-        read_kitti_folder(_folder(tmp_path, f"{IDENTITY}\n{line}\n", 2))
+        read_cloud_folder(_folder(tmp_path, f"{IDENTITY}\n{line}\n", 2))
 
 
 def test_calibration_without_tr_is_refused(tmp_path: Path) -> None:
     (_folder(tmp_path) / "calib.txt").write_text("P0: 1 0 0 0 0 1 0 0 0 0 1 0\n")
     with pytest.raises(ToolError, match="calib.txt: has no line 'Tr:'"):
-        read_kitti_folder(tmp_path)
+        read_cloud_folder(tmp_path)
 
 
 def test_scan_of_a_broken_size_is_refused_before_any_is_read(tmp_path: Path) -> None:
-    folder = read_kitti_folder(_folder(tmp_path, f"{IDENTITY}\n" * 3, 3))
+    folder = read_cloud_folder(_folder(tmp_path, f"{IDENTITY}\n" * 3, 3))
     folder.files[2].path.write_bytes(b"x" * 33)
-    words = r"000002.bin: 33 bytes are not whole points of 16"
+    words = r"000002.bin: cannot be read: 33 bytes are not whole points of 16"
     with pytest.raises(ToolError, match=words):
-        read_kitti_folder(tmp_path)
+        read_cloud_folder(tmp_path)
     with pytest.raises(ToolError, match=words):
         _points(folder, 2)
 
 
 def test_a_folder_is_a_recording(tmp_path: Path) -> None:
-    recording = read_kitti_folder(_folder(tmp_path, f"{IDENTITY}\n" * 3, 3))
-    assert is_kitti_folder(tmp_path)
-    assert not is_kitti_folder(tmp_path / "scans" / "none")
+    recording = read_cloud_folder(_folder(tmp_path, f"{IDENTITY}\n" * 3, 3))
+    assert is_cloud_folder(tmp_path)
+    assert not is_cloud_folder(tmp_path / "scans" / "none")
     assert {entry.source for entry in recording.entries} == {"default"}
     assert [stream.name for stream in recording.streams] == ["scans/*.bin", "poses.txt"]
     assert not recording.remarks
 
 
 def test_counts_that_differ_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ToolError, match=r"poses.txt: 1 poses for 3 scans"):
-        read_kitti_folder(_folder(tmp_path, scans=3))
+    with pytest.raises(ToolError, match=r"3 files such as 000000.bin, and 1 poses in .*poses.txt"):
+        read_cloud_folder(_folder(tmp_path, scans=3))
     (_folder(tmp_path / "b") / "times.txt").write_text("1.0\n2.0\n")
     with pytest.raises(ToolError, match=r"times.txt: 2 times for 1 scans"):
-        read_kitti_folder(tmp_path / "b")
+        read_cloud_folder(tmp_path / "b")
 
 
 def test_missing_parts_are_named(tmp_path: Path) -> None:
     with pytest.raises(ToolError, match="nowhere: no such folder"):
-        read_kitti_folder(tmp_path / "nowhere")
-    with pytest.raises(ToolError, match=r"holds no poses.txt"):
-        read_kitti_folder(tmp_path)
-    with pytest.raises(ToolError, match=r"holds no \*.bin"):
-        read_kitti_folder(_folder(tmp_path, scans=0))
+        read_cloud_folder(tmp_path / "nowhere")
+    with pytest.raises(ToolError, match=r"holds no .ply, .*nor does a folder"):
+        read_cloud_folder(tmp_path)
+    with pytest.raises(ToolError, match=r"holds no .ply, .*.bin, nor"):
+        read_cloud_folder(_folder(tmp_path, scans=0))
 
 
 @pytest.mark.parametrize("times", ["soon\n", "-1\n", "1e30\n", "2\n1\n"])
@@ -144,13 +144,13 @@ def test_bad_times_are_refused(tmp_path: Path, times: str) -> None:
     count = times.count("\n")
     (_folder(tmp_path, f"{IDENTITY}\n" * count, count) / "times.txt").write_text(times)
     with pytest.raises(ToolError, match=r"times.txt:\d: "):
-        read_kitti_folder(tmp_path)
+        read_cloud_folder(tmp_path)
 
 
 def _real(name: str) -> ScanFolder:
     if not (DATA / name).is_dir():
         pytest.skip(f"real scans {name} are not in ../shared/data")
-    return read_kitti_folder(DATA / name)
+    return read_cloud_folder(DATA / name)
 
 
 @pytest.mark.parametrize(("name", "scans"), [("seosan01", 21), ("kitti07_mini", 5)])

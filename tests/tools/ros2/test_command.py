@@ -46,10 +46,10 @@ def test_a_file_with_other_things_in_it_is_refused(tmp_path: Path, text: str, re
     ("arguments", "reason"),
     [
         (["--clouds", "/a b"], "'/a b' is not the name of a topic"),
-        (["--domain", "233"], "'233' is out of range: use 0 to 232"),
+        (["--domain", "233"], "'233' is not a whole number: use 0 to 232"),
         (["--wait-s", "soon"], "'soon' is not a number"),
-        (["--grid-cell-m", "0.001"], "0.001 is out of range: use 0.01 to 10"),
-        (["--mesh-bytes-per-s", "5"], "'5' is out of range: use 1000 to"),
+        (["--grid-cell-m", "0.001"], "'0.001' is not a number in range: use 0.01 to 10"),
+        (["--mesh-bytes-per-s", "5"], "'5' is not a whole number: use 1000 to"),
     ],
 )
 def test_wrong_options_are_refused_with_the_value(

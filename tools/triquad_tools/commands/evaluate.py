@@ -26,7 +26,7 @@ from triquad_tools.evaluation.score_rows import mesh_rows, street_rows, withheld
 from triquad_tools.mapfiles.meshfile import read_mesh
 from triquad_tools.mapfiles.source import Access, open_map
 from triquad_tools.recordings.cloud import is_withheld, merged, world_points
-from triquad_tools.recordings.folders.kitti import read_kitti_folder
+from triquad_tools.recordings.folders.cloud_folder import read_cloud_folder
 from triquad_tools.simulation.street import street_drive
 
 _COMMAND = "triquad-eval"
@@ -81,7 +81,7 @@ def _on_street(options: argparse.Namespace) -> Results:
 
 
 def _at_withheld(options: argparse.Namespace) -> Results:
-    folder = read_kitti_folder(options.withheld)
+    folder = read_cloud_folder(options.withheld)
     every = options.skip_every
     indices = [i for i in range(len(folder)) if every == 0 or is_withheld(i, every)]
     if not indices:
@@ -98,7 +98,7 @@ def _at_withheld(options: argparse.Namespace) -> Results:
 def _reference(path: Path, voxel_m: float, range_min_m: float) -> Doubles:
     """Return the points ``[N, 3]`` of a cloud, or of all scans of a folder in the world frame."""
     if path.is_dir():
-        folder = read_kitti_folder(path)
+        folder = read_cloud_folder(path)
         clouds = (world_points(scan, range_min_m) for scan in folder.read(range(len(folder))))
         points = merged(clouds, voxel_m)
     else:
@@ -125,7 +125,7 @@ def _parser() -> argparse.ArgumentParser:
     mesh = kinds.add_parser("mesh", help="score a mesh file")
     mesh.set_defaults(evaluate=_evaluate_mesh)
     mesh.add_argument("mesh", type=Path, metavar="MESH", help=".ply or .glb")
-    reference = "true surface points: a .ply file, or a KITTI-style folder of scans"
+    reference = "true surface points: a .ply file, or a folder of scans"
     _add_truth(mesh, "--reference", reference)
     near = "nearer than this is right; twice as far is an outlier (default: 0.1)"
     mesh.add_argument("--threshold", type=positive, default=0.1, metavar="M", help=near)
@@ -135,7 +135,7 @@ def _parser() -> argparse.ArgumentParser:
     add("target", metavar="MAP", help="map file, or endpoint of a server (tcp/HOST:PORT)")
     add("--map", default=DEFAULT_MAP, metavar="NAME", help="map of the server (default: default)")
     add_config(of_map)
-    unseen = "KITTI-style folder with scans that the map has not seen"
+    unseen = "folder with scans that the map has not seen"
     _add_truth(of_map, "--withheld", unseen)
     every = "as given to triquad-replay: score at every Nth scan only (default: at all)"
     add("--skip-every", type=count, default=0, metavar="N", help=every)

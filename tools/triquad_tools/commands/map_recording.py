@@ -1,7 +1,6 @@
 """``triquad-map``: a recording in, a map out."""
 
 import argparse
-import os
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from functools import partial
@@ -20,7 +19,7 @@ from triquad_tools.console.command import OK, ToolError, run
 from triquad_tools.console.lines import print_line, print_remark
 from triquad_tools.console.progress import progress
 from triquad_tools.mapping.mapping_run import MappingRun, stop_requests
-from triquad_tools.mapping.output import SUFFIXES, write_output
+from triquad_tools.mapping.output import SUFFIXES, check_target, write_output
 from triquad_tools.mapping.unfinished import UnfinishedMap, mapping_key
 from triquad_tools.recordings.arguments import add_recording
 from triquad_tools.recordings.selection import Selection, open_selected
@@ -37,7 +36,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _map(options: argparse.Namespace) -> int:
     output = options.output
-    _check_output(output, options.force)
+    check_target(output, force=options.force)
     settings = load_settings(options.settings, options.set, preset=options.preset)
     device = choose_device(options.device)
     selection = open_selected(options)
@@ -101,18 +100,6 @@ def _check_result(mapper: Mapper, mapping: MappingRun, selection: Selection) -> 
         if not mapper.regions:
             raise ToolError(f"nothing was mapped: {told}")
         print_remark(f"{_COMMAND}: {told}")
-
-
-def _check_output(path: Path, force: bool) -> None:
-    """Refuse a target that cannot be written, before the work is done."""
-    if path.suffix not in SUFFIXES:
-        raise ToolError(f"{path}: use a name that ends in {', '.join(SUFFIXES)}")
-    if path.is_dir():
-        raise ToolError(f"{path} is a folder; give the name of a file")
-    if os.path.lexists(path) and not force:
-        raise ToolError(f"{path} exists; give --force to replace it")
-    if not path.parent.is_dir():
-        raise ToolError(f"{path.parent} is not a folder: make it first")
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -1,7 +1,6 @@
 """``triquad-pack``: rewrite a map file: smaller, from history, repaired, as a mesh or a picture."""
 
 import argparse
-import os
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -11,11 +10,10 @@ from triquad_format.errors import DamagedMapFileError
 from triquad_format.mapfile.checkpoint import read_checkpoint
 from triquad_format.mapfile.checkpoint_folder import checkpoint_file, checkpoint_files, set_aside
 from triquad_format.mapfile.parts.part import EVIDENCE, REGION, TRAINING, VERTICES
-from triquad_format.records.field_settings import check_range
 from triquad_format.recovery.recovered_map import Loss, RecoveredMap, recover
 from triquad_format.wire.limits import MAX_FILL_M
 
-from triquad_tools.console.arguments import add_version, error_limit, not_negative, positive
+from triquad_tools.console.arguments import add_version, error_limit, within
 from triquad_tools.console.command import FAILED, OK, ToolError, refuse, run
 from triquad_tools.console.lines import print_line
 from triquad_tools.mapfiles.packing import DTYPES, pack_map
@@ -28,12 +26,11 @@ from triquad_tools.mapfiles.source import (
     is_endpoint,
     read_source,
 )
+from triquad_tools.mapping.output import MAP_SUFFIX, SUFFIXES, check_target, export
 
 _COMMAND = "triquad-pack"
 _DAMAGE = (DamagedMapFileError, NothingLeftError)
-_MAP, _MESHES, _PICTURE = ".triquad", (".ply", ".glb", ".obj", ".stl"), ".png"
 _MARKED = (".ply", ".glb", ".obj")  # meshes that can show which faces fill holes
-_SUFFIXES = (_MAP, *_MESHES, _PICTURE)
 _PLANES = ("XY", "XZ", "YZ")
 _CELL_RANGE_M = (0.01, 10.0)
 _MARGIN_M = 3.2  # so far around its box a map is needed for a mesh of cells of 0.2 m
@@ -64,7 +61,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_source(add: _Add) -> None:
     add("input", type=Path, metavar="IN", help="map file, or folder of checkpoints")
-    add("output", type=Path, metavar="OUT", help="its name ends in " + ", ".join(_SUFFIXES))
+    add("output", type=Path, metavar="OUT", help="its name ends in " + ", ".join(SUFFIXES))
     at = "take the newest checkpoint of the folder IN that is not after this, such as 120 or "
     at += "2026-01-31T12:00:00Z (default: the newest of all)"
     add("--at", metavar="EPOCH_OR_TIME", help=at)
@@ -87,12 +84,12 @@ def _add_content(add: _Add) -> None:
 
 def _add_target(add: _Add) -> None:
     cell = "side of cells of a mesh or a picture (default: half a leaf)"
-    add("--cell", type=positive, metavar="M", help=cell)
+    add("--cell", type=partial(within, *_CELL_RANGE_M), metavar="M", help=cell)
     fill = (
         "of a mesh: continue surface into unknown space, where the field does, up to so far from "
     )
     fill += f"what was seen, at most {MAX_FILL_M:g} m; those faces are marked"
-    add("--fill", type=not_negative, default=0.0, metavar="M", help=fill)
+    add("--fill", type=partial(within, 0.0, MAX_FILL_M), default=0.0, metavar="M", help=fill)
     add("--force", action="store_true", help="replace OUT where it exists")
 
 
@@ -108,7 +105,7 @@ def _pack(options: argparse.Namespace) -> int:
             if newer.name > path.name:
                 told = "is newer, but damaged: --recover saves what is intact of it"
                 print_line(f"{_COMMAND}: {newer} {told}")
-    write = _pack_map if options.output.suffix == _MAP else _export
+    write = _pack_map if options.output.suffix == MAP_SUFFIX else _export
     try:
         return write(options, path)
     except MemoryError as error:
@@ -123,16 +120,13 @@ def _check_usage(options: argparse.Namespace) -> None:
         f"{options.input} is a server: give its store, or what client.download_map saved": (
             is_endpoint(str(options.input))
         ),
-        f"{options.output}: use a name that ends in {', '.join(_SUFFIXES)}": (
-            suffix not in _SUFFIXES
-        ),
         f"--precision and --max-error are of map files: {suffix} has none": (
-            rounds and suffix != _MAP
+            rounds and suffix != MAP_SUFFIX
         ),
         f"--max-error makes integers: leave out --precision {options.precision}": (
             options.max_error and options.precision
         ),
-        "--cell is of meshes: a map file has none": options.cell and suffix == _MAP,
+        "--cell is of meshes: a map file has none": options.cell and suffix == MAP_SUFFIX,
         f"--fill is of meshes that can mark it, {', '.join(_MARKED)}": (
             options.fill and suffix not in _MARKED
         ),
@@ -146,15 +140,9 @@ def _check_target(source: Path, target: Path, force: bool) -> None:
     named_so = checkpoint_file(target) is not None
     if named_so and folder.is_dir() and checkpoint_files(folder):
         raise ToolError(f"{target} would pass for a checkpoint of {folder}; give another name")
-    if os.path.lexists(target):
-        if source.exists() and target.exists() and target.samefile(source):
-            raise ToolError(f"{target} is the input; write to another file")
-        if target.is_dir():
-            raise ToolError(f"{target} is a folder; give the name of a file")
-        if not force:
-            raise ToolError(f"{target} exists; give --force to replace it")
-    elif not target.parent.is_dir():
-        raise ToolError(f"{target.parent} is not a folder: make it first")
+    if source.exists() and target.exists() and target.samefile(source):
+        raise ToolError(f"{target} is the input; write to another file")
+    check_target(target, force=force)
 
 
 def _pack_map(options: argparse.Namespace, path: Path) -> int:
@@ -180,21 +168,10 @@ def _bytes_of(path: Path) -> int:
 
 def _export(options: argparse.Namespace, path: Path) -> int:
     box, output = _box(options.crop), options.output
-    if options.cell is not None:
-        check_range("--cell", options.cell, *_CELL_RANGE_M)
-    if options.fill:
-        check_range("--fill", options.fill, 0.0, MAX_FILL_M)
     margin_m = max(_MARGIN_M, _MARGIN_CELLS * (options.cell or 0.0)) + options.fill
     needed = None if box is None else box + [[-margin_m], [margin_m]]
     source, complete = _source(options, path, needed, training=False)
-    if output.suffix == _PICTURE:
-        from triquad_tools.plots.picture import export_picture  # slow to import
-
-        written = export_picture(source, box, options.cell, path=output)
-    else:
-        from triquad_tools.mapfiles.meshfile import export_mesh  # slow to import
-
-        written = export_mesh(source.record, box, options.cell, path=output, fill_m=options.fill)
+    written = export(source, output, box=box, cell_m=options.cell, fill_m=options.fill)
     print_line(f"{output}: {written}")
     return OK if complete else FAILED
 

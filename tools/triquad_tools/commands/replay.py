@@ -3,6 +3,7 @@
 import argparse
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 from triquad_client import Client, FlushReport, connect
@@ -10,7 +11,7 @@ from triquad_client import Client, FlushReport, connect
 from triquad_tools.console.arguments import add_version, positive
 from triquad_tools.console.command import FAILED, OK, run
 from triquad_tools.console.lines import print_line
-from triquad_tools.console.progress import Speed, progress
+from triquad_tools.console.progress import progress
 from triquad_tools.console.report import print_columns
 from triquad_tools.console.server_arguments import DEFAULT_MAP, add_server
 from triquad_tools.recordings.arguments import add_recording, options_of
@@ -20,11 +21,9 @@ from triquad_tools.recordings.publishing import (
     keep_few_pending,
     wait_until_settled,
 )
-from triquad_tools.recordings.recording import ScanEntry
 from triquad_tools.recordings.selection import Selection, length_s, open_selected
 
 _COMMAND = "triquad-replay"
-_LOOK_PERIOD_S = 1.0  # between questions how many scans were lost
 
 DueTimes = Callable[[Sequence[int]], list[float]]
 """Returns when scans are sent, seconds after the first, by their stamps in nanoseconds."""
@@ -63,14 +62,11 @@ def _replay(options: argparse.Namespace) -> int:
     selection = open_selected(options)
     with connect(options.connect, options.map or DEFAULT_MAP, config=options.config) as client:
         before = client.status().scans_dropped
-        publisher = _Publisher(client, options.source, by_server=options.rate is None)
-        publisher.publish(selection, options.rate or _at_once)
+        sent = _publish(client, selection, options.source, options.rate)
         flush = client.flush(FLUSH_TIMEOUT_S)
-        seconds = publisher.seconds
         after = client.status().scans_dropped
         refusals = {reason: count - before.get(reason, 0) for reason, count in after.items()}
-        rate = f"{seconds:.1f} s, {publisher.published / max(seconds, 1e-9):.1f} scans/s"
-        print_line(f"{publisher.summary(flush, refusals)}, {rate}")
+        print_line(_summary(sent, flush, refusals))
         if flush.last_refusal:
             print_line(f"last refusal: {flush.last_refusal}")
         if options.settle:
@@ -80,67 +76,53 @@ def _replay(options: argparse.Namespace) -> int:
     return OK if flush.lost == flush.refused == 0 else FAILED
 
 
-class _Publisher:
-    """Sends scans at a pace, and shows progress."""
+@dataclass(frozen=True)
+class _Sent:
+    """What was sent, and how long it took, with the time until it was taken."""
 
-    def __init__(self, client: Client, source: str | None, *, by_server: bool) -> None:
-        """With ``by_server``, the server sets the pace, so that nothing is lost."""
-        self._client = client
-        self._source = source
-        self._by_server = by_server
-        self._started = self._next_look = time.monotonic()
-        self._lost_before = self._lost_now = self._lost()
-        self.published = 0
-        self.skipped = 0  # not sent: no point was left of them
+    published: int
+    skipped: int  # not sent: no point was left of them
+    started_s: float  # monotonic
 
     @property
-    def seconds(self) -> float:
-        """The seconds since the first scan was sent."""
-        return time.monotonic() - self._started
+    def pace(self) -> str:
+        """How long it has taken so far, and at which rate."""
+        seconds = time.monotonic() - self.started_s
+        return f"{seconds:.1f} s, {self.published / max(seconds, 1e-9):.1f} scans/s"
 
-    def publish(self, selection: Selection, due_times: DueTimes) -> None:
-        """Send all chosen scans, each when it is due."""
-        entries, total = selection.entries, len(selection)
-        due_s = due_times([entry.stamp_ns for entry in entries])
-        with progress("publishing", total) as report:
-            for done, scan in enumerate(selection.scans(), start=1):
-                entry: ScanEntry = entries[done - 1]
-                time.sleep(max(0.0, due_s[done - 1] - self.seconds))
-                if len(scan.points):
-                    source = self._source or entry.source
-                    pose, stamp_s = scan.world_from_sensor, entry.stamp_ns / 1e9
-                    self._client.publish_scan(scan.points, pose, stamp_s, source=source)
-                    self.published += 1
-                    if self._by_server:
-                        keep_few_pending(self._client, self.published)
-                else:
-                    self.skipped += 1
-                report(done, self._note(done, total))
 
-    def summary(self, flush: FlushReport, refusals: dict[str, int]) -> str:
-        """Return what became of the scans; ``refusals`` are the server's counts by reason."""
-        reasons = ", ".join(f"{reason}: {count}" for reason, count in refusals.items() if count > 0)
-        parts = [
-            f"{self.published} scans published",
-            f"{flush.taken} taken",
-            f"{flush.refused} refused" + (f" ({reasons})" if flush.refused and reasons else ""),
-            f"{flush.lost} lost",
-        ]
-        if self.skipped:
-            parts.append(f"{self.skipped} without points not sent")
-        return ", ".join(parts)
+def _publish(
+    client: Client, selection: Selection, source: str | None, due_times: DueTimes | None
+) -> _Sent:
+    """Send all chosen scans, each when it is due; without times the server sets the pace."""
+    entries, total = selection.entries, len(selection)
+    due_s = due_times([entry.stamp_ns for entry in entries]) if due_times else [0.0] * total
+    started_s, published = time.monotonic(), 0
+    with progress("publishing", total) as report:
+        for done, (entry, scan) in enumerate(zip(entries, selection.scans(), strict=True), start=1):
+            time.sleep(max(0.0, started_s + due_s[done - 1] - time.monotonic()))
+            if len(scan.points):
+                stamp_s, name = entry.stamp_ns / 1e9, source or entry.source
+                client.publish_scan(scan.points, scan.world_from_sensor, stamp_s, source=name)
+                published += 1
+                if due_times is None:
+                    keep_few_pending(client, published)
+            report(done, f"{done} of {total} scans")
+    return _Sent(published, total - published, started_s)
 
-    def _note(self, done: int, total: int) -> str:
-        if time.monotonic() >= self._next_look:
-            self._next_look = time.monotonic() + _LOOK_PERIOD_S
-            self._lost_now = self._lost()
-        speed = Speed.of(done, total - done, self.seconds)
-        rate = f"{speed.per_s:.1f} /s, {self._lost_now - self._lost_before} lost"
-        return f"{done} of {total} scans, {rate}, {speed.left_s:.0f} s left"
 
-    def _lost(self) -> int:
-        """Return how many scans the server has lost so far, of all sources."""
-        return sum(self._client.status().scans_lost.values())
+def _summary(sent: _Sent, flush: FlushReport, refusals: dict[str, int]) -> str:
+    """Return what became of the scans; ``refusals`` are the server's counts by reason."""
+    reasons = ", ".join(f"{reason}: {count}" for reason, count in refusals.items() if count > 0)
+    parts = [
+        f"{sent.published} scans published",
+        f"{flush.taken} taken",
+        f"{flush.refused} refused" + (f" ({reasons})" if flush.refused and reasons else ""),
+        f"{flush.lost} lost",
+    ]
+    if sent.skipped:
+        parts.append(f"{sent.skipped} without points not sent")
+    return ", ".join([*parts, sent.pace])
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -169,7 +151,3 @@ def due_times(text: str) -> DueTimes:
     if text.endswith("x"):
         return lambda stamps_ns: [(stamp - stamps_ns[0]) / 1e9 / factor for stamp in stamps_ns]
     return lambda stamps_ns: [number / factor for number in range(len(stamps_ns))]
-
-
-def _at_once(stamps_ns: Sequence[int]) -> list[float]:
-    return [0.0] * len(stamps_ns)

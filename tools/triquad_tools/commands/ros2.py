@@ -14,7 +14,7 @@ from pathlib import Path
 
 from triquad_client import Client, ConnectError, UnknownMapError, connect
 
-from triquad_tools.console.arguments import add_version, count
+from triquad_tools.console.arguments import add_version, count, whole, within
 from triquad_tools.console.command import FAILED, OK, ToolError, run
 from triquad_tools.console.interrupts import sigterm_interrupts
 from triquad_tools.console.log import start_log
@@ -23,7 +23,6 @@ from triquad_tools.ros2.bridge import Bridge
 from triquad_tools.ros2.options import (
     MAX_GRID_CELLS,
     BridgeOptions,
-    MeshOptions,
     ScanOptions,
     SliceShape,
 )
@@ -152,8 +151,9 @@ def bridge_options(options: argparse.Namespace) -> BridgeOptions:
             by_arrival=options.clock == "arrival",
             wait_s=options.wait_s,
         ),
-        MeshOptions(options.mesh_level, options.mesh_bytes_per_s),
         grid,
+        options.mesh_level,
+        options.mesh_bytes_per_s,
     )
 
 
@@ -208,7 +208,7 @@ def _add_topics(group: argparse._ArgumentGroup) -> None:
     add = group.add_argument
     add(
         "--domain",
-        type=partial(_whole, 0, 232),
+        type=partial(whole, 0, 232),
         default=os.environ.get("ROS_DOMAIN_ID") or "0",
         metavar="ID",
         help="of nodes of rmw_zenoh (default: ROS_DOMAIN_ID of the environment, or 0)",
@@ -243,7 +243,7 @@ def _add_topics(group: argparse._ArgumentGroup) -> None:
     )
     add(
         "--wait-s",
-        type=partial(_within, 0, 60),
+        type=partial(within, 0, 60),
         default=2.0,
         metavar="S",
         help="for which a cloud waits for its transforms (default: 2)",
@@ -255,7 +255,7 @@ def _add_outputs(group: argparse._ArgumentGroup) -> None:
     add("--mesh-level", type=int, choices=(0, 1, 2), default=1, help="of detail (default: 1)")
     add(
         "--mesh-bytes-per-s",
-        type=partial(_whole, 1000, 2**40),
+        type=partial(whole, 1000, 2**40),
         default=5_000_000,
         metavar="N",
         help="of markers, at most (default: 5000000)",
@@ -267,7 +267,7 @@ def _add_outputs(group: argparse._ArgumentGroup) -> None:
     ):
         add(
             f"--grid-{name}-m",
-            type=partial(_within, low, high),
+            type=partial(within, low, high),
             default=default,
             metavar="M",
             help=f"{name} of the occupancy grid (default: {default:g})",
@@ -278,22 +278,6 @@ def _topic(text: str) -> str:
     if len(text) > 255 or not _TOPIC.fullmatch(text):
         raise argparse.ArgumentTypeError(f"{text!r:.300} is not the name of a topic")
     return text
-
-
-def _whole(low: int, high: int, text: str) -> int:
-    if not text.isascii() or not text.isdigit() or not low <= int(text) <= high:
-        raise argparse.ArgumentTypeError(f"{text!r:.40} is out of range: use {low} to {high}")
-    return int(text)
-
-
-def _within(low: float, high: float, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r:.40} is not a number") from None
-    if not low <= value <= high:
-        raise argparse.ArgumentTypeError(f"{text} is out of range: use {low:g} to {high:g}")
-    return value
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from triquad_tools.console.command import OK, complain, refuse, run
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.progress import progress
 from triquad_tools.console.server_arguments import DEFAULT_MAP, add_server, server_name
-from triquad_tools.viewer.sources.history import History
+from triquad_tools.viewer.sources.history import History, moment
 from triquad_tools.viewer.sources.live_source import LiveSource
 from triquad_tools.viewer.sources.map_source import MapSource
 from triquad_tools.viewer.sources.stored_map import StoredMap
@@ -69,10 +69,10 @@ def _store(path: Path) -> History:
     history = History(path)
     with progress(f"opening {path}") as report:
         report(1, _name(history.newest()))
-    for problem in history.damaged:
+    for problem in history.damaged():
         complain(_COMMAND, problem, OK)
-    moments = history.moments
-    print_line(f"{len(moments)} checkpoints: {moments[0]} to {moments[-1]}")
+    files = history.files()
+    print_line(f"{len(files)} checkpoints: {moment(files[0])} to {moment(files[-1])}")
     return history
 
 

@@ -26,14 +26,15 @@ def positive(text: str) -> float:
     return value
 
 
-def not_negative(text: str) -> float:
-    """Return a finite number of at least 0."""
+def within(least: float, most: float | None, text: str) -> float:
+    """Return a finite number of a range; without ``most`` it has no end."""
     try:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not 0.0 <= value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of at least 0")
+    if not math.isfinite(value) or value < least or (most is not None and value > most):
+        values = f"at least {least:g}" if most is None else f"{least:g} to {most:g}"
+        raise argparse.ArgumentTypeError(f"{text!r:.40} is not a number in range: use {values}")
     return value
 
 
@@ -69,6 +70,9 @@ def whole(least: int, most: int | None, text: str) -> int:
         raise argparse.ArgumentTypeError(f"{text!r:.40} is not a whole number: use {values}")
     return int(text)
 
+
+not_negative = partial(within, 0.0, None)
+"""Returns a finite number of at least 0."""
 
 count = partial(whole, 1, None)
 """Returns a whole number of at least 1."""

@@ -4,7 +4,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
 
 from triquad_format.printable import printable
 
@@ -17,22 +16,11 @@ Report = Callable[[float, str], None]
 _LINE_PERIOD_S = 10.0
 
 
-@dataclass(frozen=True)
-class Speed:
-    """The speed of work, and its remaining time."""
-
-    per_s: float
-    left_s: float
-
-    @classmethod
-    def of(cls, done: float, left: float, seconds: float) -> "Speed":
-        """Return the speed of work of which the given amount was done in ``seconds``."""
-        per_s = done / max(seconds, 1e-9)
-        return cls(per_s, left / max(per_s, 1e-9))
-
-
 def progress(title: str, total: float | None = None) -> AbstractContextManager[Report]:
-    """Show the progress of a step on standard error; without a total, that it goes on."""
+    """Show the progress of a step on standard error, and how long it will take.
+
+    Without a total it shows that it goes on.
+    """
     show = _bar if sys.stderr.isatty() else _lines
     return show(title, total)
 
@@ -40,13 +28,21 @@ def progress(title: str, total: float | None = None) -> AbstractContextManager[R
 @contextmanager
 def _bar(title: str, total: float | None) -> Iterator[Report]:
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        SpinnerColumn,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
 
     columns = (
         SpinnerColumn(),
         TextColumn("{task.description}", markup=False),
         BarColumn(),
         TimeElapsedColumn(),
+        TimeRemainingColumn(),
         TextColumn("{task.fields[note]}", markup=False),
     )
     with Progress(*columns, console=Console(stderr=True)) as bars:
@@ -65,15 +61,19 @@ def _lines(title: str, total: float | None) -> Iterator[Report]:
     started = time.monotonic()
     next_line = started + _LINE_PERIOD_S
     latest = ""
+    first: tuple[float, float] | None = None  # when it was first reported, and how much was done
     print_remark(f"{title} ...")
 
     def report(done: float, note: str) -> None:
-        nonlocal next_line, latest
+        nonlocal next_line, latest, first
+        first = first or (time.monotonic(), done)
         share = "" if total is None else f"{min(done / max(total, 1e-9), 1.0):.0%} "
         latest = f"{share}{note}".strip()
         if time.monotonic() >= next_line:
             next_line = time.monotonic() + _LINE_PERIOD_S
-            print_remark(f"  {title}: {latest}")
+            since_s, since = time.monotonic() - first[0], done - first[1]
+            left = f", {(total - done) * since_s / since:.0f} s left" if total and since > 0 else ""
+            print_remark(f"  {title}: {latest}{left}")
 
     yield report
     end = f"  {title}: done in {time.monotonic() - started:.1f} s"

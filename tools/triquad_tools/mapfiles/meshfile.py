@@ -45,24 +45,33 @@ def read_mesh(path: Path) -> Mesh:
     return Mesh(vertices, faces)
 
 
+def meshed(record: MapRecord, box: Box | None, cell_m: float | None, fill_m: float = 0.0) -> Mesh:
+    """Return the mesh of a map, with cells of side ``cell_m``, half a leaf where that is not given.
+
+    Given a box, it has the faces whose centroids lie in it. Surface is continued up to ``fill_m``
+    into unknown space.
+
+    Raises:
+        InvalidInputError: the mesh is too large, or a library is missing.
+    """
+    bounds = None if box is None else (box[0].tolist(), box[1].tolist())
+    with OfflineMap(record) as opened, progress("meshing", 1.0) as report:
+        return opened.mesh(
+            bounds, cell_m, lambda done, of: report(done / of, f"{done} blocks"), fill_m
+        )
+
+
 def export_mesh(
     record: MapRecord, box: Box | None, cell_m: float | None, path: Path, fill_m: float = 0.0
 ) -> str:
-    """Write the mesh of a map; return what was written.
-
-    Its cells have the side ``cell_m``, half a leaf where that is not given. Given a box, it has
-    the faces whose centroids lie in it. Surface is continued up to ``fill_m`` into unknown space.
+    """Write the mesh of a map, see :func:`meshed`; return what was written.
 
     Raises:
         InvalidInputError: the mesh is too large, or a library is missing.
         NothingLeftError: no surface was seen in the box.
         OSError: the file cannot be written.
     """
-    bounds = None if box is None else (box[0].tolist(), box[1].tolist())
-    with OfflineMap(record) as opened, progress("meshing", 1.0) as report:
-        mesh = opened.mesh(
-            bounds, cell_m, lambda done, of: report(done / of, f"{done} blocks"), fill_m
-        )
+    mesh = meshed(record, box, cell_m, fill_m)
     if box is not None and len(mesh.faces) == 0:
         raise NothingLeftError(f"{path} is not written: no surface was seen in the box of --crop")
     packed = mesh.file_bytes(path.suffix)

@@ -13,7 +13,7 @@ from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
 
-from triquad_tools.console.progress import Speed, progress
+from triquad_tools.console.progress import progress
 from triquad_tools.mapping.unfinished import UnfinishedMap
 from triquad_tools.recordings.selection import Selection
 
@@ -68,7 +68,6 @@ class MappingRun:
         """
         self.scans_taken = start
         total, entries = len(selection), selection.entries
-        began = time.monotonic()
         with progress("mapping", total) as report:
             for scan in selection.scans(start):
                 self._between_steps()
@@ -84,10 +83,7 @@ class MappingRun:
                     self.last_refusal = f"scan {self.scans_taken}: {error}"
                 self.scans_taken += 1
                 self._mapper.train()
-                taken = self.scans_taken
-                speed = Speed.of(taken - start, total - taken, time.monotonic() - began)
-                rate = f"{speed.per_s:.1f} /s, {speed.left_s:.0f} s left"
-                report(taken, f"{taken} of {total} scans, {rate}")
+                report(self.scans_taken, f"{self.scans_taken} of {total} scans")
 
     def settle(self) -> None:
         """Train until nothing is left to learn, and save the map.
@@ -96,16 +92,13 @@ class MappingRun:
             KeyboardInterrupt: the user wants to stop; all that was done is saved.
         """
         mapper = self._mapper
-        total, trained = mapper.samples_left, mapper.samples_trained
-        began = time.monotonic()
+        total = mapper.samples_left
         with progress("training", total) as report:
             while not mapper.settled:
                 self._between_steps()
                 mapper.train()
-                done, left = mapper.samples_trained - trained, mapper.samples_left
-                speed = Speed.of(done, left, time.monotonic() - began)
-                rate = f"{speed.per_s / 1e6:.2f} M samples/s, {speed.left_s:.0f} s left"
-                report(total - left, rate)
+                left = mapper.samples_left
+                report(total - left, f"{mapper.samples_trained / 1e6:.1f} M samples")
         self._save()
 
     def _between_steps(self) -> None:

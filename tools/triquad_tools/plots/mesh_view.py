@@ -1,15 +1,18 @@
-"""Meshes drawn in parallel projection: a z-buffer with Lambert's shading, no display and no GPU.
+"""Meshes drawn in parallel projection with Lambert's shading: no display and no GPU.
 
-Own code, as VTK takes 560 MB, and does not run where no library of OpenGL is installed.
+Faces are drawn from the farthest to the nearest, which is right where they are as small as those of
+a map's mesh.
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import TriMesh
+from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
-from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Ints
+from triquad_format.records.arrays import Bools, Doubles, Ints
 from triquad_map.height_scale import GAMMA
 
 WIDTH, HEIGHT = 1340, 740
@@ -23,12 +26,8 @@ _MOST = (0.01, 0.99)  # of the surface, along each axis of the picture: these ar
 _ROOM, _MARGIN = 0.25, 1.04  # beyond them, of their extent, as far as there is anything; an edge
 _LEAST_HEIGHT_M = 0.01
 _SOME = 200_000  # faces or points are enough to choose a view
-_FINER = 2  # pixels for one of the picture, along each side
 _TO_LIGHT = (-0.45, -0.65, -0.6)  # right, down and forward of a view: over the left shoulder
 _AMBIENT = 0.55  # of the light; the rest comes from there
-_APART_PIXELS = 0.7  # between points of a triangle: no square of a pixel lies between them
-_MOST_POINTS = 1_000_000  # that are drawn together
-_POINT_PIXELS, _LEAST_POINT_M = 2.5, 0.02  # side of a point: the greater of both
 
 
 @dataclass(frozen=True)
@@ -39,11 +38,11 @@ class View:
     target: Doubles  # [3] metres, in the middle of the picture
     height_m: float  # of what the picture shows, across the view
 
-    def project(self, points: NDArray[np.floating], height: int = HEIGHT) -> Doubles:
-        """Return column, row and metres nearer than the target [N, 3], for ``height`` rows."""
+    def project(self, points: NDArray[np.floating]) -> Doubles:
+        """Return column, row and metres nearer than the target [N, 3]."""
         seen = (points - self.target) @ self.axes.T
-        middle, per_m = np.array([WIDTH, HEIGHT]) * height / HEIGHT / 2, height / self.height_m
-        return np.column_stack([middle + per_m * seen[:, :2], -seen[:, 2]])
+        columns_rows = np.array([WIDTH, HEIGHT]) / 2 + HEIGHT / self.height_m * seen[:, :2]
+        return np.column_stack([columns_rows, -seen[:, 2]])
 
     def facing(self, corners: NDArray[np.floating]) -> Bools:
         """Return whether faces with corners [F, 3, 3] show their outer side."""
@@ -112,67 +111,20 @@ def _view_to(some: Doubles, points: Doubles, turn: float) -> View:
     return View(axes, 0.5 * (low + high) @ axes, height_m)
 
 
-class Picture:
-    """A picture of faces and points in their colours; what is nearer hides what is farther."""
+def draw_faces(axes: Axes, view: View, vertices: Doubles, faces: Ints, colours: Doubles) -> None:
+    """Draw the faces that show their outer sides onto axes, whose limits become the picture's.
 
-    def __init__(self, view: View) -> None:
-        self.view = view
-        self._shape = (HEIGHT * _FINER, WIDTH * _FINER)
-        count = self._shape[0] * self._shape[1]
-        self._light = np.tile((BACKGROUND**GAMMA).astype(np.float32), (count, 1))
-        self._nearness = np.full(count, -np.inf, np.float32)
-
-    def add_mesh(self, vertices: Doubles, faces: Ints, colours: Doubles) -> None:
-        """Draw the faces that show their outer sides; ``colours`` [V, 3] are sRGB in [0, 1].
-
-        Level ground has its own colour; light is white, so that it changes none into another.
-        """
-        to_light = np.array(_TO_LIGHT) @ self.view.axes / np.linalg.norm(_TO_LIGHT)
-        lambert = np.maximum(vertex_normals(vertices, faces) @ to_light, 0.0)
-        light = _AMBIENT + (1.0 - _AMBIENT) * lambert / max(float(to_light[2]), 0.1)
-        at = self.view.project(vertices, self._shape[0])
-        corners = np.column_stack([at, colours**GAMMA * light[:, None]]).astype(np.float32)
-        for points in _points_of(corners[faces[self.view.facing(vertices[faces])]]):
-            self._draw(points)
-
-    def add_points(self, points: Doubles, colours: Doubles) -> None:
-        """Draw points [N, 3] as squares in plain colours [N, 3], sRGB in [0, 1]."""
-        at = np.column_stack([self.view.project(points, self._shape[0]), colours**GAMMA])
-        at = at[np.argsort(at[:, 2])]
-        side = max(_POINT_PIXELS * _FINER, _LEAST_POINT_M * self._shape[0] / self.view.height_m)
-        for step in np.ndindex(math.ceil(side), math.ceil(side)):
-            self._draw(at + np.array([*(np.array(step) - side / 2), 0.0, 0.0, 0.0, 0.0]))
-
-    def pixels(self) -> Bytes:
-        """Return the picture [HEIGHT, WIDTH, 3]."""
-        fine = self._light.reshape(HEIGHT, _FINER, WIDTH, _FINER, 3).mean(axis=(1, 3))
-        return np.asarray(np.round(255.0 * np.clip(fine, 0.0, 1.0) ** (1.0 / GAMMA)), np.uint8)
-
-    def _draw(self, points: NDArray[np.floating]) -> None:
-        """Draw points [N, 6]: column, row, nearness and linear colour; the nearest are seen.
-
-        Of those in one pixel the last is: they come in about the order of their nearness.
-        """
-        high, wide = self._shape
-        columns, rows = points[:, :2].astype(np.int32).T
-        points = points[inside := (columns >= 0) & (columns < wide) & (rows >= 0) & (rows < high)]
-        pixels = (rows * wide + columns)[inside]
-        seen = points[:, 2] >= self._nearness[pixels]
-        pixels, points = pixels[seen], points[seen]
-        self._nearness[pixels], self._light[pixels] = points[:, 2], points[:, 3:]
-
-
-def _points_of(triangles: Floats) -> Iterator[Floats]:
-    """Yield points [N, 6] of triangles [F, 3, 6], some at a time, that leave out no pixel."""
-    sides = triangles[:, [1, 2, 0], :2] - triangles[..., :2]
-    longest = np.linalg.norm(sides, axis=2).max(axis=1, initial=0.0)
-    steps = np.ceil(longest / _APART_PIXELS).astype(np.int64) + 1
-    triangles = triangles[nearest_last := np.argsort(triangles[..., 2].sum(axis=1))]
-    steps = steps[nearest_last]
-    for count in np.unique(steps):
-        row, column = np.tril_indices(count + 1)
-        weights = (np.stack([count - row, row - column, column], axis=1) / count).astype(np.float32)
-        alike = triangles[steps == count]
-        together = max(1, _MOST_POINTS // len(weights))
-        for first in range(0, len(alike), together):
-            yield (weights @ alike[first : first + together]).reshape(-1, 6)
+    ``colours`` [V, 3] are sRGB in [0, 1]. Level ground has its own colour; light is white, so that
+    it changes none into another.
+    """
+    to_light = np.array(_TO_LIGHT) @ view.axes / np.linalg.norm(_TO_LIGHT)
+    lambert = np.maximum(vertex_normals(vertices, faces) @ to_light, 0.0)
+    light = _AMBIENT + (1.0 - _AMBIENT) * lambert / max(float(to_light[2]), 0.1)
+    shown = np.clip(colours**GAMMA * light[:, None], 0.0, 1.0) ** (1.0 / GAMMA)
+    at, facing = view.project(vertices), faces[view.facing(vertices[faces])]
+    axes.set(xlim=(0, WIDTH), ylim=(HEIGHT, 0))
+    if len(facing):
+        nearest_last = facing[np.argsort(at[facing, 2].sum(axis=1))]
+        triangles = TriMesh(Triangulation(at[:, 0], at[:, 1], nearest_last))
+        triangles.set_facecolor(shown)
+        axes.add_collection(triangles, autolim=False)

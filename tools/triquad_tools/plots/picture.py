@@ -3,15 +3,25 @@
 from pathlib import Path
 
 import numpy as np
-from triquad_client import Mesh, OfflineMap
+from matplotlib import rc_context
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from triquad_client import Mesh
+from triquad_format.mapfile.durable_file import replacing
 from triquad_format.mapfile.metadata import utc_time
 from triquad_map.height_scale import HeightScale
 
-from triquad_tools.console.progress import progress
+from triquad_tools.mapfiles.meshfile import meshed
 from triquad_tools.mapfiles.source import Box, NothingLeftError, SourceMap
-from triquad_tools.plots.mesh_sheet import Legend, save_mesh_sheet
-from triquad_tools.plots.mesh_view import Picture, view_along
-from triquad_tools.plots.plan import HEIGHTS, Scale
+from triquad_tools.plots.mesh_view import BACKGROUND, HEIGHT, WIDTH, draw_faces, view_along
+from triquad_tools.plots.plan import HEIGHTS, extend
+
+_WIDE, _HIGH = 1600, 900  # pixels of the whole picture
+TOP = 90
+"""Rows above the mesh, which is at the left."""
+
+_BAR = (1362 / _WIDE, 390 / _HIGH, 30 / _WIDE, 360 / _HIGH)  # left, bottom, width, height
 
 
 def export_picture(source: SourceMap, box: Box | None, cell_m: float | None, path: Path) -> str:
@@ -22,9 +32,7 @@ def export_picture(source: SourceMap, box: Box | None, cell_m: float | None, pat
         NothingLeftError: no surface was seen.
         OSError: it cannot be written.
     """
-    bounds = None if box is None else (box[0].tolist(), box[1].tolist())
-    with OfflineMap(source.record) as opened, progress("meshing", 1.0) as report:
-        mesh = opened.mesh(bounds, cell_m, lambda done, of: report(done / of, f"{done} blocks"))
+    mesh = meshed(source.record, box, cell_m)
     if not len(mesh.faces):
         where = "" if box is None else " in the box of --crop"
         raise NothingLeftError(f"{path} is not written: no surface was seen{where}")
@@ -43,13 +51,20 @@ def draw_mesh(title: str, mesh: Mesh, path: Path) -> None:
     """
     used = mesh.vertices[np.unique(mesh.faces)]
     heights = HeightScale.around(used[:, 2])
-    picture = Picture(view_along(used, mesh.vertices[mesh.faces]))
-    picture.add_mesh(mesh.vertices, mesh.faces, heights.colours(mesh.vertices[:, 2]))
+    view = view_along(used, mesh.vertices[mesh.faces])
     least_m, most_m = float(used[:, 2].min()), float(used[:, 2].max())
-    legend = Legend(
-        title,
-        Scale("height z in m", HEIGHTS, heights.low_m, heights.high_m),
-        beyond=(least_m < heights.low_m, most_m > heights.high_m),
-        notes=[f"{len(mesh.faces):,} faces, from z = {least_m:.2f} to {most_m:.2f} m"],
-    )
-    save_mesh_sheet(path, picture, legend)
+    beyond = extend(least_m < heights.low_m, most_m > heights.high_m)
+    note = f"{len(mesh.faces):,} faces, from z = {least_m:.2f} to {most_m:.2f} m"
+    with rc_context({"font.size": 15}):
+        figure = Figure((_WIDE / 100, _HIGH / 100), 100, facecolor=tuple(BACKGROUND))
+        place = (0.0, 1.0 - (TOP + HEIGHT) / _HIGH, WIDTH / _WIDE, HEIGHT / _HIGH)
+        axes = figure.add_axes(place, xticks=[], yticks=[], facecolor=tuple(BACKGROUND))
+        draw_faces(axes, view, mesh.vertices, mesh.faces, heights.colours(mesh.vertices[:, 2]))
+        axes.spines[:].set_visible(False)
+        axes.set_title(title, loc="left", x=0.01, parse_math=False)
+        axes.set_xlabel(f"{view.description}\n{note}", ha="left", x=0.01)
+        scale = ScalarMappable(Normalize(heights.low_m, heights.high_m), HEIGHTS)
+        bar = figure.add_axes(_BAR)
+        figure.colorbar(scale, cax=bar, extend=beyond, label="height z in m")
+        with replacing(path) as stream:
+            figure.savefig(stream, format="png")

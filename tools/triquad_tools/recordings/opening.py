@@ -6,7 +6,6 @@ from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.bag import find_bag
 from triquad_tools.recordings.folders.cloud_folder import is_cloud_folder, read_cloud_folder
 from triquad_tools.recordings.folders.depth_folder import is_depth_folder, read_depth_folder
-from triquad_tools.recordings.folders.kitti import is_kitti_folder, read_kitti_folder
 from triquad_tools.recordings.options import ReadingOptions
 from triquad_tools.recordings.recording import Recording
 from triquad_tools.recordings.ros_recording import RosRecording
@@ -30,9 +29,6 @@ def open_recording(path: Path, options: ReadingOptions) -> Recording:
     if bag is not None:
         _refuse_others(path, "a bag", _OF_BAGS, options)
         return RosRecording(bag, options)
-    if is_kitti_folder(path):
-        _refuse_others(path, "a folder in the style of KITTI", set(), options)
-        return read_kitti_folder(path)
     if is_depth_folder(path):
         _refuse_others(path, "a folder of depth images", _OF_DEPTH, options)
         return read_depth_folder(path, options)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from triquad_client import Client, FlushReport, ServerStatus
 
-from triquad_tools.console.progress import Speed, progress
+from triquad_tools.console.progress import progress
 from triquad_tools.sensors.sweep import PosedScan
 
 _POLL_S = 0.5  # the server says how it is doing when it is asked, not when it changes
@@ -42,11 +42,7 @@ def wait_until_settled(client: Client, limit_s: float | None = None) -> ServerSt
         while True:
             status = client.status()
             waited_s = time.monotonic() - started
-            trained = status.samples_trained - first.samples_trained
-            speed = Speed.of(trained, status.samples_left, waited_s)
             note = f"{status.samples_trained / 1e6:.1f} M samples, loss {status.loss:.4f}"
-            if trained and not status.settled:
-                note += f", {speed.left_s:.0f} s left"
             report(first.samples_left - status.samples_left, note)
             if status.settled or (limit_s is not None and waited_s >= limit_s):
                 return status

@@ -1,7 +1,7 @@
 """What a recording of ROS holds, found in one pass over it."""
 
 from collections import Counter, defaultdict
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import chain
 from typing import Any
 
@@ -14,14 +14,8 @@ from triquad_tools.sensors.errors import NoScanError
 from triquad_tools.sensors.motion.frame_tree import STATIC, FrameTree, Transform
 from triquad_tools.sensors.motion.track import Track
 from triquad_tools.sensors.ros import type_store
-from triquad_tools.sensors.ros.depth_camera import camera_topic, is_depth, sweep_of_depth
-from triquad_tools.sensors.ros.point_cloud import sweep_of_cloud
-from triquad_tools.sensors.ros.transforms import (
-    transform_of_odometry,
-    transform_of_pose,
-    transforms_of_tf,
-)
-from triquad_tools.sensors.sweep import Sweep
+from triquad_tools.sensors.ros.depth_camera import is_depth
+from triquad_tools.sensors.ros.message_reader import MessageReader
 
 _SCANS = (type_store.POINT_CLOUD, type_store.IMAGE)
 _TRANSFORMS = (type_store.TF, type_store.TF_OF_ROS_1)
@@ -57,8 +51,8 @@ class RosContent:
     order of their recording, and ``broken`` says by topic what is wrong with its poses.
     """
 
-    def __init__(self, bag: Bag, *, recorder_clock: bool) -> None:
-        """Read all of a bag; with ``recorder_clock``, stamps are when messages were recorded.
+    def __init__(self, bag: Bag, reader: MessageReader) -> None:
+        """Read all of a bag.
 
         Raises:
             ToolError: it is damaged.
@@ -70,10 +64,9 @@ class RosContent:
         self.poses: dict[str, PoseTopic] = defaultdict(PoseTopic)
         self.broken: dict[str, list[str]] = defaultdict(list)
         self.missing = 0  # messages that its index names, but that could not be read
-        self._cameras: dict[str, Any] = {}  # first CameraInfo by topic
         self._colours: set[str] = set()  # topics of images that hold no depth
         self._numbers: Counter[str] = Counter()
-        self._recorder_clock = recorder_clock
+        self._reader = reader
         with bag.open() as opened:
             for connection in opened.connections:
                 self.kinds[connection.topic] = connection.msgtype
@@ -93,37 +86,15 @@ class RosContent:
                     report(done, f"{done} of {total} messages")
             self.missing = total - done
 
-    def sweep(self, message: Message, decoded: Any, stride: int = 1) -> Sweep:
-        """Return the sweep of a cloud or a depth image.
-
-        Raises:
-            NoScanError: it is none, or what is known of its camera was not recorded.
-        """
-        if message.connection.msgtype == type_store.POINT_CLOUD:
-            sweep = sweep_of_cloud(decoded)
-        else:
-            camera = camera_topic(message.connection.topic)
-            if camera not in self._cameras:
-                there = ", ".join(sorted(self._cameras)) or "none"
-                raise NoScanError(
-                    "no_camera_info",
-                    f"{camera} was not recorded (of that kind there is {there}): record it",
-                )
-            sweep = sweep_of_depth(decoded, self._cameras[camera], stride)
-        return replace(sweep, stamp_ns=message.recorded_ns) if self._recorder_clock else sweep
-
     def _take(self, message: Message, decoded: Any) -> None:
         topic, kind = message.connection.topic, message.connection.msgtype
         try:
             if kind == type_store.CAMERA_INFO:
-                self._cameras.setdefault(topic, decoded)
-            elif kind in _TRANSFORMS:
-                for transform in transforms_of_tf(decoded, static=topic.endswith("tf_static")):
-                    self._add_transform(message, transform)
-            elif kind in _POSES:
-                of_body = kind == type_store.ODOMETRY
-                read = transform_of_odometry if of_body else transform_of_pose
-                self._add_pose(message, read(decoded))
+                self._reader.remember_camera(topic, decoded)
+            elif kind in (*_TRANSFORMS, *_POSES):
+                static, came_ns = topic.endswith("tf_static"), message.recorded_ns
+                for each in self._reader.transforms(kind, decoded, came_ns, static=static):
+                    self._add(topic, each, is_pose=kind in _POSES)
             elif kind == type_store.IMAGE and not is_depth(decoded.encoding):
                 self._colours.add(topic)
             else:
@@ -136,32 +107,25 @@ class RosContent:
         number = self._numbers[topic]
         self._numbers[topic] += 1
         try:
-            sweep = self.sweep(message, decoded)
+            kind, came_ns = message.connection.msgtype, message.recorded_ns
+            sweep = self._reader.sweep(topic, kind, decoded, came_ns)
         except NoScanError as error:
             self.clouds.append(SeenCloud(topic, number, problem=error))
             return
         first_ns, last_ns = sweep.span_ns
         self.clouds.append(SeenCloud(topic, number, sweep.frame, sweep.stamp_ns, first_ns, last_ns))
 
-    def _add_transform(self, message: Message, transform: Transform) -> None:
+    def _add(self, topic: str, transform: Transform, *, is_pose: bool) -> None:
+        """Add a transform to all, or a pose to those of its topic."""
         try:
-            self.frames.add(self._timed(transform, message))
-        except InvalidInputError as error:
-            self.broken[message.connection.topic].append(str(error))
-
-    def _add_pose(self, message: Message, transform: Transform) -> None:
-        topic, timed = message.connection.topic, self._timed(transform, message)
-        try:
-            position, quaternion = timed.pose.numbers()
+            if not is_pose:
+                self.frames.add(transform)
+                return
+            position, quaternion = transform.pose.numbers()
         except InvalidInputError as error:
             self.broken[topic].append(str(error))
             return
         known = self.poses[topic]
-        known.parent, known.child = timed.parent, timed.child
-        assert timed.stamp_ns is not STATIC
-        known.track.add(timed.stamp_ns, position, quaternion)
-
-    def _timed(self, transform: Transform, message: Message) -> Transform:
-        if not self._recorder_clock or transform.stamp_ns is STATIC:
-            return transform
-        return replace(transform, stamp_ns=message.recorded_ns)
+        known.parent, known.child = transform.parent, transform.child
+        assert transform.stamp_ns is not STATIC
+        known.track.add(transform.stamp_ns, position, quaternion)

@@ -14,7 +14,8 @@ from triquad_tools.sensors.errors import NoScanError
 from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES
 from triquad_tools.sensors.motion.placing import place
 from triquad_tools.sensors.ros import type_store
-from triquad_tools.sensors.ros.topic import source_of_topic
+from triquad_tools.sensors.ros.header import source_of_topic
+from triquad_tools.sensors.ros.message_reader import MessageReader
 from triquad_tools.sensors.sweep import PosedScan
 
 _CLOCKS = (
@@ -51,8 +52,8 @@ class RosRecording:
             ToolError: it is damaged, or does not hold what ``options`` ask for.
         """
         self._bag = bag
-        self._stride = options.stride
-        self._content = RosContent(bag, recorder_clock=options.recorder_clock)
+        self._reader = MessageReader(stride=options.stride, by_arrival=options.recorder_clock)
+        self._content = RosContent(bag, self._reader)
         self._topics = _chosen_topics(self._content, options)
         self._poses: PoseSource | None = None
         self._placed: list[SeenCloud] = []
@@ -111,11 +112,11 @@ class RosRecording:
 
     def _read(self, message: Message, decoded: Any) -> PosedScan:
         assert self._poses is not None
+        topic, kind = message.connection.topic, message.connection.msgtype
         try:
-            sweep = self._content.sweep(message, decoded, self._stride)
+            sweep = self._reader.sweep(topic, kind, decoded, message.recorded_ns)
             return place(sweep, self._poses.frames, self._poses.target)
         except NoScanError as error:
-            topic = message.connection.topic
             raise ToolError(f"{self._bag.path}: a message on {topic}: {error}") from error
 
     def _place_clouds(self, options: ReadingOptions) -> None:

@@ -40,7 +40,7 @@ class Bridge:
             parts.enter_context(closing(markers))
             slices = topic(Topic(topics.grid, OCCUPANCY_GRID), delivery=_GRID_DELIVERY)
             parts.enter_context(closing(slices))
-            mesh = MeshPublisher(markers, client, options.mesh)
+            mesh = MeshPublisher(markers, client, options.mesh_level, options.mesh_bytes_per_s)
             parts.enter_context(closing(mesh))
             grid = GridPublisher(slices, client, options.grid)
             for output in (mesh, grid):

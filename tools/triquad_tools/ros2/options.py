@@ -23,14 +23,6 @@ class ScanOptions:
 
 
 @dataclass(frozen=True)
-class MeshOptions:
-    """Options for publishing the mesh."""
-
-    level: int = 1  # of detail: cells are twice as large at each
-    bytes_per_s: int = 5_000_000  # of markers, at most
-
-
-@dataclass(frozen=True)
 class SliceShape:
     """The slice of the map that is published as an occupancy grid."""
 
@@ -56,5 +48,6 @@ class BridgeOptions:
 
     topics: TopicChoice = field(default_factory=TopicChoice)
     scans: ScanOptions = field(default_factory=ScanOptions)
-    mesh: MeshOptions = field(default_factory=MeshOptions)
     grid: SliceShape = field(default_factory=SliceShape)
+    mesh_level: int = 1  # of detail: cells are twice as large at each
+    mesh_bytes_per_s: int = 5_000_000  # of markers, at most

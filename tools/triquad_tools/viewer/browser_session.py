@@ -8,14 +8,12 @@ from triquad_format.errors import TriquadError
 from triquad_tools.viewer.mesh.mesh_layer import MeshLayer
 from triquad_tools.viewer.page.legends import problem_html, text_html
 from triquad_tools.viewer.page.page import Page
-from triquad_tools.viewer.questions.changes import Changes
 from triquad_tools.viewer.questions.clicks import Clicks
 from triquad_tools.viewer.questions.slice import SliceQuestion
 from triquad_tools.viewer.questions.unknown_space import UnknownSpace
 from triquad_tools.viewer.sources.history import History
 from triquad_tools.viewer.sources.live_source import LiveSource
 from triquad_tools.viewer.sources.map_source import MapSource
-from triquad_tools.viewer.status_panel import StatusPanel
 from triquad_tools.viewer.time_panel import TimePanel
 from triquad_tools.viewer.trail_layer import TrailLayer
 
@@ -49,11 +47,9 @@ class BrowserSession:
         page = Page(self._client, source, self._tell)
         if isinstance(shown, History):
             self._parts.callback(TimePanel(page, shown).close)
-            self._parts.callback(Changes(page, shown).close)
         for part in (MeshLayer, SliceQuestion, UnknownSpace, Clicks):
             self._parts.callback(part(page).close)
         if isinstance(source, LiveSource):
-            self._parts.callback(StatusPanel(page, source.client).close)
             self._parts.callback(TrailLayer(page, source.client).close)
 
     def _tell(self, part: str, problem: str) -> None:

@@ -1,11 +1,13 @@
 """The choice of the checkpoint that a page shows."""
 
+from triquad_format.mapfile.checkpoint_folder import CheckpointFile
+
 from triquad_tools.console.command import ToolError
 from triquad_tools.viewer.page.layer import Layer
 from triquad_tools.viewer.page.legends import problem_html, text_html
 from triquad_tools.viewer.page.page import Page
 from triquad_tools.viewer.questions.question import newest_epoch
-from triquad_tools.viewer.sources.history import History, Moment
+from triquad_tools.viewer.sources.history import History, moment
 
 _PERIOD_S = 1.0
 _PREVIOUS, _NEXT = "◀ Previous", "Next ▶"
@@ -17,11 +19,11 @@ class TimePanel(Layer):
     def __init__(self, page: Page, history: History) -> None:
         super().__init__(page, "Time", _PERIOD_S)
         self._history = history
-        self._moments: tuple[Moment, ...] = ()
+        self._files: list[CheckpointFile] = []
         with self.folder:
             self._slider = page.gui.add_slider("Checkpoint", 1, 1, 1, 1)
             self._buttons = page.gui.add_button_group("", (_PREVIOUS, _NEXT))
-            self._text = page.gui.add_html("")
+            self.add_text()
         self._buttons.on_click(
             lambda _: self._slide_to(self._slider.value + (-1, 1)[self._buttons.value == _NEXT])
         )
@@ -29,35 +31,32 @@ class TimePanel(Layer):
 
     def refresh(self) -> None:
         """Add new checkpoints, and show the one that is chosen."""
-        self._history.refresh()
-        moments, shown = self._history.moments, newest_epoch(self.page.source.queries)
-        if not moments:
+        files, shown = self._history.files(), newest_epoch(self.page.source.queries)
+        if not files:
             raise ToolError("the store has no checkpoint left that can be shown")
         # What is shown, or the one before if it was deleted.
-        place = sum(moment.epoch <= shown for moment in moments)
-        if moments != self._moments:  # the slider stays where it is in time
-            self._moments = moments
-            self._slider.max = len(moments)
+        place = sum(file.epoch <= shown for file in files)
+        if files != self._files:  # the slider stays where it is in time
+            self._files = files
+            self._slider.max = len(files)
             self._slide_to(place)
-        wanted = moments[min(self._slider.value, len(moments)) - 1]
-        told = f"{wanted}\n{self._slider.value} of {len(moments)}"
+        wanted = files[min(self._slider.value, len(files)) - 1]
+        told = f"{moment(wanted)}\n{self._slider.value} of {len(files)}"
         try:
             if wanted.epoch != shown:
-                self._tell(f"opening {wanted} …")
+                self._say(f"opening {moment(wanted)} …")
                 self.page.source = self._history.opened(wanted)
         except ToolError:
             self._slide_to(place)
             raise
         finally:
-            self._tell(told)
+            self._say(told)
 
     def _slide_to(self, number: int) -> None:
-        """Choose the moment of this number, counted from 1."""
-        chosen = max(min(number, len(self._moments)), 1)
+        """Choose the checkpoint of this number, counted from 1."""
+        chosen = max(min(number, len(self._files)), 1)
         self._slider.value = chosen  # type: ignore[misc] # viser has a setter that mypy overlooks
         self.wake()
 
-    def _tell(self, text: str) -> None:
-        content = text_html(text) + problem_html("\n".join(self._history.damaged))
-        if self._text.content != content:
-            self._text.content = content
+    def _say(self, text: str) -> None:
+        self.tell(text_html(text) + problem_html("\n".join(self._history.damaged())))

@@ -1,14 +1,13 @@
-"""The robot in a scene: the trail and the newest scan of each source."""
+"""The robot in a scene: the trail and the newest scan of each source, and what the server says."""
 
 import numpy as np
 import viser
 from matplotlib.colors import to_rgb
-from triquad_client import Client
+from triquad_client import Client, ServerStatus
 from triquad_client.calls.sources import ScanSource, SourceReport
-from triquad_format.records.arrays import Doubles
 
 from triquad_tools.viewer.page.layer import Layer
-from triquad_tools.viewer.page.legends import text_html
+from triquad_tools.viewer.page.legends import problem_html, text_html
 from triquad_tools.viewer.page.page import Page
 
 _PERIOD_S = 0.5
@@ -23,49 +22,54 @@ class TrailLayer(Layer):
     """Draws trails and newest scans, and keeps them up to date."""
 
     def __init__(self, page: Page, client: Client) -> None:
-        super().__init__(page, "Robot", _PERIOD_S)
+        super().__init__(page, "Robot and server", _PERIOD_S)
         self._client = client
         self._report: SourceReport | None = None
         self._shown: tuple[object, ...] = ()
         with self.folder:
             self._trails = page.gui.add_checkbox("Trail", True)
             self._scans = page.gui.add_checkbox("Newest scan", True)
-            self._list = page.gui.add_html(text_html("No scan has come yet."))
+            self.add_text()
         self.start(self._trails, self._scans)
 
     def refresh(self) -> None:
         """Ask for what is new, and draw all where anything is."""
         report = self._report = self._client.sources(since=self._report, max_points=_SCAN_POINTS)
+        status = self._client.status()
+        problems = (problem_html(text or "") for text in (status.store_error, status.warnings))
+        lines = (*_state(status), *map(_line, report.sources.values()))
+        self.tell(text_html("\n".join(lines)) + "".join(problems))
         wanted = (report.server, report.revision, self._trails.value, self._scans.value)
         if wanted == self._shown:
             return
         marks: list[viser.SceneNodeHandle] = []
         for number, source in enumerate(report.sources.values()):
-            marks += self._marks_of(source, np.array(to_rgb(_COLOURS[number % len(_COLOURS)])))
+            marks += self._marks_of(source, _COLOURS[number % len(_COLOURS)])
         self.draw(marks)
         self._shown = wanted
-        if report.sources:
-            self._list.content = text_html("\n".join(map(_line, report.sources.values())))
 
-    def _marks_of(self, source: ScanSource, colour: Doubles) -> list[viser.SceneNodeHandle]:
+    def _marks_of(self, source: ScanSource, colour: str) -> list[viser.SceneNodeHandle]:
         """Return the trail of a source, and points of its newest scan."""
-        scene, in_scene = self.page.scene, self.page.in_scene
         marks: list[viser.SceneNodeHandle] = []
         lines = [line for line in source.lines() if len(line) > 1] if self._trails.value else []
         if lines:
             pieces = np.concatenate([np.stack([line[:-1], line[1:]], axis=1) for line in lines])
-            trail = scene.add_line_segments(
-                self.node("trail"), in_scene(pieces), colour,
-                thickness=_LINE_PIXELS, thickness_units="screen",
-            )  # fmt: skip
-            marks.append(trail)
+            marks.append(self.lines(pieces, colour, _LINE_PIXELS, "screen"))
         if source.newest is not None and self._scans.value:
-            points = in_scene(source.newest.points)
-            cloud = scene.add_point_cloud(
-                self.node("scan"), points, colour, point_size=_POINT_M, precision="float32"
+            points, light = self.page.in_scene(source.newest.points), np.array(to_rgb(colour))
+            cloud = self.page.scene.add_point_cloud(
+                self.node("scan"), points, light, point_size=_POINT_M, precision="float32"
             )
             marks.append(cloud)
         return marks
+
+
+def _state(status: ServerStatus) -> tuple[str, str]:
+    """Return what the panel says of the server."""
+    dropped, lost = sum(status.scans_dropped.values()), sum(status.scans_lost.values())
+    left = "settled" if status.settled else f"{status.samples_left / 1e6:.1f} M samples left"
+    scans = f"{status.scans_taken:,} scans taken, {status.scans_waiting} waiting"
+    return f"epoch {status.epoch}, {left}", f"{scans}, {dropped:,} refused, {lost:,} lost"
 
 
 def _line(source: ScanSource) -> str:

@@ -10,7 +10,8 @@ from triquad_format.records.arrays import Floats
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.folders.file_names import in_order
 from triquad_tools.recordings.folders.file_poses import place_files
-from triquad_tools.recordings.folders.point_file import POINT_SUFFIXES, read_points
+from triquad_tools.recordings.folders.kitti import of_lidar, read_times
+from triquad_tools.recordings.folders.point_file import POINT_SUFFIXES, check_points, read_points
 from triquad_tools.recordings.folders.scan_folder import PlacedFile, ScanFolder, check_all
 from triquad_tools.recordings.folders.trajectory import SENSOR, WORLD, Trajectory
 from triquad_tools.recordings.options import ReadingOptions
@@ -24,32 +25,37 @@ _TRIED = 3  # clouds, to determine the frame of all
 _CLEARLY = 2.0  # times nearer to where the sensor was than to the origin, or the other way round
 
 
+_DEEPER = "velodyne_points/data"  # where KITTI's raw recordings have theirs
+
+
 def is_cloud_folder(folder: Path) -> bool:
     """Return whether a folder, or one in it, holds files of points."""
     return folder.is_dir() and bool(_folders_of_clouds(folder))
 
 
-def read_cloud_folder(folder: Path, options: ReadingOptions) -> ScanFolder:
+def read_cloud_folder(folder: Path, options: ReadingOptions | None = None) -> ScanFolder:
     """Return the clouds of a folder, or of the one folder in it that has some, with their poses.
 
     Raises:
         ToolError: there are no clouds, no trajectory or no common times, a file is damaged, or
             the clouds seem to be in another frame than it is said.
     """
+    options = options or ReadingOptions()
     paths = _cloud_paths(folder)
-    placed = place_files(folder, options.trajectory, paths)
-    if not sum(check_all(paths, lambda path: len(read_points(path).points))):
+    placed = place_files(folder, options.trajectory, paths, read_times(folder, len(paths)))
+    if not sum(check_all(paths, check_points)):
         raise ToolError(f"{paths[0].parent}: none of the {len(paths)} files holds any points")
+    first, poses, files = paths[0], placed.trajectory, placed.files
+    if first.suffix == ".bin" and poses.frames is None:
+        files = of_lidar(folder, files)
     if options.points_in is None:
-        _check_frame(placed.files)
-    first, poses = paths[0], placed.trajectory
+        _check_frame(files)
     clouds, kind = f"{first.parent.name}/*{first.suffix}", first.suffix[1:].upper() + " clouds"
     streams = (
-        Stream(clouds, kind, len(placed.files), "scans", options.points_in or SENSOR),
+        Stream(clouds, kind, len(files), "scans", options.points_in or SENSOR),
         Stream(poses.path.name, poses.kind, len(poses.poses), "poses of the sensor"),
     )
-    read_file = partial(_read_scan, poses, options)
-    return ScanFolder(placed.files, read_file, streams, placed.remarks)
+    return ScanFolder(files, partial(_read_scan, poses, options), streams, placed.remarks)
 
 
 def _read_scan(trajectory: Trajectory, options: ReadingOptions, file: PlacedFile) -> PosedScan:
@@ -73,6 +79,7 @@ def _read_scan(trajectory: Trajectory, options: ReadingOptions, file: PlacedFile
 def _folders_of_clouds(folder: Path) -> dict[Path, list[Path]]:
     """Return the files of points in a folder and in those in it."""
     folders = [folder, *sorted(path for path in folder.iterdir() if path.is_dir())]
+    folders += [folder / _DEEPER] if (folder / _DEEPER).is_dir() else []
     found = {
         each: in_order(path for path in each.iterdir() if path.suffix.lower() in POINT_SUFFIXES)
         for each in folders

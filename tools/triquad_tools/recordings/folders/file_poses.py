@@ -54,7 +54,10 @@ def place_files(
         if placed.files:
             return placed
     if len(paths) == len(trajectory.poses):
-        poses = zip(paths, trajectory.stamps_ns.tolist(), trajectory.poses, strict=True)
+        when = trajectory.stamps_ns.tolist()
+        if stamps is not None and not timed:
+            when = list(stamps)
+        poses = zip(paths, when, trajectory.poses, strict=True)
         if timed:
             remarks.append(
                 f"the times of the files, such as {paths[0].name}, are of another clock than those "

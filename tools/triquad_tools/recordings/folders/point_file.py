@@ -1,4 +1,7 @@
-"""Files of one cloud each: PLY, PCD, LAS and LAZ, read by the libraries of these formats."""
+"""Files of one cloud each: PLY, PCD, LAS and LAZ, read by the libraries of these formats, and BIN.
+
+The ``.bin`` of KITTI has ``float32`` x, y, z and intensity of each point, and nothing else.
+"""
 
 import logging
 from collections.abc import Callable, Mapping
@@ -11,6 +14,8 @@ from triquad_format.records.arrays import Doubles
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.sensors.point_times import TIME_FIELDS
+
+_BIN_BYTES = 16  # of a point
 
 
 class FilePoints(NamedTuple):
@@ -58,6 +63,27 @@ def read_points(path: Path) -> FilePoints:
     return FilePoints(points, None if time is None else np.asarray(columns[time]).ravel())
 
 
+def check_points(path: Path) -> int:
+    """Return how many points a file holds, once it is known that they can be read.
+
+    Raises:
+        ToolError: as :func:`read_points`.
+    """
+    size = path.stat().st_size
+    # Nothing but its size can be wrong with such a file.
+    if path.suffix.lower() == ".bin" and size % _BIN_BYTES == 0:
+        return size // _BIN_BYTES
+    return len(read_points(path).points)
+
+
+def _bin(path: Path) -> _Table:
+    size = path.stat().st_size
+    if size % _BIN_BYTES:
+        raise ValueError(f"{size} bytes are not whole points of {_BIN_BYTES}")
+    table = np.fromfile(path, "<f4").reshape(-1, 4)
+    return _Table({"x": table[:, 0], "y": table[:, 1], "z": table[:, 2]}, len(table))
+
+
 def _ply(path: Path) -> _Table:
     import trimesh
 
@@ -93,6 +119,7 @@ _READERS: dict[str, Callable[[Path], _Table]] = {
     ".pcd": _pcd,
     ".las": _las,
     ".laz": _las,
+    ".bin": _bin,
 }
 
 POINT_SUFFIXES = tuple(_READERS)

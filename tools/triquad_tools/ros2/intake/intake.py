@@ -4,7 +4,9 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
+from typing import Any
 
 import numpy as np
 import zenoh
@@ -15,17 +17,22 @@ from triquad_tools.ros2.attachment import SequenceGaps
 from triquad_tools.ros2.intake.drop_log import DropLog
 from triquad_tools.ros2.intake.first_scan import FirstScan
 from triquad_tools.ros2.intake.message_queue import Arrival, MessageQueue, QueueLimits
-from triquad_tools.ros2.intake.message_reader import MAX_POINTS, MessageReader
 from triquad_tools.ros2.intake.motion import Motion
 from triquad_tools.ros2.intake.placement import Placed, Placement
 from triquad_tools.ros2.intake.scan_publisher import Place, ScanPublisher
 from triquad_tools.ros2.intake.topic_listener import TopicListener
 from triquad_tools.ros2.node import Node
 from triquad_tools.ros2.options import BridgeOptions
-from triquad_tools.ros2.topic_choice import Role
+from triquad_tools.ros2.topic_choice import TYPES, Role
 from triquad_tools.sensors.errors import NoScanError
+from triquad_tools.sensors.ros.message_reader import MessageReader
+from triquad_tools.sensors.ros.type_store import decode_cdr
+from triquad_tools.sensors.sweep import Sweep
 
 _log = logging.getLogger("triquad_ros2")
+
+MAX_POINTS = 2_500_000
+"""Points of a scan at most: a message of 30 MB, which servers receive with default settings."""
 
 _OTHER_BYTES = 1_000_000  # of a message of transforms, and of a cloud without its points
 _SCAN_BYTES = 64 * MAX_POINTS + _OTHER_BYTES  # drivers write up to 64 bytes for each point
@@ -47,7 +54,12 @@ class Intake:
         self.drops = DropLog()
         self.scans = ScanPublisher(client)
         self._motion = Motion(from_topic=options.topics.poses is not None)
-        self._reader = MessageReader(options.scans)
+        self._reader = MessageReader(
+            stride=options.scans.depth_stride,
+            body_frame=options.scans.body_frame,
+            by_arrival=options.scans.by_arrival,
+            max_points=MAX_POINTS,
+        )
         self._placement = Placement(
             self._motion, map_frame=frame, max_bytes=_WAITING_BYTES, timeout_s=options.scans.wait_s
         )
@@ -121,19 +133,36 @@ class Intake:
             _log.debug("a message of %s could not be used", topic_name, exc_info=True)
 
     def _read(self, arrival: Arrival) -> None:
-        if arrival.role.brings_scans:
-            self._read_sweep(arrival)
-        elif arrival.role is Role.CAMERA_INFO:
-            self._reader.remember_camera(arrival)
+        role, topic_name, came_ns = arrival.role, arrival.topic_name, arrival.arrived_ns
+        if role.brings_scans:
+            self._first_scan.came(topic_name)
+        kind, message = _decoded(arrival)
+        if role is Role.CAMERA_INFO:
+            self._reader.remember_camera(topic_name, message)
+        elif role.brings_scans:
+            self._place(topic_name, self._reader.sweep(topic_name, kind, message, came_ns))
         else:
-            is_body = arrival.role is Role.POSE
-            self._motion.add(self._reader.transforms(arrival), is_body=is_body)
+            static = role is Role.TF_STATIC
+            found = self._reader.transforms(kind, message, came_ns, static=static)
+            self._motion.add(found, is_body=role is Role.POSE)
 
-    def _read_sweep(self, arrival: Arrival) -> None:
-        self._first_scan.came(arrival.topic_name)
-        sweep = self._reader.sweep(arrival)
-        if self.scans.time_went_back(arrival.topic_name, sweep.stamp_ns):
-            self.drops.remark(arrival.topic_name, "time went back, it starts again")
-            self._placement.give_up_after(arrival.topic_name, sweep.stamp_ns)
+    def _place(self, topic_name: str, sweep: Sweep) -> None:
+        if self.scans.time_went_back(topic_name, sweep.stamp_ns):
+            self.drops.remark(topic_name, "time went back, it starts again")
+            self._placement.give_up_after(topic_name, sweep.stamp_ns)
             self._motion.forget_after(sweep.stamp_ns)
-        self._placement.add(arrival.topic_name, sweep, time.monotonic())
+        self._placement.add(topic_name, sweep, time.monotonic())
+
+
+def _decoded(arrival: Arrival) -> tuple[str, Any]:
+    """Return a message with its type: the bytes of one type cannot be read as another.
+
+    Raises:
+        NoScanError: it has none of the types of its role.
+    """
+    payload = arrival.payload.to_bytes()
+    *others, last = TYPES[arrival.role]
+    for kind in others:
+        with suppress(NoScanError):
+            return kind, decode_cdr(payload, kind)
+    return last, decode_cdr(payload, last)

@@ -6,7 +6,7 @@ from triquad_client import Client
 from triquad_format.records.arrays import Doubles
 
 from triquad_tools.sensors.errors import NoScanError
-from triquad_tools.sensors.ros.topic import source_of_topic
+from triquad_tools.sensors.ros.header import source_of_topic
 from triquad_tools.sensors.sweep import PosedScan
 
 MAX_TOPICS = 64

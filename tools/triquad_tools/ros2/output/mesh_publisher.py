@@ -4,7 +4,6 @@ import numpy as np
 from triquad_client import Client, MeshTile, MeshWatch
 
 from triquad_tools.ros2.intake.scan_publisher import Place
-from triquad_tools.ros2.options import MeshOptions
 from triquad_tools.ros2.output.map_thread import PERIOD_S
 from triquad_tools.ros2.output.markers import Action, Marker
 from triquad_tools.ros2.output.topic_publisher import TopicPublisher
@@ -15,10 +14,14 @@ TileIndex = tuple[int, int, int]
 class MeshPublisher:
     """Follows the mesh of the map while it has subscribers."""
 
-    def __init__(self, publisher: TopicPublisher, client: Client, options: MeshOptions) -> None:
+    def __init__(
+        self, publisher: TopicPublisher, client: Client, level: int, bytes_per_s: int
+    ) -> None:
+        """``level`` is of detail; of markers, ``bytes_per_s`` are sent at most."""
         self._publisher = publisher
         self._client = client
-        self._options = options
+        self._level = level
+        self._bytes_per_s = bytes_per_s
         self._numbers: dict[TileIndex, int] = {}  # of the markers of tiles
         self._watch: MeshWatch | None = None  # while there are subscribers
         self._pending: dict[TileIndex, None] = {}  # whose markers are to be sent, in this order
@@ -26,12 +29,12 @@ class MeshPublisher:
 
     def publish(self, place: Place) -> None:
         """Send markers of what changed, as many as may be sent at a time."""
-        self._left_bytes = min(self._left_bytes, 0) + PERIOD_S * self._options.bytes_per_s
+        self._left_bytes = min(self._left_bytes, 0) + PERIOD_S * self._bytes_per_s
         if not self._publisher.is_followed:
             self.close()
             return
         if self._watch is None:
-            self._watch = self._client.watch_mesh(level=self._options.level)
+            self._watch = self._client.watch_mesh(level=self._level)
             # A bridge before this one may have left some.
             self._publisher.put(Marker(place.map_frame, 0, Action.DELETE_ALL).payload())
         if self._publisher.has_newcomers():

@@ -31,11 +31,11 @@ def transform_of_odometry(message: Any) -> Transform:
     )
 
 
-def transform_of_pose(message: Any, body_frame: str = "") -> Transform:
-    """Return where ``body_frame`` was by a ``PoseStamped``, which does not name it."""
+def transform_of_pose(message: Any) -> Transform:
+    """Return where something was by a ``PoseStamped``, which does not name it."""
     return Transform(
         parent=frame_name(message.header.frame_id),
-        child=body_frame,
+        child="",
         stamp_ns=stamp_ns(message.header),
         pose=_pose(message.pose.position, message.pose.orientation),
     )

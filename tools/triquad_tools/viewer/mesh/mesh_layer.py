@@ -46,7 +46,7 @@ class MeshLayer(Layer):
         self._replaced: list[viser.GlbHandle] = []  # they go a round later: nothing flickers
         with self.folder:
             self._by = page.gui.add_dropdown("Colour", (_HEIGHT, _CONFIDENCE))
-            self._text = page.gui.add_html("")
+            self.add_text()
             self._pixels = page.gui.add_slider("Pixels per cell", 1, 20, 1, _PIXELS)
         page.client.camera.on_update(self.wake)
         self.start(self._by, self._pixels)
@@ -83,8 +83,7 @@ class MeshLayer(Layer):
             self._camera.follow(points)
             self._framed = self._tiles.loaded
         colours = self._colours(points)
-        if self._text.content != colours.scale.html:
-            self._text.content = colours.scale.html
+        self.tell(colours.scale.html)
         for name, tile in wanted.items():
             appearance = (colours.scale.label, tile.version, colours.key(tile))
             drawn = self._shown.get(name)

@@ -4,9 +4,12 @@ import logging
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
+import numpy as np
 import viser
+from matplotlib.colors import to_rgb
+from numpy.typing import NDArray
 from triquad_format.errors import TriquadError
 
 from triquad_tools.viewer.page.page import Page
@@ -32,6 +35,15 @@ class Layer(ABC):
         self._nodes = 0  # that were named so far
         self._woken, self._stopped = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+
+    def add_text(self, html: str = "") -> None:
+        """Add the layer's text to the panel, below the controls that are there."""
+        self._text = self.page.gui.add_html(html)
+
+    def tell(self, html: str) -> None:
+        """Show a text in place of the one before."""
+        if self._text.content != html:
+            self._text.content = html
 
     def start(self, *controls: "viser.GuiInputHandle[Any]") -> None:
         """Begin to refresh; changes of the controls wake it."""
@@ -59,6 +71,19 @@ class Layer(ABC):
         """Return a name for a node of the scene that no other has."""
         self._nodes += 1
         return f"/{self.name}/{self._nodes}/{name}"
+
+    def lines(
+        self,
+        pieces: NDArray[np.floating],
+        colour: str,
+        thickness: float,
+        units: Literal["world", "screen"] = "world",
+    ) -> viser.SceneNodeHandle:
+        """Return pieces of lines [L, 2, 3], metres, map frame, as a mark of a colour."""
+        return self.page.scene.add_line_segments(
+            self.node("lines"), self.page.in_scene(pieces), np.array(to_rgb(colour)),
+            thickness=thickness, thickness_units=units,
+        )  # fmt: skip
 
     def draw(self, marks: Sequence[viser.SceneNodeHandle]) -> None:
         """Draw these marks in the scene; those drawn before go, unless they are among them."""

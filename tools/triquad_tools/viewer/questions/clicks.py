@@ -37,6 +37,7 @@ class Clicks(Question[Clicked]):
         self._events: deque[viser.SceneClickEvent] = deque()
         self._points: tuple[Point, ...] = ()
         self._sky = False
+        self.hint = _HINT
         gui = page.gui
         with self.folder:
             self._use = gui.add_dropdown("A click", (_ASKS, _LAYS, _NOTHING))
@@ -44,7 +45,7 @@ class Clicks(Question[Clicked]):
             self._radius = gui.add_number("Radius (m)", _RADIUS_M, min=0.0, max=50.0, step=0.05)
             self._undo = gui.add_button("Undo last point")
             self._clear = gui.add_button("Clear path")
-            self.add_text(_HINT)
+            self.add_text(text_html(_HINT))
         self._undo.on_click(lambda _: self._keep(self._points[:-1]))
         self._clear.on_click(lambda _: self._keep(()))
         page.scene.on_click()(self._clicked)

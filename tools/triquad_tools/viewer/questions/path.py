@@ -4,7 +4,6 @@ from itertools import pairwise
 
 import numpy as np
 import viser
-from matplotlib.colors import to_rgb
 from triquad_client import Polyline
 from triquad_client.calls.queries import MapQueries
 from triquad_format.records.arrays import Doubles
@@ -82,8 +81,6 @@ class Path:
         ]
         for colour, leg in self.legs():
             least_m = _LEAST_WIDTH * float(np.linalg.norm(leg[-1] - page.eye))
-            pieces = page.in_scene(np.stack([leg[:-1], leg[1:]], axis=1))
-            wide_m = max(2.0 * self._radius_m, least_m)
-            name, light = layer.node("leg"), np.array(to_rgb(colour))
-            marks.append(page.scene.add_line_segments(name, pieces, light, thickness=wide_m))
+            pieces = np.stack([leg[:-1], leg[1:]], axis=1)
+            marks.append(layer.lines(pieces, colour, max(2.0 * self._radius_m, least_m)))
         return marks

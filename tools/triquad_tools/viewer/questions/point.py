@@ -15,7 +15,7 @@ MAX_DISTANCE_M = 10.0
 """How far around a point surfaces are searched for."""
 
 _BALL, _ARROW = 0.006, 0.08  # radius and length, as shares of the distance of the eye
-_COLOUR = to_rgb("#c51b7d")  # no mesh has it
+_COLOUR = "#c51b7d"  # no mesh has it
 
 
 @dataclass(frozen=True)
@@ -54,17 +54,17 @@ class Point:
         """Draw a ball, a stem up from the surface, and the gradient as an arrow."""
         page, place = layer.page, self.place
         eye_m = float(np.linalg.norm(place - page.eye))
-        colour, at, radius_m = np.array(_COLOUR), page.in_scene(place), _BALL * eye_m
-        stem, thick_m = page.in_scene(np.array([[self.surface, place]])), 0.4 * radius_m
+        light, at, radius_m = to_rgb(_COLOUR), page.in_scene(place), _BALL * eye_m
+        stem, thick_m = np.array([[self.surface, place]]), 0.4 * radius_m
         marks: list[viser.SceneNodeHandle] = [
-            page.scene.add_icosphere(layer.node("ball"), radius_m, _COLOUR, position=at),
-            page.scene.add_line_segments(layer.node("stem"), stem, colour, thickness=thick_m),
+            page.scene.add_icosphere(layer.node("ball"), radius_m, light, position=at),
+            layer.lines(stem, _COLOUR, thick_m),
         ]
         if answer.found[0]:
             length_m = _ARROW * eye_m
             ends = page.in_scene(np.array([[place, place + length_m * answer.gradient[0]]]))
             arrow = page.scene.add_arrows(
-                layer.node("gradient"), ends, colour, shaft_radius=thick_m,
+                layer.node("gradient"), ends, np.array(light), shaft_radius=thick_m,
                 head_radius=radius_m, head_length=0.3 * length_m,
             )  # fmt: skip
             marks.append(arrow)

@@ -45,16 +45,6 @@ class Question(Layer, Generic[Wanted]):
         self._due_s = 0.0
         self.hint = ""  # what the panel says while nothing is asked
 
-    def add_text(self, hint: str = "") -> None:
-        """Add the text of the answer to the panel, below the controls that are there."""
-        self.hint = hint
-        self._text = self.page.gui.add_html(text_html(hint))
-
-    def tell(self, html: str) -> None:
-        """Show a text in place of the answer."""
-        if self._text.content != html:
-            self._text.content = html
-
     @abstractmethod
     def wanted(self) -> Wanted | None:
         """Return what is to be asked now; ``None``: nothing."""

@@ -2,7 +2,6 @@
 
 import threading
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -21,18 +20,6 @@ from triquad_tools.viewer.sources.stored_map import StoredMap
 _MAX_OPEN = 4  # maps that stay in memory beyond those that pages show
 
 
-@dataclass(frozen=True)
-class Moment:
-    """A checkpoint."""
-
-    epoch: int
-    time: str  # UTC as in RFC 3339; empty if the file does not say
-    path: Path
-
-    def __str__(self) -> str:
-        return f"epoch {self.epoch}, {self.time}" if self.time else f"epoch {self.epoch}"
-
-
 class DamagedError(ToolError):
     """A checkpoint that cannot be shown."""
 
@@ -41,56 +28,45 @@ class History:
     """The checkpoints of one map in a store, to which a server may add; for several threads."""
 
     def __init__(self, store: Path) -> None:
-        """Read the folder.
+        """Find the folder.
 
         Raises:
             MapFileError: there are no checkpoints, or those of several maps.
             OSError: the folder cannot be read.
         """
         self.folder = map_folder(store)
-        # What is known of each file: its moment, or why it cannot be shown.
-        self._known: dict[CheckpointFile, Moment | str] = {}
+        self._damaged: dict[CheckpointFile, str] = {}  # as far as is known, and why
         self._opening = threading.Lock()  # one at a time: it takes all cores
         self._open = lru_cache(_MAX_OPEN)(lambda path: StoredMap(path, str(self.folder)))
-        self.refresh()
 
-    @property
-    def moments(self) -> tuple[Moment, ...]:
-        """The checkpoints that can be shown as far as is known, the oldest first."""
-        return tuple(what for _, what in sorted(self._known.items()) if isinstance(what, Moment))
-
-    @property
-    def damaged(self) -> tuple[str, ...]:
-        """The errors of those that cannot be shown, the oldest first."""
-        return tuple(what for _, what in sorted(self._known.items()) if isinstance(what, str))
-
-    def refresh(self) -> None:
-        """Update from what a server wrote or deleted meanwhile.
+    def files(self) -> list[CheckpointFile]:
+        """Return the checkpoints that can be shown as far as is known, the oldest first.
 
         Raises:
             ToolError: the folder cannot be read.
         """
-        known = self._known  # which others may replace, but nobody changes
         try:
             found = checkpoint_files(self.folder)
         except OSError as error:
             raise ToolError(f"{self.folder} cannot be read: {error.strerror}") from error
-        self._known = {file: known.get(file) or _read(file) for file in found}
+        return [file for file in reversed(found) if file not in self._damaged]
 
-    def opened(self, moment: Moment) -> StoredMap:
+    def damaged(self) -> list[str]:
+        """Return the errors of those that cannot be shown and are still there."""
+        return [why for file, why in sorted(self._damaged.items()) if file.path.exists()]
+
+    def opened(self, file: CheckpointFile) -> StoredMap:
         """Return the map as it was.
 
         Raises:
-            DamagedError: it cannot be shown; it is a moment no longer.
+            DamagedError: it cannot be shown; it is among the files no longer.
         """
         try:
             with self._opening:
-                return self._open(moment.path)
+                return self._open(file.path)
         except (FormatError, OSError) as error:
-            problem = f"{moment.path.name} is left out: {error}"
-            known = self._known.items()
-            self._known = {f: problem if f.path == moment.path else what for f, what in known}
-            raise DamagedError(problem) from error
+            self._damaged[file] = f"{file.path.name} is left out: {error}"
+            raise DamagedError(self._damaged[file]) from error
 
     def newest(self) -> StoredMap:
         """Return the map as it was at the newest moment that can be shown.
@@ -98,19 +74,19 @@ class History:
         Raises:
             ToolError: there is none.
         """
-        while moments := self.moments:
+        while files := self.files():
             with suppress(DamagedError):
-                return self.opened(moments[-1])
+                return self.opened(files[-1])
         raise ToolError(
             f"{self.folder}: no checkpoint can be shown; triquad-pack --recover saves what is "
             "intact"
         )
 
 
-def _read(file: CheckpointFile) -> Moment | str:
-    """Return the moment of a file, or why it cannot be shown."""
-    try:
-        stamp_ns = open_manifest(file).stamp_ns
-    except (FormatError, OSError) as error:
-        return f"{file.path.name} is left out: {error}"
-    return Moment(file.epoch, utc_time(stamp_ns) if stamp_ns else "", file.path)
+@lru_cache
+def moment(file: CheckpointFile) -> str:
+    """Return the epoch of a checkpoint, and its time, UTC as in RFC 3339, if the file says it."""
+    with suppress(FormatError, OSError):
+        if stamp_ns := open_manifest(file).stamp_ns:
+            return f"epoch {file.epoch}, {utc_time(stamp_ns)}"
+    return f"epoch {file.epoch}"

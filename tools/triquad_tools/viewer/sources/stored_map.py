@@ -1,18 +1,17 @@
 """The map of a file, shown without a server."""
 
-import threading
 import time
 from collections.abc import Mapping
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 from triquad_client import open_map
 from triquad_client.checks import Bounds
 from triquad_client.mesh.followed_mesh import MeshTile, TileIndex
-from triquad_client.offline.map_mesh import TILE_CELLS, MapTiles
+from triquad_client.offline.map_mesh import TILE_CELLS
 
-from triquad_tools.viewer.sources.map_source import TileFollower, TileSizes
+from triquad_tools.viewer.sources.map_source import COARSEST, TileFollower, TileSizes
 
 _CELL_LEAVES = 0.5  # of a cell of level 0, as in a server's mesh
 _MAX_TILES = 500  # that are kept of an open map: some 50 to 200 MB
@@ -39,8 +38,8 @@ class StoredMap:
         self.title = f"{self.queries.name} in {place}"
         cell_m = _CELL_LEAVES * self.queries.leaf_m
         self.sizes = TileSizes(cell_m, TILE_CELLS * cell_m)
-        self._listing = threading.Lock()
-        self._listed_tiles = cache(self._listed)
+        cells_m = map(self.sizes.cell_of, range(COARSEST + 1))
+        self._tiles = [self.queries.mesh_tiles(cell_m) for cell_m in cells_m]  # by level
         self.tile = lru_cache(_MAX_TILES)(self._made)
         """The tile of a level and an index, one of :meth:`indices`."""
 
@@ -52,8 +51,7 @@ class StoredMap:
 
     def indices(self, level: int, bounds: Bounds | None) -> list[TileIndex]:
         """Return the tiles that meet a box and may have faces."""
-        with self._listing:
-            listed = self._listed_tiles(level).indices
+        listed = self._tiles[level].indices
         if bounds is None:
             return listed
         (low, high), side_m = np.asarray(bounds, np.float64), self.sizes.side_of(level)
@@ -61,11 +59,8 @@ class StoredMap:
         meets = ((tiles * side_m <= high) & ((tiles + 1) * side_m >= low)).all(axis=1)
         return [index for index, is_met in zip(listed, meets, strict=True) if is_met]
 
-    def _listed(self, level: int) -> MapTiles:
-        return self.queries.mesh_tiles(self.sizes.cell_of(level))
-
     def _made(self, level: int, index: TileIndex) -> MeshTile:
-        mesh = self._listed_tiles(level).mesh(index)
+        mesh = self._tiles[level].mesh(index)
         origin = np.array(index) * self.sizes.side_of(level)
         vertices = (mesh.vertices - origin).astype(np.float32)
         return MeshTile(

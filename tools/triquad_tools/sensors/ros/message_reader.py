@@ -1,0 +1,98 @@
+"""Messages of ROS, recorded or as they arrive, turned into sweeps and transforms."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+from triquad_tools.sensors.errors import NoScanError
+from triquad_tools.sensors.motion.frame_tree import STATIC, Transform
+from triquad_tools.sensors.ros.depth_camera import camera_topic, sweep_of_depth
+from triquad_tools.sensors.ros.point_cloud import sweep_of_cloud
+from triquad_tools.sensors.ros.transforms import (
+    transform_of_odometry,
+    transform_of_pose,
+    transforms_of_tf,
+)
+from triquad_tools.sensors.ros.type_store import ODOMETRY, POINT_CLOUD, POSE
+from triquad_tools.sensors.sweep import Sweep
+
+
+class MessageReader:
+    """Reads decoded messages; remembers the cameras, which depth images need."""
+
+    def __init__(
+        self,
+        *,
+        stride: int = 1,
+        body_frame: str = "",
+        by_arrival: bool = False,
+        max_points: float = math.inf,
+    ) -> None:
+        """Set how messages are read.
+
+        Args:
+            stride: every how many rows and columns of a depth image one is taken.
+            body_frame: whose poses are those that do not say whose they are.
+            by_arrival: stamps are when messages came, not those of their headers.
+            max_points: of a scan; what has more is refused.
+        """
+        self._stride = stride
+        self._body_frame = body_frame
+        self._by_arrival = by_arrival
+        self._max_points = max_points
+        self._cameras: dict[str, Any] = {}  # CameraInfo by its topic
+
+    def remember_camera(self, topic: str, info: Any) -> None:
+        """Remember the ``CameraInfo`` of a topic."""
+        self._cameras[topic] = info
+
+    def sweep(self, topic: str, kind: str, message: Any, came_ns: int) -> Sweep:
+        """Return the sweep of a cloud or a depth image.
+
+        Raises:
+            NoScanError: it is none, or has too many points, or its camera is not known.
+        """
+        if kind == POINT_CLOUD:
+            self._check_count(message.width * message.height)
+            sweep = sweep_of_cloud(message)
+        else:
+            stride = self._stride
+            self._check_count(-(-message.width // stride) * -(-message.height // stride))
+            sweep = sweep_of_depth(message, self._camera(camera_topic(topic)), stride)
+        return replace(sweep, stamp_ns=came_ns) if self._by_arrival else sweep
+
+    def transforms(
+        self, kind: str, message: Any, came_ns: int, *, static: bool = False
+    ) -> list[Transform]:
+        """Return the transforms of a message of transforms, ``static`` or not, or of a pose."""
+        if kind == ODOMETRY:
+            found = [transform_of_odometry(message)]
+        elif kind == POSE:
+            found = [transform_of_pose(message)]
+        else:
+            found = transforms_of_tf(message, static=static)
+        if kind in (ODOMETRY, POSE):
+            found = [replace(each, child=each.child or self._body_frame) for each in found]
+        if not self._by_arrival:
+            return found
+        return [
+            each if each.stamp_ns is STATIC else replace(each, stamp_ns=came_ns) for each in found
+        ]
+
+    def _camera(self, topic: str) -> Any:
+        if topic not in self._cameras:
+            there = ", ".join(sorted(self._cameras)) or "none"
+            raise NoScanError(
+                "no_camera_info",
+                f"nothing is known of the camera of {topic} (of that kind there is {there}): it "
+                "has to be published and recorded",
+            )
+        return self._cameras[topic]
+
+    def _check_count(self, points: int) -> None:
+        if points > self._max_points:
+            raise NoScanError(
+                "too_many_points",
+                f"{points} points exceed {self._max_points}: publish smaller clouds, or, of depth "
+                "images, raise --depth-stride",
+            )
