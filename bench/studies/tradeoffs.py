@@ -8,10 +8,12 @@ import argparse
 import io
 import math
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO, cast
 
 from matplotlib.figure import Figure as Sheet
 from matplotlib.ticker import NullFormatter, ScalarFormatter
@@ -123,10 +125,10 @@ def _by_time(made: BenchStreet) -> tuple[list[Scored], Epoch]:
 
 def _by_bytes(epoch: Epoch, made: BenchStreet) -> list[Scored]:
     """Return scores of a map's file, as it is and packed within errors."""
-    plain = io.BytesIO()
-    size = _written(epoch.record(), epoch, plain)
-    plain.seek(0)
-    stored = read_map(plain)
+    with tempfile.NamedTemporaryFile() as plain:
+        size = _written(epoch.record(), epoch, cast(BinaryIO, plain))
+        plain.flush()
+        stored = read_map(plain.name)
     scores = [_score(stored, made, curve=BYTES, cost=size / 1e6)]
     with progress("packing", len(_ERRORS_M)) as report:
         for number, error_m in enumerate(_ERRORS_M):
@@ -137,7 +139,7 @@ def _by_bytes(epoch: Epoch, made: BenchStreet) -> list[Scored]:
     return scores
 
 
-def _written(record: MapRecord, epoch: Epoch, file: io.BytesIO) -> int:
+def _written(record: MapRecord, epoch: Epoch, file: BinaryIO) -> int:
     """Write a map as a server does, with its previews; return its size in bytes."""
     return write_map(record, file, previews=previews_of(record, epoch)).bytes
 

@@ -1,8 +1,6 @@
 """The client for programs with an event loop: the blocking one, each of its calls in a thread."""
 
-import asyncio
 from collections.abc import Callable, Generator
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -183,16 +181,8 @@ class Connecting:
         await self._client.close()
 
     async def _connect(self) -> AsyncClient:
-        opener = ThreadPoolExecutor(1, "triquad-opener")
-        opening = opener.submit(self._open)
-        try:
-            connection = await asyncio.wrap_future(opening)
-        except BaseException:
-            opening.add_done_callback(_close_late)
-            raise
-        finally:
-            opener.shutdown(wait=False)
-        return AsyncClient(Client(connection), Threads())
+        # A connection that comes after its task was cancelled is closed, as nobody has it.
+        return AsyncClient(Client(await in_thread(self._open)), Threads())
 
 
 def connect_async(
@@ -212,9 +202,3 @@ def connect_async(
             endpoint, map, timeout_s, config, max_download_bytes=max_download_bytes
         )
     )
-
-
-def _close_late(opening: "Future[Connection]") -> None:
-    """Close what was opened although its task was cancelled meanwhile."""
-    if not opening.cancelled() and opening.exception() is None:
-        opening.result().close()

@@ -117,7 +117,8 @@ def _representatives(points: Doubles) -> NDArray[np.intp]:
     for shift in _SHIFTS:
         left, at = _numbered(chosen, len(points))
         names = _names(np.floor(points[left] / WELD_M + shift).astype(np.int64))
-        chosen = left[_firsts(names)][at]
+        _, firsts, same = np.unique(names, return_index=True, return_inverse=True)
+        chosen = left[firsts[same]][at]
     return chosen
 
 
@@ -126,18 +127,6 @@ def _numbered(chosen: NDArray[np.intp], count: int) -> tuple[NDArray[np.intp], N
     used = np.zeros(count, np.bool_)
     used[chosen] = True
     return np.flatnonzero(used), (np.cumsum(used) - 1)[chosen]
-
-
-def _firsts(names: Longs) -> NDArray[np.intp]:
-    """Return where each name [N] is found first."""
-    if len(names) == 0:
-        return np.zeros(0, np.intp)
-    order = np.argsort(names)
-    found = names[order]
-    is_new = np.concatenate([[True], found[1:] != found[:-1]])
-    firsts = np.empty(len(names), np.intp)
-    firsts[order] = np.minimum.reduceat(order, np.flatnonzero(is_new))[np.cumsum(is_new) - 1]
-    return firsts
 
 
 def _names(cells: Longs) -> Longs:

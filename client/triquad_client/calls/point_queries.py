@@ -6,7 +6,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from triquad_format.wire import keys
 from triquad_format.wire.limits import MAX_QUERY_POINTS, MAX_SEARCHES
 from triquad_format.wire.messages import SdfReply, SdfRequest
@@ -21,7 +21,7 @@ from triquad_format.wire.query_messages import (
 from triquad_map.questions.distance import Distances, Unknown, UnknownLike, with_unknown
 from triquad_map.questions.grid import Grid
 from triquad_map.questions.spheres import Spheres
-from triquad_map.view import asked
+from triquad_map.view import FieldAnswer
 
 from triquad_client import checks
 from triquad_client.calls.parts import Asking, Part
@@ -30,22 +30,10 @@ from triquad_client.net.connection import NEWEST, Answering, Ask, retried
 
 
 @dataclass(frozen=True)
-class SdfResult:
+class SdfResult(FieldAnswer):
     """The field and the status of N points, all of it from one epoch."""
 
-    sdf: NDArray[np.float32]  # [N] metres, positive in free space; NaN where the map has nothing
-    status: NDArray[np.uint8]  # [N] Status values
     epoch: int
-    _gradient: NDArray[np.float32] | None = None
-
-    @property
-    def gradient(self) -> NDArray[np.float32]:
-        """[N, 3] d(sdf)/dx, map frame, pointing to free space.
-
-        Raises:
-            NotAskedError: it was not asked for.
-        """
-        return asked("gradient", self._gradient, "gradient")
 
 
 class PointQueries(Asking):

@@ -7,7 +7,6 @@ import weakref
 from collections import defaultdict
 from collections.abc import Callable, Coroutine
 from concurrent.futures import Future, wait
-from queue import Empty, SimpleQueue
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import zenoh
@@ -24,14 +23,11 @@ _WAITING = {"next", "catch_up", "flush", "settle"}
 _IN_ORDER = {"publish_scan", "publish_depth", "restart_source"}
 """Methods whose effects are in the order of their calls: one goes on at a time."""
 
-_IDLE_S = 10.0  # until a thread without calls ends
 _END_S = 1.0  # for what still runs when the program ends, and its connection was closed
 
 ArgumentsP = ParamSpec("ArgumentsP")
 ResultT = TypeVar("ResultT")
 
-_calls: SimpleQueue[Callable[[], None]] = SimpleQueue()
-_idle = threading.Semaphore(0)  # counts threads that wait for calls
 _running: set[Future[Any]] = set()
 
 
@@ -50,26 +46,10 @@ def in_thread(call: Callable[[], ResultT]) -> asyncio.Future[ResultT]:
         except BaseException as error:
             result.set_exception(error)
 
-    if not _idle.acquire(blocking=False):
-        threading.Thread(target=_run_calls, name="triquad-call", daemon=True).start()
+    threading.Thread(target=run, name="triquad-call", daemon=True).start()
     _running.add(result)
     result.add_done_callback(_running.discard)
-    _calls.put(run)
     return asyncio.wrap_future(result)
-
-
-def _run_calls() -> None:
-    """Run calls until there are none for a while: starting a thread takes longer than many do."""
-    while True:
-        try:
-            run = _calls.get(timeout=_IDLE_S)
-        except Empty:
-            if _idle.acquire(blocking=False):
-                return
-            continue  # a call is on its way
-        run()
-        del run  # and what it refers to
-        _idle.release()
 
 
 class Threads:

@@ -14,7 +14,7 @@ from triquad_format.records.arrays import Bools, Doubles
 from triquad_format.records.region import MapRecord
 from triquad_format.records.seen_space import surface_voxels
 from triquad_format.wire.limits import MAX_FILL_M
-from triquad_map.questions.answers import Answers, QuestionLimits
+from triquad_map.questions.answers import Answers
 from triquad_map.record_view import open_view
 from triquad_map.view import MapView
 
@@ -26,7 +26,7 @@ from triquad_client.mesh.mesh import Mesh
 from triquad_client.net.connection import PARTS_IN_FLIGHT, Answering, Ask, ReplyT
 
 if TYPE_CHECKING:
-    from triquad_map.composition.composed_view import ComposedView
+    from triquad_map.composition.recorded_view import RecordedView
 
     from triquad_client.offline.map_mesh import MapTiles, Report
 
@@ -34,20 +34,30 @@ CELL_RANGE_M = (0.005, 10.0)
 _CELL_LEAVES = 0.5
 _REACH_LEAVES = 0.1  # how far from a voxel with seen surface the middle of a face may lie
 
-_NO_LIMITS = QuestionLimits(points=2**62, searches=2**62)
-"""No limits, since nobody else waits."""
-
 
 class LocalMap(Answering):
     """Answers requests about the map in a record, as fast as possible here; for several threads."""
 
     def __init__(self, record: MapRecord) -> None:
-        self.view = open_view(record)
-        self._answers = Answers(self._epoch, _NO_LIMITS)
+        self._opened: RecordedView | None = open_view(record)
+        self._answers = Answers(self._epoch)
+
+    @property
+    def view(self) -> "RecordedView":
+        """The map.
+
+        Raises:
+            ClosedError: it was closed.
+        """
+        if self._opened is None:
+            raise ClosedError("the map is closed")
+        return self._opened
 
     def close(self) -> None:
-        """End the threads that compiled code works on; nothing may be asked any more."""
-        self.view.close()
+        """Release the map; what is asked later raises :class:`ClosedError`."""
+        opened, self._opened = self._opened, None
+        if opened is not None:
+            opened.close()
 
     def replies(
         self,
@@ -63,19 +73,10 @@ class LocalMap(Answering):
     @contextmanager
     def _epoch(self, number: int) -> Iterator[MapView]:
         """Yield the view, where its epoch is asked for, or the newest."""
-        if number not in (0, self.view.epoch):
-            raise RefusedError(
-                "epoch_gone", f"epoch {number} is not kept; kept is [{self.view.epoch}]"
-            )
-        yield self.view
-
-
-class _ClosedMap(Answering):
-    """Answers nothing."""
-
-    def replies(self, asks: Iterable[Ask[ReplyT]], at_once: int = 0) -> Iterator[ReplyT]:  # noqa: ARG002
-        """Refuse all requests."""
-        raise ClosedError("the map is closed")
+        view = self.view
+        if number not in (0, view.epoch):
+            raise RefusedError("epoch_gone", f"epoch {number} is not kept; kept is [{view.epoch}]")
+        yield view
 
 
 class OfflineMap(MapQueries):
@@ -87,9 +88,7 @@ class OfflineMap(MapQueries):
 
     def __init__(self, record: MapRecord, stamp_ns: int = 0) -> None:
         """Open a map that is in memory already; use :func:`open_map` for a file."""
-        opened = LocalMap(record)
-        self._server: Answering = opened
-        self._map: LocalMap | None = opened
+        self._server = self._map = LocalMap(record)
         # Meshes need no more of it: the view has the rest in a form of its own.
         self._seen = dataclasses.replace(
             record,
@@ -112,9 +111,7 @@ class OfflineMap(MapQueries):
 
     def close(self) -> None:
         """Release the map; later queries raise :class:`ClosedError`."""
-        opened, self._map, self._server = self._map, None, _ClosedMap()
-        if opened is not None:
-            opened.close()
+        self._map.close()
 
     def mesh(
         self,
@@ -156,7 +153,7 @@ class OfflineMap(MapQueries):
     def _tiles(
         self, cell_m: float | None, bounds: Bounds | None, fill_m: float, *, whole: bool
     ) -> "MapTiles":
-        view = self._view()
+        view = self._map.view
         chosen_m = _CELL_LEAVES * self.leaf_m if cell_m is None else cell_m
         checked_m = checks.within("cell_m", chosen_m, CELL_RANGE_M[1], least=CELL_RANGE_M[0])
         box, fill_m = checks.box(bounds), checks.within("fill_m", fill_m, MAX_FILL_M, least=0.0)
@@ -179,13 +176,7 @@ class OfflineMap(MapQueries):
             InvalidInputError: the points are not [N, 3], or not finite.
             ClosedError: the map was closed.
         """
-        view = self._view()
-        return view.near_ends(checks.query_points(points), _REACH_LEAVES * self.leaf_m)
-
-    def _view(self) -> "ComposedView":
-        if self._map is None:
-            raise ClosedError("the map is closed")
-        return self._map.view
+        return self._map.view.near_ends(checks.query_points(points), _REACH_LEAVES * self.leaf_m)
 
 
 def open_map(path: str | Path) -> OfflineMap:

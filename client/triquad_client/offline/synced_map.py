@@ -149,7 +149,7 @@ class SyncedMap(MapQueries):
             )
             self._server = self._state.map
             if known is not None:
-                known.map.close()
+                known.map.view.close()  # questions that are under way go on without its threads
             return report
 
     def _refuse_emptier(self, info: MapInfo, seen_bytes: int) -> None:

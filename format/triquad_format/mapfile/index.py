@@ -91,23 +91,6 @@ class FileBytes:
         self._stream.close()
 
 
-class MemoryBytes:
-    """The bytes of a file that are in memory."""
-
-    def __init__(self, data: bytes, name: str = "map file") -> None:
-        self.name = name
-        self.size = len(data)
-        self.data = data
-
-    def read(self, offset: int, length: int) -> bytes:
-        """Read as :meth:`RandomAccess.read`."""
-        check_range(offset, length, self.size)
-        return self.data[offset : offset + length]
-
-    def close(self) -> None:
-        """Do nothing: there is no file."""
-
-
 def check_range(offset: int, length: int, size: int) -> None:
     """Raise :class:`DamagedMapFileError` unless the file's ``size`` bytes contain that range."""
     if offset < 0 or length < 0 or offset + length > size:

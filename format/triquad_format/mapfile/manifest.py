@@ -157,12 +157,11 @@ def manifest_in(body: PartBody, file_bytes: int) -> Manifest:
     if len({entry.key for entry in entries}) != count:
         raise DamagedMapFileError(f"{MANIFEST}: it lists a part twice")
     _check_keys([entry.key for entry in entries])
-    _check_sizes(entries)
     return Manifest(facts, body.count("created_ns"), entries)
 
 
 def _check_columns(columns: Mapping[str, NDArray[Any]], topics: int) -> None:
-    limits = {"topic": topics, "plane": 3}
+    limits = {"topic": topics, "plane": 3, "bytes": MAX_PART_BYTES + 1}
     for name, limit in limits.items():
         if (columns[name] >= limit).any():
             raise DamagedMapFileError(f"{MANIFEST}: a number in {name!r} is out of range")
@@ -180,14 +179,6 @@ def _check_keys(keys: list[PartKey]) -> None:
     for key in keys:
         if key.topic in REGION_TOPICS and key.region not in regions:
             raise DamagedMapFileError(f"the part {REGION} of {key.region} is missing")
-
-
-def _check_sizes(entries: tuple[Entry, ...]) -> None:
-    for entry in entries:
-        if entry.size > MAX_PART_BYTES:
-            raise DamagedMapFileError(
-                f"{MANIFEST}: a part {entry.key.topic:.80} exceeds {MAX_PART_BYTES} bytes"
-            )
 
 
 def total_limit(file_bytes: int) -> int:

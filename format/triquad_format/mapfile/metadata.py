@@ -82,8 +82,13 @@ def unpack_facts(body: PartBody) -> MapFacts:
             raise UnsupportedMapFileError(f"{key} = {body.value(key, str)!r:.80}, not {wanted!r}")
     name = body.value("name", str)
     check_name("map", name)
-    settings = _unpack_settings(body.mapping("settings"))
-    return MapFacts(name, body.count("epoch"), settings, _unpack_progress(body))
+    settings = FieldSettings(**_values(FieldSettings(), body.mapping("settings")))
+    progress = MapProgress(**_values(MapProgress(), body.mapping("progress")))
+    try:
+        progress.check()
+    except FormatError as error:
+        raise DamagedMapFileError(f"{body.topic}: progress: {error}") from error
+    return MapFacts(name, body.count("epoch"), settings, progress)
 
 
 def check_map_part(payload: bytes, facts: MapFacts) -> None:
@@ -92,31 +97,17 @@ def check_map_part(payload: bytes, facts: MapFacts) -> None:
         raise DamagedMapFileError(f"{MAP} and {MANIFEST} contradict each other")
 
 
-def _unpack_progress(body: PartBody) -> MapProgress:
-    told = PartBody(body.topic, body.mapping("progress"))
-    progress = MapProgress(
-        scans_taken=told.count("scans_taken"),
-        samples_trained=told.count("samples_trained"),
-        loss=told.value("loss", float),
-    )
-    try:
-        progress.check()
-    except FormatError as error:
-        raise DamagedMapFileError(f"{body.topic}: progress: {error}") from error
-    return progress
-
-
-def _unpack_settings(body: Mapping[str, object]) -> FieldSettings:
-    """Return the settings of a field; all must be there."""
+def _values(defaults: FieldSettings | MapProgress, packed: Mapping[str, object]) -> dict[str, Any]:
+    """Return the values of settings, or of a progress; all must be there."""
     values: dict[str, Any] = {}
-    for name, default in dataclasses.asdict(FieldSettings()).items():
-        value = body.get(name)
+    for name, default in dataclasses.asdict(defaults).items():
+        value = packed.get(name)
         if type(default) is float and type(value) is int and abs(value) < 2**53:
             value = float(value)
         if type(value) is not type(default):
-            raise DamagedMapFileError(f"{MAP}: setting {name} = {reprlib.repr(value)}")
+            raise DamagedMapFileError(f"{MAP}: {name} = {reprlib.repr(value)}")
         values[name] = value
-    return FieldSettings(**values)
+    return values
 
 
 def pack_metadata(

@@ -4,12 +4,10 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
 
 from triquad_format.errors import TooLargeMapFileError
 from triquad_format.mapfile.checkpoint import CheckpointIndex, open_index
-from triquad_format.mapfile.container import RandomAccess
-from triquad_format.mapfile.index import FileBytes, MapIndex, MemoryBytes, named
+from triquad_format.mapfile.index import FileBytes, MapIndex, named
 from triquad_format.mapfile.manifest import Entry, Manifest
 from triquad_format.mapfile.metadata import MAX_MAP_BYTES
 from triquad_format.mapfile.parts.part import REGION, REGION_TOPICS
@@ -17,8 +15,6 @@ from triquad_format.mapfile.parts.region_parts import RegionParts
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.record_check import check_record
 from triquad_format.records.region import MapRecord
-
-_BLOCK_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -31,17 +27,16 @@ class MapFile:
     manifest: Manifest
 
 
-def read_map(source: Path | str | BinaryIO, *, max_bytes: int = MAX_MAP_BYTES) -> MapRecord:
+def read_map(path: Path | str, *, max_bytes: int = MAX_MAP_BYTES) -> MapRecord:
     """Return the record in a map file; arguments and errors are those of :func:`read_map_file`."""
-    return read_map_file(source, max_bytes=max_bytes).record
+    return read_map_file(path, max_bytes=max_bytes).record
 
 
-def read_map_file(source: Path | str | BinaryIO, *, max_bytes: int = MAX_MAP_BYTES) -> MapFile:
+def read_map_file(path: Path | str, *, max_bytes: int = MAX_MAP_BYTES) -> MapFile:
     """Read a map file and check all of it. Arrays may be read-only.
 
     Args:
-        source: a path, or a binary stream, which is read to its end. The path may be that of a
-            checkpoint, whose parts lie in its store.
+        path: the file; it may be a checkpoint, whose parts lie in its store.
         max_bytes: limit on the file's size and, decompressed, on its parts together.
 
     Raises:
@@ -51,24 +46,10 @@ def read_map_file(source: Path | str | BinaryIO, *, max_bytes: int = MAX_MAP_BYT
         MapFileError: it is not a map file.
         OSError: the file cannot be read.
     """
-    file: RandomAccess
-    if isinstance(source, (str, Path)):
-        file = FileBytes(Path(source))
-    else:
-        file = _in_memory(source, max_bytes)
-    with closing(file), named(file.name):
+    with closing(FileBytes(Path(path))) as file, named(file.name):
         if file.size > max_bytes:
             raise TooLargeMapFileError(f"it is larger than the limit of {max_bytes} bytes")
         return _read(open_index(file), max_bytes)
-
-
-def _in_memory(stream: BinaryIO, max_bytes: int) -> MemoryBytes:
-    """Return the bytes of a stream, no more than it takes to see that there are too many."""
-    blocks: list[bytes] = []
-    # Block by block: one read of the limit's size would reserve all of it.
-    while sum(map(len, blocks)) <= max_bytes and (block := stream.read(_BLOCK_BYTES)):
-        blocks.append(block)
-    return MemoryBytes(b"".join(blocks), str(getattr(stream, "name", "map file")))
 
 
 def _read(index: MapIndex | CheckpointIndex, max_bytes: int) -> MapFile:

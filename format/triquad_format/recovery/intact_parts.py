@@ -8,7 +8,7 @@ import hashlib
 import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from triquad_format.errors import (
@@ -32,7 +32,6 @@ from triquad_format.mapfile.parts.part import (
     TRAINING,
     PartKey,
 )
-from triquad_format.records.field_settings import RegionIndex
 
 _LEAST_BUDGET, _BUDGET_RATIO = 2**24, 8
 """Bytes of all places whose contents are tried: a constant, and a multiple of the file's size."""
@@ -43,31 +42,18 @@ compression, and the length of what is stored."""
 
 
 @dataclass(frozen=True)
-class PartsOfRegion:
-    """The parts of one region."""
-
-    found: dict[PartKey, bytes] = field(default_factory=dict)  # payloads of those that are intact
-    missing: set[PartKey] = field(default_factory=set)  # as far as the manifest says
-
-
-@dataclass(frozen=True)
 class IntactParts:
     """The parts of the field and of training that are intact, and what is known of the others."""
 
     facts: MapFacts
     payloads: Mapping[PartKey, bytes]
-    missing: frozenset[PartKey] = frozenset()  # as far as the manifest says
-    parts_listed: int | None = None  # in the manifest; None: it is lost
-    stamp_ns: int = 0  # when the epoch was written, nanoseconds since 1970; 0 if not known
+    manifest: Manifest | None = None  # None: it is lost
 
-    def by_region(self) -> dict[RegionIndex, PartsOfRegion]:
-        """Return the regions of which there is a part, or was one."""
-        regions: dict[RegionIndex, PartsOfRegion] = {}
-        for key, data in self.payloads.items():
-            regions.setdefault(key.region, PartsOfRegion()).found[key] = data
-        for key in sorted(self.missing):
-            regions.setdefault(key.region, PartsOfRegion()).missing.add(key)
-        return regions
+    @property
+    def listed(self) -> frozenset[PartKey]:
+        """The parts of regions that there were, as far as the manifest says."""
+        entries = () if self.manifest is None else self.manifest.entries
+        return frozenset(entry.key for entry in entries if entry.key.topic in REGION_TOPICS)
 
 
 def intact_parts(path: Path, max_bytes: int) -> IntactParts:
@@ -86,7 +72,7 @@ def intact_parts(path: Path, max_bytes: int) -> IntactParts:
     with closing(FileBytes(path)) as file:
         if is_checkpoint(file):
             return _checkpoint_parts(CheckpointIndex(file), max_bytes)
-    payloads = list(_payloads(path, max_bytes))
+        payloads = list(_payloads(file, max_bytes))
     manifest = _manifest(payloads)
     if manifest is not None:
         by_digest = {hashlib.sha256(payload).digest(): payload for payload in payloads}
@@ -125,17 +111,11 @@ def _checkpoint_parts(index: CheckpointIndex, max_bytes: int) -> IntactParts:
 
 
 def _listed_parts(manifest: Manifest, payload_of: Callable[[Entry], bytes | None]) -> IntactParts:
-    """Return the parts of regions that a manifest lists; those without a payload are missing."""
+    """Return the parts of regions that a manifest lists, of those that have a payload."""
     entries = [entry for entry in manifest.entries if entry.key.topic in REGION_TOPICS]
-    tried = {entry.key: payload_of(entry) for entry in entries}
-    found = {key: payload for key, payload in tried.items() if payload is not None}
-    return IntactParts(
-        manifest.facts,
-        found,
-        missing=frozenset(tried.keys() - found.keys()),
-        parts_listed=len(entries),
-        stamp_ns=manifest.stamp_ns,
-    )
+    tried = ((entry.key, payload_of(entry)) for entry in entries)
+    found = {key: payload for key, payload in tried if payload is not None}
+    return IntactParts(manifest.facts, found, manifest)
 
 
 def _own_key(payload: bytes) -> PartKey | None:
@@ -151,18 +131,17 @@ def _own_key(payload: bytes) -> PartKey | None:
     return None
 
 
-def _payloads(path: Path, max_bytes: int) -> Iterator[bytes]:
+def _payloads(file: FileBytes, max_bytes: int) -> Iterator[bytes]:
     """Yield the payloads in all intact chunks of a file, in their order.
 
     Raises:
         TooLargeMapFileError: the file is larger than ``max_bytes``, or unpacks to more.
         OSError: it cannot be read.
     """
-    with closing(FileBytes(path)) as file:
-        size = file.size
-        if size > max_bytes:
-            raise TooLargeMapFileError(f"it is larger than the limit of {max_bytes} bytes")
-        data = file.read(0, size)
+    size = file.size
+    if size > max_bytes:
+        raise TooLargeMapFileError(f"it is larger than the limit of {max_bytes} bytes")
+    data = file.read(0, size)
     left = min(max_bytes, total_limit(size))
     for message in _intact_messages(data):
         try:

@@ -95,13 +95,15 @@ def _recovered(found: IntactParts) -> RecoveredMap:
     settings = found.facts.settings
     regions: list[Region] = []
     lost: set[PartKey] = set()
-    for index, parts in found.by_region().items():
-        payloads, missing = parts.found, parts.missing
+    all_missing = found.listed - found.payloads.keys()
+    for index in dict.fromkeys(key.region for key in (*found.payloads, *sorted(all_missing))):
+        payloads = {key: data for key, data in found.payloads.items() if key.region == index}
+        missing = {key for key in all_missing if key.region == index}
         region = _region(index, settings, payloads, missing=missing)
         if region is None:
             lost.add(PartKey(REGION, index))
             continue
-        if found.parts_listed is None:
+        if found.manifest is None:
             missing |= _missing_squares(settings, region, payloads)
         lost |= {key for key in missing if key.topic in FIELD_TOPICS}
         had_training = any(key.topic in TRAINING_TOPICS for key in (*payloads, *missing))
@@ -117,8 +119,8 @@ def _recovered(found: IntactParts) -> RecoveredMap:
         MapRecord(facts.name, facts.epoch, settings, tuple(regions), facts.progress),
         losses,
         parts_intact=len(found.payloads),
-        parts_listed=found.parts_listed,
-        stamp_ns=found.stamp_ns,
+        parts_listed=None if found.manifest is None else len(found.listed),
+        stamp_ns=0 if found.manifest is None else found.manifest.stamp_ns,
     )
 
 

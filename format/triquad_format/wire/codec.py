@@ -47,15 +47,10 @@ class Message:
 
     @classmethod
     @functools.cache
-    def annotations(cls) -> dict[str, Any]:
-        """Return the fields' names and annotations."""
-        return typing.get_type_hints(cls, include_extras=True)
-
-    @classmethod
-    @functools.cache
     def forms(cls) -> dict[str, "Form"]:
         """Return how each field travels, by its name."""
-        return {name: _form(annotation) for name, annotation in cls.annotations().items()}
+        annotations = typing.get_type_hints(cls, include_extras=True)
+        return {name: _form(annotation) for name, annotation in annotations.items()}
 
 
 @dataclass(frozen=True)
@@ -182,6 +177,7 @@ class Form:
     key: "Form | None" = None  # of a map, and the form of its items
     item: "Form | None" = None
     optional: bool = False
+    extras: tuple[object, ...] = ()  # what else the annotation has, such as bounds
 
     def pack(self, name: str, value: Any) -> object:
         """Return a value as it travels; ``name`` is the field's, for errors."""
@@ -208,7 +204,7 @@ class Form:
             return array
         if self.message is not None:
             if not isinstance(value, dict):
-                fields = ", ".join(self.message.annotations())
+                fields = ", ".join(self.message.forms())
                 raise WireError(f"{name}: expected a map with {fields}")
             return _unpack_fields(name, self.message, value)
         return self._plain(name, value, lambda form: form.unpack)
@@ -230,11 +226,12 @@ class Form:
 
 def _form(annotation: Any) -> Form:
     """Return the form of an annotation, which may have metadata."""
-    for extra in getattr(annotation, "__metadata__", ()):
+    extras = getattr(annotation, "__metadata__", ())
+    for extra in extras:
         if isinstance(extra, ArraySpec):
-            return Form(array=extra)
-    if hasattr(annotation, "__metadata__"):
-        return _form(annotation.__origin__)
+            return Form(array=extra, extras=extras)
+    if extras:
+        return dataclasses.replace(_form(annotation.__origin__), extras=extras)
     if isinstance(annotation, type) and issubclass(annotation, Message):
         return Form(message=annotation)
     choices = get_args(annotation)

@@ -16,7 +16,7 @@ from triquad_format.wire.messages import (
     StatusCodes,
     TileIndices,
 )
-from triquad_format.wire.reply import AskedBy, PartsOf, RowsOf, Within
+from triquad_format.wire.reply import asked_by, parts_of, rows_of, within
 
 
 @dataclass(frozen=True)
@@ -34,10 +34,10 @@ class TileListRequest(Message):
 class TileList(MapReply):
     """Answer to :class:`TileListRequest`."""
 
-    tile_side_m: Annotated[float, Within(MIN_LENGTH_M, MAX_TILE_M)]
+    tile_side_m: Annotated[float, within(MIN_LENGTH_M, MAX_TILE_M)]
     tiles: TileIndices  # [T, 3]: tile t covers [t, t + 1) * tile_side_m
     # [T] the surface of each tile last changed in this epoch
-    changed: Annotated[Epochs, RowsOf("tiles")]
+    changed: Annotated[Epochs, rows_of("tiles")]
 
 
 @dataclass(frozen=True)
@@ -54,14 +54,14 @@ class MeshRequest(Message):
 class MeshReply(MapReply):
     """Answer to :class:`MeshRequest`: the tiles as they were asked for, one behind the other."""
 
-    tile_side_m: Annotated[float, Within(MIN_LENGTH_M, MAX_TILE_M)]
-    cell_m: Annotated[float, Within(MIN_LENGTH_M, MAX_CELL_M)]
+    tile_side_m: Annotated[float, within(MIN_LENGTH_M, MAX_TILE_M)]
+    cell_m: Annotated[float, within(MIN_LENGTH_M, MAX_CELL_M)]
     # [T] bytes of each
-    sizes: Annotated[Integers, Within(0, MAX_MESSAGE_BYTES), AskedBy("tiles"), PartsOf("data")]
+    sizes: Annotated[Integers, within(0, MAX_MESSAGE_BYTES), asked_by("tiles"), parts_of("data")]
     data: bytes  # of all: triquad_format.wire.tile_codec
     # [F] of all faces, 1 where the surface was continued and no ray met it, else 0; None: was not
     # asked for
-    filled: Annotated[StatusCodes, Within(0, 1)] | None = None
+    filled: Annotated[StatusCodes, within(0, 1)] | None = None
 
 
 @dataclass(frozen=True)
@@ -87,11 +87,11 @@ class TileUpdates(Message):
     epoch: Epoch  # the tiles show this epoch, where complete
     complete: bool  # nothing more is to come
     restart: bool  # the request spoke of another server: what was known of it is void
-    tile_side_m: Annotated[float, Within(MIN_LENGTH_M, MAX_TILE_M)]
-    cell_m: Annotated[float, Within(MIN_LENGTH_M, MAX_CELL_M)]
+    tile_side_m: Annotated[float, within(MIN_LENGTH_M, MAX_TILE_M)]
+    cell_m: Annotated[float, within(MIN_LENGTH_M, MAX_CELL_M)]
     tiles: TileIndices  # [T, 3] that changed
-    versions: Annotated[Epochs, RowsOf("tiles")]  # [T] epoch of which each is
+    versions: Annotated[Epochs, rows_of("tiles")]  # [T] epoch of which each is
     # [T] bytes of each
-    sizes: Annotated[Integers, Within(0, MAX_MESSAGE_BYTES), RowsOf("tiles"), PartsOf("data")]
+    sizes: Annotated[Integers, within(0, MAX_MESSAGE_BYTES), rows_of("tiles"), parts_of("data")]
     data: bytes  # of all, one behind the other: triquad_format.wire.tile_codec
     removed: TileIndices  # [R, 3] that have no faces any more

@@ -17,10 +17,10 @@ from triquad_format.wire.codec import ArraySpec, Message, decode
 from triquad_format.wire.limits import MAX_CHUNK_BYTES
 from triquad_format.wire.reply import (
     MAX_COUNT,
-    AskedBy,
-    SameAsAsked,
-    Text,
-    Within,
+    asked_by,
+    same_as_asked,
+    text,
+    within,
 )
 
 MAX_ORIGIN_BYTES = 1024
@@ -37,17 +37,17 @@ TileIndices = Annotated[NDArray[np.int32], ArraySpec("<i4", (None, 3))]
 Integers = Annotated[NDArray[np.int64], ArraySpec("<i8", (None,))]
 
 # What replies contain, within its bounds: triquad_format.wire.reply.
-Count = Annotated[int, Within(0, MAX_COUNT)]
-Epoch = Annotated[int, Within(0, MAX_COUNT)]
-Epochs = Annotated[Integers, Within(0, MAX_COUNT)]
-Duration = Annotated[float, Within(0)]  # seconds
-Length = Annotated[float, Within(0)]  # metres
-Statuses = Annotated[StatusCodes, Within(0, 2)]  # triquad_format.records.status.Status
-FinitePositions = Annotated[Positions, Within()]
-FinitePoints = Annotated[NDArray[np.float64], ArraySpec("<f8", (None, 3)), Within()]
-Lengths = Annotated[Values, Within(0)]
-Name = Annotated[str, Text(256)]
-Digest = Annotated[str, Text(64, form="[0-9a-f]{64}")]  # SHA-256
+Count = Annotated[int, within(0, MAX_COUNT)]
+Epoch = Annotated[int, within(0, MAX_COUNT)]
+Epochs = Annotated[Integers, within(0, MAX_COUNT)]
+Duration = Annotated[float, within(0)]  # seconds
+Length = Annotated[float, within(0)]  # metres
+Statuses = Annotated[StatusCodes, within(0, 2)]  # triquad_format.records.status.Status
+FinitePositions = Annotated[Positions, within()]
+FinitePoints = Annotated[NDArray[np.float64], ArraySpec("<f8", (None, 3)), within()]
+Lengths = Annotated[Values, within(0)]
+Name = Annotated[str, text(256)]
+Digest = Annotated[str, text(64, form="[0-9a-f]{64}")]  # SHA-256
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class MapReply(Message):
     """The answer to a question about the map, all of it from one epoch."""
 
     # number of the published, immutable state of the map that answered
-    epoch: Annotated[Epoch, SameAsAsked("epoch")]
+    epoch: Annotated[Epoch, same_as_asked("epoch")]
 
 
 @dataclass(frozen=True)
@@ -91,10 +91,10 @@ class SdfReply(MapReply):
     """Answer to :class:`SdfRequest`."""
 
     # [N] metres, positive in free space; NaN where no region is
-    sdf: Annotated[Values, Within(nan=True), AskedBy("points")]
-    status: Annotated[Statuses, AskedBy("points")]  # [N]
+    sdf: Annotated[Values, within(nan=True), asked_by("points")]
+    status: Annotated[Statuses, asked_by("points")]  # [N]
     # [N, 3] d(sdf)/dx, map frame
-    gradient: Annotated[Positions, Within(nan=True), AskedBy("points")] | None
+    gradient: Annotated[Positions, within(nan=True), asked_by("points")] | None
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class StatusRequest(Message):
 class CheckpointInfo(Message):
     """A checkpoint on the server's disk; also the answer to :class:`CheckpointRequest`."""
 
-    path: Annotated[str, Text(4096)]
+    path: Annotated[str, text(4096)]
     bytes: Count
     epoch: Epoch
     sha256: Digest
@@ -149,7 +149,7 @@ class ServerStatus(Message):
     requests_refused: dict[Name, Count]  # by error code
     samples_trained: Count  # of the map, likewise
     rays_kept: Count  # rays whose lessons are in the replay pools
-    loss: Annotated[float, Within()]  # recent training loss, 0 before any training
+    loss: Annotated[float, within()]  # recent training loss, 0 before any training
     regions: Count
     vertices: Count
     parameters: Count
@@ -163,7 +163,7 @@ class ServerStatus(Message):
     map_max_bytes: Count = 0  # beyond which scans are refused as map_full; 0: not known
     fit: FieldFit | None = None  # as it was judged last, None: not yet
     rays_discarded: Count = 0  # that gave way to others, since the server started
-    replay_share: Annotated[float, Within(0, 1)] = 1.0
+    replay_share: Annotated[float, within(0, 1)] = 1.0
     """The share of the rays that each place is to keep for which memory has room."""
 
     samples_discarded: Count = 0  # above the limit of a region's training budget
@@ -210,7 +210,7 @@ class ResetReply(Message):
 
     epoch: Epoch  # the first without the box's content
     kept_epoch: Epoch | None = None  # as which the map of before stays on disk; None: it does not
-    undo: Annotated[str, Text(4096)] | None = None  # how to go back to it, or why one cannot
+    undo: Annotated[str, text(4096)] | None = None  # how to go back to it, or why one cannot
 
 
 @dataclass(frozen=True)
@@ -227,7 +227,7 @@ class MapInfo(Message):
     epoch: Epoch
     bytes: Count
     sha256: Digest
-    chunk_bytes: Annotated[int, Within(1, MAX_CHUNK_BYTES)]
+    chunk_bytes: Annotated[int, within(1, MAX_CHUNK_BYTES)]
     server: Name = ""  # a name of this server process; empty where it is not known
 
 
@@ -244,8 +244,8 @@ class MapChunkRequest(Message):
 class MapChunk(Message):
     """Answer to :class:`MapChunkRequest`."""
 
-    offset: Annotated[int, SameAsAsked("offset")]
-    data: Annotated[bytes, AskedBy("length")]
+    offset: Annotated[int, same_as_asked("offset")]
+    data: Annotated[bytes, asked_by("length")]
 
 
 @dataclass(frozen=True)

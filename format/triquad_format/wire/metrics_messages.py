@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from triquad_format.wire.codec import ArraySpec, Message
 from triquad_format.wire.messages import Count, Duration, Epoch, Integers, Name
-from triquad_format.wire.reply import MAX_COUNT, RowsOf, Within
+from triquad_format.wire.reply import MAX_COUNT, rows_of, within
 
 Seconds = Annotated[NDArray[np.float64], ArraySpec("<f8", (None,))]
 
@@ -28,7 +28,7 @@ class TimeHistogram(Message):
     """A histogram of times, as counts in the buckets of ``ServerMetrics.bounds_s``."""
 
     # [B + 1] of each bucket; the last one is of what took longer than all bounds
-    counts: Annotated[Integers, Within(0, MAX_COUNT), RowsOf("bounds_s", more=1)]
+    counts: Annotated[Integers, within(0, MAX_COUNT), rows_of("bounds_s", more=1)]
     sum_s: Duration
 
     @property
@@ -95,7 +95,7 @@ class ServerMetrics(Message):
     epochs_kept: Count  # that can be asked for by number, pinned ones included
     epochs_pinned: Count  # older ones that stay because they were asked for by number
     # [B] upper bounds of the buckets of all histograms, increasing
-    bounds_s: Annotated[Seconds, Within(0)]
+    bounds_s: Annotated[Seconds, within(0)]
     operations: dict[Name, OperationMetrics]  # by name, such as "query/sdf"
     queues: dict[Name, QueueMetrics]
     sources: dict[Name, SourceMetrics]  # by name; "*" is of those there are too many of

@@ -29,13 +29,13 @@ from triquad_format.wire.messages import (
 )
 from triquad_format.wire.reply import (
     MAX_COUNT,
-    AskedBy,
-    AtMostAsked,
-    RigidPose,
-    RowsOf,
-    SameAsAsked,
-    ShapeAskedBy,
-    Within,
+    asked_by,
+    at_most_asked,
+    rigid_pose,
+    rows_of,
+    same_as_asked,
+    shape_asked_by,
+    within,
 )
 
 Flags = Annotated[NDArray[np.uint8], ArraySpec("|u1", (None,))]
@@ -45,11 +45,11 @@ Counts = Annotated[NDArray[np.int32], ArraySpec("<i4", (3,))]
 Corners = Annotated[NDArray[np.float64], ArraySpec("<f8", (None, 3))]
 Covariance = Annotated[NDArray[np.float64], ArraySpec("<f8", (6, 6))]
 
-UnitVectors = Annotated[Positions, Within(-1.001, 1.001)]  # or zero
-Shares = Annotated[Values, Within(0, 1)]
-TruthValues = Annotated[Flags, Within(0, 1)]
-FiniteCorners = Annotated[Corners, Within()]
-PlacesAlong = Annotated[Values, Within(0, 1.001 * MAX_RANGE_M), AskedBy("starts")]
+UnitVectors = Annotated[Positions, within(-1.001, 1.001)]  # or zero
+Shares = Annotated[Values, within(0, 1)]
+TruthValues = Annotated[Flags, within(0, 1)]
+FiniteCorners = Annotated[Corners, within()]
+PlacesAlong = Annotated[Values, within(0, 1.001 * MAX_RANGE_M), asked_by("starts")]
 
 
 @dataclass(frozen=True)
@@ -69,19 +69,19 @@ class DistanceReply(MapReply):
     """Answer to :class:`DistanceRequest`."""
 
     # [N] metres, negative behind a surface; at most max_distance_m
-    distance_m: Annotated[Values, Within("-max_distance_m", "max_distance_m"), AskedBy("points")]
+    distance_m: Annotated[Values, within("-max_distance_m", "max_distance_m"), asked_by("points")]
     # [N, 3] its unit gradient, map frame; zero where nothing was found
-    gradient: Annotated[UnitVectors, AskedBy("points")]
+    gradient: Annotated[UnitVectors, asked_by("points")]
     # [N] whether there is a surface within max_distance_m
-    found: Annotated[TruthValues, AskedBy("points")]
-    status: Annotated[Statuses, AskedBy("points")]  # [N] of the points themselves
-    confidence: Annotated[Shares, AskedBy("points")]  # [N] in [0, 1]
+    found: Annotated[TruthValues, asked_by("points")]
+    status: Annotated[Statuses, asked_by("points")]  # [N] of the points themselves
+    confidence: Annotated[Shares, asked_by("points")]  # [N] in [0, 1]
     # [N, 3] relative to origin; the point where nothing was found
-    surface_point: Annotated[FinitePositions, AskedBy("points")] | None
+    surface_point: Annotated[FinitePositions, asked_by("points")] | None
     # [N] metres, at most max_distance_m
-    unknown_distance_m: Annotated[Values, Within(0, "max_distance_m"), AskedBy("points")] | None
+    unknown_distance_m: Annotated[Values, within(0, "max_distance_m"), asked_by("points")] | None
     # [N, 3] relative to origin; the point where there is none
-    unknown_point: Annotated[FinitePositions, AskedBy("points")] | None
+    unknown_point: Annotated[FinitePositions, asked_by("points")] | None
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class SpheresRequest(Message):
 class SpheresReply(MapReply):
     """Answer to :class:`SpheresRequest`."""
 
-    status: Annotated[Statuses, AskedBy("centres")]  # [N]
+    status: Annotated[Statuses, asked_by("centres")]  # [N]
 
 
 @dataclass(frozen=True)
@@ -118,13 +118,13 @@ class SegmentsReply(MapReply):
     """Answer to :class:`SegmentsRequest`; places are metres along the segment."""
 
     length_m: PlacesAlong  # [N]
-    blocked: Annotated[TruthValues, AskedBy("starts")]  # [N] the ball touches a seen surface
+    blocked: Annotated[TruthValues, asked_by("starts")]  # [N] the ball touches a seen surface
     contact_m: PlacesAlong  # [N] where it first does; the length where it does not
     # [N] least distance of the centre to a surface, up to the contact
-    clearance_m: Annotated[Values, Within("-max_distance_m", "max_distance_m"), AskedBy("starts")]
+    clearance_m: Annotated[Values, within("-max_distance_m", "max_distance_m"), asked_by("starts")]
     clearance_at_m: PlacesAlong  # [N] where
     # [N] the ball enters unknown space, before any contact
-    meets_unknown: Annotated[TruthValues, AskedBy("starts")]
+    meets_unknown: Annotated[TruthValues, asked_by("starts")]
     unknown_contact_m: PlacesAlong  # [N] where it first does; the length where it does not
 
 
@@ -144,9 +144,9 @@ class RaysRequest(Message):
 class RaysReply(MapReply):
     """Answer to :class:`RaysRequest`."""
 
-    range_m: Annotated[Values, Within(0, "max_range_m"), AskedBy("starts")]  # [N] metres
+    range_m: Annotated[Values, within(0, "max_range_m"), asked_by("starts")]  # [N] metres
     # [N] what it ends at: surface, unknown space, or the largest range (free)
-    status: Annotated[Statuses, AskedBy("starts")]
+    status: Annotated[Statuses, asked_by("starts")]
 
 
 @dataclass(frozen=True)
@@ -164,13 +164,13 @@ class GroundReply(MapReply):
     """Answer to :class:`GroundRequest`."""
 
     # [N] surface: there is ground; free: there is none; else unknown
-    status: Annotated[Statuses, AskedBy("points")]
+    status: Annotated[Statuses, asked_by("points")]
     # [N] metres down to the ground, a little up where the point lies in it; else as far as all was
     # seen to be free
-    drop_m: Annotated[Values, Within(-MAX_DISTANCE_M, "max_drop_m"), AskedBy("points")]
+    drop_m: Annotated[Values, within(-MAX_DISTANCE_M, "max_drop_m"), asked_by("points")]
     # [N, 3] of the ground, unit vectors, map frame; zero where there is none
-    normal: Annotated[UnitVectors, AskedBy("points")]
-    confidence: Annotated[Shares, AskedBy("points")]  # [N] in [0, 1]; 0 where there is no ground
+    normal: Annotated[UnitVectors, asked_by("points")]
+    confidence: Annotated[Shares, asked_by("points")]  # [N] in [0, 1]; 0 where there is no ground
 
 
 @dataclass(frozen=True)
@@ -190,9 +190,9 @@ class GridReply(MapReply):
 
     # [x, y, z] metres, as in DistanceReply
     distance_m: Annotated[
-        Volume, Within("-max_distance_m", "max_distance_m"), ShapeAskedBy("counts")
+        Volume, within("-max_distance_m", "max_distance_m"), shape_asked_by("counts")
     ]
-    status: Annotated[StatusVolume, Within(0, 2), ShapeAskedBy("counts")]  # [x, y, z]
+    status: Annotated[StatusVolume, within(0, 2), shape_asked_by("counts")]  # [x, y, z]
 
 
 @dataclass(frozen=True)
@@ -210,13 +210,13 @@ class AlignRequest(Message):
 class AlignReply(MapReply):
     """Answer to :class:`AlignRequest`."""
 
-    world_from_sensor: Annotated[Pose, RigidPose()]
+    world_from_sensor: Annotated[Pose, rigid_pose()]
     # of translation (metres) and rotation vector (radians), map frame
-    covariance: Annotated[Covariance, Within()]
-    inlier_share: Annotated[float, Within(0, 1)]
+    covariance: Annotated[Covariance, within()]
+    inlier_share: Annotated[float, within(0, 1)]
     rms_m: Length  # of the inliers' distances
     converged: bool
-    iterations: Annotated[int, Within(0, "max_iterations")]
+    iterations: Annotated[int, within(0, "max_iterations")]
     points: Count  # that were used
 
 
@@ -235,14 +235,14 @@ class ChangesReply(MapReply):
     """Answer to :class:`ChangesRequest`: boxes around voxels that changed."""
 
     server: Name
-    since: Annotated[Epoch, SameAsAsked("since")]
+    since: Annotated[Epoch, same_as_asked("since")]
     minimum: FiniteCorners  # [N, 3] metres, map frame
-    maximum: Annotated[FiniteCorners, RowsOf("minimum")]  # [N, 3]
+    maximum: Annotated[FiniteCorners, rows_of("minimum")]  # [N, 3]
     # [N] 1: surface appeared, 0: it vanished
-    appeared: Annotated[TruthValues, RowsOf("minimum")]
-    epochs: Annotated[Epochs, RowsOf("minimum")]  # [N] of the newest change in each
+    appeared: Annotated[TruthValues, rows_of("minimum")]
+    epochs: Annotated[Epochs, rows_of("minimum")]  # [N] of the newest change in each
     # [N] that changed in each
-    voxels: Annotated[Integers, Within(0, MAX_COUNT), RowsOf("minimum")]
+    voxels: Annotated[Integers, within(0, MAX_COUNT), rows_of("minimum")]
 
 
 @dataclass(frozen=True)
@@ -259,9 +259,9 @@ class ScanSample(Message):
     """Some of the points of a scan that is in the map."""
 
     stamp_ns: int  # nanoseconds since 1970, as its publisher said
-    world_from_sensor: Annotated[Pose, RigidPose()]
+    world_from_sensor: Annotated[Pose, rigid_pose()]
     # [N, 3] metres, map frame, relative to the sensor's position
-    points: Annotated[FinitePositions, AtMostAsked("max_points")]
+    points: Annotated[FinitePositions, at_most_asked("max_points")]
     points_used: Count  # of the scan, by the map: N or more
 
 
@@ -273,7 +273,7 @@ class SourceState(Message):
     whole: bool  # what was reported of this source before is void
     trail: FiniteCorners  # [N, 3] metres, map frame: positions of the sensor, oldest first
     # [N] the piece of the trail each is part of: rises where the sensor jumped
-    pieces: Annotated[Integers, Within(0, MAX_COUNT), RowsOf("trail")]
+    pieces: Annotated[Integers, within(0, MAX_COUNT), rows_of("trail")]
     newest: ScanSample | None  # where it is new
 
 

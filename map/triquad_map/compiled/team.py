@@ -31,7 +31,7 @@ THREADS = max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity"
 MineT = TypeVar("MineT")
 OtherT = TypeVar("OtherT")
 
-_MIN_SHARE = 2048
+MIN_SHARE = 2048
 """Points of a field below which splitting work costs more than it gains."""
 
 
@@ -95,7 +95,7 @@ class Team:
         """Run ``work(part)`` for every part of ``range(THREADS)``, at the same time."""
         self._run(work, THREADS)
 
-    def split(self, count: int, work: Work, least: int = _MIN_SHARE) -> None:
+    def split(self, count: int, work: Work, least: int = MIN_SHARE) -> None:
         """Run ``work(first, last)`` over ``range(count)``, in parallel where it is worth it.
 
         ``least`` is how many a thread is given at least.

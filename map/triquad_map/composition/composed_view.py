@@ -4,16 +4,13 @@ import itertools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 
 from triquad_map.compiled.surfels.nearest_surface import RegionFrame
 from triquad_map.compiled.team import Split, in_one
-from triquad_map.composition.field_view import FieldView, MapRegion
+from triquad_map.composition.field_view import FieldView, MapRegion, Owners
 from triquad_map.view import NearestSurface, NearestUnknown
-
-Rows = NDArray[np.intp]
 
 _FARTHEST_CELL = 1 << 20
 _LEAST_SEARCHES = 128
@@ -72,14 +69,17 @@ class ComposedView(FieldView):
 
         What lies in no region is unknown, too.
         """
-        nearest = NearestUnknown(np.full(len(points), max_distance_m), points.copy())
+        nearest = NearestUnknown(np.zeros(len(points)), points.copy())
 
-        def work(first: int, last: int) -> None:
-            part = slice(first, last)
-            mine = NearestUnknown(nearest.distance[part], nearest.point[part])
-            self._improve_unknown(mine, points[part])
+        def work(part: slice, owners: Owners) -> None:
+            for owned in owners.groups:
+                mine = points[part][owned.points]
+                near = NearestUnknown(np.full(len(mine), max_distance_m), mine.copy())
+                self._improve_in_cell(near, mine, owned.region.index)
+                nearest.distance[part][owned.points] = near.distance
+                nearest.point[part][owned.points] = near.point
 
-        self._split(len(points), work, _LEAST_SEARCHES)
+        self._for_owners(points, work, _LEAST_SEARCHES)
         return nearest
 
     def _regions_near(self, points: Doubles, reach_m: float) -> Iterator[MapRegion]:
@@ -97,28 +97,8 @@ class ComposedView(FieldView):
         x, y, z = self._settings.region_corner(region.index).tolist()
         return RegionFrame((x, y, z), self._settings.leaf_m, self._newest_s)
 
-    def _improve_unknown(self, found: NearestUnknown, points: Doubles) -> None:
-        """Improve ``found`` where unknown space lies nearer to ``points`` [N, 3]."""
-        cells = self._cells_of(points)
-        if (cells == cells[:1]).all():  # mostly: to sort many rows takes long, and the interpreter
-            homes, owners = cells[:1], np.zeros(len(cells), np.int64)
-        else:
-            homes, owners = np.unique(cells, axis=0, return_inverse=True)
-            owners = owners.reshape(-1)
-        known = np.array([tuple(home) in self._regions_at for home in homes.tolist()], np.bool_)
-        # Most points that are far from the map need nothing more, however many cells they lie in.
-        nowhere = np.flatnonzero(~known[owners])
-        found.distance[nowhere] = 0.0
-        found.point[nowhere] = points[nowhere]
-        for number in np.flatnonzero(known):
-            rows = np.flatnonzero(owners == number)
-            near = NearestUnknown(found.distance[rows], found.point[rows])
-            x, y, z = homes[number].tolist()
-            self._improve_in_cell(near, points[rows], (x, y, z))
-            found.distance[rows], found.point[rows] = near.distance, near.point
-
     def _improve_in_cell(self, found: NearestUnknown, points: Doubles, home: RegionIndex) -> None:
-        """Do as :meth:`_improve_unknown`, of points in the cell of one region."""
+        """Improve ``found`` by unknown space nearer to points [N, 3], which a region owns."""
         # Mostly that is all: what it finds is nearer than the other cells.
         self._search_region(found, points, self._regions_at[home])
         for cell in self._cells_around(points, float(found.distance.max())):
@@ -152,7 +132,7 @@ class ComposedView(FieldView):
     def _search_region(self, found: NearestUnknown, points: Doubles, region: MapRegion) -> None:
         """Search what a region owns of the space around."""
         leaf_m = self._settings.leaf_m
-        voxels = self._settings.leaf_coordinates(points - region.centre)
+        voxels = self._voxels(region, points)
         distances = found.distance / leaf_m
         before = distances.copy()
         nearest = np.empty((len(points), 3))

@@ -6,7 +6,7 @@ its core, away from the overlap, a region is the only one that covers a point.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -19,7 +19,7 @@ from triquad_format.records.status import Status
 from triquad_map.compiled.evidence.evidence import FrozenEvidence
 from triquad_map.compiled.field.frozen_field import FieldEngine, FieldValues, in_grid
 from triquad_map.compiled.surfels.surfel_map import SurfelMap
-from triquad_map.compiled.team import Split, in_one
+from triquad_map.compiled.team import MIN_SHARE, Split, in_one
 from triquad_map.view import FieldAnswer
 
 _REACH_VOXELS = 0.5
@@ -51,7 +51,7 @@ class MapRegion(Protocol):
 
 
 @dataclass(frozen=True)
-class _Owned:
+class Owned:
     """Points of a query that one region answers for."""
 
     region: MapRegion
@@ -59,24 +59,11 @@ class _Owned:
 
 
 @dataclass(frozen=True)
-class _Owners:
+class Owners:
     """The regions that answer for N points."""
 
-    groups: Sequence[_Owned]  # the points that have an owner, region by region
+    groups: Sequence[Owned]  # the points that have an owner, region by region
     shared: NDArray[np.intp]  # points that other regions may cover, too
-
-    @property
-    def only(self) -> MapRegion | None:
-        """The region that owns all points, and alone covers them, if one does."""
-        if len(self.groups) == 1 and not len(self.shared):
-            (owned,) = self.groups
-            if isinstance(owned.points, slice):
-                return owned.region
-        return None
-
-
-_NONE_SHARED = np.zeros(0, np.intp)
-_ALL = slice(None)
 
 
 class FieldView:
@@ -99,27 +86,24 @@ class FieldView:
         status = np.empty(count, np.uint8)
         slopes = np.empty((count, 3), np.float32) if gradient else None
 
-        def work(first: int, last: int) -> None:
-            part = slice(first, last)
-            owners = self._owners(points[part])
+        def work(part: slice, owners: Owners) -> None:
             values = self._values(points[part], owners, gradient)
             sdf[part] = values.sdf
             if slopes is not None:
                 slopes[part] = values.gradient
-            status[part] = self._status(points[part], owners, _REACH_VOXELS)
+            self._put_status(status[part], points[part], owners, _REACH_VOXELS)
 
-        self._split(count, work)
+        self._for_owners(points, work)
         return FieldAnswer(sdf, status, slopes)
 
     def distances(self, points: Doubles) -> Floats:
         """Return signed distances [N] alone at points [N, 3] of the map frame."""
         distances = np.empty(len(points), np.float32)
 
-        def work(first: int, last: int) -> None:
-            part = points[first:last]
-            distances[first:last] = self._values(part, self._owners(part), False).sdf
+        def work(part: slice, owners: Owners) -> None:
+            distances[part] = self._values(points[part], owners, False).sdf
 
-        self._split(len(points), work)
+        self._for_owners(points, work)
         return distances
 
     def distances_in_grid(self, axes: Doubles, points: Longs) -> Floats:
@@ -165,11 +149,10 @@ class FieldView:
         reach = _REACH_VOXELS if reach_m is None else reach_m / self._settings.leaf_m
         status = np.empty(len(points), np.uint8)
 
-        def work(first: int, last: int) -> None:
-            part = points[first:last]
-            status[first:last] = self._status(part, self._owners(part), reach)
+        def work(part: slice, owners: Owners) -> None:
+            self._put_status(status[part], points[part], owners, reach)
 
-        self._split(len(points), work)
+        self._for_owners(points, work)
         return status
 
     def surface_in_grid(self, axes: Doubles, reach_m: float) -> Bools:
@@ -201,17 +184,25 @@ class FieldView:
         reach = reach_m / self._settings.leaf_m
         near = np.zeros(len(points), np.bool_)
 
-        def work(first: int, last: int) -> None:
-            part, mine = points[first:last], near[first:last]
-            for owned in self._owners(part).groups:
-                offsets = part[owned.points] - owned.region.centre
-                voxels = self._settings.leaf_coordinates(offsets)
-                mine[owned.points] = owned.region.evidence.near_ends(voxels, reach)
+        def work(part: slice, owners: Owners) -> None:
+            for owned in owners.groups:
+                voxels = self._voxels(owned.region, points[part][owned.points])
+                near[part][owned.points] = owned.region.evidence.near_ends(voxels, reach)
 
-        self._split(len(points), work)
+        self._for_owners(points, work)
         return near
 
-    def _owners(self, points: Doubles) -> _Owners:
+    def _for_owners(
+        self, points: Doubles, work: Callable[[slice, Owners], None], least: int = MIN_SHARE
+    ) -> None:
+        """Do work on parts of points [N, 3], given the owners of each part's points."""
+        self._split(
+            len(points),
+            lambda first, last: work(slice(first, last), self._owners(points[first:last])),
+            least,
+        )
+
+    def _owners(self, points: Doubles) -> Owners:
         """Return which regions answer for points [N, 3], metres, map frame."""
         # Axis by axis, which makes every step here one of long vectors.
         by_axis = np.ascontiguousarray(points.T)
@@ -219,7 +210,7 @@ class FieldView:
             by_axis.min(axis=1, initial=np.inf), by_axis.max(axis=1, initial=-np.inf)
         )
         if only is not None:
-            return _Owners([_Owned(only, _ALL)], _NONE_SHARED)
+            return Owners([Owned(only, slice(None))], np.zeros(0, np.intp))
         with np.errstate(invalid="ignore", over="ignore"):  # of points that are nowhere
             places = by_axis / self._settings.region_pitch_m
             cells = np.floor(places + 0.5)
@@ -233,38 +224,32 @@ class FieldView:
         for number in np.flatnonzero(~outside).tolist():
             region = self.region_views[number]
             if (low == high).all():
-                groups.append(_Owned(region, _ALL))
+                groups.append(Owned(region, slice(None)))
                 continue
             x, y, z = region.index
             mine = np.flatnonzero((cells[0] == x) & (cells[1] == y) & (cells[2] == z))
             if len(mine):
-                groups.append(_Owned(region, mine))
-        return _Owners(groups, np.flatnonzero(off_m > core_m))
+                groups.append(Owned(region, mine))
+        return Owners(groups, np.flatnonzero(off_m > core_m))
 
-    def _status(self, points: Doubles, owners: _Owners, reach: float) -> Bytes:
-        if owners.only is not None:
-            return self._status_in(owners.only, points, reach)
-        status = np.full(len(points), Status.UNKNOWN, np.uint8)
+    def _put_status(self, status: Bytes, points: Doubles, owners: Owners, reach: float) -> None:
+        """Put the status of points [N, 3], whose owners are known, into ``status`` [N]."""
+        status[:] = Status.UNKNOWN
         for owned in owners.groups:
-            status[owned.points] = self._status_in(owned.region, points[owned.points], reach)
-        return status
+            voxels = self._voxels(owned.region, points[owned.points])
+            status[owned.points] = owned.region.evidence.status(voxels, reach)
 
-    def _status_in(self, region: MapRegion, points: Doubles, reach: float) -> Bytes:
-        voxels = self._settings.leaf_coordinates(points - region.centre)
-        return region.evidence.status(voxels, reach)
+    def _voxels(self, region: MapRegion, points: Doubles) -> Doubles:
+        """Return the leaf coordinates [N, 3] of points in a region."""
+        return self._settings.leaf_coordinates(points - region.centre)
 
-    def _values(self, points: Doubles, owners: _Owners, gradient: bool) -> FieldValues:
+    def _values(self, points: Doubles, owners: Owners, gradient: bool) -> FieldValues:
         """Return the field at points [N, 3], whose owners are known."""
-        if owners.only is not None:
-            return _values_in(owners.only, points, gradient)
-        count = len(points)
-        values = FieldValues(
-            np.full(count, np.nan, np.float32),
-            np.full((count if gradient else 0, 3), np.nan, np.float32),
-        )
+        slopes = np.full((len(points) if gradient else 0, 3), np.nan, np.float32)
+        values = FieldValues(np.full(len(points), np.nan, np.float32), slopes)
         for owned in owners.groups:
-            mine = points[owned.points]
-            _put(values, owned.points, _values_in(owned.region, mine, gradient))
+            local = (points[owned.points] - owned.region.centre).astype(np.float32)
+            _put(values, owned.points, owned.region.engine.evaluate(local, gradient))
         if len(owners.shared):
             _put(values, owners.shared, self._blend(points[owners.shared], gradient))
         return values
@@ -296,11 +281,6 @@ class FieldView:
             slopes = (slope_sum - sdf[:, None] * tilt_sum) / weight_sum[:, None]
         slopes = slopes[: len(points) if gradient else 0]
         return FieldValues(sdf.astype(np.float32), slopes.astype(np.float32))
-
-
-def _values_in(region: MapRegion, points: Doubles, gradient: bool) -> FieldValues:
-    """Return the field of a region at points [N, 3]."""
-    return region.engine.evaluate((points - region.centre).astype(np.float32), gradient)
 
 
 def _put(values: FieldValues, where: slice | NDArray[np.intp], new: FieldValues) -> None:

@@ -6,7 +6,7 @@ A server answers with this from its epochs, and a client from a map file: so the
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from triquad_format.errors import RefusedError
@@ -59,6 +59,10 @@ class QuestionLimits:
     searches: int = MAX_SEARCHES  # points around which something is searched for
 
 
+_LIMITS = QuestionLimits()
+
+ReplyT = TypeVar("ReplyT", bound=Message)
+
 Views = Callable[[int], AbstractContextManager[MapView]]
 """The map of the epoch of some number, 0 for the newest, while it is asked."""
 
@@ -69,7 +73,7 @@ class Answers:
     Whatever is asked for, :class:`RefusedError` says which argument is out of bounds.
     """
 
-    def __init__(self, views: Views, limits: QuestionLimits) -> None:
+    def __init__(self, views: Views, limits: QuestionLimits = _LIMITS) -> None:
         self._view = views
         self._limits = limits
 
@@ -87,12 +91,7 @@ class Answers:
         points = checks.points("point", request.origin, request.points, most=self._limits.points)
         with self._view(request.epoch) as view:
             answer = view.query(points, request.gradient)
-            return SdfReply(
-                epoch=view.epoch,
-                sdf=answer.sdf,
-                status=answer.status,
-                gradient=answer.gradient if request.gradient else None,
-            )
+            return _reply(SdfReply, answer, epoch=view.epoch)
 
     def distance(self, request: DistanceRequest) -> DistanceReply:
         """Return distances to the nearest surface."""
@@ -101,22 +100,11 @@ class Answers:
         options = DistanceOptions(reach_m, request.surface_point, request.unknown_distance)
         with self._view(request.epoch) as view:
             answer = distances(view, points, options)
-        surface_point = unknown_distance_m = unknown_point = None
-        if request.surface_point:
-            surface_point = _relative(answer.surface_point, request.origin)
-        if request.unknown_distance:
-            unknown_distance_m = answer.unknown_distance_m
-            unknown_point = _relative(answer.unknown_point, request.origin)
-        return DistanceReply(
-            epoch=answer.epoch,
-            distance_m=answer.distance_m,
-            gradient=answer.gradient,
-            found=answer.found.astype(np.uint8),
-            status=answer.status,
-            confidence=answer.confidence,
-            surface_point=surface_point,
-            unknown_distance_m=unknown_distance_m,
-            unknown_point=unknown_point,
+        return _reply(
+            DistanceReply,
+            answer,
+            surface_point=_relative(answer._surface_point, request.origin),
+            unknown_point=_relative(answer._unknown_point, request.origin),
         )
 
     def spheres(self, request: SpheresRequest) -> SpheresReply:
@@ -132,7 +120,7 @@ class Answers:
             )
         with self._view(request.epoch) as view:
             answer = spheres(view, centres, request.radii_m.astype(np.float64))
-        return SpheresReply(answer.epoch, answer.status)
+        return _reply(SpheresReply, answer)
 
     def segments(self, request: SegmentsRequest) -> SegmentsReply:
         """Return what a ball meets on segments."""
@@ -154,16 +142,7 @@ class Answers:
         self._check_count(total_m / SEGMENT_M_PER_SEARCH, f"segments of {total_m:.0f} m in all")
         with self._view(request.epoch) as view:
             answer = segments(view, starts, ends, options=options)
-        return SegmentsReply(
-            epoch=answer.epoch,
-            length_m=answer.length_m,
-            blocked=answer.blocked.astype(np.uint8),
-            contact_m=answer.contact_m,
-            clearance_m=answer.clearance_m,
-            clearance_at_m=answer.clearance_at_m,
-            meets_unknown=answer.meets_unknown.astype(np.uint8),
-            unknown_contact_m=answer.unknown_contact_m,
-        )
+        return _reply(SegmentsReply, answer)
 
     def rays(self, request: RaysRequest) -> RaysReply:
         """Return how far rays reach."""
@@ -184,7 +163,7 @@ class Answers:
         options = RayOptions(reach_m, request.through_unknown)
         with self._view(request.epoch) as view:
             answer = rays(view, starts, directions / lengths[:, None], options=options)
-        return RaysReply(answer.epoch, answer.range_m, answer.status)
+        return _reply(RaysReply, answer)
 
     def ground(self, request: GroundRequest) -> GroundReply:
         """Return what lies below points."""
@@ -195,13 +174,8 @@ class Answers:
         )
         with self._view(request.epoch) as view:
             answer = ground(view, points, drop_m)
-        return GroundReply(
-            epoch=answer.epoch,
-            status=answer.status,
-            drop_m=(points[:, 2] - answer.height_m).astype(np.float32),
-            normal=answer.normal,
-            confidence=answer.confidence,
-        )
+        below_m = (points[:, 2] - answer.height_m).astype(np.float32)
+        return _reply(GroundReply, answer, drop_m=below_m)
 
     def grid(self, request: GridRequest) -> GridReply:
         """Return distance and status at a grid's cells."""
@@ -216,7 +190,7 @@ class Answers:
         reach_m = checks.within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M)
         with self._view(request.epoch) as view:
             answer = grid(view, shape, reach_m)
-        return GridReply(answer.epoch, answer.distance_m, answer.status)
+        return _reply(GridReply, answer)
 
     def align(self, request: AlignRequest) -> AlignReply:
         """Return the pose of a scan near a guess."""
@@ -234,16 +208,7 @@ class Answers:
             answer = align(
                 view, request.points.astype(np.float64), request.world_from_sensor, options=options
             )
-        return AlignReply(
-            epoch=answer.epoch,
-            world_from_sensor=answer.world_from_sensor,
-            covariance=answer.covariance,
-            inlier_share=answer.inlier_share,
-            rms_m=answer.rms_m,
-            converged=answer.converged,
-            iterations=answer.iterations,
-            points=answer.points,
-        )
+        return _reply(AlignReply, answer)
 
     def _searched(self, what: str, origin: Doubles, offsets: Floats) -> Doubles:
         return checks.points(what, origin, offsets, most=self._limits.searches)
@@ -268,5 +233,18 @@ _ANSWERS: dict[type[Message], Callable[[Answers, Any], Message]] = {
 }
 
 
-def _relative(points: Doubles, origin: Doubles) -> Floats:
-    return (points - origin).astype(np.float32)
+def _reply(kind: type[ReplyT], answer: object, **given: object) -> ReplyT:
+    """Return a reply whose fields are those of an answer, but for what is given otherwise.
+
+    An answer has what was not always asked for under a name with an underscore before it.
+    """
+    there = {name.removeprefix("_"): value for name, value in vars(answer).items()} | given
+    fields: dict[str, Any] = {name: there[name] for name in kind.forms()}
+    for name, value in fields.items():
+        if isinstance(value, np.ndarray) and value.dtype == np.bool_:
+            fields[name] = value.astype(np.uint8)
+    return kind(**fields)
+
+
+def _relative(points: Doubles | None, origin: Doubles) -> Floats | None:
+    return None if points is None else (points - origin).astype(np.float32)

@@ -1,10 +1,9 @@
 """True distances to the nearest surface, at any range."""
 
 import dataclasses
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import Enum
-from typing import Any, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,9 +25,6 @@ _SURFEL_VOXELS = 1.5
 
 _WIDENED_VOXELS = float(np.sqrt(0.5)) - DISC_RADIUS
 """The way from a disc's rim to where it meets those of the next voxels, at their corners."""
-
-_PART_POINTS = 1 << 17
-"""Points that are answered together: meanwhile each takes ten times the bytes of its answer."""
 
 Rows = NDArray[np.intp]
 
@@ -108,23 +104,6 @@ class Distances:
 
 def distances(view: MapView, points: Doubles, options: DistanceOptions) -> Distances:
     """Return distances from ``points`` [N, 3], metres, map frame, to the nearest seen surface."""
-    firsts = range(0, max(1, len(points)), _PART_POINTS)
-    return _joined([_distances(view, points[at : at + _PART_POINTS], options) for at in firsts])
-
-
-def _joined(answers: Sequence[Distances]) -> Distances:
-    """Return the answers to consecutive points as one."""
-    if len(answers) == 1:
-        return answers[0]
-    columns: dict[str, Any] = {}
-    for field in fields(Distances):
-        parts = [getattr(answer, field.name) for answer in answers]
-        if isinstance(parts[0], np.ndarray):
-            columns[field.name] = np.concatenate(parts)
-    return dataclasses.replace(answers[0], **columns)
-
-
-def _distances(view: MapView, points: Doubles, options: DistanceOptions) -> Distances:
     nearest = view.nearest_surface(points, options.max_distance_m)
     status = view.status(points)
     gradient, distance = nearest.gradient, nearest.distance  # from here on, of the answer

@@ -158,7 +158,7 @@ def test_of_a_learnt_street_only_unknown_space_beside_seen_surface_is_filled() -
         plain, mesh = offline.mesh(bounds), offline.mesh(bounds, fill_m=fill_m)
         centres = mesh.vertices[mesh.faces].mean(axis=1)
         holes = centres[mesh.filled]
-        status = offline._view().status(holes, 0.0)
+        status = offline._map.view.status(holes, 0.0)
     assert area(mesh, mesh.filled) > 0.1 * area(mesh, ~mesh.filled)
     steps = holes / record.settings.leaf_m
     amid = (np.abs(steps - np.round(steps)) > 1e-6).all(axis=1)  # on a face, rounding decides

@@ -114,7 +114,7 @@ class _Planned:
             self._stop.set()
         if epoch is None:
             raise RequestTimeoutError("too late")
-        return SdfResult(np.zeros(len(points), np.float32), np.zeros(len(points)), epoch)
+        return SdfResult(np.zeros(len(points), np.float32), np.zeros(len(points)), None, epoch)
 
 
 def test_queries_are_counted_with_their_errors_and_epochs() -> None:

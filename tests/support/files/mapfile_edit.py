@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 import io
 import struct
+import tempfile
 import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -17,7 +18,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from numpy.typing import NDArray
 from triquad_format.errors import DamagedMapFileError, MapFileError
-from triquad_format.mapfile.index import MapIndex, MemoryBytes
+from triquad_format.mapfile.index import MapIndex, check_range
 from triquad_format.mapfile.manifest import Manifest, pack_manifest
 from triquad_format.mapfile.metadata import MapFacts
 from triquad_format.mapfile.parts.pack import pack_record
@@ -56,8 +57,27 @@ def file_bytes(
     return stream.getvalue()
 
 
+class MemoryBytes:
+    """The bytes of a file that is in memory: a RandomAccess."""
+
+    def __init__(self, data: bytes) -> None:
+        self.name = "map file"
+        self.size = len(data)
+        self._data = data
+
+    def read(self, offset: int, length: int) -> bytes:
+        check_range(offset, length, self.size)
+        return self._data[offset : offset + length]
+
+    def close(self) -> None:
+        pass
+
+
 def read_bytes(data: bytes) -> MapRecord:
-    return read_map(io.BytesIO(data))
+    with tempfile.NamedTemporaryFile() as file:
+        file.write(data)
+        file.flush()
+        return read_map(file.name)
 
 
 def stored(data: bytes) -> StoredMap:

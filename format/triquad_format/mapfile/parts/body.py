@@ -15,7 +15,6 @@ from triquad_format.mapfile.parts.part import (
     Column,
     join_integers,
     unshuffle,
-    unshuffle_codes,
     unshuffle_counts,
 )
 from triquad_format.records.arrays import Longs
@@ -146,11 +145,9 @@ class PartBody:
 
     def codes(self, key: str, most: int) -> Longs:
         """Return Morton codes [V], of which at most ``most`` are decoded: each takes 8 bytes."""
-        planes = self.array(key, "|u1", (None, None))
-        self._limit(key, planes.shape[1], most)
-        if not 1 <= len(planes) <= MAX_CODE_BYTES:
-            raise DamagedMapFileError(f"{self.topic}: {key} has {len(planes)} bytes per code")
-        return unshuffle_codes(planes)
+        # Differences as small as counts cannot pass over the negative numbers, so that codes which
+        # overflow are seen to decrease.
+        return np.cumsum(self.counts(key, None, most), dtype=np.int64)
 
     def counts(self, key: str, count: int | None, most: int) -> Longs:
         """Return numbers that are not negative: ``count`` of them, ``None``: any up to ``most``."""

@@ -50,7 +50,7 @@ LEVEL_BITS = MAX_LEVEL.bit_length()
 """The number of bit planes for levels of evidence."""
 
 MAX_CODE_BYTES = 6
-"""Bytes of the widest difference between two neighbouring Morton codes."""
+"""Bytes of the widest count, or difference between two neighbouring Morton codes."""
 
 
 @dataclass(frozen=True, order=True)
@@ -151,15 +151,6 @@ def unshuffle(planes: Bytes, dtype: str) -> NDArray[np.generic]:
 def shuffle_codes(codes: Longs) -> Bytes:
     """Return shuffled differences ``[B, V]`` of increasing codes ``[V]``, in the fewest bytes."""
     return shuffle_counts(np.diff(codes, prepend=np.int64(0)))
-
-
-def unshuffle_codes(planes: Bytes) -> Longs:
-    """Invert :func:`shuffle_codes`; it takes at most ``MAX_CODE_BYTES`` rows.
-
-    Differences this small cannot pass over the negative numbers, so that codes which overflow
-    are seen to decrease.
-    """
-    return np.cumsum(unshuffle_counts(planes), dtype=np.int64)
 
 
 def shuffle_counts(counts: Longs) -> Bytes:
