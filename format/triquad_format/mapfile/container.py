@@ -8,7 +8,7 @@ import contextlib
 import io
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
@@ -163,14 +163,22 @@ def chunk_messages(data: bytes, where: int) -> list[bytes]:
     return [record.data for record in records if isinstance(record, Message)]
 
 
-def compress(data: bytes, level: int) -> bytes:
-    """Return one zstd frame.
+def compress(data: bytes, seams: Sequence[int], level: int) -> bytes:
+    """Return one zstd frame in which a block ends at each seam.
+
+    A block has one Huffman table: noise and numbers in one block compress badly.
 
     Raises:
         MemoryError: zstd needs memory of its own, and nothing else can fail.
     """
     with _parsing("what is to be compressed"):
-        return zstandard.ZstdCompressor(level=level).compress(data)
+        compressor = zstandard.ZstdCompressor(level=level).compressobj(size=len(data))
+        pieces: list[bytes] = []
+        for first, last in zip([0, *seams], [*seams, len(data)], strict=True):
+            if last > first:
+                pieces.append(compressor.compress(data[first:last]))
+                pieces.append(compressor.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK))
+        return b"".join([*pieces, compressor.flush()])
 
 
 def decompress(frame: bytes, limit: int = MAX_PART_BYTES) -> bytes:

@@ -14,7 +14,7 @@ from triquad_format.mapfile.container import METADATA_NAME, compress
 from triquad_format.mapfile.durable_file import replacing
 from triquad_format.mapfile.manifest import Entry, Manifest, pack_manifest, total_limit
 from triquad_format.mapfile.metadata import MAX_MAP_BYTES, MapFacts, pack_facts, pack_metadata
-from triquad_format.mapfile.parts.pack import pack_part, pack_record
+from triquad_format.mapfile.parts.pack import pack_part, pack_record, seams
 from triquad_format.mapfile.parts.part import (
     EVIDENCE,
     MAP,
@@ -120,7 +120,7 @@ def compressed(part: Part) -> bytes:
     and better than level 3; masks and codes shrink by a fifth to level 12.
     """
     level = {EVIDENCE: 12, REGION: 3}.get(part.key.topic, 1)
-    return compress(part.payload, level)
+    return compress(part.payload, seams(part), level)
 
 
 class _Counted:

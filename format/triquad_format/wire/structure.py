@@ -5,6 +5,8 @@ block everything else for seconds and take a hundred times their size. The heade
 whose bytes are those of https://github.com/msgpack/msgpack/blob/master/spec.md
 """
 
+from collections.abc import Iterator
+
 from triquad_format.errors import WireError
 
 MAX_OBJECTS = 20_000
@@ -60,6 +62,17 @@ def check_structure(payload: bytes, max_objects: int = MAX_OBJECTS) -> None:
             raise WireError(f"not a triquad message: nested more than {_MAX_DEPTH} deep")
     if at != len(payload):
         raise WireError("not a triquad message: it is incomplete, or something follows it")
+
+
+def binary_offsets(payload: bytes) -> Iterator[range]:
+    """Yield where the bytes of each binary lie in a valid msgpack object, in their order."""
+    at, objects = 0, 1
+    while objects:
+        code = payload[at]
+        end, children = _header(payload, at)
+        if 0xC4 <= code <= 0xC6:
+            yield range(at + 1 + _LENGTH_BYTES[code], end)
+        at, objects = end, objects - 1 + children
 
 
 def _header(payload: bytes, at: int) -> tuple[int, int]:

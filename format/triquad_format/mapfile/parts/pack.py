@@ -15,6 +15,7 @@ from triquad_format.mapfile.parts.part import (
     EVIDENCE,
     LEVEL_BITS,
     MOMENTS,
+    PREFIX,
     RAYS,
     REGION,
     SAMPLE_COLUMNS,
@@ -50,9 +51,12 @@ from triquad_format.records.region import (
 )
 from triquad_format.records.replay_rays import STEPS, ReplayRays
 from triquad_format.wire.codec import pack_array
+from triquad_format.wire.structure import binary_offsets
 
 SAMPLES_PER_PART = 1 << 17
 RAYS_PER_PART = 1 << 21
+
+_MIN_SEAM_BYTES = 512  # a block of its own costs some bytes
 
 
 def pack_part(key: PartKey, body: Mapping[str, object]) -> Part:
@@ -254,3 +258,30 @@ def _pack_rays(region: Region, rays: ReplayRays) -> Iterator[Part]:
                 "slopes": pack_array(rays.slopes[rows]),
             }
             yield _region_part(PartKey(RAYS, region.index, plane=number, cell=cell), fields)
+
+
+def seams(part: Part) -> list[int]:
+    """Return offsets in a valid part's payload at which byte planes of its arrays begin and end."""
+    if not part.key.topic.startswith(PREFIX):
+        return []
+    binaries = list(_binaries(msgpack.unpackb(part.payload, max_ext_len=0)))
+    if all(size < _MIN_SEAM_BYTES for size, _ in binaries):
+        return []
+    offsets: list[int] = []
+    for place, (size, planes) in zip(binary_offsets(part.payload), binaries, strict=True):
+        if size >= _MIN_SEAM_BYTES:
+            step = size // planes if size >= planes * _MIN_SEAM_BYTES else size
+            offsets.extend(range(place.start, place.stop + 1, step))
+    return offsets
+
+
+def _binaries(value: object) -> Iterator[tuple[int, int]]:
+    """Yield size and number of byte planes of each binary in a body, in the payload's order."""
+    if isinstance(value, bytes):
+        yield len(value), 1
+    elif isinstance(value, dict) and isinstance(value.get("data"), bytes):
+        shuffled = value["dtype"] in ("|u1", "|i1") and value["shape"]
+        yield len(value["data"]), value["shape"][0] if shuffled else 1
+    elif isinstance(value, (dict, list)):
+        for item in value.values() if isinstance(value, dict) else value:
+            yield from _binaries(item)
