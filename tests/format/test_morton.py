@@ -34,10 +34,3 @@ def test_3d_against_slow_code(cell):
     code = int(morton.encode(np.array(cell)))
     assert code == slow_code(cell)
     assert morton.decode(np.array(code), 3).tolist() == cell
-
-
-def test_integers_of_any_width():
-    cells = np.array([[3, 5], [7, 1]])
-    for dtype in (np.int32, np.uint16, np.uint8):
-        assert np.array_equal(morton.encode(cells.astype(dtype)), morton.encode(cells))
-    assert morton.encode(np.zeros((0, 2), np.int64)).shape == (0,)

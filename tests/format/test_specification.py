@@ -16,6 +16,7 @@ from support.maps.map_records import SMALL
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records import morton
+from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import MapRecord
 from triquad_format.records.replay_rays import are_held_out
 from triquad_map.compiled.evidence.observations import outcome_counts
@@ -59,6 +60,9 @@ VARIANTS = {
         map_records.random_record(12, settings=WIDE, indices=((0, 0, 0), (0, 1, 0)), points=3000)
     ),
     "no vertices": map_records.random_record(9, points=0),
+    "settings as they are by default": map_records.random_record(
+        13, settings=FieldSettings(), points=100, training=False
+    ),
 }
 
 

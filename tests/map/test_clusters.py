@@ -79,10 +79,3 @@ def test_what_is_two_apart_shares_a_box_and_what_is_four_apart_does_not(cells):
     for cluster in slow_clusters(cells, 3):
         others = set(cells) - cluster
         assert not {box_of[cell] for cell in cluster} & {box_of[cell] for cell in others}
-
-
-def test_a_wall_is_cut_into_equal_pieces():
-    wall = rows([(x, y, 0) for x in range(70) for y in range(3)])
-    boxes = tight_boxes(wall, 32)
-    assert sorted((boxes.high - boxes.low)[:, 0].tolist()) == [23, 23, 24]
-    assert (boxes.high - boxes.low)[:, 1].tolist() == [3, 3, 3]

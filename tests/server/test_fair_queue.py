@@ -38,15 +38,6 @@ def test_an_owner_who_asks_again_and_again_does_not_come_first():
     assert queue.clear() == list("XbYc")
 
 
-def test_what_may_not_be_taken_is_passed_over():
-    queue = queue_of()
-    filled(queue, A, "ab")
-    filled(queue, B, "X")
-    assert queue.take(str.isupper) == "X"
-    assert queue.take(str.isupper) is None
-    assert queue.clear() == list("ab")
-
-
 @pytest.mark.parametrize(("newest_go", "left"), [(True, "aXbcd"), (False, "bXcde")])
 @pytest.mark.parametrize(("limit", "each"), [(5, 100), (100, 4)])
 def test_who_has_most_or_too_many_loses_the_newest_or_the_oldest(newest_go, left, limit, each):
@@ -55,28 +46,6 @@ def test_who_has_most_or_too_many_loses_the_newest_or_the_oldest(newest_go, left
     assert filled(queue, A, "abcde") == [("e" if newest_go else "a")]
     assert sorted(queue.clear()) == sorted(left)
     assert len(queue) == 0
-
-
-def test_where_bytes_are_too_many_who_has_most_of_them_loses():
-    queue = queue_of()
-    filled(queue, A, "abcde", nbytes=1)
-    assert filled(queue, B, "XY", nbytes=600) == ["Y"]
-    assert queue.nbytes == 605
-
-
-def test_a_single_item_may_be_larger_than_the_limit():
-    queue = queue_of(limit_bytes=10)
-    assert filled(queue, A, "a", nbytes=50) == []
-    assert filled(queue, B, "X") == ["a"]
-
-
-def test_many_invented_names_lose_to_one_owner():
-    queue = queue_of(limit=4)
-    filled(queue, A, "a")
-    for number in range(50):
-        filled(queue, Owner("", str(number)), [number])
-    assert len(filled(queue, A, "b")) == 1
-    assert {"a", "b"} <= set(queue.clear())
 
 
 def test_the_newest_of_whoever_has_most_goes_first():

@@ -17,7 +17,7 @@ from support.maps.map_records import SMALL, assert_same, evidence_of, random_rec
 from triquad_format.mapfile.parts.part import EVIDENCE
 from triquad_format.mapfile.reader import read_map
 from triquad_format.records.crop import crop_record
-from triquad_format.records.region import MAX_SEEN_S, masked, seen_voxels, surface_counts
+from triquad_format.records.region import masked, seen_voxels
 from triquad_format.records.seen_space import owned_evidence
 from triquad_format.recovery.recovered_map import recover
 from triquad_map.compiled.evidence.observations import outcome_codes
@@ -67,40 +67,6 @@ def record_of(evidence):
     record = random_record(3, training=False)
     region = dataclasses.replace(record.regions[0], evidence=evidence)
     return dataclasses.replace(record, regions=(region,))
-
-
-def test_files_hold_levels_and_times():
-    evidence = RECORD.regions[0].evidence
-    assert set(evidence.levels) == set(range(8))
-    assert evidence.outcomes.max(axis=0).tolist() == [3, 15, 15]
-    assert (evidence.seen_s[evidence.surface.any(axis=1)] == 0).any()
-    data = file_bytes(RECORD)
-    assert len([part for part in parts_of(data) if part.topic == EVIDENCE]) == 16
-    assert_same(read_bytes(data), RECORD)
-    with stored(data) as map_file:
-        assert_same(map_file.record(), RECORD)
-
-
-TIMES = st.sampled_from([0, 1, 2, 255, 256, 257, 1_700_000_000, 1_700_000_300, MAX_SEEN_S])
-
-
-@settings(max_examples=60, deadline=None)
-@given(seed=st.integers(0, 99), count=st.integers(1, 12), draw=st.data())
-def test_any_levels_and_times_come_back(seed, count, draw):
-    evidence = blocks(seed, count)
-    counts = surface_counts(evidence.surface)
-    size = int(counts.sum())
-    levels = np.frombuffer(draw.draw(st.binary(min_size=size, max_size=size)), np.uint8) & 7
-    outcomes = np.random.default_rng(seed).integers(0, (4, 16, 16), (size, 3)).astype(np.uint8)
-    seen_s = np.array(draw.draw(st.lists(TIMES, min_size=count, max_size=count)), np.int64)
-    evidence = dataclasses.replace(
-        evidence,
-        levels=levels,
-        seen_s=np.where(counts > 0, seen_s, 0),
-        outcomes=outcomes * (seed % 2),
-    )
-    (region,) = read_bytes(file_bytes(record_of(evidence))).regions
-    assert_same(region.evidence, evidence)
 
 
 def test_literal_bytes():

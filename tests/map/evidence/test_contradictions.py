@@ -11,7 +11,6 @@ from triquad_map.compiled.evidence.contradictions import Disbelief
 from triquad_map.compiled.evidence.live_evidence import LiveEvidence
 from triquad_map.compiled.evidence.observations import outcome_counts
 from triquad_map.compiled.evidence.observed import Sighting
-from triquad_map.compiled.surfels.surfel_map import surfel_voxels
 from triquad_map.surface import SurfelKind, nothing_shown
 
 SIDE = 256
@@ -70,26 +69,6 @@ def test_a_wall_through_which_rays_pass_is_taken_back(rng: np.random.Generator) 
     assert watched.believed(wall) < 0.01
     frozen = watched.evidence.freeze()
     assert (frozen.status(wall, reach=0.0) == 1).mean() > 0.99  # free
-
-
-def test_single_rays_that_end_where_a_wall_was_are_no_new_surface(
-    rng: np.random.Generator,
-) -> None:
-    watched = Watched()
-    wall = panel(rng, WALL_X)
-    for _ in range(10):
-        watched.scan(wall)
-    while watched.believed(wall) > 0:
-        watched.scan(behind(wall, 200.5))
-
-    def new_surface(ends: Doubles) -> int:
-        watched.scans += 1
-        sighting = Sighting(SENSOR, 0.2, watched.scans, scan=watched.scans)
-        return watched.evidence.new_surface(watched.evidence.mark_surface(ends, sighting), 10)
-
-    strays = wall[:5]
-    assert new_surface(strays) == 0
-    assert [new_surface(strays) for _ in range(3)] == [0, 5, 5]
 
 
 def test_a_wall_that_rays_reach_stays_for_ever(rng: np.random.Generator) -> None:
@@ -195,19 +174,6 @@ def test_nothing_goes_while_no_ray_passes(rng: np.random.Generator) -> None:
     elsewhere = SENSOR + rng.uniform(-1, 1, (500, 3)) * (0, 30, 30) - (15, 0, 0)
     for _ in range(200):
         assert watched.scan(elsewhere) == 0
-
-
-def test_support_falls_while_a_surface_is_contradicted(rng: np.random.Generator) -> None:
-    watched = Watched()
-    for _ in range(30):
-        watched.scan(panel(rng, WALL_X, half=2.0), np.array([1.0, 0, 0]))
-    before = watched.evidence.freeze().levels.astype(float).mean()
-    watched.scan(behind(panel(rng, WALL_X, half=2.0), 120.0))
-    frozen = watched.evidence.freeze()
-    voxels = surfel_voxels(frozen.cells, frozen.surface, len(frozen.levels))
-    wall = voxels[:, 0] == int(WALL_X)
-    assert wall.any()
-    assert frozen.levels[wall].astype(float).mean() < before - 0.5
 
 
 def lattice(rng: np.random.Generator, x: float, rows: Doubles) -> Doubles:

@@ -17,11 +17,6 @@ def voxel(*xyz: float) -> np.ndarray:
     return np.array([xyz], float)
 
 
-def test_nothing_is_known_at_first() -> None:
-    evidence = LiveEvidence(SIDE)
-    assert (evidence.freeze().status(RNG.uniform(-5, SIDE + 5, (1000, 3))) == Status.UNKNOWN).all()
-
-
 def test_surface_reaches_half_a_voxel() -> None:
     evidence = LiveEvidence(SIDE)
     evidence.mark_surface(voxel(10.5, 20.5, 30.5))
@@ -54,13 +49,6 @@ def test_a_ray_from_outside_carves_inside_only() -> None:
     assert evidence.freeze().status(voxel(5, 30.43, 30.3))[0] == Status.FREE
     assert evidence.freeze().status(voxel(SIDE - 0.5, 30.85, 30.6))[0] == Status.FREE
     assert evidence.freeze().status(voxel(SIDE + 2, 31, 30.6))[0] == Status.UNKNOWN
-
-
-def test_a_short_ray_carves_nothing() -> None:
-    evidence = LiveEvidence(SIDE)
-    evidence.carve(np.array([5.0, 5, 5]), voxel(5.2, 5, 5), Reach(0.5))
-    evidence.carve(np.array([5.0, 5, 5]), voxel(5, 5, 5), Reach(0.0))
-    assert (evidence.freeze().status(voxel(5.1, 5, 5)) == Status.UNKNOWN).all()
 
 
 @settings(max_examples=25, deadline=None)
@@ -104,15 +92,6 @@ def test_clearing_forgets_a_box_and_no_more() -> None:
     assert (status[~inside] == Status.SURFACE).all()
 
 
-def test_what_is_frozen_does_not_change() -> None:
-    evidence = LiveEvidence(SIDE)
-    evidence.mark_surface(voxel(1.5, 1.5, 1.5))
-    frozen = evidence.freeze()
-    evidence.mark_surface(voxel(40.5, 40.5, 40.5))
-    assert frozen.status(voxel(40.5, 40.5, 40.5))[0] == Status.UNKNOWN
-    assert frozen.status(voxel(1.5, 1.5, 1.5))[0] == Status.SURFACE
-
-
 def test_support_rises_with_each_look_from_near_and_from_other_sides() -> None:
     ends = np.array([[20.5, 20.5, 20.5], [60.5, 20.5, 20.5]])
 
@@ -146,19 +125,6 @@ def test_levels_and_times_survive_a_record() -> None:
     frozen = evidence.freeze()
     evidence.mark_surface(ends, Sighting(origins[0], 0.2, 12_000, scan=2))
     np.testing.assert_array_equal(frozen.record().seen_s, record.seen_s)
-
-
-def test_what_is_forgotten_has_no_support() -> None:
-    evidence = LiveEvidence(SIDE)
-    end = np.array([[20.5, 20.5, 20.5]])
-    for _ in range(50):
-        evidence.mark_surface(end, Sighting(np.array([25.0, 20, 20]), 0.2, 60, scan=1))
-    evidence.clear(np.zeros(3), np.full(3, float(SIDE)))
-    record = evidence.freeze().record()
-    assert len(record.levels) == 0
-    assert not record.seen_s.any()
-    evidence.mark_surface(end, Sighting(np.array([200.0, 20, 20]), 0.2, 120, scan=2))
-    assert evidence.freeze().levels.tolist() == [0]
 
 
 def crossed(origin: np.ndarray, end: np.ndarray, least: float) -> set[tuple[int, ...]]:

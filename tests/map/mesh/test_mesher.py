@@ -141,9 +141,3 @@ def test_tiles_are_those_that_meet_the_bounds(epoch: Epoch) -> None:
     low, high = np.array([0.1, 0.1, -1.0]), np.array([side + 0.1, side - 0.1, 1.0])
     some = everything[LATTICE.meets(everything, low, high)]
     assert {tuple(tile) for tile in some[:, :2].tolist()} == {(0, 0), (1, 0)}
-
-
-def test_an_empty_map_has_no_tiles() -> None:
-    epoch = Mapper("test", settings(), "cpu").publish()
-    assert len(surface_tiles(epoch, LATTICE)) == 0
-    assert len(mesh_tile(epoch, (0, 0, 0), LATTICE).vertices) == 0

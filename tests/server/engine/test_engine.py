@@ -91,20 +91,6 @@ def test_a_training_step_is_equal(settings: FieldSettings) -> None:
         np.testing.assert_allclose(part.values, other.values, atol=1e-3)
 
 
-@pytest.mark.parametrize("compiled", [True, False])
-def test_training_goes_on_after_growth(compiled: bool) -> None:
-    settings = FieldSettings(depth=8, frequencies=4)
-    field = trained(settings)
-    trainer = CompiledTrainer(field, GradientSums(), TEAM) if compiled else TensorTrainer(field)
-    batch = samples(settings, 2048, seed=5)
-    before = len(field.features)
-    field.grow(leaves(settings, batch))
-    assert len(field.features) > before
-    losses = [float(trainer.train(batch, RATES)) for _ in range(60)]
-    assert losses[-1] < losses[0]
-    assert field.features.steps[before:].min() > 0
-
-
 @pytest.mark.parametrize("compiled", [False, True], ids=["tensors", "compiled"])
 def test_an_old_decoder_moves_less_than_a_young_one(compiled: bool) -> None:
     settings = CASES[0]

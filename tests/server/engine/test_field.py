@@ -1,7 +1,5 @@
 """The torch field against a point-by-point reference with Python dictionaries."""
 
-import math
-
 import numpy as np
 import pytest
 import torch
@@ -47,85 +45,12 @@ def train(field: LiveField, points: torch.Tensor, labels: torch.Tensor) -> None:
     TensorTrainer(field).train(Batch(points, labels), RATES)
 
 
-def slow_sdf(field: LiveField, point: np.ndarray) -> float:
-    settings = field.settings
-    inputs: list[float] = []
-    record = region_record(
-        (0, 0, 0), field, LiveEvidence(1 << settings.depth).freeze(), training=None
-    )
-    tables = {
-        (table.plane, table.level): {
-            int(code): features for code, features in zip(table.codes, table.features, strict=True)
-        }
-        for table in record.tables
-    }
-    if settings.encoding != "fourier":
-        leaf = point / settings.leaf_m + 2 ** (settings.depth - 1)
-        for level in settings.levels:
-            total = np.zeros(settings.feature_size)
-            for plane, axes in enumerate(AXES):
-                uv = leaf[list(axes)] / 2 ** (settings.depth - level)
-                cell, t = np.floor(uv).astype(int), uv - np.floor(uv)
-                for i in (0, 1):
-                    for j in (0, 1):
-                        code = int(morton.encode(cell + [i, j]))
-                        weight = (t[0] if i else 1 - t[0]) * (t[1] if j else 1 - t[1])
-                        total += weight * tables[plane, level].get(code, np.zeros(1))
-            inputs.extend(total)
-    if settings.encoding != "features":
-        angles = [
-            2 * math.pi * s * q
-            for q in point / (settings.region_side_m / 2)
-            for s in field.arrays.frequencies.tolist()
-        ]
-        inputs.extend([math.sin(a) for a in angles] + [math.cos(a) for a in angles])
-    x = np.array(inputs)
-    mlp = record.mlp
-    for layer, (weight, bias) in enumerate(zip(mlp.weights, mlp.biases, strict=True)):
-        x = x @ weight + bias
-        if layer < 2:
-            x = np.maximum(x, 0)
-    return float(x[0] * settings.logit_scale_m)
-
-
-@pytest.mark.parametrize("encoding", ["both", "features", "fourier"])
-def test_it_equals_the_slow_reference(encoding: str) -> None:
-    field = grown(small(encoding))
-    points = (torch.rand((60, 3)) * 2 - 1) * field.settings.region_side_m * 0.2
-    expected = [slow_sdf(field, point) for point in points.double().numpy()]
-    np.testing.assert_allclose(in_tensors(field).sdf(points).numpy(), expected, atol=1e-5)
-
-
-def test_the_gradient_is_that_of_the_values() -> None:
-    field = grown(small())
-    points = (torch.rand((200, 3)) * 2 - 1) * field.settings.region_side_m * 0.2
-    # Bilinear cells and ReLUs have kinks; stay within cells and compare the bulk.
-    tensors = in_tensors(field)
-    _, gradient = tensors.sdf_and_gradient(points)
-    step = 1e-3
-    for axis in range(3):
-        offset = torch.zeros(3)
-        offset[axis] = step
-        slope = (tensors.sdf(points + offset) - tensors.sdf(points - offset)) / (2 * step)
-        error = (slope - gradient[:, axis]).abs()
-        assert error.median() < 2e-3 * gradient.abs().median()
-
-
 def test_the_field_is_continuous_across_cells() -> None:
     field = grown(small())
     line = torch.linspace(-4, 4, 80_001)
     points = torch.stack([line, 0.37 * line, -0.21 * line + 0.1], 1)
     steps = in_tensors(field).sdf(points).diff().abs()
     assert steps.max() < 20 * steps.median() + 1e-5
-
-
-def test_vertices_are_those_of_the_nodes_that_points_project_into() -> None:
-    settings = small()
-    field = initial_field(settings, TENSORS, 0)
-    field.grow(np.array([[70, 80, 90]]))
-    assert field.vertices == 3 * settings.feature_levels * 4
-    field.grow(np.array([[70, 80, 90]] * 3))
-    assert field.vertices == 3 * settings.feature_levels * 4, "the same nodes again"
 
 
 def test_the_tree_holds_the_vertices_of_all_nodes_and_no_others() -> None:
@@ -150,62 +75,6 @@ def test_the_tree_holds_the_vertices_of_all_nodes_and_no_others() -> None:
     assert field.vertices == sum(
         len(field.tree.table(plane, h)[0]) for plane in range(3) for h in range(3)
     )
-
-
-def test_growing_keeps_values_and_optimiser_state() -> None:
-    field = grown(small())
-    points = (torch.rand((2000, 3)) * 2 - 1) * 7
-    train(field, points, points[:, 2])
-    before = [t.clone() for t in (field.features.values, field.features.means)]
-    variances, steps = field.features.variances.clone(), field.features.steps.clone()
-    count = len(field.features)
-    assert steps.max() == 1
-    field.grow(leaves(field.settings, (torch.rand((500, 3)) * 2 - 1) * 12))
-    assert len(field.features) > count
-    assert torch.equal(field.features.values[:count], before[0])
-    assert torch.equal(field.features.means[:count], before[1])
-    assert torch.equal(field.features.variances[:count], variances)
-    assert torch.equal(field.features.steps[:count], steps)
-    assert field.features.steps[count:].max() == 0
-    train(field, points, points[:, 2])
-    assert field.features.steps.max() == 2, "the grown parameter is the one that is trained"
-
-
-@pytest.mark.parametrize("encoding", ["both", "features", "fourier"])
-def test_training_learns_a_plane(encoding: str) -> None:
-    settings = small(encoding, depth=7)
-    field = initial_field(settings, TENSORS, 1)
-    generator = torch.Generator().manual_seed(1)
-    ground = (torch.rand((4000, 3), generator=generator) * 2 - 1) * torch.tensor([6.0, 6.0, 0.0])
-    field.grow(leaves(settings, ground))
-    for _ in range(150):
-        chosen = torch.randint(len(ground), (2048,), generator=generator)
-        height = (torch.rand(2048, generator=generator) * 2 - 1) * 0.3
-        points = ground[chosen] + height[:, None] * torch.tensor([0.0, 0.0, 1.0])
-        train(field, points, height)
-    inner = ground[ground.abs().amax(1) < 5][:500]
-    above = in_tensors(field).sdf(inner + torch.tensor([0.0, 0.0, 0.05]))
-    below = in_tensors(field).sdf(inner - torch.tensor([0.0, 0.0, 0.05]))
-    assert (above > 0).float().mean() > 0.97
-    assert (below < 0).float().mean() > 0.97
-
-
-def test_absent_vertices_stay_zero() -> None:
-    field = grown(small())
-    points = (torch.rand((3000, 3)) * 2 - 1) * field.settings.region_side_m * 0.45
-    train(field, points, points[:, 0])
-    assert not field.features.values[0].any()
-
-
-def test_a_frozen_field_does_not_change() -> None:
-    field = grown(small())
-    points = (torch.rand((500, 3)) * 2 - 1) * 7
-    before = field.freeze().evaluate(points.numpy(), gradient=False).sdf
-    frozen = field.freeze()
-    train(field, points, points[:, 2])
-    field.grow(leaves(field.settings, points))
-    np.testing.assert_array_equal(frozen.evaluate(points.numpy(), gradient=False).sdf, before)
-    assert (field.freeze().evaluate(points.numpy(), gradient=False).sdf != before).any()
 
 
 @pytest.mark.gpu

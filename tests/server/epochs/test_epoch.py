@@ -4,7 +4,6 @@ from support.maps.small_world import settings, settled_mapper, world
 from triquad_format.records.status import Status
 from triquad_map.composition.recorded_view import RecordedView
 from triquad_server.epochs.epoch import Epoch
-from triquad_server.mapping.mapper import Mapper
 
 RNG = np.random.default_rng(0)
 
@@ -45,16 +44,4 @@ def test_where_no_region_is_there_is_no_distance(epoch: Epoch) -> None:
     answer = epoch.query(np.array([[5000.0, 0, 0], [0, 0, -9e6]]), gradient=True)
     assert np.isnan(answer.sdf).all()
     assert np.isnan(answer.gradient).all()
-    assert (answer.status == Status.UNKNOWN).all()
-
-
-def test_no_points_give_an_empty_answer(epoch: Epoch) -> None:
-    answer = epoch.query(np.zeros((0, 3)), gradient=True)
-    assert answer.sdf.shape == (0,)
-    assert answer.gradient.shape == (0, 3)
-
-
-def test_an_empty_map_knows_nothing() -> None:
-    epoch = Mapper("test", settings(), "cpu").publish()
-    answer = epoch.query(np.zeros((3, 3)), gradient=False)
     assert (answer.status == Status.UNKNOWN).all()

@@ -40,13 +40,6 @@ def is_gone(epochs, number):
     return False
 
 
-def test_zero_asks_for_the_newest():
-    epochs = history(kept=2)
-    epochs.add(epoch(2))
-    assert epochs.get(0).number == epochs.newest.number == 2
-    assert epochs.get(1).number == 1
-
-
 def test_an_epoch_stays_while_it_is_worked_on_and_for_the_parts_that_follow():
     epochs = history(kept=1, pinned=1)
     with epochs.view(0) as worked_on:
@@ -164,13 +157,6 @@ def test_training_waits_while_an_epoch_is_asked_but_not_for_ever():
         answered.set()
         giving.join(WAIT_S)
         assert not giving.is_alive()
-
-
-def test_the_newest_never_goes():
-    epochs = history(kept=1)
-    epochs.add(epoch(2))
-    assert epochs.get(0).number == epochs.get(2).number == 2
-    assert is_gone(epochs, 1)
 
 
 def test_once_no_epoch_follows_only_the_newest_and_those_asked_for_stay():

@@ -50,15 +50,6 @@ def test_a_scan_is_not_settled_while_an_earlier_one_waits():
     assert ledger.outcome(*SOURCE, 2).last_refusal == "scan 1: no points"
 
 
-def test_later_scans_do_not_hold_up_a_published_one():
-    ledger = SourceLedger()
-    arrive_and_take(ledger, 0)
-    ledger.publish()
-    arrive_and_take(ledger, 1)
-    assert ledger.outcome(*SOURCE, 0) is not None
-    assert ledger.outcome(*SOURCE, 1) is None
-
-
 def test_time_that_runs_backwards_is_refused_per_session():
     ledger = SourceLedger()
     arrive_and_take(ledger, 0)
@@ -114,17 +105,6 @@ def test_sessions_remembered_are_bounded_and_losses_are_not_forgotten(monkeypatc
     assert ledger.outcome("lidar", 0, 1) is None
 
 
-def test_a_scan_of_a_session_that_was_forgotten_while_it_waited_has_an_age(monkeypatch):
-    monkeypatch.setattr(source_ledger, "MAX_SESSIONS", 2)
-    ledger = SourceLedger()
-    waiting = servers.scan(0, session=0)
-    for session in range(4):
-        ledger.arrive(servers.scan(0, session=session))
-    ledger.take(waiting)
-    (metrics,) = ledger.metrics().values()
-    assert 0 <= metrics.age_s < 60
-
-
 def test_losses_of_a_hostile_publisher_still_fit_a_message():
     ledger = SourceLedger()
     for session in range(40_000):
@@ -162,33 +142,6 @@ def test_a_full_queue_pushes_out_the_oldest_scan_and_counts_it():
     assert len(queue) == 0
 
 
-def test_waiting_for_an_outcome_ends_with_the_publication():
-    ledger = SourceLedger()
-    arrive_and_take(ledger, 0)
-    publisher = threading.Timer(0.01, ledger.publish)
-    publisher.start()
-    with ledger.changed:
-        assert ledger.changed.wait_for(
-            lambda: ledger.outcome(*SOURCE, 0) is not None, servers.WAIT_S
-        )
-    publisher.join()
-
-
-def test_a_scan_that_is_not_queued_says_nothing_of_those_that_wait():
-    ledger = SourceLedger()
-    first, second = servers.scan(sequence=0), servers.scan(sequence=1)
-    ledger.arrive(first)
-    ledger.arrive(second)
-    ledger.refuse(second, "too many points")
-    asked = (first.source, first.session, 1)
-    assert ledger.outcome(*asked) is None, "the first still waits"
-    ledger.take(first)
-    ledger.publish()
-    outcome = ledger.outcome(*asked)
-    assert outcome is not None
-    assert (outcome.taken, outcome.refused, outcome.lost) == (1, 1, 0)
-
-
 def test_sources_take_turns_and_the_busiest_loses_alone():
     queue = ScanQueue(2)
     for sequence in range(9):
@@ -224,12 +177,6 @@ def test_requests_give_way_while_a_source_is_about_to_lose_scans(monkeypatch):
     queue.take()
     waiting.join(servers.WAIT_S)
     assert not waiting.is_alive()
-
-
-def test_requests_give_way_to_scans_for_a_moment_only():
-    queue = ScanQueue(limit=1)
-    queue.put(servers.scan(0))
-    queue.give_way()
 
 
 def test_scans_that_wait_are_bounded_in_bytes_over_all_sources():

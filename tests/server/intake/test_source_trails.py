@@ -1,7 +1,6 @@
 import tracemalloc
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from triquad_format.wire.messages import Scan
@@ -10,7 +9,6 @@ from triquad_server.intake.source_trails import (
     MAX_POSITIONS,
     MAX_SOURCES,
     SourceTrails,
-    evenly,
 )
 
 LEAF_M = 0.2
@@ -111,17 +109,6 @@ def test_whenever_one_asks_the_news_make_up_the_whole(steps):
         assert (apart[joined] < 50 + LEAF_M).all()
         assert (apart[joined] >= LEAF_M).all()
     assert sum(new.scans for new in deltas.values()) <= taken
-
-
-@pytest.mark.parametrize("count", [0, 1, 7, 99, 100, 101])
-def test_points_are_drawn_from_equal_runs_none_twice(count):
-    points = np.arange(300.0).reshape(100, 3)
-    drawn = evenly(points, count)
-    assert len(drawn) == min(count, 100)
-    rows = drawn[:, 0] / 3
-    assert (np.diff(rows) > 0).all()
-    if count:
-        assert (np.diff(rows) <= 2 * np.ceil(100 / count)).all()
 
 
 def test_sources_that_somebody_invents_take_little_memory():

@@ -6,9 +6,7 @@ from support.maps.small_world import (
     damage,
     settings,
     settle,
-    settled_copy,
     settled_mapper,
-    surface_error,
     world,
 )
 from triquad_format.records import replay_rays
@@ -51,36 +49,11 @@ def test_what_fits_worse_than_it_did_is_forgotten() -> None:
     assert places.forgotten_keys == place_keys(ROWS[-1:, :3], FIELD)
 
 
-def test_the_medians_are_those_of_each_place() -> None:
-    places = judged(Judgement(FIELD), off(SECOND, 0.1))
-    order = np.argsort(places.centres[:, 0])
-    of_first, of_second = (
-        np.median(np.abs(NOISE + off(SECOND, 0.1))[at]) for at in (FIRST, SECOND)
-    )
-    assert places.medians_m[order] == pytest.approx([of_first, of_second], rel=0.02)
-    assert places.rays[order].tolist() == [400, 300]
-
-
-def test_a_little_worse_is_noise() -> None:
-    judgement = Judgement(FIELD)
-    judged(judgement, off(FIRST, 0.0))
-    for _ in range(20):
-        assert not judged(judgement, RNG.normal(0, 0.002, len(ROWS))).forgotten.any()
-
-
 def test_a_little_worse_again_and_again_is_forgotten_in_the_end() -> None:
     judgement = Judgement(FIELD)
     forgotten = [judged(judgement, off(SECOND, 0.001 * n)).forgotten.any() for n in range(20)]
     assert not forgotten[1]
     assert any(forgotten)
-
-
-def test_what_fits_again_was_repaired() -> None:
-    judgement = Judgement(FIELD)
-    judged(judgement, off(FIRST, 0.0))
-    assert judged(judgement, off(FIRST, 0.03)).repaired == 0
-    places = judged(judgement, off(FIRST, 0.001))
-    assert (places.repaired, places.given_up, places.forgotten.any()) == (1, 0, False)
 
 
 def test_what_cannot_be_repaired_is_taken_as_it_is() -> None:
@@ -90,16 +63,6 @@ def test_what_cannot_be_repaired_is_taken_as_it_is() -> None:
     assert [int(places.forgotten.sum()) for places in tries] == [1, 1, 1, 0, 0]
     assert [places.given_up for places in tries] == [0, 0, 0, 1, 0]
     assert sum(places.repaired for places in tries) == 0
-
-
-def test_what_may_not_be_repaired_is_taken_as_it_is() -> None:
-    judgement = Judgement(FIELD)
-    judged(judgement, off(FIRST, 0.0))
-    assert judged(judgement, off(FIRST, 0.03)).forgotten.sum() == 1
-    worse = (NOISE + off(SECOND, 0.03)).astype(np.float32)
-    places = judgement.judge(ROWS, worse, may_repair=False)
-    assert (places.forgotten.any(), places.repaired, places.given_up) == (False, 1, 1)
-    assert judged(judgement, off(SECOND, 0.03)).given_up == 0  # it is what is known now
 
 
 @pytest.mark.parametrize("noise_m", [0.002, 0.02])
@@ -161,24 +124,6 @@ def test_a_region_is_not_judged_by_rays_that_end_beside_it() -> None:
     fit = map_fit(mapper.regions)
     assert fit is not None
     assert fit.rays == inside
-
-
-def test_forgetting_is_found_told_and_repaired() -> None:
-    mapper = settled_copy()
-    before_m = surface_error(mapper.publish(), world())
-    fit = map_fit(mapper.regions)
-    assert fit is not None
-    assert fit.repairing == 0
-    damage(mapper)
-    settle(mapper)
-    assert surface_error(mapper.publish(), world()) > 1.2 * before_m
-    assert map_fit(mapper.regions).repairing > 0
-    assert not mapper.settled
-    while not mapper.settled:
-        settle(mapper)
-        after = mapper.publish()
-    assert surface_error(after, world()) < 1.1 * before_m
-    assert map_fit(mapper.regions).repaired > 0
 
 
 def test_a_map_that_forgets_again_and_again_settles() -> None:

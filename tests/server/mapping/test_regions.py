@@ -13,14 +13,9 @@ from support.maps.small_world import (
 )
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.status import Status
-from triquad_server.engine.gradient_sums import GradientSums
-from triquad_server.engine.memory import ArrayMemory
 from triquad_server.errors import ScanRefusedError
-from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.replay.kept_rays import RAY_BYTES
-from triquad_server.mapping.replay.region_setup import RegionSetup
-from triquad_server.process.threads import Teams
 from triquad_server.settings import Settings
 from triquad_tools.sensors.sweep import moved
 
@@ -129,25 +124,6 @@ def test_the_number_of_regions_is_bounded() -> None:
         take_in(mapper, scan)
     assert refusal.value.reason == "too_many_regions"
     assert mapper.publish().regions == 0
-
-
-def test_neighbouring_regions_start_differently() -> None:
-    """Numbers that are hashed alike, such as -1 and -2, are no exception."""
-    chosen = settings()
-    setup = RegionSetup(
-        field=chosen.field,
-        scan=chosen.scan,
-        change=chosen.change,
-        training=chosen.training,
-        memory=ArrayMemory(),
-        sums=GradientSums(),
-        team=Teams().mapping,
-    )
-    indices = [(x, y, 0) for x in range(-3, 3) for y in range(-3, 3)]
-    starts = [LiveRegion.unseen(index, setup).field.arrays.frequencies for index in indices]
-    assert len({tuple(start.tolist()) for start in starts}) == len(indices)
-    again = LiveRegion.unseen(indices[0], setup).field.arrays.frequencies
-    assert np.array_equal(again, starts[0])
 
 
 def test_the_replay_pool_is_bounded_after_a_restart_and_after_a_reset() -> None:

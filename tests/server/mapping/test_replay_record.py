@@ -109,12 +109,3 @@ def test_the_same_rays_are_held_out_when_they_are_read_back(team: Team) -> None:
     )
     one, other = (np.unique(of_ends, axis=0) for of_ends in steps)
     assert np.array_equal(one, other)
-
-
-def test_rays_are_recorded_by_leaf_and_with_the_origins_that_they_have() -> None:
-    kept = table()
-    unused = np.full((3, 3), 99, np.float32)
-    kept = RayTable(kept.rows, kept.origin_of, np.concatenate([kept.origins, unused]))
-    rays, _ = recorded_rays(kept, FIELD)
-    assert (np.diff(rays.leaf_codes) >= 0).all()
-    assert np.array_equal(rays.origins, kept.origins[:2])

@@ -47,47 +47,11 @@ def test_few_new_rays_beside_many_move_what_is_old_little_and_what_is_young_much
     assert rates.young_rate == SETTINGS.learning_rate
 
 
-def test_as_many_samples_are_on_new_rays_as_the_setting_says() -> None:
-    budget = budget_of(10_000)
-    fresh = 0
-    while budget.samples:
-        step = budget.next_step(BATCH, 10_000)
-        fresh += step.fresh
-        budget.spend(step)
-    assert fresh == 50_000
-
-
-def test_the_newest_scan_is_learnt_from_for_a_while_whatever_its_share() -> None:
-    for share in (0.5, 1e-5):
-        budget = TrainingBudget(SETTINGS.model_copy(update={"fresh_share": share}))
-        budget.limit(10**12)
-        budget.add(10_000)
-        learnt = [budget.learns_newest]
-        while budget.samples:
-            budget.spend(budget.next_step(BATCH, 10_000))
-            learnt.append(budget.learns_newest)
-        assert learnt[0]
-        assert not learnt[-1]
-
-
 def test_no_more_is_owed_than_may_be_and_the_rest_is_counted() -> None:
     budget = budget_of(10_000, most=30_000)
     assert (budget.samples, budget.discarded) == (30_000, 70_000)
     budget.limit(20_000)
     assert (budget.samples, budget.discarded) == (20_000, 80_000)
-
-
-def test_half_of_each_batch_is_for_places_that_have_forgotten() -> None:
-    budget = budget_of(100)
-    spend_all(budget, 100_000)
-    budget.repair(500)
-    repaired = 0
-    while budget.samples:
-        step = budget.next_step(BATCH, 100_000)
-        assert step.repair <= BATCH // 2
-        repaired += step.repair
-        budget.spend(step)
-    assert repaired == 16 * 500
 
 
 def test_what_is_gone_is_unlearnt_while_there_is_more_to_learn_and_wakes_no_settled_map() -> None:

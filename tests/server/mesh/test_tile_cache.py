@@ -1,17 +1,14 @@
 """Tiles that are made where the surface changed, and that meet whenever they were made."""
 
 import functools
-import gc
-import weakref
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.maps.exact_maps import SETTINGS, exact_map, flat, table
+from support.maps.exact_maps import SETTINGS, exact_map, flat
 from support.maps.small_world import settings, settle, world
-from triquad_format.records.region import seen_voxels
 from triquad_format.wire.limits import LEVELS
 from triquad_format.wire.tile_codec import TileSurface, decode_tile
 from triquad_map.mesh.mesher import mesh_tile
@@ -245,46 +242,6 @@ def test_what_moves_by_less_than_the_tolerance_changes_nothing_until_it_adds_up(
     assert len(make_all(cache)) > 100
 
 
-@pytest.mark.parametrize(("height_m", "tiles"), [(0.25, set()), (0.39, {-1, 0})])
-def test_a_few_voxels_count_where_the_surface_left_them(height_m: float, tiles: set[int]) -> None:
-    """Within one layer of voxels, so that the evidence stays the same."""
-    cache = TileCache(MESH, TEAM)
-    cache.refresh(ground(flat(0.21)))
-    make_all(cache)
-    cache.refresh(ground(table(0.21, height_m, 1.6)))
-    made = make_all(cache)
-    assert {x for x, _, _ in made} == {y for _, y, _ in made} == tiles
-
-
-def cut(quarters: int) -> Epoch:
-    """A ground in whose last voxels towards greater x no ray ended so far from that side."""
-    record = exact_map(flat(0.3), epoch=next(_EPOCHS))
-    region = record.regions[0]
-    voxels = seen_voxels(region.evidence, region.evidence.surface)
-    margins = np.zeros((len(voxels), 6), np.uint8)
-    margins[voxels[:, 0] == voxels[:, 0].max(), 3] = quarters
-    region = replace(region, evidence=replace(region.evidence, margins=margins))
-    return Mapper(
-        "test", Settings(field=SETTINGS, mesh=MESH), "cpu", replace(record, regions=(region,))
-    ).publish()
-
-
-def test_tiles_follow_where_within_voxels_the_surface_ends() -> None:
-    cache = TileCache(MESH, TEAM)
-    cache.refresh(cut(0))
-    first = make_all(cache)
-    last = max(x for x, _, _ in surfaces(cache))
-    at_edge = {index for index in first if index[0] == last}
-    for quarters, changes in ((1, False), (3, True), (2, False), (0, True)):
-        before = surfaces(cache)
-        cache.refresh(cut(quarters))
-        made = set(make_all(cache))
-        assert bool(made) == changes
-        assert made <= at_edge
-        if made:
-            assert set(before) & at_edge <= made
-
-
 def test_surface_that_is_forgotten_goes_and_everybody_is_told() -> None:
     chosen = settings().model_copy(update={"mesh": MESH})
     mapper = Mapper("test", chosen, "cpu")
@@ -392,25 +349,3 @@ def test_when_tiles_changed_is_told_for_any_of_them() -> None:
     cache.refresh(first)  # an older one tells nothing
     asked = np.array([[2, 2, 0], [-2, -2, 0], [900, 0, 0]])
     assert cache.changed(0, asked).tolist() == [second.number, first.number, 0]
-
-
-def test_no_epoch_is_kept_for_tiles_that_nobody_wants() -> None:
-    cache = TileCache(MESH, TEAM)
-    first, second = ground(flat(0.3)), ground(flat(0.4))
-    cache.refresh(first)
-    made = make_all(cache, 0)
-    cache.refresh(second, to_make=False)  # somebody asked for a list
-    assert cache.made_from == second.number, "tiles that changed are not made of what was before"
-    surfels = [weakref.ref(region.surfels) for region in first.frozen_regions]
-    cache.release()
-    del first
-    gc.collect()
-    assert [kept() for kept in surfels] == [None] * len(surfels)
-    third = ground(flat(0.5))
-    cache.refresh(third, to_make=False)
-    assert cache.made_from == -1
-    cache.refresh(second)  # which it is too late for
-    assert cache.made_from == -1
-    cache.refresh(third)
-    assert cache.made_from == third.number
-    assert {index[:2] for index in make_all(cache, 0)} == {index[:2] for index in made}

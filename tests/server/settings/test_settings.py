@@ -18,14 +18,6 @@ from triquad_server.settings.settings import setting_schemas
 ROOT = Path(__file__).parents[3]
 
 
-def test_the_defaults_of_the_field_are_the_published_ones() -> None:
-    field = Settings().field
-    assert (field.leaf_m, field.depth, field.feature_levels, field.feature_size) == (0.2, 12, 3, 8)
-    assert (field.frequencies, field.frequency_variance, field.hidden) == (16, 50.0, 32)
-    assert field.region_side_m == pytest.approx(819.2)
-    assert field.input_size == 120
-
-
 def test_a_file_changes_what_it_names(tmp_path: Path) -> None:
     path = tmp_path / "settings.toml"
     path.write_text("[field]\nleaf_m = 0.3\n[mesh]\ncell_m = 1\n")
@@ -114,13 +106,6 @@ def test_lengths_follow_the_leaf_from_wherever_it_is_set(
     assert (scan.range_min_m, scan.range_max_m, scan.thin_m) == (0.375, 12.5, 0.0125)
     assert (scan.spread_m, scan.truncation_m, scan.behind_m) == (0.02, 0.075, 0.2)
     assert (mesh.cell_m, mesh.reach_m, mesh.tolerance_m) == (0.025, 0.005, 0.0025)
-
-
-def test_at_the_default_leaf_lengths_are_their_defaults() -> None:
-    scan, mesh = Settings().scan, Settings().mesh
-    assert (scan.range_min_m, scan.range_max_m, scan.thin_m) == (1.5, 50.0, 0.05)
-    assert (scan.spread_m, scan.truncation_m, scan.behind_m) == (0.08, 0.3, 0.8)
-    assert (mesh.cell_m, mesh.reach_m, mesh.tolerance_m) == (0.1, 0.02, 0.01)
 
 
 def test_a_length_that_is_given_follows_nothing() -> None:

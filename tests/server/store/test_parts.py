@@ -115,13 +115,6 @@ def test_what_did_not_change_is_neither_encoded_nor_written(store, monkeypatch):
     assert_same(read_map(paths(store)[2]), dataclasses.replace(first, epoch=2))
 
 
-def test_parts_keep_the_epoch_in_which_they_changed(store):
-    drive(store, 3)
-    entries = read_map_file(paths(store)[4]).manifest.entries
-    changed = {e.key.region: e.epoch for e in entries if e.key.topic == "/triquad/region"}
-    assert changed == {index: 1 for index in ROW} | {ROW[2]: 2, ROW[3]: 3, ROW[4]: 4}
-
-
 def test_a_restarted_store_goes_on_from_the_newest(store, tmp_path):
     records = drive(store, 2)
     store.close()
@@ -218,14 +211,6 @@ def test_a_part_that_nothing_new_needs_is_no_reason_to_write(store):
     store.write(changes(grown(2, 2)))
     assert not store.forget_base(part.name)
     assert store.base_epoch == 2
-
-
-def test_another_part_under_a_name_is_found_out(store):
-    drive(store, 1)
-    one, other = (part_of(paths(store)[2], index) for index in ROW[:2])
-    one.write_bytes(other.read_bytes())
-    with pytest.raises(DamagedMapFileError, match=one.name):
-        read_map(paths(store)[2])
 
 
 @pytest.mark.parametrize("harm", [rot, Path.unlink], ids=["rotten", "missing"])
@@ -340,32 +325,6 @@ def test_parts_go_with_the_last_checkpoint_that_names_them(tmp_path):
             assert_same(read_map(found[epoch]), records[epoch])
         needed = set().union(*map(parts_of, found.values()))
         assert set(PartFiles(store.folder).folder.iterdir()) == needed
-
-
-def test_retention_by_bytes_counts_shared_parts_once(tmp_path):
-    with closing(Store(tmp_path, "lab", StoreSettings(keep=100, keep_bytes=0))) as store:
-        drive(store, 1)
-        whole = sum(path.stat().st_size for path in parts_of(paths(store)[1]))
-    limit = whole + whole // 2
-    with closing(Store(tmp_path, "roomy", StoreSettings(keep=100, keep_bytes=limit))) as store:
-        drive(store, 12, ROW[:1])
-        assert 3 <= len(paths(store)) <= 6
-        files = [path for path in store.folder.rglob("*") if path.is_file()]
-        assert sum(path.stat().st_size for path in files) <= limit
-    with closing(Store(tmp_path, "tight", StoreSettings(keep=100, keep_bytes=1))) as store:
-        drive(store, 9, ROW[:1])
-        assert sorted(paths(store)) == [9, 10]
-
-
-def test_what_undoes_something_stays_until_enough_others_do(tmp_path):
-    with closing(Store(tmp_path, "lab", StoreSettings(keep=2, keep_resets=2))) as store:
-        for epoch in range(1, 10):
-            store.write(changes(grown(epoch, epoch)))
-            if epoch in (2, 4, 6):
-                info = store.mark_newest("a reset")
-                assert store.base_epoch == info.epoch == epoch
-        assert sorted(paths(store)) == [4, 6, 8, 9]
-        assert_same(read_map(paths(store)[4]), grown(4, 4))
 
 
 def test_a_mark_that_moves_to_a_later_checkpoint_counts_once(tmp_path):

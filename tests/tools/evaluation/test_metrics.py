@@ -43,13 +43,6 @@ def test_parallel_planes_score_their_distance_against_a_scene() -> None:
     assert scores.references == 200 * 100
 
 
-def test_parallel_planes_score_their_distance_against_a_cloud() -> None:
-    scores = score_against_cloud(_plate(4.0, 2.0, -0.05), _grid(), ScoreSettings())
-    assert scores.accuracy_m == pytest.approx(0.05, abs=0.002)
-    assert scores.completion_m == pytest.approx(0.05, abs=0.002)
-    assert scores.f_score == 1.0
-
-
 def test_samples_beyond_the_cut_are_left_out_and_counted() -> None:
     near, far = _plate(4.0, 2.0, 0.02), _plate(4.0, 2.0, 0.5)
     both = Mesh(np.vstack([near.vertices, far.vertices]), np.vstack([near.faces, far.faces + 4]))

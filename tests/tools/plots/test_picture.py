@@ -17,10 +17,8 @@ from triquad_tools.plots.mesh_view import (
     HEIGHT,
     WIDTH,
     Picture,
-    vertex_normals,
     view_along,
 )
-from triquad_tools.plots.picture import draw_mesh
 from triquad_tools.plots.plan import HEIGHTS, Scale
 
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
@@ -153,11 +151,6 @@ def test_a_square_covers_its_pixels_once():
     assert covered == pytest.approx(area, rel=0.01)
 
 
-def test_normals_of_vertices_are_those_around_them():
-    normals = vertex_normals(SQUARE, SQUARE_FACES)
-    np.testing.assert_allclose(normals, np.tile([0.0, 0.0, 1.0], (4, 1)))
-
-
 @pytest.mark.parametrize("beyond", [(False, False), (True, False), (False, True), (True, True)])
 def test_the_legend_marks_values_beyond_its_scale(tmp_path, beyond):
     picture = Picture(view_of(ground(3, 3)))
@@ -168,15 +161,6 @@ def test_the_legend_marks_values_beyond_its_scale(tmp_path, beyond):
     assert near(pixels[153, 1365], BACKGROUND) == beyond[1]
     assert near(pixels[506, 1365], BACKGROUND) == beyond[0]
     assert near(pixels[480, 1377], HEIGHT_STOPS[0], within=24)
-
-
-def test_the_legend_tells_heights_beyond_the_scale(tmp_path):
-    """A mast of few faces over a plain: its colour is that of the scale's end."""
-    mast = both(ground(30, 30), squares((15.0, 15.0, 50.0), side_m=0.5))
-    draw_mesh("map", mast, tmp_path / "mast.png")
-    draw_mesh("map", ground(30, 30), tmp_path / "plain.png")
-    corners = [read_picture(tmp_path / f"{name}.png")[153, 1365] for name in ("mast", "plain")]
-    assert [bool(near(corner, BACKGROUND)) for corner in corners] == [True, False]
 
 
 # The command

@@ -5,7 +5,7 @@ import pytest
 from support.recordings.kitti_folder import write_folder
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.cloud import world_points
-from triquad_tools.recordings.folders.kitti import is_kitti_folder, read_kitti_folder
+from triquad_tools.recordings.folders.kitti import read_kitti_folder
 from triquad_tools.recordings.folders.scan_folder import ScanFolder
 
 DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
@@ -111,15 +111,6 @@ def test_scan_of_a_broken_size_is_refused_before_any_is_read(tmp_path: Path) -> 
         read_kitti_folder(tmp_path)
     with pytest.raises(ToolError, match=words):
         _points(folder, 2)
-
-
-def test_a_folder_is_a_recording(tmp_path: Path) -> None:
-    recording = read_kitti_folder(_folder(tmp_path, f"{IDENTITY}\n" * 3, 3))
-    assert is_kitti_folder(tmp_path)
-    assert not is_kitti_folder(tmp_path / "scans" / "none")
-    assert {entry.source for entry in recording.entries} == {"default"}
-    assert [stream.name for stream in recording.streams] == ["scans/*.bin", "poses.txt"]
-    assert not recording.remarks
 
 
 def test_counts_that_differ_are_refused(tmp_path: Path) -> None:

@@ -64,19 +64,6 @@ def test_grid_of_candidates_changes_no_answer(world: Scene) -> None:
     np.testing.assert_array_equal(world.sdf(points), np.min(alone, axis=0))
 
 
-def test_distance_in_a_street_agrees_with_the_distance_to_its_surface(world: Scene) -> None:
-    spacing_m = 0.05
-    samples = surface_samples(world, spacing_m, np.random.default_rng(4))
-    points = _near_surface(world, 20_000, seed=5)
-    inner = np.all((points > world.bounds[0] + 1.0) & (points < world.bounds[1] - 1.0), axis=1)
-    points = points[inner & world.is_exact(points)]
-    brute = cKDTree(samples).query(points)[0]
-    exact = np.abs(world.sdf(points))
-    assert np.all(exact <= brute + 1e-9)
-    far = brute > 0.15
-    assert np.quantile(brute[far] - exact[far], 0.99) < 0.02
-
-
 def test_distance_near_the_surface_is_exact_but_beside_seams(world: Scene) -> None:
     points = _near_surface(world, 20_000, seed=6)
     exact = world.is_exact(points)
