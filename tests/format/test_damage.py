@@ -20,10 +20,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fuzz.choices import Mutation
-from fuzz.damage import DAMAGE, change_parts, cut, flip_bits
+from fuzz.damage import DAMAGE, cut, flip_bits
 from fuzz.forgery import FORGERY, forge_bombs
 from fuzz.valid_maps import READERS, Reader, Results, ValidMap, valid_maps
-from hypothesis import HealthCheck, Phase, event, given, settings
+from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
 from support.files.file_damage import chunks, flipped, zeroed
@@ -42,7 +42,6 @@ from triquad_format.errors import (
     TooLargeMapFileError,
     UnsupportedMapFileError,
 )
-from triquad_format.mapfile.manifest import Entry
 from triquad_format.mapfile.metadata import MapFacts
 from triquad_format.mapfile.parts.pack import pack_part, pack_record
 from triquad_format.mapfile.parts.part import PartKey
@@ -92,21 +91,6 @@ def test_forged_maps_are_valid(
 @given(data=st.data())
 def test_bombs_take_little_memory(maps: list[ValidMap], data: st.DataObject) -> None:
     check_mutant(maps, forge_bombs, data, forged=True)
-
-
-def test_a_reader_that_checks_no_digests_is_found(
-    maps: list[ValidMap], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The tests above must be able to fail."""
-    monkeypatch.setattr(Entry, "check", lambda *_: None)
-
-    @settings(mutants, max_examples=500, derandomize=True, phases=[Phase.generate])
-    @given(data=st.data())
-    def damage_is_found(data: st.DataObject) -> None:
-        check_mutant(maps, change_parts, data)
-
-    with pytest.raises(AssertionError, match="read as another map"):
-        damage_is_found()
 
 
 def check_mutant(
@@ -189,14 +173,6 @@ def little_memory(file_bytes: int) -> Iterator[None]:
 
 RECORD = random_record(6, indices=((0, 0, 0), (1, 0, 0)))
 DATA = file_bytes(RECORD, preview=True)
-
-
-def test_files_that_are_cut_anywhere() -> None:
-    offsets = {*range(200), *range(0, len(DATA), 997), *range(len(DATA) - 600, len(DATA))}
-    for offset in offsets:
-        for read in (read_bytes, stored):
-            with pytest.raises(MapFileError):
-                read(DATA[:offset])
 
 
 @pytest.mark.parametrize("number", range(len(chunks(DATA))))

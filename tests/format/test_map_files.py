@@ -32,15 +32,12 @@ from support.maps.map_records import (
     with_support,
 )
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.metadata import MapFacts
-from triquad_format.mapfile.parts.pack import pack_record
-from triquad_format.mapfile.reader import read_map, read_map_file
-from triquad_format.mapfile.writer import MapFileInfo, write_map, write_parts
+from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.writer import MapFileInfo, write_map
 from triquad_format.records import morton
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.map_progress import MapProgress
 from triquad_format.records.region import AXES, MAX_INTEGER, MapRecord
-from triquad_map.preview import previews_of
 
 
 def assert_read_back(record: MapRecord, data: bytes | None = None) -> None:
@@ -161,17 +158,6 @@ def test_stamp() -> None:
             file_bytes(random_record(4), stamp_ns=bad)
 
 
-def test_what_is_known_of_a_file_and_its_parts() -> None:
-    data = file_bytes(random_record(5))
-    file = read_map_file(io.BytesIO(data))
-    assert file.size == len(data)
-    assert file.metadata["frame_id"] == "map"
-    assert file.manifest == manifest_of(data)
-    own = file.manifest.entries
-    assert [entry.key.topic for entry in own] == [part.topic for part in parts_of(data)[:-1]]
-    assert 0 < sum(entry.stored for entry in own) < len(data)
-
-
 # The golden files
 
 
@@ -214,13 +200,6 @@ def test_stock_reader_sees_an_ordinary_file() -> None:
     assert encodings.pop("/preview/mesh") == "protobuf"
     assert set(encodings.values()) == {"msgpack-zstd"}
     assert parts_of(data)[-1].topic == "/triquad/manifest"
-
-
-def test_previews_are_written_with_their_schema_only() -> None:
-    record = random_record(6)
-    parts = pack_record(record, "<f2", previews_of(record).parts)
-    with pytest.raises(FormatError, match="give preview_schema"):
-        write_parts(io.BytesIO(), MapFacts.of(record), parts)
 
 
 def test_unknown_fields_are_skipped() -> None:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from triquad_map.clusters import connected, same_cells, tight_boxes
+from triquad_map.clusters import connected, tight_boxes
 
 CELL = st.tuples(*[st.integers(-3, 3)] * 3)
 CELLS = st.lists(CELL, max_size=40)
@@ -47,15 +47,6 @@ def test_cells_that_touch_are_in_one_cluster_and_no_others(cells, offset):
 def test_a_long_winding_cluster_is_one(length):
     turns = np.random.default_rng(0).integers(-1, 2, (length, 3))
     assert connected(np.cumsum(turns, axis=0)).max() == 0
-
-
-@given(CELLS, OFFSET)
-def test_equal_cells_share_a_number_and_the_first_row_is_told(cells, offset):
-    first, number = same_cells(rows(cells) + offset)
-    assert len(first) == len(set(cells))
-    for row, cell in enumerate(cells):
-        assert cells[first[number[row]]] == cell
-        assert first[number[row]] == cells.index(cell)
 
 
 @given(CELLS, st.integers(1, 8), st.integers(1, 3))

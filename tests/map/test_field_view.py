@@ -115,14 +115,3 @@ def test_what_is_no_place_has_no_owner() -> None:
         answer = view_of(REGIONS).query(np.concatenate([points, np.zeros((1, 3))]))
         assert answer.status.tolist() == [Status.UNKNOWN] * len(points) + [10]
         assert np.isnan(answer.sdf[:-1]).all()
-
-
-def test_what_is_beyond_all_numbers_has_no_owner_in_small_regions_either() -> None:
-    small = FieldView(FieldSettings(depth=6, leaf_m=0.01), [])
-    assert small.query(np.full((1, 3), 1.7e308)).status == [Status.UNKNOWN]
-
-
-def test_a_map_without_regions_knows_nothing() -> None:
-    answer = view_of([]).query(np.zeros((5, 3)))
-    assert (answer.status == Status.UNKNOWN).all()
-    assert np.isnan(answer.sdf).all()

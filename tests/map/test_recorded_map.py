@@ -165,12 +165,6 @@ def test_points_far_from_the_map_are_unknown_however_far_apart():
     np.testing.assert_array_equal(found.point[1:], points[1:])
 
 
-def test_no_points_get_no_answers():
-    with closing(RecordedView(exact_map(flat(0.07)))) as view:
-        answer = distances(view, np.zeros((0, 3)), DistanceOptions(unknown_distance=True))
-        assert len(answer.distance_m) == len(answer.gradient) == 0
-
-
 def test_a_closed_map_answers_on_the_callers_thread():
     view = RecordedView(exact_map(flat(0.07)))
     view.close()

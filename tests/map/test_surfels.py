@@ -157,20 +157,6 @@ def test_a_bounded_update_fits_what_is_new_and_gets_to_the_rest_in_turn():
     assert rounds > 1
 
 
-def test_where_the_voxel_goes_in_which_its_surface_lay_a_voxel_has_its_own():
-    evidence = LiveEvidence(SIDE)
-    evidence.mark_surface(np.array([[20.9, 30.5, 30.5], [21.3, 30.5, 30.5], [40.5, 30.5, 30.5]]))
-    field = plane(np.array([1.0, 0, 0]), 21.3)
-    surfels = first_surfels(evidence.freeze(), field, 1)
-    kinds = [SurfelKind.NONE, SurfelKind.DISC, SurfelKind.POINT]
-    assert surfels.surfels.kinds.tolist() == kinds
-    evidence.clear(np.array([21.0, 30, 30]), np.array([22.0, 31, 31]))
-    after = surfels.updated(evidence.freeze(), field, 2, most=0)
-    anew = first_surfels(evidence.freeze(), field, 2)
-    assert after.surfels.kinds.tolist() == anew.surfels.kinds.tolist() == [SurfelKind.POINT] * 2
-    np.testing.assert_array_equal(after.surfels.offsets, anew.surfels.offsets)
-
-
 def surfels_of(region, mapper_settings):
     samples = field_samples(region.engine, mapper_settings, in_one)  # type: ignore[arg-type]
     return first_surfels(region.evidence, samples, 1)

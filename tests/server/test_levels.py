@@ -18,8 +18,6 @@ from triquad_format.mapfile.parts.part import EVIDENCE
 from triquad_format.mapfile.reader import read_map
 from triquad_format.records.crop import crop_record
 from triquad_format.records.region import masked, seen_voxels
-from triquad_format.records.seen_space import owned_evidence
-from triquad_format.recovery.recovered_map import recover
 from triquad_map.compiled.evidence.observations import outcome_codes
 
 CUBES = dataclasses.replace(SMALL, depth=9)
@@ -129,14 +127,6 @@ def test_a_crop_keeps_the_levels_of_what_it_keeps():
         assert_same(one.evidence, other.evidence)
 
 
-def test_what_a_region_owns_keeps_its_levels():
-    whole = random_record(4, points=4000)
-    region = with_support(whole).regions[0]
-    owned = owned_evidence(whole.settings, region)
-    assert 0 < len(owned.levels) < len(region.evidence.levels)
-    assert_part_of(owned, region.evidence)
-
-
 def test_a_checkpoint_writes_the_cubes_whose_levels_changed(tmp_path):
     first, second = RECORD.regions
     levels = first.evidence.levels.copy()
@@ -150,17 +140,3 @@ def test_a_checkpoint_writes_the_cubes_whose_levels_changed(tmp_path):
     path = write_record(tmp_path, following, known=known)
     assert [entry.key.topic for entry in known.values() if entry.epoch == 8] == [EVIDENCE]
     assert_same(read_map(path), following)
-
-
-def test_what_is_recovered_has_its_levels(tmp_path):
-    data = bytearray(file_bytes(RECORD))
-    chunk = len(data) // 2
-    data[chunk : chunk + 200] = bytes(200)
-    path = tmp_path / "broken.triquad"
-    path.write_bytes(data)
-    recovery = recover(path)
-    assert recovery.losses
-    whole = {region.index: region.evidence for region in RECORD.regions}
-    assert any(len(region.evidence.levels) for region in recovery.record.regions)
-    for region in recovery.record.regions:
-        assert_part_of(region.evidence, whole[region.index])

@@ -11,7 +11,6 @@ from triquad_map.compiled.evidence.contradictions import Disbelief
 from triquad_map.compiled.evidence.live_evidence import LiveEvidence
 from triquad_map.compiled.evidence.observations import outcome_counts
 from triquad_map.compiled.evidence.observed import Sighting
-from triquad_map.surface import SurfelKind, nothing_shown
 
 SIDE = 256
 RULE = Disbelief.of(scans=3, doubt=0.01)
@@ -136,36 +135,6 @@ def test_a_record_keeps_what_became_of_rays(rng: np.random.Generator) -> None:
     assert not np.median(passes[wall])
     again = LiveEvidence.from_record(SIDE, record).record()
     np.testing.assert_array_equal(again.outcomes, record.outcomes)
-
-
-def test_what_noise_spread_over_two_voxels_goes_as_well_after_a_restart(
-    rng: np.random.Generator,
-) -> None:
-    watched, x = Watched(), 59.95
-    for _ in range(8):
-        ends = panel(rng, x)
-        ends[:, 0] += rng.uniform(-0.15, 0.15, len(ends))
-        watched.scan(ends)
-    record = watched.evidence.record()
-    watched.evidence = LiveEvidence.from_record(SIDE, record)
-    voxels = seen_voxels(record, record.surface)
-    shown = nothing_shown(voxels)  # but the field shows the wall where it was
-    at_wall = voxels[:, 0] == 59
-    shown.kinds[at_wall], shown.normals[at_wall] = SurfelKind.DISC, (-1, 0, 0)
-    shown.offsets[at_wall, 0] = x - 59.5
-    watched.evidence.set_discs(voxels, shown)
-    middle = np.abs(voxels[:, 1:] + 0.5 - SENSOR[1:]).max(axis=1) < 6
-    spread = voxels[middle & (voxels[:, 0] == 60)]
-    gone, standing = (spread[spread[:, 2] % 2 == odd] for odd in (1, 0))
-    assert watched.believed(spread) == 1
-    for _ in range(20):
-        ends = panel(rng, x)
-        through = ends[:, 2].astype(np.int64) % 2 == 1  # every second row of voxels
-        ends[:, 0] += rng.uniform(-0.15, 0.15, len(ends))
-        ends[through] = behind(ends[through], 120.0)
-        watched.scan(ends)
-    assert watched.believed(gone) < 0.05
-    assert watched.believed(standing) == 1
 
 
 def test_nothing_goes_while_no_ray_passes(rng: np.random.Generator) -> None:

@@ -26,16 +26,6 @@ def test_a_new_region_learns_quicker_than_one_that_begins_at_random(leaf_m: floa
     assert np.mean(pretrained) < 0.95 * np.mean(at_random)
 
 
-def test_it_begins_alike_whatever_the_leaf_and_the_scale_of_the_logits() -> None:
-    fine = replace(DEFAULT, leaf_m=DEFAULT.leaf_m / 4, logit_scale_m=DEFAULT.logit_scale_m / 3)
-    points = near_the_ball(np.random.default_rng(0), 500)
-    first, second = (
-        leaves_at(grown(initial_field(settings, ARRAYS, 1)), points) for settings in (DEFAULT, fine)
-    )
-    assert np.ptp(first) > 0.01
-    np.testing.assert_allclose(second, first, rtol=1e-3, atol=1e-5)
-
-
 @pytest.mark.parametrize(
     "settings",
     [

@@ -64,38 +64,6 @@ def test_older_epochs_that_nobody_asked_for_go():
     assert caught.value.code == "epoch_gone"
 
 
-def test_an_epoch_that_is_asked_for_stays_for_its_time_and_each_time_renews_it():
-    clock = Clock()
-    epochs = history(kept=1, pinned=1, pin_s=30.0, clock=clock)
-    for number in range(2, 20):
-        assert not is_gone(epochs, 1)
-        clock.now += 30.0
-        epochs.add(epoch(number))
-        assert epochs.get(0).number == number
-    clock.now += 0.1
-    epochs.add(epoch(20))
-    assert is_gone(epochs, 1)
-
-
-def test_what_is_pinned_goes_also_where_no_newer_epoch_comes():
-    clock = Clock()
-    epochs = history(kept=1, pinned=1, pin_s=30.0, clock=clock)
-    epochs.get(1)
-    epochs.add(epoch(2))
-    clock.now = 31.0
-    epochs.remove_expired()
-    assert is_gone(epochs, 1)
-
-
-def test_of_too_many_pins_the_one_that_was_asked_for_longest_ago_goes():
-    epochs = history(kept=1, pinned=2)
-    for number in range(1, 4):
-        epochs.get(number)
-        epochs.add(epoch(number + 1))
-        assert not is_gone(epochs, 1), "it is asked for again and again"
-    assert [kept.number for kept in epochs.kept().epochs] == [1, 3, 4]
-
-
 @pytest.mark.parametrize("by_view", [False, True])
 def test_who_asks_for_an_epoch_by_number_has_the_others_let_go(by_view):
     clock = Clock()

@@ -63,15 +63,6 @@ def test_a_long_drive_remains_visible_as_a_whole():
     np.testing.assert_array_equal(follower.known["lidar"][0], trail)
 
 
-def test_jumps_without_end_are_bounded_too():
-    trails = SourceTrails(LEAF_M)
-    for step in range(3 * MAX_POSITIONS):
-        add(trails, (100.0 * (step % 2), 0, 0))
-    trail, pieces = whole(trails)
-    assert MAX_POSITIONS / 2 <= len(trail) <= MAX_POSITIONS
-    assert (np.diff(pieces) > 0).all()
-
-
 POSITIONS = st.tuples(
     st.sampled_from([-60.0, -1.0, 0.0, 0.1, 0.5, 1.0, 60.0]), st.just(0), st.just(0)
 )

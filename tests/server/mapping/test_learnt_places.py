@@ -70,14 +70,6 @@ def test_what_no_longer_gets_better_is_learnt() -> None:
     assert not places.need_training(ALL).any()
 
 
-def test_what_is_not_seen_is_not_said_to_be_learnt() -> None:
-    places = LearntPlaces(FIELD)
-    judged(places, off(0.01, 0.01))
-    for _ in range(4):
-        judged(places, off(0.01, 0.01), seen=FIRST)
-    assert (places.need_training(ALL) == ~FIRST).all()
-
-
 def test_where_surface_goes_all_is_to_be_learnt() -> None:
     places = learnt()
     places.surface_removed(ALL[[0, 1, -1]])
@@ -95,13 +87,6 @@ def test_where_the_rays_fit_no_more_all_is_to_be_learnt() -> None:
     assert not places.need_training(ALL).any()
     places.judge(ENDS, NOISE + off(0.01, 0.04), no_field, settled=True)
     assert places.need_training(ALL).all()
-
-
-def test_what_gets_better_slowly_is_not_learnt() -> None:
-    places = LearntPlaces(FIELD)
-    for step in range(8):
-        judged(places, off(0.3 * 0.92**step, 0.01))
-    assert (places.need_training(ALL) == FIRST).all()
 
 
 def test_one_place_that_cannot_be_learnt_does_not_decide_for_all_that_have_few_rays() -> None:

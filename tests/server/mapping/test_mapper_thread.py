@@ -165,16 +165,6 @@ def test_a_scan_that_cannot_be_read_for_a_defect_is_refused_and_mapping_goes_on(
         assert mapping.epochs.newest.regions == 1
 
 
-def test_older_epochs_are_let_go_while_mapping_is_paused() -> None:
-    quick = SETTINGS.model_copy(update={"publish_period_s": 0.01})
-    with running(learning_mapper(), settings=quick) as mapping:
-        while len(mapping.epochs.kept().epochs) < 2:
-            mapping.thread.publish_soon()
-        mapping.thread.pause()
-        while len(mapping.epochs.kept().epochs) > 1:
-            mapping.thread.wake()  # as a heartbeat does
-
-
 def test_pending_commands_fail_when_the_thread_will_not_come_to_them() -> None:
     thread = Mapping(Mapper("test", settings(), "cpu")).thread
     with ThreadPoolExecutor(1) as pool:

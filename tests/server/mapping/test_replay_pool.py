@@ -35,15 +35,6 @@ def whole(pool: ReplayPool) -> Batch:
     return pool.draw_on(np.arange(len(pool)))
 
 
-def test_it_is_bounded() -> None:
-    pool = new_pool(1000)
-    for i in range(30):
-        pool.add(labelled(place(i, 300)))
-        assert len(pool) == min(1000, 300 * (i + 1))
-    pool.add(labelled(place(0, 5000)))
-    assert len(pool) == 1000
-
-
 def test_a_place_left_long_ago_keeps_its_share() -> None:
     pool = new_pool(20_000)
     pool.add(labelled(place(-50, 5000), -1))
@@ -51,15 +42,6 @@ def test_a_place_left_long_ago_keeps_its_share() -> None:
         pool.add(labelled(place(50, 5000), 1))
     old = (whole(pool).labels < 0).sum()
     assert old > 3000, "a hundred scans elsewhere must not push it out"
-
-
-def test_the_newest_can_be_drawn_apart() -> None:
-    pool = new_pool(100_000)
-    pool.add(labelled(place(0, 50_000)))
-    pool.add(labelled(place(0, 100), 1))
-    labels = pool.draw(1000, 400).labels
-    assert 400 <= labels.sum() < 450
-    assert pool.draw(1000, 0).labels.sum() < 50
 
 
 def test_forgetting_a_box() -> None:

@@ -312,13 +312,6 @@ def test_tiles_made_at_the_same_time_meet_as_those_made_one_by_one() -> None:
         patchwork(together, epochs, 0)  # on their faces, all of them say the same
 
 
-def test_a_box_has_the_tiles_that_meet_it() -> None:
-    cache = TileCache(MESH, TEAM)
-    cache.refresh(ground(flat(0.3)))
-    delta = cache.delta(0, np.array([0.1, 0.1, 0.1]), np.array([1.7, 0.2, 0.2]), 0, {})
-    assert {index[:2] for index in delta.to_make} == {(0, 0), (1, 0)}
-
-
 def test_tiles_whose_bytes_went_are_made_again_and_stay_the_same() -> None:
     cache = TileCache(MeshSettings(tile_cells=16, cache_bytes=2000), TEAM)
     epoch = ground(flat(0.3))

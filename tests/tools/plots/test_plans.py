@@ -17,7 +17,6 @@ from triquad_tools.plots.plan import (
     FREE,
     HEIGHTS,
     UNKNOWN,
-    PlanGrid,
     Scale,
     draw_values,
 )
@@ -35,20 +34,6 @@ def share(pixels, colour):
 
 
 # Grids
-
-
-def test_a_grid_holds_its_points_in_cells_of_whole_leaves():
-    rng = np.random.default_rng(0)
-    for size_m, cell_m in ((30.0, 0.2), (200.0, 0.2), (300.0, 0.4), (5000.0, 6.4)):
-        points = rng.uniform(-0.5, 0.5, (1000, 2)) * [size_m, size_m / 10] + [7.0, -1000.0]
-        grid = PlanGrid.around(points, 0.2)
-        assert grid.cell_m == pytest.approx(cell_m)
-        np.testing.assert_allclose(grid.low_m / grid.cell_m, np.round(grid.low_m / grid.cell_m))
-        assert (points >= grid.low_m).all()
-        assert (points <= grid.high_m).all()
-        assert grid.columns <= 1200
-        assert grid.rows >= 0.2 * grid.columns
-        assert grid.marked(points).sum() <= 1000
 
 
 # Colours and legends

@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 from support.recordings.kitti_folder import write_folder
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.cloud import world_points
 from triquad_tools.recordings.folders.kitti import read_kitti_folder
 from triquad_tools.recordings.folders.scan_folder import ScanFolder
 
-DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
 IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0"
 
 
@@ -136,28 +134,3 @@ def test_bad_times_are_refused(tmp_path: Path, times: str) -> None:
     (_folder(tmp_path, f"{IDENTITY}\n" * count, count) / "times.txt").write_text(times)
     with pytest.raises(ToolError, match=r"times.txt:\d: "):
         read_kitti_folder(tmp_path)
-
-
-def _real(name: str) -> ScanFolder:
-    if not (DATA / name).is_dir():
-        pytest.skip(f"real scans {name} are not in ../shared/data")
-    return read_kitti_folder(DATA / name)
-
-
-@pytest.mark.parametrize(("name", "scans"), [("seosan01", 21), ("kitti07_mini", 5)])
-def test_real_folder_is_read(name: str, scans: int) -> None:
-    folder = _real(name)
-    assert len(folder) == scans
-    points = _points(folder, scans - 1)
-    assert len(points) > 15_000
-    assert np.isfinite(points).all()
-    assert np.all(np.diff(_stamps(folder)) > 0)
-
-
-def test_real_scans_agree_in_the_world_frame() -> None:
-    from scipy.spatial import cKDTree
-
-    folder = _real("seosan01")
-    first, second = map(world_points, folder.read([4, 5]))
-    distances = cKDTree(first).query(second[::20])[0]
-    assert np.median(distances) < 0.1
