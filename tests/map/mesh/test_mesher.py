@@ -129,15 +129,3 @@ def test_every_tile_with_faces_is_listed_however_small_tiles_are() -> None:
         x, y, z = (np.floor(low / side).astype(int) + offset).tolist()
         if len(mesh_tile(epoch, (x, y, z), lattice).faces):
             assert (x, y, z) in listed
-
-
-def test_tiles_are_those_that_meet_the_bounds(epoch: Epoch) -> None:
-    everything = surface_tiles(epoch, LATTICE)
-    assert LATTICE.meets(everything, np.full(3, -np.inf), np.full(3, np.inf)).all()
-    side = LATTICE.tile_side_m
-    tiles = {tuple(tile) for tile in everything.tolist()}
-    seen = {tuple(tile) for tile in np.floor(world(4).hits / side).astype(int).tolist()}
-    assert seen <= tiles
-    low, high = np.array([0.1, 0.1, -1.0]), np.array([side + 0.1, side - 0.1, 1.0])
-    some = everything[LATTICE.meets(everything, low, high)]
-    assert {tuple(tile) for tile in some[:, :2].tolist()} == {(0, 0), (1, 0)}

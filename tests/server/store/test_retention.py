@@ -83,7 +83,7 @@ def test_what_is_no_file_does_not_stop_the_retention(tmp_path):
         os.mkfifo(store.folder / "epoch-000000000.triquad")
         (store.folder / "epoch-000000001.checkpoint").symlink_to("nowhere")
         for epoch in range(2, 6):
-            store.write(changes(grown(epoch, epoch)))
+            store.write(changes(grown(1, epoch)))
         assert sorted(paths(store)) == [4, 5]
 
 
@@ -102,7 +102,7 @@ def test_a_mark_that_moves_to_a_later_checkpoint_counts_once(tmp_path):
     """As of a reset during which scans arrive: the map is written before and after them."""
     with closing(Store(tmp_path, "lab", StoreSettings(keep=2, keep_resets=2))) as store:
         for epoch in range(1, 12):
-            store.write(changes(grown(epoch, epoch)))
+            store.write(changes(grown(1, epoch)))
             if epoch in (2, 5, 8):
                 store.mark_newest("a reset")
             if epoch in (3, 6, 9):
@@ -118,7 +118,7 @@ def test_a_checkpoint_that_is_replaced_within_a_tick_of_the_clock_is_read_again(
         write_checkpoint(path, dataclasses.replace(read_checkpoint(path), undoes="a reset"))
         os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
         for epoch in range(2, 5):
-            store.write(changes(grown(epoch, epoch)))
+            store.write(changes(grown(1, epoch)))
         assert sorted(paths(store)) == [1, 3, 4]
 
 

@@ -3,7 +3,6 @@ import pytest
 import triquad_client
 from matplotlib import colormaps
 from matplotlib.colors import to_rgb
-from matplotlib.figure import Figure
 from matplotlib.image import imread
 from support import servers
 from support.files.checkpoint_folder import write_checkpoints
@@ -15,10 +14,7 @@ from triquad_tools.commands.inspect import main
 from triquad_tools.plots.diff_plan import APPEARED, VANISHED
 from triquad_tools.plots.plan import (
     FREE,
-    HEIGHTS,
     UNKNOWN,
-    Scale,
-    draw_values,
 )
 from triquad_tools.plots.slice_plan import SURFACE
 
@@ -46,19 +42,6 @@ def test_what_is_not_known_has_a_colour_of_its_own(name):
         assert np.abs(colours - to_rgb(other)).max(axis=1).min() > 0.2
     lightness = colours @ [0.2126, 0.7152, 0.0722]
     assert (np.diff(lightness) > 0).all() or (np.diff(lightness) < 0).all()
-
-
-@pytest.mark.parametrize(
-    ("values", "extend"),
-    [((0.0, 1.0), "neither"), ((-1.0, 1.0), "min"), ((0.0, 9.0), "max"), ((-1.0, 9.0), "both")],
-)
-def test_a_scale_says_what_lies_beyond_it(values, extend):
-    axes = Figure().subplots()
-    draw_values(axes, np.array([[*values, np.nan]]), Scale("height in m", HEIGHTS, 0.0, 1.0))
-    (image,) = axes.images
-    assert image.colorbar.extend == extend
-    assert image.colorbar.ax.get_ylabel() == "height in m"
-    assert image.get_clim() == (0.0, 1.0)
 
 
 # What the plans show

@@ -4,8 +4,6 @@ import dataclasses
 
 import msgpack
 import numpy as np
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from support.files.checkpoint_folder import write_record
 from support.files.mapfile_edit import (
     file_bytes,
@@ -17,7 +15,7 @@ from support.maps.map_records import SMALL, assert_same, evidence_of, random_rec
 from triquad_format.mapfile.parts.part import EVIDENCE
 from triquad_format.mapfile.reader import read_map
 from triquad_format.records.crop import crop_record
-from triquad_format.records.region import masked, seen_voxels
+from triquad_format.records.region import seen_voxels
 from triquad_map.compiled.evidence.observations import outcome_codes
 
 CUBES = dataclasses.replace(SMALL, depth=9)
@@ -98,20 +96,6 @@ def test_literal_bytes_of_outcomes():
     planes = b"\x00\x04\x00\x02\x00\x00\x00\x02\x02\x02"
     stored = {"dtype": "|u1", "shape": [10, 1], "data": planes}
     assert msgpack.unpackb(part.payload)["outcomes"] == stored
-
-
-@settings(max_examples=60, deadline=None)
-@given(seed=st.integers(0, 999))
-def test_masked_voxels_take_their_levels_with_them(seed):
-    evidence = with_support(record_of(blocks(seed, 8)), seed).regions[0].evidence
-    rng = np.random.default_rng(seed)
-    mask = rng.integers(0, 256, evidence.surface.shape).astype(np.uint8)
-    mask[rng.random(len(mask)) < 0.5] = 0
-    kept = masked(evidence, mask)
-    assert_part_of(kept, evidence)
-    left = dataclasses.replace(evidence, surface=evidence.surface & mask)
-    want = set(map(tuple, seen_voxels(left, left.surface).tolist()))
-    assert level_of(kept).keys() == want
 
 
 def test_a_crop_keeps_the_levels_of_what_it_keeps():
