@@ -51,7 +51,7 @@ from triquad_format.records.region import MapRecord
 from triquad_format.recovery.recovered_map import recover
 
 CAMPAIGN = os.environ.get("TRIQUAD_FUZZ")
-COUNT = int(CAMPAIGN or 40)
+COUNT = int(CAMPAIGN or 20)
 LIMIT_BYTES = 64 * 2**20
 """Memory that a reader may take beside the size of the file."""
 
@@ -167,8 +167,6 @@ def little_memory(file_bytes: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_AS, before)
         tracemalloc.stop()
 
-
-# Damage at chosen places
 
 RECORD = random_record(6, indices=((0, 0, 0), (1, 0, 0)))
 DATA = file_bytes(RECORD, preview=True)

@@ -51,13 +51,13 @@ VARIANTS = {
         points=400,
     ),
     "no features": map_records.random_record(
-        7, settings=dataclasses.replace(SMALL, encoding="fourier", depth=7), points=2000
+        7, settings=dataclasses.replace(SMALL, encoding="fourier", depth=7), points=1000
     ),
     "many squares": map_records.random_record(
-        8, settings=WIDE, indices=((0, 0, 0), (0, 1, 0)), points=3000
+        8, settings=WIDE, indices=((0, 0, 0), (0, 1, 0)), points=2000
     ),
     "support": map_records.with_support(
-        map_records.random_record(12, settings=WIDE, indices=((0, 0, 0), (0, 1, 0)), points=3000)
+        map_records.random_record(12, settings=WIDE, indices=((0, 0, 0), (0, 1, 0)), points=1000)
     ),
     "no vertices": map_records.random_record(9, points=0),
     "settings as they are by default": map_records.random_record(

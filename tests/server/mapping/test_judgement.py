@@ -104,8 +104,8 @@ def test_rays_are_held_out_from_training_and_after_a_restart() -> None:
 
 
 def test_a_region_is_not_judged_by_rays_that_end_beside_it() -> None:
-    chosen = settings(samples_per_ray=6.0).model_copy(update={"field": FieldSettings(depth=6)})
-    mapper = settled_mapper(chosen, world())
+    chosen = settings(samples_per_ray=2.0).model_copy(update={"field": FieldSettings(depth=6)})
+    mapper = settled_mapper(chosen, world(2))
     mapper.publish()
     ends = [region.training.rays.held_out.table.rows[:, END : END + 3] for region in mapper.regions]
     inside = sum(in_cube(of_region, chosen.field).sum() for of_region in ends)

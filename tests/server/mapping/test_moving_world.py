@@ -185,11 +185,11 @@ def test_a_restored_map_stays_until_rays_contradict_it() -> None:
     voxels = surface_voxels(before.evidence)
     watched.restart()
     assert main_region(watched.mapper.publish()).evidence.ended_in(voxels).all()
-    same = main_region(watched.scan(BOX, count=12)).evidence
+    same = main_region(watched.scan(BOX, count=6)).evidence
     assert same.ended_in(voxels).mean() > 0.997
     watched.restart()
     watched.mapper.publish()
-    assert share(watched.scan(count=20), Status.SURFACE, front=True) < 0.05
+    assert share(watched.scan(count=14), Status.SURFACE, front=True) < 0.05
 
 
 @pytest.mark.long
@@ -206,7 +206,7 @@ def test_rays_that_come_back_from_beyond_the_range_contradict() -> None:
 
 def test_confidence_falls_before_it_is_removed() -> None:
     watched = Watched()
-    before = watched.scan(BOX, count=8, steps=40).nearest_surface(faces(), 0.3)
+    before = watched.scan(BOX, count=8, steps=15).nearest_surface(faces(), 0.3)
     after = watched.scan(count=1, steps=0).nearest_surface(faces(), 0.3)
     still = before.found & after.found
     assert still.mean() > 0.5

@@ -23,10 +23,10 @@ from triquad_tools.sensors.sweep import moved
 def test_regions_meet_without_hole_or_step() -> None:
     """The sensor drives over the border of two regions; the ground must go on."""
     chosen = Settings.model_validate(
-        {"field": {"depth": 7}, "training": {"batch": 4096, "samples_per_ray": 18.0}}
+        {"field": {"depth": 7}, "training": {"batch": 4096, "samples_per_ray": 9.0}}
     )
     border = chosen.field.region_pitch_m / 2
-    drive_through = world(8)
+    drive_through = world(5)
     moved = np.eye(4)
     moved[0, 3] = border - np.mean([scan.world_from_sensor[0, 3] for scan in drive_through.scans])
     mapper = Mapper("test", chosen, "cpu")
@@ -45,7 +45,7 @@ def test_regions_meet_without_hole_or_step() -> None:
 
 
 def test_a_street_across_a_corner_of_regions_is_nearly_as_right_as_in_the_middle_of_one() -> None:
-    chosen = Settings.model_validate({"training": {"samples_per_ray": 18.0}})
+    chosen = Settings.model_validate({"training": {"batch": 4096, "samples_per_ray": 12.0}})
     block_m = BLOCK_VOXELS * chosen.field.leaf_m
     corner = np.round(chosen.field.region_pitch_m / 2 / block_m) * block_m
     errors = [

@@ -2,15 +2,14 @@
 
 import numpy as np
 import pytest
-from support.maps.exact_maps import flat
+from support.maps.exact_maps import SETTINGS, exact_map, flat
 from support.maps.meshed_ground import EVERYWHERE, MESH, bump, ground, make_all, surfaces
-from support.maps.small_world import settings, settle, world
 from triquad_format.wire.limits import LEVELS
 from triquad_map.mesh.tile_lattice import TileIndex
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.tile_cache import TileCache, tile_lattice
 from triquad_server.process.threads import Teams
-from triquad_server.settings import MeshSettings
+from triquad_server.settings import MeshSettings, Settings
 
 TEAM = Teams().meshing
 
@@ -53,11 +52,8 @@ def test_what_moves_by_less_than_the_tolerance_changes_nothing_until_it_adds_up(
 
 
 def test_surface_that_is_forgotten_goes_and_everybody_is_told() -> None:
-    chosen = settings().model_copy(update={"mesh": MESH})
-    mapper = Mapper("test", chosen, "cpu")
-    for scan in world(2).scans:
-        mapper.ingest(scan.points, scan.world_from_sensor)
-    settle(mapper)
+    chosen = Settings(field=SETTINGS, mesh=MESH)
+    mapper = Mapper("test", chosen, "cpu", exact_map(flat(0.3)))
     cache = TileCache(MESH, TEAM)
     cache.refresh(mapper.publish())
     make_all(cache)
