@@ -26,28 +26,6 @@ def test_a_new_region_learns_quicker_than_one_that_begins_at_random(leaf_m: floa
     assert np.mean(pretrained) < 0.95 * np.mean(at_random)
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        replace(DEFAULT, encoding="fourier"),
-        replace(DEFAULT, hidden=16),
-        replace(DEFAULT, feature_size=4),
-        replace(DEFAULT, feature_levels=2, feature_size=12),
-        replace(DEFAULT, feature_std=1.0),
-    ],
-    ids=[
-        "no features",
-        "narrower",
-        "shorter features",
-        "as many features of other levels",
-        "larger features",
-    ],
-)
-def test_other_shapes_begin_at_random(settings: FieldSettings) -> None:
-    one, other = (initial_field(settings, ARRAYS, seed).arrays.mlp for seed in (1, 2))
-    assert not any(np.array_equal(*parts) for parts in zip(one, other, strict=True))
-
-
 def begun_at_random(settings: FieldSettings, seed: int) -> LiveField:
     generator = np.random.default_rng(seed)
     frequencies = initial_field(settings, ARRAYS, seed).arrays.frequencies

@@ -135,7 +135,7 @@ def test_a_map_that_forgets_again_and_again_settles() -> None:
 def test_where_all_rays_are_held_out_there_is_nothing_to_train_on() -> None:
     """Scans of a single point: some are held out, and nothing else is known."""
     ends = np.array([[5.0 + shift_m, 0.1, 0.1] for shift_m in np.arange(0, 0.2, 0.002)], np.float32)
-    are_alone = are_held_out(np.insert(ends, 3, 0, axis=1), FIELD)
+    are_alone = are_held_out(np.insert(ends, 3, 0, axis=1), settings().field)
     alone = 0
     for end in (ends[are_alone][0], ends[~are_alone][0]):
         mapper = Mapper("test", settings(), "cpu")

@@ -206,7 +206,7 @@ def test_rays_that_come_back_from_beyond_the_range_contradict() -> None:
 
 def test_confidence_falls_before_it_is_removed() -> None:
     watched = Watched()
-    before = watched.scan(BOX, count=8, steps=15).nearest_surface(faces(), 0.3)
+    before = watched.scan(BOX, count=8, steps=40).nearest_surface(faces(), 0.3)
     after = watched.scan(count=1, steps=0).nearest_surface(faces(), 0.3)
     still = before.found & after.found
     assert still.mean() > 0.5

@@ -44,20 +44,6 @@ def test_a_place_left_long_ago_keeps_its_share() -> None:
     assert old > 3000, "a hundred scans elsewhere must not push it out"
 
 
-def test_forgetting_a_box() -> None:
-    pool = new_pool(10_000)
-    points = place(0, 6000)
-    pool.add(labelled(points))
-    low, high = np.array([1.0, 0.0, 0.0]), np.array([2.0, 4.0, 4.0])
-    pool.forget(low, high)
-    inside = ((points >= low) & (points <= high)).all(axis=1).sum()
-    assert len(pool) == 6000 - inside
-    left = whole(pool).points
-    assert not ((left >= low) & (left <= high)).all(axis=1).any()
-    pool.add(labelled(place(1, 3000)))
-    assert len(pool) == 9000 - inside
-
-
 def test_the_smallest_pools_work() -> None:
     for capacity in (1, 2, 3):
         pool = new_pool(capacity)

@@ -143,9 +143,7 @@ def test_images_of_colour_or_8_bits_are_refused(tmp_path, mode):
     ("text", "words"),
     [
         ("{", "has no width, height and intrinsic_matrix"),
-        ("[1, 2]", "has no width"),
         ('{"width": 64, "height": 48}', "'intrinsic_matrix'"),
-        ('{"width": 64, "height": 48, "intrinsic_matrix": [1, 2]}', "has no width"),
         (
             '{"width": 64, "height": 48, "intrinsic_matrix": [60, 0, 31, 0, 60, 23, 0, 0, 1]}',
             "column by column",
