@@ -206,8 +206,11 @@ def test_rays_that_come_back_from_beyond_the_range_contradict() -> None:
 
 def test_confidence_falls_before_it_is_removed() -> None:
     watched = Watched()
-    before = watched.scan(BOX, count=8, steps=40).nearest_surface(faces(), 0.3)
+    before = watched.scan(BOX, count=8, steps=15).nearest_surface(faces(), 0.3)
     after = watched.scan(count=1, steps=0).nearest_surface(faces(), 0.3)
     still = before.found & after.found
     assert still.mean() > 0.5
-    assert after.confidence[still].mean() < before.confidence[still].mean() - 0.01
+    fell = after.confidence[still] < before.confidence[still]
+    rose = after.confidence[still] > before.confidence[still]  # what is nearest may be another disc
+    assert fell.mean() > 0.3
+    assert rose.mean() < 0.5 * fell.mean()
