@@ -103,7 +103,7 @@ def test_regions_are_split_into_squares_and_cubes(integers: bool) -> None:
     assert_same(read_bytes(data), record)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     seed=st.integers(0, 2**32 - 1),
     points=st.integers(0, 30),

@@ -187,9 +187,10 @@ def epoch():
     return settled_mapper(chosen, world(10)).publish()
 
 
-def area_m2(x, y):
+def area_m2(x, y, step_m=0.1):
     """Points [N, 3] all over a rectangle at height 0."""
-    over = np.stack(np.meshgrid(np.arange(*x, 0.1), np.arange(*y, 0.1)), axis=-1).reshape(-1, 2)
+    axes = np.arange(*x, step_m), np.arange(*y, step_m)
+    over = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
     return np.column_stack([over, np.zeros(len(over))])
 
 
@@ -235,7 +236,8 @@ def test_a_preview_is_bounded_however_much_was_seen():
         x, y, z = points.T
         return z - 0.3 * np.sin(3 * x) * np.sin(3 * y)
 
-    seen = np.concatenate([area_m2((-75, 75), (-75, 75)) + [0, 0, z] for z in (-0.2, 0, 0.2)])
+    over = area_m2((-75, 75), (-75, 75), SETTINGS.leaf_m)
+    seen = np.concatenate([over + [0, 0, z] for z in (-0.2, 0, 0.2)])
     mesh = mesh_of_seen(seen, bumps)
     assert FACES_MIN / 10 < len(mesh.faces) <= FACES_MIN  # of a field of few parameters
-    assert share_near(area_m2((-70, 70), (-70, 70))[::50], samples(mesh), 5.0) == 1.0
+    assert share_near(area_m2((-70, 70), (-70, 70), 0.7), samples(mesh), 5.0) == 1.0

@@ -21,7 +21,7 @@ from triquad_map.view import MapView
 
 
 @given(st.integers(0, 10**6), st.integers(0, 300), st.floats(0.3, 80.0))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_the_nearest_surfel_is_the_same(seed, count, reach):
     rng = np.random.default_rng(seed)
     live = LiveEvidence(64)

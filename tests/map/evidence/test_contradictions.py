@@ -102,7 +102,7 @@ def test_ground_is_not_taken_back_by_rays_that_graze_it(rng: np.random.Generator
     assert watched.believed(first) > 0.998
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(share=st.floats(0.15, 0.9), seed=st.integers(0, 1000))
 def test_what_is_hit_and_missed_by_turns_stays(share: float, seed: int) -> None:
     """A fence: of the rays to a voxel, this share ends there, and the others go on."""

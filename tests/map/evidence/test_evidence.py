@@ -51,7 +51,7 @@ def test_a_ray_from_outside_carves_inside_only() -> None:
     assert evidence.freeze().status(voxel(SIDE + 2, 31, 30.6))[0] == Status.UNKNOWN
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 3000))
 def test_it_remembers_exactly_the_marked_voxels(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
@@ -141,7 +141,7 @@ def crossed(origin: np.ndarray, end: np.ndarray, least: float) -> set[tuple[int,
     return {tuple(v) for v in voxels.tolist() if min(v) >= 0 and max(v) < SIDE}
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 40))
 def test_open_rays_mark_the_voxels_that_they_cross_and_no_others(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
@@ -185,7 +185,7 @@ def test_threads_freeze_the_same_as_one() -> None:
         evidence = LiveEvidence(SIDE)
         for scan in range(1, 4):
             sighting = Sighting(np.full(3, 5.0 * scan), 0.2, scan, scan)
-            evidence.mark_surface(ends[:: 2 * scan], sighting)
+            evidence.mark_surface(np.ascontiguousarray(ends[:: 2 * scan]), sighting)
         return evidence
 
     def in_parts(count: int, work: Work, least: int = 0) -> None:

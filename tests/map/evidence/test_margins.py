@@ -92,7 +92,7 @@ def slowly_near_ends(record: Evidence, points: Doubles, reach: float) -> Bools:
     return np.asarray(near.any(axis=0))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     seed=st.integers(0, 10_000),
     count=st.integers(0, 200),
@@ -115,7 +115,7 @@ def test_all_ways_to_ask_agree(seed: int, count: int, scans: int, reach: float) 
     assert is_surface[have].all()
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     seed=st.integers(0, 10_000),
     count=st.integers(0, 200),
@@ -135,7 +135,7 @@ def test_a_grid_has_surface_where_its_points_have(
     np.testing.assert_array_equal(frozen.surface_in_grid(axes, reach), expected)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(seed=st.integers(0, 10_000), count=st.integers(1, 200), scans=st.integers(1, MANY))
 def test_margins_outlast_a_restart(seed: int, count: int, scans: int) -> None:
     ends = random_ends(seed, count)

@@ -39,7 +39,7 @@ def client(endpoint):
             client.publish_scan(scan.points, scan.world_from_sensor)
             client.flush(servers.WAIT_S, pending=2)
         client.flush(servers.WAIT_S)
-        client.settle(servers.WAIT_S)
+        client.settle(5 * servers.WAIT_S)
         yield client
 
 

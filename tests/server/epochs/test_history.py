@@ -3,7 +3,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support.servers import WAIT_S
 from triquad_format.errors import RefusedError
@@ -147,7 +147,6 @@ DEEDS = st.one_of(
 )
 
 
-@settings(deadline=None)
 @given(st.integers(1, 4), st.integers(0, 4), st.lists(DEEDS, max_size=60))
 def test_whatever_is_asked_when_an_epoch_goes_only_where_it_may(kept, pinned, deeds):
     pin_s = 10.0
@@ -179,7 +178,6 @@ def test_whatever_is_asked_when_an_epoch_goes_only_where_it_may(kept, pinned, de
         assert epochs.newest.number == newest
 
 
-@settings(deadline=None)
 @given(st.integers(1, 4), st.integers(0, 4), st.integers(5, 30), st.data())
 def test_no_more_stay_than_may(kept, pinned, count, data):
     epochs = history(kept, pinned)

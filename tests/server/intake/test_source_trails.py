@@ -1,7 +1,7 @@
 import tracemalloc
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from triquad_format.wire.messages import Scan
 from triquad_server.intake.rays import ScanRays
@@ -76,7 +76,6 @@ STEPS = st.lists(
 )
 
 
-@settings(deadline=None)
 @given(STEPS)
 def test_whenever_one_asks_the_news_make_up_the_whole(steps):
     trails, follower, taken = SourceTrails(LEAF_M), Follower(), 0
