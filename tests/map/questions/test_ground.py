@@ -21,7 +21,7 @@ from triquad_server.settings import Settings
 
 VOXEL_M = 0.2
 SETTINGS = Settings.model_validate(
-    {"field": {"depth": 8}, "training": {"batch": 4096, "samples_per_ray": 5.0}}
+    {"field": {"depth": 8}, "training": {"batch": 4096, "samples_per_ray": 10.0}}
 )
 
 
