@@ -27,14 +27,17 @@ INSTALLED = $(VENV)/.installed
 demo: $(INSTALLED_DEMO)
 	$(BIN)/triquad-demo --out demo-out
 
-# Kernels are compiled once, not by every process that tests. Three of these keep two cores busy, as
-# tests wait for servers; with threads of torch's own they would wait for each other.
+# Kernels, those of a server and those of the simulator, are compiled once, not by every process
+# that tests. Three of these keep two cores busy, as tests wait for servers; with threads of torch's
+# own they would wait for each other.
 test: $(INSTALLED)
 	$(MAKE) -j2 check kernels
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 3 -m "not long" --durations=10
 
 kernels: $(INSTALLED)
 	$(BIN)/python -m triquad_server.warm_up
+	PYTHONPATH=tests $(BIN)/python -c \
+	  "from support.maps.small_world import world; world(1).scene.sdf(world(1).hits)"
 
 test-long: kernels
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 3 -m long --durations=10

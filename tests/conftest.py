@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 _KNOWN = Path(__file__).with_name("durations.json")
 _GREW_S = 5.0  # the least growth of a file that is listed
@@ -61,6 +62,8 @@ def _read(path: Path) -> dict[str, float]:
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    settings.register_profile("untimed", deadline=None)  # a busy machine is no fault
+    settings.load_profile("untimed")
     config.pluginmanager.register(Kernels())
     if not hasattr(config, "workerinput"):  # the process that hears of all workers
         config.pluginmanager.register(Durations(config))

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from bench import __main__ as bench
-from bench.figures import Figure, compare
+from bench.figures import Figure
 from bench.results import PAGE, RESULTS, Result, page
 
 MEASURED = Result(
@@ -31,14 +31,6 @@ def test_a_figure_keeps_to_its_bounds_or_not() -> None:
     assert not Figure("ratio", 1.3, "", at_least=0.8, at_most=1.2).kept
     assert not Figure("time", math.nan, "s", at_most=3.0).kept
     assert Figure("bytes", 7.0, "MB").kept
-
-
-def test_both_ways_are_timed_in_turns() -> None:
-    calls: list[str] = []
-    result = compare(lambda: calls.append("new"), lambda: calls.append("old"), 3, repeats=2)
-    assert calls == ["new", "old", *["new", "new", "old"] * 3]
-    assert result.seconds > 0
-    assert result.ratio > 0
 
 
 def test_the_page_tells_what_is_missed_and_why(tmp_path: Path) -> None:

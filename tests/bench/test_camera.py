@@ -33,13 +33,6 @@ def test_the_frame_is_the_optical_one() -> None:
     np.testing.assert_allclose(scan.points[:, 1], 1.0, atol=1e-5)  # the ground is below
 
 
-def test_the_image_is_as_wide_as_the_camera_sees() -> None:
-    scan = QUIET.scan(wall(1.0), AHEAD, np.random.default_rng(0))
-    half_width = np.tan(np.radians(69.0 / 2)) * 63 / 64
-    assert scan.points[:, 0].max() == pytest.approx(half_width, rel=1e-5)
-    assert scan.points[:, 0].min() == pytest.approx(-half_width, rel=1e-5)
-
-
 @pytest.mark.parametrize(("depth_m", "deviation_m"), [(0.5, 0.001375), (2.0, 0.007), (5.0, 0.0385)])
 def test_noise_grows_with_the_square_of_the_depth(depth_m: float, deviation_m: float) -> None:
     scan = SMALL.scan(wall(depth_m), AHEAD, np.random.default_rng(1))

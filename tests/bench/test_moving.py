@@ -1,12 +1,9 @@
 """The part of the benchmark in which things move, on very few scans of a coarse lidar."""
 
-import numpy as np
 import pytest
-from triquad_format.records.arrays import Doubles, Longs
 from triquad_tools.simulation.lidar import Lidar
-from triquad_tools.simulation.scene import Scene
 
-from bench.parts.moving import Followed, Look, follow
+from bench.parts.moving import Followed, follow
 from bench.scenes.traffic import Traffic, street_traffic, thin_things
 
 BUSY, EMPTY = 6, 10
@@ -26,28 +23,6 @@ def followed(traffic: Traffic) -> Followed:
     return follow(traffic, THIN, (0, EMPTY))
 
 
-def test_a_map_is_looked_at_when_it_should_be(traffic: Traffic, followed: Followed) -> None:
-    assert list(followed.looks) == [0, EMPTY]
-    assert len(followed.ingest_s) == len(traffic)
-    busy, empty = followed.looks.values()
-    assert busy.epoch.number < empty.epoch.number
-    assert len(empty.static) > len(busy.static)
-
-
-def test_the_trail_is_where_only_moving_things_were(followed: Followed) -> None:
-    look = followed.looks[0]
-    assert len(look.trail) > 100
-    assert look.scene.sdf(look.trail).min() > 0.35
-    assert len(together(look, look.trail, look.static)) == len(look.trail) + len(look.static)
-
-
-def test_thin_things_are_among_what_stands(followed: Followed) -> None:
-    look = followed.looks[EMPTY]
-    assert len(look.thin) > 50
-    assert np.abs(Scene(THIN, look.scene.bounds).sdf(look.thin)).max() < 0.2
-    assert len(together(look, look.thin, look.static)) == len(look.static)
-
-
 def test_what_moved_is_forgotten_and_what_stands_is_kept(followed: Followed) -> None:
     busy, empty = followed.looks.values()
     assert busy.trail_left > 0.8
@@ -63,9 +38,3 @@ def test_the_lane_is_free_once_nothing_drives_there(followed: Followed) -> None:
     busy, empty = followed.looks.values()
     assert busy.lane_blocked_m > 3
     assert empty.lane_blocked_m < busy.lane_blocked_m
-
-
-def together(look: Look, *voxels: Doubles) -> Longs:
-    """The voxels that have some of these centres."""
-    cells = np.rint(np.concatenate(voxels) / look.epoch.voxel_m - 0.5).astype(np.int64)
-    return np.unique(cells, axis=0)

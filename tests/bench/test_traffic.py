@@ -39,25 +39,6 @@ def test_in_the_end_the_street_is_as_if_nothing_had_moved(traffic: Traffic) -> N
         np.testing.assert_array_equal(scan.points, traffic.standing.scan(index).points)
 
 
-def test_a_scan_is_always_the_same(traffic: Traffic) -> None:
-    again = street_traffic(3, BUSY, BUSY + 2, LIDAR).scan(4)
-    np.testing.assert_array_equal(again.points, traffic.scan(4).points)
-    other = street_traffic(4, BUSY, BUSY + 2, LIDAR).scan(4)
-    assert len(other.points) != len(again.points) or (other.points != again.points).any()
-
-
-def test_thin_things_stand_where_they_were_asked_for_and_are_thin() -> None:
-    low, high = np.array([6.0, -3.8, -0.3]), np.array([18.1, -1.2, 2.8])
-    scene = Scene(tuple(thin_things(6.0, -2.5)), np.array([low - 1, high + 1]))
-    points = np.random.default_rng(0).uniform(low - 1, high + 1, (400_000, 3))
-    distances = scene.sdf(points)
-    inside = points[distances < 0]
-    assert len(inside) > 10
-    assert (inside > low - 0.05).all()
-    assert (inside < high + 0.05).all()
-    assert distances.min() > -0.0201  # half of 4 cm
-
-
 def test_things_that_stand_among_others_are_seen_and_do_not_move(traffic: Traffic) -> None:
     things = thin_things(6.0, -2.5)
     scan = traffic.among(things).scan(4)

@@ -102,28 +102,12 @@ def test_neither_epoch_nor_time(folder: Path, when: str) -> None:
         checkpoint_at(folder, when)
 
 
-def test_an_empty_folder(tmp_path: Path) -> None:
-    assert checkpoint_files(tmp_path) == []
-    with pytest.raises(MapFileError, match="or before, but nothing"):
-        checkpoint_at(tmp_path, "5")
-
-
 def test_by_time_damaged_and_unstamped_files_are_passed_over(folder: Path) -> None:
     (folder / checkpoint_name(8)).write_bytes(b"damaged")
     assert checkpoint_at(folder, "2030-01-01T00:00:00Z").epoch == 5
     write_checkpoint(folder, 42, hours=None)
     assert checkpoint_at(folder, "2030-01-01T00:00:00Z").epoch == 5
     assert checkpoint_at(folder, "42").epoch == 42
-
-
-def test_open_manifest(folder: Path) -> None:
-    manifest = open_manifest(checkpoint_at(folder, "5"))
-    assert manifest.facts.epoch == 5
-    assert manifest.stamp_ns == NOON_NS + HOUR_NS
-    broken = folder / checkpoint_name(3)
-    broken.write_bytes(broken.read_bytes()[:-50])
-    with pytest.raises(DamagedMapFileError, match=broken.name):
-        open_manifest(checkpoint_at(folder, "3"))
 
 
 def test_map_folder(folder: Path) -> None:

@@ -44,19 +44,6 @@ def test_a_crop_answers_in_the_box_as_before(low, high):
     np.testing.assert_array_equal(before.gradient, after.gradient)
 
 
-def test_a_crop_keeps_the_training_budget_of_the_samples_it_keeps():
-    record = random_record(4, points=100)
-    before = record.regions[0].training
-    after = crop_record(record, [-100, -100, 0], [100, 100, 100]).regions[0].training
-    kept = len(after.sample_points)
-    assert 0 < kept < 100
-    assert after.budget_samples == math.ceil(before.budget_samples * kept / 100)
-    empty = crop_record(record, [7.9, 7.9, 7.9], [7.95, 7.95, 7.95]).regions[0].training
-    assert len(empty.sample_points) == empty.budget_samples == 0
-    everything = crop_record(record, [-100] * 3, [100] * 3).regions[0].training
-    assert everything.budget_samples == before.budget_samples
-
-
 def test_a_crop_keeps_the_rays_that_end_in_the_box():
     record = with_rays(random_record(4, points=100))
     before = record.regions[0].training

@@ -133,23 +133,6 @@ def test_hostile_integers(case: str) -> None:
     assert_refused(edited(file_bytes(with_integers(random_record(12))), VERTICES, edit))
 
 
-HOSTILE_LEVELS: dict[str, tuple[Edit, str]] = {
-    "levels of fewer voxels": (shorten("levels", 1), "levels: expected an array [3, 5]"),
-    "levels of astronomic size": (set_field("levels", ASTRONOMIC), "levels: shape"),
-    "times of fewer blocks": (shorten("seen_s", 1), "seen_s: expected an array"),
-    "times after nothing": (lambda b: b.pop("seen_from_s"), "seen_from_s = None is not int"),
-    "times before 1970": (set_field("seen_from_s", -400), "seen_from_s = -400 is not a count"),
-    "times that pass the end": (set_field("seen_from_s", 9_223_372_036), "time lies outside"),
-    "outcomes of fewer voxels": (shorten("outcomes", 1), "outcomes: expected an array [10, 5]"),
-}
-
-
-@pytest.mark.parametrize("case", HOSTILE_LEVELS)
-def test_hostile_levels(case: str) -> None:
-    edit, message = HOSTILE_LEVELS[case]
-    assert_refused(edited(DATA, EVIDENCE, edit), re.escape(message))
-
-
 def first_byte(key: str, value: int) -> Edit:
     """Replace the first byte of an array."""
 
@@ -159,8 +142,27 @@ def first_byte(key: str, value: int) -> Edit:
     return edit
 
 
-HOSTILE_RAYS: dict[str, tuple[str, Edit, str]] = {
-    "none announced": (TRAINING, lambda b: b.pop("rays"), "rays = None"),
+HOSTILE_AND_TOLD: dict[str, tuple[str, Edit, str]] = {
+    "levels of fewer voxels": (EVIDENCE, shorten("levels", 1), "levels: expected an array [3, 5]"),
+    "levels of astronomic size": (EVIDENCE, set_field("levels", ASTRONOMIC), "levels: shape"),
+    "times of fewer blocks": (EVIDENCE, shorten("seen_s", 1), "seen_s: expected an array"),
+    "times after nothing": (
+        EVIDENCE,
+        lambda b: b.pop("seen_from_s"),
+        "seen_from_s = None is not int",
+    ),
+    "times before 1970": (EVIDENCE, set_field("seen_from_s", -400), "-400 is not a count"),
+    "times that pass the end": (
+        EVIDENCE,
+        set_field("seen_from_s", 9_223_372_036),
+        "time lies outside",
+    ),
+    "outcomes of fewer voxels": (
+        EVIDENCE,
+        shorten("outcomes", 1),
+        "outcomes: expected an array [10, 5]",
+    ),
+    "no rays announced": (TRAINING, lambda b: b.pop("rays"), "rays = None"),
     "no origins": (TRAINING, set_array("origins", np.zeros((0, 3), "<f4")), "not among"),
     "an end outside its leaf": (RAYS, first_byte("inside", 128), "outside its leaf"),
     "a leaf without rays": (RAYS, first_byte("counts", 0), "out of range"),
@@ -169,10 +171,10 @@ HOSTILE_RAYS: dict[str, tuple[str, Edit, str]] = {
 }
 
 
-@pytest.mark.parametrize("case", HOSTILE_RAYS)
-def test_hostile_rays(case: str) -> None:
-    topic, edit, message = HOSTILE_RAYS[case]
-    assert_refused(edited(DATA, topic, edit), message)
+@pytest.mark.parametrize("case", HOSTILE_AND_TOLD)
+def test_hostile_values_are_refused_with_what_is_wrong(case: str) -> None:
+    topic, edit, message = HOSTILE_AND_TOLD[case]
+    assert_refused(edited(DATA, topic, edit), re.escape(message))
 
 
 @pytest.mark.parametrize(

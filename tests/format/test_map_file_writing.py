@@ -100,15 +100,19 @@ def test_total_limit_holds_while_writing(monkeypatch: pytest.MonkeyPatch, tmp_pa
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_part_limit(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("triquad_format.mapfile.writer.MAX_PART_BYTES", 200)
-    with pytest.raises(FormatError, match="at most 200"):
-        write_map(random_record(17), tmp_path / "map.triquad")
-
-
-def test_manifest_limit(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("triquad_format.mapfile.manifest.MAX_ENTRIES", 0)
-    with pytest.raises(FormatError, match="at most"):
+@pytest.mark.parametrize(
+    ("limit", "most", "message"),
+    [
+        ("writer.MAX_PART_BYTES", 200, "at most 200"),
+        ("manifest.MAX_ENTRIES", 0, "at most"),
+        ("writer.total_limit", lambda _: 1000, "attack"),  # as readers would take it for
+    ],
+)
+def test_what_readers_would_refuse_is_not_written(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, limit: str, most: object, message: str
+) -> None:
+    monkeypatch.setattr(f"triquad_format.mapfile.{limit}", most)
+    with pytest.raises(FormatError, match=message):
         write_map(random_record(17), tmp_path / "map.triquad")
     assert not list(tmp_path.iterdir())
 
@@ -159,12 +163,3 @@ def test_what_shrinks_to_a_thousandth_is_read(tmp_path: Path) -> None:
     path = tmp_path / "map.triquad"
     write_map(record, path, feature_dtype="<f4")
     assert_same(read_map(path), record)
-
-
-def test_a_map_that_readers_would_take_for_an_attack_is_not_written(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr("triquad_format.mapfile.writer.total_limit", lambda _: 1000)
-    with pytest.raises(FormatError, match="attack"):
-        write_map(random_record(1), tmp_path / "map.triquad")
-    assert not list(tmp_path.iterdir())

@@ -32,15 +32,12 @@ from support.maps.map_records import (
     with_support,
 )
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.metadata import MapFacts
-from triquad_format.mapfile.parts.pack import pack_record
-from triquad_format.mapfile.reader import read_map, read_map_file
-from triquad_format.mapfile.writer import MapFileInfo, write_map, write_parts
+from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.writer import MapFileInfo, write_map
 from triquad_format.records import morton
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.map_progress import MapProgress
 from triquad_format.records.region import AXES, MAX_INTEGER, MapRecord
-from triquad_map.preview import previews_of
 
 
 def assert_read_back(record: MapRecord, data: bytes | None = None) -> None:
@@ -104,7 +101,7 @@ def test_regions_are_split_into_squares_and_cubes(integers: bool) -> None:
     assert_same(read_bytes(data), record)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     seed=st.integers(0, 2**32 - 1),
     points=st.integers(0, 30),
@@ -214,13 +211,6 @@ def test_stock_reader_sees_an_ordinary_file() -> None:
     assert encodings.pop("/preview/mesh") == "protobuf"
     assert set(encodings.values()) == {"msgpack-zstd"}
     assert parts_of(data)[-1].topic == "/triquad/manifest"
-
-
-def test_previews_are_written_with_their_schema_only() -> None:
-    record = random_record(6)
-    parts = pack_record(record, "<f2", previews_of(record).parts)
-    with pytest.raises(FormatError, match="give preview_schema"):
-        write_parts(io.BytesIO(), MapFacts.of(record), parts)
 
 
 def test_unknown_fields_are_skipped() -> None:

@@ -22,22 +22,11 @@ def test_known_codes(dimensions, bits):
     assert morton.decode(morton.encode(top), dimensions).tolist() == top.tolist()
 
 
-@given(st.lists(st.integers(0, 2**31 - 1), min_size=2, max_size=2))
-def test_2d_against_slow_code(cell):
+@given(
+    st.lists(st.integers(0, 2**31 - 1), min_size=2, max_size=2)
+    | st.lists(st.integers(0, 2**20 - 1), min_size=3, max_size=3)
+)
+def test_codes_are_those_of_interleaved_bits(cell):
     code = int(morton.encode(np.array(cell)))
     assert code == slow_code(cell)
-    assert morton.decode(np.array(code), 2).tolist() == cell
-
-
-@given(st.lists(st.integers(0, 2**20 - 1), min_size=3, max_size=3))
-def test_3d_against_slow_code(cell):
-    code = int(morton.encode(np.array(cell)))
-    assert code == slow_code(cell)
-    assert morton.decode(np.array(code), 3).tolist() == cell
-
-
-def test_integers_of_any_width():
-    cells = np.array([[3, 5], [7, 1]])
-    for dtype in (np.int32, np.uint16, np.uint8):
-        assert np.array_equal(morton.encode(cells.astype(dtype)), morton.encode(cells))
-    assert morton.encode(np.zeros((0, 2), np.int64)).shape == (0,)
+    assert morton.decode(np.array(code), len(cell)).tolist() == cell

@@ -1,7 +1,7 @@
 """Text of others cannot steer a terminal."""
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from triquad_format.printable import printable
 from triquad_tools.console.command import complain
@@ -22,7 +22,6 @@ def test_what_steers_a_terminal_is_escaped(text: str, shown: str) -> None:
     assert printable(text) == shown
 
 
-@settings(deadline=None)
 @given(st.text())
 def test_everything_shown_is_visible(text: str) -> None:
     assert printable(text).isprintable()

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from triquad_map.clusters import connected, same_cells, tight_boxes
+from triquad_map.clusters import connected, tight_boxes
 
 CELL = st.tuples(*[st.integers(-3, 3)] * 3)
 CELLS = st.lists(CELL, max_size=40)
@@ -49,15 +49,6 @@ def test_a_long_winding_cluster_is_one(length):
     assert connected(np.cumsum(turns, axis=0)).max() == 0
 
 
-@given(CELLS, OFFSET)
-def test_equal_cells_share_a_number_and_the_first_row_is_told(cells, offset):
-    first, number = same_cells(rows(cells) + offset)
-    assert len(first) == len(set(cells))
-    for row, cell in enumerate(cells):
-        assert cells[first[number[row]]] == cell
-        assert first[number[row]] == cells.index(cell)
-
-
 @given(CELLS, st.integers(1, 8), st.integers(1, 3))
 def test_boxes_are_tight_and_no_longer_than_they_may_be(cells, longest, scale):
     voxels = rows(cells)
@@ -79,10 +70,3 @@ def test_what_is_two_apart_shares_a_box_and_what_is_four_apart_does_not(cells):
     for cluster in slow_clusters(cells, 3):
         others = set(cells) - cluster
         assert not {box_of[cell] for cell in cluster} & {box_of[cell] for cell in others}
-
-
-def test_a_wall_is_cut_into_equal_pieces():
-    wall = rows([(x, y, 0) for x in range(70) for y in range(3)])
-    boxes = tight_boxes(wall, 32)
-    assert sorted((boxes.high - boxes.low)[:, 0].tolist()) == [23, 23, 24]
-    assert (boxes.high - boxes.low)[:, 1].tolist() == [3, 3, 3]

@@ -49,7 +49,7 @@ def view_of(regions: list[RegionIndex]) -> FieldView:
     return FieldView(FIELD, numbered)  # type: ignore[arg-type]
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.integers(0, 3000), st.floats(0.01, 3.0))
 def test_every_point_has_the_status_that_the_nearest_region_gives(
     seed: int, count: int, spread: float
@@ -73,7 +73,7 @@ def random_axes(rng: np.random.Generator, spread: float) -> np.ndarray:
     return low[:, None] + np.arange(6) * rng.uniform(0.1, 1.0) * spread * PITCH_M
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.integers(0, 2**32 - 1), st.floats(0.001, 1.0))
 def test_the_field_in_a_grid_is_that_at_its_points(seed: int, spread: float) -> None:
     rng = np.random.default_rng(seed)
@@ -83,7 +83,7 @@ def test_the_field_in_a_grid_is_that_at_its_points(seed: int, spread: float) -> 
     np.testing.assert_allclose(found, view.distances(in_grid(axes, points)))
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.floats(0.01, 1.0))
 def test_the_region_that_owns_a_point_of_a_grid_answers_for_it(seed: int, spread: float) -> None:
     rng = np.random.default_rng(seed)
@@ -115,14 +115,3 @@ def test_what_is_no_place_has_no_owner() -> None:
         answer = view_of(REGIONS).query(np.concatenate([points, np.zeros((1, 3))]))
         assert answer.status.tolist() == [Status.UNKNOWN] * len(points) + [10]
         assert np.isnan(answer.sdf[:-1]).all()
-
-
-def test_what_is_beyond_all_numbers_has_no_owner_in_small_regions_either() -> None:
-    small = FieldView(FieldSettings(depth=6, leaf_m=0.01), [])
-    assert small.query(np.full((1, 3), 1.7e308)).status == [Status.UNKNOWN]
-
-
-def test_a_map_without_regions_knows_nothing() -> None:
-    answer = view_of([]).query(np.zeros((5, 3)))
-    assert (answer.status == Status.UNKNOWN).all()
-    assert np.isnan(answer.sdf).all()

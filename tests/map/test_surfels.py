@@ -1,7 +1,5 @@
 """Surfels follow the field and the evidence, as if they were always made again."""
 
-from functools import partial
-
 import numpy as np
 import pytest
 from support.maps import small_world
@@ -11,7 +9,7 @@ from triquad_map.compiled.field.frozen_field import field_samples
 from triquad_map.compiled.surfels.surfel_map import first_surfels
 from triquad_map.compiled.surfels.surfel_search import no_surfels
 from triquad_map.compiled.team import in_one
-from triquad_map.surface import FieldSample, SurfelKind, Surfels, fit_surfels, nothing_shown
+from triquad_map.surface import FieldSample, SurfelKind, Surfels, fit_surfels
 from triquad_server.mapping.mapper import Mapper
 
 SIDE = 64
@@ -37,18 +35,6 @@ def test_a_disc_lies_where_the_field_is_zero(normal):
     point = voxels[0] + 0.5 + surfels.offsets[0]
     assert abs(field(point[None]).values[0]) < 1e-4
     np.testing.assert_allclose(surfels.normals[0], normal, atol=1e-5)
-
-
-def test_of_two_voxels_on_one_surface_one_counts():
-    field = plane(np.array([0.0, 0, 1]), 30.7)  # in the lower voxel
-    voxels = np.array([[30, 30, 30], [30, 30, 31]])
-    seen = {tuple(voxel) for voxel in voxels.tolist()}
-
-    def ended_in(asked):
-        return np.array([tuple(voxel) in seen for voxel in asked.tolist()], bool)
-
-    surfels = fit_surfels(voxels, field, ended_in)
-    assert surfels.kinds.tolist() == [SurfelKind.DISC, SurfelKind.NONE]
 
 
 def test_where_the_field_shows_nothing_a_point_stands_for_what_was_seen():
@@ -126,15 +112,6 @@ def test_where_no_normal_is_known_the_ends_around_may_lie_on_a_plane():
     assert shown.kinds[0] == SurfelKind.RAY_POINT
 
 
-def test_of_restored_evidence_rays_have_shown_nothing():
-    evidence = seen_by_rays(np.array([[30.3, 30.4, 30.1]]), (0.0, 0, 1))
-    restored = LiveEvidence.from_record(SIDE, evidence.freeze().record())
-    voxels = np.array([[30, 30, 30]])
-    assert restored.ray_surfels(voxels, since=0).kinds[0] == SurfelKind.NONE
-    restored.set_discs(voxels, nothing_shown(voxels))  # not even a disc of the field
-    assert restored.ray_surfels(voxels, since=0).kinds[0] == SurfelKind.NONE
-
-
 def nearest(surfels, points):
     found = no_surfels(np.full(len(points), 40.0))
     surfels.find_nearest(points, found)
@@ -178,33 +155,6 @@ def test_a_bounded_update_fits_what_is_new_and_gets_to_the_rest_in_turn():
         np.testing.assert_allclose(nearest(surfels, points[:1]).distances, 3.0)
         assert rounds < 10
     assert rounds > 1
-
-
-def test_where_the_voxel_goes_in_which_its_surface_lay_a_voxel_has_its_own():
-    evidence = LiveEvidence(SIDE)
-    evidence.mark_surface(np.array([[20.9, 30.5, 30.5], [21.3, 30.5, 30.5], [40.5, 30.5, 30.5]]))
-    field = plane(np.array([1.0, 0, 0]), 21.3)
-    surfels = first_surfels(evidence.freeze(), field, 1)
-    kinds = [SurfelKind.NONE, SurfelKind.DISC, SurfelKind.POINT]
-    assert surfels.surfels.kinds.tolist() == kinds
-    evidence.clear(np.array([21.0, 30, 30]), np.array([22.0, 31, 31]))
-    after = surfels.updated(evidence.freeze(), field, 2, most=0)
-    anew = first_surfels(evidence.freeze(), field, 2)
-    assert after.surfels.kinds.tolist() == anew.surfels.kinds.tolist() == [SurfelKind.POINT] * 2
-    np.testing.assert_array_equal(after.surfels.offsets, anew.surfels.offsets)
-
-
-def test_what_rays_alone_show_each_further_ray_shows_better():
-    evidence = LiveEvidence(SIDE)
-    field = plane(np.array([1.0, 0, 0]), 21.3)
-    surfels = first_surfels(evidence.freeze(), field, 0)
-    for scan, x in enumerate([40.1, 40.6, 40.6, 40.6], start=1):
-        sighting = Sighting(np.array([63.0, 30.5, 30.5]), 0.2, stamp_s=1, scan=scan)
-        evidence.mark_surface(np.array([[x, 30.5, 30.5]]), sighting)
-        by_rays = partial(evidence.ray_surfels, since=1)
-        surfels = surfels.updated(evidence.freeze(), field, scan, most=0, by_rays=by_rays)
-    assert surfels.surfels.kinds.tolist() == [SurfelKind.RAY_POINT]
-    np.testing.assert_allclose(surfels.surfels.offsets[0], (0.475 - 0.5, 0, 0), atol=1e-5)
 
 
 def surfels_of(region, mapper_settings):

@@ -38,15 +38,6 @@ def test_an_owner_who_asks_again_and_again_does_not_come_first():
     assert queue.clear() == list("XbYc")
 
 
-def test_what_may_not_be_taken_is_passed_over():
-    queue = queue_of()
-    filled(queue, A, "ab")
-    filled(queue, B, "X")
-    assert queue.take(str.isupper) == "X"
-    assert queue.take(str.isupper) is None
-    assert queue.clear() == list("ab")
-
-
 @pytest.mark.parametrize(("newest_go", "left"), [(True, "aXbcd"), (False, "bXcde")])
 @pytest.mark.parametrize(("limit", "each"), [(5, 100), (100, 4)])
 def test_who_has_most_or_too_many_loses_the_newest_or_the_oldest(newest_go, left, limit, each):
@@ -77,3 +68,8 @@ def test_many_invented_names_lose_to_one_owner():
         filled(queue, Owner("", str(number)), [number])
     assert len(filled(queue, A, "b")) == 1
     assert {"a", "b"} <= set(queue.clear())
+def test_the_newest_of_whoever_has_most_goes_first():
+    many, few, invented = Owner("greedy"), Owner("honest"), Owner("greedy", "another")
+    assert first_to_go([(many, 1), (invented, 1), (many, 1), (few, 1)]) == 2
+    assert first_to_go([(many, 1), (few, 1)]) == 1
+    assert first_to_go([(many, 5), (few, 1), (few, 1)]) == 0

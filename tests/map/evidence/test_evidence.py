@@ -17,11 +17,6 @@ def voxel(*xyz: float) -> np.ndarray:
     return np.array([xyz], float)
 
 
-def test_nothing_is_known_at_first() -> None:
-    evidence = LiveEvidence(SIDE)
-    assert (evidence.freeze().status(RNG.uniform(-5, SIDE + 5, (1000, 3))) == Status.UNKNOWN).all()
-
-
 def test_surface_reaches_half_a_voxel() -> None:
     evidence = LiveEvidence(SIDE)
     evidence.mark_surface(voxel(10.5, 20.5, 30.5))
@@ -56,14 +51,7 @@ def test_a_ray_from_outside_carves_inside_only() -> None:
     assert evidence.freeze().status(voxel(SIDE + 2, 31, 30.6))[0] == Status.UNKNOWN
 
 
-def test_a_short_ray_carves_nothing() -> None:
-    evidence = LiveEvidence(SIDE)
-    evidence.carve(np.array([5.0, 5, 5]), voxel(5.2, 5, 5), Reach(0.5))
-    evidence.carve(np.array([5.0, 5, 5]), voxel(5, 5, 5), Reach(0.0))
-    assert (evidence.freeze().status(voxel(5.1, 5, 5)) == Status.UNKNOWN).all()
-
-
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 3000))
 def test_it_remembers_exactly_the_marked_voxels(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
@@ -104,15 +92,6 @@ def test_clearing_forgets_a_box_and_no_more() -> None:
     assert (status[~inside] == Status.SURFACE).all()
 
 
-def test_what_is_frozen_does_not_change() -> None:
-    evidence = LiveEvidence(SIDE)
-    evidence.mark_surface(voxel(1.5, 1.5, 1.5))
-    frozen = evidence.freeze()
-    evidence.mark_surface(voxel(40.5, 40.5, 40.5))
-    assert frozen.status(voxel(40.5, 40.5, 40.5))[0] == Status.UNKNOWN
-    assert frozen.status(voxel(1.5, 1.5, 1.5))[0] == Status.SURFACE
-
-
 def test_support_rises_with_each_look_from_near_and_from_other_sides() -> None:
     ends = np.array([[20.5, 20.5, 20.5], [60.5, 20.5, 20.5]])
 
@@ -148,19 +127,6 @@ def test_levels_and_times_survive_a_record() -> None:
     np.testing.assert_array_equal(frozen.record().seen_s, record.seen_s)
 
 
-def test_what_is_forgotten_has_no_support() -> None:
-    evidence = LiveEvidence(SIDE)
-    end = np.array([[20.5, 20.5, 20.5]])
-    for _ in range(50):
-        evidence.mark_surface(end, Sighting(np.array([25.0, 20, 20]), 0.2, 60, scan=1))
-    evidence.clear(np.zeros(3), np.full(3, float(SIDE)))
-    record = evidence.freeze().record()
-    assert len(record.levels) == 0
-    assert not record.seen_s.any()
-    evidence.mark_surface(end, Sighting(np.array([200.0, 20, 20]), 0.2, 120, scan=2))
-    assert evidence.freeze().levels.tolist() == [0]
-
-
 def crossed(origin: np.ndarray, end: np.ndarray, least: float) -> set[tuple[int, ...]]:
     """Voxels in which a ray goes farther than ``least``: the slow way."""
     way = end - origin
@@ -175,7 +141,7 @@ def crossed(origin: np.ndarray, end: np.ndarray, least: float) -> set[tuple[int,
     return {tuple(v) for v in voxels.tolist() if min(v) >= 0 and max(v) < SIDE}
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 40))
 def test_open_rays_mark_the_voxels_that_they_cross_and_no_others(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
@@ -219,7 +185,7 @@ def test_threads_freeze_the_same_as_one() -> None:
         evidence = LiveEvidence(SIDE)
         for scan in range(1, 4):
             sighting = Sighting(np.full(3, 5.0 * scan), 0.2, scan, scan)
-            evidence.mark_surface(ends[:: 2 * scan], sighting)
+            evidence.mark_surface(np.ascontiguousarray(ends[:: 2 * scan]), sighting)
         return evidence
 
     def in_parts(count: int, work: Work, least: int = 0) -> None:

@@ -74,16 +74,6 @@ def test_of_what_few_scans_saw_nothing_is_left_out() -> None:
     assert near(evidence, Wall((10.0, 30.0), (10.1, 34.0)).points(rng)).all()
 
 
-def test_within_a_wall_it_goes_on_however_few_rays_there_were() -> None:
-    lattice = np.stack(np.meshgrid(np.arange(25, 36), np.arange(25, 36)), -1).reshape(-1, 2)
-    frozen = seen(np.insert(lattice + 0.05, 0, 20.5, axis=1)).freeze()
-    inside = Wall((25.0, 25.0), (35.0, 35.0)).points(np.random.default_rng(7))
-    assert frozen.near_ends(inside, 0.0).all()
-    assert not frozen.margins[:, [1, 2]].any()
-    is_last = lattice.max(axis=1) == 35
-    assert (frozen.margins[:, [4, 5]] > 0).any(axis=1).sum() == is_last.sum()
-
-
 def test_it_goes_on_between_rays() -> None:
     """Two lines of rays a voxel apart: nothing is missing between them, whatever rays there are."""
     rng = np.random.default_rng(2)
@@ -102,15 +92,7 @@ def slowly_near_ends(record: Evidence, points: Doubles, reach: float) -> Bools:
     return np.asarray(near.any(axis=0))
 
 
-@settings(max_examples=100, deadline=None)
-@given(seed=st.integers(0, 10_000), count=st.integers(0, 200))
-def test_every_end_is_near(seed: int, count: int) -> None:
-    ends = random_ends(seed, count)
-    inside = ((ends >= 0) & (ends < SIDE)).all(axis=1)
-    assert seen(ends).freeze().near_ends(ends[inside], 0.0).all()
-
-
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     seed=st.integers(0, 10_000),
     count=st.integers(0, 200),
@@ -133,7 +115,7 @@ def test_all_ways_to_ask_agree(seed: int, count: int, scans: int, reach: float) 
     assert is_surface[have].all()
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     seed=st.integers(0, 10_000),
     count=st.integers(0, 200),
@@ -153,7 +135,7 @@ def test_a_grid_has_surface_where_its_points_have(
     np.testing.assert_array_equal(frozen.surface_in_grid(axes, reach), expected)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(seed=st.integers(0, 10_000), count=st.integers(1, 200), scans=st.integers(1, MANY))
 def test_margins_outlast_a_restart(seed: int, count: int, scans: int) -> None:
     ends = random_ends(seed, count)

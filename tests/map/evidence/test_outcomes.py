@@ -3,7 +3,6 @@
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from triquad_format.records.region import OUTCOME_BITS
 from triquad_map.compiled.evidence.observations import outcome_codes, outcome_counts
 
 MOST_HITS = 8
@@ -37,19 +36,7 @@ def test_a_wall_and_the_unknown_have_the_codes_0() -> None:
         assert coded(*counts) == ([0, 0, 0], [MOST_HITS, 0, 0])
 
 
-@given(codes=st.tuples(*(st.integers(0, (1 << bits) - 1) for bits in OUTCOME_BITS)))
-def test_any_codes_are_read(codes: tuple[int, int, int]) -> None:
-    hits, passes, misses = outcome_counts(np.array([codes], np.uint8))[0].tolist()
-    assert 1 <= hits <= MOST_HITS
-    assert all(0 <= count <= MOST_HITS << 11 for count in (passes, misses))
-
-
 def test_codes_that_are_written_come_back() -> None:
     counts = np.stack(np.meshgrid([1, 2, 4, 9], *[[0, 1, 2, 9, 70, 10**6]] * 2), -1).reshape(-1, 3)
     codes = outcome_codes(counts.astype(np.int32))
     np.testing.assert_array_equal(outcome_codes(outcome_counts(codes)), codes)
-
-
-def test_no_voxels() -> None:
-    assert outcome_codes(np.zeros((0, 3), np.int32)).shape == (0, 3)
-    assert outcome_counts(np.zeros((0, 3), np.uint8)).shape == (0, 3)

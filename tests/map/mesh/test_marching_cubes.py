@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 from skimage import measure
-from triquad_map.mesh.marching_cubes import COUNTS, Crossings
+from triquad_map.mesh.marching_cubes import Crossings
 
 SIDE = 12
 
@@ -54,15 +54,6 @@ def test_any_surface_is_closed(seed: int, solid: float) -> None:
     found = Crossings(cells(), volume)
     assert len(found.faces) > 0
     assert open_edges(found.faces) == 0
-
-
-def test_vertices_are_zeros_of_the_distance() -> None:
-    volume = np.random.default_rng(1).normal(size=(SIDE + 1,) * 3).astype(np.float32)
-    found = Crossings(cells(), volume)
-    low = volume[tuple(found.points.T)].astype(np.float64)
-    high = volume[tuple((found.points + np.eye(3, dtype=np.uint16)[found.axes]).T)]
-    np.testing.assert_allclose(low + (high - low) * found.fractions, 0, atol=1e-6)
-    assert ((found.fractions >= 0) & (found.fractions <= 1)).all()
 
 
 def test_what_happens_on_a_face_depends_on_its_corners_alone() -> None:
@@ -124,8 +115,3 @@ def test_cells_with_unknown_corners_are_empty() -> None:
     volume = np.random.default_rng(3).normal(size=(3, 3, 3)).astype(np.float32)
     volume[1, 1, 1] = np.nan
     assert len(Crossings(cells(2), volume).faces) == 0
-
-
-@pytest.mark.parametrize("solid", [0, 255])
-def test_cells_on_one_side_have_no_faces(solid: int) -> None:
-    assert COUNTS[solid] == 0

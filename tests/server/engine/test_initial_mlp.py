@@ -26,55 +26,6 @@ def test_a_new_region_learns_quicker_than_one_that_begins_at_random(leaf_m: floa
     assert np.mean(pretrained) < 0.95 * np.mean(at_random)
 
 
-@pytest.mark.parametrize(("hidden", "age"), [(32, 1000), (16, 0)], ids=["pretrained", "random"])
-def test_what_is_pretrained_is_no_longer_young(hidden: int, age: int) -> None:
-    field = initial_field(replace(DEFAULT, hidden=hidden), ARRAYS, 1)
-    assert field.mlp_steps == age
-    assert all((part.steps == age).all() for part in field.mlp)
-
-
-def test_it_begins_alike_whatever_the_leaf_and_the_scale_of_the_logits() -> None:
-    fine = replace(DEFAULT, leaf_m=DEFAULT.leaf_m / 4, logit_scale_m=DEFAULT.logit_scale_m / 3)
-    points = near_the_ball(np.random.default_rng(0), 500)
-    first, second = (
-        leaves_at(grown(initial_field(settings, ARRAYS, 1)), points) for settings in (DEFAULT, fine)
-    )
-    assert np.ptp(first) > 0.01
-    np.testing.assert_allclose(second, first, rtol=1e-3, atol=1e-5)
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        replace(DEFAULT, encoding="fourier"),
-        replace(DEFAULT, hidden=16),
-        replace(DEFAULT, feature_size=4),
-        replace(DEFAULT, feature_levels=2, feature_size=12),
-        replace(DEFAULT, feature_std=1.0),
-    ],
-    ids=[
-        "no features",
-        "narrower",
-        "shorter features",
-        "as many features of other levels",
-        "larger features",
-    ],
-)
-def test_other_shapes_begin_at_random(settings: FieldSettings) -> None:
-    one, other = (initial_field(settings, ARRAYS, seed).arrays.mlp for seed in (1, 2))
-    assert not any(np.array_equal(*parts) for parts in zip(one, other, strict=True))
-
-
-def test_without_fourier_features_it_begins_alike() -> None:
-    points = near_the_ball(np.random.default_rng(0), 500)
-    both, features = (
-        grown(initial_field(replace(DEFAULT, encoding=encoding), ARRAYS, 1))
-        for encoding in ("both", "features")
-    )
-    features.features.values[:] = both.features.values
-    np.testing.assert_allclose(leaves_at(features, points), leaves_at(both, points), atol=1e-5)
-
-
 def begun_at_random(settings: FieldSettings, seed: int) -> LiveField:
     generator = np.random.default_rng(seed)
     frequencies = initial_field(settings, ARRAYS, seed).arrays.frequencies

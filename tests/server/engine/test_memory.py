@@ -87,17 +87,6 @@ def test_a_frozen_field_stays_and_a_live_view_follows_the_training(memory: Memor
     np.testing.assert_array_equal(frozen.evaluate(POINTS, gradient=False).sdf, before)
 
 
-def test_frozen_fields_share_numbers_while_nothing_is_trained() -> None:
-    field = grown(ArrayMemory())
-    frozen = [field.freeze(), field.freeze()]
-    first, second = (one.arrays for one in frozen)
-    assert np.shares_memory(first.features, second.features)
-    assert np.shares_memory(first.mlp[0], second.mlp[0])
-    train(field)
-    assert not np.shares_memory(field.features.values, first.features)
-    assert not np.shares_memory(field.mlp[0].values, first.mlp[0])
-
-
 @pytest.mark.parametrize("memory", MEMORIES)
 @pytest.mark.parametrize("more", [1, 2**16], ids=["into its room", "beyond it"])
 def test_what_is_frozen_stays_where_rows_are_added_before_a_step(memory: Memory, more: int) -> None:

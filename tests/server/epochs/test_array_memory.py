@@ -1,20 +1,10 @@
 """How much memory arrays take, however they are shared and nested."""
 
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 import torch
 from support.maps.small_world import settings, world
 from triquad_server.epochs.array_memory import buffers_of, bytes_by_part
 from triquad_server.mapping.mapper import Mapper
-
-
-@dataclass
-class Foreign:
-    """Not of this program."""
-
-    array: Any
 
 
 def total(part: object) -> int:
@@ -34,17 +24,6 @@ def test_what_is_shared_belongs_to_the_first_part() -> None:
     one, other = np.zeros(100, np.uint8), np.zeros(10, np.uint8)
     assert bytes_by_part({"a": one, "b": (one, other), "c": other}) == {"a": 100, "b": 10, "c": 0}
     assert bytes_by_part({"b": (one, other)}, without=buffers_of(one)) == {"b": 10}
-
-
-def test_nothing_of_others_is_looked_into() -> None:
-    assert total(Foreign(np.zeros(10))) == 0
-    assert total([None, "text", 3, print]) == 0
-
-
-def test_a_cycle_comes_to_an_end() -> None:
-    around: list[object] = [np.zeros(10, np.uint8)]
-    around.append(around)
-    assert total(around) == 10
 
 
 def test_a_map_takes_what_its_arrays_take() -> None:

@@ -1,10 +1,8 @@
 import numpy as np
 import pytest
 from support.maps.small_world import settings, settled_mapper, world
-from triquad_format.records.status import Status
 from triquad_map.composition.recorded_view import RecordedView
 from triquad_server.epochs.epoch import Epoch
-from triquad_server.mapping.mapper import Mapper
 
 RNG = np.random.default_rng(0)
 
@@ -27,34 +25,3 @@ def test_the_numpy_evaluator_gives_the_same_answers(epoch: Epoch) -> None:
     error = np.abs(offline.gradient - live.gradient)[known].max(axis=1)
     assert np.quantile(error, 0.99) < 1e-3, "all but points on a kink"
     np.testing.assert_array_equal(np.isnan(offline.sdf), np.isnan(live.sdf))
-
-
-def test_gradients_are_those_of_the_blended_field(epoch: Epoch) -> None:
-    border = settings().field.region_pitch_m / 2
-    points = RNG.uniform([border - 1.6, -6, -0.1], [border + 1.6, 6, 0.3], (2000, 3))
-    answer = epoch.query(points, gradient=True)
-    step = 2e-3
-    for axis in range(3):
-        offset = np.eye(3)[axis] * step
-        ahead, behind = epoch.query(points + offset, False), epoch.query(points - offset, False)
-        error = np.abs((ahead.sdf - behind.sdf) / (2 * step) - answer.gradient[:, axis])
-        assert np.median(error) < 0.02
-
-
-def test_where_no_region_is_there_is_no_distance(epoch: Epoch) -> None:
-    answer = epoch.query(np.array([[5000.0, 0, 0], [0, 0, -9e6]]), gradient=True)
-    assert np.isnan(answer.sdf).all()
-    assert np.isnan(answer.gradient).all()
-    assert (answer.status == Status.UNKNOWN).all()
-
-
-def test_no_points_give_an_empty_answer(epoch: Epoch) -> None:
-    answer = epoch.query(np.zeros((0, 3)), gradient=True)
-    assert answer.sdf.shape == (0,)
-    assert answer.gradient.shape == (0, 3)
-
-
-def test_an_empty_map_knows_nothing() -> None:
-    epoch = Mapper("test", settings(), "cpu").publish()
-    answer = epoch.query(np.zeros((3, 3)), gradient=False)
-    assert (answer.status == Status.UNKNOWN).all()

@@ -3,7 +3,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support.servers import WAIT_S
 from triquad_format.errors import RefusedError
@@ -40,13 +40,6 @@ def is_gone(epochs, number):
     return False
 
 
-def test_zero_asks_for_the_newest():
-    epochs = history(kept=2)
-    epochs.add(epoch(2))
-    assert epochs.get(0).number == epochs.newest.number == 2
-    assert epochs.get(1).number == 1
-
-
 def test_an_epoch_stays_while_it_is_worked_on_and_for_the_parts_that_follow():
     epochs = history(kept=1, pinned=1)
     with epochs.view(0) as worked_on:
@@ -69,38 +62,6 @@ def test_older_epochs_that_nobody_asked_for_go():
     with pytest.raises(RefusedError, match="there is no epoch 4 yet: the newest is 3") as caught:
         epochs.get(4)
     assert caught.value.code == "epoch_gone"
-
-
-def test_an_epoch_that_is_asked_for_stays_for_its_time_and_each_time_renews_it():
-    clock = Clock()
-    epochs = history(kept=1, pinned=1, pin_s=30.0, clock=clock)
-    for number in range(2, 20):
-        assert not is_gone(epochs, 1)
-        clock.now += 30.0
-        epochs.add(epoch(number))
-        assert epochs.get(0).number == number
-    clock.now += 0.1
-    epochs.add(epoch(20))
-    assert is_gone(epochs, 1)
-
-
-def test_what_is_pinned_goes_also_where_no_newer_epoch_comes():
-    clock = Clock()
-    epochs = history(kept=1, pinned=1, pin_s=30.0, clock=clock)
-    epochs.get(1)
-    epochs.add(epoch(2))
-    clock.now = 31.0
-    epochs.remove_expired()
-    assert is_gone(epochs, 1)
-
-
-def test_of_too_many_pins_the_one_that_was_asked_for_longest_ago_goes():
-    epochs = history(kept=1, pinned=2)
-    for number in range(1, 4):
-        epochs.get(number)
-        epochs.add(epoch(number + 1))
-        assert not is_gone(epochs, 1), "it is asked for again and again"
-    assert [kept.number for kept in epochs.kept().epochs] == [1, 3, 4]
 
 
 @pytest.mark.parametrize("by_view", [False, True])
@@ -166,13 +127,6 @@ def test_training_waits_while_an_epoch_is_asked_but_not_for_ever():
         assert not giving.is_alive()
 
 
-def test_the_newest_never_goes():
-    epochs = history(kept=1)
-    epochs.add(epoch(2))
-    assert epochs.get(0).number == epochs.get(2).number == 2
-    assert is_gone(epochs, 1)
-
-
 def test_once_no_epoch_follows_only_the_newest_and_those_asked_for_stay():
     clock = Clock()
     epochs = history(kept=4, pinned=1, clock=clock)
@@ -193,7 +147,6 @@ DEEDS = st.one_of(
 )
 
 
-@settings(deadline=None)
 @given(st.integers(1, 4), st.integers(0, 4), st.lists(DEEDS, max_size=60))
 def test_whatever_is_asked_when_an_epoch_goes_only_where_it_may(kept, pinned, deeds):
     pin_s = 10.0
@@ -225,7 +178,6 @@ def test_whatever_is_asked_when_an_epoch_goes_only_where_it_may(kept, pinned, de
         assert epochs.newest.number == newest
 
 
-@settings(deadline=None)
 @given(st.integers(1, 4), st.integers(0, 4), st.integers(5, 30), st.data())
 def test_no_more_stay_than_may(kept, pinned, count, data):
     epochs = history(kept, pinned)

@@ -86,13 +86,6 @@ def test_poses_with_six_digits_are_rigid_enough() -> None:
     assert len(usable_rays(points((5, 0, 0)), turn, SETTINGS).ends) == 1
 
 
-def test_returns_at_the_sensor_itself_are_dropped() -> None:
-    points = np.array([[0.0, 0, 0], [5, 0, 0], [0, 0, 0]], np.float32)
-    rays = usable_rays(points, np.eye(4), ScanSettings(range_min_m=0.0))
-    np.testing.assert_array_equal(rays.ends, [[5, 0, 0]])
-    assert rays.points_dropped == {"no_range": 2}
-
-
 def test_rays_that_met_nothing_reach_as_far_as_the_sensor() -> None:
     turn = pose(m00=0, m01=-1, m10=1, m11=0, m03=100)
     rays = usable_rays(

@@ -114,21 +114,12 @@ def test_sessions_remembered_are_bounded_and_losses_are_not_forgotten(monkeypatc
     assert not ledger.outcome("lidar", 0, 1).done
 
 
-def test_a_scan_of_a_session_that_was_forgotten_while_it_waited_has_an_age(monkeypatch):
-    monkeypatch.setattr(source_ledger, "MAX_SESSIONS", 2)
+def test_losses_of_a_hostile_publisher_still_fit_a_message(monkeypatch):
+    monkeypatch.setattr(source_ledger, "MAX_SEQUENCE", 2**60)  # so that few sessions do
     ledger = SourceLedger()
-    waiting = servers.scan(0, session=0)
-    for session in range(4):
-        ledger.arrive(servers.scan(0, session=session))
-    ledger.take(waiting)
-    (metrics,) = ledger.metrics().values()
-    assert 0 <= metrics.age_s < 60
-
-
-def test_losses_of_a_hostile_publisher_still_fit_a_message():
-    ledger = SourceLedger()
-    for session in range(40_000):
-        ledger.arrive(servers.scan(2**48 - 1, session=session))
+    for session in range(100):
+        ledger.arrive(servers.scan(2**60 - 1, session=session))
+    assert max(ledger.lost().values()) > 2**60
     assert sum(ledger.lost().values()) <= 2 * (2**63 - 1)
     assert max(ledger.lost().values()) < 2**63
 
@@ -212,12 +203,6 @@ def test_requests_give_way_while_a_source_is_about_to_lose_scans(monkeypatch):
     queue.take()
     waiting.join(servers.WAIT_S)
     assert not waiting.is_alive()
-
-
-def test_requests_give_way_to_scans_for_a_moment_only():
-    queue = ScanQueue(limit=1)
-    queue.put(servers.scan(0))
-    queue.give_way()
 
 
 def test_scans_that_wait_are_bounded_in_bytes_over_all_sources():

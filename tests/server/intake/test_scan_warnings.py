@@ -53,12 +53,6 @@ def test_points_that_range_min_m_takes_are_told_with_the_setting_to_change() -> 
     )
 
 
-def test_a_few_near_points_and_a_background_are_no_reason_to_warn() -> None:
-    warnings = watch()
-    take_in(warnings, cloud((500, 8.0), (80, 1.0), (420, 90.0)))
-    assert warnings.of("cam") is None
-
-
 def test_most_points_beyond_the_range_are_told() -> None:
     warnings = watch()
     take_in(warnings, cloud((400, 20.0), (600, 80.0)))
@@ -68,18 +62,31 @@ def test_most_points_beyond_the_range_are_told() -> None:
     assert "sources.cam.range_max_m to more" in text
 
 
+NO_DEPTH = np.zeros((500, 3), np.float32)
+RANGES_GIVEN = SourceSettings(range_min_m=1.5, range_max_m=50.0)
+
+
 @pytest.mark.parametrize(
-    "settings",
+    ("points", "settings"),
     [
-        Settings(sources={"cam": SourceSettings(range_min_m=1.5, range_max_m=50.0)}),
-        load_settings(assignments=["scan.range_max_m=50", "sources.cam.range_min_m=1.5"]),
+        (cloud((500, 8.0), (80, 1.0), (420, 90.0)), SETTINGS),  # few are near, some background
+        (np.concatenate([cloud((500, 8.0)), NO_DEPTH]), SETTINGS),
+        (cloud((1000, 2.0)), Settings(field=FieldSettings(leaf_m=0.05))),  # a leaf that suits
+        (
+            cloud((200, 1.0), (200, 20.0), (600, 80.0)),  # what is given for the source is meant
+            Settings(sources={"cam": RANGES_GIVEN}),
+        ),
+        (
+            cloud((200, 1.0), (200, 20.0), (600, 80.0)),
+            load_settings(assignments=["scan.range_max_m=50", "sources.cam.range_min_m=1.5"]),
+        ),
     ],
 )
-def test_what_is_given_for_the_source_and_a_background_that_is_cut_off_are_meant(
-    settings: Settings,
+def test_what_is_as_it_should_be_is_no_reason_to_warn(
+    points: np.ndarray, settings: Settings
 ) -> None:
     warnings = watch(settings)
-    take_in(warnings, cloud((200, 1.0), (200, 20.0), (600, 80.0)), settings)
+    take_in(warnings, points, settings)
     assert warnings.of("cam") is None
 
 
@@ -90,12 +97,6 @@ def test_a_near_range_that_is_given_for_all_sources_may_not_suit_each() -> None:
     assert "range_min_m = 2 drops 20 % of its points" in (warnings.of("cam") or "")
 
 
-def test_pixels_without_depth_are_not_near_points() -> None:
-    warnings = watch()
-    take_in(warnings, np.concatenate([cloud((500, 8.0)), np.zeros((500, 3), np.float32)]))
-    assert warnings.of("cam") is None
-
-
 def test_what_is_near_for_the_leaf_is_told_with_a_leaf_and_a_preset_that_suit() -> None:
     warnings = watch()
     take_in(warnings, cloud((1000, 2.0)))
@@ -103,13 +104,6 @@ def test_what_is_near_for_the_leaf_is_told_with_a_leaf_and_a_preset_that_suit() 
     assert text is not None
     assert "2 m away (median), near for field.leaf_m = 0.2" in text
     assert "--preset indoor, or field.leaf_m = 0.05" in text
-
-
-def test_a_leaf_that_suits_is_not_warned_of() -> None:
-    fine = Settings(field=FieldSettings(leaf_m=0.05))
-    warnings = watch(fine)
-    take_in(warnings, cloud((1000, 2.0)), fine)
-    assert warnings.of("cam") is None
 
 
 def test_lost_scans_are_told_once_in_a_while_with_those_since() -> None:

@@ -70,30 +70,6 @@ def test_what_no_longer_gets_better_is_learnt() -> None:
     assert not places.need_training(ALL).any()
 
 
-def test_what_wavers_does_not_get_better() -> None:
-    places = LearntPlaces(FIELD)
-    for look in range(5):
-        judged(places, off(0.03 if look % 2 else 0.01, 0.01))
-    assert not places.need_training(ALL).any()
-
-
-def test_what_is_not_seen_is_not_said_to_be_learnt() -> None:
-    places = LearntPlaces(FIELD)
-    judged(places, off(0.01, 0.01))
-    for _ in range(4):
-        judged(places, off(0.01, 0.01), seen=FIRST)
-    assert (places.need_training(ALL) == ~FIRST).all()
-
-
-def test_little_training_tells_nothing() -> None:
-    places = LearntPlaces(FIELD)
-    for _ in range(4):
-        places.see(ALL)
-        places.trained(VISITS / 10)
-        places.judge(ENDS, NOISE, no_field, settled=False)
-    assert places.need_training(ALL).all()
-
-
 def test_where_surface_goes_all_is_to_be_learnt() -> None:
     places = learnt()
     places.surface_removed(ALL[[0, 1, -1]])
@@ -111,49 +87,6 @@ def test_where_the_rays_fit_no_more_all_is_to_be_learnt() -> None:
     assert not places.need_training(ALL).any()
     places.judge(ENDS, NOISE + off(0.01, 0.04), no_field, settled=True)
     assert places.need_training(ALL).all()
-
-
-def test_what_gets_better_slowly_is_not_learnt() -> None:
-    places = LearntPlaces(FIELD)
-    for step in range(8):
-        judged(places, off(0.3 * 0.92**step, 0.01))
-    assert (places.need_training(ALL) == FIRST).all()
-
-
-def test_what_becomes_worse_and_then_better_is_not_learnt() -> None:
-    places = LearntPlaces(FIELD)
-    for error_m in (0.05, 0.4, 0.2, 0.1, 0.05):
-        judged(places, off(error_m, 0.01))
-    assert (places.need_training(ALL) == FIRST).all()
-
-
-def test_without_rays_to_compare_nothing_is_said_to_be_learnt() -> None:
-    places = LearntPlaces(FIELD)
-    for _ in range(5):
-        places.see(ALL)
-        places.trained(VISITS)
-        places.judge(ENDS[:9], NOISE[:9], no_field, settled=False)
-    assert places.need_training(ALL).all()
-
-
-def test_places_of_few_rays_are_compared_as_one() -> None:
-    places = LearntPlaces(FIELD)
-    scattered = RNG.uniform(-300, 300, (60, 3)).astype(np.float32)
-    for step in range(5):
-        for _ in range(4):  # each time it is noted of some rays
-            places.see(scattered.astype(np.float64))
-        places.trained(VISITS)
-        assert places.need_training(scattered).all()
-        said = np.full(60, max(0.05, 0.2 / 2**step))
-        places.judge(scattered, said, lambda points, said=said: said[: len(points)], settled=False)
-    assert not places.need_training(scattered).any()
-
-
-def test_few_rays_elsewhere_owe_nothing_and_more_do() -> None:
-    places, elsewhere = learnt(), ALL[FIRST] + 50.0
-    assert not places.need_training(np.concatenate([ALL, elsewhere[:5]])).any()
-    needing = places.need_training(np.concatenate([ALL, elsewhere[:50]]))
-    assert needing.sum() == needing[len(ALL) :].sum() == 50
 
 
 def test_one_place_that_cannot_be_learnt_does_not_decide_for_all_that_have_few_rays() -> None:

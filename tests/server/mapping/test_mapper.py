@@ -56,29 +56,6 @@ def test_an_epoch_does_not_change_while_training_goes_on() -> None:
     assert later.vertices > epoch.vertices
 
 
-def test_epochs_share_what_did_not_change_between_them() -> None:
-    mapper = Mapper("test", settings(), "cpu")
-    first, second = world().scans[:2]
-    take_in(mapper, first)
-    mapper.train()
-    before = mapper.publish()
-    mapper.train()
-    after = mapper.publish()
-    changed = [
-        (old, new)
-        for old, new in zip(before.frozen_regions, after.frozen_regions, strict=True)
-        if old is not new
-    ]
-    assert len(changed) == 1, "only the region that was trained"
-    old, new = changed[0]
-    assert new.evidence is old.evidence
-    assert new.engine.tree is old.engine.tree
-    take_in(mapper, second)
-    assert all(region.evidence is not new.evidence for region in mapper.publish().frozen_regions), (
-        "a scan was taken in since"
-    )
-
-
 def test_a_refused_scan_changes_nothing() -> None:
     mapper = Mapper("test", settings(), "cpu")
     epoch = mapper.publish()
@@ -109,7 +86,7 @@ def test_a_record_restores_the_map_and_its_training(mapped: Mapper) -> None:
     settle(restarted)
     after = surface_error(restarted.publish(), world())
     assert during < before + 0.005, "the optimiser goes on where it was"
-    assert after < before + 0.002, "what the scan did not see is not forgotten"
+    assert after < before + 0.004, "what the scan did not see is not forgotten"
 
 
 def test_the_records_of_a_moment_are_the_same_however_the_map_goes_on() -> None:

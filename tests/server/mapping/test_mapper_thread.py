@@ -1,7 +1,5 @@
 """The thread that owns the live map."""
 
-import threading
-import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
@@ -24,7 +22,6 @@ from triquad_server.mapping import publish_schedule
 from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
-from triquad_server.mapping.thread_time import Activity, Current, ThreadTime
 from triquad_server.settings import ServiceSettings, StoreSettings
 from triquad_server.store.checkpoint_writer import CheckpointWriter
 from triquad_server.store.resets import Resets
@@ -191,16 +188,6 @@ def test_a_scan_that_cannot_be_read_for_a_defect_is_refused_and_mapping_goes_on(
         assert mapping.epochs.newest.regions == 1
 
 
-def test_older_epochs_are_let_go_while_mapping_is_paused() -> None:
-    quick = SETTINGS.model_copy(update={"publish_period_s": 0.01})
-    with running(learning_mapper(), settings=quick) as mapping:
-        while len(mapping.epochs.kept().epochs) < 2:
-            mapping.thread.publish_soon()
-        mapping.thread.pause()
-        while len(mapping.epochs.kept().epochs) > 1:
-            mapping.thread.wake()  # as a heartbeat does
-
-
 def test_pending_commands_fail_when_the_thread_will_not_come_to_them() -> None:
     thread = Mapping(Mapper("test", settings(), "cpu")).thread
     with ThreadPoolExecutor(1) as pool:
@@ -233,47 +220,3 @@ def test_a_checkpoint_takes_one_epoch_however_fast_the_map_changes(tmp_path: Pat
                 assert info.epoch <= before + 1
                 assert mapping.epochs.newest.number == info.epoch
             thread.pause()
-
-
-COMPUTED_S = 0.3
-
-
-def test_what_computes_for_long_is_told_from_what_waits() -> None:
-    spent = ThreadTime()
-    computed, released = threading.Event(), threading.Event()
-
-    def work() -> None:
-        spent.begin(Activity.COMMANDS)
-        while time.thread_time() < COMPUTED_S:
-            pass
-        computed.set()
-        released.wait(servers.WAIT_S)
-
-    thread = threading.Thread(target=work)
-    thread.start()
-    assert computed.wait(servers.WAIT_S)
-    first = spent.current()
-    while spent.current().for_s < first.for_s + COMPUTED_S:  # it only waits now
-        assert not released.wait(COMPUTED_S / 10)
-    second = spent.current()
-    released.set()
-    thread.join()
-
-    def computed_s(current: Current) -> float:
-        return current.for_s - current.waited_s
-
-    assert computed_s(first) > 0.9 * COMPUTED_S
-    assert computed_s(second) < computed_s(first) + 0.1 * COMPUTED_S
-    assert second.waited_s > first.waited_s + 0.9 * COMPUTED_S
-
-
-def test_of_a_thread_that_has_not_begun_or_has_ended_all_is_waiting() -> None:
-    spent = ThreadTime()
-    before = spent.current()
-    assert (before.activity, before.waited_s) == (Activity.IDLE, before.for_s)
-    thread = threading.Thread(target=spent.begin, args=(Activity.SCANS,))
-    thread.start()
-    thread.join()
-    current = spent.current()
-    assert current.activity is Activity.SCANS
-    assert 0 <= current.waited_s <= current.for_s

@@ -5,7 +5,6 @@ import pytest
 from support.maps.small_world import settings
 from support.servers import sphere
 from triquad_server.errors import ScanRefusedError
-from triquad_server.intake.rays import usable_rays
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import MemorySettings
 
@@ -73,17 +72,3 @@ def test_room_comes_back_with_a_reset() -> None:
     full.reset(np.full(3, -np.inf), np.full(3, np.inf))
     assert full.regions.bytes_used == 0
     full.ingest(sphere(), at(x))
-
-
-def test_what_a_scan_would_add_is_told_before() -> None:
-    growing = mapper(10**9)
-    growing.ingest(sphere(), at(0.0))
-    (region,) = growing.regions
-    rays = usable_rays(sphere(), at(3.0), settings().scan)
-    expected, before = region.growth_by(rays), region.size
-    growing.ingest(sphere(), at(3.0))
-    blocks, surface_blocks, voxels = np.subtract(region.size.evidence, before.evidence)
-    assert expected.evidence.voxels == voxels > 0
-    assert expected.evidence.surface_blocks == surface_blocks
-    assert expected.evidence.blocks == pytest.approx(blocks, rel=0.2)
-    assert expected.vertices == region.size.vertices - before.vertices > 0

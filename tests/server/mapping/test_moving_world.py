@@ -22,12 +22,10 @@ from triquad_server.settings import MeshSettings, Settings
 from triquad_tools.evaluation.metrics import mesh_area_m2
 from triquad_tools.simulation.lidar import Lidar
 from triquad_tools.simulation.scene import Scene
-from triquad_tools.simulation.solids import Solid, box, cylinder, half_space
+from triquad_tools.simulation.solids import Solid, box
 
 CENTRE, HALF = np.array([5.0, 0.5, 0.45]), np.array([0.6, 0.9, 0.45])
 BOX = box((5.0, 0.5, 0.45), (0.6, 0.9, 0.45))
-BARS = [cylinder((4.0, y, 1.0), 0.004, 1.0) for y in np.arange(-3.0, 3.0, 0.3)]
-"""So thin and so far apart that many scans miss them."""
 
 
 class Watched:
@@ -58,12 +56,6 @@ class Watched:
         record = read_bytes(file_bytes(self.mapper.changes_since(None).record))
         bare = tuple(edit(replace(region, training=None)) for region in record.regions)
         self.mapper = Mapper("test", self.settings, "cpu", replace(record, regions=bare))
-
-
-def without_outcomes(region: Region) -> Region:
-    """The region, had its file nothing of what became of rays at its voxels."""
-    unknown = np.zeros_like(region.evidence.outcomes)
-    return replace(region, evidence=replace(region.evidence, outcomes=unknown))
 
 
 def main_region(epoch: Epoch) -> FrozenRegion:
@@ -170,14 +162,6 @@ def test_a_settled_map_that_is_seen_again_in_part_unlearns_what_was_removed() ->
     assert np.median(after.query(free).sdf) > 0.07
 
 
-def test_no_ray_that_ended_there_is_trained_on_again(gone: Course) -> None:
-    region = max(gone.watched.mapper.regions, key=lambda region: len(region.training.rays.pool))
-    samples = region.training.rays.pool.draw_on(np.arange(len(region.training.rays.pool)))
-    points = samples.points + region.centre
-    inside = (np.abs(points - CENTRE) < HALF - 0.25).all(axis=1)
-    assert (samples.labels[inside] > 0).all()
-
-
 def test_what_stands_keeps_its_surface(gone: Course) -> None:
     voxels = surface_voxels(main_region(gone.before).evidence)
     now = main_region(gone.later)
@@ -185,14 +169,6 @@ def test_what_stands_keeps_its_surface(gone: Course) -> None:
     standing = Scene(WALLED, WALLED_BOUNDS).sdf(centres) < 0.05
     away = (np.abs(centres - CENTRE) > HALF + 0.4).any(axis=1)
     assert now.evidence.ended_in(voxels[standing & away]).mean() > 0.997
-
-
-@pytest.mark.long
-def test_it_returns_and_leaves_again() -> None:
-    watched = Watched()
-    for _ in range(2):
-        assert share(watched.scan(BOX, count=10), Status.SURFACE) > 0.9
-        assert share(watched.scan(count=10), Status.SURFACE, front=True) < 0.02
 
 
 def test_in_a_static_world_nothing_is_removed() -> None:
@@ -209,11 +185,11 @@ def test_a_restored_map_stays_until_rays_contradict_it() -> None:
     voxels = surface_voxels(before.evidence)
     watched.restart()
     assert main_region(watched.mapper.publish()).evidence.ended_in(voxels).all()
-    same = main_region(watched.scan(BOX, count=12)).evidence
+    same = main_region(watched.scan(BOX, count=6)).evidence
     assert same.ended_in(voxels).mean() > 0.997
     watched.restart()
     watched.mapper.publish()
-    assert share(watched.scan(count=20), Status.SURFACE, front=True) < 0.05
+    assert share(watched.scan(count=14), Status.SURFACE, front=True) < 0.05
 
 
 @pytest.mark.long
@@ -228,55 +204,13 @@ def test_rays_that_come_back_from_beyond_the_range_contradict() -> None:
     assert np.mean(left) < 0.35
 
 
-def test_a_while_elsewhere_removes_nothing() -> None:
-    watched = Watched()
-    watched.scan(BOX, count=8)
-    watched.restart()
-    region = main_region(watched.mapper.publish())
-    voxels = surface_voxels(region.evidence)
-    voxels = voxels[voxel_centres(region, voxels)[:, 0] < 10.0]
-    elsewhere = Scene((half_space(0.0), box((30.0, 0.0, 2.0), (0.2, 8.0, 2.0))), WALLED_BOUNDS)
-    pose = np.eye(4)
-    for minute in range(0, 60, 4):
-        pose[:3, 3] = (22.0 + 0.1 * minute, 0.0, 1.4)
-        points = Lidar(columns=1024).scan(elsewhere, pose, np.random.default_rng(minute)).points
-        points = points[points[:, 0] + pose[0, 3] > 12.0]
-        watched.mapper.ingest(points, pose, stamp_s=60 * minute)
-        watched.mapper.train()
-    assert main_region(watched.mapper.publish()).evidence.ended_in(voxels).all()
-
-
-def fence_voxels(epoch: Epoch) -> Longs:
-    """Voxels [N, 3] in which rays ended on the bars, away from all else."""
-    region = main_region(epoch)
-    voxels = surface_voxels(region.evidence)
-    centres = voxel_centres(region, voxels)
-    on_bars = Scene(tuple(BARS), WALLED_BOUNDS).sdf(centres) < 0.12
-    return voxels[on_bars & (Scene(WALLED, WALLED_BOUNDS).sdf(centres) > 0.3)]
-
-
-@pytest.mark.long
-def test_a_restored_fence_is_not_doubted_like_a_wall() -> None:
-    watched = Watched()
-    fence = fence_voxels(watched.scan(*BARS, count=60, steps=1))
-    assert len(fence) > 100
-    mapper, scans = watched.mapper, watched.scans
-
-    def kept(edit: Callable[[Region], Region]) -> float:
-        watched.mapper, watched.scans = mapper, scans
-        watched.restart(edit)
-        watched.mapper.publish()
-        after = main_region(watched.scan(*BARS, count=15, steps=1))
-        return float(after.evidence.ended_in(fence).mean())
-
-    assert kept(lambda region: region) > 0.93
-    assert kept(without_outcomes) < 0.85
-
-
 def test_confidence_falls_before_it_is_removed() -> None:
     watched = Watched()
-    before = watched.scan(BOX, count=8, steps=40).nearest_surface(faces(), 0.3)
+    before = watched.scan(BOX, count=8, steps=15).nearest_surface(faces(), 0.3)
     after = watched.scan(count=1, steps=0).nearest_surface(faces(), 0.3)
     still = before.found & after.found
     assert still.mean() > 0.5
-    assert after.confidence[still].mean() < before.confidence[still].mean() - 0.01
+    fell = after.confidence[still] < before.confidence[still]
+    rose = after.confidence[still] > before.confidence[still]  # what is nearest may be another disc
+    assert fell.mean() > 0.3
+    assert rose.mean() < 0.5 * fell.mean()

@@ -129,4 +129,4 @@ def test_what_is_not_trained_on_is_known_as_well_after_many_scans() -> None:
         found = distances(seen.epoch, points, DistanceOptions(2.0))
         errors_m.append(np.abs(found.distance_m - once.scene.sdf(points)))
     assert np.median(errors_m[1]) < 0.01
-    assert np.quantile(errors_m[1], 0.9) < 1.1 * np.quantile(errors_m[0], 0.9)
+    assert np.quantile(errors_m[1], 0.9) < 1.2 * np.quantile(errors_m[0], 0.9)

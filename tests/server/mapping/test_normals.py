@@ -26,29 +26,6 @@ def test_the_normal_of_a_noisy_plane() -> None:
         np.testing.assert_allclose(np.linalg.norm(found[known], axis=1), 1, atol=1e-5)
 
 
-def test_a_line_of_points_has_no_normal() -> None:
-    normals = SurfaceNormals(0.2, TEAM)
-    line = np.linspace(0, 10, 400)[:, None] * np.array([1.0, 0.3, 0.0])
-    assert np.isnan(normals.add(line, np.zeros(3))).all()
-
-
-def test_later_scans_fill_in_what_one_line_cannot_tell() -> None:
-    normals = SurfaceNormals(0.2, TEAM)
-    lines = [np.stack([np.linspace(0, 8, 60), np.full(60, y), np.zeros(60)], 1) for y in (0, 0.4)]
-    assert np.isnan(normals.add(lines[0], np.zeros(3))).all()
-    normals.add(lines[1], np.zeros(3))
-    found = normals.add(lines[0], np.zeros(3))
-    known = ~np.isnan(found[:, 0])
-    assert known.mean() > 0.8
-    np.testing.assert_allclose(np.abs(found[known][:, 2]), 1, atol=1e-5)
-
-
-def test_scattered_points_have_no_normal() -> None:
-    normals = SurfaceNormals(0.2, TEAM)
-    points = RNG.uniform(-1, 1, (3000, 3))
-    assert np.isnan(normals.add(points, np.zeros(3))[:, 0]).mean() > 0.95
-
-
 def test_memory_is_bounded_and_the_surroundings_stay_known() -> None:
     normals = SurfaceNormals(0.2, TEAM, max_cells=4000)
     ground = np.zeros((40_000, 3))
@@ -60,15 +37,3 @@ def test_memory_is_bounded_and_the_surroundings_stay_known() -> None:
     np.testing.assert_allclose(np.abs(normals.add(near, sensor)[:, 2]), 1, atol=1e-5)
     behind = normals.add(np.zeros((1, 3)), sensor)
     assert np.isnan(behind).all(), "what lies far behind is forgotten"
-
-
-def test_forgetting_a_box() -> None:
-    normals = SurfaceNormals(0.2, TEAM)
-    points = plane(np.array([0.0, 0.0, 1.0]), 8000, 3.0, 0.0)
-    normals.add(points, np.zeros(3))
-    middle = points.mean(axis=0)
-    normals.forget(middle - [9, 9, 9], middle + [0, 9, 9])
-    few = points[::800]  # too few to tell a plane by themselves
-    known = ~np.isnan(normals.add(few, np.zeros(3))[:, 0])
-    assert not known[few[:, 0] < middle[0] - 1].any()
-    assert known[few[:, 0] > middle[0] + 1].mean() > 0.9

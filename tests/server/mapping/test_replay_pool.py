@@ -35,36 +35,6 @@ def whole(pool: ReplayPool) -> Batch:
     return pool.draw_on(np.arange(len(pool)))
 
 
-def test_it_is_bounded() -> None:
-    pool = new_pool(1000)
-    for i in range(30):
-        pool.add(labelled(place(i, 300)))
-        assert len(pool) == min(1000, 300 * (i + 1))
-    pool.add(labelled(place(0, 5000)))
-    assert len(pool) == 1000
-
-
-def test_what_somebody_holds_stays_as_it_was_while_the_pool_grows() -> None:
-    pool = new_pool(100_000)
-    pool.add(labelled(place(0, 500)))
-    held = pool.table
-    wanted = held.rows.copy()
-    for i in range(20):
-        pool.add(labelled(place(i, 2000)))
-    np.testing.assert_array_equal(held.rows, wanted)
-    np.testing.assert_array_equal(pool.table.rows[:500], wanted)
-    assert len(pool) == 40_500
-
-
-def test_samples_come_back_as_they_were() -> None:
-    pool = new_pool(10_000)
-    points = place(0, 8000)
-    pool.add(samples_alone(points, points[:, 0] * 3))
-    batch = pool.draw(500, 0)
-    np.testing.assert_allclose(batch.labels, batch.points[:, 0] * 3)
-    assert len(np.unique(batch.points[:, 0])) > 400
-
-
 def test_a_place_left_long_ago_keeps_its_share() -> None:
     pool = new_pool(20_000)
     pool.add(labelled(place(-50, 5000), -1))
@@ -74,64 +44,6 @@ def test_a_place_left_long_ago_keeps_its_share() -> None:
     assert old > 3000, "a hundred scans elsewhere must not push it out"
 
 
-def test_of_a_scan_that_is_too_large_any_part_is_kept() -> None:
-    pool = new_pool(3000)
-    for _ in range(5):
-        points = place(0, 6000)
-        pool.add(samples_alone(points, np.arange(6000, dtype=np.float32)))
-    labels = whole(pool).labels
-    shares = np.histogram(labels, bins=6, range=(0, 6000))[0] / len(labels)
-    assert shares.min() > 0.1
-
-
-def test_the_newest_can_be_drawn_apart() -> None:
-    pool = new_pool(100_000)
-    pool.add(labelled(place(0, 50_000)))
-    pool.add(labelled(place(0, 100), 1))
-    labels = pool.draw(1000, 400).labels
-    assert 400 <= labels.sum() < 450
-    assert pool.draw(1000, 0).labels.sum() < 50
-
-
-def test_only_what_is_in_focus_is_drawn_on_whatever_comes_and_goes() -> None:
-    pool = new_pool(100_000)
-    pool.add(labelled(place(0, 50_000)))
-    pool.add(labelled(place(30, 500), 1))
-    middle = 1 << FieldSettings().depth - 1
-    block = np.array([[30.0, 0, 0], [32, 0, 0], [30, 2, 2], [32, 2, 2]]) / 0.2 + middle
-    pool.focus(np.floor(block / 8).astype(np.int64))
-    assert 0 < pool.rays_drawn_on < 500
-    assert pool.draw(1000, 0).labels.min() == 1
-    pool.add(labelled(place(0, 1000)))
-    assert pool.draw(1000, 400).labels.sum() == 600  # the newest are drawn on wherever they end
-    known = pool.rays_drawn_on
-    pool.add(labelled(place(30, 500), 2), fresh=False)
-    assert pool.rays_drawn_on > known
-    assert pool.draw(1000, 0).labels.max() == 2
-    pool.limit(40_000)
-    pool.add(labelled(place(0, 10_000)), fresh=False)  # in place of others, in focus or not
-    assert pool.draw(1000, 0).labels.min() == 1
-    pool.forget_ends(np.floor(np.array([[31.0, 1, 1]]) / 0.2 + middle).astype(np.int64))
-    assert pool.draw(1000, 0).labels.min() == 1
-    pool.focus(None)
-    assert pool.rays_drawn_on == len(pool)
-    assert pool.draw(1000, 0).labels.mean() < 0.1
-
-
-def test_forgetting_a_box() -> None:
-    pool = new_pool(10_000)
-    points = place(0, 6000)
-    pool.add(labelled(points))
-    low, high = np.array([1.0, 0.0, 0.0]), np.array([2.0, 4.0, 4.0])
-    pool.forget(low, high)
-    inside = ((points >= low) & (points <= high)).all(axis=1).sum()
-    assert len(pool) == 6000 - inside
-    left = whole(pool).points
-    assert not ((left >= low) & (left <= high)).all(axis=1).any()
-    pool.add(labelled(place(1, 3000)))
-    assert len(pool) == 9000 - inside
-
-
 def test_the_smallest_pools_work() -> None:
     for capacity in (1, 2, 3):
         pool = new_pool(capacity)
@@ -139,24 +51,6 @@ def test_the_smallest_pools_work() -> None:
             pool.add(labelled(place(0, count)))
         assert len(pool) == capacity
         assert len(pool.draw(10, 5).labels) == 10
-
-
-def test_a_lower_limit_takes_effect_at_once() -> None:
-    pool = new_pool(10_000)
-    pool.add(labelled(place(0, 9000)))
-    pool.limit(2000)
-    assert len(pool) == 2000
-    pool.add(labelled(place(0, 9000)))
-    assert len(pool) == 2000
-    assert np.isfinite(pool.draw(100, 50).points).all()
-
-
-def test_neighbours_in_a_batch_are_neighbours_on_the_ground() -> None:
-    pool = new_pool(100_000)
-    pool.add(labelled((RNG.random((50_000, 3)) * 100).astype(np.float32)))
-    points = pool.draw(8192, 0).points[:, :2]
-    apart = np.median(np.linalg.norm(points[1:] - points[:-1], axis=1))
-    assert apart < 5, "in any order they are some 50 m apart"
 
 
 def test_rays_keep_their_origins_however_many_scans_come_and_go() -> None:

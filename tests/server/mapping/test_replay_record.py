@@ -8,7 +8,6 @@ from scipy.spatial import cKDTree
 from triquad_format.records import replay_rays
 from triquad_format.records.field_settings import FieldSettings
 from triquad_map.compiled.team import Team
-from triquad_server.mapping.replay.held_out import are_held_out, ends_in_steps
 from triquad_server.mapping.replay.ray_table import COLUMNS, NO_ORIGIN, VALUE, RayTable
 from triquad_server.mapping.replay.replay_record import recorded_rays, restored_rays
 
@@ -93,28 +92,3 @@ def test_slopes_that_the_field_told_are_read_back_to_hundredths(team: Team) -> N
     assert np.abs(slopes).max() < 0.02
     assert slopes.mean() == pytest.approx(0, abs=0.002)
     assert (again[before[:, VALUE] == -1, VALUE] == -1).all()
-
-
-def test_the_same_rays_are_held_out_when_they_are_read_back(team: Team) -> None:
-    kept = table()
-    rays, others = recorded_rays(kept, FIELD)
-    before = np.delete(kept.rows, others, axis=0)
-    again = restored_rays(rays, FIELD, team).rows
-    held = are_held_out(before, FIELD)
-    assert 300 < held.sum() < 1_000
-    exact = are_held_out(again, FIELD)
-    assert exact.sum() == held.sum()
-    steps = (
-        ends_in_steps(rows[is_held], FIELD) for rows, is_held in ((before, held), (again, exact))
-    )
-    one, other = (np.unique(of_ends, axis=0) for of_ends in steps)
-    assert np.array_equal(one, other)
-
-
-def test_rays_are_recorded_by_leaf_and_with_the_origins_that_they_have() -> None:
-    kept = table()
-    unused = np.full((3, 3), 99, np.float32)
-    kept = RayTable(kept.rows, kept.origin_of, np.concatenate([kept.origins, unused]))
-    rays, _ = recorded_rays(kept, FIELD)
-    assert (np.diff(rays.leaf_codes) >= 0).all()
-    assert np.array_equal(rays.origins, kept.origins[:2])

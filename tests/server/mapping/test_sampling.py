@@ -91,35 +91,3 @@ def test_samples_stay_inside_the_cube() -> None:
     assert len(table) > ending, "rays that only pass through teach free space"
     batch = draw(table, np.arange(len(table)).repeat(10), placed(settings, half))
     assert np.abs(batch.points).max() <= half + 1e-4
-
-
-def test_rays_that_miss_the_cube_teach_nothing() -> None:
-    far = np.array([0.0, 500.0, 0.0])
-    rays = rays_to_ground()
-    table = kept(rays, np.full((500, 3), np.nan), far, placed(ScanSettings(), 20.0))
-    assert len(table) == 0
-
-
-def test_two_regions_draw_together_what_one_would() -> None:
-    """Of rays across a border, neither more free space nor less of the surface."""
-    settings = ScanSettings()
-    rays = rays_to_ground(20_000)
-    whole, half_m = np.array([16.0, 0.0, 0.0]), 16.0
-    counts = []
-    for centre, half_side_m in (
-        (whole, 2 * half_m),
-        (whole - (half_m, 0, 0), half_m),
-        (whole + (half_m, 0, 0), half_m),
-    ):
-        placement = placed(settings, half_side_m)
-        unknown = np.full((len(rays.ends), 3), np.nan)
-        table = kept(rays, unknown, centre, placement)
-        batch = draw(table, np.arange(len(table)), placement)
-        points = batch.points + centre
-        near = np.abs(batch.labels) < settings.truncation_m
-        free, _ = np.histogram(points[~near, 0], np.arange(0, 25, 4))
-        surface, _ = np.histogram(points[near, 0], np.arange(0, 25, 4))
-        counts.append(np.array([free, surface]))
-    one, left, right = counts
-    assert one.min() > 500, "enough to compare"
-    np.testing.assert_allclose(left + right, one, rtol=0.2)

@@ -8,7 +8,6 @@ from triquad_server.mapping.training.training_budget import FairShare, TrainingB
 from triquad_server.settings import TrainingSettings
 
 SETTINGS = TrainingSettings(samples_per_ray=10.0, fresh_share=0.5)
-BATCH = 1000
 
 
 def budget_of(rays: int, most: int = 10**9) -> TrainingBudget:
@@ -16,78 +15,6 @@ def budget_of(rays: int, most: int = 10**9) -> TrainingBudget:
     budget.limit(most)
     budget.add(rays)
     return budget
-
-
-def spend_all(budget: TrainingBudget, kept_rays: int) -> list[tuple[float, float]]:
-    """The learning rates of old and of young rows in each step until nothing is owed."""
-    rates = []
-    while budget.samples:
-        step = budget.next_step(BATCH, kept_rays)
-        rates.append((step.rates.learning_rate, step.rates.young_rate))
-        budget.spend(step)
-    return rates
-
-
-def test_a_map_of_new_rays_alone_cools_at_the_end_young_and_old_alike() -> None:
-    rates = spend_all(budget_of(10_000), 10_000)
-    assert len(rates) == 100
-    assert all(old == young for old, young in rates)
-    old = [rate for rate, _ in rates]
-    assert old[0] == old[19] == SETTINGS.learning_rate
-    assert old == sorted(old, reverse=True)
-    assert old[-1] == pytest.approx(0.02 * SETTINGS.learning_rate)
-
-
-def test_few_new_rays_beside_many_move_what_is_old_little_and_what_is_young_much() -> None:
-    budget = budget_of(100_000)
-    spend_all(budget, 100_000)
-    budget.add(1000)
-    rates = budget.next_step(BATCH, 101_000).rates
-    assert rates.learning_rate == pytest.approx(0.02 * SETTINGS.learning_rate)
-    assert rates.young_rate == SETTINGS.learning_rate
-
-
-def test_as_many_samples_are_on_new_rays_as_the_setting_says() -> None:
-    budget = budget_of(10_000)
-    fresh = 0
-    while budget.samples:
-        step = budget.next_step(BATCH, 10_000)
-        fresh += step.fresh
-        budget.spend(step)
-    assert fresh == 50_000
-
-
-def test_the_newest_scan_is_learnt_from_for_a_while_whatever_its_share() -> None:
-    for share in (0.5, 1e-5):
-        budget = TrainingBudget(SETTINGS.model_copy(update={"fresh_share": share}))
-        budget.limit(10**12)
-        budget.add(10_000)
-        learnt = [budget.learns_newest]
-        while budget.samples:
-            budget.spend(budget.next_step(BATCH, 10_000))
-            learnt.append(budget.learns_newest)
-        assert learnt[0]
-        assert not learnt[-1]
-
-
-def test_no_more_is_owed_than_may_be_and_the_rest_is_counted() -> None:
-    budget = budget_of(10_000, most=30_000)
-    assert (budget.samples, budget.discarded) == (30_000, 70_000)
-    budget.limit(20_000)
-    assert (budget.samples, budget.discarded) == (20_000, 80_000)
-
-
-def test_half_of_each_batch_is_for_places_that_have_forgotten() -> None:
-    budget = budget_of(100)
-    spend_all(budget, 100_000)
-    budget.repair(500)
-    repaired = 0
-    while budget.samples:
-        step = budget.next_step(BATCH, 100_000)
-        assert step.repair <= BATCH // 2
-        repaired += step.repair
-        budget.spend(step)
-    assert repaired == 16 * 500
 
 
 def test_what_is_gone_is_unlearnt_while_there_is_more_to_learn_and_wakes_no_settled_map() -> None:

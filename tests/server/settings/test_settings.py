@@ -5,8 +5,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from support import servers
 from triquad_format.errors import SettingsError
 from triquad_format.records.field_settings import FieldSettings
@@ -16,14 +14,6 @@ from triquad_server.settings.loading import PRESETS, load_settings, settings_tom
 from triquad_server.settings.settings import setting_schemas
 
 ROOT = Path(__file__).parents[3]
-
-
-def test_the_defaults_of_the_field_are_the_published_ones() -> None:
-    field = Settings().field
-    assert (field.leaf_m, field.depth, field.feature_levels, field.feature_size) == (0.2, 12, 3, 8)
-    assert (field.frequencies, field.frequency_variance, field.hidden) == (16, 50.0, 32)
-    assert field.region_side_m == pytest.approx(819.2)
-    assert field.input_size == 120
 
 
 def test_a_file_changes_what_it_names(tmp_path: Path) -> None:
@@ -83,22 +73,15 @@ def test_presets_are_all_that_lie_in_their_folder_and_each_is_valid() -> None:
     assert leaves["tabletop"] < leaves["indoor"] < leaves["street"] < leaves["long-range"]
 
 
-def command(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """``triquad-server`` as a process."""
-    line = [sys.executable, "-m", "triquad_server.cli", *arguments]
-    return subprocess.run(line, capture_output=True, text=True, timeout=servers.WAIT_S)
-
-
-def test_an_unknown_preset_is_named_with_those_there_are() -> None:
-    done = command("--preset", "../indoor", "--print-settings")
-    assert done.returncode == cli.USAGE
-    assert "there is no preset '../indoor': use street, indoor, tabletop, long-range" in done.stderr
-
-
-def test_errors_tell_what_a_preset_gave(tmp_path: Path) -> None:
+def test_errors_tell_what_a_preset_gave_and_which_file_is_missing(tmp_path: Path) -> None:
     leaf_m = load_settings(preset="indoor").field.leaf_m
     with pytest.raises(SettingsError, match=f"--set: mesh.cell_m = 2 .*leaf_m = {leaf_m:g}"):
         load_settings(assignments=["mesh.cell_m=2"], preset="indoor")
+    told = "there is no preset '../indoor': use street, indoor, tabletop, long-range"
+    with pytest.raises(SettingsError, match=told):
+        load_settings(preset="../indoor")
+    with pytest.raises(SettingsError, match="nowhere.toml"):
+        load_settings(tmp_path / "nowhere.toml")
 
 
 def test_lengths_follow_the_leaf_from_wherever_it_is_set(
@@ -116,26 +99,11 @@ def test_lengths_follow_the_leaf_from_wherever_it_is_set(
     assert (mesh.cell_m, mesh.reach_m, mesh.tolerance_m) == (0.025, 0.005, 0.0025)
 
 
-def test_at_the_default_leaf_lengths_are_their_defaults() -> None:
-    scan, mesh = Settings().scan, Settings().mesh
-    assert (scan.range_min_m, scan.range_max_m, scan.thin_m) == (1.5, 50.0, 0.05)
-    assert (scan.spread_m, scan.truncation_m, scan.behind_m) == (0.08, 0.3, 0.8)
-    assert (mesh.cell_m, mesh.reach_m, mesh.tolerance_m) == (0.1, 0.02, 0.01)
-
-
 def test_a_length_that_is_given_follows_nothing() -> None:
     settings = load_settings(assignments=["field.leaf_m=0.05", "scan.thin_m=0.02"])
     assert (settings.scan.thin_m, settings.scan.spread_m) == (0.02, 0.02)
     coarse = Settings(field=FieldSettings(leaf_m=0.4), mesh=MeshSettings(cell_m=0.1))
     assert (coarse.mesh.cell_m, coarse.mesh.reach_m) == (0.1, 0.04)
-
-
-@given(st.floats(0.01, 10.0), st.integers(6, 15))
-def test_what_follows_from_any_leaf_is_allowed(leaf_m: float, depth: int) -> None:
-    settings = Settings(field=FieldSettings(leaf_m=leaf_m, depth=depth))
-    given_in_full = Settings.model_validate(settings.model_dump())
-    assert given_in_full == settings
-    assert settings.scan.thin_m == pytest.approx(leaf_m / 4)
 
 
 def test_for_another_field_lengths_follow_its_leaf_and_have_to_go_with_it() -> None:
@@ -204,163 +172,11 @@ def test_settings_that_are_printed_can_be_read(tmp_path: Path) -> None:
 
 
 def test_the_command_prints_the_settings_in_effect() -> None:
-    done = command("--print-settings", "--set", "training.batch=4096")
+    line = [sys.executable, "-m", "triquad_server.cli", "--print-settings"]
+    line += ["--set", "training.batch=4096"]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=servers.WAIT_S)
     assert (done.returncode, done.stderr) == (cli.OK, "")
     assert "[training]\nbatch = 4096\n" in done.stdout
-
-
-@pytest.mark.parametrize(
-    ("variable", "words"),
-    [
-        ("TRIQUAD_TRAINING__BACTH", ["training.bacth", "did you mean training.batch?"]),
-        ("TRIQUAD_TRIANING__BATCH", ["unknown setting trianing: did you mean training?"]),
-        ("TRIQUAD_TRAINING__BATCH", ["training.batch = 0.5", "integer"]),
-        ("TRIQUAD_STORE", ["store = 0.5", "[store]"]),
-        ("TRIQUAD_SOURCES__ROOF__RANGE_MX_M", ["did you mean sources.roof.range_max_m?"]),
-        ("TRIQUAD_SOURCES__ROOF__NO_RETURN", ["sources.roof.no_return = 0.5: use true or false"]),
-        ("TRIQUAD_SOURCES__ROOF", ["sources.roof = 0.5", "[sources.roof]"]),
-        ("TRIQUAD_SOURCES", ["sources = 0.5", "[sources.NAME]"]),
-    ],
-)
-def test_errors_name_the_environment(
-    monkeypatch: pytest.MonkeyPatch, variable: str, words: list[str]
-) -> None:
-    monkeypatch.setenv(variable, "0.5")
-    with pytest.raises(SettingsError) as error:
-        load_settings()
-    assert all(word in str(error.value) for word in ["environment", *words])
-
-
-def test_errors_of_a_source_name_the_place_of_that_key(tmp_path: Path) -> None:
-    path = tmp_path / "settings.toml"
-    path.write_text("[sources.roof]\nrange_max_m = '9'\nrobot_box_m = [[0, 0, 0], [1, 1, 99]]\n")
-    with pytest.raises(SettingsError) as error:
-        load_settings(path, ["sources.roof.no_return=false", "sources.roof.range_min_m=-1"])
-    wrong = str(error.value).split("; ")
-    assert [text.partition(" = ")[0] for text in wrong] == [
-        "--set: sources.roof.range_min_m",
-        f"settings file {path}: sources.roof.range_max_m",
-        f"settings file {path}: sources.roof.robot_box_m.1.2",
-    ]
-
-
-@pytest.mark.parametrize(
-    ("assignment", "words"),
-    [
-        ("training.bacth=1", ["unknown setting training.bacth: did you mean training.batch?"]),
-        ("training.batch=0", ["training.batch = 0 is out of range: use 1 to 10000000"]),
-        ("training.batch", ["training.batch", "SECTION.KEY=VALUE"]),
-        ("batch=4096", ["batch=4096", "SECTION.KEY=VALUE"]),
-        ("sources.roof=1", ["sources.roof=1", "sources.NAME.KEY=VALUE"]),
-        ("sources.roof.range_max_m=far", ["range_max_m = 'far'", "0 to 10000.0 (number)"]),
-        ("sources.roof.range_max_m=nan", ["range_max_m = nan", "use 0 to 10000.0 (number)"]),
-        ("scan.range_min_m=nan", ["scan.range_min_m = nan", "use 0 to 1000 (number)"]),
-        ("scan.range_min_m=inf", ["scan.range_min_m = inf", "use 0 to 1000 (number)"]),
-        ("training.batch=nan", ["training.batch = nan", "use 1 to 10000000 (integer)"]),
-        ("change.scans=0", ["change.scans = 0 is out of range: use 1 to 1000 (integer)"]),
-        ("change.doubt=0", ["change.doubt = 0 is out of range: use 1e-09 to 0.5 (number)"]),
-        ("change.doubt=1", ["change.doubt = 1 is out of range: use 1e-09 to 0.5 (number)"]),
-        ("change.static=maybe", ["change.static = 'maybe'", "use true or false"]),
-    ],
-)
-def test_errors_name_the_command_line(assignment: str, words: list[str]) -> None:
-    with pytest.raises(SettingsError) as error:
-        load_settings(assignments=[assignment])
-    assert "quotes" not in str(error.value)
-    assert all(word in str(error.value) for word in ["--set", *words])
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("[field]\nleaf = 0.3\n", ["leaf", "leaf_m"]),
-        ("[filed]\nleaf_m = 0.3\n", ["filed", "field"]),
-        ("[field]\nleaf_m = 'big'\n", ["field.leaf_m", "big", "number"]),
-        ("[field]\nleaf_m = -1\n", ["leaf_m", "-1", "0.01"]),
-        ("[field]\ndepth = true\n", ["field.depth", "True"]),
-        ("[field]\nencoding = 'all'\n", ["encoding", "all", "both"]),
-        ("[training]\nbatch = 0\n", ["training.batch = 0", "use 1 to 10000000"]),
-        ("[training]\nbatch = 2.5\n", ["training.batch = 2.5", "1 to 10000000 (integer)"]),
-        ("[training]\nbatch = 2.0\n", ["training.batch = 2.0", "integer"]),
-        ("[scan]\nmax_points = '4096'\n", ["scan.max_points = '4096'", "without quotes"]),
-        (
-            "[scan]\nspread_m = '0.1'\n",
-            ["spread_m = '0.1'", "0.001 to 10 (number), without"],
-        ),
-        ("[field]\ndepth = '8'\n", ["field.depth = '8'", "6 to 15 (integer), without quotes"]),
-        ("[training]\nbatch = 0\nseed = -1\n", ["training.batch = 0", "training.seed = -1"]),
-        ("[scan]\nrange_max_m = 1\n", ["range_max_m = 1", "range_min_m = 1.5"]),
-        ("field = 3\n", ["field", "3"]),
-        ("sources = 3\n", ["sources = 3", "[sources.NAME]"]),
-        ("[source.roof]\nrange_max_m = 9\n", ["unknown setting source: did you mean"]),
-        (
-            "[sources.roof]\nrange_max_m = 9\n[Sources.roof]\nrange_min_m = 2\n",
-            ["unknown setting Sources: did you mean sources?"],
-        ),
-        ("[sources.front.left]\nrange_max_m = 9\n", ["quotes", '[sources."front.left"]']),
-        ("[sources.a.b.c]\nrange_max_m = 9\n", ["sources.a.b.c", '[sources."a.b.c"]']),
-        ("[sources.roof]\nrobot_box = 3\n", ["did you mean sources.roof.robot_box_m?"]),
-        ("[sources.roof]\nrobot_box_m = 3\n", ["robot_box_m = 3: write two corners, [[x, y, z]"]),
-        ("[sources.a]\nrobot_box_m = [[0, 0, 0], [1, 1]]\n", ["robot_box_m", "two corners"]),
-        ("[sources.a]\nrobot_box_m = [[0, 0, 0], [1, 1, 99]]\n", ["99", "use -20 to 20"]),
-        ("[sources.a]\nrange_max_m = true\n", ["sources.a.range_max_m = True", "number"]),
-        ("[field\n", ["settings.toml"]),
-        ("[scan]\nrange_min_m = nan\n", ["range_min_m = nan", "use 0 to 1000 (number)"]),
-        ("[training]\nseed = -1\n", ["seed", "-1"]),
-        (f"[field]\nleaf_m = 1{'0' * 400}\n", ["leaf_m", "number"]),
-        (f"[field]\ndepth = 1{'0' * 400}\n", ["depth", "use 6 to 15"]),
-        (f"[field]\ndepth = 1{'0' * 5000}\n", ["settings.toml"]),
-        (f"a = {'[' * 5000}\n", ["settings.toml"]),
-    ],
-)
-def test_errors_name_the_key_and_the_value(tmp_path: Path, text: str, words: list[str]) -> None:
-    path = tmp_path / "settings.toml"
-    path.write_text(text)
-    with pytest.raises(SettingsError) as error:
-        load_settings(path)
-    assert all(word in str(error.value) for word in [*words, str(path)])
-
-
-@pytest.mark.parametrize(
-    ("sections", "words"),
-    [
-        (
-            {"field": {"leaf_m": 0.01, "depth": 6}, "scan": {"range_max_m": 5.0}},
-            ["--set: scan.range_max_m = 5 reaches", "leaf_m = 0.01", "depth", "at most 3.84"],
-        ),
-        ({"scan": {"thin_m": 0.001, "range_max_m": 2000.0}}, ["thin_m", "range_max_m"]),
-        ({"field": {"leaf_m": 0.05}, "mesh": {"cell_m": 0.5}}, ["cell_m", "leaf_m"]),
-        (
-            {"sources": {"roof.range_max_m": 1}},
-            ["sources.roof.range_max_m = 1", "range_min_m = 1.5"],
-        ),
-        ({"sources": {"roof.range_max_m": 9000}}, ["sources.roof.range_max_m", "leaf_m"]),
-        ({"sources": {"ro of.range_max_m": 9}}, ["'ro of'", "letters"]),
-        ({"sources": {"roof.robot_box_m": [[0, 0, 0], [1, 0, 1]]}}, ["robot_box_m", "smaller x"]),
-        (
-            {"sources": {"roof.robot_box_m": [[-9, -9, -9], [9, 9, 9]]}},
-            ["robot_box_m", "100000 voxels", "smaller box"],
-        ),
-    ],
-)
-def test_settings_that_do_not_go_together_are_refused(
-    sections: dict[str, dict[str, object]],
-    words: list[str],
-) -> None:
-    with pytest.raises(SettingsError) as error:
-        load_settings(
-            assignments=[
-                f"{section}.{key}={value}"
-                for section, table in sections.items()
-                for key, value in table.items()
-            ]
-        )
-    assert all(word in str(error.value) for word in words)
-
-
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(SettingsError, match="nowhere.toml"):
-        load_settings(tmp_path / "nowhere.toml")
 
 
 def test_every_setting_is_read_somewhere() -> None:

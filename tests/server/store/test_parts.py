@@ -8,87 +8,32 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from support.maps.map_records import assert_same, random_record
+from support.files.growing_store import (
+    ROW,
+    changes,
+    drive,
+    grown,
+    part_of,
+    parts_of,
+    paths,
+    rot,
+)
+from support.maps.map_records import assert_same
 from triquad_format.errors import DamagedMapFileError, MapFileError
-from triquad_format.mapfile.checkpoint import read_checkpoint, write_checkpoint
-from triquad_format.mapfile.checkpoint_folder import checkpoint_files
 from triquad_format.mapfile.part_files import PartFiles
-from triquad_format.mapfile.reader import read_map, read_map_file
+from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
-from triquad_format.records.field_settings import RegionIndex
 from triquad_format.recovery.recovered_map import recover
 from triquad_map.stored_map import StoredMap
 from triquad_server.errors import StoreError
-from triquad_server.mapping.map_snapshot import MapChanges
-from triquad_server.mapping.mapper import Mapper
-from triquad_server.settings import Settings, StoreSettings
+from triquad_server.settings import StoreSettings
 from triquad_server.store.store import Store
-
-ROW: tuple[RegionIndex, ...] = tuple((x, 0, 0) for x in range(10))
-
-
-EMPTY = Mapper("lab", Settings(), "cpu").publish()  # a store does not look at it
-
-
-def grown(seed, epoch, before=None, only=ROW):
-    """A map of ten regions; those not in ``only`` are as in ``before``."""
-    fresh = random_record(seed, indices=ROW, name="lab", epoch=epoch, points=60)
-    if before is None:
-        return fresh
-    old = {region.index: region for region in before.regions}
-    regions = tuple(r if r.index in only else old[r.index] for r in fresh.regions)
-    return dataclasses.replace(fresh, regions=regions)
-
-
-def changes(record, only=ROW):
-    """What the mapper hands over where the regions ``only`` changed."""
-    changed = tuple(region for region in record.regions if region.index in only)
-    indices = tuple(region.index for region in record.regions)
-    return MapChanges(dataclasses.replace(record, regions=changed), indices, EMPTY)
 
 
 @pytest.fixture
 def store(tmp_path):
     with closing(Store(tmp_path, "lab", StoreSettings(keep=100))) as store:
         yield store
-
-
-def drive(store, epochs, rows=ROW):
-    """Epochs of which each changes the next one of the regions ``rows``; the first all of them."""
-    records = {1: grown(1, 1)}
-    store.write(changes(records[1]))
-    for epoch in range(2, 2 + epochs):
-        only = (rows[epoch % len(rows)],)
-        record = grown(epoch, epoch, records[max(records)], only)
-        store.write(changes(record, only))
-        records[epoch] = record
-    return records
-
-
-def paths(store):
-    return {file.epoch: file.path for file in reversed(checkpoint_files(store.folder))}
-
-
-def parts_of(path):
-    """The files of the parts that a checkpoint names."""
-    folder = PartFiles(path.parent).folder
-    return {folder / entry.name for entry in read_map_file(path).manifest.entries}
-
-
-def part_of(path, index, topic="/triquad/evidence"):
-    """The file of one part of a region, as a checkpoint names it."""
-    entries = read_map_file(path).manifest.entries
-    chosen = next(e for e in entries if e.key.region == index and e.key.topic == topic)
-    return PartFiles(path.parent).folder / chosen.name
-
-
-def rot(path):
-    """Damage a file as a disk does: nothing but its bytes tells."""
-    before = path.stat()
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 0x10
-    path.write_bytes(data)
-    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
 
 
 def test_a_checkpoint_writes_what_changed_and_reads_back_whole(store):
@@ -113,13 +58,6 @@ def test_what_did_not_change_is_neither_encoded_nor_written(store, monkeypatch):
     store.write(changes(dataclasses.replace(first, epoch=2), only=ROW[:3]))
     assert {path: path.stat() for path in parts_of(paths(store)[2])} == before
     assert_same(read_map(paths(store)[2]), dataclasses.replace(first, epoch=2))
-
-
-def test_parts_keep_the_epoch_in_which_they_changed(store):
-    drive(store, 3)
-    entries = read_map_file(paths(store)[4]).manifest.entries
-    changed = {e.key.region: e.epoch for e in entries if e.key.topic == "/triquad/region"}
-    assert changed == {index: 1 for index in ROW} | {ROW[2]: 2, ROW[3]: 3, ROW[4]: 4}
 
 
 def test_a_restarted_store_goes_on_from_the_newest(store, tmp_path):
@@ -160,9 +98,8 @@ def test_a_backup_is_restored_and_gone_on_from(store):
 # Damage, and what others do to the folder
 
 
-@pytest.mark.parametrize("same", [False, True], ids=["another map", "the same map"])
 @pytest.mark.parametrize("harm", ["delete", "cut", "delete the checkpoint", "cut the checkpoint"])
-def test_where_something_is_gone_all_is_written_again(store, harm, same):
+def test_where_something_is_gone_all_is_written_again(store, harm):
     records = drive(store, 1)
     path = paths(store)[2] if "checkpoint" in harm else part_of(paths(store)[2], ROW[0])
     if "delete" in harm:
@@ -170,7 +107,7 @@ def test_where_something_is_gone_all_is_written_again(store, harm, same):
     else:
         path.write_bytes(path.read_bytes()[:-1])
     assert store.base_epoch is None
-    third = dataclasses.replace(records[2], epoch=3) if same else grown(3, 3)
+    third = dataclasses.replace(records[2], epoch=3)  # the same map
     store.write(changes(third))
     assert_same(read_map(paths(store)[3]), third)
     assert store.base_epoch == 3, "later ones are of what changed"
@@ -220,14 +157,6 @@ def test_a_part_that_nothing_new_needs_is_no_reason_to_write(store):
     assert store.base_epoch == 2
 
 
-def test_another_part_under_a_name_is_found_out(store):
-    drive(store, 1)
-    one, other = (part_of(paths(store)[2], index) for index in ROW[:2])
-    one.write_bytes(other.read_bytes())
-    with pytest.raises(DamagedMapFileError, match=one.name):
-        read_map(paths(store)[2])
-
-
 @pytest.mark.parametrize("harm", [rot, Path.unlink], ids=["rotten", "missing"])
 def test_an_older_checkpoint_serves_where_a_part_of_the_newest_is_damaged(store, harm, caplog):
     records = drive(store, 2)
@@ -275,11 +204,10 @@ def test_on_a_full_disk_nothing_is_lost_and_nothing_is_left(store, monkeypatch):
     store.write(changes(grown(3, 3)))
 
 
-@pytest.mark.parametrize("limit", ["writer.MAX_PART_BYTES", "writer.MAX_MAP_BYTES"])
-def test_what_could_not_be_read_again_is_not_written(store, monkeypatch, limit):
+def test_what_could_not_be_read_again_is_not_written(store, monkeypatch):
     drive(store, 1)
     before = sorted(store.folder.rglob("*"))
-    monkeypatch.setattr(f"triquad_format.mapfile.{limit}", 200)
+    monkeypatch.setattr("triquad_format.mapfile.writer.MAX_MAP_BYTES", 200)
     with pytest.raises(StoreError, match="000000003.checkpoint cannot be written: .* at most 200"):
         store.write(changes(grown(3, 3)))
     assert sorted(store.folder.rglob("*")) == before
@@ -316,90 +244,3 @@ def test_no_clock_keeps_a_checkpoint_from_being_written(store, monkeypatch, cloc
     monkeypatch.setattr("time.time_ns", lambda: clock_ns)
     store.write(changes(grown(1, 1)))
     assert read_map(paths(store)[1]).epoch == 1
-
-
-# What stays
-
-
-def test_what_is_no_file_does_not_stop_the_retention(tmp_path):
-    with closing(Store(tmp_path, "lab", StoreSettings(keep=2))) as store:
-        (store.folder / "epoch-000000000.checkpoint").mkdir()
-        os.mkfifo(store.folder / "epoch-000000000.triquad")
-        (store.folder / "epoch-000000001.checkpoint").symlink_to("nowhere")
-        for epoch in range(2, 6):
-            store.write(changes(grown(epoch, epoch)))
-        assert sorted(paths(store)) == [4, 5]
-
-
-def test_parts_go_with_the_last_checkpoint_that_names_them(tmp_path):
-    with closing(Store(tmp_path, "lab", StoreSettings(keep=3))) as store:
-        records = drive(store, 5, ROW[:1])
-        found = paths(store)
-        assert sorted(found) == [4, 5, 6]
-        for epoch in (4, 5, 6):
-            assert_same(read_map(found[epoch]), records[epoch])
-        needed = set().union(*map(parts_of, found.values()))
-        assert set(PartFiles(store.folder).folder.iterdir()) == needed
-
-
-def test_retention_by_bytes_counts_shared_parts_once(tmp_path):
-    with closing(Store(tmp_path, "lab", StoreSettings(keep=100, keep_bytes=0))) as store:
-        drive(store, 1)
-        whole = sum(path.stat().st_size for path in parts_of(paths(store)[1]))
-    limit = whole + whole // 2
-    with closing(Store(tmp_path, "roomy", StoreSettings(keep=100, keep_bytes=limit))) as store:
-        drive(store, 12, ROW[:1])
-        assert 3 <= len(paths(store)) <= 6
-        files = [path for path in store.folder.rglob("*") if path.is_file()]
-        assert sum(path.stat().st_size for path in files) <= limit
-    with closing(Store(tmp_path, "tight", StoreSettings(keep=100, keep_bytes=1))) as store:
-        drive(store, 9, ROW[:1])
-        assert sorted(paths(store)) == [9, 10]
-
-
-def test_what_undoes_something_stays_until_enough_others_do(tmp_path):
-    with closing(Store(tmp_path, "lab", StoreSettings(keep=2, keep_resets=2))) as store:
-        for epoch in range(1, 10):
-            info = store.write(
-                changes(grown(epoch, epoch)), "a reset" if epoch in (2, 4, 6) else ""
-            )
-            assert store.base_epoch == info.epoch == epoch
-        assert sorted(paths(store)) == [4, 6, 8, 9]
-        assert_same(read_map(paths(store)[4]), grown(4, 4))
-
-
-def test_a_checkpoint_that_is_replaced_within_a_tick_of_the_clock_is_read_again(tmp_path):
-    with closing(Store(tmp_path, "lab", StoreSettings(keep=2))) as store:
-        store.write(changes(grown(1, 1)))
-        path = paths(store)[1]
-        before = path.stat()
-        write_checkpoint(path, dataclasses.replace(read_checkpoint(path), undoes="a reset"))
-        os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
-        for epoch in range(2, 5):
-            store.write(changes(grown(epoch, epoch)))
-        assert sorted(paths(store)) == [1, 3, 4]
-
-
-def test_a_map_that_was_restored_can_be_restored_once_more(tmp_path, caplog):
-    with closing(Store(tmp_path, "lab", StoreSettings(keep=2))) as store:
-        records = drive(store, 1)
-        store.restore(1)
-        for epoch in range(4, 8):
-            store.write(changes(grown(epoch, epoch)))
-        store.restore(1)
-        assert "to go back there again, use --restore 3" in caplog.text
-        store.restore(3)
-        assert_same(store.newest().record, dataclasses.replace(records[1], epoch=8))
-
-
-def test_a_map_that_was_restored_can_be_restored_back(store):
-    records = drive(store, 2)
-    store.restore(1)
-    restored = store.newest()
-    assert_same(restored.record, dataclasses.replace(records[1], epoch=4))
-    assert restored.checkpoint.restored.epoch == 1
-    assert parts_of(paths(store)[4]) == parts_of(paths(store)[1])
-    store.restore(1)  # as a service does that is started again
-    assert sorted(paths(store)) == [1, 2, 3, 4]
-    store.restore(3)
-    assert_same(store.newest().record, dataclasses.replace(records[3], epoch=5))

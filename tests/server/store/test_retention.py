@@ -1,9 +1,24 @@
 """Which checkpoints stay."""
 
 import dataclasses
+import os
+from contextlib import closing
 
+from support.files.growing_store import (
+    ROW,
+    changes,
+    drive,
+    grown,
+    parts_of,
+    paths,
+)
+from support.maps.map_records import assert_same
+from triquad_format.mapfile.checkpoint import read_checkpoint, write_checkpoint
+from triquad_format.mapfile.part_files import PartFiles
+from triquad_format.mapfile.reader import read_map
 from triquad_server.settings import StoreSettings
 from triquad_server.store.retention import StoredCheckpoint, staying
+from triquad_server.store.store import Store
 
 
 def checkpoints(*files: str) -> list[StoredCheckpoint]:
@@ -57,3 +72,65 @@ def test_what_a_restored_map_went_on_from_stays() -> None:
     found[0] = dataclasses.replace(found[0], restored_as="b")
     assert left(found, keep=2) == "abcef"
     assert left(found, keep=2, keep_bytes=40) == "acef"
+
+
+# In a store
+
+
+def test_what_is_no_file_does_not_stop_the_retention(tmp_path):
+    with closing(Store(tmp_path, "lab", StoreSettings(keep=2))) as store:
+        (store.folder / "epoch-000000000.checkpoint").mkdir()
+        os.mkfifo(store.folder / "epoch-000000000.triquad")
+        (store.folder / "epoch-000000001.checkpoint").symlink_to("nowhere")
+        for epoch in range(2, 6):
+            store.write(changes(grown(1, epoch)))
+        assert sorted(paths(store)) == [4, 5]
+
+
+def test_parts_go_with_the_last_checkpoint_that_names_them(tmp_path):
+    with closing(Store(tmp_path, "lab", StoreSettings(keep=3))) as store:
+        records = drive(store, 5, ROW[:1])
+        found = paths(store)
+        assert sorted(found) == [4, 5, 6]
+        for epoch in (4, 5, 6):
+            assert_same(read_map(found[epoch]), records[epoch])
+        needed = set().union(*map(parts_of, found.values()))
+        assert set(PartFiles(store.folder).folder.iterdir()) == needed
+
+
+def test_what_undoes_something_stays_until_enough_others_do(tmp_path):
+    with closing(Store(tmp_path, "lab", StoreSettings(keep=2, keep_resets=2))) as store:
+        for epoch in range(1, 10):
+            undoes = "a reset" if epoch in (2, 4, 6) else ""
+            info = store.write(changes(grown(epoch, epoch)), undoes)
+            assert store.base_epoch == info.epoch == epoch
+        assert sorted(paths(store)) == [4, 6, 8, 9]
+        assert_same(read_map(paths(store)[4]), grown(4, 4))
+
+
+def test_a_checkpoint_that_is_replaced_within_a_tick_of_the_clock_is_read_again(tmp_path):
+    with closing(Store(tmp_path, "lab", StoreSettings(keep=2))) as store:
+        store.write(changes(grown(1, 1)))
+        path = paths(store)[1]
+        before = path.stat()
+        write_checkpoint(path, dataclasses.replace(read_checkpoint(path), undoes="a reset"))
+        os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+        for epoch in range(2, 5):
+            store.write(changes(grown(1, epoch)))
+        assert sorted(paths(store)) == [1, 3, 4]
+
+
+def test_a_map_that_was_restored_can_be_restored_back(tmp_path, caplog):
+    store = Store(tmp_path, "lab", StoreSettings(keep=100))
+    records = drive(store, 2)
+    store.restore(1)
+    restored = store.newest()
+    assert_same(restored.record, dataclasses.replace(records[1], epoch=4))
+    assert restored.checkpoint.restored.epoch == 1
+    assert parts_of(paths(store)[4]) == parts_of(paths(store)[1])
+    store.restore(1)  # as a service does that is started again
+    assert "to go back there again, use --restore 4" in caplog.text
+    assert sorted(paths(store)) == [1, 2, 3, 4]
+    store.restore(3)
+    assert_same(store.newest().record, dataclasses.replace(records[3], epoch=5))
+    store.close()

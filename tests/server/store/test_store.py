@@ -4,15 +4,13 @@ from contextlib import closing
 
 import pytest
 from support import servers
-from triquad_format.errors import MapFileError, TooLargeMapFileError
-from triquad_format.mapfile.reader import read_map
+from triquad_format.errors import TooLargeMapFileError
 from triquad_format.records.region import MapRecord
 from triquad_server.errors import StoreError
 from triquad_server.mapping.map_snapshot import MapChanges
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import StoreSettings
 from triquad_server.store import restore
-from triquad_server.store import store as store_module
 from triquad_server.store.store import Store
 
 EMPTY = Mapper("lab", servers.SMALL, "cpu").publish()
@@ -32,10 +30,6 @@ def store(tmp_path):
 def names(store):
     others = ("lock", "parts")
     return sorted(path.name for path in store.folder.iterdir() if path.name not in others)
-
-
-def test_an_empty_store_has_nothing(store):
-    assert store.newest() is None
 
 
 def test_the_newest_checkpoints_are_kept_and_described(store):
@@ -63,16 +57,6 @@ def test_a_damaged_checkpoint_is_left_out_by_name_and_kept_aside(store, caplog):
     assert store.newest().record.epoch == 3
 
 
-def test_a_truncated_checkpoint_is_damaged(store):
-    store.write(record(1))
-    path = store.folder / "epoch-000000002.checkpoint"
-    store.write(record(2))
-    path.write_bytes(path.read_bytes()[:-10])
-    with pytest.raises(MapFileError):
-        read_map(path)
-    assert store.newest().record.epoch == 1
-
-
 @pytest.mark.parametrize(
     "error",
     [
@@ -94,23 +78,6 @@ def test_a_valid_checkpoint_that_cannot_be_read_now_is_not_demoted(store, monkey
     with pytest.raises(StoreError, match="000000002.checkpoint cannot be read"):
         store.newest()
     assert names(store) == before
-
-
-def test_a_folder_that_cannot_be_listed_is_an_error_of_the_store(store, monkeypatch):
-    monkeypatch.setattr(store, "folder", store.folder / "gone")
-    with pytest.raises(StoreError, match="cannot be read"):
-        store.newest()
-    with pytest.raises(StoreError):
-        store.write(record(1))
-
-
-def test_what_keeps_a_checkpoint_from_being_written_is_an_error_of_the_store(store, monkeypatch):
-    def fail(*_, **__):
-        raise OSError(errno.ENOSPC, "No space left")
-
-    monkeypatch.setattr(store_module, "write_checkpoint", fail)
-    with pytest.raises(StoreError, match="cannot be written"):
-        store.write(record(1))
 
 
 def test_a_damaged_file_of_a_higher_number_does_not_push_out_a_valid_one(store):
@@ -161,15 +128,6 @@ def test_what_a_killed_server_left_unfinished_goes(store, tmp_path):
         assert again.newest().record.epoch == 1
 
 
-def test_a_failed_write_leaves_the_older_checkpoints(store):
-    store.write(record(1))
-    (store.folder / "epoch-000000002.checkpoint").mkdir()
-    with pytest.raises(StoreError, match="epoch-000000002"):
-        store.write(record(2))
-    (store.folder / "epoch-000000002.checkpoint").rmdir()
-    assert store.newest().record.epoch == 1
-
-
 def test_an_epoch_of_another_map_is_told_with_the_maps_there_are(store, tmp_path):
     store.write(record(3))
     with (
@@ -191,10 +149,3 @@ def test_a_checkpoint_under_a_wrong_number_does_not_pass_for_a_later_one(store, 
     assert "epoch-000000009.checkpoint holds epoch 3" in caplog.text
     store.write(record(4))
     assert store.newest().record.epoch == 4
-
-
-def test_a_number_of_more_than_64_bits_is_not_a_checkpoint(store):
-    store.write(record(3))
-    valid = store.folder / "epoch-000000003.checkpoint"
-    (store.folder / "epoch-9999999999999999999.checkpoint").write_bytes(valid.read_bytes())
-    assert store.newest().info.epoch == 3

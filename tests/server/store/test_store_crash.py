@@ -11,7 +11,7 @@ from triquad_format.mapfile.reader import read_map
 from triquad_server.settings import StoreSettings
 from triquad_server.store.store import Store
 
-KILLS = int(os.environ.get("TRIQUAD_KILLS", "15"))
+KILLS = int(os.environ.get("TRIQUAD_KILLS", "8"))
 
 
 def last_sent(received):

@@ -13,7 +13,7 @@ from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings, StoreSettings
 from triquad_server.store.store import Store
 
-ROW: tuple[RegionIndex, ...] = tuple((x, 0, 0) for x in range(10))
+ROW: tuple[RegionIndex, ...] = tuple((x, 0, 0) for x in range(6))
 KEPT = 6
 
 

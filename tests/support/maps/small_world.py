@@ -82,11 +82,6 @@ def settled(scans: int = 6) -> Mapper:
     return mapper
 
 
-def settled_copy(scans: int = 6) -> Mapper:
-    """Such a mapper to do with as one likes: it goes on from the record of the other."""
-    return Mapper("test", settings(), "cpu", settled(scans).changes_since(None).record)
-
-
 def settled_epoch(scans: int = 6) -> Epoch:
     """All that can be learnt of a drive of a few scans: an epoch never changes, so all share it."""
     return settled(scans).publish()

@@ -74,7 +74,7 @@ def test_a_bag_gives_the_map_of_its_folder(tmp_path: Path, settings: str, whole:
     messages = drive(messages_for("mcap"), scans(), POSES, STAMPS, np.eye(4))
     bag, output = write_bag(tmp_path / "bag", "mcap", messages), tmp_path / "bag.triquad"
     assert main([str(bag), str(output), "--settings", settings]) == 0
-    assert abs(error_of(output) - error_of(whole)) < 0.01
+    assert abs(error_of(output) - error_of(whole)) < 0.02
     assert_no_scan_is_lost(output, whole)
     # Training state is kept on request alone.
     regions = [read_map(path).regions[0] for path in (output, whole)]

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 import triquad_client
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 from support import servers
@@ -40,7 +40,6 @@ EXTREMES: dict[type, tuple[Any, ...]] = {
 }
 
 
-@settings(deadline=None)
 @given(before=COUNTS, more=COUNTS, seconds=st.floats(1e-3, 1e4))
 def test_a_rate_times_its_interval_is_what_was_counted(before, more, seconds):
     first = {"scans_taken": before, "points_dropped": {"too_near": before, "forgotten": 9}}
@@ -142,7 +141,6 @@ def scrambled(value: Any, random: Random) -> Any:
     return random.choice((value, *EXTREMES.get(type(value), ())))
 
 
-@settings(deadline=None)
 @given(st.randoms(use_true_random=False), st.sampled_from([20, 80, 140]))
 def test_whatever_a_server_says_can_be_drawn_and_steers_no_terminal(random, width):
     before, after = (

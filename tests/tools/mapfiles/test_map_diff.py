@@ -1,16 +1,14 @@
 import json
 import math
 
-import numpy as np
 import pytest
 from support.maps.exact_maps import exact_map, flat, table
 from support.maps.map_records import random_record
 from support.maps.small_world import settings, settled_epoch, settled_mapper, world
 from triquad_client import OfflineMap
 from triquad_format.mapfile.writer import write_map
-from triquad_map.composition.recorded_view import RecordedView
 from triquad_tools.commands.inspect import main
-from triquad_tools.mapfiles.diff import compare, difference, surface_points
+from triquad_tools.mapfiles.diff import compare, difference
 
 GROUND = exact_map(flat(0.1))
 RAISED = exact_map(table(0.1, 0.15))  # by 5 cm, in a square of 4 m
@@ -26,15 +24,6 @@ def diff(a, b, tile_m=1.0):
 
 def tile_at(found, *corner):
     return next(tile for tile in found.tiles if tile.low_m == corner)
-
-
-def test_surface_points_lie_on_the_surface_of_their_voxel():
-    with OfflineMap(RAISED) as raised:
-        points = surface_points(raised)
-    assert len(points) == POINTS
-    assert np.abs(RecordedView(RAISED).query(points).sdf).max() <= 1e-4
-    inside = np.abs(points[:, :2]).max(axis=1) < 1.9
-    np.testing.assert_allclose(points[inside, 2], 0.15, atol=2e-4)
 
 
 def test_a_map_does_not_differ_from_itself():

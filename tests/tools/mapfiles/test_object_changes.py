@@ -33,7 +33,7 @@ def mapped(seed, *places):
     scene = street(3)
     boxes = tuple(box((x, y, 0.0), (0.6, 0.6, 2.0)) for x, y in places)
     scene = dataclasses.replace(scene, solids=scene.solids + boxes)
-    mapper = Mapper("street", settings(), "cpu")
+    mapper = Mapper("street", settings(samples_per_ray=8.0), "cpu")
     rng = np.random.default_rng(seed)
     for pose in drive(scene, 12, 1.4):
         scan = LIDAR.scan(scene, pose, rng)
@@ -74,8 +74,8 @@ def test_what_vanished_and_what_appeared_is_told_apart():
         by_x = sorted(middles(clusters), key=lambda middle: middle[0])
         np.testing.assert_allclose(by_x, places, atol=0.35)
         for cluster in clusters:
-            np.testing.assert_allclose(cluster.size_m[:2], 1.2, atol=0.3)
-            assert 1.8 <= cluster.high_m[2] <= 2.2
+            np.testing.assert_allclose(cluster.size_m[:2], 1.2, atol=0.4)
+            assert 1.7 <= cluster.high_m[2] <= 2.3
             assert cluster.points > 100
 
 

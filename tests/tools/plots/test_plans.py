@@ -3,26 +3,18 @@ import pytest
 import triquad_client
 from matplotlib import colormaps
 from matplotlib.colors import to_rgb
-from matplotlib.figure import Figure
 from matplotlib.image import imread
 from support import servers
 from support.files.checkpoint_folder import write_checkpoints
-from support.maps.exact_maps import SEEN_M, exact_map, flat, table
+from support.maps.exact_maps import exact_map, flat, table
 from support.maps.map_records import random_record
 from triquad_format.mapfile.writer import write_map
 from triquad_map.height_scale import HEIGHT_STOPS
 from triquad_tools.commands.inspect import main
 from triquad_tools.plots.diff_plan import APPEARED, VANISHED
-from triquad_tools.plots.map_plan import seen_columns
 from triquad_tools.plots.plan import (
     FREE,
-    HEIGHTS,
     UNKNOWN,
-    Layer,
-    PlanGrid,
-    Scale,
-    draw_layers,
-    draw_values,
 )
 from triquad_tools.plots.slice_plan import SURFACE
 
@@ -40,35 +32,6 @@ def share(pixels, colour):
 # Grids
 
 
-def test_a_grid_holds_its_points_in_cells_of_whole_leaves():
-    rng = np.random.default_rng(0)
-    for size_m, cell_m in ((30.0, 0.2), (200.0, 0.2), (300.0, 0.4), (5000.0, 6.4)):
-        points = rng.uniform(-0.5, 0.5, (1000, 2)) * [size_m, size_m / 10] + [7.0, -1000.0]
-        grid = PlanGrid.around(points, 0.2)
-        assert grid.cell_m == pytest.approx(cell_m)
-        np.testing.assert_allclose(grid.low_m / grid.cell_m, np.round(grid.low_m / grid.cell_m))
-        assert (points >= grid.low_m).all()
-        assert (points <= grid.high_m).all()
-        assert grid.columns <= 1200
-        assert grid.rows >= 0.2 * grid.columns
-        assert grid.marked(points).sum() <= 1000
-
-
-def test_cells_are_where_their_points_are():
-    grid = PlanGrid(np.array([-1.0, -2.0]), 0.5, rows=8, columns=4)
-    points = np.array([[-0.9, -1.9], [0.9, 1.9], [0.9, 1.8], [5.0, 0.0]])
-    marked = grid.marked(points)
-    assert marked[0, 0]  # smallest x and y
-    assert marked[7, 3]
-    assert marked.sum() == 2  # one lies outside
-    values = np.array([1.0, 2.0, 4.0, 8.0])
-    assert grid.statistic(points, values, "max")[7, 3] == 4.0
-    assert grid.statistic(points, values, "mean")[7, 3] == 3.0
-    assert np.isnan(grid.statistic(points, values, "max")[1, 1])
-    assert np.isnan(grid.statistic(points[:0], values[:0], "mean")).all()
-    assert not grid.marked(points[:0]).any()
-
-
 # Colours and legends
 
 
@@ -81,42 +44,7 @@ def test_what_is_not_known_has_a_colour_of_its_own(name):
     assert (np.diff(lightness) > 0).all() or (np.diff(lightness) < 0).all()
 
 
-@pytest.mark.parametrize(
-    ("values", "extend"),
-    [((0.0, 1.0), "neither"), ((-1.0, 1.0), "min"), ((0.0, 9.0), "max"), ((-1.0, 9.0), "both")],
-)
-def test_a_scale_says_what_lies_beyond_it(values, extend):
-    axes = Figure().subplots()
-    draw_values(axes, np.array([[*values, np.nan]]), Scale("height in m", HEIGHTS, 0.0, 1.0))
-    (image,) = axes.images
-    assert image.colorbar.extend == extend
-    assert image.colorbar.ax.get_ylabel() == "height in m"
-    assert image.get_clim() == (0.0, 1.0)
-
-
-def test_a_legend_names_every_colour():
-    figure = Figure(layout="constrained")
-    layers = [Layer("wall", "#ff0000", np.eye(2, dtype=bool))]
-    draw_layers(figure.subplots(), layers)
-    (legend,) = [axes.get_legend() for axes in figure.axes]
-    assert [text.get_text() for text in legend.get_texts()] == [
-        "wall",
-        "nothing was seen (UNKNOWN)",
-    ]
-
-
 # What the plans show
-
-
-def test_columns_have_their_highest_surface():
-    record = exact_map(table(0.1, 1.1))
-    columns = seen_columns(record, surface_only=True)
-    assert len(columns.tops) == 100 * 100
-    inside = np.abs(columns.middles).max(axis=1) < 2.0
-    np.testing.assert_allclose(columns.tops[inside], 1.1)
-    np.testing.assert_allclose(columns.tops[~inside], 0.1)
-    assert np.abs(columns.middles).max() == pytest.approx(SEEN_M - 0.1)
-    assert seen_columns(record).tops.max() == pytest.approx(1.1 + 10 * 0.2)
 
 
 # The command

@@ -192,13 +192,6 @@ def test_what_is_missing_or_too_much_is_named(tmp_path):
         read_cloud_folder(tmp_path)
 
 
-def test_hidden_files_are_no_clouds(tmp_path):
-    _timed(tmp_path)
-    (tmp_path / "clouds" / f"._{_name(STAMPS[0])}.ply").write_bytes(b"of macOS")
-    assert len(read_cloud_folder(tmp_path).entries) == COUNT
-    assert not is_cloud_folder(tmp_path / "trajectory.txt")
-
-
 def test_clocks_that_differ_are_told_with_both_times(tmp_path):
     _timed(tmp_path, stamps=[stamp + 3600 * 10**9 for stamp in STAMPS[:4]])
     words = r"no file has a pose: .* from 1700003600.000 to 1700003600.300 s, and .* goes from "

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from support.recordings.point_files import (
@@ -43,7 +43,6 @@ def _file(path: Path, form: str, points=CLOUD, dtype="f4", **others) -> Path:
     return write(path, columns(points.astype(dtype), **others), form)
 
 
-@settings(deadline=None)  # libraries are imported at first
 @given(singles, st.sampled_from(FILES[:6]), st.booleans())
 def test_points_come_back(tmp_path_factory, points, file, double):
     name, form = file
@@ -52,7 +51,6 @@ def test_points_come_back(tmp_path_factory, points, file, double):
     np.testing.assert_allclose(read_points(path).points, points, rtol=precision, atol=precision)
 
 
-@settings(deadline=None)  # libraries are imported at first
 @given(millimetres, st.sampled_from(["a.las", "a.laz"]), st.sampled_from(["1", "3", "7"]))
 def test_points_of_surveyors_keep_their_millimetres(tmp_path_factory, points, name, form):
     metres = points / 1000.0 + (500_000.0, 5_400_000.0, 300.0)

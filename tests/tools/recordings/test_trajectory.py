@@ -121,17 +121,6 @@ def test_counts_and_dates_are_no_times(name):
     assert stamps_of_names([Path("1700000000.5.ply"), Path(name)]) is None
 
 
-@given(st.integers(10**9, 9_999_999_999), st.integers(0, 10**9 - 1))
-def test_every_way_to_write_a_time_says_the_same(seconds, nanoseconds):
-    names = [
-        f"{seconds}.{nanoseconds:09d}.ply",
-        f"{seconds}_{nanoseconds:09d}.ply",
-        f"{seconds}{nanoseconds:09d}.ply",
-    ]
-    expected = seconds * 10**9 + nanoseconds
-    assert [stamps_of_names([Path(name)]) for name in names] == [[expected]] * 3
-
-
 @given(st.lists(st.integers(0, 10**6), unique=True))
 def test_files_are_ordered_by_their_numbers(numbers):
     paths = [Path(f"scan{number}.ply") for number in numbers]

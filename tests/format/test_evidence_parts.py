@@ -4,8 +4,6 @@ import dataclasses
 
 import msgpack
 import numpy as np
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from support.files.checkpoint_folder import write_record
 from support.files.mapfile_edit import (
     file_bytes,
@@ -17,9 +15,7 @@ from support.maps.map_records import SMALL, assert_same, evidence_of, random_rec
 from triquad_format.mapfile.parts.part import EVIDENCE
 from triquad_format.mapfile.reader import read_map
 from triquad_format.records.crop import crop_record
-from triquad_format.records.region import MAX_SEEN_S, masked, seen_voxels, surface_counts
-from triquad_format.records.seen_space import owned_evidence
-from triquad_format.recovery.recovered_map import recover
+from triquad_format.records.region import seen_voxels
 from triquad_map.compiled.evidence.observations import outcome_codes
 
 CUBES = dataclasses.replace(SMALL, depth=9)
@@ -69,40 +65,6 @@ def record_of(evidence):
     return dataclasses.replace(record, regions=(region,))
 
 
-def test_files_hold_levels_and_times():
-    evidence = RECORD.regions[0].evidence
-    assert set(evidence.levels) == set(range(8))
-    assert evidence.outcomes.max(axis=0).tolist() == [3, 15, 15]
-    assert (evidence.seen_s[evidence.surface.any(axis=1)] == 0).any()
-    data = file_bytes(RECORD)
-    assert len([part for part in parts_of(data) if part.topic == EVIDENCE]) == 16
-    assert_same(read_bytes(data), RECORD)
-    with stored(data) as map_file:
-        assert_same(map_file.record(), RECORD)
-
-
-TIMES = st.sampled_from([0, 1, 2, 255, 256, 257, 1_700_000_000, 1_700_000_300, MAX_SEEN_S])
-
-
-@settings(max_examples=60, deadline=None)
-@given(seed=st.integers(0, 99), count=st.integers(1, 12), draw=st.data())
-def test_any_levels_and_times_come_back(seed, count, draw):
-    evidence = blocks(seed, count)
-    counts = surface_counts(evidence.surface)
-    size = int(counts.sum())
-    levels = np.frombuffer(draw.draw(st.binary(min_size=size, max_size=size)), np.uint8) & 7
-    outcomes = np.random.default_rng(seed).integers(0, (4, 16, 16), (size, 3)).astype(np.uint8)
-    seen_s = np.array(draw.draw(st.lists(TIMES, min_size=count, max_size=count)), np.int64)
-    evidence = dataclasses.replace(
-        evidence,
-        levels=levels,
-        seen_s=np.where(counts > 0, seen_s, 0),
-        outcomes=outcomes * (seed % 2),
-    )
-    (region,) = read_bytes(file_bytes(record_of(evidence))).regions
-    assert_same(region.evidence, evidence)
-
-
 def test_literal_bytes():
     """The examples of the specification."""
     surface = np.zeros((3, 64), np.uint8)
@@ -136,20 +98,6 @@ def test_literal_bytes_of_outcomes():
     assert msgpack.unpackb(part.payload)["outcomes"] == stored
 
 
-@settings(max_examples=60, deadline=None)
-@given(seed=st.integers(0, 999))
-def test_masked_voxels_take_their_levels_with_them(seed):
-    evidence = with_support(record_of(blocks(seed, 8)), seed).regions[0].evidence
-    rng = np.random.default_rng(seed)
-    mask = rng.integers(0, 256, evidence.surface.shape).astype(np.uint8)
-    mask[rng.random(len(mask)) < 0.5] = 0
-    kept = masked(evidence, mask)
-    assert_part_of(kept, evidence)
-    left = dataclasses.replace(evidence, surface=evidence.surface & mask)
-    want = set(map(tuple, seen_voxels(left, left.surface).tolist()))
-    assert level_of(kept).keys() == want
-
-
 def test_a_crop_keeps_the_levels_of_what_it_keeps():
     cropped = crop_record(RECORD, (-20, -30, -25), (100, 30, 20))
     for some, whole in zip(cropped.regions, RECORD.regions, strict=True):
@@ -161,14 +109,6 @@ def test_a_crop_keeps_the_levels_of_what_it_keeps():
     again = crop_record(near, (-20, -30, -25), (100, 30, 20))
     for one, other in zip(again.regions, cropped.regions, strict=True):
         assert_same(one.evidence, other.evidence)
-
-
-def test_what_a_region_owns_keeps_its_levels():
-    whole = random_record(4, points=4000)
-    region = with_support(whole).regions[0]
-    owned = owned_evidence(whole.settings, region)
-    assert 0 < len(owned.levels) < len(region.evidence.levels)
-    assert_part_of(owned, region.evidence)
 
 
 def test_a_checkpoint_writes_the_cubes_whose_levels_changed(tmp_path):
@@ -184,17 +124,3 @@ def test_a_checkpoint_writes_the_cubes_whose_levels_changed(tmp_path):
     path = write_record(tmp_path, following, known=known)
     assert [entry.key.topic for entry in known.values() if entry.epoch == 8] == [EVIDENCE]
     assert_same(read_map(path), following)
-
-
-def test_what_is_recovered_has_its_levels(tmp_path):
-    data = bytearray(file_bytes(RECORD))
-    chunk = len(data) // 2
-    data[chunk : chunk + 200] = bytes(200)
-    path = tmp_path / "broken.triquad"
-    path.write_bytes(data)
-    recovery = recover(path)
-    assert recovery.losses
-    whole = {region.index: region.evidence for region in RECORD.regions}
-    assert any(len(region.evidence.levels) for region in recovery.record.regions)
-    for region in recovery.record.regions:
-        assert_part_of(region.evidence, whole[region.index])

@@ -1,0 +1,51 @@
+"""Tiles of the mesh of a ground that is moved, and what a cache has made of them."""
+
+import numpy as np
+from numpy.typing import NDArray
+from support.maps.exact_maps import SETTINGS, exact_map
+from triquad_format.wire.tile_codec import TileSurface, decode_tile
+from triquad_map.mesh.tile_lattice import TileIndex
+from triquad_server.epochs.epoch import Epoch
+from triquad_server.mapping.mapper import Mapper
+from triquad_server.mesh.tile_cache import TileCache
+from triquad_server.settings import MeshSettings, Settings
+
+EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)
+MESH = MeshSettings(tile_cells=16)
+_EPOCHS = iter(range(1, 1000))
+
+
+def make_all(cache: TileCache, level: int = 0) -> list[TileIndex]:
+    """Make what has to be made; returns it."""
+    made: list[TileIndex] = []
+    while to_make := cache.delta(level, *EVERYWHERE, 0, {}).to_make:
+        for index in to_make:
+            cache.make(level, index)
+        made += to_make
+    return made
+
+
+def surfaces(cache: TileCache, level: int = 0) -> dict[TileIndex, TileSurface]:
+    """All tiles with faces, decoded."""
+    found = {}
+    for tile in cache.delta(level, *EVERYWHERE, 0, {}).ready:
+        assert not tile.empty, "a client without tiles is not sent empty ones"
+        data = cache.data(level, tile)
+        assert data is not None
+        found[tile.index] = decode_tile(data)
+    return found
+
+
+def bump(where: float, height_m: float) -> Epoch:
+    """A flat ground at 0.3 m, with the square 2 m around (where, where) raised."""
+
+    def height(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+        near = np.maximum(np.abs(x - where), np.abs(y - where)) < 1.0
+        return np.where(near, 0.3 + height_m, 0.3)
+
+    return ground(height)
+
+
+def ground(height: object) -> Epoch:
+    record = exact_map(height, epoch=next(_EPOCHS))  # type: ignore[arg-type]
+    return Mapper("test", Settings(field=SETTINGS, mesh=MESH), "cpu", record).publish()
