@@ -1,5 +1,6 @@
 """A client takes nothing from a server but answers to what it asked."""
 
+import itertools
 import math
 import os
 import random
@@ -11,16 +12,29 @@ from pathlib import Path
 import numpy as np
 import pytest
 import triquad_client
-from support.attackers.hostile_server import HostileServer, hostile_server, packed, told
-from support.attackers.lies import COUNT, LIES, QUESTIONS, TILE, Ask, Lie
+from support.attackers.hostile_server import (
+    Body,
+    HostileServer,
+    hostile_server,
+    packed,
+    told,
+)
+from support.attackers.lies import COUNT, LIES, QUESTIONS, TILE, Ask, Lie, out_of_bounds
 from triquad_client import Client, Mesh
 from triquad_client.errors import BadReplyError, DownloadError
 from triquad_format.errors import TriquadError
 from triquad_format.wire import codec, keys
 
-MUTANTS = int(os.environ.get("TRIQUAD_FUZZ_REPLIES", "20"))  # of each reply
+MUTANTS = int(os.environ.get("TRIQUAD_FUZZ_REPLIES", "10"))  # of each reply
 TIMEOUT_S = 9.0
 MOST_BYTES = 2**20
+ANY_VALUE = {
+    "/tiles",
+    "/stamp_ns",
+    "/last_checkpoint/stamp_ns",
+    "/sources/default/newest/stamp_ns",
+    "/sources/default/newest/points, shorter",
+}
 VALUES = [
     None, True, -1, 0, 1, 2**31, 2**53 + 1, 2**62, -(2**63), 0.5, math.nan, math.inf, -1e308,
     "", "x", "\x1b[2J", "9" * 5000, b"", b"\xff" * 7, [], [1, 2], {}, {"a": 1},
@@ -28,6 +42,11 @@ VALUES = [
     {"dtype": "<f4", "shape": [1], "data": b"1234"},
     {"dtype": "|u1", "shape": [3], "data": b"\x01\x02\x09"},
 ]  # fmt: skip
+
+
+# These are replies of these kinds once more, and take longer.
+REPEATED = ("filled mesh", "sdf of epoch", "sources again", "watch again", "copy")
+CHANGED = [name for name in QUESTIONS if name not in REPEATED]
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +88,33 @@ def test_a_lie_is_refused_whole(
     assert isinstance(refusal.value, BadReplyError | DownloadError)
     assert str(refusal.value).isprintable()
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", CHANGED)
+def test_values_out_of_bounds_are_refused_one_by_one(
+    server: HostileServer, client: Client, name: str, tmp_path: Path
+) -> None:
+    operation, ask = QUESTIONS[name]
+    taken = set()
+    for number in itertools.count():
+        tried: list[str] = []
+
+        def lie(body: Body, number: int = number, tried: list[str] = tried) -> None:
+            lies_in_it = list(out_of_bounds(body))
+            if number < len(lies_in_it):
+                what, change = lies_in_it[number]
+                tried.append(what)
+                change()
+
+        server.lie = told(operation, lie)
+        try:
+            ask(client, tmp_path / "map.triquad")
+        except (BadReplyError, DownloadError):
+            continue
+        if not tried:
+            break
+        taken.add(tried[0])
+    assert taken <= ANY_VALUE
 
 
 @pytest.mark.parametrize("name", QUESTIONS)

@@ -155,15 +155,3 @@ def test_a_reset_promises_what_is_kept(
             servers.learn(client, scans=1)
             client.checkpoint()
         assert reply.kept_epoch in {file.epoch for file in checkpoint_files(folder)}
-
-
-def test_epochs_that_are_not_there_are_named_with_those_that_are(tmp_path: Path) -> None:
-    with served(tmp_path) as (server, client):
-        servers.learn(client)
-        epoch = client.checkpoint().epoch
-        stop(server)
-    settings = tmp_path / "server.toml"
-    arguments = ["--settings", settings, "--store", tmp_path / "store", "--restore", str(epoch + 7)]
-    with servers.server_process(arguments, ready=False) as server:
-        assert server.wait() == 4
-        assert f"holds no checkpoint of epoch {epoch + 7}; there are: " in server.log

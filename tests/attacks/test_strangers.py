@@ -1,7 +1,9 @@
 """What comes from beyond the machine of a server that listens on all addresses, and no more."""
 
+import socket
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +11,6 @@ import pytest
 import triquad_client
 import zenoh
 from support.attackers.beyond import from_beyond
-from support.attackers.hostile_links import half_open
 from support.operations import OPERATIONS
 from support.servers import (
     MAP,
@@ -97,12 +98,12 @@ def test_twenty_resets_and_checkpoints_change_nothing(server, stranger):
         assert client.query_sdf(sphere(20)).status.all()
 
 
-@pytest.mark.parametrize("selector", WILD)
-def test_no_operation_answers_a_wildcard_wherever_it_comes_from(server, stranger, selector):
+def test_no_operation_answers_a_wildcard_wherever_it_comes_from(server, stranger):
     with connected(server) as client, raw_session(connect=here(server)) as program:
         before = client.status().epoch
-        assert ask(stranger, selector, codec.encode(EVERYWHERE)) == []
-        assert ask(program, selector, codec.encode(EVERYWHERE)) == []
+        for selector in WILD:
+            assert ask(stranger, selector, codec.encode(EVERYWHERE)) == []
+            assert ask(program, selector, codec.encode(EVERYWHERE)) == []
         assert client.status().epoch == before
 
 
@@ -176,8 +177,14 @@ def test_messages_that_no_operation_takes_leave_no_memory_behind(server, strange
 
 
 def test_an_honest_client_gets_in_beside_half_open_links(server):
-    with half_open(here(server), 900), connected(server) as client:
-        assert client.query_sdf(sphere(20)).status.all()
+    host, _, port = here(server).removeprefix("tcp/").rpartition(":")
+    with ExitStack() as links:
+        for _ in range(900):  # which never say a word
+            link = links.enter_context(socket.socket())
+            link.setblocking(False)
+            link.connect_ex((host, int(port)))
+        with connected(server) as client:
+            assert client.query_sdf(sphere(20)).status.all()
 
 
 @pytest.mark.parametrize("beyond", [True, False])

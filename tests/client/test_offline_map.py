@@ -1,7 +1,5 @@
 """A map file answers as the server that it came from, without one."""
 
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -170,21 +168,3 @@ def test_damaged_and_foreign_files_are_refused_by_name(tmp_path: Path) -> None:
         open_map(tmp_path / "nowhere.triquad")
     with pytest.raises(MapFileError, match="not a folder of checkpoints"):
         open_map(tmp_path)
-
-
-WITHOUT_NUMBA = """
-import sys
-for name in ("numba", "llvmlite", "torch", "skimage"):
-    sys.modules[name] = None  # as if it were not installed
-import triquad_client
-triquad_client.open_map(sys.argv[1])
-"""
-
-
-def test_without_numba_the_error_names_the_extra(tmp_path: Path) -> None:
-    path = tmp_path / "map.triquad"
-    write_map(exact_map(flat(0.07)), path)
-    command = [sys.executable, "-c", WITHOUT_NUMBA, str(path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 1
-    assert done.stderr.endswith("numba is missing: pip install 'triquad[fast]'\n")

@@ -1,5 +1,7 @@
 """Rays that met nothing, from the client to what the map answers."""
 
+import itertools
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,13 @@ POSE = np.eye(4)
 UP = [[0.0, 0.0, 1.0]]
 NOTHING = np.empty((0, 3))
 GLASS_M = 6.0
+SESSIONS = itertools.count(1)
+
+
+@pytest.fixture(scope="module")
+def endpoint() -> Iterator[str]:
+    with servers.running_service() as endpoint:
+        yield endpoint
 
 
 def open_settings(**sources: dict[str, object]) -> Settings:
@@ -138,9 +147,8 @@ def test_where_the_robot_drove_surfaces_stay() -> None:
         (None, "no points"),
     ],
 )
-def test_what_is_no_direction_is_refused_here(no_return: Any, text: str) -> None:
+def test_what_is_no_direction_is_refused_here(endpoint: str, no_return: Any, text: str) -> None:
     with (
-        servers.running_service() as endpoint,
         triquad_client.connect(endpoint) as client,
         pytest.raises(InvalidScanError, match=text),
     ):
@@ -156,11 +164,13 @@ def test_what_is_no_direction_is_refused_here(no_return: Any, text: str) -> None
     ],
 )
 def test_what_is_no_direction_is_refused_by_the_server(
-    no_return: np.ndarray, words: list[str]
+    endpoint: str, no_return: np.ndarray, words: list[str]
 ) -> None:
-    with servers.running_service() as endpoint, servers.raw_session(connect=endpoint) as session:
+    with servers.raw_session(connect=endpoint) as session:
         peer = servers.RawPeer(session)
-        bad, good = servers.scan(no_return=no_return), servers.scan(1)
+        number = next(SESSIONS)
+        bad = servers.scan(session=number, no_return=no_return)
+        good = servers.scan(1, session=number)
         for scan in (bad, good):
             peer.put(scan.source, codec.encode(scan))
         reply = peer.flush(good)

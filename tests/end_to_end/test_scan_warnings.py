@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from support import servers
 from triquad_client import FlushReport
-from triquad_server.settings import SourceSettings
 
 POSE = np.eye(4)
 
@@ -32,12 +31,3 @@ def test_a_publisher_learns_what_a_setting_takes_of_its_scans_and_is_told_once(
     assert status.scans_taken == 24
     for logger in ("triquad_client", "triquad_server.intake.scan_warnings"):
         assert [r.getMessage() for r in caplog.records if r.name == logger] == [text]
-
-
-def test_a_range_that_fits_the_source_ends_the_warning() -> None:
-    fits = servers.SMALL.model_copy(update={"sources": {"cam": SourceSettings(range_min_m=0.5)}})
-    with servers.service_and_client(fits) as client:
-        for _ in range(12):
-            client.publish_scan(half_near() * np.float32(1.5), POSE, source="cam")
-        assert client.flush(servers.WAIT_S).warnings == ()
-        assert client.status().warnings is None

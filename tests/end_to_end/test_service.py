@@ -1,6 +1,5 @@
 """The service with a real map, asked by the real client over the loopback."""
 
-import math
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
@@ -10,17 +9,9 @@ import triquad_client
 from support import servers
 from triquad_client import InvalidInputError, Status
 from triquad_format.wire import codec, keys
-from triquad_format.wire.mesh_messages import MeshReply, MeshRequest
 from triquad_format.wire.messages import (
-    ErrorReply,
-    FlushRequest,
-    SdfRequest,
     ServerStatus,
-    StatusRequest,
 )
-from triquad_format.wire.tile_codec import decode_tile
-from triquad_map.questions.answers import Answers
-from triquad_server.settings import ServiceSettings
 
 POSE = np.eye(4)
 PROBES = np.concatenate([servers.sphere(50, radius) for radius in (2.0, 3.9, 4.0, 4.1)])
@@ -77,28 +68,6 @@ def test_flush_lets_a_publisher_run_ahead(client):
     assert client.flush(servers.WAIT_S).taken == 6
 
 
-def test_sources_of_one_client_are_flushed_together(client):
-    for source in ("front", "rear", "front"):
-        client.publish_scan(servers.sphere(), POSE, source=source)
-    assert client.flush(servers.WAIT_S).taken == 3
-
-
-def test_flush_of_a_scan_that_never_arrives_counts_it_as_lost(endpoint):
-    with servers.raw_session(connect=endpoint) as session:
-        peer = servers.RawPeer(session)
-        peer.put("lidar", codec.encode(servers.scan(1)))
-        reply = peer.flush(servers.scan(2))
-        assert (reply.taken, reply.lost) == (1, 2)
-
-
-def test_flush_ends_when_its_time_is_over(endpoint):
-    with servers.raw_session(connect=endpoint) as session:
-        peer = servers.RawPeer(session)
-        assert peer.refusal(keys.FLUSH, FlushRequest("lidar", 1, 0, 0.0)) == "timeout"
-        assert peer.refusal(keys.FLUSH, FlushRequest("lidar", 1, 0, math.nan)) == "bad_request"
-        assert peer.refusal(keys.FLUSH, FlushRequest("lidar", 1, 0, 1e9)) == "bad_request"
-
-
 def test_large_queries_are_answered_from_one_epoch_while_the_map_changes(client, endpoint):
     servers.learn(client)
     probes = np.tile(PROBES, (1500, 1))  # 300 000 points: several requests
@@ -147,14 +116,6 @@ def test_a_query_of_no_points_tells_the_epoch(client):
     assert result.epoch == client.status().epoch
 
 
-def test_an_epoch_that_is_gone_is_told_apart(endpoint):
-    with servers.raw_session(connect=endpoint) as session:
-        peer = servers.RawPeer(session)
-        request = SdfRequest(np.zeros(3), np.zeros((1, 3), np.float32), False, 999)
-        assert peer.refusal(keys.SDF, request) == "epoch_gone"
-        assert peer.refusal(keys.MESH, MeshRequest(np.zeros((1, 3), np.int32), 999)) == "epoch_gone"
-
-
 def test_tiles_make_one_mesh(client):
     servers.learn(client)
     client.settle(servers.WAIT_S)
@@ -179,26 +140,6 @@ def test_tiles_make_one_mesh(client):
         client.mesh_tile(np.int64(-(2**63)), 0, 0)
 
 
-def test_tiles_that_are_asked_for_together_are_those_asked_for_alone(endpoint, client):
-    servers.learn(client)
-    client.settle(servers.WAIT_S)
-    listed = client.tiles()
-    nowhere = np.array([[900_000, 0, 0]], np.int32)
-    tiles = np.concatenate([listed.tiles[:3], nowhere, listed.tiles[3:5]])
-    with servers.raw_session(connect=endpoint) as session:
-        answer = servers.RawPeer(session).ask(keys.MESH, codec.encode(MeshRequest(tiles, 0)))
-    assert isinstance(answer, bytes), answer
-    reply = codec.decode(MeshReply, answer)
-    ends = np.cumsum(reply.sizes)
-    for row, index in enumerate(tiles.tolist()):
-        surface = decode_tile(reply.data[ends[row] - reply.sizes[row] : ends[row]])
-        alone = client.mesh_tile(*index)
-        assert (len(alone.faces) == 0) == (row == 3)
-        np.testing.assert_array_equal(surface.faces, alone.faces)
-        vertices = np.array(index) * reply.tile_side_m + surface.positions(reply.cell_m)
-        np.testing.assert_array_equal(vertices, alone.vertices)
-
-
 def test_holes_of_a_mesh_are_filled_where_that_is_asked_for(client):
     client.reset()
     points = servers.sphere(20_000)
@@ -214,8 +155,6 @@ def test_holes_of_a_mesh_are_filled_where_that_is_asked_for(client):
     assert np.abs(centres[mesh.filled, 0]).min() < 0.1
     assert (client.query_sdf(centres[mesh.filled]).status != Status.FREE).all()
     assert client.mesh(((50, 50, 50), (60, 60, 60)), fill_m=0.6).filled.shape == (0,)
-    with pytest.raises(InvalidInputError, match="fill_m = 9: use 0 to 5"):
-        client.mesh(fill_m=9)
 
 
 def test_meshes_are_cropped_to_bounds(client):
@@ -250,34 +189,3 @@ def test_the_status_is_published(endpoint):
     assert status.map_name == servers.MAP
     assert status.memory_bytes > 2**20
     assert str(sample.encoding) == keys.encoding(ServerStatus)
-
-
-def test_requests_beyond_the_queue_are_told_to_come_back(monkeypatch):
-    begun, go_on = threading.Event(), threading.Event()
-    answer = Answers.answer
-
-    def answer_later(queries, request):
-        begun.set()
-        assert go_on.wait(servers.WAIT_S)
-        return answer(queries, request)
-
-    monkeypatch.setattr(Answers, "answer", answer_later)
-    limits = ServiceSettings(request_queue=1)
-    settings = servers.SMALL.model_copy(update={"service": limits})
-    key = keys.operation_key(servers.MAP, keys.SDF)
-    payload = codec.encode(SdfRequest(np.zeros(3), np.zeros((1, 3), np.float32), True, 0))
-    with (
-        servers.running_service(settings) as endpoint,
-        servers.raw_session(connect=endpoint) as session,
-    ):
-        answered = [session.get(key, payload=payload, timeout=servers.WAIT_S)]
-        assert begun.wait(servers.WAIT_S)  # the only worker is at it: one more can wait
-        answered.append(session.get(key, payload=payload, timeout=servers.WAIT_S))
-        for _ in range(5):
-            (reply,) = session.get(key, payload=payload, timeout=servers.WAIT_S)
-            assert codec.decode(ErrorReply, reply.err.payload.to_bytes()).code == "busy"
-        status = keys.operation_key(servers.MAP, keys.STATUS)
-        (reply,) = session.get(status, payload=codec.encode(StatusRequest()))
-        assert reply.ok is not None, "how the server is doing is told however many questions wait"
-        go_on.set()
-        assert [reply.ok is not None for replies in answered for reply in replies] == [True, True]

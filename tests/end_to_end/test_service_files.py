@@ -1,8 +1,5 @@
 """The map of a service as a file: downloaded, and written to a store."""
 
-import shutil
-from pathlib import Path
-
 import numpy as np
 import pytest
 import triquad_client
@@ -87,76 +84,3 @@ def test_a_reset_while_the_last_checkpoint_is_written_is_not_acknowledged(tmp_pa
             servers.learn(client)
         monkeypatch.setattr(Store, "write", reset_meanwhile)
     assert replies == [None]
-
-
-def test_a_store_that_fails_does_not_stop_the_map(tmp_path):
-    with servers.service_and_client(store=tmp_path) as client:
-        servers.learn(client)
-        shutil.rmtree(tmp_path / servers.MAP)
-        (tmp_path / servers.MAP).write_text("in the way")
-        with pytest.raises(RefusedError, match="cannot be written"):
-            client.checkpoint()
-        assert "cannot be written" in client.status().store_error
-        assert servers.learn(client, 1).taken == 3
-        (tmp_path / servers.MAP).unlink()
-        (tmp_path / servers.MAP).mkdir()
-        assert client.checkpoint().epoch > 0
-        assert client.status().store_error is None
-
-
-def stored_bytes(folder):
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-
-
-def test_a_checkpoint_while_it_learns_writes_what_changed(tmp_path):
-    far = np.eye(4)
-    far[0, 3] = 75.0
-    probes = np.concatenate([servers.sphere(200), servers.sphere(200) + far[:3, 3]])
-    with servers.service_and_client(store=tmp_path) as client:
-        for place in range(4):
-            pose = np.eye(4)
-            pose[0, 3] = 25.0 * place
-            client.publish_scan(servers.sphere(), pose)
-        client.settle(servers.WAIT_S)
-        whole = client.checkpoint()
-        before_bytes = stored_bytes(tmp_path)
-        client.publish_scan(servers.sphere(3000), far)
-        client.settle(servers.WAIT_S)
-        part = client.checkpoint()
-        assert part.bytes > whole.bytes / 2
-        assert stored_bytes(tmp_path) - before_bytes < whole.bytes / 2
-        before = client.query_sdf(probes)
-    with servers.service_and_client(store=tmp_path) as client:
-        assert client.status().last_checkpoint.epoch == part.epoch
-        assert_same_map(before, client.query_sdf(probes))
-
-
-def test_a_checkpoint_that_was_spoilt_is_written_again_when_asked_for(tmp_path):
-    with servers.service_and_client(store=tmp_path) as client:
-        servers.learn(client)
-        client.settle(servers.WAIT_S)
-        path = Path(client.checkpoint().path)
-        path.write_bytes(path.read_bytes()[:1000])
-        again = client.checkpoint()
-        assert again.epoch == client.status().epoch
-        assert read_map(again.path).epoch == again.epoch
-    with servers.service_and_client(store=tmp_path) as client:
-        assert client.status().regions == 1
-
-
-def test_a_damaged_checkpoint_falls_back_to_the_one_before_and_says_so(tmp_path, caplog):
-    with servers.service_and_client(store=tmp_path) as client:
-        servers.learn(client)
-        client.settle(servers.WAIT_S)
-        before = client.query_sdf(PROBES, gradient=True)
-        good = client.checkpoint().path
-        client.publish_scan(servers.sphere(2000, 6.0), np.eye(4))
-        client.settle(servers.WAIT_S)
-        bad = Path(client.checkpoint().path)
-    payload = bytearray(bad.read_bytes())
-    payload[len(payload) // 2] ^= 0xFF
-    bad.write_bytes(payload)
-    with servers.service_and_client(store=tmp_path) as client:
-        assert f"checkpoint {bad} is damaged" in caplog.text
-        assert f"the older checkpoint {good} is used instead" in caplog.text
-        assert_same_map(before, client.query_sdf(PROBES, gradient=True))

@@ -5,7 +5,6 @@ import pytest
 import triquad_client
 from support import servers
 from triquad_client import (
-    BadReplyError,
     Client,
     InvalidInputError,
     NoReplyError,
@@ -14,10 +13,7 @@ from triquad_client import (
 )
 from triquad_format.records.arrays import Doubles
 from triquad_format.wire import codec, keys
-from triquad_format.wire.messages import FlushRequest
-from triquad_format.wire.query_messages import SourcesReply, SourcesRequest, SourceState
-from triquad_server.intake.source_trails import MAX_SOURCES
-from triquad_server.queries import source_queries
+from triquad_format.wire.query_messages import SourcesReply, SourcesRequest
 
 BOX = ((2.5, -1, -1), (3.5, 1, 1))
 
@@ -121,15 +117,6 @@ def test_as_many_points_come_as_are_wanted_of_all_that_are_used(client):
     assert none.points_used == everything.points_used
 
 
-def test_the_points_of_very_many_sources_are_bounded(client, monkeypatch):
-    monkeypatch.setattr(source_queries, "MOST_POINTS", 100)
-    for source in ("one", "other"):
-        client.publish_scan(servers.sphere(500), np.eye(4), source=source)
-    client.flush(servers.WAIT_S)
-    report = client.sources(max_points=1000)
-    assert [len(source.newest.points) for source in report.sources.values()] == [50, 50]
-
-
 def test_refused_scans_leave_no_trace(client):
     drive(client, [1])
     before = client.sources()
@@ -198,28 +185,6 @@ def test_after_a_restart_everything_is_anew(tmp_path):
         assert trail(client.sources(before)) == trail(client.sources(empty)) == [4, 5]
 
 
-def test_the_sources_that_are_remembered_are_bounded(client, endpoint):
-    names = [f"s{number}" for number in range(MAX_SOURCES + 10)]
-    with servers.raw_session(connect=endpoint) as session:
-        peer = servers.RawPeer(session)
-
-        def take(*sources: str, sequence: int = 0) -> None:
-            points = servers.sphere(20)
-            scans = [servers.scan(sequence, source=source, points=points) for source in sources]
-            for scan in scans:
-                peer.put(scan.source, codec.encode(scan))
-            for scan in scans:
-                assert peer.flush(scan).taken == sequence + 1
-
-        take(*names)
-        first = client.sources()
-        assert sorted(first.sources) == sorted(names[10:])
-        take(names[10], sequence=1)
-        take(names[0], sequence=1)
-    report = client.sources(first)
-    assert sorted(report.sources) == sorted([names[0], names[10], *names[12:]])
-
-
 def test_what_cannot_be_asked_is_refused_at_both_ends(client, endpoint):
     drive(client, [1])
     for bad in (-1, 10_001, 1.5, "many", True, None):
@@ -234,17 +199,11 @@ def test_what_cannot_be_asked_is_refused_at_both_ends(client, endpoint):
     assert caught.value.code == "bad_request"
     with servers.raw_session(connect=endpoint) as session:
         peer = servers.RawPeer(session)
-        for request in (
-            SourcesRequest("", 0, -1),
-            SourcesRequest("", 0, 10_001),
-            SourcesRequest("", -1, 0),
-            SourcesRequest(report.server, -(2**63), 0),
-            SourcesRequest(report.server, 2**63 - 1, 0),
-            b"\xc1",
-            FlushRequest("a", 0, 0, 1.0),
-        ):
-            payload = request if isinstance(request, bytes) else codec.encode(request)
-            assert peer.refusal(keys.SOURCES, payload) == "bad_request"
+        for points in (-1, 10_001):
+            assert peer.refusal(keys.SOURCES, SourcesRequest("", 0, points)) == "bad_request"
+        for revision in (-(2**63), -1, 2**63 - 1):
+            request = SourcesRequest(report.server, revision, 0)
+            assert peer.refusal(keys.SOURCES, request) == "bad_request"
     assert trail(client.sources()) == [1]
 
 
@@ -253,28 +212,5 @@ def test_a_server_that_does_not_know_the_question_is_told_apart():
         servers.answering({}) as endpoint,
         triquad_client.connect(endpoint) as client,
         pytest.raises(NoReplyError, match="older than this question"),
-    ):
-        client.sources()
-
-
-@pytest.mark.parametrize(
-    ("state", "words"),
-    [
-        (
-            SourceState(1, True, np.zeros((2, 3)), np.zeros(1, np.int64), None),
-            "1 rows do not go with 2",
-        ),
-        (SourceState(1, False, np.zeros((0, 3)), np.zeros(0, np.int64), None), "only what is new"),
-    ],
-)
-def test_replies_that_do_not_fit_together_are_named(state, words):
-    def answer(query, key):
-        with query:
-            query.reply(key, codec.encode(SourcesReply("x", 1, {"lidar": state})))
-
-    with (
-        servers.answering({keys.SOURCES: answer}) as endpoint,
-        triquad_client.connect(endpoint) as client,
-        pytest.raises(BadReplyError, match=words),
     ):
         client.sources()

@@ -10,7 +10,8 @@ from support.files import golden, spec_reader
 from support.files.checkpoint_folder import write_record
 from support.files.file_damage import flipped
 from support.files.mapfile_edit import rewritten
-from support.files.spec_parts import Map, RefusedError, Region, Settings, is_held_out
+from support.files.spec_answers import Map
+from support.files.spec_parts import RefusedError, Region, Settings, is_held_out
 from support.maps import map_records
 from support.maps.map_records import SMALL
 from triquad_format.mapfile.reader import read_map

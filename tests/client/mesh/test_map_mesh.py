@@ -1,9 +1,6 @@
 """Meshes of map files, without a server."""
 
 import dataclasses
-import subprocess
-import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -111,37 +108,6 @@ def test_a_closed_map_has_no_mesh() -> None:
     offline.close()
     with pytest.raises(ClosedError):
         offline.mesh()
-
-
-PLAIN = """
-import sys
-for name in sys.argv[3:]:
-    sys.modules[name] = None  # as if it were not installed
-import triquad_client
-with triquad_client.open_map(sys.argv[1]) as offline:
-    offline.mesh(cell_m=0.4).save(sys.argv[2])
-assert not {"triquad_server", "triquad_tools"} & sys.modules.keys()
-"""
-
-
-@pytest.fixture
-def without(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
-    """Writes the mesh of a map to ``mesh.ply`` in a process without some libraries."""
-    path = tmp_path / "map.triquad"
-    write_map(RECORD, path)
-
-    def run(*libraries: str) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-c", PLAIN, path, tmp_path / "mesh.ply", *libraries]
-        return subprocess.run(command, capture_output=True, text=True, check=False)
-
-    return run
-
-
-def test_it_needs_neither_torch_nor_scikit_image_nor_the_tools(without, tmp_path: Path) -> None:
-    done = without("torch", "skimage", "scipy", "trimesh")
-    assert done.returncode == 0, done.stderr
-    faces = len(mesh_of(RECORD, cell_m=0.4).faces)
-    assert f"element face {faces}\n".encode() in (tmp_path / "mesh.ply").read_bytes()
 
 
 def test_tile_by_tile_it_is_the_same_surface() -> None:

@@ -1,9 +1,6 @@
 """Followers of the mesh, over the loopback: only what changed travels, and all hold the same."""
 
-import os
 import signal
-import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -199,64 +196,6 @@ def test_a_restarted_server_is_followed_anew(tmp_path: Path) -> None:
         fresh.catch_up()
         assert digests(watch) == digests(fresh)
         assert watch.known_tiles().server != known.server
-
-
-FROZEN = """
-import sys
-import numpy as np, triquad_client
-from triquad_client.net.connection import Ask
-from triquad_format.wire import keys
-from triquad_format.wire import codec
-from triquad_format.wire.mesh_messages import TileUpdatesRequest, TileUpdates
-everywhere = np.full(3, np.inf)
-with triquad_client.connect(sys.argv[1]) as client:
-    asks = TileUpdatesRequest(-everywhere, everywhere, 0, "", 0, np.zeros((0, 3), np.int32),
-        np.zeros(0, np.int64), 100_000_000, 60.0, "frozen", 0)
-    ask = Ask(keys.TILE_UPDATES, asks, TileUpdates, background=True)
-    pending = [client._connection._send(ask) for _ in range(24)]
-    print(len(client._connection._read(ask, next(iter(pending[0]))).data), flush=True)
-    for replies in pending[1:]:
-        list(replies)
-"""
-
-
-def test_a_frozen_client_holds_up_nobody(tmp_path: Path) -> None:
-    """Stopped amid large replies, it delays no query and no tile of others for good."""
-    settings = tmp_path / "settings.toml"
-    settings.write_text(servers.SMALL_TOML + "[mesh]\ncell_m = 0.025\n")
-    with (
-        servers.server_process(["--settings", settings]) as server,
-        triquad_client.connect(server.endpoint) as client,
-        client.watch_mesh() as watch,
-    ):
-        learn(client, half(1))
-        watch.catch_up()
-        size = sum(tile.size_bytes for tile in watch.tiles.values())
-        assert size > 500_000
-        command = [sys.executable, "-c", FROZEN, server.endpoint]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as frozen:
-            try:
-                assert frozen.stdout is not None
-                assert int(frozen.stdout.readline()) > 100_000
-                os.kill(frozen.pid, signal.SIGSTOP)
-                for _ in range(20):  # while Zenoh gives up the frozen one, and after
-                    with client.watch_mesh() as late:
-                        late.catch_up(servers.WAIT_S)
-                        assert digests(late) == digests(watch)
-                for _ in range(200):
-                    assert len(client.query_sdf(servers.sphere(500)).sdf) == 500
-                learn(client, half(-1))
-                before = digests(watch)
-                watch.catch_up(servers.WAIT_S)
-                assert digests(watch) != before
-                with client.watch_mesh() as late:
-                    late.catch_up(servers.WAIT_S)
-                    assert digests(late) == digests(watch)
-                stat = Path(f"/proc/{frozen.pid}/stat")
-                if stat.exists():
-                    assert stat.read_text().rpartition(")")[2].split()[0] == "T"
-            finally:
-                frozen.kill()
 
 
 def test_iteration_ends_with_the_watch(learnt: Client) -> None:

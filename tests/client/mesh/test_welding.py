@@ -1,7 +1,6 @@
 from dataclasses import replace
 
 import numpy as np
-from triquad_client.mesh.mesh import compacted
 from triquad_map.triangles import TileJoin, Triangles, joined
 
 EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)
@@ -10,19 +9,6 @@ EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)
 def of(*corners):
     """The mesh of a tile with one triangle."""
     return Triangles(np.array(corners, np.float64), np.array([[0, 1, 2]], np.int32))
-
-
-def test_vertices_on_a_common_face_become_one():
-    # Two triangles in the tiles left and right of x = 1, which share an edge on that face.
-    left = of([0.5, 0.5, 0.5], [1, 0.2, 0.3], [1, 0.8, 0.3])
-    right = of([1, 0.2, 0.3], [1.5, 0.5, 0.5], [1, 0.8, 0.3])
-    mesh = joined([left, right], 1.0, box=EVERYWHERE)
-    assert len(mesh.vertices) == 4
-    assert len(mesh.faces) == 2
-    assert len(set(mesh.faces.ravel())) == 4
-    for face, tile in zip(mesh.faces, (left, right), strict=True):
-        np.testing.assert_array_equal(mesh.vertices[face], tile.vertices)
-    assert mesh.filled is None
 
 
 def test_rounding_boundaries_do_not_leave_cracks():
@@ -50,13 +36,6 @@ def test_faces_that_become_degenerate_are_left_out():
     assert mesh.filled.tolist() == [True]
 
 
-def test_an_empty_mesh_stays_empty():
-    mesh = joined([], 6.4, box=EVERYWHERE)
-    assert mesh.vertices.shape == (0, 3)
-    assert mesh.faces.shape == (0, 3)
-    assert mesh.faces.dtype == np.int32
-
-
 def test_faces_out_of_the_box_go_with_their_vertices():
     tile = Triangles(
         np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [3, 0, 0], [3, 1, 0]], np.float64) + 0.1,
@@ -65,9 +44,3 @@ def test_faces_out_of_the_box_go_with_their_vertices():
     mesh = joined([tile], 6.4, box=(np.zeros(3), np.full(3, 1.4)))
     np.testing.assert_allclose(mesh.vertices, tile.vertices[:3])
     assert mesh.faces.tolist() == [[0, 1, 2]]
-
-
-def test_unused_vertices_go():
-    mesh = compacted(np.arange(12.0).reshape(4, 3), np.array([[3, 1, 0]]))
-    assert np.array_equal(mesh.vertices, [[0, 1, 2], [3, 4, 5], [9, 10, 11]])
-    assert np.array_equal(mesh.faces, [[2, 1, 0]])

@@ -144,17 +144,6 @@ def test_what_cannot_be_is_refused(arguments, error, text):
         triquad_server.serve(**arguments)
 
 
-def test_a_map_is_taken_back_to_the_epoch_that_a_reset_kept(tmp_path):
-    with triquad_server.serve(store=tmp_path, settings=servers.SMALL) as server:
-        client = server.client()
-        servers.learn(client)
-        kept = client.reset().kept_epoch
-        assert kept is not None
-    assert statuses(tmp_path) == {Status.UNKNOWN}
-    triquad_server.serve(store=tmp_path, settings=servers.SMALL, restore=kept).close()
-    assert statuses(tmp_path) == {Status.SURFACE}
-
-
 def test_a_restored_map_keeps_its_leaf_and_lengths_that_are_not_set_follow_it(tmp_path, caplog):
     with triquad_server.serve(store=tmp_path, settings=servers.SMALL) as server:
         servers.learn(server.client())

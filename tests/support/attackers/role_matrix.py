@@ -29,21 +29,6 @@ FORGE_STATUS = "publish the server's status"
 FORGE_ANSWER = "answer in the server's name"
 FORGE_TOKEN = "pass for a server"
 
-ATTEMPTS = (
-    *OPERATIONS,
-    FOLLOW_STATUS,
-    FOLLOW_SCANS,
-    FIND,
-    PUBLISH_OWN,
-    PUBLISH_OTHERS,
-    PUBLISH_ALL,
-    DELETE,
-    WILD,
-    FORGE_STATUS,
-    FORGE_ANSWER,
-    FORGE_TOKEN,
-)
-
 _REPLY_S = 20.0  # none comes where none is allowed: then the router says at once that it is over
 _EVENT_S = 30.0
 
@@ -84,7 +69,10 @@ def tokens(session: zenoh.Session) -> set[str]:
 
 
 def achieved(role: str, session: zenoh.Session, observer: zenoh.Session) -> set[str]:
-    """What of ``ATTEMPTS`` a session with this role can do; ``observer`` may see everything."""
+    """What a session with this role can do: operations, and what has a name above.
+
+    ``observer`` may see everything.
+    """
     done = _answered(session)
     done |= {FIND} if tokens(session) else set()
     with ExitStack() as parts:

@@ -127,7 +127,8 @@ def place(coordinates: NDArray[np.int64]) -> NDArray[np.int64]:
     return coordinates @ (1 << 20 * np.arange(coordinates.shape[1]))
 
 
-OfVoxels = Callable[[dict[str, Any], NDArray[np.bool_]], Array]
+OfBlocks = Callable[[dict[str, Any], NDArray[np.bool_]], Array]
+"""Values [B, width], of a part and the surface voxels [B, 512] of its blocks."""
 
 
 class Table:
@@ -164,10 +165,12 @@ class Region:
             for plane in range(3)
             for i, level in enumerate(settings.levels)
         }
-        self.surface, self.free = self._evidence(own, "surface"), self._evidence(own, "free")
-        self.levels, self.seen = self._support(own)
-        self.outcomes = self._of_voxels(own, outcomes_of, 3, "<f8")
-        self.margins = self._of_voxels(own, margins_of, 6, "|u1")
+        self.surface = self._of_blocks(own, lambda part, _: plain(part["surface"]), 64, "|u1")
+        self.free = self._of_blocks(own, lambda part, _: plain(part["free"]), 64, "|u1")
+        self.seen = self._of_blocks(own, times_of, 1, "<i8")
+        self.levels = self._of_blocks(own, levels_of, 512, "|u1")
+        self.outcomes = self._of_blocks(own, outcomes_of, 3 * 512, "<f8")
+        self.margins = self._of_blocks(own, margins_of, 6 * 512, "|u1")
 
     def _table(self, own: dict[Key, Any], plane: int, i: int, scale: Array) -> Table:
         bits = 2 * (8 - (self.settings.sizes - 1 - i))
@@ -180,34 +183,15 @@ class Region:
                 chunks.append((place(demorton(codes, 2)), features))
         return Table(chunks, self.settings.feature_size, "<f4")
 
-    def _evidence(self, own: dict[Key, Any], name: str) -> Table:
-        chunks = []
-        for key, part in own.items():
-            if key[0] == "/triquad/evidence":
-                codes = codes_of(part["codes"], key[3], 15)
-                chunks.append((place(demorton(codes, 3)), plain(part[name])))
-        return Table(chunks, 64, "|u1")
-
-    def _support(self, own: dict[Key, Any]) -> tuple[Table, Table]:
-        """Level of each voxel [512] of a block, in the order of bits; time of each block [1]."""
-        levels, times = [], []
-        for key, part in own.items():
-            if key[0] == "/triquad/evidence":
-                blocks = place(demorton(codes_of(part["codes"], key[3], 15), 3))
-                surface = np.unpackbits(plain(part["surface"]), axis=1, bitorder="little")
-                levels.append((blocks, levels_of(part, surface.astype(bool))))
-                times.append((blocks, times_of(part, surface.any(1))))
-        return Table(levels, 512, "|u1"), Table(times, 1, "<i8")
-
-    def _of_voxels(self, own: dict[Key, Any], of: OfVoxels, width: int, dtype: str) -> Table:
-        """What a part tells ``of`` each voxel of a block [512 * width], in the order of bits."""
+    def _of_blocks(self, own: dict[Key, Any], of: OfBlocks, width: int, dtype: str) -> Table:
+        """What a part tells ``of`` each block; of voxels in the order of bits."""
         chunks = []
         for key, part in own.items():
             if key[0] == "/triquad/evidence":
                 blocks = place(demorton(codes_of(part["codes"], key[3], 15), 3))
                 surface = np.unpackbits(plain(part["surface"]), axis=1, bitorder="little")
                 chunks.append((blocks, of(part, surface.astype(bool))))
-        return Table(chunks, width * 512, dtype)
+        return Table(chunks, width, dtype)
 
 
 def is_of(key: Key, index: Index) -> bool:
@@ -261,8 +245,9 @@ def voxel_codes(part: dict[str, Any], name: str, bits: list[int], count: int) ->
     return codes
 
 
-def times_of(part: dict[str, Any], touched: NDArray[np.bool_]) -> Array:
+def times_of(part: dict[str, Any], surface: NDArray[np.bool_]) -> Array:
     """Section 5.4: times [B, 1] of the blocks that hold surface; else 0."""
+    touched = surface.any(1)
     times = np.zeros((len(touched), 1), np.int64)
     planes = plain(part["seen_s"]).astype(np.int64)
     check(1 <= len(planes) <= 5 and planes.shape[1] == touched.sum(), "times of other blocks")
@@ -275,118 +260,3 @@ def features_of(level: dict[str, Any], scale: Array) -> Array:
     if len(scale):
         return integers_of(level["integers"]) * scale
     return unshuffled(level["features"], {2: "<f2", 4: "<f4"}).astype(np.float32)
-
-
-# Section 8
-
-
-def interpolated(table: Table, v: Array) -> tuple[Array, Array, Array]:
-    """g and its derivatives by the two coordinates of v."""
-    base = np.floor(v)
-    t, w = (v - base)[:, :1], (v - base)[:, 1:]
-    f00, f10, f01, f11 = (
-        table(base.astype(np.int64) + corner) for corner in ((0, 0), (1, 0), (0, 1), (1, 1))
-    )
-    value = (1 - t) * (1 - w) * f00 + t * (1 - w) * f10 + (1 - t) * w * f01 + t * w * f11
-    by_t = (1 - w) * (f10 - f00) + w * (f11 - f01)
-    return value, by_t, (1 - t) * (f01 - f00) + t * (f11 - f10)
-
-
-def features_at(region: Region, x: Array) -> tuple[Array, Array]:
-    """Features [N, L S] and their Jacobian [N, L S, 3]."""
-    settings = region.settings
-    u = x / np.float32(settings.leaf) + np.float32(2.0 ** (settings.depth - 1))
-    width = settings.feature_size
-    values = np.zeros((len(x), settings.sizes * width), np.float32)
-    jacobian = np.zeros((*values.shape, 3), np.float32)
-    for k, level in enumerate(settings.levels):
-        node, column = 2.0 ** (settings.depth - level), slice(k * width, (k + 1) * width)
-        for plane, (i, j) in enumerate(PLANES):
-            table = region.tables[plane, level]
-            g, by_i, by_j = interpolated(table, u[:, (i, j)] / np.float32(node))
-            values[:, column] += g
-            jacobian[:, column, i] += by_i / np.float32(node * settings.leaf)
-            jacobian[:, column, j] += by_j / np.float32(node * settings.leaf)
-    return values, jacobian
-
-
-def fourier_at(region: Region, x: Array) -> tuple[Array, Array]:
-    """Fourier features [N, 6 m] and their Jacobian [N, 6 m, 3]."""
-    half = np.float32(region.settings.side / 2)
-    turns = np.float32(2 * np.pi) * region.frequencies
-    angle = (x / half)[:, :, None] * turns
-    flat = (len(x), angle[0].size) if len(x) else (0, 3 * len(turns))
-    sin, cos = np.sin(angle).reshape(flat), np.cos(angle).reshape(flat)
-    slope = np.repeat(np.eye(3, dtype=np.float32), len(turns), 0) * np.tile(turns, 3)[:, None]
-    outer = np.concatenate([cos, -sin], 1)[:, :, None] * np.tile(slope / half, (2, 1))
-    return np.concatenate([sin, cos], 1), outer
-
-
-def field_at(region: Region, x: Array) -> tuple[Array, Array]:
-    """f and its gradient in one region; x in single precision from its centre."""
-    kinds = {"features": [features_at], "fourier": [fourier_at], "both": [features_at, fourier_at]}
-    inputs = [kind(region, x) for kind in kinds[region.settings.encoding]]
-    values, jacobian = (np.concatenate(column, 1) for column in zip(*inputs, strict=True))
-    w1, w2, w3 = region.weights
-    b1, b2, b3 = region.biases
-    y1 = values @ w1 + b1
-    y2 = np.maximum(y1, 0) @ w2 + b2
-    logit = np.maximum(y2, 0) @ w3 + b3
-    back = (((y2 > 0) * w3[:, 0]) @ w2.T * (y1 > 0)) @ w1.T
-    scale = np.float32(region.settings.logit)
-    return logit[:, 0] * scale, np.einsum("nk,nka->na", back, jacobian) * scale
-
-
-class Map:
-    """Answers from the parts of a map, or from those near the points."""
-
-    def __init__(self, facts: dict[str, Any], parts: dict[Key, bytes]) -> None:
-        self.settings = Settings(facts["settings"])
-        heads = [key[1] for key in parts if key[0] == "/triquad/region"]
-        self.regions = {index: Region(self.settings, parts, index) for index in heads}
-
-    def distance(self, points: Array) -> tuple[Array, Array]:
-        """Section 8.2: distance and gradient."""
-        total, value = np.zeros((2, len(points)))
-        slope, total_slope = np.zeros((2, len(points), 3))
-        for region in self.regions.values():
-            used = self.settings.inside(points, region.index)
-            d = points[used] - region.centre
-            f, gradient = field_at(region, d.astype(np.float32))
-            w, by_p = weight(self.settings, d)
-            total[used] += w
-            value[used] += w * f
-            slope[used] += w[:, None] * gradient + f[:, None] * by_p
-            total_slope[used] += by_p
-        total[total == 0] = np.nan
-        sdf = value / total
-        return sdf, (slope - sdf[:, None] * total_slope) / total[:, None]
-
-    def status(self, points: Array) -> NDArray[np.uint8]:
-        """Section 8.3."""
-        result = np.full(len(points), UNKNOWN, np.uint8)
-        owners = np.floor(points / self.settings.pitch + 0.5).astype(np.int64)
-        for region in self.regions.values():
-            owned = (owners == region.index).all(1)
-            u = self.settings.leaf_coordinates(points[owned], region.index)
-            halves = np.stack(np.meshgrid(*[(-0.5, 0.5)] * 3), -1).reshape(-1, 3)
-            surface = np.any([bits(region.surface, np.floor(u + half)) for half in halves], 0)
-            free = bits(region.free, np.floor(u))
-            result[owned] = np.where(surface, SURFACE, np.where(free, FREE, UNKNOWN))
-        return result
-
-
-def weight(settings: Settings, d: Array) -> tuple[Array, Array]:
-    """The weight of a region and its derivative."""
-    ramp = (settings.side / 2 - np.abs(d)) / settings.overlap
-    factors = np.clip(ramp, 0, 1)
-    slope = np.where(ramp < 1, -np.sign(d) / settings.overlap, 0)
-    x, y, z = factors.T
-    return x * y * z, slope * np.stack([y * z, x * z, x * y], 1)
-
-
-def bits(table: Table, voxels: Array) -> NDArray[np.bool_]:
-    voxels = voxels.astype(np.int64)
-    x, y, z = (voxels % 8).T
-    rows = table(voxels // 8)
-    return (rows[np.arange(len(rows)), 8 * x + y] >> z & 1).astype(bool)

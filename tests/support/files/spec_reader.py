@@ -15,7 +15,8 @@ from typing import Any
 import msgpack
 import numpy as np
 import zstandard
-from support.files.spec_parts import Array, Key, Map, Settings, check, plain, rays_of
+from support.files.spec_answers import Map
+from support.files.spec_parts import Array, Key, Settings, check, plain, rays_of
 
 MAGIC = b"\x89MCAP0\r\n"
 FOOTER, MESSAGE, CHUNK, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = 2, 5, 6, 12, 13, 14, 15
