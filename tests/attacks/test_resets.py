@@ -1,7 +1,5 @@
 """Whoever may reset the map, on purpose or by mistake, does not destroy it."""
 
-import errno
-import os
 import resource
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,14 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import triquad_client
-import triquad_server
 from support import servers
 from triquad_client import Client, RefusedError
-from triquad_format.mapfile.checkpoint import Checkpoint, write_checkpoint
 from triquad_format.mapfile.checkpoint_folder import checkpoint_files
 from triquad_format.mapfile.reader import read_map
-from triquad_format.mapfile.writer import MapFileInfo
-from triquad_server.settings import StoreSettings
 
 ATTACKS = 20
 PROBES = servers.sphere(200)
@@ -114,44 +108,3 @@ def test_a_reset_is_refused_where_the_map_cannot_be_kept(tmp_path: Path) -> None
     (folder,) = (tmp_path / "store").iterdir()
     (file,) = (file for file in checkpoint_files(folder) if file.epoch == kept)
     assert len(read_map(file.path).regions) == 1
-
-
-@pytest.mark.parametrize("works", [1, 2], ids=["its mark fails", "what came meanwhile fails"])
-def test_a_reset_promises_what_is_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, works: int
-) -> None:
-    """The file of the map is written, then marked to stay, then what was learnt meanwhile is."""
-    servers.compiled()
-    settings = StoreSettings(keep=2, period_s=0)
-    small = servers.SMALL.model_copy(update={"store": settings})
-    with (
-        triquad_server.serve(store=tmp_path, settings=small) as server,
-        server.client() as client,
-        triquad_client.connect(server.endpoint) as robot,
-    ):
-        servers.learn(client)
-        written = []
-
-        def write(path: Path, checkpoint: Checkpoint) -> MapFileInfo:
-            written.append(path)
-            if len(written) > works:
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            robot.publish_scan(servers.sphere(300, 2.0), np.eye(4))
-            robot.flush(servers.WAIT_S)
-            return write_checkpoint(path, checkpoint)
-
-        monkeypatch.setattr("triquad_server.store.store.write_checkpoint", write)
-        if works == 1:
-            with pytest.raises(RefusedError, match="nothing was reset.*No space left"):
-                client.reset()
-            monkeypatch.undo()
-            assert client.status().regions > 0
-            return
-        reply = client.reset()
-        monkeypatch.undo()
-        assert "without what was learnt while it was written" in (reply.undo or "")
-        (folder,) = (path for path in tmp_path.iterdir() if path.is_dir())
-        for _ in range(3):
-            servers.learn(client, scans=1)
-            client.checkpoint()
-        assert reply.kept_epoch in {file.epoch for file in checkpoint_files(folder)}

@@ -1,6 +1,5 @@
 """Rays that met nothing, from the client to what the map answers."""
 
-import itertools
 from collections.abc import Iterator
 from typing import Any
 
@@ -10,14 +9,12 @@ import triquad_client
 from numpy.typing import ArrayLike
 from support import servers
 from triquad_client import Client, InvalidScanError, Status
-from triquad_format.wire import codec
 from triquad_server.settings import Settings
 
 POSE = np.eye(4)
 UP = [[0.0, 0.0, 1.0]]
 NOTHING = np.empty((0, 3))
 GLASS_M = 6.0
-SESSIONS = itertools.count(1)
 
 
 @pytest.fixture(scope="module")
@@ -153,30 +150,6 @@ def test_what_is_no_direction_is_refused_here(endpoint: str, no_return: Any, tex
         pytest.raises(InvalidScanError, match=text),
     ):
         client.publish_scan(NOTHING, POSE, no_return=no_return)
-
-
-@pytest.mark.parametrize(
-    ("no_return", "words"),
-    [
-        (np.array([[0, 0, 1], [0, 0, 0]], np.float32), ["direction 1", "length"]),
-        (np.array([[np.nan, 0, 1]], np.float32), ["direction 0", "finite"]),
-        (np.ones((499_600, 3), np.float32), ["500100", "scan.max_points = 500000"]),
-    ],
-)
-def test_what_is_no_direction_is_refused_by_the_server(
-    endpoint: str, no_return: np.ndarray, words: list[str]
-) -> None:
-    with servers.raw_session(connect=endpoint) as session:
-        peer = servers.RawPeer(session)
-        number = next(SESSIONS)
-        bad = servers.scan(session=number, no_return=no_return)
-        good = servers.scan(1, session=number)
-        for scan in (bad, good):
-            peer.put(scan.source, codec.encode(scan))
-        reply = peer.flush(good)
-        assert (reply.taken, reply.refused, reply.lost) == (1, 1, 0)
-        assert reply.last_refusal is not None
-        assert all(word in reply.last_refusal for word in words), reply.last_refusal
 
 
 def test_an_organised_cloud_tells_its_empty_returns() -> None:

@@ -1,37 +1,20 @@
 """Maps that stay open, tiles that are made, and checkpoints that come and go."""
 
-import gc
-import weakref
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from support.files.changing_store import EMPTY, box_at, write_checkpoint
-from triquad_tools.console.command import ToolError
 from triquad_tools.viewer.sources.history import DamagedError, History
 from triquad_tools.viewer.sources.map_source import COARSEST
 from triquad_tools.viewer.sources.stored_map import StoredMap, StoredTiles
-
-ORIGIN = [[0.0, 0.0, 1.0]]
 
 
 def completed(follower: StoredTiles) -> StoredTiles:
     while not follower.complete:
         follower.next(0.0)
     return follower
-
-
-def test_few_maps_stay_open_but_those_that_are_shown_do(tmp_path: Path) -> None:
-    for epoch in range(1, 7):
-        write_checkpoint(tmp_path, epoch, EMPTY)
-    history = History(tmp_path)
-    shown = history.opened(history.moments[0])
-    others = [weakref.ref(history.opened(moment)) for moment in history.moments[1:]]
-    gc.collect()
-    assert [other() is None for other in others] == [True, False, False, False, False]
-    shown.queries.query_sdf(ORIGIN)
-    assert history.opened(history.moments[5]) is others[4](), "the last one is open still"
 
 
 def test_tiles_of_a_file_are_its_mesh(tmp_path: Path) -> None:
@@ -100,9 +83,3 @@ def test_a_moment_that_cannot_be_shown_is_none_any_more(tmp_path: Path) -> None:
     with pytest.raises(DamagedError, match="epoch-000000002"):
         history.opened(history.moments[1])
     assert [moment.epoch for moment in history.moments] == [1, 3]
-
-
-def test_a_store_of_which_nothing_is_left(tmp_path: Path) -> None:
-    flip(write_checkpoint(tmp_path, 1, EMPTY))
-    with pytest.raises(ToolError, match="no checkpoint can be shown"):
-        History(tmp_path).newest()

@@ -19,7 +19,6 @@ from triquad_tools.viewer.questions.slice_picture import line_distances, slice_p
 from triquad_tools.viewer.questions.unknown_space import (
     ask_boundary,
     border_faces,
-    face_triangles,
 )
 
 GROUND_M = 0.1  # in the middle of a voxel
@@ -77,13 +76,6 @@ def test_unknown_space_has_no_line_and_is_grey(ground: OfflineMap) -> None:
     assert (pictured(ground, Slice.around(FOCUS, 2, 5.0, 3.0)) == GREY).all()
 
 
-@given(st.floats(0.2, 50.0))
-def test_steps_from_line_to_line_are_round(most_m: float) -> None:
-    step_m = line_distances(most_m)[1]
-    assert f"{step_m:.0e}"[0] in "125"
-    assert 3 <= most_m / step_m < 12
-
-
 @given(st.integers(0, 2**32 - 1))
 def test_borders_lie_between_free_and_unknown_cells(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -99,16 +91,6 @@ def test_borders_lie_between_free_and_unknown_cells(seed: int) -> None:
                 expected.add((cell, tuple(step.tolist())))
     assert pairs == expected
     assert len(cells) == len(expected)
-
-
-def test_faces_lie_between_the_cells() -> None:
-    steps = np.concatenate([np.eye(3), -np.eye(3)]).astype(np.int32)
-    vertices, rows = face_triangles(np.full((6, 3), 4, np.int32), steps)
-    middles = vertices.reshape(6, 4, 3).mean(axis=1)
-    np.testing.assert_allclose(middles, 4.5 + 0.5 * steps)
-    first, second, third = (vertices[rows[:, corner]] for corner in range(3))
-    normals = np.cross(second - first, third - first)
-    assert np.linalg.norm(normals, axis=1).sum() == pytest.approx(12.0)
 
 
 def test_ground_is_no_border_of_unknown_space_however_coarse_the_cells(ground: OfflineMap) -> None:

@@ -43,9 +43,3 @@ def test_the_pictures_are_small_files():
     for path in IMAGES.glob("*.png"):
         with Image.open(path) as picture:
             assert picture.width <= 1200
-
-
-def test_a_picture_that_there_is_not_is_named():
-    main = run("pictures.py")["main"]
-    with pytest.raises(SystemExit, match=r"no picture is called moon.png; there are street.png"):
-        main(["moon.png"])

@@ -20,6 +20,8 @@ from triquad_client import Client, NoReplyError, Status
 from triquad_server.settings import SourceSettings
 from triquad_tools.ros2.intake import first_scan
 
+NO_NAMES = ("§§", "a§§b", "%", "*")  # of topics
+
 
 @pytest.fixture(scope="module")
 def endpoint() -> Iterator[str]:
@@ -90,6 +92,10 @@ def test_clouds_that_are_no_scans_are_refused_with_the_reason(
     endpoint: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     with bridging(endpoint) as bridged, robot(endpoint) as r2:
+        declare = r2.session.liveliness().declare_token
+        kind = CLOUD.replace("/", "§")
+        tokens = [declare(f"@/x/@ros2_lv/MP/{name}/{kind}/q") for name in NO_NAMES]
+        assert tokens
         stand(r2, 0, 1)
         flat = r2.messages.cloud(servers.sphere(10), T0)
         flat.fields = flat.fields[:2]
@@ -223,16 +229,6 @@ def test_other_domains_and_namespaces_are_not_heard(endpoint: str) -> None:
         assert (bridged.taken, bridged.bridge.dropped) == (2, {})
 
 
-def test_clouds_that_the_network_lost_are_counted(endpoint: str) -> None:
-    with bridging(endpoint) as bridged, robot(endpoint) as r2:
-        stand(r2, 0, 1)
-        r2.cloud(0.1, servers.sphere())
-        r2.wire.skip("/points", 2)
-        r2.cloud(0.4, servers.sphere())
-        bridged.wait_for(lambda: bridged.taken == 2)
-        assert bridged.bridge.dropped == {"not_received": 2}
-
-
 def test_a_better_frame_that_turns_up_late_is_named(
     endpoint: str, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -250,23 +246,6 @@ def test_a_better_frame_that_turns_up_late_is_named(
                 break
         assert finds_its_sphere(bridged)
     assert "use --map-frame map" in caplog.text
-
-
-def test_tokens_with_impossible_names_stop_nothing(endpoint: str) -> None:
-    with bridging(endpoint) as bridged, robot(endpoint, "bridge") as r2:
-        token_of = {}
-        cloud, dds = "sensor_msgs§msg§PointCloud2", "sensor_msgs::msg::dds_::PointCloud2_"
-        for token in (
-            f"@/x/@ros2_lv/MP/§§/{cloud}/q",
-            f"@/x/@ros2_lv/MP/a§§b/{cloud}/q",
-            f"@ros2_lv/0/x/0/1/MP/%/%/n/%%/{dds}/RIHS01_0/q",
-            f"@ros2_lv/0/x/0/1/MP/%/%/n/%a/{dds}/%/q",
-            "@ros2_lv/0/x/0/1/MP/%/%/n/%a/no_type/RIHS01_0/q",
-        ):
-            token_of[token] = r2.session.liveliness().declare_token(token)
-        stand(r2, 0, 1)
-        r2.cloud(0.5, servers.sphere())
-        bridged.wait_for(lambda: bridged.taken == 1)
 
 
 @contextmanager
