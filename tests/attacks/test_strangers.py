@@ -1,7 +1,6 @@
 """What comes from beyond the machine of a server that listens on all addresses, and no more."""
 
 import socket
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -20,7 +19,6 @@ from support.servers import (
     free_endpoint,
     learn,
     raw_session,
-    scan,
     server_process,
     sphere,
 )
@@ -145,25 +143,6 @@ def test_a_stranger_does_not_read_scans_which_would_tell_their_session(server, s
             learn(client, 1)
         settle(stranger)
         assert received.try_recv() is None
-
-
-def test_forged_scans_far_ahead_cost_the_true_source_at_most_one_scan(server):
-    forged = [scan(2**47), scan(1, stamp_ns=2**62)]
-    with raw_session(connect=here(server)) as program, connected(server) as client:
-        before = client.status()
-        for each in (scan(0), *forged, *(scan(number) for number in range(2, 12))):
-            program.put(
-                keys.scan_key(MAP, each.source),
-                codec.encode(each),
-                congestion_control=zenoh.CongestionControl.BLOCK,
-            )
-        deadline = time.monotonic() + WAIT_S
-        while (after := client.status()).scans_taken < before.scans_taken + 11:
-            assert time.monotonic() < deadline, after.scans_dropped
-            time.sleep(0.02)
-        assert after.scans_dropped["sequence_ahead"] == 1
-        assert after.scans_dropped["time_backwards"] == 1
-        assert after.scans_lost.get("lidar", 0) == 0
 
 
 def test_messages_that_no_operation_takes_leave_no_memory_behind(server, stranger):

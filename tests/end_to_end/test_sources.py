@@ -1,19 +1,22 @@
 """Where sources have been and what they see, asked by the real client over the loopback."""
 
+import logging
+
 import numpy as np
 import pytest
 import triquad_client
 from support import servers
 from triquad_client import (
     Client,
+    FlushReport,
     InvalidInputError,
     NoReplyError,
     RefusedError,
     SourceReport,
 )
 from triquad_format.records.arrays import Doubles
-from triquad_format.wire import codec, keys
-from triquad_format.wire.query_messages import SourcesReply, SourcesRequest
+from triquad_format.wire import keys
+from triquad_format.wire.query_messages import SourcesRequest
 
 BOX = ((2.5, -1, -1), (3.5, 1, 1))
 
@@ -40,13 +43,6 @@ def lines(report: SourceReport, source: str = "lidar") -> list[list[float]]:
     return [line[:, 0].tolist() for line in report.sources[source].lines()]
 
 
-def asked(peer: servers.RawPeer, server: str = "", revision: int = 0) -> SourcesReply:
-    """A reply as it travels."""
-    answer = peer.ask(keys.SOURCES, codec.encode(SourcesRequest(server, revision, 100)))
-    assert isinstance(answer, bytes), answer
-    return codec.decode(SourcesReply, answer)
-
-
 def test_a_program_follows_the_sources_with_the_report_before(client):
     report = client.sources()
     assert report.sources == {}
@@ -65,24 +61,6 @@ def test_a_program_follows_the_sources_with_the_report_before(client):
     assert (trail(at_once), trail(at_once, "camera")) == ([1, 2, 3, 4, 5], [7, 8])
     unmoved = client.sources(report).sources["lidar"]
     np.testing.assert_array_equal(unmoved.newest.points, report.sources["lidar"].newest.points)
-
-
-def test_only_what_is_new_travels(client, endpoint):
-    drive(client, [1, 2, 3])
-    drive(client, [7], source="camera")
-    with servers.raw_session(connect=endpoint) as session:
-        peer = servers.RawPeer(session)
-        first = asked(peer)
-        assert all(state.whole for state in first.sources.values())
-        drive(client, [4])
-        second = asked(peer, first.server, first.revision)
-        lidar, camera = second.sources["lidar"], second.sources["camera"]
-        assert (lidar.whole, lidar.trail[:, 0].tolist()) == (False, [4])
-        assert lidar.newest.world_from_sensor[0, 3] == 4
-        assert (camera.whole, len(camera.trail), camera.newest) == (False, 0, None)
-        assert len(codec.encode(asked(peer, second.server, second.revision))) < 600
-        of_another = asked(peer, "another", second.revision + 1000)
-        assert all(state.whole for state in of_another.sources.values())
 
 
 def test_the_newest_scan_lies_in_the_map_frame(client):
@@ -214,3 +192,26 @@ def test_a_server_that_does_not_know_the_question_is_told_apart():
         pytest.raises(NoReplyError, match="older than this question"),
     ):
         client.sources()
+
+
+def half_near() -> np.ndarray:
+    return np.concatenate([servers.sphere(500, 1.0), servers.sphere(500, 6.0)])
+
+
+def test_a_publisher_learns_what_a_setting_takes_of_its_scans_and_is_told_once(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    with servers.service_and_client() as client, caplog.at_level(logging.WARNING):
+        reports: list[FlushReport] = []
+        for _ in range(2):
+            for _ in range(12):
+                client.publish_scan(half_near(), np.eye(4), source="cam")
+            reports.append(client.flush(servers.WAIT_S))
+        status = client.status()
+    (text,) = reports[0].warnings
+    assert text.startswith("source 'cam': range_min_m = 1.5 drops 50 % of its points: set ")
+    assert reports[1].warnings == (text,)
+    assert status.warnings == text
+    assert status.scans_taken == 24
+    for logger in ("triquad_client", "triquad_server.intake.scan_warnings"):
+        assert [r.getMessage() for r in caplog.records if r.name == logger] == [text]

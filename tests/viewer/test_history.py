@@ -3,11 +3,9 @@
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
-from support.files.changing_store import EMPTY, box_at, write_checkpoint
+from support.files.changing_store import EMPTY, write_checkpoint
 from triquad_tools.viewer.sources.history import DamagedError, History
-from triquad_tools.viewer.sources.map_source import COARSEST
 from triquad_tools.viewer.sources.stored_map import StoredMap, StoredTiles
 
 
@@ -15,17 +13,6 @@ def completed(follower: StoredTiles) -> StoredTiles:
     while not follower.complete:
         follower.next(0.0)
     return follower
-
-
-def test_tiles_of_a_file_are_its_mesh(tmp_path: Path) -> None:
-    source = StoredMap(write_checkpoint(tmp_path, 1, box_at(3, 3)), "file")
-    whole = source.queries.mesh(cell_m=source.sizes.cell_of(COARSEST))
-    tiles = completed(source.follow(COARSEST)).tiles
-    assert sum(len(tile.faces) for tile in tiles.values()) == len(whole.faces)
-    for index, made in tiles.items():
-        np.testing.assert_allclose(made.origin, np.array(index) * source.sizes.side_of(COARSEST))
-    again = completed(source.follow(COARSEST)).tiles
-    assert all(again[index] is made for index, made in tiles.items()), "they are made once"
 
 
 def test_a_box_has_the_tiles_that_meet_it(tmp_path: Path) -> None:

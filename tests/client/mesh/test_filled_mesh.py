@@ -11,7 +11,7 @@ from support.maps.small_world import settled_epoch, world
 from triquad_client import InvalidInputError, Mesh, OfflineMap
 from triquad_format.records import morton
 from triquad_format.records.field_settings import BLOCK_VOXELS
-from triquad_format.records.region import MapRecord, Region, masked, seen_voxels
+from triquad_format.records.region import MapRecord, masked, seen_voxels
 from triquad_format.records.seen_space import surface_voxels
 from triquad_format.records.status import Status
 
@@ -64,17 +64,6 @@ def with_hole(record: MapRecord, *, free: bool = False) -> MapRecord:
     return changed(record, evidence=without)
 
 
-def steep(region: Region, share: float) -> Region:
-    """The region with a field that rises by only that share of a distance, in and over the hole."""
-
-    def scaled(table_: object) -> object:
-        x = morton.decode(table_.codes, 2)[:, 0] - HALF  # of both planes with features
-        flatter = np.where((x > HOLE[0]) & (x < HOLE[1]), share, 1.0).astype(np.float32)
-        return dataclasses.replace(table_, features=table_.features * flatter[:, None])
-
-    return dataclasses.replace(region, tables=tuple(map(scaled, region.tables)))
-
-
 def mesh_of(record: MapRecord, **options: object) -> Mesh:
     with OfflineMap(record) as offline:
         return offline.mesh(((0, 0, -2), (4, 4, 2)), **options)
@@ -120,14 +109,6 @@ def test_what_does_not_lie_in_line_with_the_seen_surface_is_not_filled() -> None
     pit = ground(lambda x, y: np.where((x > 1) & (x < 3) & (y > 1) & (y < 3), -0.7, 0.1))
     mesh = mesh_of(with_hole(pit), fill_m=1.0)
     assert area(mesh, mesh.filled) < 1.0
-
-
-@pytest.mark.parametrize(("share", "filled"), [(0.9, True), (0.4, False)])
-def test_where_the_field_is_no_distance_nothing_is_filled(share: float, filled: bool) -> None:
-    record = with_hole(GROUND)
-    flatter = dataclasses.replace(record, regions=(steep(record.regions[0], share),))
-    mesh = mesh_of(flatter, fill_m=1.0)
-    assert area(mesh, mesh.filled) > 3.5 if filled else area(mesh, mesh.filled) < 1.5
 
 
 def test_without_filling_it_is_the_mesh_as_ever(tmp_path) -> None:
@@ -202,9 +183,3 @@ def test_the_rest_of_a_voxel_is_filled_and_marked() -> None:
     assert middles[~mesh.filled, 0].max() == pytest.approx(seen_to_m, abs=0.02)
     assert area(mesh, mesh.filled) >= 4 * 0.15 - 0.05
     assert mesh.vertices[mesh.faces][..., 0].max() <= 0.2 * EDGE + 0.3 + 0.02
-
-
-def test_large_faces_are_kept_whole() -> None:
-    """They stand for rays that ended on any part of them."""
-    mesh, whole = (mesh_of(with_edge(quarters), cell_m=0.2) for quarters in (3, 0))
-    assert np.array_equal(mesh.faces, whole.faces)

@@ -10,11 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import triquad_client
-import zenoh
 from support import servers
 from support.watched_ball import SETTINGS, digests, half, learn
-from triquad_client import Client, InvalidInputError, RequestTimeoutError
-from triquad_format.wire import keys
+from triquad_client import Client, InvalidInputError
 
 
 @pytest.fixture
@@ -214,21 +212,3 @@ def test_iteration_ends_with_the_watch(learnt: Client) -> None:
         assert seen.wait(servers.WAIT_S)
         watch.close()
         assert following.result(servers.WAIT_S) > 0
-
-
-def test_a_server_that_does_not_answer_is_an_error_and_the_tiles_stay(client: Client) -> None:
-    with client.watch_mesh() as watch:
-        watch.catch_up(servers.WAIT_S)
-        known = watch.known_tiles()
-    silent: list[zenoh.Query] = []
-    answers = {keys.TILE_UPDATES: lambda query, key: silent.append(query)}
-    with (
-        servers.answering(answers) as endpoint,
-        triquad_client.connect(endpoint, timeout_s=0.5) as other,
-        other.watch_mesh(known=known) as watch,
-    ):
-        with pytest.raises(RequestTimeoutError):
-            watch.next(0.0)
-        assert watch.tiles.keys() == known.tiles.keys()
-        for query in silent:
-            query.drop()

@@ -11,13 +11,10 @@ import pytest
 import trimesh
 import triquad_client
 from numpy.typing import NDArray
-from PIL import Image, ImageColor
+from PIL import Image
 from scipy.spatial import cKDTree
 from support import servers
-from triquad_tools.commands.inspect import main as inspect_map
 from triquad_tools.mapfiles.meshfile import read_mesh
-from triquad_tools.plots.plan import FREE, UNKNOWN
-from triquad_tools.plots.slice_plan import SURFACE
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.street import street
 
@@ -232,13 +229,3 @@ def test_a_scan_finds_its_place_in_a_file(endpoint: str, ask: Run, tmp_path: Pat
     with triquad_client.connect(endpoint, "demo") as client:
         client.download_map(tmp_path / "demo.triquad")
     assert "\nbelieve it" in ask("localise.py", "--file", tmp_path / "demo.triquad")
-
-
-def test_a_slice_shows_what_is_known(endpoint: str, tmp_path: Path) -> None:
-    box = ("--box", "0", "-10", "20", "10")
-    out = tmp_path / "slice.png"
-    command = [endpoint, "--map", "demo", "--slice", "1", *box, "--plot", str(out)]
-    assert inspect_map(command) == 0
-    with Image.open(out) as picture:
-        colours = {colour for _, colour in picture.convert("RGB").getcolors(1 << 24)}
-    assert {ImageColor.getrgb(colour) for colour in (UNKNOWN, FREE, SURFACE)} <= colours

@@ -3,6 +3,7 @@
 import ast
 import json
 import re
+import runpy
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -62,6 +63,24 @@ def test_docstrings_refer_to_what_there_is(known: set[str]) -> None:
         if name not in known and not known.issuperset(name.split("."))
     }
     assert missing == set()
+
+
+def test_every_picture_is_made_by_make_pictures_and_shown_on_a_page(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    docs = ROOT / "docs"
+    monkeypatch.syspath_prepend(str(docs))
+    pages = [ROOT / "README.md", *docs.rglob("*.md")]
+    made = set()
+    for program in ("pictures.py", "viewer_pictures.py", "top_picture.py"):
+        assert f"docs/{program}" in (ROOT / "Makefile").read_text()
+        names = runpy.run_path(str(docs / program))
+        made |= {*names["PICTURES"]} if "PICTURES" in names else {names["PICTURE"].name}
+    kept = {path.name for path in (docs / "images").iterdir()}
+    shown = {
+        name for page in pages for name in re.findall(r"images/(\w+\.\w+)\)", page.read_text())
+    }
+    assert made == kept == shown
 
 
 def test_the_dashboard_shows_metrics_and_labels_that_there_are() -> None:

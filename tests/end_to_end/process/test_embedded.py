@@ -94,17 +94,6 @@ def test_no_thread_is_left_and_what_came_of_the_server_is_closed():
         server.client()
 
 
-def test_an_exception_passes_and_the_map_is_kept(tmp_path):
-    def work() -> None:
-        with triquad_server.serve(store=tmp_path, settings=servers.SMALL) as server:
-            servers.learn(server.client())
-            raise KeyError("mine")
-
-    with pytest.raises(KeyError, match="mine"):
-        work()
-    assert statuses(tmp_path) == {Status.SURFACE}
-
-
 def test_a_server_that_is_forgotten_stops_and_leaves_its_store(tmp_path):
     server = triquad_server.serve(store=tmp_path, settings=servers.SMALL)
     servers.learn(server.client())
@@ -236,15 +225,6 @@ def test_ctrl_c_loses_nothing_that_was_acknowledged(tmp_path, settings):
     later = [int(line.split()[1]) for line in out.splitlines() if "acknowledged" in line]
     for scans in range(max(later, default=4) + 1):
         assert statuses(store, 10.0 * scans) == {Status.SURFACE}
-
-
-def test_ctrl_c_while_it_starts_ends_the_program(tmp_path, settings):
-    with program(_LEARN_WITHOUT_END, tmp_path / "store", settings) as process:
-        read_until(process, "preparing compiled code")
-        process.send_signal(signal.SIGINT)
-        out, errors = process.communicate(timeout=servers.WAIT_S)
-    assert errors.splitlines()[-1] == "KeyboardInterrupt"
-    assert "stopped" in out  # at once, or as soon as it is ready: nobody waits for it in vain
 
 
 def test_a_program_that_ends_without_closing_ends_well(tmp_path, settings):

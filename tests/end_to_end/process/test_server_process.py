@@ -89,28 +89,6 @@ def test_what_is_not_compiled_yet_is_compiled_before_it_serves_and_the_log_says_
         assert "compiling" not in server.log
 
 
-def test_a_signal_before_it_has_started_stops_it(arguments):
-    with servers.server_process(arguments, ready=False) as server:
-        server.wait_for("preparing compiled code")
-        server.process.send_signal(signal.SIGINT)
-        assert server.wait() == 0
-    assert server.lines[-1].endswith("stopped\n")
-    assert "ready" not in server.log
-    assert "Traceback" not in server.log
-
-
-def test_after_sigkill_the_last_checkpoint_counts(store, arguments):
-    with servers.server_process(arguments) as server:
-        before = learn(server.endpoint)
-        with triquad_client.connect(server.endpoint) as client:
-            client.checkpoint()
-            client.publish_scan(servers.sphere(2000, 6.0), POSE)
-            client.flush(servers.WAIT_S)
-        server.process.kill()
-        server.wait()
-    assert_kept(store, before)
-
-
 def test_where_memory_runs_out_it_ends_and_the_last_checkpoint_counts(store, arguments):
     with servers.server_process(arguments) as server:
         before = learn(server.endpoint)
@@ -136,6 +114,7 @@ def test_where_memory_runs_out_it_ends_and_the_last_checkpoint_counts(store, arg
         (["--no-such-option"], 2, "usage: triquad-server"),
         (["--map", "a/b"], 2, "a/b"),
         (["--config", "missing.json5"], 2, "Zenoh configuration missing.json5"),
+        (["--log-format", "xml"], 2, "is no format: use text or json"),
         (["--set", "service.scan_que=3"], 2, "did you mean service.scan_queue?"),
         (["--connect", "tcp/127.0.0.1:1"], 3, "Start a router there first."),
         (["--store", "/dev/null/store"], 4, "cannot be written"),

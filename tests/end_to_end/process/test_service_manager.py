@@ -1,18 +1,22 @@
 """A server process and the service manager that started it, over a real socket."""
 
+import os
+import queue
 import signal
 import socket
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
 import triquad_client
 from support import servers
 from support.servers import ServerProcess
-from support.service_manager import Manager, service_manager
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import ServerStatus, StatusRequest
 from triquad_server.process.service_manager import ServiceManager
@@ -46,6 +50,50 @@ hanging("workers", Answers, "answer")
 threading.Thread(target=listen, daemon=True).start()
 sys.exit(main())
 """
+
+
+@dataclass
+class Manager:
+    """Hears what a server tells, a datagram at a time."""
+
+    address: str  # as the environment has it
+    heard: list[list[str]] = field(default_factory=list)
+    _datagrams: "queue.SimpleQueue[list[str]]" = field(default_factory=queue.SimpleQueue)
+
+    def wait_for(self, line: str) -> list[str]:
+        """The lines of the next datagram that has a line which begins with ``line``."""
+        until = time.monotonic() + servers.WAIT_S
+        while True:
+            lines = self._datagrams.get(timeout=max(0.0, until - time.monotonic()))
+            if any(told.startswith(line) for told in lines):
+                return lines
+
+    def listen(self, receiver: socket.socket) -> None:
+        while lines := receiver.recv(65_536).decode().split("\n"):
+            if lines == [""]:
+                return
+            self.heard.append(lines)
+            self._datagrams.put(lines)
+
+
+@contextmanager
+def service_manager(address: str) -> Iterator[Manager]:
+    """Listens at a path, or at an abstract socket, which begins with @."""
+    bound = "\0" + address[1:] if address.startswith("@") else address
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(bound)
+        manager = Manager(address)
+        thread = threading.Thread(target=manager.listen, args=(receiver,))
+        thread.start()
+        try:
+            yield manager
+        finally:
+            receiver_address = receiver.getsockname()
+            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
+                sender.sendto(b"", receiver_address)
+            thread.join()
+    if not address.startswith("@"):
+        os.unlink(address)
 
 
 @pytest.fixture
@@ -132,6 +180,8 @@ def test_asked_to_stop_while_it_starts_it_says_that_it_stops(manager, arguments)
         manager.wait_for("STOPPING=1")
         assert server.wait() == 0
     assert told(manager, "READY") == []
+    assert server.lines[-1].endswith("stopped\n")
+    assert "Traceback" not in server.log
 
 
 def assert_nothing_more_is_well(manager: Manager, server: ServerProcess, why: str) -> None:

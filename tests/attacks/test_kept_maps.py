@@ -1,4 +1,4 @@
-"""Whoever may reset the map, on purpose or by mistake, does not destroy it."""
+"""Neither who resets the map, on purpose or by mistake, nor a disk that rots destroys it."""
 
 import resource
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ import triquad_client
 from support import servers
 from triquad_client import Client, RefusedError
 from triquad_format.mapfile.checkpoint_folder import checkpoint_files
-from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.reader import read_map, read_map_file
 
 ATTACKS = 20
 PROBES = servers.sphere(200)
@@ -108,3 +108,31 @@ def test_a_reset_is_refused_where_the_map_cannot_be_kept(tmp_path: Path) -> None
     (folder,) = (tmp_path / "store").iterdir()
     (file,) = (file for file in checkpoint_files(folder) if file.epoch == kept)
     assert len(read_map(file.path).regions) == 1
+
+
+def rot(path: Path) -> None:
+    """Flip a bit in the middle of a file, whose time stays: as a disk does it."""
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    with path.open("r+b") as file:
+        file.write(data)
+
+
+def test_a_part_that_rots_is_written_again(tmp_path: Path) -> None:
+    with served(tmp_path, "--set", f"store.scrub_h={0.5 / 3600}") as (server, client):
+        servers.learn(client)
+        client.settle(servers.WAIT_S)
+        newest = client.checkpoint()
+        server.wait_for("checkpoints on disk")
+        before = client.query_sdf(PROBES)
+        entry = read_map_file(newest.path).manifest.entries[0]
+        part = Path(newest.path).parent / "parts" / entry.name
+        rot(part)
+        server.wait_for(f"bit rot: {part} is damaged")
+        server.wait_for("all of the map is written again")
+        server.wait_for(f"checkpoint {newest.path}: ")
+        server.process.kill()
+        server.wait()
+    assert read_map(newest.path).epoch == newest.epoch
+    with served(tmp_path) as (_, client):
+        assert np.array_equal(client.query_sdf(PROBES).status, before.status)
