@@ -3,7 +3,6 @@
 import socket
 from collections.abc import Iterator
 from contextlib import ExitStack
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -70,11 +69,6 @@ def ask(session: zenoh.Session, selector: str, payload: bytes) -> list[zenoh.Rep
 def settle(session: zenoh.Session) -> None:
     """Return once the server has dealt with what was declared before."""
     assert list(session.liveliness().get(keys.alive_key(MAP, "*")))
-
-
-def resident_bytes(server: ServerProcess) -> int:
-    status = Path(f"/proc/{server.process.pid}/statm").read_text()
-    return int(status.split()[1]) * 4096
 
 
 def test_the_log_says_what_listening_beyond_allows(server):
@@ -146,13 +140,13 @@ def test_a_stranger_does_not_read_scans_which_would_tell_their_session(server, s
 
 
 def test_messages_that_no_operation_takes_leave_no_memory_behind(server, stranger):
-    before = resident_bytes(server)
+    before = server.resident_bytes
     huge = bytes(200 * MB)
     for key in ("triquad/unknown", f"triquad/{MAP}/scan/huge", f"triquad/{MAP}/query/sdf"):
         stranger.put(key, huge, congestion_control=zenoh.CongestionControl.BLOCK)
     with connected(server) as client:
         assert client.query_sdf(sphere(20)).status.all()
-    assert resident_bytes(server) - before < 60 * MB
+    assert server.resident_bytes - before < 60 * MB
 
 
 def test_an_honest_client_gets_in_beside_half_open_links(server):

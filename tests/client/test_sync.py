@@ -119,21 +119,18 @@ def test_a_damaged_copy_is_mended_and_a_foreign_file_replaced(
 def test_it_answers_while_the_server_is_gone_and_outlives_one_that_lost_its_map(
     tmp_path: Path,
 ) -> None:
-    path, settings = tmp_path / "copy.triquad", tmp_path / "settings.toml"
-    settings.write_text(servers.SMALL_TOML)
-    with servers.server_process(["--settings", settings]) as server:
-        client = triquad_client.connect(server.endpoint, timeout_s=5.0)
+    path, endpoint = tmp_path / "copy.triquad", servers.free_endpoint()
+    with servers.running_service(endpoint=endpoint):
+        client = triquad_client.connect(endpoint, timeout_s=5.0)
         learn(client, 0.0)
         local = client.sync(FIRST, path)
         before, data, age_s = local.query_distance(POINTS), path.read_bytes(), local.age_s
-        server.process.kill()
-        server.wait()
     with pytest.raises(ConnectError, match="down"):
         refresh_until_the_link_is_lost(local)
     assert local.age_s > age_s
     np.testing.assert_array_equal(local.query_distance(POINTS).distance_m, before.distance_m)
     assert triquad_client.open_map(path).epoch == before.epoch
-    with client, servers.server_process(["--settings", settings], endpoint=server.endpoint):
+    with client, servers.running_service(endpoint=endpoint):
         with pytest.raises(EmptierMapError, match="The copy stays as it is.*accept_emptier=True"):
             refresh_once_linked(local)
         # A program that was started again, too, has the file alone.
@@ -152,7 +149,7 @@ def test_it_answers_while_the_server_is_gone_and_outlives_one_that_lost_its_map(
 
 
 def refresh_until_the_link_is_lost(local: SyncedMap) -> None:
-    """Raises what refreshing does then: that a server was killed is noticed some time after."""
+    """Raises what refreshing does then: that a server is gone is noticed some time after."""
     deadline = time.monotonic() + servers.WAIT_S
     while time.monotonic() < deadline:
         with suppress(UnknownMapError):

@@ -1,6 +1,5 @@
 """Followers of the mesh, over the loopback: only what changed travels, and all hold the same."""
 
-import signal
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -169,21 +168,14 @@ def test_bad_arguments_are_refused_before_anything_is_sent(
 
 def test_a_restarted_server_is_followed_anew(tmp_path: Path) -> None:
     """What is held from the old process is void: all comes again, and the old stays until then."""
-    settings = tmp_path / "settings.toml"
-    settings.write_text(servers.SMALL_TOML + "[mesh]\ntile_cells = 16\n")
-    arguments = ["--store", tmp_path / "store", "--settings", settings]
-    with servers.server_process(arguments) as server:
-        with triquad_client.connect(server.endpoint) as client, client.watch_mesh() as watch:
-            learn(client)
+    with servers.service_and_client(SETTINGS, store=tmp_path) as client:
+        learn(client)
+        with client.watch_mesh() as watch:
             watch.catch_up()
             known = watch.known_tiles()
-            client.checkpoint()
-        server.process.send_signal(signal.SIGTERM)
-        assert server.wait() == 0
     assert len(known.tiles) > 50
     with (
-        servers.server_process(arguments) as server,
-        triquad_client.connect(server.endpoint) as client,
+        servers.service_and_client(SETTINGS, store=tmp_path) as client,
         client.watch_mesh(known=known) as watch,
         client.watch_mesh() as fresh,
     ):

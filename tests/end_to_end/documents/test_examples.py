@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial import cKDTree
 from support import servers
+from triquad_server.settings import Settings, TrainingSettings
 from triquad_tools.mapfiles.meshfile import read_mesh
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.street import street
 
 DOCS = Path(__file__).parents[3] / "docs"
 EXAMPLES = DOCS / "examples"
-SETTINGS = "[training]\nbatch = 4096\nsamples_per_ray = 8.0\n"
+SETTINGS = Settings(training=TrainingSettings(batch=4096, samples_per_ray=8.0))
 SCENE = street(1)  # of triquad-demo, which the guides begin with
 DRIVE = SimulatedDrive(SCENE, Lidar(columns=360), drive(SCENE, 20, 1.5), seed=1)
 RADIUS_M = 0.4  # of what the planners move
@@ -31,18 +32,16 @@ Run = Callable[..., str]
 
 
 @pytest.fixture(scope="module")
-def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def endpoint() -> Iterator[str]:
     """Of a server with a map like that of triquad-demo: fewer scans, trained for less time."""
-    settings = tmp_path_factory.mktemp("settings") / "settings.toml"
-    settings.write_text(SETTINGS)
-    with servers.server_process(["--map", "demo", "--settings", settings]) as server:
-        with triquad_client.connect(server.endpoint, "demo") as client:
+    with servers.running_service(SETTINGS, map_name="demo") as endpoint:
+        with triquad_client.connect(endpoint, "demo") as client:
             for scan in DRIVE:
                 client.publish_scan(scan.points, scan.world_from_sensor)
                 client.flush(servers.WAIT_S, pending=2)
             client.flush(servers.WAIT_S)
             client.settle(servers.WAIT_S)
-        yield server.endpoint
+        yield endpoint
 
 
 @pytest.fixture
