@@ -80,7 +80,7 @@ def test_memory_and_time_are_told_by_part(client):
     assert sum(metrics.memory_bytes.values()) < metrics.resident_bytes
     assert metrics.mapper_s["training"] > 0
     assert metrics.mapper_s["scans"] > 0
-    assert sum(metrics.mapper_s.values()) == pytest.approx(metrics.uptime_s, abs=1)
+    assert sum(metrics.mapper_s.values()) == pytest.approx(metrics.uptime_s, abs=3)
     assert metrics.problem is None
 
 

@@ -192,7 +192,7 @@ def test_a_click_asks_the_map(looked: Looked) -> None:
     click_until(page, (480, 380), raised.is_visible, "a surface was met")
     expect(raised).to_contain_text("0.75 m", timeout=TIMEOUT_MS)
     place = numbers_in(cell(page, "position"))
-    assert np.linalg.norm(np.array(place) - [0, 0, 0.75]) == pytest.approx(4.0, abs=0.1)
+    assert np.linalg.norm(np.array(place) - [0, 0, 0.75]) == pytest.approx(4.0, abs=0.2)
     answer = client.query_distance([place], 10.0)
     assert numbers_in(cell(page, "distance")) == [pytest.approx(answer.distance_m[0], abs=0.002)]
     assert numbers_in(cell(page, "gradient")) == pytest.approx(answer.gradient[0], abs=0.02)

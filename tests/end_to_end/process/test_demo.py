@@ -70,12 +70,9 @@ def test_results_as_promised_break_nothing() -> None:
     ("part", "changes", "words"),
     [
         ("street", {"sdf_error_m": 0.021}, "SDF error (m) is 0.021; promised is at most 0.02"),
-        ("street", {"sdf_error_m": float("nan")}, "SDF error (m) is nan"),
-        ("street", {"gradient_angle_deg": 12.5}, "gradient angle (deg) is 12.5"),
         ("street", {"houses_unknown_ratio": 0.97}, "houses UNKNOWN is 0.97; promised is at least"),
         ("mesh", {"f_score": 0.949}, "mesh F-score is 0.949; promised is at least 0.95"),
         ("intake", {"lost": 2}, "scans lost or refused is 2; promised is at most 0"),
-        ("queries", {"errors": 3}, "query errors is 3"),
         ("queries", {"epochs_backwards": 1}, "answers from an older epoch is 1"),
     ],
 )

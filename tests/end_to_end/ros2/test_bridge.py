@@ -72,7 +72,7 @@ def test_clouds_wait_for_their_transforms_and_stay_in_order(endpoint: str) -> No
 def test_what_cannot_be_placed_is_counted_by_its_reason(
     endpoint: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with bridging(endpoint, "--wait-s", 0.2) as bridged, robot(endpoint) as r2:
+    with bridging(endpoint, "--wait-s", 1.0) as bridged, robot(endpoint) as r2:
         r2.cloud(0, servers.sphere())
         bridged.wait_for(lambda: bridged.bridge.dropped == {"no_transform": 1})
         stand(r2, 10, 10.1, 20)
