@@ -14,7 +14,7 @@ from triquad_format.mapfile.checkpoint_folder import checkpoint_files
 from triquad_format.mapfile.reader import read_map, read_map_file
 from triquad_server.settings import StoreSettings
 
-ATTACKS = 7
+ATTACKS = 14
 PROBES = servers.sphere(200)
 
 

@@ -128,6 +128,6 @@ def test_sigterm_ends_it_soon_whatever_waits(server, store) -> None:
         assert server.wait() == 0
         took_s = time.monotonic() - started
     assert taken
-    assert took_s < LIMIT_S
+    assert took_s < LIMIT_S, "10 s are promised, of a machine that does nothing else"
     assert "Traceback" not in server.log
     assert checkpoint_files(store / servers.MAP)[0].epoch >= epoch

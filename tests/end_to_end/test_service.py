@@ -1,5 +1,6 @@
 """The service with a real map, asked by the real client over the loopback."""
 
+import shutil
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
@@ -267,3 +268,18 @@ def test_a_reset_while_the_last_checkpoint_is_written_is_not_acknowledged(tmp_pa
             servers.learn(client)
         monkeypatch.setattr(Store, "write", reset_meanwhile)
     assert replies == [None]
+
+
+def test_a_store_that_fails_does_not_stop_the_map(tmp_path):
+    with servers.service_and_client(store=tmp_path) as client:
+        servers.learn(client)
+        shutil.rmtree(tmp_path / servers.MAP)
+        (tmp_path / servers.MAP).write_text("in the way")
+        with pytest.raises(RefusedError, match="cannot be written"):
+            client.checkpoint()
+        assert "cannot be written" in client.status().store_error
+        assert servers.learn(client, 1).taken == 3
+        (tmp_path / servers.MAP).unlink()
+        (tmp_path / servers.MAP).mkdir()
+        assert client.checkpoint().epoch > 0
+        assert client.status().store_error is None
