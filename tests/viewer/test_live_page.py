@@ -48,7 +48,6 @@ def looked(show: Show) -> Iterator[Looked]:
         connect(endpoint) as watching,
         show(LiveSource(watching, endpoint)) as page,
     ):
-        page.set_viewport_size({"width": 1000, "height": 640})  # drawn in software
         yield Looked(page, client)
 
 
