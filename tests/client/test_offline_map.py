@@ -109,13 +109,6 @@ def test_the_file_answers_as_the_server(pair: Pair, offline: OfflineMap, name: s
     assert_close(QUESTIONS[name](offline), QUESTIONS[name](pair.client), name)
 
 
-def test_it_tells_what_it_is(pair: Pair, offline: OfflineMap) -> None:
-    status = pair.client.status()
-    assert (offline.name, offline.epoch) == (status.map_name, status.epoch)
-    assert offline.stamp_ns > 1.7e18
-    assert offline.query_distance(POINTS).epoch == offline.epoch
-
-
 def test_large_questions_are_one_call(offline: OfflineMap) -> None:
     many = np.tile(POINTS, (60, 1))  # more than go into one request
     answer = offline.query_distance(many)

@@ -54,14 +54,6 @@ def test_a_scan_of_which_no_ray_returned_shows_open_air_and_nothing_else() -> No
         assert client.tiles().tiles.shape == (0, 3)
 
 
-def test_rays_without_a_return_stop_at_the_range_of_their_source() -> None:
-    with servers.service_and_client(open_settings(near={"range_max_m": 5.0})) as client:
-        client.publish_scan(NOTHING, POSE, source="near", no_return=UP)
-        client.publish_scan(NOTHING, POSE, source="other", no_return=[[0, 1, 0]])
-        asked = [[0, 0, 4.9], [0, 0, 5.5], [0, 5.5, 0]]
-        assert statuses(client, asked) == [Status.FREE, Status.UNKNOWN, Status.FREE]
-
-
 def test_a_source_that_is_not_believed_shows_nothing() -> None:
     with servers.service_and_client(open_settings(glassy={"no_return": False})) as client:
         client.publish_scan(wall(3.0), POSE, source="glassy", no_return=UP)

@@ -77,24 +77,6 @@ def test_the_newest_scan_lies_in_the_map_frame(client):
     assert apart.max() < 1e-5
 
 
-def test_as_many_points_come_as_are_wanted_of_all_that_are_used(client):
-    with np.errstate(divide="ignore"):
-        rays = servers.sphere(60_000)
-        walls = (np.sign(rays) * (20, 20, 20)) / rays
-    client.publish_scan(rays * walls.min(axis=1, keepdims=True), pose(0), source="lidar")
-    client.flush(servers.WAIT_S)
-    everything = client.sources(max_points=10_000).sources["lidar"].newest
-    assert len(everything.points) == 10_000 < everything.points_used
-    some = client.sources(max_points=600).sources["lidar"].newest
-    assert len(np.unique(some.points, axis=0)) == 600
-    for wall in range(6):  # all of which are as large
-        away = some.points[:, wall // 2] * (-1) ** wall
-        assert 60 < (away > 19.9).sum() < 140
-    none = client.sources(max_points=0).sources["lidar"].newest
-    assert none.points.shape == (0, 3)
-    assert none.points_used == everything.points_used
-
-
 def test_refused_scans_leave_no_trace(client):
     drive(client, [1])
     before = client.sources()

@@ -6,22 +6,6 @@ from pathlib import Path
 import pytest
 from support.files.changing_store import EMPTY, write_checkpoint
 from triquad_tools.viewer.sources.history import DamagedError, History
-from triquad_tools.viewer.sources.stored_map import StoredMap, StoredTiles
-
-
-def completed(follower: StoredTiles) -> StoredTiles:
-    while not follower.complete:
-        follower.next(0.0)
-    return follower
-
-
-def test_a_box_has_the_tiles_that_meet_it(tmp_path: Path) -> None:
-    source = StoredMap(write_checkpoint(tmp_path, 1, EMPTY), "file")
-    follower = completed(source.follow(0, ((1.0, 1.0, 0.0), (2.0, 2.0, 1.0))))
-    assert set(follower.tiles) == {(0, 0, 0)}
-    moved = source.follow(0, ((-2.0, 1.0, 0.0), (2.0, 2.0, 1.0)), follower)
-    assert set(moved.tiles) == {(0, 0, 0)}, "what both have is there at once"
-    assert set(completed(moved).tiles) == {(0, 0, 0), (-1, 0, 0)}
 
 
 def test_checkpoints_come_and_go(tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.maps.exact_maps import SEEN_M, exact_map, flat
 from triquad_client import OfflineMap, Status
-from triquad_tools.plots.plan import UNKNOWN
 from triquad_tools.viewer.page.page import Focus
 from triquad_tools.viewer.questions.cell_box import CellBox
 from triquad_tools.viewer.questions.path import Path
@@ -96,12 +95,3 @@ def test_a_path_is_blocked_where_the_map_says(ground: OfflineMap) -> None:
     assert sum(lengths) == pytest.approx(answer.length_m, abs=1e-4)
     assert any(np.allclose(place, points[1]) for place in free), "corners are kept"
     assert path(ground, 50.0, (-1.0, 0.0, 1.0), (1.0, 0.0, 1.0)).answer.blocked, "a large robot"
-
-
-def test_unknown_space_on_a_path_is_grey_and_named(ground: OfflineMap) -> None:
-    laid = path(ground, 0.1, (0.0, 0.0, 1.0), (0.0, 0.0, 4.0))
-    assert not laid.answer.blocked
-    assert f"from {laid.answer.unknown_contact_m:.2f} m" in laid.html()
-    (first, _), (second, unknown) = laid.legs()
-    assert (first != UNKNOWN, second) == (True, UNKNOWN)
-    assert unknown[0][2] == pytest.approx(1.0 + laid.answer.unknown_contact_m, abs=1e-4)

@@ -89,13 +89,6 @@ def test_a_hole_that_no_ray_met_is_closed_and_marked() -> None:
         assert (offline.query_sdf(middle).status == Status.UNKNOWN).all()
 
 
-def test_of_a_large_hole_a_rim_is_filled() -> None:
-    mesh = mesh_of(with_hole(GROUND), fill_m=0.4)
-    centres = mesh.vertices[mesh.faces[mesh.filled]].mean(axis=1)
-    assert np.abs(centres[:, :2] - 2.0).max(axis=1).min() > 1 - 0.4
-    assert area(mesh, mesh.filled) == pytest.approx(4.0 - 1.2**2, abs=0.3)
-
-
 def test_an_opening_that_rays_passed_stays_open() -> None:
     record = with_hole(GROUND, free=True)
     mesh = mesh_of(record, fill_m=1.0)
@@ -117,13 +110,6 @@ def test_without_filling_it_is_the_mesh_as_ever(tmp_path) -> None:
     assert plain.filled is None
     assert plain.file_bytes(".ply") == none.file_bytes(".ply")
     assert area(plain, np.ones(len(plain.faces), np.bool_)) == pytest.approx(12.0, abs=0.2)
-
-
-def test_where_nothing_was_seen_nothing_is_filled() -> None:
-    with OfflineMap(GROUND) as offline:
-        mesh = offline.mesh(((50, 50, 50), (60, 60, 60)), fill_m=1.0)
-    assert mesh.faces.shape == (0, 3)
-    assert mesh.filled.shape == (0,)
 
 
 @pytest.mark.parametrize("fill_m", [-0.1, 6.0, float("nan")])

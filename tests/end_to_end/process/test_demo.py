@@ -6,11 +6,9 @@ from pathlib import Path
 import pytest
 from triquad_format.mapfile.reader import read_map
 from triquad_tools.commands import demo
-from triquad_tools.console.command import ToolError
 from triquad_tools.demo import steps
 from triquad_tools.demo.probe import ProbeReport
 from triquad_tools.demo.results import DemoResults, Intake, broken_promises, table_rows
-from triquad_tools.demo.server import DemoServer
 from triquad_tools.evaluation.map_scores import StreetScores
 from triquad_tools.evaluation.metrics import MeshScores
 from triquad_tools.mapfiles.meshfile import read_mesh
@@ -83,15 +81,6 @@ def test_a_broken_promise_is_named_with_its_value(
     broken = broken_promises(dataclasses.replace(GOOD, **{part: changed}))
     assert len(broken) == 1
     assert words in broken[0]
-
-
-def test_a_server_that_cannot_start_is_reported_with_its_last_line(tmp_path: Path) -> None:
-    (tmp_path / "store").write_text("a file")
-    log = tmp_path / "server.log"
-    with pytest.raises(ToolError, match="the server did not start: .*store") as caught:
-        DemoServer(tmp_path, "demo")
-    assert str(log) in str(caught.value)
-    assert str(tmp_path / "store") in log.read_text()
 
 
 @pytest.mark.parametrize("arguments", [("--scans", "0"), ("--seed", "x"), ("street",)])

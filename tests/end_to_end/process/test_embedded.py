@@ -21,8 +21,6 @@ from triquad_client import ClosedError, Status
 from triquad_format.errors import FormatError, SettingsError
 from triquad_server.errors import ListenError, ServerError, StoreError
 
-POSE = np.eye(4)
-
 
 @pytest.fixture(autouse=True)
 def _compiled() -> None:
@@ -54,18 +52,6 @@ def test_a_map_is_learnt_asked_and_found_again(tmp_path, settings):
         after = server.client().query_distance(servers.sphere(50, 3.0))
     assert np.array_equal(after.found, before.found)
     assert np.median(np.abs(after.distance_m - 1.0)) < 0.2
-
-
-def test_two_servers_of_one_program_have_maps_of_their_own():
-    with (
-        triquad_server.serve(settings=servers.SMALL) as one,
-        triquad_server.serve(settings=servers.SMALL) as other,
-    ):
-        assert one.endpoint != other.endpoint
-        servers.learn(one.client())
-        assert one.client().maps() == other.client().maps() == [servers.MAP]
-        assert one.client().status().regions == 1
-        assert other.client().status().regions == 0
 
 
 def test_the_program_keeps_its_signals_and_its_interpreter_its_ways():
