@@ -154,8 +154,6 @@ def test_markers_show_the_mesh_and_what_changes(server: str, way: str) -> None:
     with shown(server) as client, listening(server, "/triquad/mesh", MARKER, way) as rviz:
         markers = shown_once_complete(rviz, client)
         assert len(markers.triangles) > 8, "a marker each tile"
-        with listening(server, "/triquad/mesh", MARKER, way) as late:
-            shown_once_complete(late, client)
         client.reset(((0.5, -9, -9), (9, 9, 9)))
         client.settle(servers.WAIT_S)
         with client.watch_mesh() as watch:
@@ -165,6 +163,8 @@ def test_markers_show_the_mesh_and_what_changes(server: str, way: str) -> None:
             markers.take(rviz.message())
             changed += 1
         assert changed < len(markers.triangles) + 10, "what did not change is not sent again"
+        with listening(server, "/triquad/mesh", MARKER, way) as late:
+            shown_once_complete(late, client)
 
 
 def test_markers_carry_colours_frame_and_what_rmw_zenoh_attaches(server: str) -> None:
