@@ -151,9 +151,9 @@ def test_colours_are_those_that_are_chosen(looked: Looked) -> None:
 
 
 def _is_still(page: Page) -> bool:
-    """Whether the picture stays as it is for two seconds."""
+    """Whether the picture stays as it is for a second."""
     before = scene(page)
-    page.wait_for_timeout(2000)
+    page.wait_for_timeout(1000)
     return bool((scene(page) == before).all())
 
 
