@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 import triquad_client
-from support.attackers.hostile_server import HostileServer, hostile_server, told
+from support.attackers.hostile_server import hostile_server, told
 from support.files.mapfile_edit import file_bytes, rewritten
 from support.maps.map_records import random_record
 from triquad_format.errors import MapFileError
-from triquad_format.wire import codec, keys
+from triquad_format.wire import keys
 from triquad_tools.commands import inspect, pack, replay, top
 from triquad_tools.console.lines import print_line
 
@@ -63,16 +63,6 @@ def test_metadata_of_a_file(
         assert_harmless(str(error))
 
 
-def test_metadata_on_a_real_terminal_stream(map_bytes: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "map.triquad"
-    path.write_bytes(rewritten(map_bytes, metadata={"producer": SENT}))
-    code = f"from triquad_tools.commands.inspect import main; main({[str(path)]})"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
-    assert b"\\x1b]0;owned\\x07" in done.stdout
-    for byte in (b"\x1b", b"\x07", b"\r", b"\x00", b"\xc2\x9b", "\u202e".encode()):
-        assert byte not in done.stdout + done.stderr
-
-
 def test_metadata_of_a_million_characters(
     map_bytes: bytes, harmless: Callable[[Main, list[str]], str], tmp_path: Path
 ) -> None:
@@ -103,15 +93,6 @@ def test_words_of_a_server(harmless: Callable[[Main, list[str]], str]) -> None:
         )
         shown = harmless(top.main, ["--connect", server.endpoint, "--once"])
         assert "x1b" in shown
-        refuse(server)
-        harmless(top.main, ["--connect", server.endpoint, "--once"])
-        harmless(inspect.main, [server.endpoint])
-
-
-def refuse(server: HostileServer) -> None:
-    """Have it refuse everything in words of its own."""
-    body = {"triquad": codec.PROTOCOL_VERSION, "kind": "ErrorReply", "code": SENT, "message": SENT}
-    server.refusal = codec.msgpack.packb(body)
 
 
 def test_letters_that_a_terminal_does_not_know_are_escapes() -> None:

@@ -1,8 +1,6 @@
 """A client takes nothing from a server but answers to what it asked."""
 
-import math
-import os
-import random
+import itertools
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -11,23 +9,31 @@ from pathlib import Path
 import numpy as np
 import pytest
 import triquad_client
-from support.attackers.hostile_server import HostileServer, hostile_server, packed, told
-from support.attackers.lies import COUNT, LIES, QUESTIONS, TILE, Ask, Lie
-from triquad_client import Client, Mesh
+from support.attackers.hostile_server import (
+    Body,
+    HostileServer,
+    hostile_server,
+    packed,
+    told,
+)
+from support.attackers.lies import LIES, QUESTIONS, TILE, Ask, Lie, out_of_bounds
+from triquad_client import Client
 from triquad_client.errors import BadReplyError, DownloadError
 from triquad_format.errors import TriquadError
 from triquad_format.wire import codec, keys
 
-MUTANTS = int(os.environ.get("TRIQUAD_FUZZ_REPLIES", "20"))  # of each reply
 TIMEOUT_S = 9.0
 MOST_BYTES = 2**20
-VALUES = [
-    None, True, -1, 0, 1, 2**31, 2**53 + 1, 2**62, -(2**63), 0.5, math.nan, math.inf, -1e308,
-    "", "x", "\x1b[2J", "9" * 5000, b"", b"\xff" * 7, [], [1, 2], {}, {"a": 1},
-    {"dtype": "<f4", "shape": [2**39], "data": b""},
-    {"dtype": "<f4", "shape": [1], "data": b"1234"},
-    {"dtype": "|u1", "shape": [3], "data": b"\x01\x02\x09"},
-]  # fmt: skip
+ANY_VALUE = {
+    "/tiles",
+    "/stamp_ns",
+    "/last_checkpoint/stamp_ns",
+    "/sources/default/newest/stamp_ns",
+    "/sources/default/newest/points, shorter",
+}
+# These are replies of these kinds once more, and take longer.
+REPEATED = ("filled mesh", "sdf of epoch", "sources again", "watch again", "copy")
+CHANGED = [name for name in QUESTIONS if name not in REPEATED]
 
 
 @pytest.fixture(scope="module")
@@ -71,53 +77,31 @@ def test_a_lie_is_refused_whole(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("name", QUESTIONS)
-def test_a_reply_that_is_wrong_at_random_is_an_answer_or_is_refused(
+@pytest.mark.parametrize("name", CHANGED)
+def test_values_out_of_bounds_are_refused_one_by_one(
     server: HostileServer, client: Client, name: str, tmp_path: Path
 ) -> None:
-    choice = random.Random(name)
     operation, ask = QUESTIONS[name]
-    server.lie = lambda asked, honest: mutant(honest, choice) if asked == operation else honest
-    refusals = []
-    for _ in range(MUTANTS):
+    taken = set()
+    for number in itertools.count():
+        tried: list[str] = []
+
+        def lie(body: Body, number: int = number, tried: list[str] = tried) -> None:
+            lies_in_it = list(out_of_bounds(body))
+            if number < len(lies_in_it):
+                what, change = lies_in_it[number]
+                tried.append(what)
+                change()
+
+        server.lie = told(operation, lie)
         try:
-            answer = ask(client, tmp_path / "map.triquad")
-        except TriquadError as error:
-            refusals.append(str(error))
-        else:
-            assert_answers(answer)
-    assert all(map(str.isprintable, refusals))
-
-
-def mutant(honest: bytes, choice: random.Random) -> bytes:
-    """A reply with some bits flipped, cut short, or with another value in a field."""
-    how = choice.randrange(3)
-    if how == 0:
-        data = bytearray(honest)
-        for _ in range(choice.randint(1, 4)):
-            data[choice.randrange(len(data))] ^= 1 << choice.randrange(8)
-        return bytes(data)
-    if how == 1:
-        return honest[: choice.randrange(len(honest))]
-    body = inner = codec.msgpack.unpackb(honest)
-    name = choice.choice([*body])
-    while isinstance(inner[name], dict) and inner[name] and choice.random() < 0.7:
-        inner = inner[name]
-        name = choice.choice([*inner])
-    inner[name] = choice.choice(VALUES)
-    return codec.msgpack.packb(body)
-
-
-def assert_answers(answer: object) -> None:
-    """What was taken can be used: as much as was asked for, statuses that exist, faces that fit."""
-    status = getattr(answer, "status", None)
-    if isinstance(status, np.ndarray):
-        assert status.size in (COUNT, 64)
-        assert status.max() <= 2
-    assert 0 <= getattr(answer, "epoch", 0) <= 2**53
-    if isinstance(answer, Mesh):
-        assert np.isfinite(answer.vertices).all()
-        assert not answer.faces.size or answer.faces.max() < len(answer.vertices)
+            ask(client, tmp_path / "map.triquad")
+        except (BadReplyError, DownloadError):
+            continue
+        if not tried:
+            break
+        taken.add(tried[0])
+    assert taken <= ANY_VALUE
 
 
 def test_a_download_stays_below_what_the_client_takes(
@@ -236,10 +220,3 @@ def test_the_words_of_a_refusal_are_shown_as_what_they_are(
         client.status()
     assert str(caught.value).isprintable()
     assert len(str(caught.value)) < 5_000
-
-
-def test_bytes_that_are_no_message_are_refused(server: HostileServer, client: Client) -> None:
-    for data in (b"", b"\x1b[2J", b"\xc1" * 100, b"\xdf\xff\xff\xff\xff", b"\x91" * 5000):
-        server.lie = lambda _asked, _honest, data=data: data
-        with pytest.raises(BadReplyError):
-            client.status()

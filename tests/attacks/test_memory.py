@@ -2,7 +2,6 @@
 
 import threading
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,15 +11,10 @@ from support.requests import tile_updates
 from support.servers import RawPeer, ServerProcess
 from triquad_format.wire import codec, keys
 
-MAP_BYTES = 400_000_000
-EPOCHS_BYTES = 100_000_000
+MAP_BYTES = 200_000_000
+EPOCHS_BYTES = 50_000_000
 BESIDE = 250_000_000  # for code that is compiled late, replay samples and what is in between
-SPHERES, POINTS, RADIUS_M = 8, 60_000, 48.0
-
-
-def resident(server: ServerProcess) -> int:
-    pages = int(Path(f"/proc/{server.process.pid}/statm").read_text().split()[1])
-    return pages * 4096
+SPHERES, POINTS, RADIUS_M = 6, 40_000, 30.0
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +27,7 @@ def server() -> Iterator[ServerProcess]:
 
 def test_spheres_all_around_fill_the_map_and_no_more(server: ServerProcess) -> None:
     rng = np.random.default_rng(0)
-    before = resident(server)
+    before = server.resident_bytes
     with triquad_client.connect(server.endpoint) as client:
         for number in range(SPHERES):
             directions = rng.normal(size=(POINTS, 3))
@@ -42,13 +36,14 @@ def test_spheres_all_around_fill_the_map_and_no_more(server: ServerProcess) -> N
             pose[0, 3] = 20.0 * number
             client.publish_scan((RADIUS_M * directions).astype(np.float32), pose, source="liar")
             report = client.flush(servers.WAIT_S)
-        grown = resident(server) - before
+        grown = server.resident_bytes - before
         print(f"grown by {grown / 1e6:.0f} MB")
         assert grown < MAP_BYTES + EPOCHS_BYTES + BESIDE
         status = client.status()
         assert status.scans_dropped["map_full"] == report.refused > 0
         assert "map_full" not in str(status.warnings)
         assert "memory.max_bytes" in str(report.last_refusal)
+        print(f"map {status.map_bytes / 1e6:.0f} MB, {report}")
         assert 0 < status.map_bytes <= status.map_max_bytes == MAP_BYTES
         assert client.query_distance(np.zeros((10, 3)), max_distance_m=1.0).epoch > 0
         client.publish_scan(servers.sphere(500, 10.0), np.eye(4), source="honest")
@@ -67,7 +62,7 @@ def test_junk_in_a_request_for_tiles_is_refused(server: ServerProcess) -> None:
 
 def test_followers_that_ask_at_once_take_little(server: ServerProcess) -> None:
     """Each of 64 names as many tiles as it may."""
-    before = resident(server)
+    before = server.resident_bytes
     known = np.arange(300_000, dtype=np.int32).reshape(-1, 3)
     versions = np.ones(len(known), np.int64)
     payload = codec.encode(tile_updates(known=known, known_versions=versions))
@@ -79,6 +74,6 @@ def test_followers_that_ask_at_once_take_little(server: ServerProcess) -> None:
             session.get(key, lambda _: done.release(), payload=payload, timeout=30)
         for _ in range(60):
             assert done.acquire(timeout=servers.WAIT_S)
-        grown = resident(server) - before
+        grown = server.resident_bytes - before
     print(f"grown by {grown / 1e6:.0f} MB")
     assert grown < 250_000_000

@@ -1,15 +1,14 @@
 """What comes from beyond the machine of a server that listens on all addresses, and no more."""
 
-import time
+import socket
 from collections.abc import Iterator
-from pathlib import Path
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
 import triquad_client
 import zenoh
 from support.attackers.beyond import from_beyond
-from support.attackers.hostile_links import half_open
 from support.operations import OPERATIONS
 from support.servers import (
     MAP,
@@ -19,7 +18,6 @@ from support.servers import (
     free_endpoint,
     learn,
     raw_session,
-    scan,
     server_process,
     sphere,
 )
@@ -73,11 +71,6 @@ def settle(session: zenoh.Session) -> None:
     assert list(session.liveliness().get(keys.alive_key(MAP, "*")))
 
 
-def resident_bytes(server: ServerProcess) -> int:
-    status = Path(f"/proc/{server.process.pid}/statm").read_text()
-    return int(status.split()[1]) * 4096
-
-
 def test_the_log_says_what_listening_beyond_allows(server):
     (line,) = [line for line in server.lines if "access: " in line]
     assert "from beyond this machine may question and follow the map and publish scans" in line
@@ -97,12 +90,12 @@ def test_twenty_resets_and_checkpoints_change_nothing(server, stranger):
         assert client.query_sdf(sphere(20)).status.all()
 
 
-@pytest.mark.parametrize("selector", WILD)
-def test_no_operation_answers_a_wildcard_wherever_it_comes_from(server, stranger, selector):
+def test_no_operation_answers_a_wildcard_wherever_it_comes_from(server, stranger):
     with connected(server) as client, raw_session(connect=here(server)) as program:
         before = client.status().epoch
-        assert ask(stranger, selector, codec.encode(EVERYWHERE)) == []
-        assert ask(program, selector, codec.encode(EVERYWHERE)) == []
+        for selector in WILD:
+            assert ask(stranger, selector, codec.encode(EVERYWHERE)) == []
+            assert ask(program, selector, codec.encode(EVERYWHERE)) == []
         assert client.status().epoch == before
 
 
@@ -146,38 +139,25 @@ def test_a_stranger_does_not_read_scans_which_would_tell_their_session(server, s
         assert received.try_recv() is None
 
 
-def test_forged_scans_far_ahead_cost_the_true_source_at_most_one_scan(server):
-    forged = [scan(2**47), scan(1, stamp_ns=2**62)]
-    with raw_session(connect=here(server)) as program, connected(server) as client:
-        before = client.status()
-        for each in (scan(0), *forged, *(scan(number) for number in range(2, 12))):
-            program.put(
-                keys.scan_key(MAP, each.source),
-                codec.encode(each),
-                congestion_control=zenoh.CongestionControl.BLOCK,
-            )
-        deadline = time.monotonic() + WAIT_S
-        while (after := client.status()).scans_taken < before.scans_taken + 11:
-            assert time.monotonic() < deadline, after.scans_dropped
-            time.sleep(0.02)
-        assert after.scans_dropped["sequence_ahead"] == 1
-        assert after.scans_dropped["time_backwards"] == 1
-        assert after.scans_lost.get("lidar", 0) == 0
-
-
 def test_messages_that_no_operation_takes_leave_no_memory_behind(server, stranger):
-    before = resident_bytes(server)
+    before = server.resident_bytes
     huge = bytes(200 * MB)
     for key in ("triquad/unknown", f"triquad/{MAP}/scan/huge", f"triquad/{MAP}/query/sdf"):
         stranger.put(key, huge, congestion_control=zenoh.CongestionControl.BLOCK)
     with connected(server) as client:
         assert client.query_sdf(sphere(20)).status.all()
-    assert resident_bytes(server) - before < 60 * MB
+    assert server.resident_bytes - before < 60 * MB
 
 
 def test_an_honest_client_gets_in_beside_half_open_links(server):
-    with half_open(here(server), 900), connected(server) as client:
-        assert client.query_sdf(sphere(20)).status.all()
+    host, _, port = here(server).removeprefix("tcp/").rpartition(":")
+    with ExitStack() as links:
+        for _ in range(900):  # which never say a word
+            link = links.enter_context(socket.socket())
+            link.setblocking(False)
+            link.connect_ex((host, int(port)))
+        with connected(server) as client:
+            assert client.query_sdf(sphere(20)).status.all()
 
 
 @pytest.mark.parametrize("beyond", [True, False])
@@ -189,5 +169,6 @@ def test_an_honest_client_finds_its_map_among_thousands_of_tokens(server, beyond
         settle(hostile)
         with connected(server) as client:
             assert client.query_sdf(sphere(20)).status.all()
-            assert len(client.maps()) == (1 if beyond else TOKENS + 1)
+            if beyond:
+                assert client.maps() == [MAP]
         del tokens

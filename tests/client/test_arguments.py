@@ -8,8 +8,6 @@ import pytest
 import triquad_client
 from support import servers
 from triquad_client import Client, InvalidInputError, InvalidScanError, Status
-from triquad_client.calls.point_queries import grid_blocks
-from triquad_format.wire.limits import MAX_SEARCHES
 
 POSE = np.eye(4)
 CLOUD = np.ones((10, 3), np.float32)
@@ -166,15 +164,6 @@ def test_a_flush_that_cannot_be_waited_for_is_refused_here(
         client.flush(timeout_s, pending)
 
 
-def test_however_long_a_settled_map_may_take_it_is_told_at_once(client: Client) -> None:
-    client.flush(servers.WAIT_S)
-    client.settle(servers.WAIT_S)
-    assert client.settle(10**400).settled
-    for bad in (np.nan, "long"):
-        with pytest.raises(InvalidInputError, match="timeout_s = "):
-            client.settle(bad)
-
-
 def test_far_coordinates_keep_their_precision(client: Client) -> None:
     """Offsets travel in single precision from an origin in double precision."""
     far = np.array([[50_000.0, 0, 0]]) + servers.sphere(20)
@@ -183,18 +172,3 @@ def test_far_coordinates_keep_their_precision(client: Client) -> None:
     client.publish_scan(servers.sphere(), pose, source="far")
     client.flush(servers.WAIT_S)
     assert (client.query_sdf(far).status == triquad_client.Status.SURFACE).all()
-
-
-@pytest.mark.parametrize(
-    "counts", [(1, 1, 1), (300, 200, 1), (7, 150, 200), (3, 1, MAX_SEARCHES), (2, MAX_SEARCHES, 1)]
-)
-def test_a_grid_goes_in_blocks_none_of_which_is_too_large(counts: tuple[int, int, int]) -> None:
-    cells = np.arange(np.prod(counts)).reshape(counts)
-    parts = []
-    for block in grid_blocks(counts):
-        ends = np.array(block.first) + block.counts
-        part = cells[tuple(slice(*ends) for ends in zip(block.first, ends, strict=True))]
-        assert part.shape == block.counts
-        assert part.size <= MAX_SEARCHES
-        parts.append(part.ravel())
-    np.testing.assert_array_equal(np.concatenate(parts), cells.ravel())

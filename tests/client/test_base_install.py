@@ -3,8 +3,10 @@ import sys
 
 import pytest
 from support.files.mapfile_edit import file_bytes, parts_of
+from support.maps.exact_maps import exact_map, flat
 from support.maps.map_records import random_record
 from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.writer import write_map
 from triquad_tools.commands import pack
 
 CODE = """
@@ -20,6 +22,34 @@ sys.exit(f"importing the client brought in {heavy}" if heavy else 0)
 def test_client_comes_without_the_server_and_its_libraries():
     done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+WITHOUT = """
+import sys
+for name in sys.argv[2:]:
+    sys.modules[name] = None  # as if it were not installed
+import triquad_client
+with triquad_client.open_map(sys.argv[1]) as offline:
+    print(len(offline.mesh(cell_m=0.4).faces))
+assert not {"triquad_server", "triquad_tools"} & sys.modules.keys()
+"""
+
+
+def faces_without(path, *libraries):
+    """What a program prints of the mesh of a map, without some libraries."""
+    command = [sys.executable, "-c", WITHOUT, path, *libraries]
+    return subprocess.run(command, capture_output=True, text=True)
+
+
+def test_a_map_file_has_a_mesh_with_numba_alone(tmp_path):
+    path = tmp_path / "map.triquad"
+    write_map(exact_map(flat(0.1)), path)
+    done = faces_without(path, "torch", "skimage", "scipy", "trimesh")
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) > 1000
+    done = faces_without(path, "numba", "llvmlite")
+    assert done.returncode == 1
+    assert done.stderr.endswith("numba is missing: pip install 'triquad[fast]'\n")
 
 
 WITHOUT_HEAVY = """
@@ -74,13 +104,6 @@ def test_a_map_file_is_written_with_previews_where_they_can_be_made(map_with_pre
     copy = tmp_path / "copy.triquad"
     assert pack.main([str(map_with_preview), str(copy)]) == 0
     assert "/preview/mesh" in {part.topic for part in parts_of(copy.read_bytes())}
-
-
-def test_all_public_names_exist():
-    import triquad_client
-
-    for name in triquad_client.__all__:
-        assert getattr(triquad_client, name) is not None
 
 
 @pytest.mark.parametrize(

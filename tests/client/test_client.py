@@ -19,7 +19,6 @@ from triquad_client import (
     NoReplyError,
     RefusedError,
     RequestTimeoutError,
-    TriquadError,
     UnknownMapError,
 )
 from triquad_format.wire import codec, keys
@@ -103,13 +102,6 @@ def wait_for_maps(client: triquad_client.Client, names: list[str]) -> None:
         pause.wait(0.05)
 
 
-def test_a_map_that_goes_away_is_noticed() -> None:
-    with servers.running_service() as endpoint:
-        client = triquad_client.connect(endpoint, timeout_s=5.0)
-    with client, pytest.raises(TriquadError):
-        client.status()
-
-
 def test_a_closed_client_says_so(endpoint: str) -> None:
     client = triquad_client.connect(endpoint)
     client.close()
@@ -137,20 +129,6 @@ def test_a_reply_that_never_comes_is_a_timeout() -> None:
         with pytest.raises(RequestTimeoutError, match=r"query/sdf within 0\.2 s"):
             client.query_sdf(CLOUD)
         held[0].drop()
-
-
-def test_a_refusal_carries_its_code() -> None:
-    def answer(query: zenoh.Query, _: str) -> None:
-        with query:
-            query.reply_err(codec.encode(ErrorReply("busy", "try later")))
-
-    with (
-        servers.answering({keys.SDF: answer}) as endpoint,
-        triquad_client.connect(endpoint) as client,
-    ):
-        with pytest.raises(RefusedError, match="busy: try later") as caught:
-            client.query_sdf(CLOUD)
-        assert caught.value.code == "busy"
 
 
 def test_a_query_whose_epoch_goes_starts_again_and_gives_up_after_three_tries() -> None:

@@ -40,16 +40,17 @@ def reason(endpoint: str | None, config: Path | None = None) -> str:
     return str(caught.value)
 
 
-def test_a_host_without_an_address_is_told() -> None:
-    assert "no address is known of the host 'nonsense.invalid'" in reason("nonsense.invalid")
-
-
-def test_a_port_at_which_nothing_listens_is_told() -> None:
-    assert "nothing listens at 127.0.0.1" in reason(servers.free_endpoint())
-
-
-def test_a_protocol_that_is_none_is_told_with_those_there_are() -> None:
-    assert "'http' is no protocol of Zenoh: use tcp/HOST:PORT" in reason("http://127.0.0.1:7447")
+@pytest.mark.parametrize(
+    ("endpoint", "why"),
+    [
+        ("nonsense.invalid", "no address is known of the host 'nonsense.invalid'"),
+        (servers.free_endpoint(), "nothing listens at 127.0.0.1"),
+        ("http://127.0.0.1:7447", "'http' is no protocol of Zenoh: use tcp/HOST:PORT"),
+    ],
+    ids=["host", "port", "protocol"],
+)
+def test_why_there_is_no_link_is_told(endpoint: str, why: str) -> None:
+    assert why in reason(endpoint)
 
 
 def test_certificates_that_are_not_there_are_named(tmp_path: Path) -> None:

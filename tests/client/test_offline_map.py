@@ -1,7 +1,5 @@
 """A map file answers as the server that it came from, without one."""
 
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -111,13 +109,6 @@ def test_the_file_answers_as_the_server(pair: Pair, offline: OfflineMap, name: s
     assert_close(QUESTIONS[name](offline), QUESTIONS[name](pair.client), name)
 
 
-def test_it_tells_what_it_is(pair: Pair, offline: OfflineMap) -> None:
-    status = pair.client.status()
-    assert (offline.name, offline.epoch) == (status.map_name, status.epoch)
-    assert offline.stamp_ns > 1.7e18
-    assert offline.query_distance(POINTS).epoch == offline.epoch
-
-
 def test_large_questions_are_one_call(offline: OfflineMap) -> None:
     many = np.tile(POINTS, (60, 1))  # more than go into one request
     answer = offline.query_distance(many)
@@ -170,21 +161,3 @@ def test_damaged_and_foreign_files_are_refused_by_name(tmp_path: Path) -> None:
         open_map(tmp_path / "nowhere.triquad")
     with pytest.raises(MapFileError, match="not a folder of checkpoints"):
         open_map(tmp_path)
-
-
-WITHOUT_NUMBA = """
-import sys
-for name in ("numba", "llvmlite", "torch", "skimage"):
-    sys.modules[name] = None  # as if it were not installed
-import triquad_client
-triquad_client.open_map(sys.argv[1])
-"""
-
-
-def test_without_numba_the_error_names_the_extra(tmp_path: Path) -> None:
-    path = tmp_path / "map.triquad"
-    write_map(exact_map(flat(0.07)), path)
-    command = [sys.executable, "-c", WITHOUT_NUMBA, str(path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 1
-    assert done.stderr.endswith("numba is missing: pip install 'triquad[fast]'\n")

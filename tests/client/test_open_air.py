@@ -1,5 +1,6 @@
 """Rays that met nothing, from the client to what the map answers."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -8,13 +9,18 @@ import triquad_client
 from numpy.typing import ArrayLike
 from support import servers
 from triquad_client import Client, InvalidScanError, Status
-from triquad_format.wire import codec
 from triquad_server.settings import Settings
 
 POSE = np.eye(4)
 UP = [[0.0, 0.0, 1.0]]
 NOTHING = np.empty((0, 3))
 GLASS_M = 6.0
+
+
+@pytest.fixture(scope="module")
+def endpoint() -> Iterator[str]:
+    with servers.running_service() as endpoint:
+        yield endpoint
 
 
 def open_settings(**sources: dict[str, object]) -> Settings:
@@ -46,14 +52,6 @@ def test_a_scan_of_which_no_ray_returned_shows_open_air_and_nothing_else() -> No
         status = client.status()
         assert (status.rays_kept, status.regions) == (0, 1), "nothing to learn, no far region"
         assert client.tiles().tiles.shape == (0, 3)
-
-
-def test_rays_without_a_return_stop_at_the_range_of_their_source() -> None:
-    with servers.service_and_client(open_settings(near={"range_max_m": 5.0})) as client:
-        client.publish_scan(NOTHING, POSE, source="near", no_return=UP)
-        client.publish_scan(NOTHING, POSE, source="other", no_return=[[0, 1, 0]])
-        asked = [[0, 0, 4.9], [0, 0, 5.5], [0, 5.5, 0]]
-        assert statuses(client, asked) == [Status.FREE, Status.UNKNOWN, Status.FREE]
 
 
 def test_a_source_that_is_not_believed_shows_nothing() -> None:
@@ -138,35 +136,12 @@ def test_where_the_robot_drove_surfaces_stay() -> None:
         (None, "no points"),
     ],
 )
-def test_what_is_no_direction_is_refused_here(no_return: Any, text: str) -> None:
+def test_what_is_no_direction_is_refused_here(endpoint: str, no_return: Any, text: str) -> None:
     with (
-        servers.running_service() as endpoint,
         triquad_client.connect(endpoint) as client,
         pytest.raises(InvalidScanError, match=text),
     ):
         client.publish_scan(NOTHING, POSE, no_return=no_return)
-
-
-@pytest.mark.parametrize(
-    ("no_return", "words"),
-    [
-        (np.array([[0, 0, 1], [0, 0, 0]], np.float32), ["direction 1", "length"]),
-        (np.array([[np.nan, 0, 1]], np.float32), ["direction 0", "finite"]),
-        (np.ones((499_600, 3), np.float32), ["500100", "scan.max_points = 500000"]),
-    ],
-)
-def test_what_is_no_direction_is_refused_by_the_server(
-    no_return: np.ndarray, words: list[str]
-) -> None:
-    with servers.running_service() as endpoint, servers.raw_session(connect=endpoint) as session:
-        peer = servers.RawPeer(session)
-        bad, good = servers.scan(no_return=no_return), servers.scan(1)
-        for scan in (bad, good):
-            peer.put(scan.source, codec.encode(scan))
-        reply = peer.flush(good)
-        assert (reply.taken, reply.refused, reply.lost) == (1, 1, 0)
-        assert reply.last_refusal is not None
-        assert all(word in reply.last_refusal for word in words), reply.last_refusal
 
 
 def test_an_organised_cloud_tells_its_empty_returns() -> None:

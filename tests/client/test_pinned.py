@@ -16,7 +16,7 @@ SETTINGS = servers.SMALL.model_copy(
 )
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def client() -> Iterator[Client]:
     """Of a service that keeps the newest epoch, and two that are asked for."""
     with servers.service_and_client(SETTINGS) as client:

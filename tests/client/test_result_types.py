@@ -4,7 +4,7 @@ Words that do not exist are errors twice over: mypy tells where such a comment i
 """
 
 import asyncio
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import get_args
 
@@ -72,26 +72,13 @@ def ask(queries: MapQueries) -> None:
     )
 
 
-Open = Callable[[triquad_client.Client, Path], MapQueries]
-
-
-def offline(client: triquad_client.Client, path: Path) -> MapQueries:
-    client.download_map(path)
-    return triquad_client.open_map(path)
-
-
-@pytest.mark.parametrize(
-    "open_",
-    [
-        lambda client, _: client,
-        lambda client, _: client.pinned(),
-        lambda client, path: client.sync(BOX, path),
-        offline,
-    ],
-)
-def test_whoever_asks_has_it(server: triquad_server.Server, tmp_path: Path, open_: Open) -> None:
+def test_whoever_asks_has_it(server: triquad_server.Server, tmp_path: Path) -> None:
+    path = tmp_path / "map.triquad"
     with server.client() as client:
-        ask(open_(client, tmp_path / "map.triquad"))
+        ask(client)
+        ask(client.pinned())
+        ask(client.sync(BOX, path))
+        ask(triquad_client.open_map(path))
 
 
 async def ask_async(queries: AsyncClient | AsyncPinnedMap | AsyncSyncedMap) -> None:

@@ -1,6 +1,5 @@
 """Copies of a server's map that stay current, and answer when the link drops."""
 
-import asyncio
 import subprocess
 import sys
 import time
@@ -30,19 +29,12 @@ FIRST = ((-10, -10, -10), (10, 10, 10))
 POINTS = np.random.default_rng(0).uniform(-6, 6, (3000, 3))
 
 
-@pytest.fixture
-def endpoint() -> Iterator[str]:
-    """Of a server that has learnt two rooms."""
-    with servers.running_service() as endpoint:
-        with triquad_client.connect(endpoint) as client:
-            learn(client, 0.0)
-            learn(client, FAR_M)
-        yield endpoint
-
-
-@pytest.fixture
-def client(endpoint: str) -> Iterator[Client]:
-    with triquad_client.connect(endpoint) as client:
+@pytest.fixture(scope="module")
+def client() -> Iterator[Client]:
+    """Of a server that has learnt two rooms, of which tests change some."""
+    with servers.service_and_client() as client:
+        learn(client, 0.0)
+        learn(client, FAR_M)
         yield client
 
 
@@ -127,21 +119,18 @@ def test_a_damaged_copy_is_mended_and_a_foreign_file_replaced(
 def test_it_answers_while_the_server_is_gone_and_outlives_one_that_lost_its_map(
     tmp_path: Path,
 ) -> None:
-    path, settings = tmp_path / "copy.triquad", tmp_path / "settings.toml"
-    settings.write_text(servers.SMALL_TOML)
-    with servers.server_process(["--settings", settings]) as server:
-        client = triquad_client.connect(server.endpoint, timeout_s=5.0)
+    path, endpoint = tmp_path / "copy.triquad", servers.free_endpoint()
+    with servers.running_service(endpoint=endpoint):
+        client = triquad_client.connect(endpoint, timeout_s=5.0)
         learn(client, 0.0)
         local = client.sync(FIRST, path)
         before, data, age_s = local.query_distance(POINTS), path.read_bytes(), local.age_s
-        server.process.kill()
-        server.wait()
     with pytest.raises(ConnectError, match="down"):
         refresh_until_the_link_is_lost(local)
     assert local.age_s > age_s
     np.testing.assert_array_equal(local.query_distance(POINTS).distance_m, before.distance_m)
     assert triquad_client.open_map(path).epoch == before.epoch
-    with client, servers.server_process(["--settings", settings], endpoint=server.endpoint):
+    with client, servers.running_service(endpoint=endpoint):
         with pytest.raises(EmptierMapError, match="The copy stays as it is.*accept_emptier=True"):
             refresh_once_linked(local)
         # A program that was started again, too, has the file alone.
@@ -160,7 +149,7 @@ def test_it_answers_while_the_server_is_gone_and_outlives_one_that_lost_its_map(
 
 
 def refresh_until_the_link_is_lost(local: SyncedMap) -> None:
-    """Raises what refreshing does then: that a server was killed is noticed some time after."""
+    """Raises what refreshing does then: that a server is gone is noticed some time after."""
     deadline = time.monotonic() + servers.WAIT_S
     while time.monotonic() < deadline:
         with suppress(UnknownMapError):
@@ -224,7 +213,7 @@ def test_a_process_that_is_killed_leaves_a_whole_copy(tmp_path: Path) -> None:
     with servers.running_service() as endpoint, triquad_client.connect(endpoint) as client:
         learn(client, 0.0)
         epoch = client.status().epoch
-        for rounds in (1, 4, 9):
+        for rounds in (1, 3):
             command = [sys.executable, "-c", SYNCING, endpoint, str(path)]
             with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
                 assert process.stdout is not None
@@ -232,20 +221,3 @@ def test_a_process_that_is_killed_leaves_a_whole_copy(tmp_path: Path) -> None:
                     assert process.stdout.readline() == "synced\n"
                 process.kill()
             assert triquad_client.open_map(path).epoch == epoch
-
-
-def test_copies_for_event_loops(endpoint: str, client: Client, tmp_path: Path) -> None:
-    async def follow() -> None:
-        async with triquad_client.connect_async(endpoint) as awaited:
-            local = await awaited.sync(WHOLE, tmp_path / "copy.triquad")
-            answers = await asyncio.gather(*(local.query_distance(POINTS) for _ in range(4)))
-            want = client.query_distance(POINTS)
-            for answer in answers:
-                assert np.quantile(np.abs(answer.distance_m - want.distance_m), 0.99) < 1e-3
-            assert (await local.refresh()).bytes_received == 0
-            assert local.age_s >= 0
-        with pytest.raises(ClosedError):
-            await local.refresh()
-        assert (await local.query_sdf(POINTS)).epoch == local.epoch
-
-    asyncio.run(follow())

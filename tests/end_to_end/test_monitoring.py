@@ -30,9 +30,7 @@ from triquad_server.monitoring.prometheus import FAMILIES
 from triquad_server.settings import MetricsSettings
 from triquad_tools.demo.server import free_port
 
-DOCS = Path(__file__).parents[2] / "docs"
-PAGE = (DOCS / "metrics.md").read_text(encoding="utf-8")
-DASHBOARD = DOCS / "deploy" / "grafana-dashboard.json"
+PAGE = (Path(__file__).parents[2] / "docs" / "metrics.md").read_text(encoding="utf-8")
 
 
 class Answer(NamedTuple):
@@ -89,13 +87,11 @@ def test_prometheus_is_told_what_clients_are_told(port):
     found = samples(port)
     sdf = (("operation", "query/sdf"),)
     assert found["triquad_request_duration_seconds_count", sdf] == 5
-    assert 0 < found["triquad_request_duration_seconds_sum", sdf] < servers.WAIT_S
     buckets = {
         float(dict(labels)["le"]): count
         for (name, labels), count in found.items()
         if name == "triquad_request_duration_seconds_bucket" and sdf[0] in labels
     }
-    assert len(buckets) > 20
     assert [count for _, count in sorted(buckets.items())] == sorted(buckets.values())
     assert buckets[math.inf] == 5
     gone = (("code", "epoch_gone"), ("operation", "query/distance"))
@@ -129,27 +125,6 @@ def test_the_page_lists_what_is_exposed(port):
     assert len(rows) == len(FAMILIES) == len(families)
 
 
-def test_the_dashboard_shows_metrics_and_labels_that_there_are():
-    dashboard = json.loads(DASHBOARD.read_text(encoding="utf-8"))
-    panels = [panel for panel in dashboard["panels"] if panel["type"] != "row"]
-    assert len({panel["id"] for panel in dashboard["panels"]}) == len(dashboard["panels"])
-    labels = {
-        name: {*family.labels, "instance", "le"}
-        for family in FAMILIES
-        for name in (family.name, *(f"{family.name}_{part}" for part in ("bucket", "count", "sum")))
-    }
-    shown = set()
-    for target in (target for panel in panels for target in panel["targets"]):
-        names = re.findall(r"triquad_\w+", target["expr"])
-        assert names, target
-        used = set(re.findall(r'(\w+)!?[=~]+"', target["expr"]))
-        used |= set(re.findall(r"{{(\w+)}}", target["legendFormat"]))
-        for name in names:
-            assert used <= labels[name], (target, name)
-        shown |= {re.sub("_(bucket|count|sum)$", "", name) for name in names}
-    assert shown == {family.name for family in FAMILIES}
-
-
 def test_nothing_else_is_answered_and_nothing_breaks_it(port):
     assert get(port, "/").code == 404
     assert "/healthz" in get(port, "/map").body
@@ -163,15 +138,11 @@ def test_nothing_else_is_answered_and_nothing_breaks_it(port):
     with socket.create_connection(("127.0.0.1", port)) as connection:
         connection.sendall(b"POST /healthz HTTP/1.0\r\n\r\n")
         assert b"501" in connection.recv(1000)
-    assert health(port)[0] == 200
-
-
-def test_a_probe_may_ask_for_the_head_alone(port):
     with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=servers.WAIT_S)) as probe:
-        probe.request("HEAD", "/healthz")
+        probe.request("HEAD", "/healthz")  # the head alone
         reply = probe.getresponse()
         assert (reply.status, reply.read()) == (200, b"")
-        assert int(reply.headers["Content-Length"]) > 0
+    assert health(port)[0] == 200
 
 
 def test_connections_that_stall_or_trickle_take_some_threads_for_some_seconds(port, monkeypatch):
@@ -213,37 +184,14 @@ def until(is_so: Callable[[], bool]) -> None:
     assert any(is_so() for _ in range(1000))
 
 
-def test_a_process_is_watched_from_its_start_to_its_end(arguments):
-    port = free_port()
-    process = servers.server_process([*arguments, "--metrics-port", str(port)], ready=False)
-    with process as server:
-        server.wait_for("metrics on")
-        code, report = health(port)
-        if code != 200:  # as a rule: it takes a second to start
-            assert "starting" in report["problem"]
-        server.wait_for("ready: ")
-        until(lambda: is_healthy(port))  # the line comes a moment before
-        with triquad_client.connect(server.endpoint) as client:
-            servers.learn(client)
-            status = client.status()
-        code, report = health(port)
-        assert (code, report["problem"]) == (200, None)
-        assert (report["map"], report["scans_taken"]) == (servers.MAP, 2)
-        assert report["epoch"] >= status.epoch
-        server.process.send_signal(signal.SIGTERM)
-        assert server.wait() == 0
-    with pytest.raises(OSError, match="refused"):
-        get(port, "/healthz")
-    assert "Traceback" not in server.log
-
-
 @contextmanager
 def no_space(pid):
     """Every file that the process writes ends after 10 kB, as on a disk that is full."""
     _, hard = resource.prlimit(pid, resource.RLIMIT_FSIZE)
     resource.prlimit(pid, resource.RLIMIT_FSIZE, (10_000, hard))
     yield
-    resource.prlimit(pid, resource.RLIMIT_FSIZE, (hard, hard))
+    with suppress(ProcessLookupError):
+        resource.prlimit(pid, resource.RLIMIT_FSIZE, (hard, hard))
 
 
 def test_while_the_disk_is_full_it_goes_on_mapping_and_says_so(tmp_path, arguments):
@@ -255,6 +203,10 @@ def test_while_the_disk_is_full_it_goes_on_mapping_and_says_so(tmp_path, argumen
         servers.learn(client)
         client.settle(servers.WAIT_S)
         kept = client.checkpoint()
+        code, report = health(port)
+        assert (code, report["problem"]) == (200, None)
+        assert (report["map"], report["scans_taken"]) == (servers.MAP, 2)
+        assert report["epoch"] == kept.epoch
         with no_space(server.process.pid):
             servers.learn(client, 1)
             with pytest.raises(RefusedError, match="cannot be written: .*too large"):
@@ -277,8 +229,12 @@ def test_while_the_disk_is_full_it_goes_on_mapping_and_says_so(tmp_path, argumen
         assert health(port)[0] == 200
         assert client.status().store_error is None
         assert read_map(later.path).epoch == later.epoch == client.status().epoch
-        server.process.send_signal(signal.SIGTERM)
-        assert server.wait() == 0
+        servers.learn(client, 1)
+        with no_space(server.process.pid):
+            server.process.send_signal(signal.SIGTERM)
+            assert server.wait() == 5, "whoever started it hears of it"
+    assert f"what was mapped since epoch {later.epoch} is lost" in server.log
+    assert read_map(later.path).epoch == later.epoch
     assert not list((tmp_path / "store").rglob("*.tmp"))
     assert "Traceback" not in server.log
 

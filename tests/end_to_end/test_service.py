@@ -1,6 +1,7 @@
 """The service with a real map, asked by the real client over the loopback."""
 
 import math
+import shutil
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
@@ -8,20 +9,18 @@ import numpy as np
 import pytest
 import triquad_client
 from support import servers
-from triquad_client import InvalidInputError, Status
+from triquad_client import InvalidInputError, RefusedError, Status
+from triquad_format.mapfile.reader import read_map
 from triquad_format.wire import codec, keys
-from triquad_format.wire.mesh_messages import MeshReply, MeshRequest
 from triquad_format.wire.messages import (
-    ErrorReply,
     FlushReply,
     FlushRequest,
-    SdfRequest,
+    MapChunk,
+    MapChunkRequest,
+    ResetRequest,
     ServerStatus,
-    StatusRequest,
 )
-from triquad_format.wire.tile_codec import decode_tile
-from triquad_map.questions.answers import Answers
-from triquad_server.settings import ServiceSettings
+from triquad_server.store.store import Store
 
 POSE = np.eye(4)
 PROBES = np.concatenate([servers.sphere(50, radius) for radius in (2.0, 3.9, 4.0, 4.1)])
@@ -76,20 +75,6 @@ def test_flush_lets_a_publisher_run_ahead(client):
         client.publish_scan(servers.sphere(), POSE)
         assert client.flush(servers.WAIT_S, pending=3).lost == 0
     assert client.flush(servers.WAIT_S).taken == 6
-
-
-def test_sources_of_one_client_are_flushed_together(client):
-    for source in ("front", "rear", "front"):
-        client.publish_scan(servers.sphere(), POSE, source=source)
-    assert client.flush(servers.WAIT_S).taken == 3
-
-
-def test_flush_of_a_scan_that_never_arrives_counts_it_as_lost(endpoint):
-    with servers.raw_session(connect=endpoint) as session:
-        peer = servers.RawPeer(session)
-        peer.put("lidar", codec.encode(servers.scan(1)))
-        reply = peer.flush(servers.scan(2))
-        assert (reply.taken, reply.lost) == (1, 2)
 
 
 def test_flush_tells_at_once_that_a_scan_is_not_in_the_map_yet(endpoint):
@@ -149,14 +134,6 @@ def test_a_query_of_no_points_tells_the_epoch(client):
     assert result.epoch == client.status().epoch
 
 
-def test_an_epoch_that_is_gone_is_told_apart(endpoint):
-    with servers.raw_session(connect=endpoint) as session:
-        peer = servers.RawPeer(session)
-        request = SdfRequest(np.zeros(3), np.zeros((1, 3), np.float32), False, 999)
-        assert peer.refusal(keys.SDF, request) == "epoch_gone"
-        assert peer.refusal(keys.MESH, MeshRequest(np.zeros((1, 3), np.int32), 999)) == "epoch_gone"
-
-
 def test_tiles_make_one_mesh(client):
     servers.learn(client)
     client.settle(servers.WAIT_S)
@@ -181,26 +158,6 @@ def test_tiles_make_one_mesh(client):
         client.mesh_tile(np.int64(-(2**63)), 0, 0)
 
 
-def test_tiles_that_are_asked_for_together_are_those_asked_for_alone(endpoint, client):
-    servers.learn(client)
-    client.settle(servers.WAIT_S)
-    listed = client.tiles()
-    nowhere = np.array([[900_000, 0, 0]], np.int32)
-    tiles = np.concatenate([listed.tiles[:3], nowhere, listed.tiles[3:5]])
-    with servers.raw_session(connect=endpoint) as session:
-        answer = servers.RawPeer(session).ask(keys.MESH, codec.encode(MeshRequest(tiles, 0)))
-    assert isinstance(answer, bytes), answer
-    reply = codec.decode(MeshReply, answer)
-    ends = np.cumsum(reply.sizes)
-    for row, index in enumerate(tiles.tolist()):
-        surface = decode_tile(reply.data[ends[row] - reply.sizes[row] : ends[row]])
-        alone = client.mesh_tile(*index)
-        assert (len(alone.faces) == 0) == (row == 3)
-        np.testing.assert_array_equal(surface.faces, alone.faces)
-        vertices = np.array(index) * reply.tile_side_m + surface.positions(reply.cell_m)
-        np.testing.assert_array_equal(vertices, alone.vertices)
-
-
 def test_holes_of_a_mesh_are_filled_where_that_is_asked_for(client):
     client.reset()
     points = servers.sphere(20_000)
@@ -216,8 +173,6 @@ def test_holes_of_a_mesh_are_filled_where_that_is_asked_for(client):
     assert np.abs(centres[mesh.filled, 0]).min() < 0.1
     assert (client.query_sdf(centres[mesh.filled]).status != Status.FREE).all()
     assert client.mesh(((50, 50, 50), (60, 60, 60)), fill_m=0.6).filled.shape == (0,)
-    with pytest.raises(InvalidInputError, match="fill_m = 9: use 0 to 5"):
-        client.mesh(fill_m=9)
 
 
 def test_meshes_are_cropped_to_bounds(client):
@@ -254,32 +209,89 @@ def test_the_status_is_published(endpoint):
     assert str(sample.encoding) == keys.encoding(ServerStatus)
 
 
-def test_requests_beyond_the_queue_are_told_to_come_back(monkeypatch):
-    begun, go_on = threading.Event(), threading.Event()
-    answer = Answers.answer
+def assert_same_map(before, after):
+    assert after.epoch >= before.epoch
+    assert np.array_equal(after.status, before.status)
+    assert np.allclose(after.sdf, before.sdf, rtol=0, atol=2e-3)  # features in half precision
 
-    def answer_later(queries, request):
-        begun.set()
-        assert go_on.wait(servers.WAIT_S)
-        return answer(queries, request)
 
-    monkeypatch.setattr(Answers, "answer", answer_later)
-    limits = ServiceSettings(request_queue=1)
-    settings = servers.SMALL.model_copy(update={"service": limits})
-    key = keys.operation_key(servers.MAP, keys.SDF)
-    payload = codec.encode(SdfRequest(np.zeros(3), np.zeros((1, 3), np.float32), True, 0))
-    with (
-        servers.running_service(settings) as endpoint,
-        servers.raw_session(connect=endpoint) as session,
-    ):
-        answered = [session.get(key, payload=payload, timeout=servers.WAIT_S)]
-        assert begun.wait(servers.WAIT_S)  # the only worker is at it: one more can wait
-        answered.append(session.get(key, payload=payload, timeout=servers.WAIT_S))
-        for _ in range(5):
-            (reply,) = session.get(key, payload=payload, timeout=servers.WAIT_S)
-            assert codec.decode(ErrorReply, reply.err.payload.to_bytes()).code == "busy"
-        status = keys.operation_key(servers.MAP, keys.STATUS)
-        (reply,) = session.get(status, payload=codec.encode(StatusRequest()))
-        assert reply.ok is not None, "how the server is doing is told however many questions wait"
-        go_on.set()
-        assert [reply.ok is not None for replies in answered for reply in replies] == [True, True]
+def test_a_downloaded_map_is_the_map(client, tmp_path):
+    servers.learn(client)
+    client.settle(servers.WAIT_S)
+    path = tmp_path / "map.triquad"
+    info = client.download_map(path)
+    assert path.stat().st_size == info.bytes
+    record = read_map(path)
+    assert record.epoch == info.epoch == client.status().epoch
+    assert len(record.regions) == 1
+    assert record.regions[0].training is None
+    assert client.download_map(path) == info
+    client.download_map(path, training=True)
+    assert read_map(path).regions[0].training is not None
+    assert [entry.name for entry in tmp_path.iterdir()] == ["map.triquad"]
+
+
+def test_chunks_of_other_files_or_beyond_the_end_are_refused(client, endpoint, tmp_path):
+    info = client.download_map(tmp_path / "map.triquad")
+    with servers.raw_session(connect=endpoint) as session:
+        peer = servers.RawPeer(session)
+        assert peer.refusal(keys.MAP_CHUNK, MapChunkRequest("00" * 32, 0, 10)) == "chunk_gone"
+        for offset, length in ((-1, 10), (info.bytes, 10), (2**62, 10), (0, 0), (0, -1)):
+            request = MapChunkRequest(info.sha256, offset, length)
+            assert peer.refusal(keys.MAP_CHUNK, request) == "bad_request"
+        data = (tmp_path / "map.triquad").read_bytes()
+        for length, end in ((5, 8), (2**62, None)):
+            answer = peer.ask(keys.MAP_CHUNK, codec.encode(MapChunkRequest(info.sha256, 3, length)))
+            assert codec.decode(MapChunk, answer).data == data[3:end]
+
+
+def test_without_a_store_checkpoints_are_refused_and_the_status_says_so(client):
+    with pytest.raises(RefusedError, match="without a store") as caught:
+        client.checkpoint()
+    assert caught.value.code == "store"
+    assert "not kept" in client.status().store_error
+
+
+def test_a_checkpoint_restores_the_same_answers(tmp_path):
+    with servers.service_and_client(store=tmp_path) as client:
+        servers.learn(client)
+        client.settle(servers.WAIT_S)
+        info = client.checkpoint()
+        assert client.checkpoint() == info
+        assert client.status().last_checkpoint == info
+        before = client.query_sdf(PROBES, gradient=True)
+    with servers.service_and_client(store=tmp_path) as client:
+        assert_same_map(before, client.query_sdf(PROBES, gradient=True))
+        assert client.status().last_checkpoint.epoch == before.epoch == info.epoch
+
+
+def test_a_reset_while_the_last_checkpoint_is_written_is_not_acknowledged(tmp_path, monkeypatch):
+    replies = []
+    write = Store.write
+
+    def reset_meanwhile(store, changes, undoes=""):
+        with servers.raw_session(connect=endpoint) as session:
+            request = ResetRequest(np.full(3, -np.inf), np.full(3, np.inf))
+            replies.append(servers.RawPeer(session).ask(keys.RESET, codec.encode(request)))
+        return write(store, changes, undoes)
+
+    with servers.running_service(store=tmp_path) as endpoint:
+        with triquad_client.connect(endpoint) as client:
+            servers.learn(client)
+        monkeypatch.setattr(Store, "write", reset_meanwhile)
+    assert replies == [None]
+
+
+def test_a_store_that_fails_does_not_stop_the_map(tmp_path):
+    with servers.service_and_client(store=tmp_path) as client:
+        servers.learn(client)
+        shutil.rmtree(tmp_path / servers.MAP)
+        (tmp_path / servers.MAP).write_text("in the way")
+        with pytest.raises(RefusedError, match="cannot be written"):
+            client.checkpoint()
+        assert "cannot be written" in client.status().store_error
+        assert servers.learn(client, 1).taken == 3
+        (tmp_path / servers.MAP).unlink()
+        (tmp_path / servers.MAP).mkdir()
+        assert client.checkpoint().epoch > 0
+        assert client.status().store_error is None

@@ -1,23 +1,22 @@
 """Where sources have been and what they see, asked by the real client over the loopback."""
 
+import logging
+
 import numpy as np
 import pytest
 import triquad_client
 from support import servers
 from triquad_client import (
-    BadReplyError,
     Client,
+    FlushReport,
     InvalidInputError,
     NoReplyError,
     RefusedError,
     SourceReport,
 )
 from triquad_format.records.arrays import Doubles
-from triquad_format.wire import codec, keys
-from triquad_format.wire.messages import FlushRequest
-from triquad_format.wire.query_messages import SourcesReply, SourcesRequest, SourceState
-from triquad_server.intake.source_trails import MAX_SOURCES
-from triquad_server.queries import source_queries
+from triquad_format.wire import keys
+from triquad_format.wire.query_messages import SourcesRequest
 
 BOX = ((2.5, -1, -1), (3.5, 1, 1))
 
@@ -44,13 +43,6 @@ def lines(report: SourceReport, source: str = "lidar") -> list[list[float]]:
     return [line[:, 0].tolist() for line in report.sources[source].lines()]
 
 
-def asked(peer: servers.RawPeer, server: str = "", revision: int = 0) -> SourcesReply:
-    """A reply as it travels."""
-    answer = peer.ask(keys.SOURCES, codec.encode(SourcesRequest(server, revision, 100)))
-    assert isinstance(answer, bytes), answer
-    return codec.decode(SourcesReply, answer)
-
-
 def test_a_program_follows_the_sources_with_the_report_before(client):
     report = client.sources()
     assert report.sources == {}
@@ -71,24 +63,6 @@ def test_a_program_follows_the_sources_with_the_report_before(client):
     np.testing.assert_array_equal(unmoved.newest.points, report.sources["lidar"].newest.points)
 
 
-def test_only_what_is_new_travels(client, endpoint):
-    drive(client, [1, 2, 3])
-    drive(client, [7], source="camera")
-    with servers.raw_session(connect=endpoint) as session:
-        peer = servers.RawPeer(session)
-        first = asked(peer)
-        assert all(state.whole for state in first.sources.values())
-        drive(client, [4])
-        second = asked(peer, first.server, first.revision)
-        lidar, camera = second.sources["lidar"], second.sources["camera"]
-        assert (lidar.whole, lidar.trail[:, 0].tolist()) == (False, [4])
-        assert lidar.newest.world_from_sensor[0, 3] == 4
-        assert (camera.whole, len(camera.trail), camera.newest) == (False, 0, None)
-        assert len(codec.encode(asked(peer, second.server, second.revision))) < 600
-        of_another = asked(peer, "another", second.revision + 1000)
-        assert all(state.whole for state in of_another.sources.values())
-
-
 def test_the_newest_scan_lies_in_the_map_frame(client):
     client.publish_scan(servers.sphere(500), pose(1.0), stamp_s=10.0)
     client.publish_scan(servers.sphere(500), pose(9000.0, -7), stamp_s=12.5)
@@ -101,33 +75,6 @@ def test_the_newest_scan_lies_in_the_map_frame(client):
     sent = servers.sphere(500) @ pose(9000.0, -7)[:3, :3].T + (9000.0, -7, 0)
     apart = np.linalg.norm(newest.points[:, None] - sent, axis=2).min(axis=1)
     assert apart.max() < 1e-5
-
-
-def test_as_many_points_come_as_are_wanted_of_all_that_are_used(client):
-    with np.errstate(divide="ignore"):
-        rays = servers.sphere(60_000)
-        walls = (np.sign(rays) * (20, 20, 20)) / rays
-    client.publish_scan(rays * walls.min(axis=1, keepdims=True), pose(0), source="lidar")
-    client.flush(servers.WAIT_S)
-    everything = client.sources(max_points=10_000).sources["lidar"].newest
-    assert len(everything.points) == 10_000 < everything.points_used
-    some = client.sources(max_points=600).sources["lidar"].newest
-    assert len(np.unique(some.points, axis=0)) == 600
-    for wall in range(6):  # all of which are as large
-        away = some.points[:, wall // 2] * (-1) ** wall
-        assert 60 < (away > 19.9).sum() < 140
-    none = client.sources(max_points=0).sources["lidar"].newest
-    assert none.points.shape == (0, 3)
-    assert none.points_used == everything.points_used
-
-
-def test_the_points_of_very_many_sources_are_bounded(client, monkeypatch):
-    monkeypatch.setattr(source_queries, "MOST_POINTS", 100)
-    for source in ("one", "other"):
-        client.publish_scan(servers.sphere(500), np.eye(4), source=source)
-    client.flush(servers.WAIT_S)
-    report = client.sources(max_points=1000)
-    assert [len(source.newest.points) for source in report.sources.values()] == [50, 50]
 
 
 def test_refused_scans_leave_no_trace(client):
@@ -198,28 +145,6 @@ def test_after_a_restart_everything_is_anew(tmp_path):
         assert trail(client.sources(before)) == trail(client.sources(empty)) == [4, 5]
 
 
-def test_the_sources_that_are_remembered_are_bounded(client, endpoint):
-    names = [f"s{number}" for number in range(MAX_SOURCES + 10)]
-    with servers.raw_session(connect=endpoint) as session:
-        peer = servers.RawPeer(session)
-
-        def take(*sources: str, sequence: int = 0) -> None:
-            points = servers.sphere(20)
-            scans = [servers.scan(sequence, source=source, points=points) for source in sources]
-            for scan in scans:
-                peer.put(scan.source, codec.encode(scan))
-            for scan in scans:
-                assert peer.flush(scan).taken == sequence + 1
-
-        take(*names)
-        first = client.sources()
-        assert sorted(first.sources) == sorted(names[10:])
-        take(names[10], sequence=1)
-        take(names[0], sequence=1)
-    report = client.sources(first)
-    assert sorted(report.sources) == sorted([names[0], names[10], *names[12:]])
-
-
 def test_what_cannot_be_asked_is_refused_at_both_ends(client, endpoint):
     drive(client, [1])
     for bad in (-1, 10_001, 1.5, "many", True, None):
@@ -234,17 +159,11 @@ def test_what_cannot_be_asked_is_refused_at_both_ends(client, endpoint):
     assert caught.value.code == "bad_request"
     with servers.raw_session(connect=endpoint) as session:
         peer = servers.RawPeer(session)
-        for request in (
-            SourcesRequest("", 0, -1),
-            SourcesRequest("", 0, 10_001),
-            SourcesRequest("", -1, 0),
-            SourcesRequest(report.server, -(2**63), 0),
-            SourcesRequest(report.server, 2**63 - 1, 0),
-            b"\xc1",
-            FlushRequest("a", 0, 0, 1.0),
-        ):
-            payload = request if isinstance(request, bytes) else codec.encode(request)
-            assert peer.refusal(keys.SOURCES, payload) == "bad_request"
+        for points in (-1, 10_001):
+            assert peer.refusal(keys.SOURCES, SourcesRequest("", 0, points)) == "bad_request"
+        for revision in (-(2**63), -1, 2**63 - 1):
+            request = SourcesRequest(report.server, revision, 0)
+            assert peer.refusal(keys.SOURCES, request) == "bad_request"
     assert trail(client.sources()) == [1]
 
 
@@ -257,24 +176,24 @@ def test_a_server_that_does_not_know_the_question_is_told_apart():
         client.sources()
 
 
-@pytest.mark.parametrize(
-    ("state", "words"),
-    [
-        (
-            SourceState(1, True, np.zeros((2, 3)), np.zeros(1, np.int64), None),
-            "1 rows do not go with 2",
-        ),
-        (SourceState(1, False, np.zeros((0, 3)), np.zeros(0, np.int64), None), "only what is new"),
-    ],
-)
-def test_replies_that_do_not_fit_together_are_named(state, words):
-    def answer(query, key):
-        with query:
-            query.reply(key, codec.encode(SourcesReply("x", 1, {"lidar": state})))
+def half_near() -> np.ndarray:
+    return np.concatenate([servers.sphere(500, 1.0), servers.sphere(500, 6.0)])
 
-    with (
-        servers.answering({keys.SOURCES: answer}) as endpoint,
-        triquad_client.connect(endpoint) as client,
-        pytest.raises(BadReplyError, match=words),
-    ):
-        client.sources()
+
+def test_a_publisher_learns_what_a_setting_takes_of_its_scans_and_is_told_once(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    with servers.service_and_client() as client, caplog.at_level(logging.WARNING):
+        reports: list[FlushReport] = []
+        for _ in range(2):
+            for _ in range(12):
+                client.publish_scan(half_near(), np.eye(4), source="cam")
+            reports.append(client.flush(servers.WAIT_S))
+        status = client.status()
+    (text,) = reports[0].warnings
+    assert text.startswith("source 'cam': range_min_m = 1.5 drops 50 % of its points: set ")
+    assert reports[1].warnings == (text,)
+    assert status.warnings == text
+    assert status.scans_taken == 24
+    for logger in ("triquad_client", "triquad_server.intake.scan_warnings"):
+        assert [r.getMessage() for r in caplog.records if r.name == logger] == [text]

@@ -18,9 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fuzz.choices import Mutation
-from fuzz.damage import DAMAGE, cut, flip_bits
-from fuzz.forgery import FORGERY, forge_bombs
+from fuzz.mutants import DAMAGE, FORGERY, Mutation, cut, flip_bits
 from fuzz.valid_maps import READERS, Reader, Results, ValidMap, valid_maps
 from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
@@ -62,7 +60,6 @@ mutants = settings(
     suppress_health_check=list(HealthCheck),
     report_multiple_bugs=False,
 )
-bombs = settings(mutants, max_examples=max(COUNT // 20, 10))
 
 
 @pytest.fixture(scope="module")
@@ -84,12 +81,6 @@ def test_forged_maps_are_valid(
     maps: list[ValidMap], mutation: Mutation, data: st.DataObject
 ) -> None:
     check_mutant(maps, mutation, data, forged=True)
-
-
-@bombs
-@given(data=st.data())
-def test_bombs_take_little_memory(maps: list[ValidMap], data: st.DataObject) -> None:
-    check_mutant(maps, forge_bombs, data, forged=True)
 
 
 def check_mutant(

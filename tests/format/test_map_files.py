@@ -156,19 +156,6 @@ def test_stamp() -> None:
             file_bytes(random_record(4), stamp_ns=bad)
 
 
-def test_what_is_known_of_a_file_and_its_parts(tmp_path: Path) -> None:
-    data = file_bytes(random_record(5))
-    path = tmp_path / "map.triquad"
-    path.write_bytes(data)
-    file = read_map_file(path)
-    assert file.size == len(data)
-    assert file.metadata["frame_id"] == "map"
-    assert file.manifest == manifest_of(data)
-    own = file.manifest.entries
-    assert [entry.key.topic for entry in own] == [part.topic for part in parts_of(data)[:-1]]
-    assert 0 < sum(entry.stored for entry in own) < len(data)
-
-
 # The golden files
 
 

@@ -68,8 +68,3 @@ def test_many_invented_names_lose_to_one_owner():
         filled(queue, Owner("", str(number)), [number])
     assert len(filled(queue, A, "b")) == 1
     assert {"a", "b"} <= set(queue.clear())
-def test_the_newest_of_whoever_has_most_goes_first():
-    many, few, invented = Owner("greedy"), Owner("honest"), Owner("greedy", "another")
-    assert first_to_go([(many, 1), (invented, 1), (many, 1), (few, 1)]) == 2
-    assert first_to_go([(many, 1), (few, 1)]) == 1
-    assert first_to_go([(many, 5), (few, 1), (few, 1)]) == 0

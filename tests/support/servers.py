@@ -2,6 +2,7 @@
 
 import os
 import queue
+import resource
 import subprocess
 import sys
 import threading
@@ -218,6 +219,11 @@ class ServerProcess:
     @property
     def log(self) -> str:
         return "".join(self.lines)
+
+    @property
+    def resident_bytes(self) -> int:
+        pages = Path(f"/proc/{self.process.pid}/statm").read_text().split()[1]
+        return int(pages) * resource.getpagesize()
 
     def wait_for(self, text: str) -> None:
         """Return once a line holds ``text``."""

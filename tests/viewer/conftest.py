@@ -5,12 +5,12 @@ from contextlib import AbstractContextManager, closing, contextmanager
 
 import pytest
 from playwright.sync_api import Browser, Page, expect
-from support.browser import running_browser
+from triquad_tools.console.command import ToolError
 from triquad_tools.viewer.sources.history import History
 from triquad_tools.viewer.sources.map_source import MapSource
 from triquad_tools.viewer.viewer import Viewer
 
-from bench.clients.browser import opened_page
+from bench.clients import browser
 
 expect.set_options(timeout=60_000)  # a browser that draws in software takes seconds at times
 
@@ -19,18 +19,23 @@ Show = Callable[[MapSource | History], AbstractContextManager[Page]]
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with running_browser() as browser:
-        yield browser
+def chromium() -> Iterator[Browser]:
+    """A browser; tests skip where there is none."""
+    try:
+        browser.installed()
+    except ToolError as missing:
+        pytest.skip(str(missing))
+    with browser.running_browser() as running:
+        yield running
 
 
 @pytest.fixture(scope="module")
-def show(browser: Browser) -> Show:
+def show(chromium: Browser) -> Show:
     @contextmanager
     def opened(shown: MapSource | History) -> Iterator[Page]:
         with (
             closing(Viewer(shown, "127.0.0.1", 0)) as viewer,
-            opened_page(browser, viewer.url) as page,
+            browser.opened_page(chromium, viewer.url) as page,
         ):
             yield page
 

@@ -1,34 +1,12 @@
 """How finely what is drawn, from where, and in which colours."""
 
 import numpy as np
-from hypothesis import given
-from hypothesis import strategies as st
 from support.servers import SMALL, learn, running_service
 from triquad_client import connect
-from triquad_tools.plots.mesh_view import view_axes
-from triquad_tools.viewer.mesh.overview_camera import view_of
 from triquad_tools.viewer.mesh.tile_colours import before_tone_mapping
-from triquad_tools.viewer.mesh.tiles_in_view import NearTiles, TilesInView, near_columns
+from triquad_tools.viewer.mesh.tiles_in_view import NearTiles, TilesInView
 from triquad_tools.viewer.sources.live_source import LiveSource
 from triquad_tools.viewer.sources.map_source import COARSEST
-
-SIDE_M = 25.6
-COORDINATES = st.tuples(*[st.floats(-500, 500)] * 3)
-
-
-@given(eye=COORDINATES, reach_m=st.floats(1, 500), seed=st.integers(0, 1000))
-def test_near_tiles_are_whole_columns_with_a_tile_within_reach(
-    eye: tuple[float, ...], reach_m: float, seed: int
-) -> None:
-    roots = [(x, y, z) for x, y, z in np.random.default_rng(seed).integers(-9, 9, (20, 3)).tolist()]
-    away_m = {
-        root: np.linalg.norm(np.clip(eye, SIDE_M * low, SIDE_M * (low + 1)) - eye)
-        for root in roots
-        for low in (np.array(root),)
-    }
-    near = {root[:2] for root in roots if away_m[root] <= reach_m}
-    chosen = near_columns(roots, SIDE_M, np.array(eye), reach_m)
-    assert chosen == [root for root in roots if root[:2] in near]
 
 
 def test_near_tiles_are_those_of_the_server() -> None:
@@ -64,25 +42,6 @@ def test_near_tiles_are_those_of_the_server() -> None:
                 tiles.refresh(eye, 1.0)
             assert {name.level for name in tiles.refresh(eye, 1.0)} == {level}
         tiles.close()
-
-
-@given(
-    corner=st.tuples(*[st.floats(-1e3, 1e3)] * 3),
-    side=st.tuples(*[st.floats(0.5, 500)] * 3),
-    aspect=st.floats(0.3, 3),
-)
-def test_all_of_a_map_is_in_view(
-    corner: tuple[float, ...], side: tuple[float, ...], aspect: float
-) -> None:
-    """98 of 100 points of a box are in the picture, and they fill a good part of it."""
-    points = np.random.default_rng(1).uniform(size=(500, 3)) * side + corner
-    view = view_of(points, aspect)
-    right, down, ahead = ((points - view.eye) @ view_axes(view.target - view.eye).T).T
-    assert (ahead > 0).mean() > 0.98
-    height = np.tan(np.radians(25)) * ahead
-    outmost = np.maximum(np.abs(right) / aspect, np.abs(down)) / height
-    assert (outmost < 1).mean() > 0.98
-    assert np.percentile(outmost, 99) > 0.5
 
 
 def test_the_browser_shows_the_colours_of_the_legend() -> None:

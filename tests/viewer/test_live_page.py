@@ -5,7 +5,7 @@ All tests look at one page, in their order: each leaves it as it was.
 
 import re
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager, ExitStack, suppress
 from functools import partial
 from typing import NamedTuple
 
@@ -17,6 +17,7 @@ from support import servers
 from support.servers import WAIT_S, learn, running_service, sphere
 from triquad_client import Client, Status, connect
 from triquad_format.records.arrays import Bytes
+from triquad_tools.console.command import ToolError
 from triquad_tools.plots.plan import UNKNOWN
 from triquad_tools.plots.slice_plan import BEHIND, DISTANCE_COLOURS
 from triquad_tools.recordings.publishing import wait_until_settled
@@ -99,9 +100,14 @@ def numbers_in(text: str) -> list[float]:
     return [float(number) for number in NUMBER.findall(text)]
 
 
-def click_at(page: Page, x: int, y: int) -> None:
-    page.mouse.move(x, y)
-    page.mouse.click(x, y)
+def click_until(page: Page, place: tuple[int, int], holds: Callable[[], bool], what: str) -> None:
+    """Click once more where a page that draws slowly has not taken the click."""
+    for last in (False, False, True):
+        page.mouse.move(*place)
+        page.mouse.click(*place)
+        with suppress(() if last else ToolError):
+            wait_until(page, holds, what, timeout_s=60.0 if last else 20.0)
+            return
 
 
 def test_a_map_is_watched_from_its_first_scan(looked: Looked) -> None:
@@ -144,9 +150,9 @@ def test_colours_are_those_that_are_chosen(looked: Looked) -> None:
 
 
 def _is_still(page: Page) -> bool:
-    """Whether the picture stays as it is for two seconds."""
+    """Whether the picture stays as it is for a second."""
     before = scene(page)
-    page.wait_for_timeout(2000)
+    page.wait_for_timeout(1000)
     return bool((scene(page) == before).all())
 
 
@@ -181,18 +187,18 @@ def test_the_border_of_unknown_space_is_drawn_and_goes(looked: Looked) -> None:
 def test_a_click_asks_the_map(looked: Looked) -> None:
     page, client = looked
     control(page, "Raised by (m)").fill("0.75")
-    click_at(page, 480, 380)
     raised = page.get_by_role("row", name="raised by")
+    click_until(page, (480, 380), raised.is_visible, "a surface was met")
     expect(raised).to_contain_text("0.75 m", timeout=TIMEOUT_MS)
     place = numbers_in(cell(page, "position"))
-    assert np.linalg.norm(np.array(place) - [0, 0, 0.75]) == pytest.approx(4.0, abs=0.1)
+    assert np.linalg.norm(np.array(place) - [0, 0, 0.75]) == pytest.approx(4.0, abs=0.2)
     answer = client.query_distance([place], 10.0)
     assert numbers_in(cell(page, "distance")) == [pytest.approx(answer.distance_m[0], abs=0.002)]
     assert numbers_in(cell(page, "gradient")) == pytest.approx(answer.gradient[0], abs=0.02)
     assert cell(page, "status") == Status(answer.status[0]).name
     wait_until(page, lambda: share_where(page, is_magenta) > 2e-5, "the marker is drawn")
-    click_at(page, 12, 480)
-    expect(page.get_by_text("No surface there: sky")).to_be_visible()
+    sky = page.get_by_text("No surface there: sky")
+    click_until(page, (12, 480), sky.is_visible, "no surface was met")
     wait_until(page, lambda: share_where(page, is_magenta) == 0, "the marker is gone")
 
 
@@ -202,10 +208,8 @@ def test_a_path_is_laid_checked_and_blocked_as_the_map_goes_on(looked: Looked) -
     choose(page, "A click", "adds to the path")
     control(page, "Radius (m)").fill("0.1")
     points: list[list[float]] = []
-    for x, y in ((400, 400), (560, 420)):
-        click_at(page, x, y)
-        expect(page.get_by_role("row", name="raised by")).to_contain_text("2.50 m")
-        wait_until(page, lambda: _position(page) not in points, "the point is shown")
+    for place in ((400, 400), (560, 420)):
+        click_until(page, place, lambda: _shown_point(page) not in (None, *points), "it is shown")
         points.append(_position(page))
     expect(page.get_by_role("row", name="least clearance")).to_be_visible()
     whole = client.query_polyline(points, 0.1, 1.0)
@@ -240,6 +244,12 @@ def test_a_path_is_laid_checked_and_blocked_as_the_map_goes_on(looked: Looked) -
 
 def _position(page: Page) -> list[float]:
     return numbers_in(cell(page, "position"))
+
+
+def _shown_point(page: Page) -> list[float] | None:
+    """Where the point is that the panel tells of, once it is raised as the path is."""
+    raised = page.get_by_role("row", name="raised by")
+    return _position(page) if raised.is_visible() and "2.50 m" in raised.inner_text() else None
 
 
 def test_nothing_is_drawn_after_a_reset(looked: Looked) -> None:

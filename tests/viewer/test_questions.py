@@ -6,25 +6,19 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from matplotlib.colors import to_rgb
-from support.maps.exact_maps import SEEN_M, exact_map, flat, table
+from support.maps.exact_maps import SEEN_M, exact_map, flat
 from triquad_client import OfflineMap, Status
-from triquad_format.records.arrays import Bytes
-from triquad_tools.plots.plan import UNKNOWN
 from triquad_tools.viewer.page.page import Focus
 from triquad_tools.viewer.questions.cell_box import CellBox
 from triquad_tools.viewer.questions.path import Path
 from triquad_tools.viewer.questions.slice import Slice
-from triquad_tools.viewer.questions.slice_picture import line_distances, slice_picture
 from triquad_tools.viewer.questions.unknown_space import (
     ask_boundary,
     border_faces,
-    face_triangles,
 )
 
 GROUND_M = 0.1  # in the middle of a voxel
 FOCUS = Focus(np.array([0.3, -0.4, 1.2]), 16.0)
-GREY = tuple(round(255 * part) for part in to_rgb(UNKNOWN))
 
 
 @pytest.fixture(scope="module")
@@ -32,12 +26,6 @@ def ground() -> Iterator[OfflineMap]:
     """Flat ground, free up to 2 m above it, seen within 10 m."""
     with OfflineMap(exact_map(flat(GROUND_M))) as opened:
         yield opened
-
-
-def pictured(ground: OfflineMap, cut: Slice) -> Bytes:
-    found = cut.box.ask(ground, cut.most_m)
-    distance_m, status = (np.take(v, 0, cut.axis).T for v in (found.distance_m, found.status))
-    return slice_picture(distance_m, status != Status.UNKNOWN, cut.most_m)
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -59,31 +47,6 @@ def test_a_slice_is_asked_and_drawn_where_it_is(ground: OfflineMap, axis: int) -
     np.testing.assert_allclose(corner, expected, atol=1e-9)
 
 
-def test_lines_lie_at_their_distances(ground: OfflineMap) -> None:
-    """An upright slice through level ground: lines are level."""
-    cut = Slice.around(FOCUS, 1, 0.0, 3.0)
-    drawn = pictured(ground, cut).astype(int)
-    heights_m = cut.box.corner[2] + (np.arange(len(drawn)) + 0.5) * cut.box.size_m[2] / len(drawn)
-    inside = drawn[:, drawn.shape[1] // 2 - 50 : drawn.shape[1] // 2 + 50]
-    for level_m in line_distances(3.0)[:4]:
-        colour = 0 if level_m == 0 else 255
-        shares = (np.abs(inside - colour).max(axis=-1) < 60).mean(axis=1)
-        near = np.abs(heights_m - GROUND_M - level_m) < 0.1
-        assert shares[near].max() > 0.5
-    assert (drawn[0] == GREY).all(), "what is below the ground is not known"
-
-
-def test_unknown_space_has_no_line_and_is_grey(ground: OfflineMap) -> None:
-    assert (pictured(ground, Slice.around(FOCUS, 2, 5.0, 3.0)) == GREY).all()
-
-
-@given(st.floats(0.2, 50.0))
-def test_steps_from_line_to_line_are_round(most_m: float) -> None:
-    step_m = line_distances(most_m)[1]
-    assert f"{step_m:.0e}"[0] in "125"
-    assert 3 <= most_m / step_m < 12
-
-
 @given(st.integers(0, 2**32 - 1))
 def test_borders_lie_between_free_and_unknown_cells(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -99,16 +62,6 @@ def test_borders_lie_between_free_and_unknown_cells(seed: int) -> None:
                 expected.add((cell, tuple(step.tolist())))
     assert pairs == expected
     assert len(cells) == len(expected)
-
-
-def test_faces_lie_between_the_cells() -> None:
-    steps = np.concatenate([np.eye(3), -np.eye(3)]).astype(np.int32)
-    vertices, rows = face_triangles(np.full((6, 3), 4, np.int32), steps)
-    middles = vertices.reshape(6, 4, 3).mean(axis=1)
-    np.testing.assert_allclose(middles, 4.5 + 0.5 * steps)
-    first, second, third = (vertices[rows[:, corner]] for corner in range(3))
-    normals = np.cross(second - first, third - first)
-    assert np.linalg.norm(normals, axis=1).sum() == pytest.approx(12.0)
 
 
 def test_ground_is_no_border_of_unknown_space_however_coarse_the_cells(ground: OfflineMap) -> None:
@@ -142,20 +95,3 @@ def test_a_path_is_blocked_where_the_map_says(ground: OfflineMap) -> None:
     assert sum(lengths) == pytest.approx(answer.length_m, abs=1e-4)
     assert any(np.allclose(place, points[1]) for place in free), "corners are kept"
     assert path(ground, 50.0, (-1.0, 0.0, 1.0), (1.0, 0.0, 1.0)).answer.blocked, "a large robot"
-
-
-def test_unknown_space_on_a_path_is_grey_and_named(ground: OfflineMap) -> None:
-    laid = path(ground, 0.1, (0.0, 0.0, 1.0), (0.0, 0.0, 4.0))
-    assert not laid.answer.blocked
-    assert f"from {laid.answer.unknown_contact_m:.2f} m" in laid.html()
-    (first, _), (second, unknown) = laid.legs()
-    assert (first != UNKNOWN, second) == (True, UNKNOWN)
-    assert unknown[0][2] == pytest.approx(1.0 + laid.answer.unknown_contact_m, abs=1e-4)
-
-
-def test_a_path_over_a_table_is_free() -> None:
-    with OfflineMap(exact_map(table(0.1, 0.7))) as opened:
-        laid = path(opened, 0.3, (-4.0, 0.0, 1.3), (4.0, 0.0, 1.3))
-    assert "all along, with radius 0.3 m" in laid.html()
-    assert laid.answer.clearance_m == pytest.approx(0.6, abs=0.05)
-    assert len(laid.legs()) == 1

@@ -27,14 +27,6 @@ def test_files_that_cannot_be_shown(tmp_path: Path, capsys: pytest.CaptureFixtur
         assert str(path) in told([str(path)], capsys)
 
 
-def test_a_store_without_intact_checkpoints(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = write_checkpoint(tmp_path, 1, EMPTY)
-    path.write_bytes(path.read_bytes()[:-1000])
-    assert "no checkpoint can be shown" in told([str(tmp_path)], capsys)
-
-
 @pytest.mark.parametrize("option", ["--connect", "--map", "--config"])
 def test_a_file_and_a_server_exclude_each_other(
     option: str, capsys: pytest.CaptureFixture[str]
@@ -48,10 +40,3 @@ def test_addresses_that_are_not_ours_are_refused(
 ) -> None:
     path = write_checkpoint(tmp_path, 1, EMPTY)
     assert f"cannot serve a page at {host!r}" in told([str(path), "--host", host], capsys)
-
-
-@pytest.mark.parametrize("port", ["-1", "65536", "x", ""])
-def test_ports_that_are_none_are_refused(port: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit, match="2"):
-        main(["map.triquad", "--port", port])
-    assert f"{port!r} is not a whole number: use 0 to 65535" in capsys.readouterr().err

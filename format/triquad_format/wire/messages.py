@@ -18,6 +18,7 @@ from triquad_format.wire.limits import MAX_CHUNK_BYTES
 from triquad_format.wire.reply import (
     MAX_COUNT,
     asked_by,
+    rows_of,
     same_as_asked,
     text,
     within,
@@ -125,7 +126,7 @@ class FieldFit(Message):
     median_m: Length  # of all these rays
     upper_m: Length  # what 90 % of them keep below
     worst: FinitePoints  # [K, 3] map frame, metres: centres of the places with the largest medians
-    worst_median_m: Lengths  # [K]
+    worst_median_m: Annotated[Lengths, rows_of("worst")]  # [K]
     repairing: Count  # places that have forgotten and are being trained again
     repaired: Count  # places that were, so far
     given_up: Count  # and places that training did not mend

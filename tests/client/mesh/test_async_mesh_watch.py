@@ -100,32 +100,6 @@ def test_any_number_of_watches_wait_at_a_time_until_they_are_closed() -> None:
         connected(endpoint, use, timeout_s=servers.WAIT_S)
 
 
-def test_iteration_ends_with_the_watch(endpoint: str) -> None:
-    async def use(client: AsyncClient) -> None:
-        watch = client.watch_mesh()
-        seen = asyncio.Event()
-
-        async def follow() -> int:
-            count = 0
-            async for update in watch:
-                count += len(update.changed)
-                seen.set()
-            return count
-
-        following = asyncio.ensure_future(follow())
-        await seen.wait()
-        assert not following.done()
-        await watch.close()
-        assert await following > 0
-        await watch.close()
-        assert await watch.next() is None
-        with pytest.raises(ClosedError, match="the watch is closed"):
-            await watch.catch_up()
-        assert len((await watch.mesh()).faces), "the tiles stay"
-
-    connected(endpoint, use)
-
-
 def test_a_cancelled_wait_leaves_the_watch_in_order_until_the_client_is_closed(
     endpoint: str,
 ) -> None:

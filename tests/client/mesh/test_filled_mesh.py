@@ -11,7 +11,7 @@ from support.maps.small_world import settled_epoch, world
 from triquad_client import InvalidInputError, Mesh, OfflineMap
 from triquad_format.records import morton
 from triquad_format.records.field_settings import BLOCK_VOXELS
-from triquad_format.records.region import MapRecord, Region, masked, seen_voxels
+from triquad_format.records.region import MapRecord, masked, seen_voxels
 from triquad_format.records.seen_space import surface_voxels
 from triquad_format.records.status import Status
 
@@ -64,17 +64,6 @@ def with_hole(record: MapRecord, *, free: bool = False) -> MapRecord:
     return changed(record, evidence=without)
 
 
-def steep(region: Region, share: float) -> Region:
-    """The region with a field that rises by only that share of a distance, in and over the hole."""
-
-    def scaled(table_: object) -> object:
-        x = morton.decode(table_.codes, 2)[:, 0] - HALF  # of both planes with features
-        flatter = np.where((x > HOLE[0]) & (x < HOLE[1]), share, 1.0).astype(np.float32)
-        return dataclasses.replace(table_, features=table_.features * flatter[:, None])
-
-    return dataclasses.replace(region, tables=tuple(map(scaled, region.tables)))
-
-
 def mesh_of(record: MapRecord, **options: object) -> Mesh:
     with OfflineMap(record) as offline:
         return offline.mesh(((0, 0, -2), (4, 4, 2)), **options)
@@ -100,13 +89,6 @@ def test_a_hole_that_no_ray_met_is_closed_and_marked() -> None:
         assert (offline.query_sdf(middle).status == Status.UNKNOWN).all()
 
 
-def test_of_a_large_hole_a_rim_is_filled() -> None:
-    mesh = mesh_of(with_hole(GROUND), fill_m=0.4)
-    centres = mesh.vertices[mesh.faces[mesh.filled]].mean(axis=1)
-    assert np.abs(centres[:, :2] - 2.0).max(axis=1).min() > 1 - 0.4
-    assert area(mesh, mesh.filled) == pytest.approx(4.0 - 1.2**2, abs=0.3)
-
-
 def test_an_opening_that_rays_passed_stays_open() -> None:
     record = with_hole(GROUND, free=True)
     mesh = mesh_of(record, fill_m=1.0)
@@ -122,27 +104,12 @@ def test_what_does_not_lie_in_line_with_the_seen_surface_is_not_filled() -> None
     assert area(mesh, mesh.filled) < 1.0
 
 
-@pytest.mark.parametrize(("share", "filled"), [(0.9, True), (0.4, False)])
-def test_where_the_field_is_no_distance_nothing_is_filled(share: float, filled: bool) -> None:
-    record = with_hole(GROUND)
-    flatter = dataclasses.replace(record, regions=(steep(record.regions[0], share),))
-    mesh = mesh_of(flatter, fill_m=1.0)
-    assert area(mesh, mesh.filled) > 3.5 if filled else area(mesh, mesh.filled) < 1.5
-
-
 def test_without_filling_it_is_the_mesh_as_ever(tmp_path) -> None:
     record = with_hole(GROUND)
     plain, none = mesh_of(record), mesh_of(record, fill_m=0.0)
     assert plain.filled is None
     assert plain.file_bytes(".ply") == none.file_bytes(".ply")
     assert area(plain, np.ones(len(plain.faces), np.bool_)) == pytest.approx(12.0, abs=0.2)
-
-
-def test_where_nothing_was_seen_nothing_is_filled() -> None:
-    with OfflineMap(GROUND) as offline:
-        mesh = offline.mesh(((50, 50, 50), (60, 60, 60)), fill_m=1.0)
-    assert mesh.faces.shape == (0, 3)
-    assert mesh.filled.shape == (0,)
 
 
 @pytest.mark.parametrize("fill_m", [-0.1, 6.0, float("nan")])
@@ -202,9 +169,3 @@ def test_the_rest_of_a_voxel_is_filled_and_marked() -> None:
     assert middles[~mesh.filled, 0].max() == pytest.approx(seen_to_m, abs=0.02)
     assert area(mesh, mesh.filled) >= 4 * 0.15 - 0.05
     assert mesh.vertices[mesh.faces][..., 0].max() <= 0.2 * EDGE + 0.3 + 0.02
-
-
-def test_large_faces_are_kept_whole() -> None:
-    """They stand for rays that ended on any part of them."""
-    mesh, whole = (mesh_of(with_edge(quarters), cell_m=0.2) for quarters in (3, 0))
-    assert np.array_equal(mesh.faces, whole.faces)

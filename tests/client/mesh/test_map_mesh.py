@@ -1,9 +1,5 @@
 """Meshes of map files, without a server."""
 
-import dataclasses
-import subprocess
-import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 from support.maps.exact_maps import SEEN_M, exact_map, flat, table
 from support.maps.map_records import with_support
-from triquad_client import ClosedError, InvalidInputError, Mesh, OfflineMap, open_map
+from triquad_client import InvalidInputError, Mesh, OfflineMap, open_map
 from triquad_client.offline import map_mesh
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.region import MapRecord
@@ -44,11 +40,6 @@ def test_the_mesh_of_a_file_lies_on_the_surface_that_was_seen(tmp_path: Path) ->
     assert area == pytest.approx((2 * SEEN_M) ** 2, rel=0.02)
 
 
-def test_larger_cells_make_fewer_faces() -> None:
-    fine, coarse = (len(mesh_of(RECORD, cell_m=cell_m).faces) for cell_m in (0.1, 0.2))
-    assert 3.5 < fine / coarse < 4.5
-
-
 def test_a_box_holds_the_faces_whose_centroids_lie_in_it() -> None:
     whole = mesh_of(RECORD, cell_m=0.2)
     low, high = np.array([-3.05, -1.0, 0.0]), np.array([0.0, np.inf, 0.3])
@@ -57,15 +48,6 @@ def test_a_box_holds_the_faces_whose_centroids_lie_in_it() -> None:
     assert 0 < len(part.faces) == inside.sum() < len(whole.faces)
     nowhere = mesh_of(RECORD, bounds=((50, 50, 50), (60, 60, 60)))
     assert nowhere.vertices.shape == nowhere.faces.shape == (0, 3)
-
-
-def test_far_regions_are_meshed_as_near_ones() -> None:
-    def at(index: int) -> MapRecord:
-        region = dataclasses.replace(RECORD.regions[0], index=(index, 0, 0))
-        return dataclasses.replace(RECORD, regions=(region,))
-
-    near, far = (mesh_of(at(index), cell_m=0.2) for index in (0, 2**31 - 1))
-    assert len(near.faces) == len(far.faces) > 10_000
 
 
 def test_surface_is_where_the_mesh_has_faces() -> None:
@@ -104,44 +86,6 @@ def test_a_mesh_that_is_too_large_is_refused(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(map_mesh, "MAX_FACES", 1000)
     with pytest.raises(InvalidInputError, match=r"1,000 faces with cells of 0\.1 m.*smaller box"):
         mesh_of(RECORD)
-
-
-def test_a_closed_map_has_no_mesh() -> None:
-    offline = OfflineMap(RECORD)
-    offline.close()
-    with pytest.raises(ClosedError):
-        offline.mesh()
-
-
-PLAIN = """
-import sys
-for name in sys.argv[3:]:
-    sys.modules[name] = None  # as if it were not installed
-import triquad_client
-with triquad_client.open_map(sys.argv[1]) as offline:
-    offline.mesh(cell_m=0.4).save(sys.argv[2])
-assert not {"triquad_server", "triquad_tools"} & sys.modules.keys()
-"""
-
-
-@pytest.fixture
-def without(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
-    """Writes the mesh of a map to ``mesh.ply`` in a process without some libraries."""
-    path = tmp_path / "map.triquad"
-    write_map(RECORD, path)
-
-    def run(*libraries: str) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-c", PLAIN, path, tmp_path / "mesh.ply", *libraries]
-        return subprocess.run(command, capture_output=True, text=True, check=False)
-
-    return run
-
-
-def test_it_needs_neither_torch_nor_scikit_image_nor_the_tools(without, tmp_path: Path) -> None:
-    done = without("torch", "skimage", "scipy", "trimesh")
-    assert done.returncode == 0, done.stderr
-    faces = len(mesh_of(RECORD, cell_m=0.4).faces)
-    assert f"element face {faces}\n".encode() in (tmp_path / "mesh.ply").read_bytes()
 
 
 def test_tile_by_tile_it_is_the_same_surface() -> None:

@@ -1,9 +1,5 @@
 """Followers of the mesh, over the loopback: only what changed travels, and all hold the same."""
 
-import os
-import signal
-import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -13,11 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import triquad_client
-import zenoh
 from support import servers
 from support.watched_ball import SETTINGS, digests, half, learn
-from triquad_client import Client, InvalidInputError, RequestTimeoutError
-from triquad_format.wire import keys
+from triquad_client import Client, InvalidInputError
 
 
 @pytest.fixture
@@ -174,21 +168,14 @@ def test_bad_arguments_are_refused_before_anything_is_sent(
 
 def test_a_restarted_server_is_followed_anew(tmp_path: Path) -> None:
     """What is held from the old process is void: all comes again, and the old stays until then."""
-    settings = tmp_path / "settings.toml"
-    settings.write_text(servers.SMALL_TOML + "[mesh]\ntile_cells = 16\n")
-    arguments = ["--store", tmp_path / "store", "--settings", settings]
-    with servers.server_process(arguments) as server:
-        with triquad_client.connect(server.endpoint) as client, client.watch_mesh() as watch:
-            learn(client)
+    with servers.service_and_client(SETTINGS, store=tmp_path) as client:
+        learn(client)
+        with client.watch_mesh() as watch:
             watch.catch_up()
             known = watch.known_tiles()
-            client.checkpoint()
-        server.process.send_signal(signal.SIGTERM)
-        assert server.wait() == 0
     assert len(known.tiles) > 50
     with (
-        servers.server_process(arguments) as server,
-        triquad_client.connect(server.endpoint) as client,
+        servers.service_and_client(SETTINGS, store=tmp_path) as client,
         client.watch_mesh(known=known) as watch,
         client.watch_mesh() as fresh,
     ):
@@ -199,64 +186,6 @@ def test_a_restarted_server_is_followed_anew(tmp_path: Path) -> None:
         fresh.catch_up()
         assert digests(watch) == digests(fresh)
         assert watch.known_tiles().server != known.server
-
-
-FROZEN = """
-import sys
-import numpy as np, triquad_client
-from triquad_client.net.connection import Ask
-from triquad_format.wire import keys
-from triquad_format.wire import codec
-from triquad_format.wire.mesh_messages import TileUpdatesRequest, TileUpdates
-everywhere = np.full(3, np.inf)
-with triquad_client.connect(sys.argv[1]) as client:
-    asks = TileUpdatesRequest(-everywhere, everywhere, 0, "", 0, np.zeros((0, 3), np.int32),
-        np.zeros(0, np.int64), 100_000_000)
-    ask = Ask(keys.TILE_UPDATES, asks, TileUpdates, background=True)
-    pending = [client._connection._send(ask) for _ in range(24)]
-    print(len(client._connection._read(ask, next(iter(pending[0]))).data), flush=True)
-    for replies in pending[1:]:
-        list(replies)
-"""
-
-
-def test_a_frozen_client_holds_up_nobody(tmp_path: Path) -> None:
-    """Stopped amid large replies, it delays no query and no tile of others for good."""
-    settings = tmp_path / "settings.toml"
-    settings.write_text(servers.SMALL_TOML + "[mesh]\ncell_m = 0.025\n")
-    with (
-        servers.server_process(["--settings", settings]) as server,
-        triquad_client.connect(server.endpoint) as client,
-        client.watch_mesh() as watch,
-    ):
-        learn(client, half(1))
-        watch.catch_up()
-        size = sum(tile.size_bytes for tile in watch.tiles.values())
-        assert size > 500_000
-        command = [sys.executable, "-c", FROZEN, server.endpoint]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as frozen:
-            try:
-                assert frozen.stdout is not None
-                assert int(frozen.stdout.readline()) > 100_000
-                os.kill(frozen.pid, signal.SIGSTOP)
-                for _ in range(20):  # while Zenoh gives up the frozen one, and after
-                    with client.watch_mesh() as late:
-                        late.catch_up(servers.WAIT_S)
-                        assert digests(late) == digests(watch)
-                for _ in range(200):
-                    assert len(client.query_sdf(servers.sphere(500)).sdf) == 500
-                learn(client, half(-1))
-                before = digests(watch)
-                watch.catch_up(servers.WAIT_S)
-                assert digests(watch) != before
-                with client.watch_mesh() as late:
-                    late.catch_up(servers.WAIT_S)
-                    assert digests(late) == digests(watch)
-                stat = Path(f"/proc/{frozen.pid}/stat")
-                if stat.exists():
-                    assert stat.read_text().rpartition(")")[2].split()[0] == "T"
-            finally:
-                frozen.kill()
 
 
 def test_iteration_ends_with_the_watch(learnt: Client) -> None:
@@ -275,21 +204,3 @@ def test_iteration_ends_with_the_watch(learnt: Client) -> None:
         assert seen.wait(servers.WAIT_S)
         watch.close()
         assert following.result(servers.WAIT_S) > 0
-
-
-def test_a_server_that_does_not_answer_is_an_error_and_the_tiles_stay(client: Client) -> None:
-    with client.watch_mesh() as watch:
-        watch.catch_up(servers.WAIT_S)
-        known = watch.known_tiles()
-    silent: list[zenoh.Query] = []
-    answers = {keys.TILE_UPDATES: lambda query, key: silent.append(query)}
-    with (
-        servers.answering(answers) as endpoint,
-        triquad_client.connect(endpoint, timeout_s=0.5) as other,
-        other.watch_mesh(known=known) as watch,
-    ):
-        with pytest.raises(RequestTimeoutError):
-            watch.next(0.0)
-        assert watch.tiles.keys() == known.tiles.keys()
-        for query in silent:
-            query.drop()

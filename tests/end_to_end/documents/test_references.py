@@ -1,11 +1,14 @@
 """What docstrings, comments and pages refer to is there."""
 
 import ast
+import json
 import re
+import runpy
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
+from triquad_server.monitoring.prometheus import FAMILIES
 
 ROOT = Path(__file__).parents[3]
 PACKAGES = ("format", "map", "client", "server", "tools")
@@ -60,3 +63,43 @@ def test_docstrings_refer_to_what_there_is(known: set[str]) -> None:
         if name not in known and not known.issuperset(name.split("."))
     }
     assert missing == set()
+
+
+def test_every_picture_is_made_by_make_pictures_and_shown_on_a_page(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    docs = ROOT / "docs"
+    monkeypatch.syspath_prepend(str(docs))
+    pages = [ROOT / "README.md", *docs.rglob("*.md")]
+    made = set()
+    for program in ("pictures.py", "viewer_pictures.py", "top_picture.py"):
+        assert f"docs/{program}" in (ROOT / "Makefile").read_text()
+        names = runpy.run_path(str(docs / program))
+        made |= {*names["PICTURES"]} if "PICTURES" in names else {names["PICTURE"].name}
+    kept = {path.name for path in (docs / "images").iterdir()}
+    shown = {
+        name for page in pages for name in re.findall(r"images/(\w+\.\w+)\)", page.read_text())
+    }
+    assert made == kept == shown
+
+
+def test_the_dashboard_shows_metrics_and_labels_that_there_are() -> None:
+    file = ROOT / "docs" / "deploy" / "grafana-dashboard.json"
+    dashboard = json.loads(file.read_text(encoding="utf-8"))
+    panels = [panel for panel in dashboard["panels"] if panel["type"] != "row"]
+    assert len({panel["id"] for panel in dashboard["panels"]}) == len(dashboard["panels"])
+    labels = {
+        name: {*family.labels, "instance", "le"}
+        for family in FAMILIES
+        for name in (family.name, *(f"{family.name}_{part}" for part in ("bucket", "count", "sum")))
+    }
+    shown = set()
+    for target in (target for panel in panels for target in panel["targets"]):
+        names = re.findall(r"triquad_\w+", target["expr"])
+        assert names, target
+        used = set(re.findall(r'(\w+)!?[=~]+"', target["expr"]))
+        used |= set(re.findall(r"{{(\w+)}}", target["legendFormat"]))
+        for name in names:
+            assert used <= labels[name], (target, name)
+        shown |= {re.sub("_(bucket|count|sum)$", "", name) for name in names}
+    assert shown == {family.name for family in FAMILIES}

@@ -21,8 +21,6 @@ from triquad_client import ClosedError, Status
 from triquad_format.errors import FormatError, SettingsError
 from triquad_server.errors import ListenError, ServerError, StoreError
 
-POSE = np.eye(4)
-
 
 @pytest.fixture(autouse=True)
 def _compiled() -> None:
@@ -56,18 +54,6 @@ def test_a_map_is_learnt_asked_and_found_again(tmp_path, settings):
     assert np.median(np.abs(after.distance_m - 1.0)) < 0.2
 
 
-def test_two_servers_of_one_program_have_maps_of_their_own():
-    with (
-        triquad_server.serve(settings=servers.SMALL) as one,
-        triquad_server.serve(settings=servers.SMALL) as other,
-    ):
-        assert one.endpoint != other.endpoint
-        servers.learn(one.client())
-        assert one.client().maps() == other.client().maps() == [servers.MAP]
-        assert one.client().status().regions == 1
-        assert other.client().status().regions == 0
-
-
 def test_the_program_keeps_its_signals_and_its_interpreter_its_ways():
     def ways() -> tuple[object, ...]:
         handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
@@ -92,17 +78,6 @@ def test_no_thread_is_left_and_what_came_of_the_server_is_closed():
         client.status()
     with pytest.raises(ServerError, match="has stopped"):
         server.client()
-
-
-def test_an_exception_passes_and_the_map_is_kept(tmp_path):
-    def work() -> None:
-        with triquad_server.serve(store=tmp_path, settings=servers.SMALL) as server:
-            servers.learn(server.client())
-            raise KeyError("mine")
-
-    with pytest.raises(KeyError, match="mine"):
-        work()
-    assert statuses(tmp_path) == {Status.SURFACE}
 
 
 def test_a_server_that_is_forgotten_stops_and_leaves_its_store(tmp_path):
@@ -142,17 +117,6 @@ def test_a_last_checkpoint_that_cannot_be_written_is_an_error(tmp_path):
 def test_what_cannot_be_is_refused(arguments, error, text):
     with pytest.raises(error, match=text):
         triquad_server.serve(**arguments)
-
-
-def test_a_map_is_taken_back_to_the_epoch_that_a_reset_kept(tmp_path):
-    with triquad_server.serve(store=tmp_path, settings=servers.SMALL) as server:
-        client = server.client()
-        servers.learn(client)
-        kept = client.reset().kept_epoch
-        assert kept is not None
-    assert statuses(tmp_path) == {Status.UNKNOWN}
-    triquad_server.serve(store=tmp_path, settings=servers.SMALL, restore=kept).close()
-    assert statuses(tmp_path) == {Status.SURFACE}
 
 
 def test_a_restored_map_keeps_its_leaf_and_lengths_that_are_not_set_follow_it(tmp_path, caplog):
@@ -247,15 +211,6 @@ def test_ctrl_c_loses_nothing_that_was_acknowledged(tmp_path, settings):
     later = [int(line.split()[1]) for line in out.splitlines() if "acknowledged" in line]
     for scans in range(max(later, default=4) + 1):
         assert statuses(store, 10.0 * scans) == {Status.SURFACE}
-
-
-def test_ctrl_c_while_it_starts_ends_the_program(tmp_path, settings):
-    with program(_LEARN_WITHOUT_END, tmp_path / "store", settings) as process:
-        read_until(process, "preparing compiled code")
-        process.send_signal(signal.SIGINT)
-        out, errors = process.communicate(timeout=servers.WAIT_S)
-    assert errors.splitlines()[-1] == "KeyboardInterrupt"
-    assert "stopped" in out  # at once, or as soon as it is ready: nobody waits for it in vain
 
 
 def test_a_program_that_ends_without_closing_ends_well(tmp_path, settings):

@@ -104,12 +104,3 @@ def test_what_is_wrong_at_the_start_is_json() -> None:
         assert server.wait() == 2
     (fields,) = records(server.lines)
     assert "unknown setting service.scan_que" in fields["message"]
-
-
-def test_a_format_that_there_is_not_is_wrong_usage(monkeypatch) -> None:
-    monkeypatch.setenv("TRIQUAD_LOG_FORMAT", "xml")
-    with servers.server_process(ready=False) as server:
-        assert server.wait() == 2
-    assert "'xml', given here or in TRIQUAD_LOG_FORMAT, is no format: use text or json" in (
-        server.log
-    )

@@ -46,14 +46,6 @@ def assert_kept(store, before):
         assert_same_map(before, client.query_sdf(PROBES, gradient=True))
 
 
-def run(arguments):
-    """A server that ends by itself, with its exit code."""
-    with servers.server_process(arguments, ready=False) as server:
-        code = server.wait()
-    assert "Traceback" not in server.log
-    return code, server.log
-
-
 def test_sigterm_keeps_the_map_and_the_next_server_gives_the_same_answers(store, arguments):
     with servers.server_process(arguments) as server:
         before = learn(server.endpoint)
@@ -70,6 +62,12 @@ def test_sigterm_keeps_the_map_and_the_next_server_gives_the_same_answers(store,
         assert f"restoring epoch {before.epoch} from {newest}" in server.log
         with triquad_client.connect(server.endpoint) as client:
             assert_same_map(before, client.query_sdf(PROBES, gradient=True))
+            epoch = client.status().epoch
+        server.process.send_signal(signal.SIGINT)
+        server.process.send_signal(signal.SIGTERM)
+        assert server.wait() == 0
+    assert "Traceback" not in server.log
+    assert read_map(newest_checkpoint(store)).epoch == epoch
 
 
 @pytest.mark.long
@@ -89,53 +87,6 @@ def test_what_is_not_compiled_yet_is_compiled_before_it_serves_and_the_log_says_
         learn(server.endpoint)
     with servers.server_process(arguments, environment={"XDG_CACHE_HOME": str(cache)}) as server:
         assert "compiling" not in server.log
-
-
-def test_sigint_and_a_second_signal_stop_it_cleanly(store, arguments):
-    with servers.server_process(arguments) as server:
-        before = learn(server.endpoint)
-        server.process.send_signal(signal.SIGINT)
-        server.process.send_signal(signal.SIGTERM)
-        assert server.wait() == 0
-    assert "Traceback" not in server.log
-    assert read_map(newest_checkpoint(store)).epoch == before.epoch
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_before_it_has_started_stops_it(arguments, number):
-    with servers.server_process(arguments, ready=False) as server:
-        server.wait_for("preparing compiled code")
-        server.process.send_signal(number)
-        assert server.wait() == 0
-    assert server.lines[-1].endswith("stopped\n")
-    assert "ready" not in server.log
-    assert "Traceback" not in server.log
-
-
-def test_sigterm_amid_a_stream_of_scans(store, arguments):
-    with (
-        servers.server_process(arguments) as server,
-        triquad_client.connect(server.endpoint) as client,
-    ):
-        for _ in range(40):
-            client.publish_scan(servers.sphere(20_000), POSE)
-        client.flush(servers.WAIT_S, pending=20)  # fewer than may wait: some are taken
-        server.process.send_signal(signal.SIGTERM)
-        assert server.wait() == 0
-    assert "Traceback" not in server.log
-    assert len(read_map(newest_checkpoint(store)).regions) == 1
-
-
-def test_after_sigkill_the_last_checkpoint_counts(store, arguments):
-    with servers.server_process(arguments) as server:
-        before = learn(server.endpoint)
-        with triquad_client.connect(server.endpoint) as client:
-            client.checkpoint()
-            client.publish_scan(servers.sphere(2000, 6.0), POSE)
-            client.flush(servers.WAIT_S)
-        server.process.kill()
-        server.wait()
-    assert_kept(store, before)
 
 
 def test_where_memory_runs_out_it_ends_and_the_last_checkpoint_counts(store, arguments):
@@ -163,25 +114,24 @@ def test_where_memory_runs_out_it_ends_and_the_last_checkpoint_counts(store, arg
         (["--no-such-option"], 2, "usage: triquad-server"),
         (["--map", "a/b"], 2, "a/b"),
         (["--config", "missing.json5"], 2, "Zenoh configuration missing.json5"),
+        (["--log-format", "xml"], 2, "is no format: use text or json"),
         (["--set", "service.scan_que=3"], 2, "did you mean service.scan_queue?"),
         (["--connect", "tcp/127.0.0.1:1"], 3, "Start a router there first."),
         (["--store", "/dev/null/store"], 4, "cannot be written"),
+        (["--store", "STORE"], 4, "all 1 checkpoints"),
+        (["--store", "STORE", "--restore", "3"], 4, "holds no checkpoint of epoch 3; there are: "),
     ],
 )
-def test_each_cause_for_which_it_cannot_start_has_its_exit_code(arguments, code, text):
-    ended, log = run(arguments)
-    assert ended == code
-    assert text in log
-    assert "ready" not in log
-
-
-def test_all_checkpoints_damaged_is_no_reason_to_start_empty(store, arguments):
+def test_each_cause_for_which_it_cannot_start_has_its_exit_code(store, arguments, code, text):
     folder = store / servers.MAP
     folder.mkdir(parents=True)
     (folder / "epoch-000000007.triquad").write_bytes(b"not a map")
-    code, log = run(arguments)
-    assert code == 4
-    assert "all 1 checkpoints" in log
+    arguments = [word.replace("STORE", str(store)) for word in arguments]
+    with servers.server_process(arguments, ready=False) as server:
+        assert server.wait() == code
+    assert text in server.log
+    assert "ready" not in server.log
+    assert "Traceback" not in server.log
 
 
 A_THREAD_ENDS = """

@@ -1,18 +1,22 @@
 """A server process and the service manager that started it, over a real socket."""
 
+import os
+import queue
 import signal
 import socket
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
 import triquad_client
 from support import servers
 from support.servers import ServerProcess
-from support.service_manager import Manager, service_manager
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import ServerStatus, StatusRequest
 from triquad_server.process.service_manager import ServiceManager
@@ -25,25 +29,71 @@ from triquad_map.questions.answers import Answers
 from triquad_server.cli import main
 from triquad_server.mapping.mapper import Mapper
 
-may_go_on = threading.Event()
-may_go_on.set()
+may_go_on = {"mapper": threading.Event(), "workers": threading.Event()}
 
-def hanging(work):
+def hanging(part, owner, name):
+    work = getattr(owner, name)
+    may_go_on[part].set()
     def wait_and_work(*arguments, **named):
-        may_go_on.wait()
+        may_go_on[part].wait()
         return work(*arguments, **named)
-    return wait_and_work
+    setattr(owner, name, wait_and_work)
 
 def listen():
     for line in sys.stdin:
-        (may_go_on.clear if line == "hang\\n" else may_go_on.set)()
+        part, _, word = line.strip().partition(" ")
+        (may_go_on[part].clear if word == "hang" else may_go_on[part].set)()
         print(line, end="", flush=True)
 
-owner, method = {"mapper": (Mapper, "ingest"), "workers": (Answers, "answer")}[sys.argv.pop(1)]
-setattr(owner, method, hanging(getattr(owner, method)))
+hanging("mapper", Mapper, "ingest")
+hanging("workers", Answers, "answer")
 threading.Thread(target=listen, daemon=True).start()
 sys.exit(main())
 """
+
+
+@dataclass
+class Manager:
+    """Hears what a server tells, a datagram at a time."""
+
+    address: str  # as the environment has it
+    heard: list[list[str]] = field(default_factory=list)
+    _datagrams: "queue.SimpleQueue[list[str]]" = field(default_factory=queue.SimpleQueue)
+
+    def wait_for(self, line: str) -> list[str]:
+        """The lines of the next datagram that has a line which begins with ``line``."""
+        until = time.monotonic() + servers.WAIT_S
+        while True:
+            lines = self._datagrams.get(timeout=max(0.0, until - time.monotonic()))
+            if any(told.startswith(line) for told in lines):
+                return lines
+
+    def listen(self, receiver: socket.socket) -> None:
+        while lines := receiver.recv(65_536).decode().split("\n"):
+            if lines == [""]:
+                return
+            self.heard.append(lines)
+            self._datagrams.put(lines)
+
+
+@contextmanager
+def service_manager(address: str) -> Iterator[Manager]:
+    """Listens at a path, or at an abstract socket, which begins with @."""
+    bound = "\0" + address[1:] if address.startswith("@") else address
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(bound)
+        manager = Manager(address)
+        thread = threading.Thread(target=manager.listen, args=(receiver,))
+        thread.start()
+        try:
+            yield manager
+        finally:
+            receiver_address = receiver.getsockname()
+            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
+                sender.sendto(b"", receiver_address)
+            thread.join()
+    if not address.startswith("@"):
+        os.unlink(address)
 
 
 @pytest.fixture
@@ -55,10 +105,10 @@ def manager(tmp_path, monkeypatch) -> Iterator[Manager]:
 
 
 @contextmanager
-def server_that_hangs_when_told(part: str, arguments: list[str]) -> Iterator[ServerProcess]:
+def server_that_hangs_when_told(arguments: list[str]) -> Iterator[ServerProcess]:
     """A server whose mapper or workers hang as soon as they have something to do."""
     endpoint = servers.free_endpoint()
-    command = [sys.executable, "-c", HANGS_WHEN_TOLD, part, "--listen", endpoint]
+    command = [sys.executable, "-c", HANGS_WHEN_TOLD, "--listen", endpoint]
     command += ["--no-multicast-scouting", "--device", "cpu", *arguments]
     pipe = subprocess.PIPE
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
@@ -72,7 +122,7 @@ def server_that_hangs_when_told(part: str, arguments: list[str]) -> Iterator[Ser
 
 
 def tell(server: ServerProcess, word: str) -> None:
-    """Tell a server to "hang" or to "go on"; it has heard it once this returns."""
+    """Tell a part of a server to "hang" or to "go on"; it has heard it once this returns."""
     assert server.process.stdin is not None
     assert server.process.stdout is not None
     server.process.stdin.write(f"{word}\n")
@@ -130,6 +180,8 @@ def test_asked_to_stop_while_it_starts_it_says_that_it_stops(manager, arguments)
         manager.wait_for("STOPPING=1")
         assert server.wait() == 0
     assert told(manager, "READY") == []
+    assert server.lines[-1].endswith("stopped\n")
+    assert "Traceback" not in server.log
 
 
 def assert_nothing_more_is_well(manager: Manager, server: ServerProcess, why: str) -> None:
@@ -140,44 +192,34 @@ def assert_nothing_more_is_well(manager: Manager, server: ServerProcess, why: st
     assert not any("WATCHDOG=1" in lines for lines in manager.heard[before:])
 
 
-def test_while_the_mapper_hangs_the_watchdog_is_not_told_that_all_is_well(
-    manager, arguments
-) -> None:
-    with server_that_hangs_when_told("mapper", arguments) as server:
+def test_while_a_part_hangs_the_watchdog_is_not_told_that_all_is_well(manager, arguments) -> None:
+    with server_that_hangs_when_told(arguments) as server:
         manager.wait_for("WATCHDOG=1")
-        tell(server, "hang")
+        tell(server, "mapper hang")
         with triquad_client.connect(server.endpoint) as client:
             client.publish_scan(servers.sphere(), np.eye(4))
             assert_nothing_more_is_well(manager, server, "mapping makes no progress: it is at scan")
             assert_answers_at_once(server.endpoint)  # all else goes on
-            tell(server, "go on")
+            tell(server, "mapper go on")
             assert client.flush(servers.WAIT_S).taken == 1
         manager.wait_for("WATCHDOG=1")
-
-
-def test_while_nobody_answers_the_watchdog_is_not_told_that_all_is_well(manager, arguments) -> None:
-    with server_that_hangs_when_told("workers", arguments) as server:
-        manager.wait_for("WATCHDOG=1")
-        tell(server, "hang")
+        tell(server, "workers hang")
         assert_nothing_more_is_well(manager, server, "a question that the server asked itself")
-        tell(server, "go on")
+        tell(server, "workers go on")
         manager.wait_for("WATCHDOG=1")
-
-
-def ends_by_an_abort(manager: Manager, arguments: list[str]) -> str:
-    """The log of a server that is given up, as systemd does."""
-    with servers.server_process(arguments) as server:
-        manager.wait_for("READY=1")
-        server.process.send_signal(signal.SIGABRT)
-        assert server.wait() < 0
-    return server.log
 
 
 def test_given_up_by_the_watchdog_it_leaves_the_stacks_of_its_threads(manager, arguments) -> None:
     # The interpreter reads the stacks of threads that may go on meanwhile. In one of some dozens
     # of times one does, and its reading ends early.
-    logs = (ends_by_an_abort(manager, arguments) for _ in range(3))
-    assert any('mapper_thread.py", line' in log for log in logs)
+    for _ in range(3):
+        with servers.server_process(arguments) as server:
+            manager.wait_for("READY=1")
+            server.process.send_signal(signal.SIGABRT)  # as systemd does
+            assert server.wait() < 0
+        if 'mapper_thread.py", line' in server.log:
+            return
+    raise AssertionError(server.log)
 
 
 @pytest.mark.parametrize("address", ["vsock:2:1234", "/nowhere/at/all"])

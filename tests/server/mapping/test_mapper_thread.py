@@ -1,5 +1,7 @@
 """The thread that owns the live map."""
 
+import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager

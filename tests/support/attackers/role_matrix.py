@@ -5,7 +5,6 @@ nothing. What is published or claimed is watched from behind the server, where o
 which it let pass.
 """
 
-import threading
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
@@ -17,7 +16,6 @@ from triquad_format.wire import keys
 MAP = "default"
 OWN, OTHERS = "roof", "rear"  # sources of scans
 
-FOLLOW_STATUS = "follow the status"
 FOLLOW_SCANS = "follow the scans of others"
 FIND = "find servers"
 PUBLISH_OWN = "publish as its own source"
@@ -29,23 +27,7 @@ FORGE_STATUS = "publish the server's status"
 FORGE_ANSWER = "answer in the server's name"
 FORGE_TOKEN = "pass for a server"
 
-ATTEMPTS = (
-    *OPERATIONS,
-    FOLLOW_STATUS,
-    FOLLOW_SCANS,
-    FIND,
-    PUBLISH_OWN,
-    PUBLISH_OTHERS,
-    PUBLISH_ALL,
-    DELETE,
-    WILD,
-    FORGE_STATUS,
-    FORGE_ANSWER,
-    FORGE_TOKEN,
-)
-
 _REPLY_S = 20.0  # none comes where none is allowed: then the router says at once that it is over
-_EVENT_S = 30.0
 
 
 @dataclass
@@ -55,7 +37,6 @@ class _Inbox:
     samples: list[tuple[str, str]] = field(default_factory=list)  # key, and whom it is from:
     # an attachment says so, which the server's own have not
     deleted_by: set[str] = field(default_factory=set)
-    from_server: threading.Event = field(default_factory=threading.Event)
 
     @property
     def senders(self) -> set[str]:
@@ -67,8 +48,6 @@ class _Inbox:
             self.deleted_by.add(sender)
         else:
             self.samples.append((str(sample.key_expr), sender))
-        if not sender:
-            self.from_server.set()
 
 
 def status_replies(session: zenoh.Session) -> list[zenoh.Reply]:
@@ -84,24 +63,22 @@ def tokens(session: zenoh.Session) -> set[str]:
 
 
 def achieved(role: str, session: zenoh.Session, observer: zenoh.Session) -> set[str]:
-    """What of ``ATTEMPTS`` a session with this role can do; ``observer`` may see everything."""
+    """What a session with this role can do: operations, and what has a name above.
+
+    ``observer`` may see everything.
+    """
     done = _answered(session)
     done |= {FIND} if tokens(session) else set()
     with ExitStack() as parts:
         seen = parts.enter_context(_subscribed(observer, "triquad/**"))
         scans = parts.enter_context(_subscribed(session, keys.all_scans_key(MAP)))
-        status = parts.enter_context(_subscribed(session, keys.status_key(MAP)))
-        status_replies(session)  # the subscriptions are known from here on
+        status_replies(session)  # the subscription is known from here on
         done |= _published(role, session, observer, seen)
         done |= _forged(role, session, observer)
         observer.put(keys.scan_key(MAP, OTHERS), b"", attachment="the observer")
-        for _ in range(2):  # on a busy machine, a status may be dropped
-            _wait_for_status(observer)
-            status_replies(session)
-            if "" in status.senders:
-                break
+        status_replies(observer)
+        status_replies(session)
         done |= {FOLLOW_SCANS} if "the observer" in scans.senders else set()
-        done |= {FOLLOW_STATUS} if "" in status.senders else set()
     return done
 
 
@@ -152,12 +129,6 @@ def _forged(role: str, session: zenoh.Session, observer: zenoh.Session) -> set[s
     return done
 
 
-def _wait_for_status(observer: zenoh.Session) -> None:
-    """Until the server has published its status once more."""
-    with _subscribed(observer, keys.status_key(MAP)) as status:
-        assert status.from_server.wait(_EVENT_S), "the server publishes no status"
-
-
 @contextmanager
 def _subscribed(session: zenoh.Session, key: str) -> Iterator[_Inbox]:
     inbox = _Inbox()
@@ -171,7 +142,7 @@ def expected(role: str, sources: Sequence[str]) -> set[str]:
     """What docs/security.md says of a role."""
     if role not in ("viewer", "robot", "admin"):
         return set()
-    may = {FOLLOW_STATUS, FIND}
+    may = {FIND}
     may |= {operation for operation in OPERATIONS if operation.startswith("query/")}
     if role == "admin":
         may |= {operation for operation in OPERATIONS if operation.startswith("admin/")}

@@ -127,7 +127,8 @@ def place(coordinates: NDArray[np.int64]) -> NDArray[np.int64]:
     return coordinates @ (1 << 20 * np.arange(coordinates.shape[1]))
 
 
-OfVoxels = Callable[[dict[str, Any], NDArray[np.bool_]], Array]
+OfBlocks = Callable[[dict[str, Any], NDArray[np.bool_]], Array]
+"""Values [B, width], of a part and the surface voxels [B, 512] of its blocks."""
 
 
 class Table:
@@ -164,10 +165,12 @@ class Region:
             for plane in range(3)
             for i, level in enumerate(settings.levels)
         }
-        self.surface, self.free = self._evidence(own, "surface"), self._evidence(own, "free")
-        self.levels, self.seen = self._support(own)
-        self.outcomes = self._of_voxels(own, outcomes_of, 3, "<f8")
-        self.margins = self._of_voxels(own, margins_of, 6, "|u1")
+        self.surface = self._of_blocks(own, lambda part, _: plain(part["surface"]), 64, "|u1")
+        self.free = self._of_blocks(own, lambda part, _: plain(part["free"]), 64, "|u1")
+        self.seen = self._of_blocks(own, times_of, 1, "<i8")
+        self.levels = self._of_blocks(own, levels_of, 512, "|u1")
+        self.outcomes = self._of_blocks(own, outcomes_of, 3 * 512, "<f8")
+        self.margins = self._of_blocks(own, margins_of, 6 * 512, "|u1")
 
     def _table(self, own: dict[Key, Any], plane: int, i: int, scale: Array) -> Table:
         bits = 2 * (8 - (self.settings.sizes - 1 - i))
@@ -180,34 +183,15 @@ class Region:
                 chunks.append((place(demorton(codes, 2)), features))
         return Table(chunks, self.settings.feature_size, "<f4")
 
-    def _evidence(self, own: dict[Key, Any], name: str) -> Table:
-        chunks = []
-        for key, part in own.items():
-            if key[0] == "/triquad/evidence":
-                codes = codes_of(part["codes"], key[3], 15)
-                chunks.append((place(demorton(codes, 3)), plain(part[name])))
-        return Table(chunks, 64, "|u1")
-
-    def _support(self, own: dict[Key, Any]) -> tuple[Table, Table]:
-        """Level of each voxel [512] of a block, in the order of bits; time of each block [1]."""
-        levels, times = [], []
-        for key, part in own.items():
-            if key[0] == "/triquad/evidence":
-                blocks = place(demorton(codes_of(part["codes"], key[3], 15), 3))
-                surface = np.unpackbits(plain(part["surface"]), axis=1, bitorder="little")
-                levels.append((blocks, levels_of(part, surface.astype(bool))))
-                times.append((blocks, times_of(part, surface.any(1))))
-        return Table(levels, 512, "|u1"), Table(times, 1, "<i8")
-
-    def _of_voxels(self, own: dict[Key, Any], of: OfVoxels, width: int, dtype: str) -> Table:
-        """What a part tells ``of`` each voxel of a block [512 * width], in the order of bits."""
+    def _of_blocks(self, own: dict[Key, Any], of: OfBlocks, width: int, dtype: str) -> Table:
+        """What a part tells ``of`` each block; of voxels in the order of bits."""
         chunks = []
         for key, part in own.items():
             if key[0] == "/triquad/evidence":
                 blocks = place(demorton(codes_of(part["codes"], key[3], 15), 3))
                 surface = np.unpackbits(plain(part["surface"]), axis=1, bitorder="little")
                 chunks.append((blocks, of(part, surface.astype(bool))))
-        return Table(chunks, width * 512, dtype)
+        return Table(chunks, width, dtype)
 
 
 def is_of(key: Key, index: Index) -> bool:
@@ -261,8 +245,9 @@ def voxel_codes(part: dict[str, Any], name: str, bits: list[int], count: int) ->
     return codes
 
 
-def times_of(part: dict[str, Any], touched: NDArray[np.bool_]) -> Array:
+def times_of(part: dict[str, Any], surface: NDArray[np.bool_]) -> Array:
     """Section 5.4: times [B, 1] of the blocks that hold surface; else 0."""
+    touched = surface.any(1)
     times = np.zeros((len(touched), 1), np.int64)
     planes = plain(part["seen_s"]).astype(np.int64)
     check(1 <= len(planes) <= 5 and planes.shape[1] == touched.sum(), "times of other blocks")

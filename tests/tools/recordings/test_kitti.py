@@ -8,6 +8,7 @@ from triquad_tools.recordings.cloud import world_points
 from triquad_tools.recordings.folders.cloud_folder import is_cloud_folder, read_cloud_folder
 from triquad_tools.recordings.folders.scan_folder import ScanFolder
 
+DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
 IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0"
 
 
