@@ -16,7 +16,7 @@ from triquad_format.mapfile.parts.part import EVIDENCE
 from triquad_format.mapfile.reader import read_map
 from triquad_format.records.crop import crop_record
 from triquad_format.records.region import seen_voxels
-from triquad_map.compiled.evidence.observations import outcome_codes
+from triquad_map.evidence.observations import outcome_codes
 
 CUBES = dataclasses.replace(SMALL, depth=9)
 """Two cubes to a side."""

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 from support.maps import small_world
-from triquad_map.compiled.evidence.live_evidence import LiveEvidence
-from triquad_map.compiled.evidence.observed import Sighting
-from triquad_map.compiled.field.frozen_field import field_samples
-from triquad_map.compiled.surfels.surfel_map import first_surfels
-from triquad_map.compiled.surfels.surfel_search import no_surfels
 from triquad_map.compiled.team import in_one
+from triquad_map.evidence.live_evidence import LiveEvidence
+from triquad_map.evidence.observed import Sighting
+from triquad_map.field.frozen_field import field_samples
 from triquad_map.surface import FieldSample, SurfelKind, Surfels, fit_surfels
+from triquad_map.surfels.surfel_map import first_surfels
+from triquad_map.surfels.surfel_search import no_surfels
 from triquad_server.mapping.mapper import Mapper
 
 SIDE = 64

@@ -1,1 +1,1 @@
-"""What is compiled: the evidence, field and surfels of a region, learnt and queried."""
+"""What compiled code is made with: kernels, vectors, sparse voxels, and threads."""

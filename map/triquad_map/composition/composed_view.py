@@ -7,9 +7,9 @@ import numpy as np
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 
-from triquad_map.compiled.surfels.nearest_surface import RegionFrame
 from triquad_map.compiled.team import Split, in_one
 from triquad_map.composition.field_view import FieldView, MapRegion, Owners
+from triquad_map.surfels.nearest_surface import RegionFrame
 from triquad_map.view import NearestSurface, NearestUnknown
 
 _FARTHEST_CELL = 1 << 20

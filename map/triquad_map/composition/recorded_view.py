@@ -5,12 +5,12 @@ import threading
 
 from triquad_format.records.region import MapRecord, Region
 
-from triquad_map.compiled.evidence.evidence import FrozenEvidence
-from triquad_map.compiled.field.frozen_field import field_samples, recorded_field
 from triquad_map.compiled.kernel import is_first_use
-from triquad_map.compiled.surfels.surfel_map import SurfelMap, first_surfels
 from triquad_map.compiled.team import Split, Team
 from triquad_map.composition.composed_view import ComposedView
+from triquad_map.evidence.evidence import FrozenEvidence
+from triquad_map.field.frozen_field import field_samples, recorded_field
+from triquad_map.surfels.surfel_map import SurfelMap, first_surfels
 
 _log = logging.getLogger(__name__)
 

@@ -17,9 +17,12 @@ from typing import NamedTuple
 
 import numpy as np
 from triquad_format.records.arrays import Bools, Doubles, Floats, Ints
-from triquad_map.compiled.field.encoding import BATCH, PointBatch, add_feature_gradient, load
-from triquad_map.compiled.field.feature_rows import move_row
-from triquad_map.compiled.field.field import (
+from triquad_map.compiled.kernel import inner_kernel, kernel
+from triquad_map.compiled.lanes import prefetch_row
+from triquad_map.compiled.team import THREADS, Team, share
+from triquad_map.field.encoding import BATCH, PointBatch, add_feature_gradient, load
+from triquad_map.field.feature_rows import move_row
+from triquad_map.field.field import (
     CompiledField,
     Mlp,
     add_weight_gradient,
@@ -29,9 +32,6 @@ from triquad_map.compiled.field.field import (
     make_field,
     transposed,
 )
-from triquad_map.compiled.kernel import inner_kernel, kernel
-from triquad_map.compiled.lanes import prefetch_row
-from triquad_map.compiled.team import THREADS, Team, share
 
 from triquad_server.engine.gradient_sums import GradientSums, Touched
 from triquad_server.engine.live_field import LAST_AGE, Batch, LiveField, Parameter, Rates

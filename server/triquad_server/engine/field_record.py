@@ -4,8 +4,8 @@ import numpy as np
 from triquad_format.records.arrays import Floats
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.region import AXES, Mlp, Region, TrainingState, VertexTable
-from triquad_map.compiled.evidence.evidence import FrozenEvidence
-from triquad_map.compiled.evidence.live_evidence import LiveEvidence
+from triquad_map.evidence.evidence import FrozenEvidence
+from triquad_map.evidence.live_evidence import LiveEvidence
 
 from triquad_server.engine.live_field import LiveField
 from triquad_server.engine.memory import FrozenField, Memory

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from triquad_format.records.arrays import Bools, Floats, Ints, Longs
 from triquad_format.records.field_settings import FieldSettings
-from triquad_map.compiled.field.field import FieldArrays
-from triquad_map.compiled.field.quadtree import LiveQuadtree
+from triquad_map.field.field import FieldArrays
+from triquad_map.field.quadtree import LiveQuadtree
 
 from triquad_server.engine.initial_mlp import initial_mlp
 from triquad_server.engine.memory import FieldNumbers, FrozenField, Memory, Rows

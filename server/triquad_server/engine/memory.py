@@ -5,9 +5,9 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from triquad_format.records.field_settings import FieldSettings
-from triquad_map.compiled.field.field import FieldArrays
-from triquad_map.compiled.field.frozen_field import FieldEngine, FrozenCompiledField
-from triquad_map.compiled.field.quadtree import FrozenQuadtree, LiveQuadtree
+from triquad_map.field.field import FieldArrays
+from triquad_map.field.frozen_field import FieldEngine, FrozenCompiledField
+from triquad_map.field.quadtree import FrozenQuadtree, LiveQuadtree
 
 Array = NDArray[Any]
 

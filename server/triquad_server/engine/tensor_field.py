@@ -16,14 +16,14 @@ from torch import Tensor
 from triquad_format.records.arrays import Floats, Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES
-from triquad_map.compiled.field.field import FieldArrays
-from triquad_map.compiled.field.frozen_field import FieldValues, in_grid
-from triquad_map.compiled.field.quadtree import (
+from triquad_map.compiled.voxel_index import home_slot, longest_probe, morton_code
+from triquad_map.field.field import FieldArrays
+from triquad_map.field.frozen_field import FieldValues, in_grid
+from triquad_map.field.quadtree import (
     PLANE_BITS,
     FrozenQuadtree,
     LiveQuadtree,
 )
-from triquad_map.compiled.voxel_index import home_slot, longest_probe, morton_code
 
 from triquad_server.engine.live_field import LiveField
 from triquad_server.engine.memory import Array, FieldNumbers

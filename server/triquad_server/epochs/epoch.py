@@ -8,10 +8,10 @@ from triquad_format.records.arrays import Doubles
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.map_progress import MapProgress
 from triquad_format.records.region import MapRecord, Region
-from triquad_map.compiled.evidence.evidence import FrozenEvidence
-from triquad_map.compiled.surfels.surfel_map import SurfelMap
 from triquad_map.compiled.team import Split, in_one
 from triquad_map.composition.composed_view import ComposedView
+from triquad_map.evidence.evidence import FrozenEvidence
+from triquad_map.surfels.surfel_map import SurfelMap
 
 from triquad_server.engine.field_record import region_record
 from triquad_server.engine.memory import FrozenField

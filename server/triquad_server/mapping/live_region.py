@@ -4,9 +4,9 @@ import numpy as np
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.region import Region
-from triquad_map.compiled.evidence.growth import EvidenceSize
-from triquad_map.compiled.evidence.live_evidence import LiveEvidence
-from triquad_map.compiled.field.frozen_field import field_samples
+from triquad_map.evidence.growth import EvidenceSize
+from triquad_map.evidence.live_evidence import LiveEvidence
+from triquad_map.field.frozen_field import field_samples
 
 from triquad_server.engine.field_record import field_from_record, region_record
 from triquad_server.engine.live_field import LiveField, initial_field

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
 from triquad_format.records.region import BLOCK_BYTES
-from triquad_map.compiled.evidence.growth import EvidenceSize
-from triquad_map.compiled.evidence.observed import OBSERVED_VOXEL
+from triquad_map.evidence.growth import EvidenceSize
+from triquad_map.evidence.observed import OBSERVED_VOXEL
 
 from triquad_server.errors import ScanRefusedError
 from triquad_server.intake.rays import ScanRays

@@ -7,14 +7,14 @@ from typing import NamedTuple
 import numpy as np
 from triquad_format.records.arrays import Doubles, Ints, Longs
 from triquad_format.records.region import Evidence
-from triquad_map.compiled.evidence.carving import Reach
-from triquad_map.compiled.evidence.evidence import FrozenEvidence
-from triquad_map.compiled.evidence.growth import EvidenceSize
-from triquad_map.compiled.evidence.live_evidence import LiveEvidence, Marks
-from triquad_map.compiled.evidence.observed import Sighting
-from triquad_map.compiled.surfels.surfel_map import SurfelMap, first_surfels
 from triquad_map.compiled.voxel_index import empty_keys, thin
+from triquad_map.evidence.carving import Reach
+from triquad_map.evidence.evidence import FrozenEvidence
+from triquad_map.evidence.growth import EvidenceSize
+from triquad_map.evidence.live_evidence import LiveEvidence, Marks
+from triquad_map.evidence.observed import Sighting
 from triquad_map.surface import SampleField, ShownByRays, nothing_shown
+from triquad_map.surfels.surfel_map import SurfelMap, first_surfels
 
 from triquad_server.intake.rays import ScanRays
 from triquad_server.mapping.replay.region_setup import RegionSetup

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
-from triquad_map.compiled.evidence.evidence import FrozenEvidence
-from triquad_map.compiled.surfels.surfel_map import surfel_voxels
 from triquad_map.compiled.team import Team
+from triquad_map.evidence.evidence import FrozenEvidence
+from triquad_map.surfels.surfel_map import surfel_voxels
 
 from triquad_server.engine.memory import FrozenField
 from triquad_server.epochs.epoch import FrozenRegion

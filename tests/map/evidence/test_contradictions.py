@@ -6,11 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.region import seen_voxels
-from triquad_map.compiled.evidence.carving import Reach
-from triquad_map.compiled.evidence.contradictions import Disbelief
-from triquad_map.compiled.evidence.live_evidence import LiveEvidence
-from triquad_map.compiled.evidence.observations import outcome_counts
-from triquad_map.compiled.evidence.observed import Sighting
+from triquad_map.evidence.carving import Reach
+from triquad_map.evidence.contradictions import Disbelief
+from triquad_map.evidence.live_evidence import LiveEvidence
+from triquad_map.evidence.observations import outcome_counts
+from triquad_map.evidence.observed import Sighting
 
 SIDE = 256
 RULE = Disbelief.of(scans=3, doubt=0.01)

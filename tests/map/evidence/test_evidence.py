@@ -2,11 +2,11 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from triquad_format.records.status import Status
-from triquad_map.compiled.evidence.carving import Reach
-from triquad_map.compiled.evidence.evidence import FrozenEvidence
-from triquad_map.compiled.evidence.live_evidence import LiveEvidence
-from triquad_map.compiled.evidence.observed import Sighting
 from triquad_map.compiled.team import Work
+from triquad_map.evidence.carving import Reach
+from triquad_map.evidence.evidence import FrozenEvidence
+from triquad_map.evidence.live_evidence import LiveEvidence
+from triquad_map.evidence.observed import Sighting
 from triquad_map.surface import LEVELS
 
 SIDE = 64

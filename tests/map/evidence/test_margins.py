@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 from triquad_format.records.arrays import Bools, Doubles
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import Evidence, seen_voxels
-from triquad_map.compiled.evidence.carving import Reach
-from triquad_map.compiled.evidence.contradictions import Disbelief
-from triquad_map.compiled.evidence.evidence import FrozenEvidence
-from triquad_map.compiled.evidence.live_evidence import LiveEvidence
-from triquad_map.compiled.evidence.observed import Sighting
+from triquad_map.evidence.carving import Reach
+from triquad_map.evidence.contradictions import Disbelief
+from triquad_map.evidence.evidence import FrozenEvidence
+from triquad_map.evidence.live_evidence import LiveEvidence
+from triquad_map.evidence.observed import Sighting
 from triquad_map.surface import MARGIN_STEP
 
 SETTINGS = FieldSettings(depth=8)

@@ -7,10 +7,10 @@ from support.maps import small_world
 from triquad_format.records import morton
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES
-from triquad_map.compiled.evidence.live_evidence import LiveEvidence
-from triquad_map.compiled.field.encoding import load, locate, new_batch
-from triquad_map.compiled.field.field import make_field
-from triquad_map.compiled.field.frozen_field import in_grid
+from triquad_map.evidence.live_evidence import LiveEvidence
+from triquad_map.field.encoding import load, locate, new_batch
+from triquad_map.field.field import make_field
+from triquad_map.field.frozen_field import in_grid
 from triquad_server.engine.compiled_trainer import CompiledTrainer
 from triquad_server.engine.field_record import field_from_record, region_record
 from triquad_server.engine.gradient_sums import GradientSums

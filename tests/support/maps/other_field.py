@@ -5,8 +5,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.region import MapRecord
-from triquad_map.compiled.field.frozen_field import in_grid
 from triquad_map.composition.recorded_view import RecordedView
+from triquad_map.field.frozen_field import in_grid
 
 Sdf = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Signed distances [N] at points [N, 3], metres, map frame."""

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
-from triquad_map.compiled.evidence.contradictions import Disbelief
 from triquad_map.compiled.team import Team
+from triquad_map.evidence.contradictions import Disbelief
 
 from triquad_server.engine.gradient_sums import GradientSums
 from triquad_server.engine.memory import Memory

@@ -3,8 +3,8 @@
 import numpy as np
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
-from triquad_map.compiled.evidence.live_evidence import LiveEvidence
 from triquad_map.compiled.voxel_index import cells_of, keys_of
+from triquad_map.evidence.live_evidence import LiveEvidence
 
 from triquad_server.engine.live_field import LiveField
 from triquad_server.mapping.replay.replay_pool import ReplayPool

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 from triquad_format.records.arrays import Doubles, Floats, Longs
 from triquad_format.records.region import TrainingState
-from triquad_map.compiled.evidence.live_evidence import LiveEvidence
-from triquad_map.compiled.surfels.surfel_map import SurfelMap
-from triquad_map.compiled.surfels.surfel_search import no_surfels
+from triquad_map.evidence.live_evidence import LiveEvidence
+from triquad_map.surfels.surfel_map import SurfelMap
+from triquad_map.surfels.surfel_search import no_surfels
 
 from triquad_server.engine.field_record import training_state
 from triquad_server.engine.live_field import LiveField

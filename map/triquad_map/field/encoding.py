@@ -10,11 +10,11 @@ import numpy as np
 from triquad_format.records.arrays import Floats, Ints, Longs
 from triquad_format.records.region import AXES
 
-from triquad_map.compiled.field.feature_rows import add_rows, add_to_row, row_slopes
-from triquad_map.compiled.field.quadtree import Shape, Vertices, block_key
 from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.lanes import prefetch_row
 from triquad_map.compiled.voxel_index import EMPTY, find_row
+from triquad_map.field.feature_rows import add_rows, add_to_row, row_slopes
+from triquad_map.field.quadtree import Shape, Vertices, block_key
 
 BATCH = 64
 """Points of a batch."""

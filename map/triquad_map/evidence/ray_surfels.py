@@ -3,10 +3,10 @@
 import numpy as np
 from triquad_format.records.arrays import Bytes, Doubles, Floats, Longs
 
-from triquad_map.compiled.evidence.observed import Observed, row_of
-from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
 from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.planes import MOMENTS, add_points, plane_normal
+from triquad_map.evidence.observed import Observed, row_of
+from triquad_map.evidence.seen_voxels import SeenVoxels
 from triquad_map.surface import SurfelKind, Surfels, nothing_shown
 
 _RAY_DISC, _RAY_POINT = int(SurfelKind.RAY_DISC), int(SurfelKind.RAY_POINT)

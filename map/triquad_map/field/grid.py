@@ -7,15 +7,15 @@ grid share coordinates, and most of them two with others: each pair is encoded o
 import numpy as np
 from triquad_format.records.arrays import Floats, Ints, Longs
 
-from triquad_map.compiled.field.encoding import (
+from triquad_map.compiled.kernel import inner_kernel, kernel
+from triquad_map.field.encoding import (
     BATCH,
     PLANE_AXES,
     PointBatch,
     interpolate_plane,
     wave,
 )
-from triquad_map.compiled.field.field import CompiledField, add_product, batch_for, decode_rest
-from triquad_map.compiled.kernel import inner_kernel, kernel
+from triquad_map.field.field import CompiledField, add_product, batch_for, decode_rest
 
 _ZERO = np.float32(0)
 

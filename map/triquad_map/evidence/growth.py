@@ -6,8 +6,6 @@ import numpy as np
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
 
-from triquad_map.compiled.evidence.carving import part_inside
-from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.voxel_index import (
     Index,
@@ -21,6 +19,8 @@ from triquad_map.compiled.voxel_index import (
     is_set,
     thin,
 )
+from triquad_map.evidence.carving import part_inside
+from triquad_map.evidence.seen_voxels import SeenVoxels
 
 _APART, _STEP = 4.0, 2.0
 """The distances between the ends of checked ways, and between their checked places, voxels."""

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles, Ints, Longs
 
-from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
 from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.voxel_index import LOW, SHIFT, bit_of, byte_of, find_block, unpack
+from triquad_map.evidence.seen_voxels import SeenVoxels
 from triquad_map.surface import NEAR_M
 
 OBSERVED_VOXEL = np.dtype(

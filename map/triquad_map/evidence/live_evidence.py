@@ -8,21 +8,21 @@ from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.region import BLOCK_BYTES
 from triquad_format.records.region import Evidence as EvidenceRecord
 
-from triquad_map.compiled.evidence.carving import Reach, mark_crossed
-from triquad_map.compiled.evidence.contradictions import (
+from triquad_map.compiled.team import Split, in_one
+from triquad_map.compiled.voxel_index import VoxelIndex, with_room
+from triquad_map.evidence.carving import Reach, mark_crossed
+from triquad_map.evidence.contradictions import (
     Disbelief,
     doubted,
     middles,
     take_back,
 )
-from triquad_map.compiled.evidence.evidence import FrozenEvidence
-from triquad_map.compiled.evidence.growth import EvidenceSize, NewEnds, new_blocks, new_ends
-from triquad_map.compiled.evidence.observations import Observations
-from triquad_map.compiled.evidence.observed import Sighting
-from triquad_map.compiled.evidence.ray_surfels import ray_surfels
-from triquad_map.compiled.evidence.seen_voxels import SeenVoxels, mark_ends
-from triquad_map.compiled.team import Split, in_one
-from triquad_map.compiled.voxel_index import VoxelIndex, with_room
+from triquad_map.evidence.evidence import FrozenEvidence
+from triquad_map.evidence.growth import EvidenceSize, NewEnds, new_blocks, new_ends
+from triquad_map.evidence.observations import Observations
+from triquad_map.evidence.observed import Sighting
+from triquad_map.evidence.ray_surfels import ray_surfels
+from triquad_map.evidence.seen_voxels import SeenVoxels, mark_ends
 from triquad_map.surface import SampleField, Surfels
 
 _MIN_CAPACITY = 256

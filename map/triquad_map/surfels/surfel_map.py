@@ -12,12 +12,9 @@ from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Ints, L
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.region import BLOCK_BYTES, surface_counts
 
-from triquad_map.compiled.evidence.evidence import FrozenEvidence
 from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.surfels.nearest_surface import RegionFrame, ShownSurfels, improve_nearest
-from triquad_map.compiled.surfels.surfel_search import NearestSurfels, find_nearest
-from triquad_map.compiled.surfels.surfel_tree import TreeShape, surfel_tree, tree_shape
 from triquad_map.compiled.voxel_index import LOW, SHIFT, keys_of
+from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.surface import (
     SampleField,
     ShownByRays,
@@ -27,6 +24,9 @@ from triquad_map.surface import (
     nothing_shown,
     support_confidence,
 )
+from triquad_map.surfels.nearest_surface import RegionFrame, ShownSurfels, improve_nearest
+from triquad_map.surfels.surfel_search import NearestSurfels, find_nearest
+from triquad_map.surfels.surfel_tree import TreeShape, surfel_tree, tree_shape
 from triquad_map.view import NearestSurface
 
 _NEVER = -1

@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from triquad_map.compiled.evidence.observed import Observed, has_surface, rows_around, voxel_of
-from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
 from triquad_map.compiled.kernel import inner_kernel
+from triquad_map.evidence.observed import Observed, has_surface, rows_around, voxel_of
+from triquad_map.evidence.seen_voxels import SeenVoxels
 
 
 class Around(NamedTuple):

@@ -17,12 +17,6 @@ from triquad_format.records.region import OUTCOME_BITS, surface_counts
 from triquad_format.records.region import Evidence as EvidenceRecord
 from triquad_format.records.status import Status
 
-from triquad_map.compiled.evidence.seen_voxels import SeenVoxels, find_unknown, surface_in_grid
-from triquad_map.compiled.evidence.support import (
-    SurfaceEnds,
-    margins_that_count,
-    near_ends,
-)
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.voxel_index import (
     SHIFT,
@@ -30,6 +24,12 @@ from triquad_map.compiled.voxel_index import (
     cells_of,
     find_block,
     is_set,
+)
+from triquad_map.evidence.seen_voxels import SeenVoxels, find_unknown, surface_in_grid
+from triquad_map.evidence.support import (
+    SurfaceEnds,
+    margins_that_count,
+    near_ends,
 )
 
 _SEEN_STEP_S = 60

@@ -199,7 +199,7 @@ def _search(at: Place, seen: SeenVoxels, cells: tuple[int, int], state: Doubles)
 def find_unknown(
     points: Doubles, seen: SeenVoxels, cells: tuple[int, int], distances: Doubles, nearest: Doubles
 ) -> None:
-    """Do as :meth:`triquad_map.compiled.evidence.evidence.FrozenEvidence.find_unknown`.
+    """Do as :meth:`triquad_map.evidence.evidence.FrozenEvidence.find_unknown`.
 
     Only blocks whose indices are in ``range(*cells)`` on each axis are searched; where there is
     none, all is unknown.

@@ -12,15 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from triquad_format.records.arrays import Doubles, Ints
 
-from triquad_map.compiled.evidence.observed import (
-    Observed,
-    ObservedVoxel,
-    Vector,
-    Voxel,
-    is_flat,
-    voxel_of,
-)
-from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
 from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.voxel_index import (
     LOW,
@@ -31,6 +22,15 @@ from triquad_map.compiled.voxel_index import (
     is_inside,
     make_row,
 )
+from triquad_map.evidence.observed import (
+    Observed,
+    ObservedVoxel,
+    Vector,
+    Voxel,
+    is_flat,
+    voxel_of,
+)
+from triquad_map.evidence.seen_voxels import SeenVoxels
 
 _SPREAD_SHARE = 0.8
 _LEAST_RADIUS, _GREATEST_RADIUS = 0.15, 0.5

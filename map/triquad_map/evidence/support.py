@@ -16,11 +16,11 @@ from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.region import BLOCK_BYTES
 
-from triquad_map.compiled.evidence.observed import EIGHTHS, Observed, ObservedVoxel, Voxel
-from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
 from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.lanes import prefetch_row
 from triquad_map.compiled.voxel_index import LOW, SHIFT, byte_of, find_block, is_set, unpack
+from triquad_map.evidence.observed import EIGHTHS, Observed, ObservedVoxel, Voxel
+from triquad_map.evidence.seen_voxels import SeenVoxels
 from triquad_map.surface import LEAST_STRENGTH, LEVELS, MARGIN_STEP, SECTORS_COUNTED
 
 

@@ -11,7 +11,8 @@ import numpy as np
 from triquad_format.records.arrays import Floats
 from triquad_format.records.field_settings import FieldSettings
 
-from triquad_map.compiled.field.encoding import (
+from triquad_map.compiled.kernel import inner_kernel, kernel
+from triquad_map.field.encoding import (
     BATCH,
     Geometry,
     PointBatch,
@@ -23,8 +24,7 @@ from triquad_map.compiled.field.encoding import (
     new_batch,
     wave,
 )
-from triquad_map.compiled.field.quadtree import FrozenQuadtree, LiveQuadtree, Vertices
-from triquad_map.compiled.kernel import inner_kernel, kernel
+from triquad_map.field.quadtree import FrozenQuadtree, LiveQuadtree, Vertices
 
 _ZERO = np.float32(0)
 

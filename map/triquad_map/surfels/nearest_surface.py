@@ -6,9 +6,9 @@ import numpy as np
 from triquad_format.records.arrays import Bytes, Doubles, Floats, Longs
 
 from triquad_map.compiled.kernel import inner_kernel, kernel
-from triquad_map.compiled.surfels.surfel_search import NearestSurfels, find_nearest
-from triquad_map.compiled.surfels.surfel_tree import SurfelTree
 from triquad_map.surface import HALF_LIFE_S, SurfelKind
+from triquad_map.surfels.surfel_search import NearestSurfels, find_nearest
+from triquad_map.surfels.surfel_tree import SurfelTree
 from triquad_map.view import NO_LENGTH_M, NearestSurface
 
 _RAY_DISC = int(SurfelKind.RAY_DISC)

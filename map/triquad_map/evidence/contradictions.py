@@ -12,7 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from triquad_format.records.arrays import Doubles, Ints, Longs
 
-from triquad_map.compiled.evidence.observed import (
+from triquad_map.compiled.kernel import inner_kernel, kernel
+from triquad_map.compiled.voxel_index import SHIFT, bit_of, byte_of
+from triquad_map.evidence.observed import (
     Observed,
     ObservedVoxel,
     Voxel,
@@ -21,10 +23,8 @@ from triquad_map.compiled.evidence.observed import (
     rows_around,
     voxel_of,
 )
-from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
-from triquad_map.compiled.evidence.surroundings import Around, depth_around, seen_around
-from triquad_map.compiled.kernel import inner_kernel, kernel
-from triquad_map.compiled.voxel_index import SHIFT, bit_of, byte_of
+from triquad_map.evidence.seen_voxels import SeenVoxels
+from triquad_map.evidence.surroundings import Around, depth_around, seen_around
 
 _PRIOR_HITS, _PRIOR_PASSES = 0.3, 0.7
 """The prior of a voxel before anything was seen of it: one ray in all."""

@@ -59,7 +59,7 @@ def row_slopes(
     """Return how ``values[point, start:start + size] @ row`` changes across and along a cell.
 
     The row is interpolated between those of the cell's corners, in the order of
-    :class:`triquad_map.compiled.field.encoding.PointBatch`, at a ``place`` in it, float32.
+    :class:`triquad_map.field.encoding.PointBatch`, at a ``place`` in it, float32.
     """
     if table.shape[1] == LANES:
         corner, right = load(table, (rows[0], 0)), load(table, (rows[1], 0))

@@ -25,7 +25,9 @@ from triquad_map.compiled.lanes import (
     total,
     whole,
 )
-from triquad_map.compiled.surfels.surfel_tree import (
+from triquad_map.compiled.voxel_index import CELL_LIMIT
+from triquad_map.surface import SMOOTHING
+from triquad_map.surfels.surfel_tree import (
     CORNER,
     NORMAL_X,
     NORMAL_Y,
@@ -36,8 +38,6 @@ from triquad_map.compiled.surfels.surfel_tree import (
     Y,
     Z,
 )
-from triquad_map.compiled.voxel_index import CELL_LIMIT
-from triquad_map.surface import SMOOTHING
 
 _FARTHEST = CELL_LIMIT / 2
 

@@ -11,7 +11,10 @@ from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.region import MARGIN_BITS, OUTCOME_BITS, surface_counts, used_blocks
 
-from triquad_map.compiled.evidence.observed import (
+from triquad_map.compiled.kernel import inner_kernel, kernel
+from triquad_map.compiled.team import Split
+from triquad_map.compiled.voxel_index import SHIFT, with_room
+from triquad_map.evidence.observed import (
     EIGHTHS,
     MOST_SCANS,
     OBSERVED_VOXEL,
@@ -23,11 +26,8 @@ from triquad_map.compiled.evidence.observed import (
     rows_around,
     voxel_of,
 )
-from triquad_map.compiled.evidence.seen_voxels import SeenVoxels
-from triquad_map.compiled.evidence.support import Support, fill_support
-from triquad_map.compiled.kernel import inner_kernel, kernel
-from triquad_map.compiled.team import Split
-from triquad_map.compiled.voxel_index import SHIFT, with_room
+from triquad_map.evidence.seen_voxels import SeenVoxels
+from triquad_map.evidence.support import Support, fill_support
 from triquad_map.surface import LEAST_STRENGTH, SurfelKind, Surfels
 
 _MOST_HITS = 8

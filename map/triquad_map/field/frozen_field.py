@@ -9,10 +9,10 @@ from triquad_format.records.arrays import Doubles, Floats, Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import Region
 
-from triquad_map.compiled.field.field import FieldArrays, evaluate, make_field
-from triquad_map.compiled.field.grid import evaluate_in_grid
-from triquad_map.compiled.field.quadtree import FrozenQuadtree, LiveQuadtree
 from triquad_map.compiled.team import Split
+from triquad_map.field.field import FieldArrays, evaluate, make_field
+from triquad_map.field.grid import evaluate_in_grid
+from triquad_map.field.quadtree import FrozenQuadtree, LiveQuadtree
 from triquad_map.surface import FieldSample, SampleField
 
 _Float = TypeVar("_Float", np.float32, np.float64)
