@@ -7,6 +7,7 @@ what most tests need, and each kernel beyond takes seconds to a minute.
 """
 
 import json
+import signal
 import sys
 from collections import defaultdict
 from collections.abc import Iterator
@@ -62,6 +63,8 @@ def _read(path: Path) -> dict[str, float]:
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    # A shell's background ignores Ctrl-C, and so would all processes that tests start.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     settings.register_profile("untimed", deadline=None)  # a busy machine is no fault
     settings.load_profile("untimed")
     config.pluginmanager.register(Kernels())

@@ -55,17 +55,19 @@ class RemoteBytes:
         Raises:
             DamagedMapFileError: the file does not have as many.
             RefusedError: ``chunk_gone``, where the server does not keep the file any more.
-            DownloadError: it is too much in all.
+            DownloadError: other bytes came than were asked for, or it is too much in all.
         """
         check_range(offset, length, self.size)
         if self.bytes_read + length > self._max_bytes:
             raise DownloadError(f"{self.name} names more than {self._max_bytes} bytes to be read")
         end = offset + length
         starts = range(offset, end, self._info.chunk_bytes)
-        chunks = self._connection.replies(self._ask(at, end) for at in starts)
-        data = b"".join(chunk.data for chunk in chunks)
+        chunks = list(self._connection.replies(self._ask(at, end) for at in starts))
+        for chunk, start in zip(chunks, starts, strict=True):
+            if chunk.offset != start:
+                raise DownloadError(f"chunk at {chunk.offset} came, not {start}")
         self.bytes_read += length
-        return data
+        return b"".join(chunk.data for chunk in chunks)
 
     def close(self) -> None:
         """Do nothing: only the connection is open, which is not this object's."""
