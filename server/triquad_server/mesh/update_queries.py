@@ -99,7 +99,7 @@ class UpdateQueries:
             if encoded is None or (data and encoded and size + len(encoded) > limit):
                 complete = False
                 break
-            revision = tile.revision
+            revision = min(tile.revision, delta.known_to)
             if tile.empty:
                 removed.append(tile.index)
             else:
