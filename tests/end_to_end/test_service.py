@@ -20,6 +20,7 @@ from triquad_format.wire.messages import (
     ResetRequest,
     ServerStatus,
 )
+from triquad_server.settings import ServiceSettings
 from triquad_server.store.store import Store
 
 POSE = np.eye(4)
@@ -75,6 +76,15 @@ def test_flush_lets_a_publisher_run_ahead(client):
         client.publish_scan(servers.sphere(), POSE)
         assert client.flush(servers.WAIT_S, pending=3).lost == 0
     assert client.flush(servers.WAIT_S).taken == 6
+
+
+def test_flush_of_more_sources_than_requests_may_wait():
+    few = ServiceSettings(request_queue=8)
+    settings = servers.SMALL.model_copy(update={"service": few})
+    with servers.service_and_client(settings) as client:
+        for number in range(100):
+            client.publish_scan(servers.sphere(20), POSE, source=f"camera{number}")
+        assert client.flush(servers.WAIT_S).taken == 100
 
 
 def test_flush_tells_at_once_that_a_scan_is_not_in_the_map_yet(endpoint):

@@ -245,7 +245,7 @@ class ScanCalls:
                 Ask(keys.FLUSH, replace(request, waited_s=waited_s), FlushReply)
                 for request in requests
             ]
-            replies = list(self._connection.replies(asks, at_once=len(asks)))
+            replies = list(self._connection.replies(asks))
             for request, reply in zip(requests, replies, strict=True):
                 if reply.done:
                     done[request.source] = reply

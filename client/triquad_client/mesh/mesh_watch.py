@@ -116,15 +116,16 @@ class MeshWatch(WatchedTiles):
             RequestTimeoutError: it does not answer.
         """
         ends = math.inf if timeout_s is None else checks.deadline(timeout_s)
-        with suppress(_WatchClosedError), self._cancelled_by_close():
-            self._wait_until(min(self._ready_s, ends))
+        with suppress(_WatchClosedError), self._cancelled_by_close() as token:
+            self._wait_until(min(self._ready_s, ends), token)
             while time.monotonic() >= self._ready_s:
                 update = self._update()
                 if update.changed or update.removed:
                     return update
                 if time.monotonic() >= ends:
                     break
-                self._wait_until(min(max(self._ready_s, time.monotonic() + _PAUSE_S), ends))
+                asks_s = max(self._ready_s, time.monotonic() + _PAUSE_S)
+                self._wait_until(min(asks_s, ends), token)
         return None
 
     def catch_up(self, timeout_s: float = 60.0) -> None:
@@ -135,14 +136,16 @@ class MeshWatch(WatchedTiles):
             ClosedError: the watch was closed.
         """
         ends = checks.deadline(timeout_s)
-        with self._cancelled_by_close():
-            self._wait_until(min(self._ready_s, ends))
-            while not (update := self._update()).complete:
-                if time.monotonic() > ends:
+        with self._cancelled_by_close() as token:
+            while True:
+                self._wait_until(min(self._ready_s, ends), token)
+                update = self._update() if time.monotonic() >= self._ready_s else None
+                if update is not None and update.complete:
+                    return
+                if update is None or time.monotonic() > ends:
                     raise RequestTimeoutError(f"the mesh is not complete after {timeout_s:g} s")
-                # Nothing came although there is something: the server is making it.
-                pause_s = 0.0 if update.changed else _PAUSE_S
-                self._wait_until(max(self._ready_s, time.monotonic() + pause_s))
+                if not update.changed:  # although there is something: the server is making it
+                    self._wait_until(min(time.monotonic() + _PAUSE_S, ends), token)
 
     def mesh(self) -> Mesh:
         """Return the tiles as one mesh, faces by their centroids within the bounds."""
@@ -158,14 +161,15 @@ class MeshWatch(WatchedTiles):
     def _now(self) -> FollowedMesh:
         return self._followed
 
-    def _wait_until(self, time_s: float) -> None:
-        """Wait until a monotonic time, or until the watch is closed.
+    def _wait_until(self, time_s: float, token: zenoh.CancellationToken) -> None:
+        """Wait until a monotonic time, or until the call was cancelled or the watch is closed.
 
         Raises:
             ClosedError: it was closed.
         """
-        if self._closed.wait(max(0.0, min(time_s - time.monotonic(), threading.TIMEOUT_MAX))):
-            raise _WatchClosedError
+        while (left_s := time_s - time.monotonic()) > 0 and not token.is_cancelled:
+            if self._closed.wait(min(left_s, _PAUSE_S)):
+                raise _WatchClosedError
 
     def _update(self) -> MeshUpdate:
         """Return what one reply changed: nothing where that of another call came first."""
@@ -174,7 +178,8 @@ class MeshWatch(WatchedTiles):
         reply = self._server.ask(ask)
         after = before.after(reply)
         with self._changing:
-            self._ready_s = time.monotonic() + len(reply.data) / self._max_bytes_per_s
+            since_s = max(self._ready_s, time.monotonic())
+            self._ready_s = since_s + len(reply.data) / self._max_bytes_per_s
             now = self._followed
             if now is not before:  # by what is known now, the reply may be old
                 return MeshUpdate((), (), now.epoch, complete=now.complete, size_bytes=0)
@@ -189,15 +194,15 @@ class MeshWatch(WatchedTiles):
         )
 
     @contextmanager
-    def _cancelled_by_close(self) -> Iterator[None]:
-        """Let closing end what is asked meanwhile, with an error that says so."""
+    def _cancelled_by_close(self) -> Iterator[zenoh.CancellationToken]:
+        """Let closing end what is asked meanwhile, with an error that says so; yield the token."""
         with cancellable() as token:
             with self._changing:
                 if self._closed.is_set():
                     raise _WatchClosedError
                 self._asking.append(token)
             try:
-                yield
+                yield token
             except TriquadError as error:
                 if self._closed.is_set():
                     raise _WatchClosedError from error

@@ -63,10 +63,8 @@ class Answering(ABC):
     """Answers requests."""
 
     @abstractmethod
-    def replies(
-        self, asks: Iterable[Ask[ReplyT]], at_once: int = PARTS_IN_FLIGHT
-    ) -> Iterator[ReplyT]:
-        """Yield the reply to each request, in their order; ``at_once`` are awaited at a time."""
+    def replies(self, asks: Iterable[Ask[ReplyT]]) -> Iterator[ReplyT]:
+        """Yield the reply to each request, in their order."""
 
     def ask(self, request: Ask[ReplyT]) -> ReplyT:
         """Return the reply to one request."""
@@ -101,10 +99,8 @@ class Connection(Answering):
         """Close the session; closing twice does no harm. What is under way ends unanswered."""
         self._close()
 
-    def replies(
-        self, asks: Iterable[Ask[ReplyT]], at_once: int = PARTS_IN_FLIGHT
-    ) -> Iterator[ReplyT]:
-        """Yield the reply to each request, in their order; ``at_once`` are awaited at a time.
+    def replies(self, asks: Iterable[Ask[ReplyT]]) -> Iterator[ReplyT]:
+        """Yield the reply to each request, in their order; a few are under way at a time.
 
         Nothing of a reply is used before all of it was checked.
 
@@ -119,7 +115,7 @@ class Connection(Answering):
         waiting: deque[tuple[Ask[ReplyT], Iterable[zenoh.Reply]]] = deque()
         for ask in asks:
             waiting.append((ask, self._send(ask)))
-            if len(waiting) >= at_once:
+            if len(waiting) >= PARTS_IN_FLIGHT:
                 yield self._received(*waiting.popleft())
         while waiting:
             yield self._received(*waiting.popleft())

@@ -23,7 +23,7 @@ from triquad_client.calls.queries import MapQueries
 from triquad_client.checks import Bounds
 from triquad_client.errors import ClosedError
 from triquad_client.mesh.mesh import Mesh
-from triquad_client.net.connection import PARTS_IN_FLIGHT, Answering, Ask, ReplyT
+from triquad_client.net.connection import Answering, Ask, ReplyT
 
 if TYPE_CHECKING:
     from triquad_map.composition.recorded_view import RecordedView
@@ -59,11 +59,7 @@ class LocalMap(Answering):
         if opened is not None:
             opened.close()
 
-    def replies(
-        self,
-        asks: Iterable[Ask[ReplyT]],
-        at_once: int = PARTS_IN_FLIGHT,  # noqa: ARG002 - nothing is under way here
-    ) -> Iterator[ReplyT]:
+    def replies(self, asks: Iterable[Ask[ReplyT]]) -> Iterator[ReplyT]:
         """Yield the reply to each request, one after the other."""
         for ask in asks:
             reply = self._answers.answer(ask.message)

@@ -65,6 +65,7 @@ class TileDelta:
     missing: list[TileIndex]  # that were never made
     outdated: list[TileIndex]  # to be made again, those made longest ago first
     revision: int  # a client with all of this knows everything up to here
+    known_to: int  # the most up to which one knows everything that lacks what is to be made
 
     @property
     def to_make(self) -> list[TileIndex]:
@@ -111,20 +112,32 @@ class TileLevel:
         ready: list[CachedTile] = []
         missing: list[TileIndex] = []
         outdated: list[TileIndex] = []
+        owed = revision + 1  # the least revision of what is lacked, and to be made again
         inside = self._indices[self.lattice.meets(self._indices, low, high)]
         for x, y, z in inside.tolist():
             index = (x, y, z)
-            tile = self.clean(index)
+            tile = self.tiles.get(index)
             if tile is None:
-                (outdated if index in self.tiles else missing).append(index)
+                missing.append(index)
                 continue
             unknown = tile.revision > known_to and known.get(index) != tile.version
-            if unknown and (not tile.empty or known_to or index in known):
+            if self.clean(index) is None:
+                outdated.append(index)
+                if unknown:  # if it turns out to be as it was, it keeps its revision
+                    owed = min(owed, tile.revision)
+            elif unknown and (not tile.empty or known_to or index in known):
                 ready.append(tile)
         ready.sort(key=lambda tile: tile.revision)
         outdated.sort(key=lambda index: (self.tiles[index].made, index))
         removed = [index for index in known if index not in self.changed]
-        return TileDelta(ready, removed, sorted(missing), outdated=outdated, revision=revision)
+        return TileDelta(
+            ready,
+            removed,
+            sorted(missing),
+            outdated=outdated,
+            revision=revision,
+            known_to=owed - 1,
+        )
 
     def borders_around(self, index: TileIndex) -> dict[TileIndex, TileBorder]:
         """Return the borders with which a tile has to agree, by their tiles, in its own lattice.

@@ -47,7 +47,7 @@ class UpdateQueries:
         newest = self._epochs.newest
         self._refresh(newest)
         delta = self._delta(request)
-        if delta.to_make and not delta.ready:
+        if delta.to_make and (not delta.ready or delta.known_to < delta.revision):
             self._make(request.level, delta.missing or delta.outdated)
             delta = self._delta(request)
         return self._reply(request, delta, is_current=self._cache.epoch >= newest.number)
@@ -99,7 +99,7 @@ class UpdateQueries:
             if encoded is None or (data and encoded and size + len(encoded) > limit):
                 complete = False
                 break
-            revision = tile.revision
+            revision = min(tile.revision, delta.known_to)
             if tile.empty:
                 removed.append(tile.index)
             else:

@@ -6,6 +6,7 @@ import os
 import reprlib
 import sys
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -162,11 +163,17 @@ def _put(tables: dict[str, Any], names: Sequence[str], text: str) -> None:
 
 
 def _value(text: str) -> Any:
-    """Return the value that a text would be in a file; without quotes, it may be text itself."""
-    try:
+    """Return the value that a text would be in a file; without quotes, it may be text itself.
+
+    A number may also be written in ways that a file does not know, such as ``.05``.
+    """
+    with suppress(ValueError, RecursionError):
         return tomllib.loads(f"value = {text}")["value"]
-    except (ValueError, RecursionError):
-        return text
+    with suppress(ValueError):
+        return int(text)
+    with suppress(ValueError):
+        return float(text)
+    return text
 
 
 def _explain(details: ErrorDetails, origins: list[_Origin]) -> str:

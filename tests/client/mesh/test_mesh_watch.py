@@ -11,7 +11,7 @@ import pytest
 import triquad_client
 from support import servers
 from support.watched_ball import SETTINGS, digests, half, learn
-from triquad_client import Client, InvalidInputError
+from triquad_client import Client, InvalidInputError, RequestTimeoutError
 
 
 @pytest.fixture
@@ -127,6 +127,15 @@ def test_a_cap_makes_replies_small(learnt: Client) -> None:
         assert len(sizes) > 1
         assert max(sizes) <= max(20_000, largest)
         assert digests(capped) == digests(free)
+
+
+def test_who_waits_for_bandwidth_waits_no_longer_than_told(learnt: Client) -> None:
+    with learnt.watch_mesh(max_bytes_per_s=1) as watch:
+        assert watch.next(servers.WAIT_S).changed
+        with pytest.raises(RequestTimeoutError):
+            watch.catch_up(0.1)
+        assert watch.next(0.1) is None
+        assert len(watch.tiles) == 1
 
 
 def test_a_watch_that_waits_ends_when_something_comes(client: Client, endpoint: str) -> None:

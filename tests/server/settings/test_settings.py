@@ -91,7 +91,7 @@ def test_lengths_follow_the_leaf_from_wherever_it_is_set(
     path.write_text("[field]\nleaf_m = 0.05\n")
     in_python = Settings(field=FieldSettings(leaf_m=0.05))
     assert load_settings(path) == load_settings(assignments=["field.leaf_m=0.05"]) == in_python
-    monkeypatch.setenv("TRIQUAD_FIELD__LEAF_M", "0.05")
+    monkeypatch.setenv("TRIQUAD_FIELD__LEAF_M", ".05")
     assert load_settings() == in_python
     scan, mesh = in_python.scan, in_python.mesh
     assert (scan.range_min_m, scan.range_max_m, scan.thin_m) == (0.375, 12.5, 0.0125)
