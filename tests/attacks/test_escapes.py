@@ -11,7 +11,7 @@ from support.attackers.hostile_server import hostile_server, told
 from support.files.mapfile_edit import file_bytes, rewritten
 from support.maps.map_records import random_record
 from triquad_format.errors import MapFileError
-from triquad_format.wire import keys
+from triquad_format.wire import codec, keys
 from triquad_tools.commands import inspect, pack, replay, top
 from triquad_tools.console.lines import print_line
 
@@ -93,6 +93,10 @@ def test_words_of_a_server(harmless: Callable[[Main, list[str]], str]) -> None:
         )
         shown = harmless(top.main, ["--connect", server.endpoint, "--once"])
         assert "x1b" in shown
+        body = {"triquad": codec.PROTOCOL_VERSION, "kind": "ErrorReply"}
+        server.refusal = codec.msgpack.packb({**body, "code": SENT, "message": SENT})
+        harmless(top.main, ["--connect", server.endpoint, "--once"])
+        harmless(inspect.main, [server.endpoint])
 
 
 def test_letters_that_a_terminal_does_not_know_are_escapes() -> None:

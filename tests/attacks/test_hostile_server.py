@@ -77,6 +77,15 @@ def test_a_lie_is_refused_whole(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("data", [b"", b"\x1b[2J", b"\xc1" * 100, b"\xdf\xff\xff\xff\xff"])
+def test_bytes_that_are_no_message_are_refused(
+    server: HostileServer, client: Client, data: bytes
+) -> None:
+    server.lie = lambda _asked, _honest: data
+    with pytest.raises(BadReplyError):
+        client.status()
+
+
 @pytest.mark.parametrize("name", CHANGED)
 def test_values_out_of_bounds_are_refused_one_by_one(
     server: HostileServer, client: Client, name: str, tmp_path: Path

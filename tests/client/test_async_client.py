@@ -218,6 +218,20 @@ def test_a_cancelled_scan_that_the_network_holds_up_is_not_waited_for(tmp_path: 
         token.undeclare()
 
 
+def test_a_lack_of_threads_is_called_so_and_does_no_harm(endpoint: str) -> None:
+    async def use(client: AsyncClient) -> None:
+        before = threading.stack_size(2**46)  # more than there is: no thread can be started
+        try:
+            for _ in range(40):  # more than may go on at once
+                with pytest.raises(RuntimeError, match="can't start new thread"):
+                    await client.status()
+        finally:
+            threading.stack_size(before)
+        assert (await client.status()).map_name == servers.MAP
+
+    connected(endpoint, use)
+
+
 def test_a_connection_that_is_cancelled_while_it_opens_is_closed() -> None:
     endpoint = servers.free_endpoint()
 

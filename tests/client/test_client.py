@@ -24,6 +24,7 @@ from triquad_client import (
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import (
     ErrorReply,
+    FlushReply,
     SdfReply,
     SdfRequest,
 )
@@ -129,6 +130,25 @@ def test_a_reply_that_never_comes_is_a_timeout() -> None:
         with pytest.raises(RequestTimeoutError, match=r"query/sdf within 0\.2 s"):
             client.query_sdf(CLOUD)
         held[0].drop()
+
+
+def test_a_scan_that_stays_out_of_the_map_is_not_waited_for_without_end() -> None:
+    def answer(query: zenoh.Query, key: str) -> None:
+        with query:
+            query.reply(key, codec.encode(FlushReply(False, 0, 0, 0, None)))
+
+    with (
+        servers.answering({keys.FLUSH: answer}) as endpoint,
+        triquad_client.connect(endpoint) as client,
+    ):
+        client.publish_scan(CLOUD, POSE)
+        with pytest.raises(RefusedError, match=r"scan 0 .* not in the map after 0\.2 s") as caught:
+            client.flush(0.2)
+        assert caught.value.code == "timeout"
+        with pytest.raises(RequestTimeoutError, match=r"still learns after 0\.2 s"):
+            client.settle(0.2)
+        with pytest.raises(InvalidInputError, match="timeout_s = "):
+            client.settle(np.nan)
 
 
 def test_a_query_whose_epoch_goes_starts_again_and_gives_up_after_three_tries() -> None:

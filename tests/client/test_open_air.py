@@ -82,12 +82,13 @@ def test_surfaces_stay_where_later_rays_return_nothing() -> None:
         assert statuses(client, [[9.0, 0, 0]]) == [Status.FREE], "what lies behind was crossed"
 
 
-def test_points_beyond_the_range_show_the_space_up_to_it() -> None:
+def test_points_beyond_the_range_and_none_show_the_space_up_to_it() -> None:
     with servers.service_and_client(open_settings(short={"range_max_m": 8.0})) as client:
-        client.publish_scan([[0, 0, 9], [0, 3e30, 0], [3, 0, 0]], POSE, source="short")
-        asked = [[0, 0, 7.9], [0, 0, 8.5], [0, 7.9, 0], [3, 0, 0]]
+        points, no_return = [[0, 0, 9], [0, 3e30, 0], [3, 0, 0]], [[0, -1, 0]]
+        client.publish_scan(points, POSE, source="short", no_return=no_return)
+        asked = [[0, 0, 7.9], [0, 0, 8.5], [0, 7.9, 0], [3, 0, 0], [0, -7.9, 0], [0, -8.5, 0]]
         expected = [Status.FREE, Status.UNKNOWN, Status.FREE, Status.SURFACE]
-        assert statuses(client, asked) == expected
+        assert statuses(client, asked) == [*expected, Status.FREE, Status.UNKNOWN]
         assert client.status().points_dropped == {"too_far": 2}
 
 

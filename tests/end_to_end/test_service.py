@@ -275,6 +275,30 @@ def test_a_checkpoint_restores_the_same_answers(tmp_path):
         assert client.status().last_checkpoint.epoch == before.epoch == info.epoch
 
 
+def test_a_checkpoint_writes_what_changed_and_the_next_server_has_all(tmp_path):
+    def stored_bytes():
+        return sum(path.stat().st_size for path in tmp_path.rglob("*") if path.is_file())
+
+    def learn_at(client, *places_m):
+        for pose[0, 3] in places_m:
+            client.publish_scan(servers.sphere(), pose)
+        client.settle(servers.WAIT_S)
+
+    pose = np.eye(4)
+    probes = np.concatenate([servers.sphere(200) + [x_m, 0, 0] for x_m in (0, 75)])
+    with servers.service_and_client(store=tmp_path) as client:
+        learn_at(client, 0, 25, 50, 75)
+        whole, whole_bytes = client.checkpoint(), stored_bytes()
+        learn_at(client, 75)
+        part = client.checkpoint()
+        assert part.bytes > whole.bytes / 2
+        assert stored_bytes() - whole_bytes < whole.bytes / 2
+        before = client.query_sdf(probes)
+    with servers.service_and_client(store=tmp_path) as client:
+        assert client.status().last_checkpoint.epoch == part.epoch == before.epoch
+        assert_same_map(before, client.query_sdf(probes))
+
+
 def test_a_reset_while_the_last_checkpoint_is_written_is_not_acknowledged(tmp_path, monkeypatch):
     replies = []
     write = Store.write

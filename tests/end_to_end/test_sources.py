@@ -75,6 +75,9 @@ def test_the_newest_scan_lies_in_the_map_frame(client):
     sent = servers.sphere(500) @ pose(9000.0, -7)[:3, :3].T + (9000.0, -7, 0)
     apart = np.linalg.norm(newest.points[:, None] - sent, axis=2).min(axis=1)
     assert apart.max() < 1e-5
+    some = client.sources(max_points=100).sources["default"].newest
+    assert len(np.unique(some.points, axis=0)) == len(some.points) == 100
+    assert client.sources(max_points=0).sources["default"].newest.points.shape == (0, 3)
 
 
 def test_refused_scans_leave_no_trace(client):

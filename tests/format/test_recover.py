@@ -37,6 +37,7 @@ from triquad_format.mapfile.parts.part import (
     VERTICES,
 )
 from triquad_format.mapfile.reader import read_map_file
+from triquad_format.records import morton
 from triquad_format.records.crop import without_training
 from triquad_format.records.region import seen_voxels
 from triquad_format.records.status import Status
@@ -134,6 +135,27 @@ def test_a_lost_part_is_named_and_all_else_is_there(recovered: Recover, topic: s
         assert not recovery.complete
         assert recovery.parts_intact == recovery.parts_listed - 1
         assert_answers(recovery)
+
+
+def test_outside_of_the_boxes_that_are_told_nothing_changes(recovered: Recover) -> None:
+    """Also where surface was seen across the border of the box, and right beside it."""
+    rng = np.random.default_rng(0)
+    leaves = np.concatenate([np.full((300, 1), 255.0), rng.uniform(0, 512, (300, 2))], axis=1)
+    seen = random_record(6, settings=SQUARES, points=4000).regions[0].evidence
+    region = dataclasses.replace(RECORD.regions[0], evidence=seen, training=None)
+    record = dataclasses.replace(RECORD, regions=(region,))
+    data = file_bytes(record)
+    recovery = recovered(flipped(data, first_chunk(data, VERTICES).middle))
+    (loss,) = recovery.losses
+    blocks = 8.0 * morton.decode(seen.codes, 3)
+    places = np.tile(np.concatenate([blocks, blocks + 7, leaves]), (10, 1))
+    places += rng.uniform(-1, 2, places.shape)
+    points = SQUARES.region_corner(region.index) + places * SQUARES.leaf_m
+    points = points[((points < loss.minimum) | (points > loss.maximum)).any(axis=1)]
+    assert len(points) > 1000
+    before, after = (RecordedView(one).query(points) for one in (record, recovery.record))
+    np.testing.assert_array_equal(after.sdf, before.sdf)
+    np.testing.assert_array_equal(after.status, before.status)
 
 
 @pytest.mark.parametrize("topic", [TRAINING, MOMENTS, SAMPLES, RAYS])

@@ -1,5 +1,6 @@
 """Meshes of map files, without a server."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +65,14 @@ def test_surface_is_where_the_mesh_has_faces() -> None:
     beside = np.abs(points[:, :2]).max(axis=1) > SEEN_M + 0.05
     assert not has[beside].any()
     assert 0.4 < has[~beside].mean() < 0.5, "margins are on a third of all sides"
+
+
+def test_far_regions_are_meshed_as_near_ones() -> None:
+    def faces_at(index: int) -> int:
+        region = dataclasses.replace(RECORD.regions[0], index=(index, 0, 0))
+        return len(mesh_of(dataclasses.replace(RECORD, regions=(region,)), cell_m=0.2).faces)
+
+    assert faces_at(2**31 - 1) == faces_at(0) > 10_000
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Followers of the mesh, over the loopback: only what changed travels, and all hold the same."""
 
 import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -9,9 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import triquad_client
+import zenoh
 from support import servers
 from support.watched_ball import SETTINGS, digests, half, learn
 from triquad_client import Client, InvalidInputError, RequestTimeoutError
+from triquad_format.wire import keys
 
 
 @pytest.fixture
@@ -116,15 +119,16 @@ def test_a_watch_of_a_box_has_the_tiles_that_meet_it(learnt: Client) -> None:
         assert (mesh.vertices[mesh.faces].mean(axis=1)[:, :2] >= 0.2).all()
 
 
-def test_a_cap_makes_replies_small(learnt: Client) -> None:
+def test_a_cap_makes_replies_small_and_rare(learnt: Client) -> None:
     with learnt.watch_mesh() as free, learnt.watch_mesh(max_bytes_per_s=20_000) as capped:
         free.catch_up()
         largest = max(tile.size_bytes for tile in free.tiles.values())
-        sizes = []
+        started, sizes = time.monotonic(), []
         while not capped.complete:
             update = capped.next(servers.WAIT_S)
             sizes.append(update.size_bytes)
         assert len(sizes) > 1
+        assert sum(sizes[:-1]) <= 20_000 * (time.monotonic() - started)
         assert max(sizes) <= max(20_000, largest)
         assert digests(capped) == digests(free)
 
@@ -195,6 +199,24 @@ def test_a_restarted_server_is_followed_anew(tmp_path: Path) -> None:
         fresh.catch_up()
         assert digests(watch) == digests(fresh)
         assert watch.known_tiles().server != known.server
+
+
+def test_a_server_that_does_not_answer_is_an_error_and_the_tiles_stay(learnt: Client) -> None:
+    with learnt.watch_mesh() as watch:
+        watch.catch_up()
+        known = watch.known_tiles()
+    silent: list[zenoh.Query] = []
+    answers = {keys.TILE_UPDATES: lambda query, _: silent.append(query)}
+    with (
+        servers.answering(answers) as endpoint,
+        triquad_client.connect(endpoint, timeout_s=0.5) as other,
+        other.watch_mesh(known=known) as watch,
+    ):
+        with pytest.raises(RequestTimeoutError):
+            watch.next(0.0)
+        assert watch.tiles.keys() == known.tiles.keys()
+        for query in silent:
+            query.drop()
 
 
 def test_iteration_ends_with_the_watch(learnt: Client) -> None:

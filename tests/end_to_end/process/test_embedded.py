@@ -103,6 +103,30 @@ def test_a_last_checkpoint_that_cannot_be_written_is_an_error(tmp_path):
         client.status()
 
 
+def test_an_exception_passes_and_what_was_reset_can_be_taken_back(tmp_path):
+    def reset_and_fail():
+        with triquad_server.serve(store=tmp_path, settings=servers.SMALL) as server:
+            servers.learn(server.client())
+            raise KeyError(server.client().reset().kept_epoch)
+
+    with pytest.raises(KeyError) as caught:
+        reset_and_fail()
+    assert statuses(tmp_path) == {Status.UNKNOWN}
+    (kept,) = caught.value.args
+    triquad_server.serve(store=tmp_path, settings=servers.SMALL, restore=kept).close()
+    assert statuses(tmp_path) == {Status.SURFACE}
+
+
+def test_two_servers_of_one_program_have_maps_of_their_own():
+    with (
+        triquad_server.serve(settings=servers.SMALL) as one,
+        triquad_server.serve(settings=servers.SMALL) as other,
+    ):
+        servers.learn(one.client())
+        assert one.client().status().regions == 1
+        assert other.client().status().regions == 0
+
+
 @pytest.mark.parametrize(
     ("arguments", "error", "text"),
     [

@@ -79,6 +79,16 @@ def test_what_cannot_be_placed_is_counted_by_its_reason(
     assert "use --clock arrival" in caplog.text
 
 
+def test_clouds_that_the_network_lost_are_counted(endpoint: str) -> None:
+    with bridging(endpoint) as bridged, robot(endpoint) as r2:
+        stand(r2, 0, 1)
+        r2.cloud(0.1, servers.sphere())
+        r2.wire.skip("/points", 2)
+        r2.cloud(0.4, servers.sphere())
+        bridged.wait_for(lambda: bridged.taken == 2)
+        assert bridged.bridge.dropped == {"not_received": 2}
+
+
 def test_clouds_that_are_no_scans_are_refused_with_the_reason(
     endpoint: str, caplog: pytest.LogCaptureFixture
 ) -> None:

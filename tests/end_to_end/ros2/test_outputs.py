@@ -4,7 +4,8 @@ import queue
 import struct
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,9 @@ from triquad_server.settings import MeshSettings
 from triquad_tools.commands import ros2
 from triquad_tools.commands.ros2 import bridge_options
 from triquad_tools.ros2.bridge import Bridge
+from triquad_tools.ros2.intake.scan_publisher import Place
+from triquad_tools.ros2.output.map_thread import PERIOD_S
+from triquad_tools.ros2.output.mesh_publisher import MeshPublisher
 from triquad_tools.ros2.topics import End, read_token
 
 MARKER = "visualization_msgs/msg/Marker"
@@ -240,6 +244,21 @@ def test_a_mesh_that_nobody_takes_does_not_hold_up_grids(server: str) -> None:
             assert grids.get(timeout=servers.WAIT_S)
         finally:
             taken.set()
+
+
+def test_markers_keep_to_their_rate_however_large_each_is(server: str) -> None:
+    sizes: list[int] = []
+    publisher: Any = SimpleNamespace(
+        is_followed=True,
+        has_newcomers=lambda: False,
+        put=lambda payload: sizes.append(len(payload)),
+    )
+    rounds = 0
+    with shown(server) as client, closing(MeshPublisher(publisher, client, 0, 1000)) as mesh:
+        while len(sizes) < 5:
+            mesh.publish(Place("world", np.zeros(3), stamp_ns=0))
+            rounds += len(sizes) > 1  # the first marker deletes all
+    assert sum(sizes[1:-1]) <= rounds * 1000 * PERIOD_S
 
 
 def test_nodes_and_bridges_find_the_topics_and_their_types(server: str) -> None:

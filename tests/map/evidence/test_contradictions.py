@@ -11,6 +11,7 @@ from triquad_map.evidence.contradictions import Disbelief
 from triquad_map.evidence.live_evidence import LiveEvidence
 from triquad_map.evidence.observations import outcome_counts
 from triquad_map.evidence.observed import Sighting
+from triquad_map.surface import SurfelKind, nothing_shown
 
 SIDE = 256
 RULE = Disbelief.of(scans=3, doubt=0.01)
@@ -88,6 +89,22 @@ def test_it_comes_back_and_goes_again_each_time(rng: np.random.Generator) -> Non
         assert watched.believed(wall) < 0.02
 
 
+def test_single_rays_that_end_where_a_wall_was_are_no_new_surface(
+    rng: np.random.Generator,
+) -> None:
+    watched, wall = Watched(), panel(rng, WALL_X)
+    for _ in range(10):
+        watched.scan(wall)
+    while watched.believed(wall) > 0:
+        watched.scan(behind(wall, 200.5))
+    found = []
+    for scan in range(watched.scans + 1, watched.scans + 5):
+        sighting = Sighting(SENSOR, 0.2, scan, scan=scan)
+        marks = watched.evidence.mark_surface(wall[:5], sighting)
+        found.append(watched.evidence.new_surface(marks, 10))
+    assert found == [0, 0, 5, 5]
+
+
 def test_ground_is_not_taken_back_by_rays_that_graze_it(rng: np.random.Generator) -> None:
     watched, up = Watched(), np.array([0.0, 0, 1.0])
     ground_z, first = SENSOR[2] - 8.3, None
@@ -135,6 +152,37 @@ def test_a_record_keeps_what_became_of_rays(rng: np.random.Generator) -> None:
     assert not np.median(passes[wall])
     again = LiveEvidence.from_record(SIDE, record).record()
     np.testing.assert_array_equal(again.outcomes, record.outcomes)
+
+
+def test_what_noise_spread_over_two_voxels_goes_as_well_after_a_restart(
+    rng: np.random.Generator,
+) -> None:
+    watched, x = Watched(), 59.95
+
+    def noisy() -> Doubles:
+        return panel(rng, x) + rng.uniform(-0.15, 0.15, (1500, 1)) * (1, 0, 0)
+
+    for _ in range(8):
+        watched.scan(noisy())
+    record = watched.evidence.record()
+    watched.evidence = LiveEvidence.from_record(SIDE, record)
+    voxels = seen_voxels(record, record.surface)
+    shown = nothing_shown(voxels)  # but the field shows the wall where it was
+    at_wall = voxels[:, 0] == 59
+    shown.kinds[at_wall], shown.normals[at_wall] = SurfelKind.DISC, (-1, 0, 0)
+    shown.offsets[at_wall, 0] = x - 59.5
+    watched.evidence.set_discs(voxels, shown)
+    middle = np.abs(voxels[:, 1:] + 0.5 - SENSOR[1:]).max(axis=1) < 6
+    spread = voxels[middle & (voxels[:, 0] == 60)]
+    gone, standing = (spread[spread[:, 2] % 2 == odd] for odd in (1, 0))
+    assert watched.believed(spread) == 1
+    for _ in range(20):
+        ends = noisy()
+        through = ends[:, 2].astype(np.int64) % 2 == 1  # every second row of voxels
+        ends[through] = behind(ends[through], 120.0)
+        watched.scan(ends)
+    assert watched.believed(gone) < 0.05
+    assert watched.believed(standing) == 1
 
 
 def test_nothing_goes_while_no_ray_passes(rng: np.random.Generator) -> None:

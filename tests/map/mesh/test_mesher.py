@@ -6,6 +6,7 @@ from support.maps.small_world import settings, settled_epoch, world
 from triquad_client import OfflineMap
 from triquad_format.records.status import Status
 from triquad_map.mesh.mesher import TileMesh, mesh_tile
+from triquad_map.triangles import Triangles, joined
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.tile_cache import tile_lattice
@@ -129,3 +130,18 @@ def test_every_tile_with_faces_is_listed_however_small_tiles_are() -> None:
         x, y, z = (np.floor(low / side).astype(int) + offset).tolist()
         if len(mesh_tile(epoch, (x, y, z), lattice).faces):
             assert (x, y, z) in listed
+
+
+def test_tiles_are_joined_without_cracks_however_their_numbers_are_rounded() -> None:
+    rng = np.random.default_rng(0)
+    edge = np.stack([np.full(2000, 6.4), rng.uniform(0, 6.4, 2000), np.full(2000, 0.3)], axis=1)
+    edge[:, 1] = np.round(edge[:, 1] / 1e-3) * 1e-3 + 0.5e-4  # on boundaries of the rounding
+    edge = np.unique(edge, axis=0)
+    copy = edge + rng.normal(0, 1e-7, edge.shape) * (0, 1, 0)
+    at = np.arange(len(edge) - 1)
+    fan = np.stack([at, at + 1, np.full(len(at), len(edge))], axis=1).astype(np.int32)
+    left = Triangles(np.concatenate([edge, [[6.0, 3.0, 0.5]]]), fan)
+    right = Triangles(np.concatenate([copy, [[6.8, 3.0, 0.5]]]), fan[:, ::-1])
+    mesh = joined([left, right], 6.4, box=(np.full(3, -np.inf), np.full(3, np.inf)))
+    assert len(mesh.vertices) == len(edge) + 2
+    assert len(mesh.faces) == 2 * len(at)

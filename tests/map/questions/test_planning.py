@@ -5,6 +5,7 @@ import pytest
 import triquad_client
 from support import servers
 from triquad_client import InvalidInputError, Status, Unknown, UnknownSpaceError
+from triquad_format.wire.limits import MAX_SEARCHES
 
 RADIUS_M = servers.RADIUS_M
 POSE = np.eye(4)
@@ -182,6 +183,14 @@ def test_parts_and_the_whole_agree(client):
     np.testing.assert_allclose(whole.surface_point[::100], some.surface_point, atol=1e-3)
     np.testing.assert_allclose(whole.unknown_distance_m[::100], some.unknown_distance_m, atol=1e-4)
     np.testing.assert_array_equal(whole.status[::100], some.status)
+
+
+def test_a_grid_of_several_requests_is_put_together_right(client):
+    grid = client.query_grid(((-6.0, -6, -1), (6.0, 6, 1)), cell_m=0.15)
+    assert grid.status.size > 4 * MAX_SEARCHES
+    some = client.query_distance(grid.shape.middles()[::501])
+    np.testing.assert_array_equal(grid.status.reshape(-1)[::501], some.status)
+    np.testing.assert_allclose(grid.distance_m.reshape(-1)[::501], some.distance_m, atol=1e-3)
 
 
 def test_no_points_are_no_error(client):

@@ -205,6 +205,12 @@ def test_requests_give_way_while_a_source_is_about_to_lose_scans(monkeypatch):
     assert not waiting.is_alive()
 
 
+def test_requests_give_way_to_scans_that_nobody_takes_for_a_moment_only():
+    queue = ScanQueue(limit=1)
+    queue.put(servers.scan(0))
+    queue.give_way()
+
+
 def test_scans_that_wait_are_bounded_in_bytes_over_all_sources():
     nbytes = servers.scan().points.nbytes
     queue = ScanQueue(100, 10 * nbytes)

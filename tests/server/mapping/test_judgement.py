@@ -49,6 +49,13 @@ def test_what_fits_worse_than_it_did_is_forgotten() -> None:
     assert places.forgotten_keys == place_keys(ROWS[-1:, :3], FIELD)
 
 
+def test_a_little_worse_again_and_again_is_forgotten_in_the_end() -> None:
+    judgement = Judgement(FIELD)
+    forgotten = [judged(judgement, off(SECOND, 0.001 * n)).forgotten.any() for n in range(20)]
+    assert not forgotten[1]
+    assert any(forgotten)
+
+
 def test_what_cannot_be_repaired_is_taken_as_it_is() -> None:
     judgement = Judgement(FIELD)
     judged(judgement, off(FIRST, 0.0))

@@ -17,9 +17,11 @@ from support.maps.small_world import (
 )
 from triquad_format.records.replay_rays import no_rays
 from triquad_format.records.status import Status
+from triquad_map.field_fit import in_cube
 from triquad_server.errors import ScanRefusedError
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.replay.kept_rays import RAY_BYTES
+from triquad_server.mapping.replay.ray_table import END
 from triquad_server.settings import Settings
 
 EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)
@@ -54,6 +56,18 @@ def test_an_epoch_does_not_change_while_training_goes_on() -> None:
     later = mapper.publish()
     assert later.number > epoch.number
     assert later.vertices > epoch.vertices
+
+
+def test_epochs_share_what_did_not_change_between_them() -> None:
+    mapper = mapper_of(world().scans[0])
+    mapper.train()
+    before = mapper.publish()
+    mapper.train()
+    pairs = zip(before.frozen_regions, mapper.publish().frozen_regions, strict=True)
+    ((old, new),) = [(old, new) for old, new in pairs if new is not old]  # what was trained
+    assert len(before.frozen_regions) > 1
+    assert new.evidence is old.evidence
+    assert new.engine.tree is old.engine.tree
 
 
 def test_a_refused_scan_changes_nothing() -> None:
@@ -144,6 +158,12 @@ def test_reset_forgets_a_box_and_everything() -> None:
     assert inside.any()
     assert (status[inside] == Status.UNKNOWN).all()
     assert (status[outside] == Status.SURFACE).mean() > 0.99
+    for region in mapper.regions:
+        for kept in (region.training.rays.pool, region.training.rays.held_out):
+            ends = kept.table.rows[:, END : END + 3]
+            ends = region.centre + ends[in_cube(ends, settings().field)]
+            forgotten = ((ends > low + 0.01) & (ends < high - 0.01)).all(axis=1)
+            assert not forgotten.any(), "rays that ended there are not trained on again"
     mapper.reset(*EVERYWHERE)
     assert mapper.publish().regions == 0
     assert mapper.rays_kept == 0

@@ -1,11 +1,15 @@
 """Tiles are made where the surface changed, and there alone."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.maps.exact_maps import SETTINGS, exact_map, flat
 from support.maps.meshed_ground import EVERYWHERE, MESH, bump, ground, make_all, surfaces
+from triquad_format.records.region import seen_voxels
 from triquad_format.wire.limits import LEVELS
 from triquad_map.mesh.tile_lattice import TileIndex
+from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.tile_cache import TileCache, tile_lattice
 from triquad_server.mesh.tile_level import TileBytes
@@ -50,6 +54,30 @@ def test_what_moves_by_less_than_the_tolerance_changes_nothing_until_it_adds_up(
     assert make_all(cache) == []
     cache.refresh(ground(flat(0.312)))
     assert len(make_all(cache)) > 100
+
+
+def cut(quarters: int) -> Epoch:
+    """A ground in whose last voxels towards greater x no ray ended so far from that side."""
+    (region,) = exact_map(flat(0.3)).regions
+    voxels = seen_voxels(region.evidence, region.evidence.surface)
+    margins = np.zeros((len(voxels), 6), np.uint8)
+    margins[voxels[:, 0] == voxels[:, 0].max(), 3] = quarters
+    return ground(flat(0.3), evidence=replace(region.evidence, margins=margins))
+
+
+def test_tiles_follow_where_within_voxels_the_surface_ends() -> None:
+    cache = TileCache(MESH, TEAM)
+    cache.refresh(cut(0))
+    first = make_all(cache)
+    last = max(x for x, _, _ in surfaces(cache))
+    at_edge = {index for index in first if index[0] == last}
+    for quarters, changes in ((1, False), (3, True), (2, False), (0, True)):
+        before = surfaces(cache)
+        cache.refresh(cut(quarters))
+        made = set(make_all(cache))
+        assert bool(made) == changes
+        assert made <= at_edge
+        assert not made or set(before) & at_edge <= made
 
 
 def test_surface_that_is_forgotten_goes_and_everybody_is_told() -> None:

@@ -5,6 +5,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from support import servers
 from triquad_format.errors import SettingsError
 from triquad_format.records.field_settings import FieldSettings
@@ -104,6 +106,13 @@ def test_a_length_that_is_given_follows_nothing() -> None:
     assert (settings.scan.thin_m, settings.scan.spread_m) == (0.02, 0.02)
     coarse = Settings(field=FieldSettings(leaf_m=0.4), mesh=MeshSettings(cell_m=0.1))
     assert (coarse.mesh.cell_m, coarse.mesh.reach_m) == (0.1, 0.04)
+
+
+@given(st.floats(0.01, 10.0), st.integers(6, 15))
+def test_what_follows_from_any_leaf_is_allowed(leaf_m: float, depth: int) -> None:
+    settings = Settings(field=FieldSettings(leaf_m=leaf_m, depth=depth))
+    assert Settings.model_validate(settings.model_dump()) == settings
+    assert settings.scan.thin_m == pytest.approx(leaf_m / 4)
 
 
 def test_for_another_field_lengths_follow_its_leaf_and_have_to_go_with_it() -> None:

@@ -157,6 +157,14 @@ def test_a_part_that_nothing_new_needs_is_no_reason_to_write(store):
     assert store.base_epoch == 2
 
 
+def test_another_part_under_a_name_is_found_out(store):
+    drive(store, 1)
+    one, other = (part_of(paths(store)[2], index) for index in ROW[:2])
+    one.write_bytes(other.read_bytes())
+    with pytest.raises(DamagedMapFileError, match=one.name):
+        read_map(paths(store)[2])
+
+
 @pytest.mark.parametrize("harm", [rot, Path.unlink], ids=["rotten", "missing"])
 def test_an_older_checkpoint_serves_where_a_part_of_the_newest_is_damaged(store, harm, caplog):
     records = drive(store, 2)

@@ -134,3 +134,15 @@ def test_a_map_that_was_restored_can_be_restored_back(tmp_path, caplog):
     store.restore(3)
     assert_same(store.newest().record, dataclasses.replace(records[3], epoch=5))
     store.close()
+
+
+def test_a_map_that_was_restored_can_be_restored_once_more(tmp_path, caplog):
+    with closing(Store(tmp_path, "lab", StoreSettings(keep=2))) as store:
+        records = drive(store, 1)
+        store.restore(1)
+        for epoch in range(4, 8):
+            store.write(changes(grown(epoch, epoch)))
+        store.restore(1)
+        assert "to go back there again, use --restore 3" in caplog.text
+        store.restore(3)
+        assert_same(store.newest().record, dataclasses.replace(records[1], epoch=8))

@@ -1,5 +1,7 @@
 """Tiles of the mesh of a ground that is moved, and what a cache has made of them."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from support.maps.exact_maps import SETTINGS, exact_map
@@ -46,6 +48,9 @@ def bump(where: float, height_m: float) -> Epoch:
     return ground(height)
 
 
-def ground(height: object) -> Epoch:
+def ground(height: object, **parts: object) -> Epoch:
+    """A ground of that height, of whose region some ``parts`` are others."""
     record = exact_map(height, epoch=next(_EPOCHS))  # type: ignore[arg-type]
+    region = replace(record.regions[0], **parts)  # type: ignore[arg-type]
+    record = replace(record, regions=(region,))
     return Mapper("test", Settings(field=SETTINGS, mesh=MESH), "cpu", record).publish()

@@ -76,6 +76,10 @@ class RmwZenoh:
         attachment = struct.pack("<qqB", self._sent[topic], T0, 16) + identity
         self._publishers[key].put(payload, attachment=attachment)
 
+    def skip(self, topic: str, count: int) -> None:
+        """As if ``count`` messages were lost on the way."""
+        self._sent[self._namespace + topic] += count
+
 
 class Bridge:
     """As zenoh-bridge-ros2dds publishes: the topic alone as the key, the type in a token."""
