@@ -80,13 +80,6 @@ def learn_all(mapper: Mapper) -> None:
         mapper.train()
 
 
-def learn_again(mapper: Mapper) -> None:
-    """Train as :func:`learn_all`, with what was removed meanwhile, found as it is published."""
-    while not mapper.settled:
-        learn_all(mapper)
-        mapper.publish()
-
-
 def sdf_error_cm(epoch: Epoch, probes: StreetProbes) -> float:
     """Return the mean error of the signed distance at points near the surface."""
     return 100 * score_street(epoch.query, probes).sdf_error_m

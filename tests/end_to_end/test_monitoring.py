@@ -232,7 +232,7 @@ def test_while_the_disk_is_full_it_goes_on_mapping_and_says_so(tmp_path, argumen
         servers.learn(client, 1)
         with no_space(server.process.pid):
             server.process.send_signal(signal.SIGTERM)
-            assert server.wait() == 5, "whoever started it hears of it"
+            assert server.wait() == 5, "the program that started it hears of it"
     assert f"what was mapped since epoch {later.epoch} is lost" in server.log
     assert read_map(later.path).epoch == later.epoch
     assert not list((tmp_path / "store").rglob("*.tmp"))

@@ -1,7 +1,6 @@
 """The service with a real map, asked by the real client over the loopback."""
 
 import math
-import shutil
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
@@ -9,19 +8,14 @@ import numpy as np
 import pytest
 import triquad_client
 from support import servers
-from triquad_client import InvalidInputError, RefusedError, Status
-from triquad_format.mapfile.reader import read_map
+from triquad_client import InvalidInputError, Status
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import (
     FlushReply,
     FlushRequest,
-    MapChunk,
-    MapChunkRequest,
-    ResetRequest,
     ServerStatus,
 )
 from triquad_server.settings import ServiceSettings
-from triquad_server.store.store import Store
 
 POSE = np.eye(4)
 PROBES = np.concatenate([servers.sphere(50, radius) for radius in (2.0, 3.9, 4.0, 4.1)])
@@ -217,115 +211,3 @@ def test_the_status_is_published(endpoint):
     assert status.map_name == servers.MAP
     assert status.memory_bytes > 2**20
     assert str(sample.encoding) == keys.encoding(ServerStatus)
-
-
-def assert_same_map(before, after):
-    assert after.epoch >= before.epoch
-    assert np.array_equal(after.status, before.status)
-    assert np.allclose(after.sdf, before.sdf, rtol=0, atol=2e-3)  # features in half precision
-
-
-def test_a_downloaded_map_is_the_map(client, tmp_path):
-    servers.learn(client)
-    client.settle(servers.WAIT_S)
-    path = tmp_path / "map.triquad"
-    info = client.download_map(path)
-    assert path.stat().st_size == info.bytes
-    record = read_map(path)
-    assert record.epoch == info.epoch == client.status().epoch
-    assert len(record.regions) == 1
-    assert record.regions[0].training is None
-    assert client.download_map(path) == info
-    client.download_map(path, training=True)
-    assert read_map(path).regions[0].training is not None
-    assert [entry.name for entry in tmp_path.iterdir()] == ["map.triquad"]
-
-
-def test_chunks_of_other_files_or_beyond_the_end_are_refused(client, endpoint, tmp_path):
-    info = client.download_map(tmp_path / "map.triquad")
-    with servers.raw_session(connect=endpoint) as session:
-        peer = servers.RawPeer(session)
-        assert peer.refusal(keys.MAP_CHUNK, MapChunkRequest("00" * 32, 0, 10)) == "chunk_gone"
-        for offset, length in ((-1, 10), (info.bytes, 10), (2**62, 10), (0, 0), (0, -1)):
-            request = MapChunkRequest(info.sha256, offset, length)
-            assert peer.refusal(keys.MAP_CHUNK, request) == "bad_request"
-        data = (tmp_path / "map.triquad").read_bytes()
-        for length, end in ((5, 8), (2**62, None)):
-            answer = peer.ask(keys.MAP_CHUNK, codec.encode(MapChunkRequest(info.sha256, 3, length)))
-            assert codec.decode(MapChunk, answer).data == data[3:end]
-
-
-def test_without_a_store_checkpoints_are_refused_and_the_status_says_so(client):
-    with pytest.raises(RefusedError, match="without a store") as caught:
-        client.checkpoint()
-    assert caught.value.code == "store"
-    assert "not kept" in client.status().store_error
-
-
-def test_a_checkpoint_restores_the_same_answers(tmp_path):
-    with servers.service_and_client(store=tmp_path) as client:
-        servers.learn(client)
-        client.settle(servers.WAIT_S)
-        info = client.checkpoint()
-        assert client.checkpoint() == info
-        assert client.status().last_checkpoint == info
-        before = client.query_sdf(PROBES, gradient=True)
-    with servers.service_and_client(store=tmp_path) as client:
-        assert_same_map(before, client.query_sdf(PROBES, gradient=True))
-        assert client.status().last_checkpoint.epoch == before.epoch == info.epoch
-
-
-def test_a_checkpoint_writes_what_changed_and_the_next_server_has_all(tmp_path):
-    def stored_bytes():
-        return sum(path.stat().st_size for path in tmp_path.rglob("*") if path.is_file())
-
-    def learn_at(client, *places_m):
-        for pose[0, 3] in places_m:
-            client.publish_scan(servers.sphere(), pose)
-        client.settle(servers.WAIT_S)
-
-    pose = np.eye(4)
-    probes = np.concatenate([servers.sphere(200) + [x_m, 0, 0] for x_m in (0, 75)])
-    with servers.service_and_client(store=tmp_path) as client:
-        learn_at(client, 0, 25, 50, 75)
-        whole, whole_bytes = client.checkpoint(), stored_bytes()
-        learn_at(client, 75)
-        part = client.checkpoint()
-        assert part.bytes > whole.bytes / 2
-        assert stored_bytes() - whole_bytes < whole.bytes / 2
-        before = client.query_sdf(probes)
-    with servers.service_and_client(store=tmp_path) as client:
-        assert client.status().last_checkpoint.epoch == part.epoch == before.epoch
-        assert_same_map(before, client.query_sdf(probes))
-
-
-def test_a_reset_while_the_last_checkpoint_is_written_is_not_acknowledged(tmp_path, monkeypatch):
-    replies = []
-    write = Store.write
-
-    def reset_meanwhile(store, changes, undoes=""):
-        with servers.raw_session(connect=endpoint) as session:
-            request = ResetRequest(np.full(3, -np.inf), np.full(3, np.inf))
-            replies.append(servers.RawPeer(session).ask(keys.RESET, codec.encode(request)))
-        return write(store, changes, undoes)
-
-    with servers.running_service(store=tmp_path) as endpoint:
-        with triquad_client.connect(endpoint) as client:
-            servers.learn(client)
-        monkeypatch.setattr(Store, "write", reset_meanwhile)
-    assert replies == [None]
-
-
-def test_a_store_that_fails_does_not_stop_the_map(tmp_path):
-    with servers.service_and_client(store=tmp_path) as client:
-        servers.learn(client)
-        shutil.rmtree(tmp_path / servers.MAP)
-        (tmp_path / servers.MAP).write_text("in the way")
-        with pytest.raises(RefusedError, match="cannot be written"):
-            client.checkpoint()
-        assert "cannot be written" in client.status().store_error
-        assert servers.learn(client, 1).taken == 3
-        (tmp_path / servers.MAP).unlink()
-        (tmp_path / servers.MAP).mkdir()
-        assert client.checkpoint().epoch > 0
-        assert client.status().store_error is None

@@ -112,7 +112,7 @@ class TileLevel:
         ready: list[CachedTile] = []
         missing: list[TileIndex] = []
         outdated: list[TileIndex] = []
-        owed = revision + 1  # the least revision of what is lacked, and to be made again
+        lacked_from = revision + 1  # the least revision that is lacked and made again
         inside = self._indices[self.lattice.meets(self._indices, low, high)]
         for x, y, z in inside.tolist():
             index = (x, y, z)
@@ -124,7 +124,7 @@ class TileLevel:
             if self.clean(index) is None:
                 outdated.append(index)
                 if unknown:  # if it turns out to be as it was, it keeps its revision
-                    owed = min(owed, tile.revision)
+                    lacked_from = min(lacked_from, tile.revision)
             elif unknown and (not tile.empty or known_to or index in known):
                 ready.append(tile)
         ready.sort(key=lambda tile: tile.revision)
@@ -136,7 +136,7 @@ class TileLevel:
             sorted(missing),
             outdated=outdated,
             revision=revision,
-            known_to=owed - 1,
+            known_to=lacked_from - 1,
         )
 
     def borders_around(self, index: TileIndex) -> dict[TileIndex, TileBorder]:

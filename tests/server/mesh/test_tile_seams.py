@@ -140,7 +140,7 @@ def test_tiles_made_at_different_times_are_one_mesh(level: int) -> None:
         low, high = np.array([0.0, -8, -2]), np.array([10.0, 8, 6])
         wanted = cache.delta(level, low, high, 0, {})
         some_kept += len(wanted.ready)
-        while wanted.to_make:  # also those that no longer fit what was made beside them
+        while wanted.to_make:  # also those that no longer fit their new neighbours
             for index in wanted.to_make[::-1]:
                 cache.make(level, index)
             wanted = cache.delta(level, low, high, 0, {})

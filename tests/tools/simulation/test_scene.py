@@ -44,7 +44,7 @@ def _near_surface(scene: Scene, count: int, seed: int) -> np.ndarray:
 
 @pytest.mark.parametrize("name", SOLIDS)
 def test_a_solid_lies_where_it_should_and_tells_the_way_to_its_nearest_surface(name: str) -> None:
-    """Slopes of one and feet on the surface: so the distance is that to the nearest point."""
+    """Slopes of one, and nearest points on the surface: so distances are those to these points."""
     solid, known = SOLIDS[name]
     scene = Scene((solid,), BOUNDS)
     cos, sin = np.cos(solid.yaw), np.sin(solid.yaw)
@@ -53,8 +53,8 @@ def test_a_solid_lies_where_it_should_and_tells_the_way_to_its_nearest_surface(n
     assert scene.sdf(np.array([CENTRE]))[0] < -0.3
     points = np.random.default_rng(1).uniform(-1.8, 1.8, (5_000, 3))
     gradients = scene.gradient(points)
-    feet = points - scene.sdf(points)[:, None] * gradients
-    assert np.abs(scene.sdf(feet)).max() < 1e-6
+    nearest = points - scene.sdf(points)[:, None] * gradients
+    assert np.abs(scene.sdf(nearest)).max() < 1e-6
     np.testing.assert_allclose(np.linalg.norm(gradients, axis=1), 1.0, atol=1e-9)
     assert _gradient_error(scene, points, gradients) < 0.005
 

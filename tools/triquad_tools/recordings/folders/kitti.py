@@ -1,4 +1,4 @@
-"""What folders in the style of KITTI odometry hold beside their scans and ``poses.txt``.
+"""Reads what folders in the style of KITTI have in addition to scans and ``poses.txt``.
 
 ``times.txt`` has seconds, one a line. In ``calib.txt`` the line ``Tr:`` is ``camera_from_lidar``:
 the poses are then those of the camera, as KITTI gives them.
