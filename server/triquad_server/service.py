@@ -165,15 +165,16 @@ class Service:
         serve, health = self._operations.serve, self.health
         answers = Answers(self._epochs.view, QuestionLimits())
         for name, kind in QUESTIONS.items():
-            serve(name, kind, answers.answer, max_bytes=MAX_QUESTION_BYTES)
+            lane = Lane.LONG_QUESTIONS if name == keys.GRID else Lane.QUESTIONS
+            serve(name, kind, answers.answer, lane, MAX_QUESTION_BYTES)
         changes = ChangeQueries(self._epochs, self._surface, health.server)
         sources = SourceQueries(self._trails, health.server)
         mesh = TileQueries(self._epochs, tiles)
         serve(keys.CHANGES, ChangesRequest, changes.changes)
         serve(keys.SOURCES, SourcesRequest, sources.sources)
         serve(keys.TILE_LIST, TileListRequest, mesh.tiles)
-        serve(keys.MESH, MeshRequest, mesh.mesh)
-        serve(keys.MAP_CHUNK, MapChunkRequest, downloads.chunk)
+        serve(keys.MESH, MeshRequest, mesh.mesh, Lane.LONG_QUESTIONS)
+        serve(keys.MAP_CHUNK, MapChunkRequest, downloads.chunk, Lane.LONG_QUESTIONS)
 
         updates = UpdateQueries(self._epochs, tiles, health.server)
         serve(keys.TILE_UPDATES, TileUpdatesRequest, updates.updates, Lane.MESH, MAX_REQUEST_BYTES)

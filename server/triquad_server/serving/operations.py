@@ -36,6 +36,10 @@ class Lane(Enum):
     """The operations that share a queue and its workers."""
 
     QUESTIONS = "questions"
+    LONG_QUESTIONS = "long_questions"
+    """The lane of questions about many places, which take a tenth of a second: short ones, such as
+    a planner's, do not wait for them, and mapping is not slowed down."""
+
     ADMINISTRATION = "administration"
     """The lane of what takes no time: it is answered however many queries wait."""
 
@@ -46,8 +50,20 @@ class Lane(Enum):
     """The lane of checkpoints and map files, which take seconds, one after the other."""
 
 
-_WORKERS = {Lane.QUESTIONS: max(2, THREADS), Lane.ADMINISTRATION: 2, Lane.MESH: 1, Lane.FILES: 1}
+_WORKERS = {
+    Lane.QUESTIONS: max(2, THREADS),
+    Lane.LONG_QUESTIONS: max(2, THREADS),
+    Lane.ADMINISTRATION: 2,
+    Lane.MESH: 1,
+    Lane.FILES: 1,
+}
 """The threads of each lane; for questions there is one for each core."""
+
+_UNHURRIED = (Lane.LONG_QUESTIONS, Lane.MESH, Lane.FILES)
+"""The lanes whose work is long, and done at the priority of mapping."""
+
+_LONG_BYTES = 32_768
+"""A question of more bytes is long: some 2,700 points, which take a server 10 ms."""
 
 
 @dataclass(frozen=True)
@@ -136,11 +152,11 @@ class Operations:
     def _queue(self, lane: Lane, requests_each: int) -> RequestQueue[Request]:
         """Return a queue with workers, whose threads are started when they are needed."""
         workers = _WORKERS[lane]
-        nice = NICENESS if lane in (Lane.MESH, Lane.FILES) else 0  # their work is long
+        nice = NICENESS if lane in _UNHURRIED else 0
         pool = ThreadPoolExecutor(workers + MOST_SENDING, lane.value, lower_priority, (nice,))
         self._pools.append(pool)
         return RequestQueue(
-            lambda request: submit(pool, self._work, request),
+            lambda request: submit(pool, self._work, lane, request),
             workers=workers,
             requests_each=requests_each,
             nbytes=_QUEUE_BYTES,
@@ -158,8 +174,11 @@ class Operations:
     def _take(self, key: str, query: zenoh.Query) -> None:
         """Queue a request, or refuse it."""
         operation = self._operations[key]
-        queue = self._queues[operation.lane]
         source = self._sessions.source(query, MAX_WAIT_S)
+        lane, nbytes = operation.lane, 0 if query.payload is None else len(query.payload)
+        if lane is Lane.QUESTIONS and nbytes > _LONG_BYTES:
+            lane = Lane.LONG_QUESTIONS
+        queue = self._queues[lane]
         request = Request(query, key, operation.counts, source.owner, source.deadline_s, queue.send)
         if request.size > operation.max_bytes:
             text = f"{request.size} bytes exceed the limit of {operation.max_bytes}: split it"
@@ -171,20 +190,19 @@ class Operations:
                 text = "too many requests wait already, most of them of this client; try later"
                 self._refusals.send(excess, "busy", text)
 
-    def _work(self, request: Request) -> None:
-        operation = self._operations[request.key]
+    def _work(self, lane: Lane, request: Request) -> None:
         try:
             request.begin()
-            if operation.lane is Lane.QUESTIONS:
+            if lane is Lane.LONG_QUESTIONS:
                 self._give_way()
             self._check(request)
-            operation.answer(request)
+            self._operations[request.key].answer(request)
         except RefusedError as error:
             request.refuse(error.code, error.message)
         except Exception as error:
             request.fail(error)
         finally:
-            self._queues[operation.lane].finish(request)
+            self._queues[lane].finish(request)
 
     def _check(self, request: Request) -> None:
         """Refuse a request whose client no longer waits."""

@@ -1,0 +1,49 @@
+"""Each operation has a lane: what is long keeps nobody waiting whose question is short."""
+
+import threading
+from contextlib import closing
+
+import numpy as np
+from support.servers import MAP, WAIT_S, free_endpoint, raw_session
+from triquad_format.wire import codec, keys
+from triquad_format.wire.messages import SdfReply, SdfRequest
+from triquad_server.serving.operations import Operations
+from triquad_server.settings import ServiceSettings
+
+LONG, SHORT = 4_000, 100
+
+
+def question(count: int) -> bytes:
+    points = np.zeros((count, 3), np.float32)
+    return codec.encode(SdfRequest(np.zeros(3), points, False, 0))
+
+
+def answer(count: int) -> SdfReply:
+    return SdfReply(
+        epoch=1, sdf=np.zeros(count, np.float32), status=np.zeros(count, np.uint8), gradient=None
+    )
+
+
+def test_short_questions_are_answered_while_any_number_of_long_ones_are_worked_at() -> None:
+    endpoint, key = free_endpoint(), keys.operation_key(MAP, keys.SDF)
+    begun, end = threading.Semaphore(0), threading.Event()
+
+    def work(request: SdfRequest) -> SdfReply:
+        if len(request.points) == LONG:
+            begun.release()
+            end.wait(WAIT_S)
+        return answer(len(request.points))
+
+    with (
+        raw_session("peer", listen=endpoint) as session,
+        closing(Operations(session, MAP, ServiceSettings())) as operations,
+        raw_session(connect=endpoint) as client,
+    ):
+        operations.serve(keys.SDF, SdfRequest, work, max_bytes=10**6)
+        waiting = [client.get(key, payload=question(LONG), timeout=WAIT_S) for _ in range(8)]
+        assert begun.acquire(timeout=WAIT_S)
+        (reply,) = client.get(key, payload=question(SHORT), timeout=WAIT_S)
+        assert reply.ok is not None
+        assert not end.is_set()
+        end.set()
+        assert all(reply.ok is not None for replies in waiting for reply in replies)
