@@ -15,7 +15,7 @@ from triquad_server.epochs.history import EpochHistory
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper_thread import MapperThread
-from triquad_server.process.memory import resident_bytes
+from triquad_server.process.memory import give_back_free, resident_bytes
 from triquad_server.serving.operation_counts import OperationCounts
 from triquad_server.store.checkpoint_writer import CheckpointWriter
 
@@ -155,6 +155,8 @@ class Heartbeat:
                 _log.exception("the status could not be published")
                 continue
             if beat % _BEATS_PER_LOG_LINE == 0:
+                if status.settled:
+                    give_back_free()
                 self._log_progress(status)
 
     def _log_progress(self, status: ServerStatus) -> None:

@@ -13,7 +13,7 @@ import triquad_client
 import triquad_server
 from support import servers
 from triquad_client import Client, RefusedError
-from triquad_format.mapfile.checkpoint import Checkpoint, write_checkpoint
+from triquad_format.mapfile.checkpoint import Checkpoint
 from triquad_format.mapfile.checkpoint_folder import checkpoint_files
 from triquad_format.mapfile.reader import read_map, read_map_file
 from triquad_format.mapfile.writer import MapFileInfo
@@ -87,20 +87,6 @@ def test_the_map_of_before_outlives_resets_and_checkpoints_without_end(
         assert np.array_equal(client.query_sdf(PROBES).status, before.status)
 
 
-def test_what_was_learnt_while_the_map_is_being_kept_is_kept_too(tmp_path: Path) -> None:
-    """Scans stream in all the while: each is in the kept map, or in the new one."""
-    with servers.service_and_client(store=tmp_path) as client:
-        for _ in range(3):
-            servers.learn(client, scans=1)
-            for _ in range(10):
-                client.publish_scan(servers.sphere(3000), np.eye(4))
-            reply = client.reset()
-            assert reply.kept_epoch is not None
-            # No epoch lies between the one that is kept and the one that is empty.
-            assert reply.epoch == reply.kept_epoch + 1
-            client.flush(servers.WAIT_S)
-
-
 def test_a_reset_is_refused_where_the_map_cannot_be_kept(tmp_path: Path) -> None:
     with served(tmp_path) as (server, client):
         servers.learn(client)
@@ -118,11 +104,9 @@ def test_a_reset_is_refused_where_the_map_cannot_be_kept(tmp_path: Path) -> None
     assert len(read_map(file.path).regions) == 1
 
 
-@pytest.mark.parametrize("works", [0, 1], ids=["the map fails", "what came meanwhile fails"])
-def test_nothing_is_reset_where_any_of_it_cannot_be_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, works: int
+def test_nothing_is_reset_where_the_map_cannot_be_kept_and_mapping_goes_on_while_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The map is written, then what was learnt meanwhile is."""
     servers.compiled()
     settings = StoreSettings(keep=2, period_s=0)
     small = servers.SMALL.model_copy(update={"store": settings})
@@ -132,20 +116,18 @@ def test_nothing_is_reset_where_any_of_it_cannot_be_kept(
         triquad_client.connect(server.endpoint) as robot,
     ):
         servers.learn(client)
-        written = []
+        taken = []
 
-        def write(path: Path, checkpoint: Checkpoint) -> MapFileInfo:
-            written.append(path)
-            if len(written) > works:
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        def fail(path: Path, checkpoint: Checkpoint) -> MapFileInfo:
             robot.publish_scan(servers.sphere(300, 2.0), np.eye(4))
-            robot.flush(servers.WAIT_S)
-            return write_checkpoint(path, checkpoint)
+            taken.append(robot.flush(servers.WAIT_S).taken)
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-        monkeypatch.setattr("triquad_server.store.store.write_checkpoint", write)
+        monkeypatch.setattr("triquad_server.store.store.write_checkpoint", fail)
         with pytest.raises(RefusedError, match="nothing was reset.*No space left"):
             client.reset()
         monkeypatch.undo()
+        assert taken == [1]
         assert client.status().regions > 0
         reply = client.reset()
         assert client.status().regions == 0

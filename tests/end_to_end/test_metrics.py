@@ -85,6 +85,7 @@ def test_memory_and_time_are_told_by_part(client):
         "surfels",
         "normals",
         "surface_history",
+        "tile_cache",
     ):
         assert metrics.memory_bytes[part] > 0, part
     assert sum(metrics.memory_bytes.values()) < metrics.resident_bytes

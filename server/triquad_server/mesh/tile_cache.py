@@ -15,6 +15,7 @@ from triquad_map.mesh.mesher import mesh_tile
 from triquad_map.mesh.tile_lattice import TileBorder, TileIndex, TileLattice
 
 from triquad_server.epochs.epoch import Epoch
+from triquad_server.mesh.answered_tiles import AnsweredTiles
 from triquad_server.mesh.surface_changes import SurfaceChanges
 from triquad_server.mesh.tile_level import CachedTile, TileBytes, TileDelta, TileLevel
 from triquad_server.settings import MeshSettings
@@ -47,11 +48,12 @@ class TileCache:
         self._view: ComposedView | None = None  # epoch from which tiles are made
         self.revision = 0  # number of times that bytes of any tile came to differ
         self._bytes = TileBytes(settings.cache_bytes)
+        self.answered = AnsweredTiles()  # those of queries, which need not fit their neighbours
 
     @property
     def nbytes(self) -> int:
         """Return the bytes of the encoded tiles that are kept."""
-        return self._bytes.size
+        return self._bytes.size + self.answered.nbytes
 
     def lattice(self, level: int) -> TileLattice:
         """Return where the tiles of a level lie."""

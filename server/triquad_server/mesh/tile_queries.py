@@ -7,12 +7,14 @@ from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.wire.limits import MAX_FILL_M, MAX_TILES_ASKED, TILE_INDEX_LIMIT
 from triquad_format.wire.mesh_messages import MeshReply, MeshRequest, TileList, TileListRequest
 from triquad_format.wire.tile_codec import encode_tile
+from triquad_map.composition.composed_view import ComposedView
 from triquad_map.mesh.mesher import mesh_tile
 from triquad_map.mesh.tile_lattice import TileLattice, check_level
 from triquad_map.questions.checks import check_box
 
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.history import EpochHistory
+from triquad_server.mesh.answered_tiles import AnsweredTile, TileRequest
 from triquad_server.mesh.tile_cache import TileCache
 
 MAX_TILES = 1_000_000
@@ -63,20 +65,29 @@ class TileQueries:
         epoch = self._epochs.get(request.epoch)
         # In the answering thread alone: for a box full of tiles, other threads make more of them.
         view, lattice = epoch.with_split(), self._cache.lattice(request.level)
-        meshes = [
-            mesh_tile(view, (x, y, z), lattice, fill_m=request.fill_m)
+        tiles = [
+            self._tile(view, TileRequest(request.level, (x, y, z), request.fill_m), lattice)
             for x, y, z in request.tiles.tolist()
         ]
-        data = [encode_tile(mesh.surface) for mesh in meshes]
-        filled = np.concatenate([mesh.filled for mesh in meshes]).astype(np.uint8)
+        filled = np.concatenate([tile.filled for tile in tiles])
         return MeshReply(
             epoch=epoch.number,
             tile_side_m=lattice.tile_side_m,
             cell_m=lattice.cell_m,
-            sizes=np.array([len(tile) for tile in data]),
-            data=b"".join(data),
+            sizes=np.array([len(tile.data) for tile in tiles]),
+            data=b"".join(tile.data for tile in tiles),
             filled=filled if request.fill_m > 0 else None,
         )
+
+    def _tile(self, view: ComposedView, request: TileRequest, lattice: TileLattice) -> AnsweredTile:
+        """Return a tile as it was answered before, or make it."""
+        kept = self._cache.answered.get(view.epoch, request)
+        if kept is not None:
+            return kept
+        mesh = mesh_tile(view, request.index, lattice, fill_m=request.fill_m)
+        made = AnsweredTile(encode_tile(mesh.surface), mesh.filled.astype(np.uint8))
+        self._cache.answered.put(view.epoch, request, made)
+        return made
 
 
 def _check_tiles(tiles: Ints) -> None:

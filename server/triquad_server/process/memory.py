@@ -37,3 +37,14 @@ def give_back_early() -> None:
         options(_M_ARENA_MAX, _ARENAS)
         options(_M_MMAP_THRESHOLD, _LARGE_BYTES)
         options(_M_TRIM_THRESHOLD, 2 * _LARGE_BYTES)
+
+
+def give_back_free() -> None:
+    """Return the memory that is free between what is in use to the system: some milliseconds.
+
+    Small arrays of many threads lie side by side. At rest with 100 m of street a server kept 80 of
+    520 MB for nothing.
+    """
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError, AttributeError):
+            ctypes.CDLL(None).malloc_trim(0)

@@ -11,7 +11,6 @@ from triquad_format.wire.metrics_messages import CheckpointMetrics
 from triquad_map.compiled.team import lower_priority
 
 from triquad_server.errors import LastCheckpointError, MapperStoppedError, StoreError
-from triquad_server.mapping.map_snapshot import MapSnapshot
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.process.threads import NICENESS
 from triquad_server.store.store import Store
@@ -42,7 +41,7 @@ class CheckpointWriter:
         self._metrics = CheckpointMetrics(0, 0, None, None)
         self._ended_s: float | None = None  # when the last was written, monotonic
         self._timer = threading.Thread(target=self._write_regularly, name="checkpoints")
-        self.writing = threading.RLock()  # locked while anything is written
+        self._writing = threading.RLock()  # locked while anything is written
         self.last = last
         self.error = None if store else _NO_STORE
 
@@ -50,11 +49,6 @@ class CheckpointWriter:
     def has_store(self) -> bool:
         """Return whether there is a store to write checkpoints to."""
         return self._store is not None
-
-    @property
-    def base_epoch(self) -> int | None:
-        """As of :class:`Store`; only for who has locked ``writing``."""
-        return self._opened.base_epoch
 
     def start(self) -> None:
         """Begin to write checkpoints, while the map changes and on request."""
@@ -100,66 +94,51 @@ class CheckpointWriter:
 
     def found_damaged(self, name: str) -> None:
         """Write all of the map again, if the newest checkpoint needs the file ``name``."""
-        with self.writing:
-            if self._opened.forget_base(name):
+        with self._writing:
+            if self._store is not None and self._store.forget_base(name):
                 _log.warning(
                     "the newest checkpoint needs %s: all of the map is written again", name
                 )
                 self._write_if_changed()
 
-    def write(self) -> CheckpointInfo:
-        """Write what changed, as :meth:`answer` does.
+    def write(self, undoes: str = "") -> CheckpointInfo:
+        """Write what changed since the last checkpoint, and return that one if nothing did.
+
+        A checkpoint that ``undoes`` something is written even if nothing changed.
 
         Raises:
             StoreError: it cannot be written, or there is no store.
         """
         if self._store is None:
             raise StoreError(_NO_STORE)
-        with self.writing:
-            base = self.base_epoch
-            return self.write_changes(self._mapper.call(lambda mapper: mapper.snapshot_since(base)))
+        with self._writing:
+            base, last = self._store.base_epoch, self.last
+            snapshot = self._mapper.call(lambda mapper: mapper.snapshot_since(base))
+            # The base is the last checkpoint, as long as its file and parts are there.
+            if not undoes and last is not None and last.epoch == snapshot.epoch.number == base:
+                return last
+            started = time.monotonic()
+            try:
+                changes = snapshot.changes()
+                del snapshot  # the records have all of it, and memory is shortest now
+                info = self._store.write(changes, undoes)
+            except Exception as error:
+                self._metrics = replace(self._metrics, failed=self._metrics.failed + 1)
+                if isinstance(error, StoreError):
+                    self.error = str(error)
+                    _log.error("%s", error)
+                raise
+            self._record(info, time.monotonic() - started)
+            return info
 
-    def write_changes(self, snapshot: MapSnapshot, undoes: str = "") -> CheckpointInfo:
-        """Write what changed since the last checkpoint, for who has locked ``writing``.
-
-        A checkpoint that ``undoes`` something is written even if nothing changed.
-
-        Raises:
-            StoreError: it cannot be written.
-        """
-        last = self.last
-        # The base is the last checkpoint, as long as its file and parts are there.
-        if (
-            not undoes
-            and last is not None
-            and last.epoch == snapshot.epoch.number == self.base_epoch
-        ):
-            return last
-        started = time.monotonic()
-        try:
-            changes = snapshot.changes()
-            del snapshot  # the records have all of it, and memory is shortest now
-            info = self._opened.write(changes, undoes)
-        except Exception as error:
-            self._metrics = replace(self._metrics, failed=self._metrics.failed + 1)
-            if isinstance(error, StoreError):
-                self.error = str(error)
-                _log.error("%s", error)
-            raise
+    def _record(self, info: CheckpointInfo, took_s: float) -> None:
+        """Record that a checkpoint was written."""
         self.last, self.error = info, None
         self._ended_s = time.monotonic()
         self._metrics = replace(
-            self._metrics,
-            written=self._metrics.written + 1,
-            last_duration_s=self._ended_s - started,
+            self._metrics, written=self._metrics.written + 1, last_duration_s=took_s
         )
         _log.info("checkpoint %s: epoch %d, %d bytes", info.path, info.epoch, info.bytes)
-        return info
-
-    @property
-    def _opened(self) -> Store:
-        assert self._store is not None, "nothing is written where there is no store"
-        return self._store
 
     def _write_regularly(self) -> None:
         lower_priority(2 * NICENESS)

@@ -43,49 +43,38 @@ class Resets:
             RefusedError: it is not a box; or the map as it is could not be kept, and was not reset.
         """
         check_box(request.minimum, request.maximum)
+        emptied = self._mapper.call(lambda mapper: self._forget_empty(mapper, request))
+        if emptied is not None:
+            return ResetReply(emptied, undo="the map was empty before")
         if not self._checkpoints.has_store or self._keep_resets == 0:
-            return self._unkept(request)
+            has_store = self._checkpoints.has_store
+            why = "store.keep_resets = 0" if has_store else "the server has no store"
+            kept, undo = None, f"the map before was not kept: {why}"
+        else:
+            kept = self._keep()
+            undo = (
+                f"epoch {kept}, the map before, is kept; to go back to it, stop the server and "
+                f"start it with --restore {kept}"
+            )
+        epoch = self._mapper.call(lambda mapper: self._forget(mapper, request))
+        _log.warning("the map was reset as of epoch %d: %s", epoch, undo)
+        return ResetReply(epoch, kept, undo)
+
+    def _keep(self) -> int:
+        """Write the map to a checkpoint that stays, and return its epoch; mapping goes on."""
         try:
-            with self._checkpoints.writing:
-                reply = self._keep_and_reset(request)
+            return self._checkpoints.write(_UNDOES).epoch
         except StoreError as error:
             raise RefusedError(
                 "store", f"nothing was reset, for the map as it is could not be kept: {error}"
             ) from error
-        if reply.kept_epoch is not None:
-            _log.warning("the map was reset as of epoch %d: %s", reply.epoch, reply.undo)
-        return reply
 
-    def _unkept(self, request: ResetRequest) -> ResetReply:
-        epoch = self._mapper.call(lambda mapper: self._forget(mapper, request))
-        has_store = self._checkpoints.has_store
-        why = "store.keep_resets = 0" if has_store else "the server has no store"
-        undo = f"the map before was not kept: {why}"
-        _log.warning("the map was reset as of epoch %d: %s", epoch, undo)
-        return ResetReply(epoch, undo=undo)
+    def _forget_empty(self, mapper: Mapper, request: ResetRequest) -> int | None:
+        """Do as :meth:`_forget` where nothing is mapped; return None where something is."""
+        return None if mapper.regions else self._forget(mapper, request)
 
     def _forget(self, mapper: Mapper, request: ResetRequest) -> int:
         """Forget what lies in the box; return the epoch that shows it. For the mapper's thread."""
         mapper.reset(request.minimum, request.maximum)
         self._trails.forget(request.minimum, request.maximum)
         return mapper.publish().number
-
-    def _keep_and_reset(self, request: ResetRequest) -> ResetReply:
-        """Write the map, and what was learnt meanwhile; then forget what lies in the box."""
-        checkpoints = self._checkpoints
-        if self._mapper.call(lambda mapper: len(mapper.regions)) > 0:
-            checkpoints.write()  # nearly all of it, while mapping goes on
-        base = checkpoints.base_epoch
-
-        def keep_and_forget(mapper: Mapper) -> ResetReply:
-            """Do so on the mapper's thread: no scan comes in between."""
-            if not mapper.regions:
-                return ResetReply(self._forget(mapper, request), undo="the map was empty before")
-            kept = checkpoints.write_changes(mapper.snapshot_since(base), _UNDOES).epoch
-            undo = (
-                f"epoch {kept}, the map before, is kept; to go back to it, stop the server and "
-                f"start it with --restore {kept}"
-            )
-            return ResetReply(self._forget(mapper, request), kept, undo)
-
-        return self._mapper.call(keep_and_forget)
