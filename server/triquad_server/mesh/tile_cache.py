@@ -135,7 +135,7 @@ class TileCache:
                 digest=digest,
                 border=mesh.border,
             )
-            tiles.tiles[index] = tile
+            tiles.put(tile)
             self._bytes.put((level, index), data)
         return tile
 
@@ -180,6 +180,6 @@ class TileCache:
                 moved = np.abs(view.distances(places) - border.values[near])
                 if 2 * np.count_nonzero(moved > self._settings.tolerance_m) > len(moved):
                     with self._lock:
-                        tiles.changed[other] = max(tiles.changed[other], view.epoch)
+                        tiles.touch(other, view.epoch)
                     continue
             yield border

@@ -80,12 +80,23 @@ class TileLevel:
         self.lattice = lattice
         self.tiles: dict[TileIndex, CachedTile] = {}  # as they were last made
         self.changed: dict[TileIndex, int] = {}  # epoch in which the surface last changed
+        self._stale: set[TileIndex] = set()  # those that do not show the current surface
         self._indices = np.zeros((0, 3), np.int64)  # of ``changed``
 
     def clean(self, index: TileIndex) -> CachedTile | None:
         """Return the tile if it shows the current surface; None if it has to be made."""
-        tile = self.tiles.get(index)
-        return tile if tile is not None and self.changed.get(index, 0) <= tile.made else None
+        return None if index in self._stale else self.tiles.get(index)
+
+    def touch(self, index: TileIndex, epoch: int) -> None:
+        """Record that the surface of a tile changed in ``epoch``."""
+        self.changed[index] = max(epoch, self.changed.get(index, 0))
+        self._stale.add(index)
+
+    def put(self, tile: CachedTile) -> None:
+        """Keep a tile that was made."""
+        self.tiles[tile.index] = tile
+        if self.changed.get(tile.index, 0) <= tile.made:
+            self._stale.discard(tile.index)
 
     def record(self, changes: Changes, half_m: float, epoch: int) -> None:
         """Record what changed in ``epoch``; voxels have sides of twice ``half_m``."""
@@ -96,7 +107,7 @@ class TileLevel:
         ]
         known = len(self.changed)
         for x, y, z in touched:
-            self.changed[x, y, z] = epoch
+            self.touch((x, y, z), epoch)
         if len(self.changed) > known:
             self._indices = np.array(list(self.changed), np.int64)
 
@@ -109,6 +120,9 @@ class TileLevel:
         revision: int,
     ) -> TileDelta:
         """Return :meth:`TileCache.delta`; ``revision`` is that of the newest tile of any level."""
+        if known_to == revision and not known and not self._stale:
+            # Nearly always so: not to look through all tiles, which may be many.
+            return TileDelta([], [], [], outdated=[], revision=revision, known_to=revision)
         ready: list[CachedTile] = []
         missing: list[TileIndex] = []
         outdated: list[TileIndex] = []
