@@ -56,8 +56,8 @@ class Campaign:
         self._ends_s = time.monotonic() + seconds
         try:
             with ThreadPoolExecutor(lanes) as pool:
-                running = [pool.submit(self._lane) for _ in range(lanes)]
                 try:
+                    running = [pool.submit(self._lane) for _ in range(lanes)]
                     for lane in running:
                         lane.result()
                 except BaseException:
