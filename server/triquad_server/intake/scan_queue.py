@@ -1,8 +1,10 @@
 """The queue of scans that wait for the mapper."""
 
 import threading
+import time
 from collections import Counter
 from collections.abc import Collection
+from typing import NamedTuple
 
 from triquad_format.wire.messages import Scan
 
@@ -17,16 +19,25 @@ _BEHIND = 0.25
 """A source falls behind if more than this share of its limit waits."""
 
 _PRESSED = 0.5
-"""Requests give way to scans once more than this share of a source's limit waits."""
+"""Questions give way to scans once more than this share of a source's limit waits,"""
+
+_WAITED_S = 0.5
+"""and the oldest has waited for so long. A source that sends hundreds of scans a second, of which
+most are lost whatever gives way, never waits for so long."""
 
 _GIVE_WAY_S = 0.05
-"""Each request waits this many seconds at most: it is late then, but scans that do not fit in the
+"""Each question waits this many seconds at most: it is late then, but scans that do not fit in the
 queue are lost."""
 
 _MAX_BYTES = 100_000_000
 """The bytes of the scans of all sources that wait; of the source that has most, the oldest goes."""
 
 _SCAN_BYTES = 2_000  # memory of a scan in addition to its points
+
+
+class _WaitingScan(NamedTuple):
+    scan: Scan
+    arrived_s: float  # monotonic
 
 
 class ScanQueue:
@@ -44,7 +55,7 @@ class ScanQueue:
         self.points_dropped: Counter[str] = Counter()  # of scans that are in the map, by reason
         self.received_bytes = 0  # of all messages of scans that arrived
         self._taken = threading.Condition()
-        self._scans: FairQueue[Scan] = FairQueue(
+        self._scans: FairQueue[_WaitingScan] = FairQueue(
             limit * MAX_SOURCES_WAITING, limit_bytes, limit, newest_go=False
         )
         self._in_hand = False
@@ -64,8 +75,9 @@ class ScanQueue:
             if reason is not None:
                 self.dropped[reason] += 1
                 return
-            for pushed_out in self._scans.put(Owner(scan.source), scan, _bytes_of(scan)):
-                self.ledger.push_out(pushed_out)
+            waiting = _WaitingScan(scan, time.monotonic())
+            for pushed_out in self._scans.put(Owner(scan.source), waiting, _bytes_of(scan)):
+                self.ledger.push_out(pushed_out.scan)
 
     def refuse(self, scan: Scan, reason: str, text: str) -> None:
         """Record that a scan that arrived is not queued."""
@@ -92,12 +104,15 @@ class ScanQueue:
         one is requested.
         """
         with self._taken:
-            scan = self._scans.take(
-                lambda scan: scan.source not in passed_over or self._falls_behind(scan.source)
+            waiting = self._scans.take(
+                lambda waiting: (
+                    waiting.scan.source not in passed_over
+                    or self._falls_behind(waiting.scan.source)
+                )
             )
-            self._in_hand = scan is not None
+            self._in_hand = waiting is not None
             self._taken.notify_all()
-            return scan
+            return None if waiting is None else waiting.scan
 
     def taken(self, scan: Scan, rays: ScanRays) -> None:
         """Record that a scan is in the map; ``rays`` are what of it is used."""
@@ -113,9 +128,15 @@ class ScanQueue:
     def give_way(self) -> None:
         """Return once no source is about to lose scans, or after a moment."""
         with self._taken:
-            self._taken.wait_for(
-                lambda: self._scans.most() <= _PRESSED * self._scans.limit_each, _GIVE_WAY_S
-            )
+            self._taken.wait_for(lambda: not self._is_pressed(), _GIVE_WAY_S)
+
+    def _is_pressed(self) -> bool:
+        """Return whether a source is about to lose scans that would not be lost otherwise."""
+        before_s = time.monotonic() - _WAITED_S
+        return any(
+            count > _PRESSED * self.limit and waiting.arrived_s < before_s
+            for waiting, count in self._scans.oldest()
+        )
 
     def _falls_behind(self, source: str) -> bool:
         return self._scans.count(source) > _BEHIND * self.limit

@@ -193,7 +193,7 @@ class Operations:
     def _work(self, lane: Lane, request: Request) -> None:
         try:
             request.begin()
-            if lane is Lane.LONG_QUESTIONS:
+            if lane in (Lane.QUESTIONS, Lane.LONG_QUESTIONS):
                 self._give_way()
             self._check(request)
             self._operations[request.key].answer(request)
