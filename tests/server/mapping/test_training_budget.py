@@ -62,3 +62,13 @@ def test_all_rays_together_fit_into_memory_at_any_size(voxels: int) -> None:
     share = FairShare.of(voxels, TRAINING)
     assert share.rays * voxels * RAY_BYTES <= TRAINING.pool_bytes * (1 + 1e-9)
     assert 0 < share.rays_share <= 1
+
+
+def test_the_rate_begins_high_and_ends_low_however_little_may_be_learnt() -> None:
+    budget = budget_of(rays=1000, most=500)
+    first = budget.next_step(100, kept_rays=1000)
+    assert first.rates.learning_rate == first.rates.young_rate == SETTINGS.learning_rate
+    for _ in range(4):
+        budget.spend(budget.next_step(100, kept_rays=1000))
+    last = budget.next_step(100, kept_rays=1000)
+    assert last.rates.learning_rate < 0.2 * SETTINGS.learning_rate

@@ -36,6 +36,9 @@ class FairShare:
 
 _LEAST_RATE = 0.02  # share of the learning rate with which the last samples are trained
 _COOLDOWN = 8.0  # samples left per ray below which the learning rate falls
+_COOLDOWN_SHARE = 0.5
+"""It does not fall before less than this share of the most that may be left is left: else, where
+little may be, it would begin low."""
 _REPAIR_SHARE = 0.5  # share of a batch that is drawn where the field has forgotten
 _REPAIR_VISITS = 16  # samples on each ray there
 _REPAIR_ROUNDS = 3
@@ -143,5 +146,5 @@ class TrainingBudget:
         It falls the later, the fewer the ``rays`` are from which there is something to learn: so
         what is new learns quickly where much has settled.
         """
-        enough = _COOLDOWN * max(1, rays)
+        enough = max(1.0, min(_COOLDOWN * rays, _COOLDOWN_SHARE * self._most))
         return min(1.0, max(_LEAST_RATE, (self.samples / enough) ** 2))
