@@ -19,11 +19,7 @@ _BEHIND = 0.25
 """A source falls behind if more than this share of its limit waits."""
 
 _PRESSED = 0.5
-"""Questions give way to scans once more than this share of a source's limit waits,"""
-
-_WAITED_S = 0.5
-"""and the oldest has waited for so long. A source that sends hundreds of scans a second, of which
-most are lost whatever gives way, never waits for so long."""
+"""Questions give way to scans once more than this share of a source's limit waits."""
 
 _GIVE_WAY_S = 0.05
 """Each question waits this many seconds at most: it is late then, but scans that do not fit in the
@@ -125,16 +121,19 @@ class ScanQueue:
         self.drop(reason)
         self.ledger.refuse(scan, text)
 
-    def give_way(self) -> None:
-        """Return once no source is about to lose scans, or after a moment."""
-        with self._taken:
-            self._taken.wait_for(lambda: not self._is_pressed(), _GIVE_WAY_S)
+    def give_way(self, waited_s: float = 0.0) -> None:
+        """Return once no source is about to lose scans, or after a moment.
 
-    def _is_pressed(self) -> bool:
-        """Return whether a source is about to lose scans that would not be lost otherwise."""
-        before_s = time.monotonic() - _WAITED_S
+        Sources whose oldest scan has waited for less than ``waited_s`` do not count: one that
+        floods loses most scans whatever gives way, and none of them waits for long.
+        """
+        with self._taken:
+            self._taken.wait_for(lambda: not self._is_pressed(waited_s), _GIVE_WAY_S)
+
+    def _is_pressed(self, waited_s: float) -> bool:
+        before_s = time.monotonic() - waited_s
         return any(
-            count > _PRESSED * self.limit and waiting.arrived_s < before_s
+            count > _PRESSED * self.limit and waiting.arrived_s <= before_s
             for waiting, count in self._scans.oldest()
         )
 

@@ -62,6 +62,10 @@ _WORKERS = {
 _UNHURRIED = (Lane.LONG_QUESTIONS, Lane.MESH, Lane.FILES)
 """The lanes whose work is long, and done at the priority of mapping."""
 
+_GIVING_WAY = {Lane.QUESTIONS: 0.5, Lane.LONG_QUESTIONS: 0.0}
+"""The lanes that give way to sources which are about to lose scans, and for how many seconds these
+scans have waited: a planner does not wait for a source that floods, a long question does."""
+
 _LONG_BYTES = 32_768
 """A question of more bytes is long: some 2,700 points, which take a server 10 ms."""
 
@@ -82,7 +86,7 @@ class Operations:
         session: zenoh.Session,
         map_name: str,
         settings: ServiceSettings,
-        give_way: Callable[[], None] = lambda: None,
+        give_way: Callable[[float], None] = lambda _: None,
     ) -> None:
         """Begin; ``give_way`` returns when a query may begin, as far as other work is concerned."""
         self._session = session
@@ -193,8 +197,8 @@ class Operations:
     def _work(self, lane: Lane, request: Request) -> None:
         try:
             request.begin()
-            if lane in (Lane.QUESTIONS, Lane.LONG_QUESTIONS):
-                self._give_way()
+            if lane in _GIVING_WAY:
+                self._give_way(_GIVING_WAY[lane])
             self._check(request)
             self._operations[request.key].answer(request)
         except RefusedError as error:

@@ -191,7 +191,6 @@ def test_a_source_is_passed_over_until_it_falls_behind():
 
 def test_questions_give_way_while_a_source_is_about_to_lose_scans(monkeypatch):
     monkeypatch.setattr(scan_queue, "_GIVE_WAY_S", servers.WAIT_S)
-    monkeypatch.setattr(scan_queue, "_WAITED_S", 0.0)
     queue = ScanQueue(limit=8)
     for sequence in range(4):
         queue.put(servers.scan(sequence))
@@ -208,18 +207,16 @@ def test_questions_give_way_while_a_source_is_about_to_lose_scans(monkeypatch):
 
 def test_questions_do_not_give_way_to_a_source_whose_scans_never_wait_long(monkeypatch):
     monkeypatch.setattr(scan_queue, "_GIVE_WAY_S", 10 * servers.WAIT_S)
-    monkeypatch.setattr(scan_queue, "_WAITED_S", 10 * servers.WAIT_S)
     queue = ScanQueue(limit=4)
     for sequence in range(100):
         queue.put(servers.scan(sequence))
-    waiting = threading.Thread(target=queue.give_way, daemon=True)
+    waiting = threading.Thread(target=queue.give_way, args=(10 * servers.WAIT_S,), daemon=True)
     waiting.start()
     waiting.join(servers.WAIT_S)
     assert not waiting.is_alive()
 
 
-def test_questions_give_way_to_scans_that_nobody_takes_for_a_moment_only(monkeypatch):
-    monkeypatch.setattr(scan_queue, "_WAITED_S", 0.0)
+def test_questions_give_way_to_scans_that_nobody_takes_for_a_moment_only():
     queue = ScanQueue(limit=1)
     queue.put(servers.scan(0))
     queue.give_way()
