@@ -1,4 +1,4 @@
-"""Keeps the mesh tiles that were answered with, for whoever asks for the same epoch next."""
+"""Keeps the mesh tiles that were answered with, for the next client that asks for their epoch."""
 
 import threading
 from dataclasses import dataclass
@@ -30,8 +30,8 @@ class AnsweredTile:
 class AnsweredTiles:
     """Keeps tiles of the newest epoch that was asked for any; safe for any thread.
 
-    Those that come first stay: whoever asks for a mesh asks for all of its tiles in their order,
-    so that the last would push out the first.
+    Those that come first stay: a client that asks for a mesh asks for all of its tiles in their
+    order, so that the last would push out the first.
     """
 
     def __init__(self) -> None:

@@ -21,7 +21,7 @@ from triquad_server.process.threads import NICENESS, submit
 from triquad_server.serving.client_sessions import ClientSessions
 from triquad_server.serving.operation_counts import OperationCounts
 from triquad_server.serving.refusal_sender import RefusalSender
-from triquad_server.serving.request import Request, RequestT
+from triquad_server.serving.request import Request, RequestT, payload_size
 from triquad_server.serving.request_queue import MOST_SENDING, RequestQueue
 from triquad_server.settings import ServiceSettings
 
@@ -179,10 +179,8 @@ class Operations:
         """Queue a request, or refuse it."""
         operation = self._operations[key]
         source = self._sessions.source(query, MAX_WAIT_S)
-        lane, nbytes = operation.lane, 0 if query.payload is None else len(query.payload)
-        if lane is Lane.QUESTIONS and nbytes > _LONG_BYTES:
-            lane = Lane.LONG_QUESTIONS
-        queue = self._queues[lane]
+        is_long = operation.lane is Lane.QUESTIONS and payload_size(query) > _LONG_BYTES
+        queue = self._queues[Lane.LONG_QUESTIONS if is_long else operation.lane]
         request = Request(query, key, operation.counts, source.owner, source.deadline_s, queue.send)
         if request.size > operation.max_bytes:
             text = f"{request.size} bytes exceed the limit of {operation.max_bytes}: split it"

@@ -18,6 +18,11 @@ _log = logging.getLogger(__name__)
 RequestT = TypeVar("RequestT", bound=Message)
 
 
+def payload_size(query: zenoh.Query) -> int:
+    """Return the number of bytes of a query's payload."""
+    return 0 if query.payload is None else len(query.payload)
+
+
 class Request:
     """A query that waits for its answer."""
 
@@ -47,8 +52,7 @@ class Request:
     @property
     def size(self) -> int:
         """The number of bytes of the payload."""
-        payload = self._query.payload
-        return 0 if payload is None else len(payload)
+        return payload_size(self._query)
 
     def begin(self) -> None:
         """Count the time that the request waited for a worker."""

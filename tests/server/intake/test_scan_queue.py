@@ -219,7 +219,10 @@ def test_questions_do_not_give_way_to_a_source_whose_scans_never_wait_long(monke
 def test_questions_give_way_to_scans_that_nobody_takes_for_a_moment_only():
     queue = ScanQueue(limit=1)
     queue.put(servers.scan(0))
-    queue.give_way()
+    waiting = threading.Thread(target=queue.give_way, daemon=True)
+    waiting.start()
+    waiting.join(servers.WAIT_S)
+    assert not waiting.is_alive()
 
 
 def test_scans_that_wait_are_bounded_in_bytes_over_all_sources():
