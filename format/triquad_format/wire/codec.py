@@ -20,12 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triquad_format.errors import ProtocolVersionError, WireError
-from triquad_format.wire.structure import check_structure
+from triquad_format.wire.unpacking import unpacked
 
 PROTOCOL_VERSION = 1
 MAX_MESSAGE_BYTES = 256 * 2**20
-_MAX_WIRE_STRING_BYTES = 65_536
-_MAX_ITEMS = 65_536
 # To begin with: a refusal for want of memory must not want 256 KiB.
 _BUFFER_BYTES = 4096
 
@@ -152,15 +150,9 @@ def unpack_array(name: str, packed: object) -> NDArray[np.generic]:
 def _unpack_map(payload: bytes) -> dict[str, object]:
     if len(payload) > MAX_MESSAGE_BYTES:
         raise WireError(f"message of {len(payload)} bytes exceeds {MAX_MESSAGE_BYTES}")
-    check_structure(payload)
     try:
-        body = msgpack.unpackb(
-            payload,
-            max_str_len=_MAX_WIRE_STRING_BYTES,
-            max_array_len=_MAX_ITEMS,
-            max_map_len=_MAX_ITEMS,
-        )
-    except (ValueError, msgpack.exceptions.UnpackException) as error:
+        body = unpacked(payload)
+    except WireError as error:
         raise WireError(f"not a triquad message: {error}") from error
     if not isinstance(body, dict):
         raise WireError(f"not a triquad message: a {type(body).__name__}, not a map")

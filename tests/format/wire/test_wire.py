@@ -111,7 +111,7 @@ def array(dtype="<f4", shape=(2, 3), data=bytes(24)):
         array("<f4", (True, 3), bytes(12)),
         array("<f4", (2.0, 3)),
         array("<f4", None),
-        array("<f4", (1,) * 99, bytes(4)),
+        array("<f4", (1,) * 9, bytes(4)),
         {"dtype": "<f4"},
         [1, 2, 3],
         None,

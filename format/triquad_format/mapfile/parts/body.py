@@ -5,7 +5,6 @@ import reprlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,11 +19,9 @@ from triquad_format.mapfile.parts.part import (
 from triquad_format.records.arrays import Longs
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.wire.codec import ArraySpec, unpack_array
-from triquad_format.wire.structure import MAX_OBJECTS, check_structure
+from triquad_format.wire.unpacking import unpacked
 
 _MAX_REGION_INDEX = 2**31 - 1
-_MAX_ITEMS = 64
-_MAX_STRING_BYTES = 4096
 _TOPIC = re.compile(rb"[\x80-\x8f]\xa5topic[\xa0-\xbf](/triquad/[a-z]+)")
 """The beginning of a part: a short msgpack map, whose first key is ``topic``."""
 
@@ -35,7 +32,10 @@ def unpack_body(topic: str, payload: bytes) -> "PartBody":
     Raises:
         DamagedMapFileError: it is not a msgpack map, exceeds a limit, or is of another topic.
     """
-    part = PartBody(topic, _unpacked(topic, payload))
+    try:
+        part = PartBody(topic, unpacked(payload))
+    except WireError as error:
+        raise DamagedMapFileError(f"{topic}: {error}") from error
     part.expect("topic", topic)
     return part
 
@@ -44,20 +44,6 @@ def part_topic(payload: bytes) -> str | None:
     """Return the topic that a part names first; ``None``: it is no part."""
     match = _TOPIC.match(payload)
     return None if match is None else match[1].decode()
-
-
-def _unpacked(topic: str, payload: bytes) -> object:
-    try:
-        check_structure(payload, MAX_OBJECTS)
-        return msgpack.unpackb(
-            payload,
-            max_str_len=_MAX_STRING_BYTES,
-            max_array_len=_MAX_ITEMS,
-            max_map_len=_MAX_ITEMS,
-            max_ext_len=0,
-        )
-    except (WireError, ValueError, msgpack.exceptions.UnpackException) as error:
-        raise DamagedMapFileError(f"{topic}: not a msgpack map: {error}") from error
 
 
 class PartBody:

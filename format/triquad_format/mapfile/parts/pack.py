@@ -51,7 +51,6 @@ from triquad_format.records.region import (
 )
 from triquad_format.records.replay_rays import STEPS, ReplayRays
 from triquad_format.wire.codec import pack_array
-from triquad_format.wire.structure import binary_offsets
 
 SAMPLES_PER_PART = 1 << 17
 RAYS_PER_PART = 1 << 21
@@ -261,27 +260,31 @@ def _pack_rays(region: Region, rays: ReplayRays) -> Iterator[Part]:
 
 
 def seams(part: Part) -> list[int]:
-    """Return offsets in a valid part's payload at which byte planes of its arrays begin and end."""
+    """Return offsets in a valid part's payload at which byte planes of its arrays begin and end.
+
+    Where zeros come before zeros, they may be some bytes too small, which costs nothing.
+    """
     if not part.key.topic.startswith(PREFIX):
         return []
-    binaries = list(_binaries(msgpack.unpackb(part.payload, max_ext_len=0)))
-    if all(size < _MIN_SEAM_BYTES for size, _ in binaries):
-        return []
     offsets: list[int] = []
-    for place, (size, planes) in zip(binary_offsets(part.payload), binaries, strict=True):
+    at = 0
+    for data, planes in _binaries(msgpack.unpackb(part.payload)):
+        size = len(data)
         if size >= _MIN_SEAM_BYTES:
+            at = part.payload.index(data[:_MIN_SEAM_BYTES], at)
             step = size // planes if size >= planes * _MIN_SEAM_BYTES else size
-            offsets.extend(range(place.start, place.stop + 1, step))
+            offsets.extend(range(at, at + size + 1, step))
+            at += size
     return offsets
 
 
-def _binaries(value: object) -> Iterator[tuple[int, int]]:
-    """Yield size and number of byte planes of each binary in a body, in the payload's order."""
+def _binaries(value: object) -> Iterator[tuple[bytes, int]]:
+    """Yield each binary in a body, and its number of byte planes, in the payload's order."""
     if isinstance(value, bytes):
-        yield len(value), 1
+        yield value, 1
     elif isinstance(value, dict) and isinstance(value.get("data"), bytes):
         shuffled = value["dtype"] in ("|u1", "|i1") and value["shape"]
-        yield len(value["data"]), value["shape"][0] if shuffled else 1
+        yield value["data"], value["shape"][0] if shuffled else 1
     elif isinstance(value, (dict, list)):
         for item in value.values() if isinstance(value, dict) else value:
             yield from _binaries(item)
