@@ -70,7 +70,7 @@ class SourceCalls:
     def sources(self, since: SourceReport | None = None, max_points: int = 5_000) -> SourceReport:
         """Return where each source of scans has been, and its newest scan.
 
-        To follow them, give the report before: only what is new travels, and the report has all.
+        To follow them, give the report before: it comes back where nothing is new.
 
         Args:
             since: the report before; ``None``: nothing is known yet.
@@ -85,35 +85,20 @@ class SourceCalls:
         known = since or SourceReport(server="", revision=0, sources={})
         request = SourcesRequest(server=known.server, revision=known.revision, max_points=limit)
         reply = self._connection.ask(Ask(keys.SOURCES, request, SourcesReply, background=True))
-        goes_on = reply.server == known.server
-        if goes_on and reply.revision < known.revision:
-            raise BadReplyError(f"revision {reply.revision} comes after {known.revision}")
-        before = known.sources if goes_on else {}
-        found = {name: _source(name, state, before) for name, state in reply.sources.items()}
-        return SourceReport(reply.server, reply.revision, found)
+        if reply.sources is not None:
+            found = {name: _source(name, state) for name, state in reply.sources.items()}
+            return SourceReport(reply.server, reply.revision, found)
+        if (reply.server, reply.revision) != (known.server, known.revision):
+            raise BadReplyError(
+                f"nothing is new of server {known.server!r}, revision {known.revision}, says "
+                f"server {reply.server!r}, revision {reply.revision}"
+            )
+        return known
 
 
-def _source(name: str, state: SourceState, before: Mapping[str, ScanSource]) -> ScanSource:
-    """Return a source after what is new of it.
-
-    Raises:
-        BadReplyError: that does not fit with what was reported before.
-    """
+def _source(name: str, state: SourceState) -> ScanSource:
     newest = None if state.newest is None else _newest(state.newest)
-    if state.whole:
-        return ScanSource(name, state.scans, state.trail, pieces=state.pieces, newest=newest)
-    if name not in before:
-        raise BadReplyError(
-            f"source {name!r}: only what is new of it came, and nothing was known before"
-        )
-    old = before[name]
-    return ScanSource(
-        name,
-        state.scans,
-        trail=np.concatenate([old.trail, state.trail]),
-        pieces=np.concatenate([old.pieces, state.pieces]),
-        newest=newest or old.newest,
-    )
+    return ScanSource(name, state.scans, state.trail, pieces=state.pieces, newest=newest)
 
 
 def _newest(sample: ScanSample) -> NewestScan:

@@ -19,7 +19,7 @@ class SourceQueries:
         self._server = server
 
     def sources(self, request: SourcesRequest) -> SourcesReply:
-        """Return all sources, with what is new of them since the request's revision.
+        """Return all sources, if anything of them is new since the reply before.
 
         Raises:
             RefusedError: a field is out of range.
@@ -28,13 +28,8 @@ class SourceQueries:
             raise RefusedError(
                 "bad_request", f"max_points = {request.max_points}: use 0 to {MAX_SAMPLE_POINTS}"
             )
-        # The revision of another run of the server is ignored.
-        known = request.revision if request.server == self._server else 0
-        revision, sources = self._trails.since(known, request.max_points, MOST_POINTS)
-        if request.revision < 0 or known > revision:
-            raise RefusedError(
-                "bad_request",
-                f"revision = {request.revision} is not one that this server gave: use that of the "
-                "reply before, or 0",
-            )
+        revision = self._trails.revision  # first: what comes meanwhile is new the next time
+        if (request.server, request.revision) == (self._server, revision):
+            return SourcesReply(self._server, revision, None)
+        sources = self._trails.states(request.max_points, MOST_POINTS)
         return SourcesReply(self._server, revision, sources)
