@@ -11,7 +11,6 @@ with triquad.connect("tcp/127.0.0.1:7447") as client:
 from triquad_format import __version__
 from triquad_format.errors import InvalidInputError, MapFileError, RefusedError, TriquadError
 from triquad_format.records.status import Status
-from triquad_format.wire.mesh_messages import TileList
 from triquad_format.wire.messages import CheckpointInfo, FieldFit, MapInfo, ResetReply, ServerStatus
 from triquad_format.wire.metrics_messages import (
     CheckpointMetrics,
@@ -123,7 +122,6 @@ __all__ = [
     "Status",
     "SyncReport",
     "SyncedMap",
-    "TileList",
     "TimeHistogram",
     "TriquadError",
     "Unknown",

@@ -118,8 +118,6 @@ class AsyncClient(AsyncMapQueries):
     settle = awaited(Client.settle)
     changes = awaited(Client.changes)
     sources = awaited(Client.sources)
-    tiles = awaited(Client.tiles)
-    mesh_tile = awaited(Client.mesh_tile)
     mesh = awaited(Client.mesh)
     status = awaited(Client.status)
     metrics = awaited(Client.metrics)

@@ -51,7 +51,7 @@ def test_a_scan_of_which_no_ray_returned_shows_open_air_and_nothing_else() -> No
         ]
         status = client.status()
         assert (status.rays_kept, status.regions) == (0, 1), "nothing to learn, no far region"
-        assert client.tiles().tiles.shape == (0, 3)
+        assert client.mesh().faces.shape == (0, 3)
 
 
 def test_a_source_that_is_not_believed_shows_nothing() -> None:

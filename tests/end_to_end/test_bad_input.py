@@ -223,9 +223,8 @@ def test_a_request_for_another_map_gets_no_reply(asked):
     assert stranger.ask(keys.STATUS, codec.encode(StatusRequest())) is None
 
 
-def test_far_tiles_and_far_points_are_empty(client):
-    tile = client.mesh_tile(1_000_000, -1_000_000, 0)
-    assert len(tile.faces) == 0
+def test_what_is_far_is_empty(client):
+    assert len(client.mesh(((6.4e6, -6.4e6, 0), (6.5e6, -6.3e6, 9))).faces) == 0
     result = client.query_sdf([[1e9, 0, 0], [-1e9, 1e9, 1e9]], gradient=True)
     assert (result.status == triquad_client.Status.UNKNOWN).all()
     assert np.isnan(result.sdf).all()

@@ -5,10 +5,9 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-import pytest
 import triquad_client
 from support import servers
-from triquad_client import InvalidInputError, Status
+from triquad_client import Status
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import (
     FlushReply,
@@ -27,7 +26,6 @@ def test_an_empty_map_answers_that_it_knows_nothing(client):
     assert np.isnan(result.gradient).all()
     assert (result.status == Status.UNKNOWN).all()
     assert len(client.mesh().faces) == 0
-    assert len(client.tiles().tiles) == 0
 
 
 def test_what_was_flushed_shows_in_the_next_answer(client):
@@ -141,25 +139,17 @@ def test_a_query_of_no_points_tells_the_epoch(client):
 def test_tiles_make_one_mesh(client):
     servers.learn(client)
     client.settle(servers.WAIT_S)
-    listed = client.tiles()
-    assert len(listed.tiles) == len(listed.changed) > 1
     mesh = client.mesh()
     distance = np.linalg.norm(mesh.vertices, axis=1)
     assert np.abs(distance - servers.RADIUS_M).mean() < 0.2  # after little training
-    parts = [client.mesh_tile(*map(int, index)) for index in listed.tiles]
-    assert sum(len(part.faces) for part in parts) >= len(mesh.faces)
-    assert sum(len(part.vertices) for part in parts) > len(mesh.vertices)
-    steps = mesh.vertices / listed.tile_side_m
+    with client.watch_mesh() as watch:
+        watch.catch_up()
+        assert len(watch.tiles) > 1
+        steps = mesh.vertices / watch.tile_side_m
     border = mesh.vertices[(np.abs(steps - np.round(steps)) < 1e-6).any(axis=1)]
     assert len(border) > 100
     assert len(np.unique(np.round(border, 5), axis=0)) == len(border)
-    assert mesh.epoch == listed.epoch
-    with pytest.raises(InvalidInputError, match="y = 0.5: use a whole number"):
-        client.mesh_tile(0, 0.5, 0)
-    with pytest.raises(InvalidInputError, match="z = -1000001: use a whole number"):
-        client.mesh_tile(0, 0, -1_000_001)
-    with pytest.raises(InvalidInputError, match="x = .*: use a whole number"):
-        client.mesh_tile(np.int64(-(2**63)), 0, 0)
+    assert mesh.epoch == client.status().epoch
 
 
 def test_holes_of_a_mesh_are_filled_where_that_is_asked_for(client):

@@ -1,4 +1,4 @@
-"""Calls that fetch a surface as triangles, in the background of all else."""
+"""The call that fetches a surface as triangles, in the background of all else."""
 
 from collections.abc import Iterator
 
@@ -22,26 +22,9 @@ are filled, each may take a part of a second, and goes alone."""
 
 
 class MeshCalls:
-    """The calls that fetch the mesh, as it is now."""
+    """The call that fetches the mesh, as it is now."""
 
     _connection: Connection
-
-    def tiles(self, bounds: Bounds | None = None, level: int = 0) -> TileList:
-        """Return the mesh tiles that meet ``bounds``, with the epoch in which each last changed.
-
-        Args:
-            bounds: corners of a box, metres, map frame; ``None``: everywhere.
-            level: of detail: 0, 1 or 2, each with cells and tiles twice as large as the one before.
-        """
-        return self._list(bounds, level, fill_m=0.0)
-
-    def mesh_tile(self, x: int, y: int, z: int, level: int = 0) -> Mesh:
-        """Return the newest mesh of one tile of a level's lattice, as :meth:`tiles` names it."""
-        level, tiles = checks.level_of_detail(level), checks.tile_indices((x, y, z))
-        reply = self._connection.ask(_ask_mesh(tiles, NEWEST, level, fill_m=0.0))
-        decoder = TileDecoder(self._connection.max_download_bytes)
-        (tile,) = _decoded(reply, tiles, decoder, filled=False)
-        return tile
 
     def mesh(self, bounds: Bounds | None = None, level: int = 0, fill_m: float = 0.0) -> Mesh:
         """Return the mesh in ``bounds`` (faces by their centroids), its tiles joined, of one epoch.
@@ -56,8 +39,10 @@ class MeshCalls:
         fill_m = checks.within("fill_m", fill_m, MAX_FILL_M, least=0.0)
         each = 1 if fill_m > 0 else _TILES_EACH
 
+        request = TileListRequest(*box, NEWEST, level=level, fill_m=fill_m)
+
         def fetch() -> Mesh:
-            listed = self._list(bounds, level, fill_m)
+            listed = self._connection.ask(Ask(keys.TILE_LIST, request, TileList, background=True))
             join = TileJoin(listed.tile_side_m, box, marked=fill_m > 0)
             decoder = TileDecoder(self._connection.max_download_bytes)
             firsts = range(0, len(listed.tiles), each)
@@ -69,12 +54,6 @@ class MeshCalls:
             return Mesh.of(join.mesh(), listed.epoch)
 
         return retried("epoch_gone", fetch)
-
-    def _list(self, bounds: Bounds | None, level: int, fill_m: float) -> TileList:
-        minimum, maximum = checks.box(bounds)
-        level = checks.level_of_detail(level)
-        request = TileListRequest(minimum, maximum, NEWEST, level=level, fill_m=fill_m)
-        return self._connection.ask(Ask(keys.TILE_LIST, request, TileList, background=True))
 
 
 def _ask_mesh(tiles: Ints, epoch: int, level: int, fill_m: float) -> Ask[MeshReply]:

@@ -152,7 +152,7 @@ def test_a_watch_that_waits_ends_when_something_comes(client: Client, endpoint: 
         waiting = [threads.submit(watch.next, servers.WAIT_S) for watch in watches]
         with triquad_client.connect(endpoint) as other:
             assert len(other.query_sdf(servers.sphere(50)).sdf) == 50
-            other.tiles()
+            other.mesh()
             assert other.status().map_name == servers.MAP
             learn(other, half(-1))
         assert all(future.result().changed for future in waiting)
