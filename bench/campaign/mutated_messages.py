@@ -62,7 +62,7 @@ def good_requests() -> dict[str, list[Message]]:
         keys.RAYS: [RaysRequest(_ORIGIN, some * 0, way, 20.0, True, 0)],
         keys.GROUND: [GroundRequest(_ORIGIN, some, 5.0, 0)],
         keys.GRID: [GridRequest(_ORIGIN, 0.5, np.array([4, 4, 4], np.int32), 5.0, 0)],
-        keys.ALIGN: [AlignRequest(some, np.eye(4), 1.0, 5, 0)],
+        keys.ALIGN: [AlignRequest(some, np.eye(4), 1.0, 0)],
         keys.CHANGES: [ChangesRequest(1, "", *_BOX)],
         keys.SOURCES: [SourcesRequest("", 0, 10)],
         keys.TILE_LIST: [TileListRequest(*_BOX, 0)],

@@ -12,7 +12,7 @@ from triquad_client import Mesh
 from triquad_format.records.arrays import Bools, Doubles
 from triquad_map.mesh.marching_cubes import centroids
 from triquad_map.mesh.mesher import mesh_tile
-from triquad_map.questions.segments import SegmentOptions, segments
+from triquad_map.questions.segments import segments
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mesh.tile_cache import tile_lattice
 from triquad_server.settings import MeshSettings, Settings
@@ -50,7 +50,7 @@ _TRAIL_CLEAR_M = 0.35  # from anything static: no voxel of the trail touches it
 _GHOST_CLEAR_M = 0.2
 _AIR_M = 0.05
 _THIN_X_M, _THIN_Y_M = 6.0, -2.5  # next to the lane
-_ROBOT = SegmentOptions(radius_m=0.4, max_distance_m=1.0)
+_ROBOT_M, _REACH_M = 0.4, 1.0
 _ROBOT_Z_M = 0.6
 _WAY_M = 25  # of the lane, in which the car drove
 
@@ -125,7 +125,9 @@ class Look:
     def lane_blocked_m(self) -> int:
         """Metres of the lane that a robot cannot pass because of what it takes to be surface."""
         starts = np.array([(x, LANE_M, _ROBOT_Z_M) for x in range(_WAY_M)])
-        return int(segments(self.epoch, starts, starts + (1.0, 0, 0), _ROBOT).blocked.sum())
+        return int(
+            segments(self.epoch, starts, starts + (1.0, 0, 0), _ROBOT_M, _REACH_M).blocked.sum()
+        )
 
     @property
     def ghost_m2(self) -> float:

@@ -13,13 +13,12 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from triquad_format.errors import InvalidInputError
-from triquad_format.records.arrays import Doubles, Floats, Ints
+from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.wire.limits import (
     LEVELS,
     MAX_DISTANCE_M,
     MAX_POSITION_M,
     MIN_LENGTH_M,
-    TILE_INDEX_LIMIT,
 )
 from triquad_map.questions.distance import Unknown, UnknownLike
 from triquad_map.questions.grid import GridShape
@@ -134,37 +133,16 @@ def flag(name: str, value: bool) -> bool:
     return bool(value)
 
 
-def level_of_detail(level: int) -> int:
-    """Return ``level`` where the mesh has such a level of detail."""
-    if type(level) is not int or not 0 <= level < LEVELS:
-        raise InvalidInputError(f"level = {_shown(level)}: use 0 to {LEVELS - 1}")
-    return level
-
-
-def tile_indices(index: Sequence[int]) -> Ints:
-    """Return the index of one tile, as a row [1, 3] of several."""
-    for axis, number in zip("xyz", index, strict=True):
-        is_whole = isinstance(number, int | np.integer) and not isinstance(number, bool)
-        if not is_whole or not -TILE_INDEX_LIMIT <= number <= TILE_INDEX_LIMIT:
-            raise InvalidInputError(
-                f"{axis} = {_shown(number)}: use a whole number from -{TILE_INDEX_LIMIT} to "
-                f"{TILE_INDEX_LIMIT}, such as client.tiles() lists"
-            )
-    return np.array([index], np.int32)
-
-
-def count(name: str, value: int, most: int) -> int:
-    """Return ``value`` where it is a number of things, ``most`` at most."""
-    if type(value) is not int or not 0 <= value <= most:
-        raise InvalidInputError(f"{name} = {_shown(value)}: use 0 to {most}")
+def count(name: str, value: int, most: int, *, least: int = 0) -> int:
+    """Return ``value`` where it is a number of things, from ``least`` to ``most``."""
+    if type(value) is not int or not least <= value <= most:
+        raise InvalidInputError(f"{name} = {_shown(value)}: use {least} to {most}")
     return value
 
 
-def bytes_per_second(limit: int | None) -> int:
-    """Return a limit as it is sent: 0 is none."""
-    if limit is not None and (type(limit) is not int or limit < 1):
-        raise InvalidInputError(f"max_bytes_per_s = {limit!r}: use 1 or more, or None")
-    return limit or 0
+def level_of_detail(level: int) -> int:
+    """Return ``level`` where the mesh has such a level of detail."""
+    return count("level", level, LEVELS - 1)
 
 
 def finite_box(bounds: Bounds) -> tuple[Doubles, Doubles]:

@@ -19,7 +19,7 @@ from triquad_format.wire.messages import (
 )
 from triquad_format.wire.metrics_messages import MetricsRequest
 from triquad_format.wire.query_messages import ChangesRequest, SourcesRequest
-from triquad_map.questions.answers import Answers, QuestionLimits
+from triquad_map.questions.answers import Answers
 
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.epochs.surface_history import CHANGES_KEPT, SurfaceHistory
@@ -163,7 +163,7 @@ class Service:
     def _serve(self, tiles: TileCache, downloads: MapDownloads) -> None:
         """Answer the requests of clients from now on."""
         serve, health = self._operations.serve, self.health
-        answers = Answers(self._epochs.view, QuestionLimits())
+        answers = Answers(self._epochs.view)
         for name, kind in QUESTIONS.items():
             lane = Lane.LONG_QUESTIONS if name == keys.GRID else Lane.QUESTIONS
             serve(name, kind, answers.answer, lane, MAX_QUESTION_BYTES)

@@ -251,14 +251,16 @@ def test_unknown_parts_are_skipped_but_checked() -> None:
         read_bytes(other)
 
 
-def test_total_is_limited(tmp_path: Path) -> None:
+def test_total_is_limited(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     data = file_bytes(random_record(14, points=300))
     path = tmp_path / "map.triquad"
     path.write_bytes(data)
     for limit in (len(data) + 100, len(data) - 1):
+        monkeypatch.setattr("triquad_format.mapfile.manifest.MAX_MAP_BYTES", limit)
         with pytest.raises(TooLargeMapFileError, match="limit"):
-            read_map(path, max_bytes=limit)
-    assert read_map(path, max_bytes=10 * len(data)).regions
+            read_map(path)
+    monkeypatch.setattr("triquad_format.mapfile.manifest.MAX_MAP_BYTES", 10 * len(data))
+    assert read_map(path).regions
 
 
 READ_WITH_LITTLE_MEMORY = """

@@ -23,7 +23,7 @@ from triquad_format.wire.query_messages import (
     SpheresRequest,
 )
 from triquad_format.wire.reply import check_answers
-from triquad_map.questions.answers import Answers, QuestionLimits
+from triquad_map.questions.answers import Answers
 
 _POINTS = 60
 _LENGTHS_M = st.floats(1e-3, 100.0)
@@ -34,8 +34,10 @@ def answers():
     """Of a settled street."""
     world = small_world.world()
     epoch = small_world.settled_epoch()
-    limits = QuestionLimits(points=10**6, searches=10**6)
-    return Answers(lambda _: nullcontext(epoch), limits), world.hits
+    with pytest.MonkeyPatch.context() as patched:
+        for limit in ("MAX_QUERY_POINTS", "MAX_SEARCHES"):
+            patched.setattr(f"triquad_map.questions.answers.{limit}", 10**6)
+        yield Answers(lambda _: nullcontext(epoch)), world.hits
 
 
 def near_the_surface(rng, hits):
@@ -63,7 +65,7 @@ def questions(rng, hits, length_m):
     yield GridRequest(
         origin, float(rng.uniform(0.01, 0.5)), np.array([5, 4, 3], np.int32), length_m, 0
     )
-    yield AlignRequest(points, np.eye(4), min(length_m, 5.0), 5, 0)
+    yield AlignRequest(points, np.eye(4), min(length_m, 5.0), 0)
 
 
 @settings(max_examples=25, deadline=None)

@@ -23,7 +23,7 @@ from triquad_format.wire.query_messages import (
     SegmentsReply,
     SegmentsRequest,
 )
-from triquad_map.questions.align import FINE_POINTS, Alignment, AlignOptions, thinned
+from triquad_map.questions.align import FINE_POINTS, Alignment, thinned
 from triquad_map.questions.ground import Ground
 from triquad_map.questions.rays import RayRanges
 from triquad_map.questions.segments import Polyline, Segments, along_polyline
@@ -161,7 +161,7 @@ class WayQueries(Asking):
         few = thinned(cloud.astype(np.float64), FINE_POINTS).astype(np.float32)
         guess = rigid_pose(world_from_sensor_guess)
         reach_m = checks.within("max_distance_m", max_distance_m)
-        request = AlignRequest(few, guess, reach_m, AlignOptions.max_iterations, epoch)
+        request = AlignRequest(few, guess, reach_m, epoch)
         return Alignment(**vars(self._server.ask(Ask(keys.ALIGN, request, AlignReply))))
 
 

@@ -12,6 +12,7 @@ from triquad_format.errors import InvalidInputError, WireError
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.wire.limits import MAX_KNOWN_TILES
 from triquad_format.wire.mesh_messages import TileUpdates, TileUpdatesRequest
+from triquad_format.wire.reply import MAX_COUNT
 from triquad_format.wire.tile_codec import TileSurface, decode_tile, decoded_bytes
 from triquad_map.triangles import Triangles, joined
 
@@ -103,8 +104,11 @@ class FollowedMesh:
         """
         minimum, maximum = checks.box(bounds)
         checks.level_of_detail(level)
-        rate = checks.bytes_per_second(max_bytes_per_s)
-        empty = cls(minimum, maximum, level, min(rate or _REPLY_BYTES, _REPLY_BYTES), max_bytes)
+        reply_bytes = _REPLY_BYTES
+        if max_bytes_per_s is not None:
+            limit = checks.count("max_bytes_per_s", max_bytes_per_s, MAX_COUNT, least=1)
+            reply_bytes = min(limit, reply_bytes)
+        empty = cls(minimum, maximum, level, reply_bytes, max_bytes)
         if known is None:
             return empty
         if not isinstance(known, KnownTiles):

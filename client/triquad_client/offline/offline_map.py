@@ -133,18 +133,17 @@ class OfflineMap(MapQueries):
         """
         return self._tiles(cell_m, bounds, fill_m, whole=True).joined(report)
 
-    def mesh_tiles(self, cell_m: float | None = None, fill_m: float = 0.0) -> "MapTiles":
+    def mesh_tiles(self, cell_m: float | None = None) -> "MapTiles":
         """Return the surface as :meth:`mesh` has it, everywhere, to be made tile by tile.
 
         Args:
             cell_m: as of :meth:`mesh`.
-            fill_m: as of :meth:`mesh`.
 
         Raises:
-            InvalidInputError: the cells or ``fill_m`` are out of range.
+            InvalidInputError: the cells are out of range.
             ClosedError: the map was closed.
         """
-        return self._tiles(cell_m, None, fill_m, whole=False)
+        return self._tiles(cell_m, None, 0.0, whole=False)
 
     def _tiles(
         self, cell_m: float | None, bounds: Bounds | None, fill_m: float, *, whole: bool

@@ -19,14 +19,13 @@ from triquad_format.mapfile.manifest import (
     DIGEST_BYTES,
     Entry,
     Manifest,
-    manifest_body,
     manifest_in,
+    pack_manifest,
 )
 from triquad_format.mapfile.metadata import FORMAT_VERSION, PRODUCER, utc_time
 from triquad_format.mapfile.part_files import PartFiles
 from triquad_format.mapfile.parts.body import PartBody, unpack_body
-from triquad_format.mapfile.parts.pack import pack_part
-from triquad_format.mapfile.parts.part import MANIFEST, MAX_PART_BYTES, PartKey
+from triquad_format.mapfile.parts.part import MANIFEST, MAX_PART_BYTES
 from triquad_format.mapfile.writer import MapFileInfo, check_totals
 
 MAGIC = b"triquad checkpoint\n"
@@ -62,15 +61,11 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> MapFileInfo:
     """
     entries = checkpoint.manifest.entries
     check_totals(sum(entry.size for entry in entries), checkpoint.manifest.stored_bytes)
-    body = {
-        **manifest_body(checkpoint.manifest),
-        "producer": PRODUCER,
-        "undoes": checkpoint.undoes,
-    }
+    more: dict[str, object] = {"producer": PRODUCER, "undoes": checkpoint.undoes}
     if checkpoint.restored is not None:
-        body["restored"] = vars(checkpoint.restored)
-    payload = pack_part(PartKey(MANIFEST), body).payload
-    frame = zstandard.ZstdCompressor(level=_LEVEL).compress(payload)
+        more["restored"] = vars(checkpoint.restored)
+    part = pack_manifest(checkpoint.manifest, more)
+    frame = zstandard.ZstdCompressor(level=_LEVEL).compress(part.payload)
     data = MAGIC + hashlib.sha256(frame).digest() + frame
     with replacing(path) as file:
         file.write(data)

@@ -15,14 +15,15 @@ from triquad_format.errors import (
     TooLargeMapFileError,
 )
 from triquad_format.mapfile.container import RandomAccess, decompress, read_end, read_message
-from triquad_format.mapfile.manifest import Entry, unpack_manifest
+from triquad_format.mapfile.manifest import Entry, manifest_in
 from triquad_format.mapfile.metadata import (
     check_agreement,
     check_map_part,
     check_readable,
     manifest_place,
 )
-from triquad_format.mapfile.parts.part import MAP, PREFIX, REGION_TOPICS, PartKey
+from triquad_format.mapfile.parts.body import unpack_body
+from triquad_format.mapfile.parts.part import MANIFEST, MAP, PREFIX, REGION_TOPICS, PartKey
 
 DAMAGED_SUFFIX = ".damaged"
 """Added to the names of files that are set aside."""
@@ -119,7 +120,7 @@ class MapIndex:
         check_readable(self.metadata)
         try:
             packed = decompress(read_message(source, *manifest_place(self.metadata)))
-            self.manifest = unpack_manifest(packed, source.size)
+            self.manifest = manifest_in(unpack_body(MANIFEST, packed), source.size)
             self.manifest.check_total(source.size)
         except DamagedMapFileError as error:
             raise DamagedMapFileError(f"{error} (or another program rewrote it)") from error

@@ -3,14 +3,15 @@
 import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from triquad_format.errors import DamagedMapFileError, FormatError
-from triquad_format.mapfile.metadata import MapFacts, pack_facts, unpack_facts
-from triquad_format.mapfile.parts.body import PartBody, unpack_body
+from triquad_format.errors import DamagedMapFileError, FormatError, TooLargeMapFileError
+from triquad_format.mapfile.metadata import MAX_MAP_BYTES, MapFacts, pack_facts, unpack_facts
+from triquad_format.mapfile.parts.body import PartBody
 from triquad_format.mapfile.parts.pack import pack_part
 from triquad_format.mapfile.parts.part import (
     MANIFEST,
@@ -81,21 +82,25 @@ class Manifest:
         return sum(entry.stored for entry in self.entries)
 
     def check_total(self, stored_bytes: int) -> None:
-        """Raise :class:`DamagedMapFileError` where so few stored bytes unpack to too much."""
+        """Refuse parts that unpack to too much, at all or for so few stored bytes.
+
+        Raises:
+            TooLargeMapFileError, DamagedMapFileError: they do.
+        """
         total = sum(entry.size for entry in self.entries)
+        if max(total, stored_bytes) > MAX_MAP_BYTES:
+            raise TooLargeMapFileError(f"it exceeds the limit of {MAX_MAP_BYTES} bytes")
         if total > total_limit(stored_bytes):
             raise DamagedMapFileError(
                 f"{MANIFEST}: parts of {total} bytes in a file of {stored_bytes}"
             )
 
 
-def pack_manifest(manifest: Manifest) -> Part:
-    """Return the manifest as the last part of its file; errors are those of manifest_body."""
-    return pack_part(PartKey(MANIFEST), manifest_body(manifest))
+_NOTHING: Mapping[str, object] = MappingProxyType({})
 
 
-def manifest_body(manifest: Manifest) -> dict[str, object]:
-    """Return the manifest as a msgpack map.
+def pack_manifest(manifest: Manifest, more: Mapping[str, object] = _NOTHING) -> Part:
+    """Return the manifest as the last part of its file, with ``more`` fields.
 
     Raises:
         FormatError: it lists more than a manifest may.
@@ -115,20 +120,12 @@ def manifest_body(manifest: Manifest) -> dict[str, object]:
         "offset": [entry.offset for entry in entries],
         "stored": [entry.stored for entry in entries],
     }
-    return {
-        **pack_facts(manifest.facts),
-        "created_ns": manifest.stamp_ns,
-        "topics": topics,
-        "parts": {
-            name: pack_array(np.array(columns[name], dtype).reshape(-1, *row))
-            for name, (dtype, row) in _COLUMNS.items()
-        },
+    parts = {
+        name: pack_array(np.array(columns[name], dtype).reshape(-1, *row))
+        for name, (dtype, row) in _COLUMNS.items()
     }
-
-
-def unpack_manifest(payload: bytes, file_bytes: int) -> Manifest:
-    """Return the manifest in a payload; arguments and errors are those of manifest_in."""
-    return manifest_in(unpack_body(MANIFEST, payload), file_bytes)
+    own = {"created_ns": manifest.stamp_ns, "topics": topics, "parts": parts}
+    return pack_part(PartKey(MANIFEST), {**pack_facts(manifest.facts), **own, **more})
 
 
 def manifest_in(body: PartBody, file_bytes: int) -> Manifest:

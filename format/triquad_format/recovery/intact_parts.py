@@ -21,7 +21,7 @@ from triquad_format.errors import (
 from triquad_format.mapfile.checkpoint import CheckpointIndex, is_checkpoint
 from triquad_format.mapfile.container import chunk_messages, decompress
 from triquad_format.mapfile.index import FileBytes
-from triquad_format.mapfile.manifest import Entry, Manifest, total_limit, unpack_manifest
+from triquad_format.mapfile.manifest import Entry, Manifest, manifest_in, total_limit
 from triquad_format.mapfile.metadata import MAX_MAP_BYTES, MapFacts, unpack_facts
 from triquad_format.mapfile.parts.body import part_topic, unpack_body
 from triquad_format.mapfile.parts.part import (
@@ -56,23 +56,19 @@ class IntactParts:
         return frozenset(entry.key for entry in entries if entry.key.topic in REGION_TOPICS)
 
 
-def intact_parts(path: Path, max_bytes: int) -> IntactParts:
+def intact_parts(path: Path) -> IntactParts:
     """Return the intact parts of a map file, or of a checkpoint with what its store has of it.
-
-    Args:
-        path: the file.
-        max_bytes: limit on the file's size and, decompressed, on its parts together.
 
     Raises:
         UnsupportedMapFileError: the file needs a newer reader.
-        TooLargeMapFileError: it exceeds ``max_bytes``.
+        TooLargeMapFileError: it exceeds the limits of map files.
         MapFileError: nothing says what map this is, or its server deleted it meanwhile.
         OSError: it cannot be read.
     """
     with closing(FileBytes(path)) as file:
         if is_checkpoint(file):
-            return _checkpoint_parts(CheckpointIndex(file), max_bytes)
-        payloads = list(_payloads(file, max_bytes))
+            return _checkpoint_parts(CheckpointIndex(file))
+        payloads = list(_payloads(file))
     manifest = _manifest(payloads)
     if manifest is not None:
         by_digest = {hashlib.sha256(payload).digest(): payload for payload in payloads}
@@ -90,7 +86,7 @@ def _manifest(payloads: list[bytes]) -> Manifest | None:
         if part_topic(payload) == MANIFEST:
             try:
                 # A file that was cut lists parts for which it has no room: any size will do.
-                return unpack_manifest(payload, MAX_MAP_BYTES)
+                return manifest_in(unpack_body(MANIFEST, payload), MAX_MAP_BYTES)
             except UnsupportedMapFileError:
                 raise
             except FormatError:
@@ -98,10 +94,7 @@ def _manifest(payloads: list[bytes]) -> Manifest | None:
     return None
 
 
-def _checkpoint_parts(index: CheckpointIndex, max_bytes: int) -> IntactParts:
-    if sum(entry.size for entry in index.manifest.entries) > max_bytes:
-        raise TooLargeMapFileError(f"its parts exceed the limit of {max_bytes} bytes together")
-
+def _checkpoint_parts(index: CheckpointIndex) -> IntactParts:
     def intact(entry: Entry) -> bytes | None:
         with suppress(DamagedMapFileError, OSError):
             return index.payload(entry)
@@ -131,18 +124,18 @@ def _own_key(payload: bytes) -> PartKey | None:
     return None
 
 
-def _payloads(file: FileBytes, max_bytes: int) -> Iterator[bytes]:
+def _payloads(file: FileBytes) -> Iterator[bytes]:
     """Yield the payloads in all intact chunks of a file, in their order.
 
     Raises:
-        TooLargeMapFileError: the file is larger than ``max_bytes``, or unpacks to more.
+        TooLargeMapFileError: the file is larger than map files are, or unpacks to more.
         OSError: it cannot be read.
     """
     size = file.size
-    if size > max_bytes:
-        raise TooLargeMapFileError(f"it is larger than the limit of {max_bytes} bytes")
+    if size > MAX_MAP_BYTES:
+        raise TooLargeMapFileError(f"it is larger than the limit of {MAX_MAP_BYTES} bytes")
     data = file.read(0, size)
-    left = min(max_bytes, total_limit(size))
+    left = min(MAX_MAP_BYTES, total_limit(size))
     for message in _intact_messages(data):
         try:
             payload = decompress(message)

@@ -13,7 +13,6 @@ import numpy as np
 
 from triquad_format.errors import FormatError, MapFileError
 from triquad_format.mapfile.index import named
-from triquad_format.mapfile.metadata import MAX_MAP_BYTES
 from triquad_format.mapfile.parts.part import (
     FIELD_TOPICS,
     REGION,
@@ -69,23 +68,19 @@ class RecoveredMap:
         return not self.losses and self.parts_intact == self.parts_listed
 
 
-def recover(path: Path, *, max_bytes: int = MAX_MAP_BYTES) -> RecoveredMap:
-    """Return all that is intact in a map file, or of a checkpoint in its store.
+def recover(path: Path) -> RecoveredMap:
+    """Return all that is intact in a map file, damaged in any way, or of a checkpoint in its store.
 
     The result is valid. It answers as the whole map did wherever no loss reaches. Where vertices
     are lost, evidence goes with them: so nothing there passes for known. Training state stays
     where all of a region's is intact.
-
-    Args:
-        path: the file, truncated or damaged in any way.
-        max_bytes: limit on the file's size and, decompressed, on its parts together.
 
     Raises:
         MapFileError: nothing could be saved, or the file needs a newer reader.
         OSError: it cannot be read.
     """
     with named(str(path)):
-        recovered = _recovered(intact_parts(path, max_bytes))
+        recovered = _recovered(intact_parts(path))
         if not recovered.record.regions and not recovered.complete:
             raise MapFileError("nothing can be saved: no region is intact")
         return recovered

@@ -15,7 +15,7 @@ MAX_DISTANCE_M = 100.0
 MAX_RANGE_M = 1_000.0
 """The longest range of a ray; also the longest segment."""
 
-MAX_ITERATIONS = 200
+MAX_ITERATIONS = 50
 """The most steps of an alignment."""
 
 MAX_QUERY_POINTS = 100_000

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triquad_format.wire.codec import ArraySpec, Message
-from triquad_format.wire.limits import MAX_DISTANCE_M, MAX_RANGE_M
+from triquad_format.wire.limits import MAX_DISTANCE_M, MAX_ITERATIONS, MAX_RANGE_M
 from triquad_format.wire.messages import (
     Count,
     Epoch,
@@ -202,7 +202,6 @@ class AlignRequest(Message):
     points: Positions  # [N, 3] metres, sensor frame
     world_from_sensor: Pose  # the guess
     max_distance_m: float  # points farther from any surface do not count
-    max_iterations: int
     epoch: int
 
 
@@ -216,7 +215,7 @@ class AlignReply(MapReply):
     inlier_share: Annotated[float, within(0, 1)]
     rms_m: Length  # of the inliers' distances
     converged: bool
-    iterations: Annotated[int, within(0, "max_iterations")]
+    iterations: Annotated[int, within(0, MAX_ITERATIONS)]
     points: Count  # that were used
 
 
@@ -250,7 +249,7 @@ class SourcesRequest(Message):
     """Ask where the sources of scans have been, and for the newest scan of each."""
 
     server: str  # of the reply before, to which revision belongs; empty at first
-    revision: int  # of the reply before: what was reported up to it is known; 0 at first
+    revision: int  # of the reply before, which is not sent again; 0 at first
     max_points: int  # of each newest scan
 
 
@@ -267,20 +266,19 @@ class ScanSample(Message):
 
 @dataclass(frozen=True)
 class SourceState(Message):
-    """The changes of one source of scans."""
+    """One source of scans."""
 
     scans: Count  # that were accepted into the map since the server heard of the source
-    whole: bool  # what was reported of this source before is void
     trail: FiniteCorners  # [N, 3] metres, map frame: positions of the sensor, oldest first
     # [N] the piece of the trail each is part of: rises where the sensor jumped
     pieces: Annotated[Integers, within(0, MAX_COUNT), rows_of("trail")]
-    newest: ScanSample | None  # where it is new
+    newest: ScanSample | None  # None: a reset forgot it, and no scan has come since
 
 
 @dataclass(frozen=True)
 class SourcesReply(Message):
-    """Answer to :class:`SourcesRequest`: all sources that there are, by name."""
+    """Answer to :class:`SourcesRequest`."""
 
     server: Name
     revision: Count  # for the next request
-    sources: dict[Name, SourceState]
+    sources: dict[Name, SourceState] | None  # all, by name; None: as in the reply before

@@ -7,6 +7,7 @@ import numpy as np
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.pose import orthonormal
 from triquad_format.records.status import Status
+from triquad_format.wire.limits import MAX_ITERATIONS
 
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.view import MapView
@@ -58,16 +59,6 @@ _UNSEEN_M, _UNSEEN_RAD = 100.0, math.pi
 
 
 @dataclass(frozen=True)
-class AlignOptions:
-    """The limits of how far a scan may be off, and of how long to search."""
-
-    max_distance_m: float = 6.0
-    """Points farther than this from any surface do not count."""
-
-    max_iterations: int = 50
-
-
-@dataclass(frozen=True)
 class Alignment:
     """The pose where a scan fits best near a guess, in one epoch of the map.
 
@@ -87,7 +78,7 @@ class Alignment:
     epoch: int
 
 
-def align(view: MapView, points: Doubles, guess: Doubles, options: AlignOptions) -> Alignment:
+def align(view: MapView, points: Doubles, guess: Doubles, max_distance_m: float) -> Alignment:
     """Move a scan from where it is guessed to be to where it fits the map best.
 
     The squared distances of its points to the nearest seen surface are made small by Gauss-Newton
@@ -101,15 +92,15 @@ def align(view: MapView, points: Doubles, guess: Doubles, options: AlignOptions)
         points: [N, 3] metres, sensor frame; those that are not finite are left out, and the
             rest is thinned to some 2000, evenly in space.
         guess: [4, 4] world_from_sensor.
-        options: see there.
+        max_distance_m: points farther than this from any surface do not count.
 
     Raises:
         ValueError: ``points`` are not of this shape, or ``guess`` is no rigid pose.
     """
     pose = orthonormal(guess)
     fine = thinned(points, FINE_POINTS)
-    found = _descend(view, fine, pose, options=options)
-    return _judged(view, fine, found, options=options)
+    found = _descend(view, fine, pose, max_distance_m)
+    return _judged(view, fine, found, max_distance_m)
 
 
 @dataclass(frozen=True)
@@ -155,13 +146,15 @@ class _Found:
     settled: bool
 
 
-def _descend(view: MapView, fine: Doubles, pose: Doubles, options: AlignOptions) -> _Found:
+def _descend(view: MapView, fine: Doubles, pose: Doubles, max_distance_m: float) -> _Found:
     points = thinned(fine, _COARSE_POINTS)
     final = _FINAL_VOXELS * view.voxel_m
-    scale = max(options.max_distance_m, final)
+    scale = max(max_distance_m, final)
     overshoot, last = _OVERSHOOT, np.zeros(6)
-    for iteration in range(1, options.max_iterations + 1):
-        normal = _normal(view, points, pose, scale=scale, options=options, is_final=scale == final)
+    for iteration in range(1, MAX_ITERATIONS + 1):
+        normal = _normal(
+            view, points, pose, scale=scale, max_distance_m=max_distance_m, is_final=scale == final
+        )
         if normal is None:
             return _Found(pose, iteration, False)
         step = normal.step()
@@ -178,7 +171,7 @@ def _descend(view: MapView, fine: Doubles, pose: Doubles, options: AlignOptions)
             return _Found(pose, iteration, True)
         elif size < _COARSE_STEP_M:
             points = fine
-    return _Found(pose, options.max_iterations, False)
+    return _Found(pose, MAX_ITERATIONS, False)
 
 
 def _normal(
@@ -186,12 +179,12 @@ def _normal(
     points: Doubles,
     pose: Doubles,
     scale: float,
-    options: AlignOptions,
+    max_distance_m: float,
     is_final: bool,
 ) -> _Normal | None:
     """Return the normal equations at a pose; None where no point counts."""
     turned = points @ pose[:3, :3].T
-    reach_m = min(options.max_distance_m, _REACH_SCALES * scale)
+    reach_m = min(max_distance_m, _REACH_SCALES * scale)
     answer = distances(view, turned + pose[:3, 3], DistanceOptions(reach_m))
     distance = answer.distance_m.astype(np.float64)
     spread = 1.0 if is_final else 1.0 + _PER_RANGE * np.linalg.norm(points, axis=1)
@@ -216,18 +209,20 @@ def _normal(
     )
 
 
-def _judged(view: MapView, points: Doubles, found: _Found, options: AlignOptions) -> Alignment:
+def _judged(view: MapView, points: Doubles, found: _Found, max_distance_m: float) -> Alignment:
     """Return the alignment at the pose where the search ended."""
     final = _FINAL_VOXELS * view.voxel_m
     world = points @ found.pose[:3, :3].T + found.pose[:3, 3]
-    answer = distances(view, world, DistanceOptions(options.max_distance_m))
+    answer = distances(view, world, DistanceOptions(max_distance_m))
     known = answer.status != Status.UNKNOWN
     inliers = answer.found & known & (np.abs(answer.distance_m) <= _INLIER_SCALES * final)
     count = int(inliers.sum())
     share = count / max(int((answer.found | known).sum()), 1)
     squares = answer.distance_m[inliers].astype(np.float64) ** 2
     rms_m = math.sqrt(float(squares.sum()) / max(count, 1))
-    normal = _normal(view, points, found.pose, scale=final, options=options, is_final=True)
+    normal = _normal(
+        view, points, found.pose, scale=final, max_distance_m=max_distance_m, is_final=True
+    )
     covariance = np.diag(np.repeat([_UNSEEN_M**2, _UNSEEN_RAD**2], 3))
     all_seen = False
     if normal is not None:

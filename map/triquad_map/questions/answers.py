@@ -5,7 +5,6 @@ A server answers with this from its epochs, and a client from a map file: so the
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
@@ -15,7 +14,6 @@ from triquad_format.records.pose import is_rigid
 from triquad_format.wire.codec import Message
 from triquad_format.wire.limits import (
     MAX_DISTANCE_M,
-    MAX_ITERATIONS,
     MAX_QUERY_POINTS,
     MAX_RANGE_M,
     MAX_SEARCHES,
@@ -41,25 +39,14 @@ from triquad_format.wire.query_messages import (
 )
 
 from triquad_map.questions import checks
-from triquad_map.questions.align import AlignOptions, align
+from triquad_map.questions.align import align
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.questions.grid import GridShape, grid
 from triquad_map.questions.ground import ground
-from triquad_map.questions.rays import RayOptions, rays
-from triquad_map.questions.segments import SegmentOptions, segments
+from triquad_map.questions.rays import rays
+from triquad_map.questions.segments import segments
 from triquad_map.questions.spheres import spheres
 from triquad_map.view import MapView
-
-
-@dataclass(frozen=True)
-class QuestionLimits:
-    """The most that one question may ask."""
-
-    points: int = MAX_QUERY_POINTS  # at which the field is evaluated
-    searches: int = MAX_SEARCHES  # points around which something is searched for
-
-
-_LIMITS = QuestionLimits()
 
 ReplyT = TypeVar("ReplyT", bound=Message)
 
@@ -73,9 +60,8 @@ class Answers:
     Whatever is asked for, :class:`RefusedError` says which argument is out of bounds.
     """
 
-    def __init__(self, views: Views, limits: QuestionLimits = _LIMITS) -> None:
+    def __init__(self, views: Views) -> None:
         self._view = views
-        self._limits = limits
 
     def answer(self, request: Message) -> Message:
         """Return the answer to a question of any kind.
@@ -88,14 +74,14 @@ class Answers:
 
     def sdf(self, request: SdfRequest) -> SdfReply:
         """Return the trained field, and status."""
-        points = checks.points("point", request.origin, request.points, most=self._limits.points)
+        points = checks.points("point", request.origin, request.points, most=MAX_QUERY_POINTS)
         with self._view(request.epoch) as view:
             answer = view.query(points, request.gradient)
             return _reply(SdfReply, answer, epoch=view.epoch)
 
     def distance(self, request: DistanceRequest) -> DistanceReply:
         """Return distances to the nearest surface."""
-        points = self._searched("point", request.origin, request.points)
+        points = _searched("point", request.origin, request.points)
         reach_m = checks.within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M)
         options = DistanceOptions(reach_m, request.surface_point, request.unknown_distance)
         with self._view(request.epoch) as view:
@@ -109,7 +95,7 @@ class Answers:
 
     def spheres(self, request: SpheresRequest) -> SpheresReply:
         """Return what spheres contain."""
-        centres = self._searched("sphere", request.origin, request.centres)
+        centres = _searched("sphere", request.origin, request.centres)
         checks.same_length(request.centres, "radii_m", request.radii_m)
         good = (request.radii_m >= 0) & (request.radii_m <= MAX_DISTANCE_M)
         if not good.all():
@@ -124,13 +110,11 @@ class Answers:
 
     def segments(self, request: SegmentsRequest) -> SegmentsReply:
         """Return what a ball meets on segments."""
-        starts = self._searched("start", request.origin, request.starts)
+        starts = _searched("start", request.origin, request.starts)
         checks.same_length(request.starts, "ends", request.ends)
-        ends = self._searched("end", request.origin, request.ends)
-        options = SegmentOptions(
-            checks.within("radius_m", request.radius_m, MAX_DISTANCE_M, least=0.0),
-            checks.within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M),
-        )
+        ends = _searched("end", request.origin, request.ends)
+        radius_m = checks.within("radius_m", request.radius_m, MAX_DISTANCE_M, least=0.0)
+        reach_m = checks.within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M)
         lengths = np.linalg.norm(ends - starts, axis=1)
         if lengths.max(initial=0.0) > MAX_RANGE_M:  # each step waits for the one before
             worst = int(lengths.argmax())
@@ -139,14 +123,14 @@ class Answers:
                 f"segment {worst} is {lengths[worst]:g} m long: use at most {MAX_RANGE_M:g} m",
             )
         total_m = float(lengths.sum())
-        self._check_count(total_m / SEGMENT_M_PER_SEARCH, f"segments of {total_m:.0f} m in all")
+        _check_count(total_m / SEGMENT_M_PER_SEARCH, f"segments of {total_m:.0f} m in all")
         with self._view(request.epoch) as view:
-            answer = segments(view, starts, ends, options=options)
+            answer = segments(view, starts, ends, radius_m, max_distance_m=reach_m)
         return _reply(SegmentsReply, answer)
 
     def rays(self, request: RaysRequest) -> RaysReply:
         """Return how far rays reach."""
-        starts = self._searched("start", request.origin, request.starts)
+        starts = _searched("start", request.origin, request.starts)
         checks.same_length(request.starts, "directions", request.directions)
         directions = request.directions.astype(np.float64)
         lengths = np.linalg.norm(directions, axis=1)
@@ -157,19 +141,19 @@ class Answers:
                 "bad_request", f"direction {worst} has length {lengths[worst]:g}, not 1"
             )
         reach_m = checks.within("max_range_m", request.max_range_m, MAX_RANGE_M)
-        self._check_count(
+        _check_count(
             len(starts) * reach_m / RAY_M_PER_SEARCH, f"{len(starts)} rays of {reach_m:g} m"
         )
-        options = RayOptions(reach_m, request.through_unknown)
+        directions /= lengths[:, None]
         with self._view(request.epoch) as view:
-            answer = rays(view, starts, directions / lengths[:, None], options=options)
+            answer = rays(view, starts, directions, reach_m, request.through_unknown)
         return _reply(RaysReply, answer)
 
     def ground(self, request: GroundRequest) -> GroundReply:
         """Return what lies below points."""
-        points = self._searched("point", request.origin, request.points)
+        points = _searched("point", request.origin, request.points)
         drop_m = checks.within("max_drop_m", request.max_drop_m, MAX_DISTANCE_M)
-        self._check_count(
+        _check_count(
             len(points) * drop_m / RAY_M_PER_SEARCH, f"{len(points)} points with {drop_m:g} m below"
         )
         with self._view(request.epoch) as view:
@@ -186,7 +170,7 @@ class Answers:
                 "bad_request", f"not a grid: counts {counts}, corner {request.corner}"
             )
         shape = GridShape(request.corner, cell_m, counts)
-        self._check_count(shape.cells, f"{shape.cells} cells")
+        _check_count(shape.cells, f"{shape.cells} cells")
         reach_m = checks.within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M)
         with self._view(request.epoch) as view:
             answer = grid(view, shape, reach_m)
@@ -194,31 +178,17 @@ class Answers:
 
     def align(self, request: AlignRequest) -> AlignReply:
         """Return the pose of a scan near a guess."""
-        self._check_count(len(request.points), f"{len(request.points)} points")
+        _check_count(len(request.points), f"{len(request.points)} points")
         if not is_rigid(request.world_from_sensor):
             raise RefusedError(
                 "bad_request",
                 f"world_from_sensor is no rotation and translation: {request.world_from_sensor}",
             )
-        options = AlignOptions(
-            checks.within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M),
-            int(checks.within("max_iterations", request.max_iterations, MAX_ITERATIONS, least=1)),
-        )
+        reach_m = checks.within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M)
         with self._view(request.epoch) as view:
-            answer = align(
-                view, request.points.astype(np.float64), request.world_from_sensor, options=options
-            )
+            points = request.points.astype(np.float64)
+            answer = align(view, points, request.world_from_sensor, reach_m)
         return _reply(AlignReply, answer)
-
-    def _searched(self, what: str, origin: Doubles, offsets: Floats) -> Doubles:
-        return checks.points(what, origin, offsets, most=self._limits.searches)
-
-    def _check_count(self, count: float, what: str) -> None:
-        if count > self._limits.searches:
-            raise RefusedError(
-                "too_large",
-                f"{what} exceed the limit of {self._limits.searches} searches: split the request",
-            )
 
 
 _ANSWERS: dict[type[Message], Callable[[Answers, Any], Message]] = {
@@ -231,6 +201,17 @@ _ANSWERS: dict[type[Message], Callable[[Answers, Any], Message]] = {
     GridRequest: Answers.grid,
     AlignRequest: Answers.align,
 }
+
+
+def _searched(what: str, origin: Doubles, offsets: Floats) -> Doubles:
+    return checks.points(what, origin, offsets, most=MAX_SEARCHES)
+
+
+def _check_count(count: float, what: str) -> None:
+    if count > MAX_SEARCHES:
+        raise RefusedError(
+            "too_large", f"{what} exceed the limit of {MAX_SEARCHES} searches: split the request"
+        )
 
 
 def _reply(kind: type[ReplyT], answer: object, **given: object) -> ReplyT:

@@ -20,14 +20,6 @@ _LOOK_AHEAD_M = 3.0
 
 
 @dataclass(frozen=True)
-class RayOptions:
-    """The options of how far rays go and what stops them."""
-
-    max_range_m: float
-    through_unknown: bool = False
-
-
-@dataclass(frozen=True)
 class RayRanges:
     """The ranges of N rays, metres, of one epoch.
 
@@ -40,13 +32,22 @@ class RayRanges:
     epoch: int
 
 
-def rays(view: MapView, origins: Doubles, directions: Doubles, options: RayOptions) -> RayRanges:
-    """Return ranges of rays from ``origins`` [N, 3] along unit ``directions`` [N, 3], map frame."""
+def rays(
+    view: MapView,
+    origins: Doubles,
+    directions: Doubles,
+    max_range_m: float,
+    through_unknown: bool = False,
+) -> RayRanges:
+    """Return ranges of rays from ``origins`` [N, 3] along unit ``directions`` [N, 3], map frame.
+
+    Unknown space stops them, unless they go ``through_unknown``.
+    """
     status = np.full(len(origins), Status.FREE, np.uint8)
-    ranges = np.full(len(origins), options.max_range_m)
+    ranges = np.full(len(origins), max_range_m)
     hit = trace(view, origins, directions, ranges=ranges)
     status[hit] = Status.SURFACE
-    if not options.through_unknown:
+    if not through_unknown:
         _stop_at_unknown(view, origins, directions, ranges=ranges, status=status)
     return RayRanges(ranges.astype(np.float32), status, view.epoch)
 

@@ -21,14 +21,6 @@ STEP_VOXELS = 0.5
 
 
 @dataclass(frozen=True)
-class SegmentOptions:
-    """The ball that moves along the segments, and how far around surfaces are searched for."""
-
-    radius_m: float
-    max_distance_m: float
-
-
-@dataclass(frozen=True)
 class Segments:
     """The contacts of a ball on N segments, metres, of one epoch.
 
@@ -68,22 +60,26 @@ class _March:
     clearance_at: Doubles
 
 
-def segments(view: MapView, starts: Doubles, ends: Doubles, options: SegmentOptions) -> Segments:
-    """Return what a ball meets that moves from ``starts`` to ``ends`` [N, 3], metres, map frame."""
+def segments(
+    view: MapView, starts: Doubles, ends: Doubles, radius_m: float, max_distance_m: float
+) -> Segments:
+    """Return what a ball meets that moves from ``starts`` to ``ends`` [N, 3], metres, map frame.
+
+    Surfaces are searched for up to ``max_distance_m``.
+    """
     lengths = np.linalg.norm(ends - starts, axis=1)
     directions = (ends - starts) / np.maximum(lengths, 1e-12)[:, None]
-    reach_m = max(options.max_distance_m, options.radius_m + view.voxel_m)
+    reach_m = max(max_distance_m, radius_m + view.voxel_m)
     step_m = STEP_VOXELS * view.voxel_m
 
     def to_surface(points: Doubles) -> Doubles:
         return distances(view, points, DistanceOptions(reach_m)).distance_m.astype(np.float64)
 
-    radius = options.radius_m
     solid = _march(
-        to_surface, starts, directions, lengths, radius_m=radius, step_m=step_m, clearance=True
+        to_surface, starts, directions, lengths, radius_m=radius_m, step_m=step_m, clearance=True
     )
     # Unknown space is entered, not touched: a ball may touch it from outside.
-    inside = np.nextafter(radius, 0.0) if radius > 0 else 0.0
+    inside = np.nextafter(radius_m, 0.0) if radius_m > 0 else 0.0
     unknown = _march(
         lambda points: view.nearest_unknown(points, reach_m).distance,
         starts,
@@ -97,7 +93,7 @@ def segments(view: MapView, starts: Doubles, ends: Doubles, options: SegmentOpti
         length_m=lengths.astype(np.float32),
         blocked=solid.blocked,
         contact_m=solid.contact.astype(np.float32),
-        clearance_m=np.minimum(solid.clearance, options.max_distance_m).astype(np.float32),
+        clearance_m=np.minimum(solid.clearance, max_distance_m).astype(np.float32),
         clearance_at_m=solid.clearance_at.astype(np.float32),
         meets_unknown=unknown.blocked,
         unknown_contact_m=np.where(unknown.blocked, unknown.contact, lengths).astype(np.float32),

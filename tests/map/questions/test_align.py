@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from support.maps.exact_view import ExactView
 from support.maps.small_world import settled_epoch, world
-from triquad_map.questions.align import Alignment, AlignOptions, align
+from triquad_map.questions.align import Alignment, align
 from triquad_server.settings import Settings, TrainingSettings
 from triquad_tools.simulation.lidar import Lidar
 from triquad_tools.simulation.scene import Scene
@@ -22,7 +22,7 @@ from bench.street import settled_mapper
 SEOSAN = Path(__file__).resolve().parents[4] / "shared" / "data" / "seosan01"
 LIDAR = Lidar(beams=32, columns=360)
 FAR = np.full(3, 1e4)
-OPTIONS = AlignOptions()
+REACH_M = 6.0
 BOUNDS = np.array([[-40.0, -40.0, -1.0], [40.0, 40.0, 10.0]])
 
 
@@ -93,7 +93,7 @@ def error_of(alignment: Alignment, true: NDArray[np.float64] = TRUE) -> NDArray[
 @hypothesis_settings(max_examples=8)
 @given(st.integers(0, 2**31), st.floats(0.0, 1.0), st.floats(0.0, 10.0))
 def test_a_scan_is_put_back_to_where_it_was_taken(seed: int, metres: float, degrees: float) -> None:
-    found = align(view_of(YARD), scan_of(YARD), guessed(metres, degrees, seed), OPTIONS)
+    found = align(view_of(YARD), scan_of(YARD), guessed(metres, degrees, seed), REACH_M)
     error = error_of(found)
     assert found.converged
     assert np.linalg.norm(error[:3]) < 0.01
@@ -109,7 +109,7 @@ def test_a_scan_is_put_back_to_where_it_was_taken(seed: int, metres: float, degr
 
 def test_on_a_plain_only_height_and_tilt_are_found() -> None:
     guess = guessed(0.3, 3.0)
-    found = align(view_of(PLAIN), scan_of(PLAIN), guess, OPTIONS)
+    found = align(view_of(PLAIN), scan_of(PLAIN), guess, REACH_M)
     deviation = np.sqrt(np.diag(found.covariance))
     assert not found.converged
     assert deviation[[0, 1]].min() > 50
@@ -127,7 +127,7 @@ def test_on_a_plain_only_height_and_tilt_are_found() -> None:
 def test_along_a_corridor_the_guess_is_kept_and_the_variance_says_so(angle: float) -> None:
     turn = yawed(angle, 20.0, -7.0, 1.0)
     true, guess = turn @ TRUE, turn @ guessed(0.4, 4.0)
-    found = align(view_of(CORRIDOR, turn), scan_of(CORRIDOR), guess, OPTIONS)
+    found = align(view_of(CORRIDOR, turn), scan_of(CORRIDOR), guess, REACH_M)
     along, across, up = turn[:3, :3].T
     position = found.covariance[:3, :3]
     assert not found.converged
@@ -145,7 +145,7 @@ def test_along_a_corridor_the_guess_is_kept_and_the_variance_says_so(angle: floa
 def test_nothing_is_found_in_unknown_space() -> None:
     unseen = ExactView(YARD, np.eye(4), FAR, FAR + 1)
     guess = guessed(0.5, 5.0)
-    found = align(unseen, scan_of(YARD), guess, OPTIONS)
+    found = align(unseen, scan_of(YARD), guess, REACH_M)
     assert not found.converged
     assert found.inlier_share == 0
     np.testing.assert_allclose(found.world_from_sensor, guess, atol=1e-12)
@@ -158,21 +158,21 @@ def test_a_scan_that_sees_beyond_the_map_is_aligned_by_what_the_map_has_seen() -
     )
     whole = scan_of(YARD)
     assert ((whole @ TRUE[:3, :3].T + TRUE[:3, 3])[:, 0] < -1.0).mean() > 0.3
-    found = align(corner, whole, guessed(0.5, 5.0), AlignOptions(max_distance_m=2.0))
+    found = align(corner, whole, guessed(0.5, 5.0), 2.0)
     assert found.converged
     assert np.linalg.norm(error_of(found)[:3]) < 0.02
 
 
 def test_far_from_where_it_was_taken_a_scan_does_not_pass_for_aligned() -> None:
     guess = yawed(2.0, -6.0, 4.0, 1.7)
-    found = align(view_of(YARD), scan_of(YARD), guess, OPTIONS)
+    found = align(view_of(YARD), scan_of(YARD), guess, REACH_M)
     assert np.linalg.norm(error_of(found)[:3]) > 1.0
     assert not found.converged
 
 
 @pytest.mark.parametrize("count", [0, 3, 40])
 def test_a_few_points_are_not_enough(count: int) -> None:
-    found = align(view_of(YARD), scan_of(YARD)[:count], TRUE, OPTIONS)
+    found = align(view_of(YARD), scan_of(YARD)[:count], TRUE, REACH_M)
     assert not found.converged
     assert found.points == count
     assert np.isfinite(found.covariance).all()
@@ -181,8 +181,8 @@ def test_a_few_points_are_not_enough(count: int) -> None:
 def test_it_does_not_matter_where_the_map_lies() -> None:
     moved = displaced(yawed(2.5, 300.0, -80.0, 20.0), 5.0, 20.0, np.random.default_rng(2))
     guess = guessed(0.5, 5.0)
-    here = align(view_of(YARD), scan_of(YARD), guess, OPTIONS)
-    there = align(view_of(YARD, moved), scan_of(YARD), moved @ guess, OPTIONS)
+    here = align(view_of(YARD), scan_of(YARD), guess, REACH_M)
+    there = align(view_of(YARD, moved), scan_of(YARD), moved @ guess, REACH_M)
     np.testing.assert_allclose(
         there.world_from_sensor, moved @ here.world_from_sensor, rtol=0, atol=1e-4
     )
@@ -197,13 +197,14 @@ def test_it_does_not_matter_where_the_map_lies() -> None:
 def test_points_that_are_not_finite_are_left_out() -> None:
     points = scan_of(YARD)
     holes = np.insert(points, [0, 500, len(points)], np.nan, axis=0)
-    found = align(view_of(YARD), holes, guessed(0.5, 5.0), OPTIONS)
-    expected = align(view_of(YARD), points, guessed(0.5, 5.0), OPTIONS)
+    found = align(view_of(YARD), holes, guessed(0.5, 5.0), REACH_M)
+    expected = align(view_of(YARD), points, guessed(0.5, 5.0), REACH_M)
     np.testing.assert_array_equal(found.world_from_sensor, expected.world_from_sensor)
 
 
-def test_iterations_are_limited() -> None:
-    found = align(view_of(YARD), scan_of(YARD), guessed(0.5, 5.0), AlignOptions(max_iterations=2))
+def test_iterations_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("triquad_map.questions.align.MAX_ITERATIONS", 2)
+    found = align(view_of(YARD), scan_of(YARD), guessed(0.5, 5.0), REACH_M)
     assert found.iterations == 2
     assert not found.converged
 
@@ -214,12 +215,12 @@ def test_iterations_are_limited() -> None:
 )
 def test_a_guess_that_is_no_pose_is_refused(guess: NDArray[np.float64]) -> None:
     with pytest.raises(ValueError, match="not a rotation and a translation"):
-        align(view_of(YARD), scan_of(YARD), guess, OPTIONS)
+        align(view_of(YARD), scan_of(YARD), guess, REACH_M)
 
 
 def test_points_of_another_shape_are_refused() -> None:
     with pytest.raises(ValueError, match=r"\(5, 4\)"):
-        align(view_of(YARD), np.zeros((5, 4)), TRUE, OPTIONS)
+        align(view_of(YARD), np.zeros((5, 4)), TRUE, REACH_M)
 
 
 def test_a_scan_is_put_back_into_a_map_that_was_learnt() -> None:
@@ -230,7 +231,7 @@ def test_a_scan_is_put_back_into_a_map_that_was_learnt() -> None:
     for _ in range(5):
         true = displaced(middle, 0.3, 2.0, rng)
         points = Lidar(columns=360).scan(drive.scene, true, rng).points.astype(np.float64)
-        found = align(epoch, points, displaced(true, 0.5, 5.0, rng), OPTIONS)
+        found = align(epoch, points, displaced(true, 0.5, 5.0, rng), REACH_M)
         error = error_of(found, true)
         assert found.converged
         assert np.linalg.norm(error[:3]) < 0.05
@@ -248,7 +249,7 @@ def test_withheld_real_scans_are_put_back() -> None:
     for scan in [scan for scan in scans.withheld for _ in range(10)]:
         true = scan.world_from_sensor
         points = np.asarray(scan.points, np.float64)
-        found = align(view, points, displaced(true, 0.5, 5.0, rng), OPTIONS)
+        found = align(view, points, displaced(true, 0.5, 5.0, rng), REACH_M)
         error = error_of(found, true)
         near = np.linalg.norm(error[:3]) < 0.05 and np.linalg.norm(error[3:]) < np.radians(0.5)
         good.append(found.converged and near)

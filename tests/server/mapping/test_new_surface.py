@@ -10,8 +10,8 @@ from triquad_format.records.region import MapRecord
 from triquad_format.records.status import Status
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.questions.ground import ground
-from triquad_map.questions.rays import RayOptions, rays
-from triquad_map.questions.segments import SegmentOptions, segments
+from triquad_map.questions.rays import rays
+from triquad_map.questions.segments import segments
 from triquad_map.questions.spheres import spheres
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
@@ -79,12 +79,12 @@ def seen(request: pytest.FixtureRequest) -> Seen:
 def test_segments_through_it_are_blocked(seen: Seen) -> None:
     starts, ends = seen.hits + 0.5 * seen.normals, seen.hits - 0.15 * seen.normals
     for radius_m, least in ((0.0, 0.9), (0.1, 0.99)):
-        found = segments(seen.epoch, starts, ends, SegmentOptions(radius_m, 1.0))
+        found = segments(seen.epoch, starts, ends, radius_m, 1.0)
         assert found.blocked.mean() > least
 
 
 def test_rays_end_on_it(seen: Seen) -> None:
-    found = rays(seen.epoch, seen.hits + 0.5 * seen.normals, -seen.normals, RayOptions(2.0, True))
+    found = rays(seen.epoch, seen.hits + 0.5 * seen.normals, -seen.normals, 2.0, True)
     assert (found.status == Status.SURFACE).mean() > 0.97
     assert (np.abs(found.range_m - 0.5) < VOXEL_M / 2).mean() > 0.9
 

@@ -32,7 +32,6 @@ from triquad_format.mapfile.parts.part import (
     leaf_shift,
     moment_columns,
     square_shift,
-    unshuffle_counts,
 )
 from triquad_format.records import morton
 from triquad_format.records.arrays import Bytes, Longs
@@ -41,7 +40,6 @@ from triquad_format.records.region import (
     AXES,
     BLOCK_BYTES,
     MARGIN_BITS,
-    MAX_SEEN_S,
     MLP_LAYERS,
     OUTCOME_BITS,
     Evidence,
@@ -53,8 +51,6 @@ from triquad_format.records.region import (
     surface_counts,
 )
 from triquad_format.records.replay_rays import STEPS, ReplayRays, no_rays
-
-_MAX_SEEN_BYTES = (MAX_SEEN_S.bit_length() + 7) // 8
 
 _Columns = tuple[NDArray[Any], ...]
 """Columns of equal length: some rows of a table."""
@@ -259,16 +255,12 @@ def _planes(body: PartBody, key: str, planes: int, count: int) -> Bytes:
 
 
 def _read_seen(body: PartBody, surface: Bytes) -> Longs:
+    """Return the times [B] of blocks with these masks; a sum that overflows is negative."""
     touched = surface.any(axis=1)
-    planes = body.array("seen_s", "|u1", (None, int(touched.sum())))
-    if not 1 <= len(planes) <= _MAX_SEEN_BYTES:
-        raise DamagedMapFileError(f"{body.topic}: seen_s has {len(planes)} bytes per time")
-    start = body.count("seen_from_s")
-    if start > MAX_SEEN_S:
-        raise DamagedMapFileError(f"{body.topic}: seen_from_s = {start} is above {MAX_SEEN_S}")
-    since = unshuffle_counts(planes)
+    count = int(touched.sum())
+    since = body.counts("seen_s", count, count)
     seen_s = np.zeros(len(surface), np.int64)
-    seen_s[touched] = np.where(since > 0, start + since, 0)
+    seen_s[touched] = np.where(since > 0, body.count("seen_from_s") + since, 0)
     return seen_s
 
 
