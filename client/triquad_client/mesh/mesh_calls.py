@@ -38,7 +38,6 @@ class MeshCalls:
         box, level = checks.box(bounds), checks.level_of_detail(level)
         fill_m = checks.within("fill_m", fill_m, MAX_FILL_M, least=0.0)
         each = 1 if fill_m > 0 else _TILES_EACH
-
         request = TileListRequest(*box, NEWEST, level=level, fill_m=fill_m)
 
         def fetch() -> Mesh:

@@ -150,7 +150,9 @@ def test_a_restored_map_keeps_its_leaf_and_lengths_that_are_not_set_follow_it(tm
     fine.write_text("[field]\nleaf_m = 0.05\n")
     with triquad_server.serve(store=tmp_path, settings=fine) as server:
         assert "lengths that are not set follow its leaf_m = 0.2, not the 0.05" in caplog.text
-        assert server.client().mesh().faces.shape == (0, 3)
+        with server.client() as client, client.watch_mesh() as watch:
+            watch.catch_up()
+            assert watch.tile_side_m == pytest.approx(6.4)
     fine.write_text("[field]\nleaf_m = 0.4\n[mesh]\ncell_m = 1\n")
     with pytest.raises(SettingsError, match="for the restored map: mesh.cell_m = 1"):
         triquad_server.serve(store=tmp_path, settings=fine)
