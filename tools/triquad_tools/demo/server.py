@@ -4,7 +4,7 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
+import time
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -13,6 +13,7 @@ from triquad_tools.console.command import ToolError
 
 _READY_TIMEOUT_S = 300.0  # kernels are compiled on the first start
 _STOP_TIMEOUT_S = 60.0
+_POLL_S = 0.02
 
 
 def free_port() -> int:
@@ -49,22 +50,14 @@ class DemoServer:
         """
         self.endpoint = endpoint or free_endpoint()
         self._log = folder / "server.log"
-        self._started = threading.Event()  # ready, or ended
-        self._ready = False
-        self._last_line = "it said nothing"
         command = [sys.executable, "-m", "triquad_server.cli", "--listen", self.endpoint]
         command += ["--map", map_name, "--store", str(folder / "store")]
         command += ["--no-multicast-scouting", *arguments]
-        self._process = subprocess.Popen(
-            command, stderr=subprocess.PIPE, text=True, errors="replace", env=variables
-        )
-        self._reader = threading.Thread(target=self._read_log, name="server log")
-        self._reader.start()
+        with self._log.open("a") as log:
+            self._begins = log.tell()  # bytes, of what servers before have logged
+            self._process = subprocess.Popen(command, stderr=log, env=variables)
         try:
-            if not self._started.wait(_READY_TIMEOUT_S):
-                raise self._failure(f"the server is not ready after {_READY_TIMEOUT_S:g} s")
-            if not self._ready:
-                raise self._failure("the server did not start")
+            self._wait_until_ready()
         except BaseException:
             self._end()
             raise
@@ -92,20 +85,21 @@ class DemoServer:
         if code != 0:
             raise self._failure(f"the server stopped with exit code {code}")
 
-    def _failure(self, what: str) -> ToolError:
-        return ToolError(f"{what}: {self._last_line}; its log is {self._log}")
+    def _wait_until_ready(self) -> None:
+        ends_s = time.monotonic() + _READY_TIMEOUT_S
+        while " ready: " not in self._logged():
+            if self._process.poll() is not None:
+                raise self._failure("the server did not start")
+            if time.monotonic() > ends_s:
+                raise self._failure(f"the server is not ready after {_READY_TIMEOUT_S:g} s")
+            time.sleep(_POLL_S)
 
-    def _read_log(self) -> None:
-        assert self._process.stderr is not None
-        with self._log.open("a", encoding="utf-8") as log:
-            for line in self._process.stderr:
-                log.write(line)
-                log.flush()
-                self._last_line = line.strip()
-                if " ready: " in line:
-                    self._ready = True
-                    self._started.set()
-        self._started.set()
+    def _failure(self, what: str) -> ToolError:
+        *_, last_line = ["it said nothing", *self._logged().splitlines()]
+        return ToolError(f"{what}: {last_line}; its log is {self._log}")
+
+    def _logged(self) -> str:
+        return self._log.read_bytes()[self._begins :].decode(errors="replace")
 
     def _end(self) -> None:
         """Stop the process, by force where it does not react."""
@@ -116,5 +110,3 @@ class DemoServer:
             except BaseException:  # also a second Ctrl-C: nothing may stay behind
                 self._process.kill()
                 self._process.wait()
-        self._reader.join()
-        self._process.__exit__(None, None, None)
