@@ -17,7 +17,6 @@ from triquad_server.epochs.epoch import Epoch
 from triquad_server.mesh.tile_cache import tile_lattice
 from triquad_server.settings import MeshSettings, Settings
 from triquad_tools.console.progress import progress
-from triquad_tools.evaluation.metrics import mesh_area_m2
 from triquad_tools.simulation.scene import Scene
 from triquad_tools.simulation.solids import Solid
 
@@ -140,7 +139,7 @@ class Look:
             tile = mesh_tile(self.epoch, (x, y, z), lattice)
             vertices = tile.vertices + tile.origin
             ghosts = self._ghosts(centroids(vertices, tile.faces))
-            area_m2 += mesh_area_m2(Mesh(vertices, tile.faces[ghosts]))
+            area_m2 += float(Mesh(vertices, tile.faces[ghosts]).to_trimesh().area)
         return area_m2
 
     def _ghosts(self, middles: Doubles) -> Bools:

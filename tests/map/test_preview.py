@@ -15,14 +15,15 @@ from support.files.mapfile_edit import file_bytes
 from support.maps.map_records import SMALL, evidence_of, random_record, surface_evidence
 from support.maps.other_field import OtherField
 from support.maps.small_world import settings, settled_mapper, world
-from triquad_client import Mesh, OfflineMap
+from trimesh import Trimesh
+from trimesh.sample import sample_surface
+from triquad_client import OfflineMap
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import BLOCK_BYTES, Evidence, MapRecord
 from triquad_map.height_scale import HeightScale
 from triquad_map.preview import CELL_LEAVES, FACES_MIN, coarse_mesh, previews_of
-from triquad_tools.evaluation.metrics import mesh_area_m2, sample_mesh
 
 SETTINGS = FieldSettings()
 GROUND_M = 1.3
@@ -163,8 +164,12 @@ def mesh_of_seen(seen, sdf):
     return coarse_mesh(region, SETTINGS, view)
 
 
+def surface(mesh):
+    return Trimesh(mesh.vertices, mesh.faces, process=False)
+
+
 def samples(mesh):
-    return sample_mesh(mesh, 200_000, np.random.default_rng(0))
+    return sample_surface(surface(mesh), 200_000, seed=0)[0]
 
 
 def share_near(points, others, reach_m):
@@ -176,8 +181,8 @@ def largest_piece(mesh):
     a, b, c = mesh.faces.T
     links = coo_matrix((np.ones(2 * len(a)), (np.r_[a, b], np.r_[b, c])), (len(mesh.vertices),) * 2)
     piece = connected_components(links, directed=False)[1][a]
-    areas = [mesh_area_m2(Mesh(mesh.vertices, mesh.faces[piece == p])) for p in np.unique(piece)]
-    return max(areas) / sum(areas)
+    areas = np.bincount(piece, surface(mesh).area_faces)
+    return areas.max() / areas.sum()
 
 
 @pytest.fixture(scope="module")
@@ -210,7 +215,7 @@ def test_the_preview_of_a_street_is_its_mesh_in_few_faces(epoch):
 def test_surface_is_found_in_the_cell_beside_the_voxel_that_was_hit():
     """Noise, and the field, put it on either side of a border of cells."""
     mesh = mesh_of_seen(area_m2((-10, 10), (-10, 10)) + 0.01, lambda points: points[:, 2] + 0.01)
-    assert mesh_area_m2(mesh) == pytest.approx(20**2, rel=0.1)
+    assert surface(mesh).area == pytest.approx(20**2, rel=0.1)
     np.testing.assert_allclose(mesh.vertices[:, 2], -0.01, atol=1e-6)
 
 
@@ -220,7 +225,7 @@ def test_both_sides_of_a_thin_wall_stay():
     sides = np.concatenate([wall + [0, half_m, 0], wall - [0, half_m, 0]])
     mesh = mesh_of_seen(sides, lambda points: np.abs(points[:, 1]) - half_m)
     np.testing.assert_allclose(np.abs(mesh.vertices[:, 1]), half_m, atol=1e-6)
-    assert mesh_area_m2(mesh) == pytest.approx(2 * 20 * 5, rel=0.15)
+    assert surface(mesh).area == pytest.approx(2 * 20 * 5, rel=0.15)
 
 
 def test_a_preview_is_a_small_part_of_its_map(epoch):

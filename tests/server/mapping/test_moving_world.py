@@ -19,7 +19,6 @@ from triquad_server.epochs.epoch import Epoch, FrozenRegion
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.tile_cache import tile_lattice
 from triquad_server.settings import MeshSettings, Settings
-from triquad_tools.evaluation.metrics import mesh_area_m2
 from triquad_tools.simulation.lidar import Lidar
 from triquad_tools.simulation.scene import Scene
 from triquad_tools.simulation.solids import Solid, box
@@ -100,7 +99,7 @@ def mesh_area(epoch: Epoch) -> float:
         vertices = tile.origin + tile.vertices
         middles = centroids(vertices, tile.faces)
         inside = ((middles > low) & (middles < high)).all(axis=1)
-        area += mesh_area_m2(Mesh(vertices, tile.faces[inside]))
+        area += Mesh(vertices, tile.faces[inside]).to_trimesh().area
     return area
 
 

@@ -3,8 +3,6 @@ import pytest
 from triquad_client import Mesh
 from triquad_tools.evaluation.metrics import (
     ScoreSettings,
-    mesh_area_m2,
-    sample_mesh,
     score_against_cloud,
     score_against_scene,
 )
@@ -26,10 +24,6 @@ def _grid(z: float = 0.0) -> np.ndarray:
     """A cloud of 2 cm spacing over 4 m x 2 m."""
     x, y = np.meshgrid(np.arange(0.01, 4.0, 0.02), np.arange(0.01, 2.0, 0.02))
     return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, z)])
-
-
-def _rng() -> np.random.Generator:
-    return np.random.default_rng(0)
 
 
 def test_parallel_planes_score_their_distance_against_a_scene() -> None:
@@ -90,15 +84,3 @@ def test_an_empty_mesh_scores_nothing() -> None:
 def test_scores_without_a_truth_are_refused() -> None:
     with pytest.raises(ValueError, match="no reference points"):
         score_against_cloud(_plate(1.0, 1.0, 0.0), np.empty((0, 3)), ScoreSettings())
-
-
-def test_samples_of_a_mesh_are_uniform_over_its_area() -> None:
-    small, large = _plate(1.0, 1.0, 0.0), _plate(4.0, 1.0, 0.0, start=1.0)
-    mesh = Mesh(
-        np.vstack([small.vertices, large.vertices]), np.vstack([small.faces, large.faces + 4])
-    )
-    assert mesh_area_m2(mesh) == pytest.approx(4.0)
-    samples = sample_mesh(mesh, 40_000, _rng())
-    counts, _, _ = np.histogram2d(samples[:, 0], samples[:, 1], bins=(8, 4))
-    assert np.all(np.abs(counts / (40_000 / 32) - 1.0) < 0.15)
-    assert np.all(samples[:, 2] == 0.0)

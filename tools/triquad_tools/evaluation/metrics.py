@@ -6,7 +6,6 @@ bounding box are left out, and so are those farther from the truth than the accu
 count in ``outlier_ratio`` alone.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,9 +20,6 @@ from triquad_tools.simulation.scene import Scene
 STREET_VOXEL_M = 0.05
 """The spacing of the points of a simulated street that completion asks for."""
 
-Distances = Callable[[Doubles], Doubles]
-"""Distances ``[N]`` of places ``[N, 3]`` to a surface, metres; infinite beyond a limit, perhaps."""
-
 
 @dataclass(frozen=True)
 class ScoreSettings:
@@ -33,9 +29,7 @@ class ScoreSettings:
     accuracy_cut_m: float = 0.2  # samples farther than this are left out
     completion_cut_m: float = 2.0  # greater distances count as this
     voxel_m: float = 0.02  # samples and truth are thinned to this
-    samples_max: int = (
-        3_000_000  # drawn from the mesh before thinning: more change scores by little
-    )
+    samples_max: int = 3_000_000  # of a mesh, before thinning: more change scores by little
     seed: int = 0  # of these samples: scores can be repeated
 
 
@@ -60,14 +54,10 @@ def score_against_cloud(mesh: Mesh, reference: Doubles, settings: ScoreSettings)
     The spacing of the cloud bounds the accuracy from below: a cloud of 3 cm spacing shows no
     mesh as better than about 1.5 cm.
     """
-    points = _thinned_reference(reference, settings)
-    tree, cut = _tree(points), settings.accuracy_cut_m
-
-    def distances(places: Doubles) -> Doubles:
-        found: Doubles = tree.query(places, distance_upper_bound=cut, workers=-1)[0]
-        return found
-
-    return _scored(mesh, points, distances, settings)
+    points = _thinned(reference, settings)
+    samples = _samples(mesh, points, settings)
+    distances = _nearest(points, samples, settings.accuracy_cut_m)
+    return _scores(distances, samples, points, settings)
 
 
 def score_against_scene(
@@ -82,21 +72,9 @@ def score_against_scene(
             have (see :meth:`triquad_tools.simulation.lidar.SimulatedDrive.true_hits`).
         settings: thresholds.
     """
-    points = _thinned_reference(visible, settings)
-    return _scored(mesh, points, lambda places: np.abs(scene.sdf(places)), settings)
-
-
-def _scored(
-    mesh: Mesh, truth: Doubles, distances: Distances, settings: ScoreSettings
-) -> MeshScores:
-    """Return scores of a mesh by the distances of its samples, and of ``truth`` [M, 3] to them."""
-    samples = _samples(mesh, truth, settings)
-    missing_m = np.full(len(truth), settings.completion_cut_m)
-    if len(samples):
-        cut = settings.completion_cut_m
-        found = _tree(samples).query(truth, distance_upper_bound=cut, workers=-1)[0]
-        missing_m = np.minimum(missing_m, found)
-    return _scores(distances(samples), missing_m, settings)
+    points = _thinned(visible, settings)
+    samples = _samples(mesh, points, settings)
+    return _scores(np.abs(scene.sdf(samples)), samples, points, settings)
 
 
 def median_angle_deg(one: NDArray[np.floating], other: NDArray[np.floating]) -> float:
@@ -107,29 +85,7 @@ def median_angle_deg(one: NDArray[np.floating], other: NDArray[np.floating]) -> 
     return float(np.median(angles)) if len(angles) else float("nan")
 
 
-def sample_mesh(mesh: Mesh, count: int, rng: np.random.Generator) -> Doubles:
-    """Return random points ``[count, 3]`` on a mesh, of uniform density over its area."""
-    corners = np.asarray(mesh.vertices, np.float64)[mesh.faces]  # [F, 3, 3]
-    sides = corners[:, 1:] - corners[:, :1]
-    ends = np.cumsum(np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1))
-    # One draw per equal slice of the area: no large face is left out by chance.
-    slices = (np.arange(count) + rng.uniform(size=count)) / count
-    faces = np.minimum(np.searchsorted(ends, slices * ends[-1], side="right"), len(ends) - 1)
-    u, v = rng.uniform(size=(2, count, 1))
-    over = u + v > 1.0
-    u, v = np.where(over, 1.0 - u, u), np.where(over, 1.0 - v, v)
-    points: Doubles = corners[faces, 0] + u * sides[faces, 0] + v * sides[faces, 1]
-    return points
-
-
-def mesh_area_m2(mesh: Mesh) -> float:
-    """Return the area of all faces."""
-    corners = np.asarray(mesh.vertices, np.float64)[mesh.faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return 0.5 * float(np.linalg.norm(cross, axis=1).sum())
-
-
-def _thinned_reference(reference: Doubles, settings: ScoreSettings) -> Doubles:
+def _thinned(reference: Doubles, settings: ScoreSettings) -> Doubles:
     if len(reference) == 0:
         raise ValueError("no reference points to score against")
     return thin(np.asarray(reference, np.float64), settings.voxel_m)
@@ -137,12 +93,14 @@ def _thinned_reference(reference: Doubles, settings: ScoreSettings) -> Doubles:
 
 def _samples(mesh: Mesh, reference: Doubles, settings: ScoreSettings) -> Doubles:
     """Return thinned samples of the mesh where it is scored."""
+    import trimesh.sample  # slow to import
+
+    surface = mesh.to_trimesh()
     # More than four samples per voxel's face would only be thinned away again.
-    wanted = int(mesh_area_m2(mesh) / (0.5 * settings.voxel_m) ** 2)
-    count = min(wanted, settings.samples_max)
+    count = min(int(surface.area / (0.5 * settings.voxel_m) ** 2), settings.samples_max)
     if count == 0:
         return np.empty((0, 3))
-    samples = sample_mesh(mesh, count, np.random.default_rng(settings.seed))
+    samples = trimesh.sample.sample_surface(surface, count, seed=settings.seed)[0]
     low, high = np.array(scored_box(reference, settings))
     inside = ((samples >= low) & (samples <= high)).all(axis=1)
     return thin(samples[inside], settings.voxel_m)
@@ -159,12 +117,19 @@ def scored_box(reference: Doubles, settings: ScoreSettings) -> tuple[list[float]
     return low.tolist(), high.tolist()
 
 
-def _tree(points: Doubles) -> cKDTree:
-    return cKDTree(points, balanced_tree=False, compact_nodes=False)  # much faster to build
+def _nearest(points: Doubles, places: Doubles, limit_m: float) -> Doubles:
+    """Return the distances [N] of places [N, 3] to the nearest point; infinite beyond a limit."""
+    tree = cKDTree(points, balanced_tree=False, compact_nodes=False)  # much faster to build
+    found: Doubles = tree.query(places, distance_upper_bound=limit_m, workers=-1)[0]
+    return found
 
 
-def _scores(distances: Doubles, missing_m: Doubles, settings: ScoreSettings) -> MeshScores:
-    """Return scores from the distances of samples to the truth, and of the truth to the samples."""
+def _scores(
+    distances: Doubles, samples: Doubles, truth: Doubles, settings: ScoreSettings
+) -> MeshScores:
+    """Return scores of samples [N, 3] of a mesh by their distances [N] from the truth [M, 3]."""
+    cut_m = settings.completion_cut_m
+    missing_m = np.minimum(_nearest(samples, truth, cut_m), cut_m)
     kept = distances[distances < settings.accuracy_cut_m]
     accuracy_ratio = mean_or_nan(kept < settings.threshold_m)
     completion_ratio = mean_or_nan(missing_m < settings.threshold_m)
