@@ -19,7 +19,8 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from PIL import Image
 from triquad_server import serve
-from triquad_tools.plots.mesh_view import BACKGROUND, HEIGHT, WIDTH, draw_faces, view_along
+from triquad_tools.plots.mesh_view import draw_faces, view_along
+from triquad_tools.plots.picture import BACKGROUND, HEIGHT, WIDTH
 from triquad_tools.simulation.lidar import SimulatedDrive
 from triquad_tools.simulation.solids import Solid, box
 from triquad_tools.simulation.street import street_drive
@@ -73,7 +74,7 @@ def preview(out: Path) -> None:
         scene = example["preview"](make_reader(file, decoder_factories=[DecoderFactory()]))
     shown: Any = trimesh.util.concatenate(list(scene.geometry.values()))
     colours = shown.visual.vertex_colors[:, :3] / 255.0
-    figure = Figure((WIDTH / 100, HEIGHT / 100), 100, facecolor=tuple(BACKGROUND))
+    figure = Figure((WIDTH / 100, HEIGHT / 100), 100, facecolor=BACKGROUND)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set_axis_off()
     view = view_along(shown.vertices, shown.vertices[shown.faces])

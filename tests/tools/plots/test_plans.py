@@ -12,10 +12,7 @@ from triquad_format.mapfile.writer import write_map
 from triquad_map.height_scale import HEIGHT_STOPS
 from triquad_tools.commands.inspect import main
 from triquad_tools.plots.diff_plan import APPEARED, VANISHED
-from triquad_tools.plots.plan import (
-    FREE,
-    UNKNOWN,
-)
+from triquad_tools.plots.plan import FREE, UNKNOWN
 from triquad_tools.plots.slice_plan import SURFACE
 
 
@@ -29,12 +26,6 @@ def share(pixels, colour):
     return (np.abs(pixels - 255 * np.array(to_rgb(colour))) <= 1).all(axis=-1).mean()
 
 
-# Grids
-
-
-# Colours and legends
-
-
 @pytest.mark.parametrize("name", ["viridis", "plasma_r"])
 def test_what_is_not_known_has_a_colour_of_its_own(name):
     colours = colormaps[name](np.linspace(0.0, 1.0, 256))[:, :3]
@@ -42,12 +33,6 @@ def test_what_is_not_known_has_a_colour_of_its_own(name):
         assert np.abs(colours - to_rgb(other)).max(axis=1).min() > 0.2
     lightness = colours @ [0.2126, 0.7152, 0.0722]
     assert (np.diff(lightness) > 0).all() or (np.diff(lightness) < 0).all()
-
-
-# What the plans show
-
-
-# The command
 
 
 def test_picture_of_a_map(tmp_path, capsys):

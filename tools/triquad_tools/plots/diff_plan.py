@@ -1,6 +1,5 @@
 """A picture of how two maps differ: how far surface moved, and what only one of them has."""
 
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -8,18 +7,17 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
 from triquad_format.records.status import Status
 
-from triquad_tools.mapfiles.diff import Comparison
+from triquad_tools.mapfiles.diff import Comparison, Sighting
 from triquad_tools.mapfiles.object_changes import Cluster, ObjectChanges
 from triquad_tools.plots.plan import (
     ERRORS,
     FREE,
     Layer,
-    Plan,
     PlanGrid,
     Scale,
     draw_layers,
     draw_values,
-    save_sheet,
+    sheet,
 )
 
 # From Okabe and Ito's colours, which all can distinguish.
@@ -27,7 +25,6 @@ APPEARED, VANISHED, NEWLY_SEEN, NO_LONGER_KNOWN = "#0072b2", "#d55e00", "#56b4e9
 _LEAST_RANGE_CM = 5.0
 _LINE_PT = 1.5
 _BESIDE_M = 0.1  # outlines lie this far outside of what they surround
-_NOTE = "outlined: what appeared or vanished as a whole"
 
 
 def draw_diff(title: str, comparison: Comparison, objects: ObjectChanges, path: Path) -> None:
@@ -39,15 +36,17 @@ def draw_diff(title: str, comparison: Comparison, objects: ObjectChanges, path: 
     old, new = comparison.old, comparison.new
     points = np.concatenate([old.points, new.points])[:, :2]
     grid = PlanGrid.around(points, min(old.leaf_m, new.leaf_m))
-    plans = [
-        Plan("How far the surface moved", partial(_draw_movement, grid, comparison)),
-        Plan("In only one of the maps", partial(_draw_presence, grid, comparison, objects), _NOTE),
-    ]
-    save_sheet(path, title, grid, plans=plans)
+    headings = ("How far the surface moved", "In only one of the maps")
+    with sheet(path, title, grid, headings) as (movement, presence):
+        _draw_movement(movement, grid, old)
+        _draw_presence(presence, grid, comparison)
+        for found, colour in ((objects.appeared, APPEARED), (objects.vanished, VANISHED)):
+            for cluster in found:
+                _draw_box(presence, cluster, colour)
+        presence.set_xlabel("x in m\noutlined: what appeared or vanished as a whole")
 
 
-def _draw_movement(grid: PlanGrid, comparison: Comparison, axes: Axes) -> None:
-    old = comparison.old
+def _draw_movement(axes: Axes, grid: PlanGrid, old: Sighting) -> None:
     near = old.status == Status.SURFACE
     moved_cm = 100 * np.abs(old.sdf[near]).astype(np.float64)
     cells = grid.statistic(old.points[near], moved_cm, "mean")
@@ -57,9 +56,7 @@ def _draw_movement(grid: PlanGrid, comparison: Comparison, axes: Axes) -> None:
     draw_values(axes, cells, scale)
 
 
-def _draw_presence(
-    grid: PlanGrid, comparison: Comparison, objects: ObjectChanges, axes: Axes
-) -> None:
+def _draw_presence(axes: Axes, grid: PlanGrid, comparison: Comparison) -> None:
     old, new = comparison.old, comparison.new
     # Later ones cover earlier ones: what only one map has seen says least.
     layers = (
@@ -70,9 +67,6 @@ def _draw_presence(
         ("vanished: free space in B", VANISHED, old.having(Status.FREE)),
     )
     draw_layers(axes, [Layer(*layer[:2], grid.marked(layer[2])) for layer in layers])
-    for found, colour in ((objects.appeared, APPEARED), (objects.vanished, VANISHED)):
-        for cluster in found:
-            _draw_box(axes, cluster, colour)
 
 
 def _draw_box(axes: Axes, cluster: Cluster, colour: str) -> None:

@@ -1,11 +1,9 @@
 """A picture of what a map file holds: where surface and where only free space was seen."""
 
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
 from triquad_format.records import morton
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.field_settings import BLOCK_VOXELS
@@ -17,12 +15,11 @@ from triquad_tools.plots.plan import (
     FREE,
     HEIGHTS,
     Layer,
-    Plan,
     PlanGrid,
     Scale,
     draw_layers,
     draw_values,
-    save_sheet,
+    sheet,
 )
 
 
@@ -34,8 +31,11 @@ def draw_map(title: str, record: MapRecord, path: Path) -> None:
     """
     surface, seen = seen_columns(record, surface_only=True), seen_columns(record)
     grid = PlanGrid.around(seen.middles, record.settings.leaf_m)
-    plan = Plan("Coverage", partial(_draw_coverage, grid, surface, seen))
-    save_sheet(path, title, grid, plans=[plan])
+    heights = HeightScale.around(surface.tops)
+    scale = Scale("height of the topmost surface in m", HEIGHTS, heights.low_m, heights.high_m)
+    with sheet(path, title, grid, ["Coverage"]) as (axes,):
+        draw_layers(axes, [Layer("only free space was seen", FREE, grid.marked(seen.middles))])
+        draw_values(axes, grid.statistic(surface.middles, surface.tops, "max"), scale)
 
 
 @dataclass(frozen=True)
@@ -60,10 +60,3 @@ def seen_columns(record: MapRecord, surface_only: bool = False) -> Columns:
         parts.append(settings.region_corner(region.index) + (voxels + 0.5) * settings.leaf_m)
     middles = np.concatenate(parts)
     return Columns(middles[:, :2], middles[:, 2])
-
-
-def _draw_coverage(grid: PlanGrid, surface: Columns, seen: Columns, axes: Axes) -> None:
-    draw_layers(axes, [Layer("only free space was seen", FREE, grid.marked(seen.middles))])
-    heights = HeightScale.around(surface.tops)
-    scale = Scale("height of the topmost surface in m", HEIGHTS, heights.low_m, heights.high_m)
-    draw_values(axes, grid.statistic(surface.middles, surface.tops, "max"), scale)

@@ -1,5 +1,6 @@
 """A picture of a whole mesh, seen aslant from above, coloured by height."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +15,16 @@ from triquad_map.height_scale import HeightScale
 
 from triquad_tools.mapfiles.meshfile import meshed
 from triquad_tools.mapfiles.source import Box, NothingLeftError, SourceMap
-from triquad_tools.plots.mesh_view import BACKGROUND, HEIGHT, WIDTH, draw_faces, view_along
+from triquad_tools.plots.mesh_view import draw_faces, view_along
 from triquad_tools.plots.plan import HEIGHTS, extend
 
-_WIDE, _HIGH = 1600, 900  # pixels of the whole picture
-TOP = 90
-"""Rows above the mesh, which is at the left."""
+BACKGROUND = (0.93, 0.94, 0.95)
+"""The sRGB colour of the background."""
 
+TOP, WIDTH, HEIGHT = 90, 1340, 740
+"""Rows above the mesh, which is at the left, and its size, pixels."""
+
+_WIDE, _HIGH = 1600, 900  # pixels of the whole picture
 _BAR = (1362 / _WIDE, 390 / _HIGH, 30 / _WIDE, 360 / _HIGH)  # left, bottom, width, height
 
 
@@ -56,13 +60,19 @@ def draw_mesh(title: str, mesh: Mesh, path: Path) -> None:
     beyond = extend(least_m < heights.low_m, most_m > heights.high_m)
     note = f"{len(mesh.faces):,} faces, from z = {least_m:.2f} to {most_m:.2f} m"
     with rc_context({"font.size": 15}):
-        figure = Figure((_WIDE / 100, _HIGH / 100), 100, facecolor=tuple(BACKGROUND))
+        figure = Figure((_WIDE / 100, _HIGH / 100), 100, facecolor=BACKGROUND)
         place = (0.0, 1.0 - (TOP + HEIGHT) / _HIGH, WIDTH / _WIDE, HEIGHT / _HIGH)
-        axes = figure.add_axes(place, xticks=[], yticks=[], facecolor=tuple(BACKGROUND))
+        axes = figure.add_axes(place, xticks=[], yticks=[], facecolor=BACKGROUND)
         draw_faces(axes, view, mesh.vertices, mesh.faces, heights.colours(mesh.vertices[:, 2]))
         axes.spines[:].set_visible(False)
         axes.set_title(title, loc="left", x=0.01, parse_math=False)
-        axes.set_xlabel(f"{view.description}\n{note}", ha="left", x=0.01)
+        wide_m, turn_deg = np.ptp(axes.get_xlim()), math.degrees(math.atan2(view[2, 1], view[2, 0]))
+        seen = (
+            f"parallel projection, {wide_m:.3g} m wide, looking down and to {turn_deg:.0f}° from "
+            "+x; faces seen from behind (ceilings), and what lies far away from all else, are left "
+            "out"
+        )
+        axes.set_xlabel(f"{seen}\n{note}", ha="left", x=0.01)
         scale = ScalarMappable(Normalize(heights.low_m, heights.high_m), HEIGHTS)
         bar = figure.add_axes(_BAR)
         figure.colorbar(scale, cax=bar, extend=beyond, label="height z in m")

@@ -6,7 +6,8 @@ scale has an arrow at its end.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -100,15 +101,6 @@ class Scale:
 
 
 @dataclass(frozen=True)
-class Plan:
-    """One plan of a sheet."""
-
-    heading: str
-    draw: Callable[[Axes], None]  # onto axes of the grid
-    note: str = ""
-
-
-@dataclass(frozen=True)
 class Layer:
     """Cells of one colour, and what it stands for."""
 
@@ -117,28 +109,31 @@ class Layer:
     cells: Bools  # [rows, columns]
 
 
-def save_sheet(path: Path, title: str, grid: PlanGrid, plans: Sequence[Plan]) -> None:
-    """Draw plans of one grid at each other's side, or below each other where the map is wide.
+@contextmanager
+def sheet(path: Path, title: str, grid: PlanGrid, headings: Sequence[str]) -> Iterator[list[Axes]]:
+    """Yield axes of a grid for each of the plans with these headings, and then save the picture.
+
+    They are at each other's side, or below each other where the map is wide.
 
     Raises:
         OSError: ``path`` cannot be written.
     """
     wide = grid.columns > _WIDE * grid.rows
     inches = (_LONGEST_IN if wide else _LONGEST_ASIDE_IN) / max(grid.columns, grid.rows)
-    rows, columns = (len(plans), 1) if wide else (1, len(plans))
+    rows, columns = (len(headings), 1) if wide else (1, len(headings))
     width = columns * (inches * grid.columns + _ROOM_IN[0])
     height = rows * (inches * grid.rows + _ROOM_IN[1])
     with rc_context({"font.size": _LETTERS_PT}):
         figure = Figure((width, height), dpi=110, layout="constrained")
         figure.suptitle(title, x=0.01, ha="left", parse_math=False)
         places = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
-        for plan, axes in zip(plans, places.flat, strict=True):
-            axes.set_title(plan.heading, loc="left")
+        for heading, axes in zip(headings, places.flat, strict=True):
+            axes.set_title(heading, loc="left")
             axes.set_facecolor(UNKNOWN)
-            axes.set(xlabel=f"x in m\n{plan.note}".rstrip(), ylabel="y in m", aspect="equal")
+            axes.set(xlabel="x in m", ylabel="y in m", aspect="equal")
             axes.set_xlim(grid.low_m[0], grid.high_m[0])
             axes.set_ylim(grid.low_m[1], grid.high_m[1])
-            plan.draw(axes)
+        yield list(places.flat)
         figure.savefig(path)
 
 

@@ -2,13 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 from matplotlib import colormaps
-from matplotlib.axes import Axes
-from triquad_client import Grid, OfflineMap, Status
+from triquad_client import OfflineMap, Status
 from triquad_format.records.seen_space import evidence_bounds
 
 from triquad_tools.console.command import ToolError
@@ -16,12 +14,11 @@ from triquad_tools.mapfiles.source import Access, is_endpoint, open_map, read_wh
 from triquad_tools.plots.plan import (
     FREE,
     Layer,
-    Plan,
     PlanGrid,
     Scale,
     draw_layers,
     draw_values,
-    save_sheet,
+    sheet,
 )
 
 _MAX_DISTANCE_M = 3.0
@@ -57,12 +54,18 @@ def draw_slice(target: str, access: Access, options: SliceOptions, path: Path) -
         name = opened.name if isinstance(opened, OfflineMap) else access.map_name
     shape = answer.shape
     grid = PlanGrid(shape.corner[:2], shape.cell_m, rows=shape.counts[1], columns=shape.counts[0])
-    plans = [
-        Plan("Distance", partial(_draw_distance, answer)),
-        Plan("Status", partial(_draw_status, answer)),
-    ]
+    seen = answer.status[:, :, 0].T
+    label = (
+        f"m to the nearest surface, {_MAX_DISTANCE_M:g} or more\norange: behind it; grey: not seen"
+    )
+    scale = Scale(label, DISTANCE_COLOURS, 0.0, _MAX_DISTANCE_M)
+    # Elsewhere distances only say how far the last wall is.
+    distance_m = np.where(seen == Status.UNKNOWN, np.nan, answer.distance_m[:, :, 0].T)
     title = f"{target}: map {name!r}, epoch {answer.epoch}, at z = {height:g} m"
-    save_sheet(path, title, grid, plans=plans)
+    with sheet(path, title, grid, ["Distance", "Status"]) as (distances, statuses):
+        draw_values(distances, distance_m.astype(np.float64), scale)
+        kinds = (Status.FREE, FREE), (Status.SURFACE, SURFACE)
+        draw_layers(statuses, [Layer(kind.name, colour, seen == kind) for kind, colour in kinds])
 
 
 def _seen_box(target: str) -> list[float]:
@@ -73,22 +76,3 @@ def _seen_box(target: str) -> list[float]:
     if box is None:
         raise ToolError(f"{target}: no ray has shown anything of this map: nothing to slice")
     return [*box[0, :2].tolist(), *box[1, :2].tolist()]
-
-
-def _draw_distance(answer: Grid, axes: Axes) -> None:
-    """Draw distances where something was seen: elsewhere they only say how far the last wall is."""
-    label = (
-        f"m to the nearest surface, {_MAX_DISTANCE_M:g} or more\norange: behind it; grey: not seen"
-    )
-    seen = answer.status != Status.UNKNOWN
-    distance_m = np.where(seen, answer.distance_m.astype(np.float64), np.nan)
-    draw_values(axes, distance_m[:, :, 0].T, Scale(label, DISTANCE_COLOURS, 0.0, _MAX_DISTANCE_M))
-
-
-def _draw_status(answer: Grid, axes: Axes) -> None:
-    status = answer.status[:, :, 0].T
-    layers = [
-        Layer("FREE", FREE, status == Status.FREE),
-        Layer("SURFACE", SURFACE, status == Status.SURFACE),
-    ]
-    draw_layers(axes, layers)
