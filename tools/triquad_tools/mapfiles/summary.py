@@ -1,21 +1,24 @@
 """The content of a map file, in figures."""
 
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
+from triquad_format.errors import NoCompiledCodeError
 from triquad_format.mapfile.manifest import Entry
 from triquad_format.mapfile.reader import MapFile
-from triquad_format.records.arrays import Bytes, Doubles
+from triquad_format.records.arrays import Bytes, Doubles, Floats
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.map_progress import MapProgress
 from triquad_format.records.region import MapRecord, Region
+from triquad_format.records.replay_rays import are_held_out
 from triquad_format.records.seen_space import evidence_box, owned_evidence
-from triquad_map.field_fit import MapFit
+from triquad_map.field_fit import MapFit, PlaceFits, Places, in_cube, map_fit
+from triquad_map.record_view import open_view
 
 from triquad_tools.console.amounts import within
 from triquad_tools.console.report import Row, print_columns, print_rows
-from triquad_tools.mapfiles.recorded_fit import recorded_fit
 
 
 @dataclass(frozen=True)
@@ -77,7 +80,7 @@ def summarise(file: MapFile) -> MapSummary:
         free_m3=sum(region.free_m3 for region in regions),
         progress=record.progress,
         training=any(region.training is not None for region in record.regions),
-        fit=recorded_fit(record),
+        fit=_fit(record),
         regions=regions,
         parts=_summarise_parts(file),
     )
@@ -164,3 +167,34 @@ def _summarise_parts(file: MapFile) -> dict[str, TopicSummary]:
         topic: TopicSummary(len(own), sum(e.size for e in own), sum(e.stored for e in own))
         for topic, own in by_topic.items()
     }
+
+
+def _fit(record: MapRecord) -> MapFit | None:
+    """Return how well a map fits rays that it was not trained on, as a server computes it.
+
+    ``None``: it has no held-out rays, which are training state, or numba is missing.
+    """
+    ends = {number: _held_out_ends(region, record) for number, region in enumerate(record.regions)}
+    ends = {number: points for number, points in ends.items() if len(points)}
+    if not ends:
+        return None
+    try:
+        view = open_view(record)
+    except NoCompiledCodeError:
+        return None
+    fits = []
+    with closing(view):
+        for number, points in ends.items():
+            region = view.region_views[number]
+            sdf = region.engine.evaluate(points, gradient=False).sdf
+            fits.append((region.centre, PlaceFits.of(Places.of(points, record.settings), sdf)))
+    return map_fit(fits)
+
+
+def _held_out_ends(region: Region, record: MapRecord) -> Floats:
+    """Return where a region's held-out rays end in its cube [N, 3], metres from its centre."""
+    if region.training is None:
+        return np.zeros((0, 3), np.float32)
+    rays = region.training.rays
+    ends = rays.ends_m(record.settings)[are_held_out(rays.ends)].astype(np.float32)
+    return ends[in_cube(ends, record.settings)]

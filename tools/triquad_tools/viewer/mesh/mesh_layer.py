@@ -85,7 +85,7 @@ class MeshLayer(Layer):
         colours = self._colours(points)
         self.tell(colours.scale.html)
         for name, tile in wanted.items():
-            appearance = (colours.scale.label, tile.version, colours.key(tile))
+            appearance = (colours.scale.label, colours.scale.low, colours.scale.high, tile.version)
             drawn = self._shown.get(name)
             if drawn is None or drawn.appearance != appearance:
                 self._shown[name] = _DrawnTile(appearance, self._add(tile, colours))

@@ -1,7 +1,7 @@
 """The colours of the mesh, and how to have them unchanged in a browser."""
 
 import math
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,7 +34,6 @@ class TileColours:
     """Colours of mesh tiles."""
 
     scale: ColourScale
-    key: Callable[[MeshTile], Hashable]  # where this is another one, a tile has other colours
     values: Callable[[MeshTile], NDArray[np.floating]]  # [V] places of the vertices on the scale
 
 
@@ -45,7 +44,6 @@ def height_colours(heights_m: NDArray[np.floating]) -> TileColours:
     high_m = math.ceil(around.high_m / _STEP_M) * _STEP_M
     return TileColours(
         ColourScale("height, m", HEIGHTS, low_m, high_m, open_below=True, open_above=True),
-        key=lambda _: (low_m, high_m),
         values=lambda tile: tile.origin[2] + tile.vertices[:, 2],
     )
 
@@ -54,7 +52,6 @@ def confidence_colours(queries: MapQueries) -> TileColours:
     """Colour by how much the rays have shown of the surface: the confidence of distances."""
     return TileColours(
         ColourScale("confidence", HEIGHTS, 0.0, 1.0),
-        key=lambda tile: tile.version,
         values=lambda t: queries.query_distance(t.origin + t.vertices, _NEAR_M).confidence,
     )
 

@@ -4,7 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import viser
-from triquad_format.records.arrays import Doubles
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats
 from triquad_format.records.status import Status
 from viser.transforms import SO3
 
@@ -15,7 +19,6 @@ from triquad_tools.viewer.page.page import Focus, Page
 from triquad_tools.viewer.questions.cell_box import CellBox
 from triquad_tools.viewer.questions.picking import ground_in_view
 from triquad_tools.viewer.questions.question import Answer, Question
-from triquad_tools.viewer.questions.slice_picture import line_distances, slice_picture
 
 _HEIGHT_AXIS = 2
 _AXES = {"level, at some z": _HEIGHT_AXIS, "upright, at some x": 0, "upright, at some y": 1}
@@ -24,6 +27,9 @@ _REACH_M = 20.0  # of the slider, to both sides of where the slice was put
 _STEP_M = 0.05
 _ABOVE_M = 0.75  # the ground in the middle of the view: where a level slice is put
 _MAX_DISTANCE_M = 3.0
+_PIXELS, _DPI = 6, 100  # along a cell, so that the browser blurs no more than their borders
+_LINE_PT, _SURFACE_PT, _LETTERS_PT = 1.2, 3.0, 14
+_LEVELS = MaxNLocator(8, steps=[1, 2, 5, 10])  # no more lines, at round distances
 
 
 @dataclass(frozen=True)
@@ -57,7 +63,7 @@ class Slice:
         scale = ColourScale(label, DISTANCE_COLOURS, 0.0, self.most_m, open_above=True)
         return scale.html + lines_html(
             ("#000000", "the surface itself"),
-            ("#ffffff", f"white: every {line_distances(self.most_m)[1]:g} m from it"),
+            ("#ffffff", f"white: every {_line_distances(self.most_m)[1]:g} m from it"),
             (BEHIND, "behind a surface"),
             (UNKNOWN, "unknown: not seen"),
         )
@@ -101,7 +107,7 @@ class SliceQuestion(Question[Slice]):
         box, axis = wanted.box, wanted.axis
         found = box.ask(self.page.source.queries, wanted.most_m)
         distance_m, status = (values.take(0, axis).T for values in (found.distance_m, found.status))
-        image = slice_picture(distance_m, status != Status.UNKNOWN, wanted.most_m)
+        image = _picture(distance_m, status != Status.UNKNOWN, wanted.most_m)
         # The same node where only its colours change: a new one is white until it is decoded.
         if self._drawn is not None and self._drawn[0] == box:
             self._drawn[1].image = image
@@ -127,3 +133,38 @@ class SliceQuestion(Question[Slice]):
         self._unplaced = False
         self._at.min, self._at.max = at_m - _REACH_M, at_m + _REACH_M
         self._at.value = at_m  # type: ignore[misc]  # mypy takes it for read-only
+
+
+def _line_distances(max_distance_m: float) -> Doubles:
+    """Return the round distances at which a slice has lines, from 0 up, metres."""
+    levels = np.asarray(_LEVELS.tick_values(0.0, max_distance_m), np.float64)
+    return levels[levels < max_distance_m]
+
+
+def _picture(distance_m: Floats, known: Bools, max_distance_m: float) -> Bytes:
+    """Return colours [height, width, 3], the least row first, with lines at round distances.
+
+    Lines end where nothing was seen; those of the surface itself are black.
+
+    Args:
+        distance_m: [rows, columns] at the centres of cells.
+        known: [rows, columns] whether anything was seen there.
+        max_distance_m: where the scale of colours ends.
+    """
+    rows, columns = known.shape
+    figure = Figure((columns * _PIXELS / _DPI, rows * _PIXELS / _DPI), _DPI)
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), frameon=False)
+    axes.set_axis_off()
+    colours = DISTANCE_COLOURS(distance_m.astype(np.float64) / max_distance_m)[..., :3]
+    colours[~known] = to_rgb(UNKNOWN)
+    axes.imshow(colours, origin="lower", aspect="auto", interpolation="nearest")
+    if known.any():
+        shown_m = np.ma.array(distance_m, mask=~known)
+        levels = _line_distances(max_distance_m)[1:]
+        lines = axes.contour(shown_m, levels, colors="white", linewidths=_LINE_PT)
+        axes.clabel(lines, fmt="%g m", fontsize=_LETTERS_PT)
+        axes.contour(shown_m, [0.0], colors="black", linewidths=_SURFACE_PT)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()  # type: ignore[no-untyped-call]
+    drawn = canvas.buffer_rgba()  # type: ignore[no-untyped-call]
+    return np.asarray(drawn)[::-1, :, :3]
