@@ -67,7 +67,7 @@ def _gradient_error(scene: Scene, points: np.ndarray, gradients: np.ndarray) -> 
     return float(np.mean(np.abs(np.stack(slopes, axis=1) - gradients).max(axis=1) > 1e-4))
 
 
-def test_grid_of_candidates_changes_no_answer(world: Scene) -> None:
+def test_distance_is_that_to_the_nearest_solid(world: Scene) -> None:
     rng = np.random.default_rng(3)
     points = rng.uniform(world.bounds[0] - 5.0, world.bounds[1] + 5.0, (20_000, 3))
     alone = [Scene((solid,), world.bounds).sdf(points) for solid in world.solids]

@@ -3,15 +3,12 @@
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
-from triquad_format.records.arrays import Bools, Doubles, Longs
+from triquad_format.records.arrays import Bools, Doubles
 from triquad_map.compiled.kernel import inner_kernel, kernel
 
 from triquad_tools.simulation.solids import BOUND, Solid, X, Y, Z, distance_to, solid_table
-
-CELL_M = 2.5
 
 _ON_SURFACE_M = 1e-7
 _NEWTON_STEPS = 64
@@ -83,16 +80,12 @@ class Scene:
         return solid_table(self.solids)
 
     @cached_property
-    def _grid(self) -> "_CandidateGrid":
-        return _candidate_grid(self._table, self.bounds)
-
-    @cached_property
     def _houses(self) -> "Scene":
         return Scene(self.houses, self.bounds)
 
     def _nearest(self, points: Doubles) -> tuple[Doubles, Doubles]:
         """Return distances [N] to the nearest solids, and their gradients [N, 3]."""
-        return _nearest(self._table, *self._grid, _rows(points))
+        return _nearest(self._table, _rows(points))
 
 
 def _rows(points: Doubles) -> Doubles:
@@ -103,70 +96,19 @@ def _rows(points: Doubles) -> Doubles:
     return rows
 
 
-class _CandidateGrid(NamedTuple):
-    """The solids that are nearest to some point of each cube of a grid.
-
-    The last list, for points outside the grid, names all solids.
-    """
-
-    origin: Doubles  # [3] metres, lower corner
-    shape: Longs  # [3] cells
-    starts: Longs  # [cells + 2] into members
-    members: Longs  # rows of the table of solids
-
-
-def _candidate_grid(solids: Doubles, bounds: Doubles) -> _CandidateGrid:
-    """Return the grid over ``bounds [2, 3]`` for a table of solids ``[S, 11]``."""
-    shape = np.ceil((bounds[1] - bounds[0]) / CELL_M).astype(np.int64)
-    cells = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1)
-    centres = bounds[0] + (cells.reshape(-1, 3) + 0.5) * CELL_M
-    distances = _all_distances(solids, centres)
-    # A distance changes by at most half a diagonal between a cell's centre and its corners.
-    reach = distances.min(axis=1, keepdims=True) + np.sqrt(3.0) * CELL_M
-    candidates = np.vstack([distances <= reach, np.ones(len(solids), np.bool_)])
-    return _CandidateGrid(
-        origin=np.ascontiguousarray(bounds[0], np.float64),
-        shape=shape,
-        starts=np.concatenate([[0], np.cumsum(candidates.sum(axis=1))]),
-        members=np.nonzero(candidates)[1],
-    )
-
-
 @kernel()
-def _all_distances(solids: Doubles, points: Doubles) -> Doubles:
-    distances = np.empty((points.shape[0], solids.shape[0]))
-    for i in range(points.shape[0]):
-        for s in range(solids.shape[0]):
-            x, y, z = points[i, 0], points[i, 1], points[i, 2]
-            distances[i, s] = distance_to(solids[s], x, y, z)[0]
-    return distances
-
-
-@inner_kernel()
-def _cell(origin: Doubles, shape: Longs, point: Doubles) -> int:
-    """Return the flat index of a point's cell; one past the last for a point outside the grid."""
-    flat = np.int64(0)
-    for axis in range(3):
-        cell = np.floor((point[axis] - origin[axis]) / CELL_M)
-        if not 0 <= cell < shape[axis]:
-            return int(shape[0] * shape[1] * shape[2])
-        flat = flat * shape[axis] + int(cell)
-    return int(flat)
-
-
-@kernel()
-def _nearest(
-    solids: Doubles, origin: Doubles, shape: Longs, starts: Longs, members: Longs, points: Doubles
-) -> tuple[Doubles, Doubles]:
+def _nearest(solids: Doubles, points: Doubles) -> tuple[Doubles, Doubles]:
     count = points.shape[0]
     distances = np.full(count, np.inf)
     gradients = np.zeros((count, 3))
     for i in range(count):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        cell = _cell(origin, shape, points[i])
-        for k in range(starts[cell], starts[cell + 1]):
-            row = solids[members[k]]
-            distance, gx, gy, gz = distance_to(row, x, y, z)
+        for s in range(solids.shape[0]):
+            dx, dy, dz = x - solids[s, X], y - solids[s, Y], z - solids[s, Z]
+            # No part of a solid is nearer than the sphere around it.
+            if math.sqrt(dx * dx + dy * dy + dz * dz) - solids[s, BOUND] > distances[i]:
+                continue
+            distance, gx, gy, gz = distance_to(solids[s], x, y, z)
             if distance < distances[i]:
                 distances[i] = distance
                 gradients[i, 0], gradients[i, 1], gradients[i, 2] = gx, gy, gz
