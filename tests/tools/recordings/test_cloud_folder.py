@@ -176,6 +176,7 @@ def test_another_trajectory_can_be_chosen(tmp_path):
 def test_what_is_missing_or_too_much_is_named(tmp_path):
     with pytest.raises(ToolError, match="nowhere: no such folder"):
         read_cloud_folder(tmp_path / "nowhere")
+    assert not is_cloud_folder(tmp_path / "nowhere")
     assert not is_cloud_folder(tmp_path)
     with pytest.raises(ToolError, match=r"holds no .ply, .pcd, .las, .laz, .bin, nor does"):
         read_cloud_folder(tmp_path)

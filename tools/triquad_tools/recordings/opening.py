@@ -1,5 +1,7 @@
 """Finding out what kind of recording a path is."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 from triquad_tools.console.command import ToolError
@@ -10,11 +12,49 @@ from triquad_tools.recordings.options import ReadingOptions
 from triquad_tools.recordings.recording import Recording
 from triquad_tools.recordings.ros_recording import RosRecording
 
-_OF_BAGS = {"topics", "poses", "map_frame", "body_frame", "transforms", "recorder_clock", "stride"}
-_OF_CLOUDS = {"trajectory", "points_in", "deskew"}
-_OF_DEPTH = {"trajectory", "intrinsics", "units_per_metre", "stride"}
 _FLAGS = {"transforms": "--transform", "deskew": "--no-deskew"}
 """The flags whose names are not those of the choices that they set."""
+
+
+@dataclass(frozen=True)
+class _Reader:
+    """The reader of one kind of recording."""
+
+    kind: str  # in words, for messages
+    options: frozenset[str]  # the choices that mean something for this kind
+    is_of_kind: Callable[[Path], bool]  # whether a path that exists holds such a recording
+    read: Callable[[Path, ReadingOptions], Recording]
+
+
+def _read_bag(path: Path, options: ReadingOptions) -> Recording:
+    bag = find_bag(path)
+    assert bag is not None  # or another reader would have been chosen
+    return RosRecording(bag, options)
+
+
+_READERS = (
+    _Reader(
+        "a bag",
+        frozenset(
+            {"topics", "poses", "map_frame", "body_frame", "transforms", "recorder_clock", "stride"}
+        ),
+        lambda path: find_bag(path) is not None,
+        _read_bag,
+    ),
+    _Reader(
+        "a folder of depth images",
+        frozenset({"trajectory", "intrinsics", "units_per_metre", "stride"}),
+        is_depth_folder,
+        read_depth_folder,
+    ),
+    _Reader(
+        "a folder of clouds",
+        frozenset({"trajectory", "points_in", "deskew"}),
+        is_cloud_folder,
+        read_cloud_folder,
+    ),
+)
+"""All readers; the first whose kind a path is reads it."""
 
 
 def open_recording(path: Path, options: ReadingOptions) -> Recording:
@@ -25,25 +65,21 @@ def open_recording(path: Path, options: ReadingOptions) -> Recording:
     """
     if not path.exists():
         raise ToolError(f"{path}: no such file or folder")
-    bag = find_bag(path)
-    if bag is not None:
-        _refuse_others(path, "a bag", _OF_BAGS, options)
-        return RosRecording(bag, options)
-    if is_depth_folder(path):
-        _refuse_others(path, "a folder of depth images", _OF_DEPTH, options)
-        return read_depth_folder(path, options)
-    if is_cloud_folder(path):
-        _refuse_others(path, "a folder of clouds", _OF_CLOUDS, options)
-        return read_cloud_folder(path, options)
+    for reader in _READERS:
+        if reader.is_of_kind(path):
+            _refuse_others(path, reader, options)
+            return reader.read(path, options)
     raise ToolError(
         f"{path}: no recording that is understood: give a bag of ROS, an MCAP file, or a folder as "
         "docs/tools.md describes them"
     )
 
 
-def _refuse_others(path: Path, kind: str, known: set[str], options: ReadingOptions) -> None:
+def _refuse_others(path: Path, reader: _Reader, options: ReadingOptions) -> None:
     """Refuse choices that are not for the kind of recording that was found."""
     for name in options.given:
-        if name not in known:
+        if name not in reader.options:
             flag = _FLAGS.get(name, f"--{name.replace('_', '-')}")
-            raise ToolError(f"{path} is {kind}, for which {flag} means nothing: leave it out")
+            raise ToolError(
+                f"{path} is {reader.kind}, for which {flag} means nothing: leave it out"
+            )

@@ -32,20 +32,18 @@ class _Images(NamedTuple):
 
 def is_depth_folder(folder: Path) -> bool:
     """Return whether a folder is laid out as those of TUM RGB-D or of Open3D are."""
-    return (folder / _LIST_NAME).is_file() or any((folder / _FOLDER_NAME).glob("*.png"))
+    return (folder / _LIST_NAME).is_file() or bool(in_order((folder / _FOLDER_NAME).glob("*.png")))
 
 
 def read_depth_folder(folder: Path, options: ReadingOptions) -> ScanFolder:
-    """Return the depth images of a folder with their poses.
+    """Return the depth images of a folder that is laid out so, with their poses.
 
     An image that shows nothing is a scan without points.
 
     Raises:
-        ToolError: there are no images, no trajectory, no common times or no intrinsics, an
-            image is damaged or no depth image, or does not fit to the camera.
+        ToolError: there is no trajectory, no common time or no intrinsics, an image is missing,
+            damaged or no depth image, or does not fit to the camera.
     """
-    if not folder.is_dir():
-        raise ToolError(f"{folder}: no such folder")
     images = _listed(folder) if (folder / _LIST_NAME).is_file() else _found(folder)
     camera = choose_camera(folder, options.intrinsics)
     placed = place_files(folder, options.trajectory, images.paths, images.stamps_ns)
@@ -114,7 +112,4 @@ def _listed(folder: Path) -> _Images:
 
 def _found(folder: Path) -> _Images:
     """Return the images as Open3D has them: all that lie in a folder."""
-    paths = in_order((folder / _FOLDER_NAME).glob("*.png"))
-    if not paths:
-        raise ToolError(f"{folder}: holds neither {_LIST_NAME} nor {_FOLDER_NAME}/*.png")
-    return _Images(paths, None, _OPEN3D_UNITS_PER_M)
+    return _Images(in_order((folder / _FOLDER_NAME).glob("*.png")), None, _OPEN3D_UNITS_PER_M)
