@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from triquad_format.records.arrays import Doubles, Ints, Longs
+from triquad_format.records.arrays import Bools, Doubles, Ints, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.region import BLOCK_BYTES
 from triquad_format.records.region import Evidence as EvidenceRecord
@@ -29,8 +29,6 @@ _MIN_CAPACITY = 256
 
 _FIELD_FREE = 0.3
 """A field of more voxels than this, where a surface was seen, shows none."""
-
-_LEAST_SCANS = 3  # in which new surface was seen
 
 
 class Marks(NamedTuple):
@@ -94,20 +92,13 @@ class LiveEvidence:
         """Keep the unit ``normals`` [N, 3] of surfaces that were marked; NaN where unknown."""
         self._observations.set_normals(marks.rows, normals)
 
-    def new_surface(self, marks: Marks, scans: int) -> int:
-        """Return in how many voxels the newest scan's rays ended on surface of the last ``scans``.
+    def seen_by_few(self, marks: Marks, scans: int) -> Bools:
+        """Return which rays [N] ended on a surface that at most ``scans`` scans have seen so far.
 
-        It was first seen in these, and seen in at least half of the scans since and in three:
-        single rays end next to a surface by chance.
+        Rays that ended outside the region did not.
         """
-        voxels = self._observations.arrays.voxels
-        rows = marks.rows[marks.rows > 0]
-        if len(rows) == 0:
-            return 0
-        age = voxels["hit_scan"][rows].max() - voxels["first_scan"][rows] + 1
-        rows, age = rows[age <= scans], age[age <= scans]
-        scans = voxels["scans"][rows].astype(np.int64)
-        return len(np.unique(rows[(scans >= _LEAST_SCANS) & (2 * scans >= age)]))
+        seen_by: Bools = self._observations.arrays.voxels["scans"][marks.rows] <= scans
+        return seen_by & (marks.rows > 0)
 
     def set_discs(self, voxels: Longs, surfels: Surfels) -> None:
         """Take from ``surfels`` [N] where the surface lies in ``voxels`` [N, 3].

@@ -49,7 +49,7 @@ def map_fit(regions: Iterable[LiveRegion]) -> FieldFit | None:
         upper_m=fit.upper_m,
         worst=fit.worst,
         worst_median_m=fit.worst_median_m.astype(np.float32),
-        repairing=sum(int(places.forgotten.sum()) for _, places in judged),
+        repairing=sum(judgement.repairing for _, judgement in judgements),
         repaired=sum(judgement.repairs.done for _, judgement in judgements),
         given_up=sum(judgement.repairs.given_up for _, judgement in judgements),
     )

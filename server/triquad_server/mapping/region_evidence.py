@@ -26,19 +26,9 @@ _FAR_THINNED_AT, _OPEN_THINNED_AT = 0.5, 0.25  # shares of the rays' length
 _NEW_SCANS = 10
 """The number of scans, after a surface is first seen, that give the field time to learn it."""
 
-_FEW_NEW = 2
-"""New surface in more voxels than these makes the region learn again what it had learnt."""
-
 _SURFELS_REFITTED = 8_000
 """The number of surfels that are fitted again with each epoch while the field is trained: some
 10 ms."""
-
-
-class SeenSurface(NamedTuple):
-    """The surface that the rays of a scan show in a region."""
-
-    marks: Marks
-    is_new: bool  # they ended on surface that the field has had no time to learn
 
 
 class PublishedEvidence(NamedTuple):
@@ -87,7 +77,7 @@ class RegionEvidence:
         """Return the voxel coordinates [N, 3] of points [N, 3], map frame."""
         return self._setup.field.leaf_coordinates(points - self._centre)
 
-    def scan_taken(self, rays: ScanRays, stamp_s: int) -> SeenSurface:
+    def scan_taken(self, rays: ScanRays, stamp_s: int) -> Marks:
         """Record where rays ended and what they crossed, and remove surface that they contradict.
 
         ``stamp_s`` is when the scan was taken, seconds since 1970.
@@ -96,7 +86,6 @@ class RegionEvidence:
         ends, origin = self.voxels(rays.ends), self.voxels(rays.origin[None])[0]
         leaf_m = self._setup.field.leaf_m
         marks = self.live.mark_surface(ends, Sighting(origin, leaf_m, stamp_s, self._scans))
-        is_new = self.live.new_surface(marks, _NEW_SCANS) > _FEW_NEW
         clear = math.inf if self._setup.change.static else _CLEAR_SHORT
         reach = Reach(_CARVE_SHORT, clear, self._scans)
         thinned = ends[thin(ends, 1.0, empty_keys(len(ends)))]
@@ -112,7 +101,7 @@ class RegionEvidence:
         self.live.carve(origin, open_ends, Reach(0.0))
         if rays.robot is not None:
             self.live.mark_free(self.voxels(rays.robot.voxel_centres(leaf_m)))
-        return SeenSurface(marks, is_new)
+        return marks
 
     def step_taken(self) -> None:
         """Record that the field was trained on what was seen so far."""

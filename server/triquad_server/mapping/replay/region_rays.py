@@ -1,5 +1,7 @@
 """The kept rays of a region: those to train on, and those to judge its field with."""
 
+from typing import NamedTuple
+
 import numpy as np
 from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
 from triquad_format.records.region import TrainingState
@@ -12,6 +14,13 @@ from triquad_server.mapping.replay.ray_table import END, RayTable, samples_alone
 from triquad_server.mapping.replay.region_setup import RegionSetup
 from triquad_server.mapping.replay.replay_pool import ReplayPool
 from triquad_server.mapping.replay.replay_record import restored_rays
+
+
+class JudgingRays(NamedTuple):
+    """Rays that judge a field."""
+
+    ends: Floats  # [N, 3] metres from the region's centre
+    are_new: Bools  # [N]
 
 
 class RegionRays:
@@ -42,11 +51,14 @@ class RegionRays:
             np.concatenate([trained.origins, held.origins]),
         )
 
-    @property
-    def judging(self) -> Floats:
-        """Return the rows [N, COLUMNS] of held-out rays that end in the region's cube."""
-        rows = self.held_out.table.rows
-        return rows[in_cube(rows[:, END : END + 3], self._settings)]
+    def judging(self, newest: int) -> JudgingRays:
+        """Return the rays that are held out and end in the region's cube, the ``newest`` marked."""
+        table = self.held_out.table
+        order = np.argsort(table.origin_of, kind="stable")
+        ends = np.ascontiguousarray(table.rows[order, END : END + 3])
+        are_new = np.arange(len(ends)) >= len(ends) - newest
+        inside = in_cube(ends, self._settings)
+        return JudgingRays(ends[inside], are_new[inside])
 
     @property
     def ends(self) -> Floats:

@@ -4,7 +4,7 @@ import logging
 from dataclasses import replace
 
 import numpy as np
-from triquad_format.records.arrays import Doubles, Floats, Longs
+from triquad_format.records.arrays import Bools, Doubles, Longs
 from triquad_format.records.region import TrainingState
 from triquad_map.evidence.live_evidence import LiveEvidence
 from triquad_map.surfels.surfel_map import SurfelMap
@@ -15,12 +15,11 @@ from triquad_server.engine.live_field import LiveField
 from triquad_server.engine.memory import FrozenField
 from triquad_server.engine.trainer import Loss, trainer_of
 from triquad_server.intake.rays import ScanRays
-from triquad_server.mapping.replay.ray_table import END, rays_through, samples_alone
+from triquad_server.mapping.replay.ray_table import rays_through, samples_alone
 from triquad_server.mapping.replay.region_rays import RegionRays
 from triquad_server.mapping.replay.region_setup import RegionSetup
 from triquad_server.mapping.training.focus import Focus
 from triquad_server.mapping.training.judgement import Judgement, Repairs
-from triquad_server.mapping.training.learnt_places import VISITS, LearntPlaces
 from triquad_server.mapping.training.slopes import Slopes
 from triquad_server.mapping.training.training_budget import FairShare, TrainingBudget
 
@@ -40,6 +39,18 @@ kept, it is as soon as each was sampled often enough to make a difference."""
 
 _JUDGED_AFTER_SHARE = 0.5
 """A field that has settled is judged once this share of the rays that are held out is new."""
+
+LEARNT_SCANS = 50
+"""A surface is new until this many scans have seen it: a drive at 1 m a scan sees most of them less
+often."""
+
+_NEW_SHARE = 0.01
+"""A scan owes training if more of its rays than this share end on new surface. The others show what
+is still there, but teach little: so the map of a robot at rest settles while scans come. Single
+rays always end where few have ended, by chance."""
+
+VISITS = 5
+"""The samples per ray, on average, that can make a difference."""
 
 _FEW_REMOVED = 32
 """If the surface of more voxels is removed, all of the region learns: rows that others use as well
@@ -74,8 +85,7 @@ class RegionTraining:
         self._random = np.random.default_rng([seed, 1])  # other numbers than those of the pool
         self.rays = rays or RegionRays(setup, seed)
         self.budget = TrainingBudget(setup.training)
-        self.judgement = Judgement(setup.field)
-        self._learnt = LearntPlaces(setup.field)
+        self.judgement = Judgement(setup.field, Repairs())
         self._focus = Focus(field, evidence, self.rays.pool)
         self._slopes = Slopes(field, self.rays.pool)
         self._trainer = trainer_of(field, setup.sums, setup.team)
@@ -97,9 +107,8 @@ class RegionTraining:
         training = cls(field, evidence, setup, centre, seed, rays)
         training.budget.restore(state.budget_samples, len(rays.pool))
         repairs = Repairs(state.places_repaired, state.places_given_up)
-        judging = rays.judging
-        sdf = _sdf(field.freeze(), judging[:, END : END + 3])
-        training.judgement = Judgement.restored(setup.field, repairs, judging, sdf)
+        training.judgement = Judgement(setup.field, repairs)
+        training._judge(field.freeze())
         return training
 
     @property
@@ -129,30 +138,26 @@ class RegionTraining:
         self.rays.limit(max(1, int(share.rays * voxels)))
         self.budget.limit(int(share.samples * voxels))
 
-    def scan_taken(self, rays: ScanRays, normals: Doubles, *, is_new: bool) -> None:
+    def scan_taken(self, rays: ScanRays, normals: Doubles, is_new: Bools) -> None:
         """Keep the rays of a scan, to be trained on.
 
         Args:
             rays: N rays, map frame.
             normals: [N, 3] of the surface at their ends, NaN where unknown.
-            is_new: they show surface that the field has had no time to learn.
+            is_new: [N] which of them end on new surface.
         """
-        if is_new and len(self._learnt):
-            self._learnt.learn_all_again()
         if self.is_settled:
             self._focus.narrow()
-        offsets = rays.ends - self._centre
-        self._learnt.see(offsets)
-        needing = self._learnt.need_training(offsets)
-        self._focus.widen_to(self._setup.field.leaf_coordinates(offsets[needing]))
+        shows_new = is_new.mean() > _NEW_SHARE or self.judgement.repairing > 0
+        ends = rays.ends[is_new & shows_new] - self._centre
+        self._focus.widen_to(self._setup.field.leaf_coordinates(ends))
         placement = self._setup.placement
         passing = rays_through(rays, normals, self._centre, placement, self._random)
         if len(passing) == 0:
             return
         held = self.rays.keep(passing)
         self._unjudged_rays += int(held.sum())
-        needing = self._learnt.need_training(passing.rows[:, END : END + 3])
-        self.budget.add(int((needing & ~held).sum()))
+        self.budget.add(int((~held).sum()) if shows_new else 0)
 
     def take_step(self) -> tuple[Loss, int]:
         """Take one optimiser step; return loss and samples. On a GPU, reading the loss waits."""
@@ -162,7 +167,6 @@ class RegionTraining:
         loss = self._trainer.train(pool.draw(step.samples, step.fresh, step.repair), step.rates)
         self.budget.spend(step)
         self._unjudged_samples += step.samples
-        self._learnt.trained(step.samples / pool.rays_drawn_on)
         self._slopes.after(step)
         return loss, step.samples
 
@@ -180,7 +184,6 @@ class RegionTraining:
     def forget(self, low: Doubles, high: Doubles) -> None:
         """Forget the rays that end between two corners [3], map frame."""
         self._focus.release()
-        self._learnt.learn_all_again()
         self.rays.forget(low - self._centre, high - self._centre)
         if len(self.rays.pool) == 0:
             self.budget.clear()
@@ -196,7 +199,6 @@ class RegionTraining:
     def _unlearn(self, removed: Longs, surfels: SurfelMap) -> None:
         """Forget the rays that ended in voxels, and have the field learn what is there now."""
         settings = self._setup.field
-        self._learnt.surface_removed(settings.offsets(removed.astype(np.float64) + 0.5))
         self.rays.forget_ends(removed)
         if len(removed) > _FEW_REMOVED:
             self._focus.release()
@@ -221,29 +223,13 @@ class RegionTraining:
 
     def _judge(self, field: FrozenField) -> None:
         """Find where the field has forgotten what it knew, and have it learnt again."""
+        rays = self.rays.judging(newest=self._unjudged_rays)
         self._unjudged_samples = self._unjudged_rays = 0
-        rows = self.rays.judging
-        if len(rows) == 0:
+        if len(rays.ends) == 0:
             return
-        ends = np.ascontiguousarray(rows[:, END : END + 3])
-        sdf = _sdf(field, ends)
-        places = self.judgement.judge(rows, sdf, may_repair=self.budget.may_repair)
-        rose = self._learnt.judge(
-            ends, sdf, lambda points: _sdf(field, points), settled=self.is_settled
-        )
-        if len(places.forgotten_keys):
-            _log.info(
-                "%d places fit held-out rays worse than before, and are learnt again: one is at "
-                "%.1f, %.1f, %.1f",
-                len(places.forgotten_keys),
-                *(places.centres[places.forgotten][0] + self._centre),
-            )
-        oversampled = self.rays.pool.oversample(places.forgotten_keys)
-        if oversampled or rose:
+        sdf = field.evaluate(rays.ends, gradient=False).sdf
+        again = self.judgement.judge(rays.ends, sdf, rays.are_new)
+        if len(again):
+            _log.info("%d places fit rays worse than before, and are learnt again", len(again))
             self._focus.release()
-        self.budget.repair(oversampled)
-
-
-def _sdf(field: FrozenField, points: Floats) -> Floats:
-    """Return a field's values at ``points`` [N, 3], metres from the region's centre."""
-    return field.evaluate(np.ascontiguousarray(points), gradient=False).sdf
+        self.budget.repair(self.rays.pool.oversample(again))

@@ -41,9 +41,6 @@ _COOLDOWN_SHARE = 0.5
 little may be, it would begin low."""
 _REPAIR_SHARE = 0.5  # share of a batch that is drawn where the field has forgotten
 _REPAIR_VISITS = 16  # samples on each ray there
-_REPAIR_ROUNDS = 3
-"""How often in a row what was forgotten is learnt again before new rays must arrive. Else two
-places that make each other forget would do so for ever."""
 
 
 class Step(NamedTuple):
@@ -65,7 +62,6 @@ class TrainingBudget:
         self._most = 0  # limit of what may be left
         self._fresh = 0  # of the samples, those that are to be on rays of the newest scan
         self._repair = 0  # of the samples, those in places that have forgotten
-        self._rounds = 0  # rounds of repair since there were new rays
         self._new_rays = 0  # since nothing was left
 
     @property
@@ -73,15 +69,8 @@ class TrainingBudget:
         """Return whether rays of the newest scan have yet to be learnt from."""
         return self._fresh > 0
 
-    @property
-    def may_repair(self) -> bool:
-        """Return whether what was forgotten may be learnt again."""
-        return self._rounds < _REPAIR_ROUNDS
-
     def add(self, rays: int) -> None:
         """Add new rays to learn from."""
-        if rays:
-            self._rounds = 0
         if self.samples == 0:
             self._new_rays = 0
         self._new_rays += rays
@@ -109,8 +98,6 @@ class TrainingBudget:
 
     def repair(self, rays: int) -> None:
         """Learn again the ``rays`` rays in places that have forgotten, and nothing else."""
-        if rays:
-            self._rounds += 1
         self._repair = _REPAIR_VISITS * rays
         needed = int(self._repair / _REPAIR_SHARE)
         self.samples = max(self.samples, min(needed, self._most))
