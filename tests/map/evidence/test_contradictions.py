@@ -89,20 +89,21 @@ def test_it_comes_back_and_goes_again_each_time(rng: np.random.Generator) -> Non
         assert watched.believed(wall) < 0.02
 
 
-def test_single_rays_that_end_where_a_wall_was_are_no_new_surface(
+def test_surface_is_new_until_enough_scans_saw_it_and_again_where_it_comes_back(
     rng: np.random.Generator,
 ) -> None:
     watched, wall = Watched(), panel(rng, WALL_X)
-    for _ in range(10):
-        watched.scan(wall)
-    while watched.believed(wall) > 0:
-        watched.scan(behind(wall, 200.5))
-    found = []
-    for scan in range(watched.scans + 1, watched.scans + 5):
-        sighting = Sighting(SENSOR, 0.2, scan, scan=scan)
+
+    def are_new() -> bool:
+        sighting = Sighting(SENSOR, 0.2, watched.scans + 1, scan=watched.scans + 1)
         marks = watched.evidence.mark_surface(wall[:5], sighting)
-        found.append(watched.evidence.new_surface(marks, 10))
-    assert found == [0, 0, 5, 5]
+        watched.scans += 1
+        return bool(watched.evidence.seen_by_few(marks, 3).all())
+
+    assert [are_new() for _ in range(5)] == [True, True, True, False, False]
+    while watched.believed(wall[:5]) > 0:
+        watched.scan(behind(wall, 200.5))
+    assert [are_new() for _ in range(5)] == [True, True, True, False, False]
 
 
 def test_ground_is_not_taken_back_by_rays_that_graze_it(rng: np.random.Generator) -> None:

@@ -17,22 +17,26 @@ from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.progress import map_fit
 from triquad_server.mapping.replay.held_out import are_held_out, ends_in_steps
 from triquad_server.mapping.replay.ray_table import END
-from triquad_server.mapping.training.judgement import JudgedPlaces, Judgement
+from triquad_server.mapping.training.judgement import Judgement, Repairs
 
 FIELD = FieldSettings()
 NOISE_M = 0.02
 RNG = np.random.default_rng(0)
 # Of two places, a hundred metres apart.
-ROWS = np.concatenate([RNG.uniform(0.1, 6.3, (400, 4)), RNG.uniform(100, 102, (300, 4))]).astype(
+ENDS = np.concatenate([RNG.uniform(0.1, 6.3, (400, 3)), RNG.uniform(100, 102, (300, 3))]).astype(
     np.float32
 )
-NOISE = RNG.normal(0, NOISE_M, len(ROWS))
-FIRST, SECOND = np.arange(len(ROWS)) < 400, np.arange(len(ROWS)) >= 400
+NOISE = RNG.normal(0, NOISE_M, len(ENDS))
+FIRST, SECOND = np.arange(len(ENDS)) < 400, np.arange(len(ENDS)) >= 400
 
 
-def judged(judgement: Judgement, error_m: np.ndarray) -> JudgedPlaces:
-    """A field that is off by ``error_m`` where noisy rays end."""
-    return judgement.judge(ROWS, (NOISE + error_m).astype(np.float32))
+def judged(judgement: Judgement, error_m: np.ndarray, new: float = 0.0) -> list[int]:
+    """The places to learn again, of a field that is off by ``error_m`` where noisy rays end.
+
+    A share of them is ``new``.
+    """
+    are_new = np.random.default_rng(1).random(len(ENDS)) < new
+    return judgement.judge(ENDS, (NOISE + error_m).astype(np.float32), are_new).tolist()
 
 
 def off(at: np.ndarray, by_m: float) -> np.ndarray:
@@ -40,51 +44,54 @@ def off(at: np.ndarray, by_m: float) -> np.ndarray:
     return np.where(at, by_m, 0.0) * np.where(np.arange(len(at)) % 2, 1, -1)
 
 
-def test_what_fits_worse_than_it_did_is_forgotten() -> None:
-    judgement = Judgement(FIELD)
-    assert not judged(judgement, off(FIRST, 0.005)).forgotten.any()
-    places = judged(judgement, off(SECOND, 0.02))
-    (gone,) = places.centres[places.forgotten]
-    assert np.linalg.norm(gone - 101) < 10
-    assert places.forgotten_keys == place_keys(ROWS[-1:, :3], FIELD)
+def test_what_fits_worse_than_it_did_is_learnt_again() -> None:
+    judgement = Judgement(FIELD, Repairs())
+    assert not judged(judgement, off(FIRST, 0.005))
+    (second,) = place_keys(ENDS[-1:], FIELD).tolist()
+    assert judged(judgement, off(SECOND, 0.03)) == [second]
+    assert judgement.repairing == 1
+    assert not judged(judgement, off(FIRST, 0.005))
+    assert judgement.repairs == Repairs(done=1)
 
 
-def test_a_little_worse_again_and_again_is_forgotten_in_the_end() -> None:
-    judgement = Judgement(FIELD)
-    forgotten = [judged(judgement, off(SECOND, 0.001 * n)).forgotten.any() for n in range(20)]
-    assert not forgotten[1]
-    assert any(forgotten)
+def test_a_little_worse_again_and_again_is_told_in_the_end() -> None:
+    judgement = Judgement(FIELD, Repairs())
+    told = [bool(judged(judgement, off(SECOND, 0.001 * n))) for n in range(20)]
+    assert not told[1]
+    assert any(told)
 
 
-def test_what_cannot_be_repaired_is_taken_as_it_is() -> None:
-    judgement = Judgement(FIELD)
+def test_a_few_new_rays_tell_that_the_surface_moved() -> None:
+    judgement = Judgement(FIELD, Repairs())
     judged(judgement, off(FIRST, 0.0))
-    tries = [judged(judgement, off(FIRST, 0.03)) for _ in range(5)]
-    assert [int(places.forgotten.sum()) for places in tries] == [1, 1, 1, 0, 0]
-    assert [places.given_up for places in tries] == [0, 0, 0, 1, 0]
-    assert sum(places.repaired for places in tries) == 0
+    are_new = FIRST & (np.arange(len(ENDS)) < 40)
+    moved = (NOISE + off(are_new, 0.08)).astype(np.float32)
+    assert judgement.judge(ENDS, moved, are_new).tolist() == place_keys(ENDS[:1], FIELD).tolist()
+
+
+def test_what_cannot_be_repaired_is_taken_as_it_is_until_new_rays_come() -> None:
+    judgement = Judgement(FIELD, Repairs())
+    judged(judgement, off(FIRST, 0.0))
+    assert [len(judged(judgement, off(FIRST, 0.03))) for _ in range(5)] == [1, 1, 1, 0, 0]
+    assert judgement.repairs == Repairs(done=0, given_up=1)
+    assert not judged(judgement, off(FIRST, 0.06))
+    assert judged(judgement, off(FIRST, 0.12), new=0.7)
 
 
 @pytest.mark.parametrize("noise_m", [0.002, 0.02])
 def test_a_rise_that_is_small_beside_the_noise_is_none(noise_m: float) -> None:
     noise = RNG.normal(0, noise_m, 100_000)
-    rows = RNG.uniform(0.01, 0.3, (len(noise), 4)).astype(np.float32)
+    ends = RNG.uniform(0.01, 0.3, (len(noise), 3)).astype(np.float32)
     side = np.where(np.arange(len(noise)) % 2, 1, -1)
+    none = np.zeros(len(noise), np.bool_)
 
-    def is_forgotten(share: float) -> bool:
-        judgement = Judgement(FieldSettings(leaf_m=0.01))
-        judgement.judge(rows, noise)
-        return bool(judgement.judge(rows, noise + share * noise_m * side).forgotten.any())
+    def is_worse(share: float) -> bool:
+        judgement = Judgement(FieldSettings(leaf_m=0.01), Repairs())
+        judgement.judge(ends, noise, none)
+        return bool(len(judgement.judge(ends, noise + share * noise_m * side, none)))
 
-    assert not is_forgotten(0.3)  # 9 % of its square
-    assert is_forgotten(0.5)
-
-
-def test_a_place_that_is_seen_anew_may_change() -> None:
-    judgement = Judgement(FIELD)
-    judgement.judge(ROWS[FIRST][:300], NOISE[:300].astype(np.float32))
-    moved = (NOISE + off(FIRST, 0.05)).astype(np.float32)[FIRST]
-    assert not judgement.judge(ROWS[FIRST], moved).forgotten.any()
+    assert not is_worse(0.6)  # 36 % of its square
+    assert is_worse(0.8)
 
 
 def test_one_ray_in_some_dozens_is_held_out_by_compiled_code_too() -> None:
