@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from triquad_format.wire.codec import MAX_MESSAGE_BYTES, Message
-from triquad_format.wire.limits import MAX_CELL_M, MAX_TILE_M, MIN_LENGTH_M
+from triquad_format.wire.limits import MAX_CELL_M, MAX_TILE_M, MIN_LENGTH_M, TILE_INDEX_LIMIT
 from triquad_format.wire.messages import (
     Count,
     Epoch,
@@ -17,6 +17,8 @@ from triquad_format.wire.messages import (
     TileIndices,
 )
 from triquad_format.wire.reply import asked_by, parts_of, rows_of, within
+
+_IN_RANGE = within(-TILE_INDEX_LIMIT, TILE_INDEX_LIMIT)
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,8 @@ class TileList(MapReply):
     """Answer to :class:`TileListRequest`."""
 
     tile_side_m: Annotated[float, within(MIN_LENGTH_M, MAX_TILE_M)]
-    tiles: TileIndices  # [T, 3]: tile t covers [t, t + 1) * tile_side_m
+    # [T, 3]: tile t covers [t, t + 1) * tile_side_m
+    tiles: Annotated[TileIndices, _IN_RANGE]
     # [T] the surface of each tile last changed in this epoch
     changed: Annotated[Epochs, rows_of("tiles")]
 
@@ -89,9 +92,9 @@ class TileUpdates(Message):
     restart: bool  # the request spoke of another server: what was known of it is void
     tile_side_m: Annotated[float, within(MIN_LENGTH_M, MAX_TILE_M)]
     cell_m: Annotated[float, within(MIN_LENGTH_M, MAX_CELL_M)]
-    tiles: TileIndices  # [T, 3] that changed
+    tiles: Annotated[TileIndices, _IN_RANGE]  # [T, 3] that changed
     versions: Annotated[Epochs, rows_of("tiles")]  # [T] epoch of which each is
     # [T] bytes of each
     sizes: Annotated[Integers, within(0, MAX_MESSAGE_BYTES), rows_of("tiles"), parts_of("data")]
     data: bytes  # of all, one behind the other: triquad_format.wire.tile_codec
-    removed: TileIndices  # [R, 3] that have no faces any more
+    removed: Annotated[TileIndices, _IN_RANGE]  # [R, 3] that have no faces any more
