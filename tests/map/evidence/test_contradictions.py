@@ -89,16 +89,16 @@ def test_it_comes_back_and_goes_again_each_time(rng: np.random.Generator) -> Non
         assert watched.believed(wall) < 0.02
 
 
-def test_surface_is_new_until_enough_scans_saw_it_and_again_where_it_comes_back(
+def test_surface_is_new_for_some_scans_and_again_where_it_comes_back(
     rng: np.random.Generator,
 ) -> None:
     watched, wall = Watched(), panel(rng, WALL_X)
 
     def are_new() -> bool:
-        sighting = Sighting(SENSOR, 0.2, watched.scans + 1, scan=watched.scans + 1)
-        marks = watched.evidence.mark_surface(wall[:5], sighting)
         watched.scans += 1
-        return bool(watched.evidence.seen_by_few(marks, 3).all())
+        sighting = Sighting(SENSOR, 0.2, watched.scans, scan=watched.scans)
+        marks = watched.evidence.mark_surface(wall[:5], sighting)
+        return bool(watched.evidence.first_seen_since(watched.scans - 2, marks).all())
 
     assert [are_new() for _ in range(5)] == [True, True, True, False, False]
     while watched.believed(wall[:5]) > 0:

@@ -42,7 +42,7 @@ class Resting:
 
     def settle(self, *there: Solid) -> None:
         """Rest until scans cause no more training."""
-        while sum(self.scan(*there) for _ in range(10)) > 20_000:
+        while sum(self.scan(*there) for _ in range(30)) > 20_000:
             assert self.scans < 400, "it never settles"
 
     def error_m(self, points: Doubles) -> float:

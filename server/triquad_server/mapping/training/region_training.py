@@ -41,13 +41,12 @@ _JUDGED_AFTER_SHARE = 0.5
 """A field that has settled is judged once this share of the rays that are held out is new."""
 
 LEARNT_SCANS = 50
-"""A surface is new until this many scans have seen it: a drive at 1 m a scan sees most of them less
-often."""
+"""A surface is new for this many scans: a drive at 1 m a scan leaves it behind earlier."""
 
 _NEW_SHARE = 0.01
-"""A scan owes training if more of its rays than this share end on new surface. The others show what
-is still there, but teach little: so the map of a robot at rest settles while scans come. Single
-rays always end where few have ended, by chance."""
+"""A scan owes training once as many rays as this share of its own ended on new surface. The others
+show what is still there, but teach little: so the map of a robot at rest settles while scans come,
+though single rays always end, by chance, where none has ended before."""
 
 VISITS = 5
 """The samples per ray, on average, that can make a difference."""
@@ -91,6 +90,7 @@ class RegionTraining:
         self._trainer = trainer_of(field, setup.sums, setup.team)
         self._unjudged_samples = 0  # samples that were trained since it was judged
         self._unjudged_rays = 0  # rays that were held out since
+        self._new_rays = 0  # that ended on new surface since the last scan that owed training
 
     @classmethod
     def restored(
@@ -148,7 +148,10 @@ class RegionTraining:
         """
         if self.is_settled:
             self._focus.narrow()
-        shows_new = is_new.mean() > _NEW_SHARE or self.judgement.repairing > 0
+        self._new_rays += int(is_new.sum())
+        shows_new = self._new_rays > _NEW_SHARE * len(is_new) or self.judgement.repairing > 0
+        if shows_new:
+            self._new_rays = 0
         ends = rays.ends[is_new & shows_new] - self._centre
         self._focus.widen_to(self._setup.field.leaf_coordinates(ends))
         placement = self._setup.placement
