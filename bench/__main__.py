@@ -93,6 +93,12 @@ def _moving(options: argparse.Namespace) -> list[Figure]:
     return measure_moving(options.seed, options.recorded) + measure_parked(options.seed)
 
 
+def _belief(options: argparse.Namespace) -> list[Figure]:  # noqa: ARG001
+    from bench.parts.belief import measure_belief
+
+    return measure_belief(held=False) + measure_belief(held=True)
+
+
 def _presets(options: argparse.Namespace) -> list[Figure]:
     from bench.parts.presets import measure_presets
 
@@ -117,6 +123,7 @@ PARTS: dict[str, _Measure] = {
     "answers": _answers,
     "file": _file,
     "moving": _moving,
+    "belief": _belief,
     "presets": _presets,
     "start": _start,
     "viewer": _viewer,

@@ -4,6 +4,7 @@ A voxel of a thing counts once rays of some later scans passed it: within ``_PAS
 middle of the hits in it, and on beyond. So what no ray shows any more is nobody's fault.
 """
 
+import math
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -12,30 +13,36 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 from triquad_format.records.arrays import Bools, Doubles, Longs
-from triquad_format.records.status import Status
-from triquad_map.questions.segments import SegmentOptions, segments
-from triquad_server.epochs.epoch import Epoch
+from triquad_map.evidence.live_evidence import LiveEvidence
+from triquad_server.engine.gradient_sums import GradientSums
+from triquad_server.engine.memory import memory_on
+from triquad_server.intake.rays import usable_rays
+from triquad_server.mapping.region_evidence import RegionEvidence
+from triquad_server.mapping.replay.normals import SurfaceNormals
+from triquad_server.mapping.replay.region_setup import RegionSetup
+from triquad_server.process.threads import Teams
 from triquad_server.settings import Settings
+from triquad_server.settings.loading import load_settings
 from triquad_tools.console.progress import progress
 from triquad_tools.sensors.sweep import moved
 
-from bench.ended_voxels import EndedVoxels, end_keys, surface_share, voxel_centres, voxel_keys
+from bench.ended_voxels import EndedVoxels, end_keys, voxel_centres, voxel_keys
 from bench.figures import Figure
 from bench.scenes.episodes import STANDING, Episode, EpisodeScan
 from bench.scenes.known_episodes import held_episodes, tuned_episodes
-from bench.street import StreamedMap
 
+_EMPTY_SCANS = 110  # of each place, once the things have left
 PASSES = (3, 10, 30, 100)  # scans whose rays pass, after which a voxel is looked at
 _PASSED_M = 0.06
 _BEYOND_M = 0.5  # that such a ray goes on
 _CLEAR_M = 0.35  # a voxel of a thing counts where nothing that stands is nearer
 _LANE_AFTER = 10  # scans of the empty place after which its lane is looked at
-_ROBOT = SegmentOptions(radius_m=0.4, max_distance_m=1.0)
+_ROBOT_RADIUS_M = 0.4
 
 
-def measure_belief(scans: int, *, held: bool) -> list[Figure]:
-    """Return figures of all episodes, with ``scans`` scans of each place when it is empty."""
-    episodes = held_episodes(scans) if held else tuned_episodes(scans)
+def measure_belief(*, held: bool) -> list[Figure]:
+    """Return figures of the episodes to tune on, or of those ``held`` back to score on only."""
+    episodes = held_episodes(_EMPTY_SCANS) if held else tuned_episodes(_EMPTY_SCANS)
     return [figure for episode in episodes for figure in _figures(episode)]
 
 
@@ -61,37 +68,76 @@ class Seen:
     blocked_m: int = 0
 
 
-def follow(episode: Episode, settings: Settings | None = None) -> Seen:
-    """Map an episode as a server does, and look at what its things and rays have left."""
-    streamed = StreamedMap(settings or Settings())
-    record = _Record(episode, streamed.settings)
+class Believed:
+    """The evidence of a map alone, in one region: belief needs no field."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self._setup = RegionSetup(
+            field=settings.field,
+            scan=settings.scan,
+            change=settings.change,
+            training=settings.training,
+            memory=memory_on("cpu"),
+            sums=GradientSums(),
+            team=Teams().mapping,
+        )
+        self._normals = SurfaceNormals(settings.field.leaf_m, self._setup.team)
+        live = LiveEvidence(1 << settings.field.depth)
+        self._region = RegionEvidence(live, self._setup, np.zeros(3), 0)
+
+    def take_in(self, scan: EpisodeScan) -> None:
+        """Take in a scan as a map does."""
+        points = scan.points.astype(np.float32)
+        rays = usable_rays(points, scan.world_from_sensor, self.settings.scan)
+        seen = self._region.scan_taken(rays, 0)
+        self._region.live.set_normals(seen.marks, self._normals.add(rays.ends, rays.origin))
+
+    def is_surface(self, centres: Doubles) -> Bools:
+        """Return whether voxels with ``centres`` [N, 3] are taken to be surface."""
+        voxels = np.floor(self._region.voxels(centres)).astype(np.int64)
+        return self._region.live.freeze().ended_in(voxels)
+
+    def blocked_m(self, lane: Doubles) -> int:
+        """Return how many of the ways ``lane`` [L, 2, 3], a metre each, a robot cannot go."""
+        leaf_m, cube = self.settings.field.leaf_m, _cube(_ROBOT_RADIUS_M, self.settings)
+        steps = np.linspace(0.0, 1.0, math.ceil(1.0 / leaf_m))
+        ways = lane[:, :1] + steps[:, None] * (lane[:, 1:] - lane[:, :1])
+        places = (ways[:, :, None] + cube).reshape(-1, 3)
+        return int(self.is_surface(places).reshape(len(lane), -1).any(axis=1).sum())
+
+
+def _cube(radius_m: float, settings: Settings) -> Doubles:
+    """Return points [N, 3] of a ball about the origin, one in each voxel."""
+    leaf_m = settings.field.leaf_m
+    reach = np.arange(-math.ceil(radius_m / leaf_m), math.ceil(radius_m / leaf_m) + 1) * leaf_m
+    points = np.stack(np.meshgrid(reach, reach, reach), axis=-1).reshape(-1, 3)
+    return np.asarray(points[np.linalg.norm(points, axis=1) <= radius_m])
+
+
+def follow(episode: Episode) -> Seen:
+    """Show an episode to a map, and look at what its things and rays have left."""
+    believed = Believed(load_settings(preset=episode.preset))
+    record = _Record(episode, believed.settings)
     seen = Seen()
     trails: list[_Trail] = []
     with progress(episode.name, len(episode)) as report:
         for number, scan in enumerate(episode, start=1):
             record.add(scan)
-            streamed.take_in(scan)
+            believed.take_in(scan)
             empty = number - episode.busy_scans
             if empty == 0:
-                epoch = streamed.mapper.publish()
-                trails = record.trails(epoch)
-                seen.left |= {
-                    f"{trail.name} amid it": {0: trail.surface(epoch)} for trail in trails
-                }
+                trails = record.trails()
+                seen.left |= {f"{one.name} amid it": {0: one.surface(believed)} for one in trails}
             if empty > 0 and any([trail.passed_by(scan) for trail in trails]):
-                epoch = streamed.mapper.publish()
                 for trail in trails:
-                    trail.look(epoch)
+                    trail.look(believed)
             if empty == _LANE_AFTER:
-                seen.blocked_m = _blocked_m(streamed.mapper.publish(), episode.lane)
+                seen.blocked_m = believed.blocked_m(episode.lane)
             report(number, f"{number} of {len(episode)} scans")
     seen.left |= {trail.name: trail.left for trail in trails}
-    seen.kept = record.kept(streamed.mapper.publish())
+    seen.kept = record.kept(believed)
     return seen
-
-
-def _blocked_m(epoch: Epoch, lane: Doubles) -> int:
-    return int(segments(epoch, lane[:, 0], lane[:, 1], _ROBOT).blocked.sum())
 
 
 class _Trail:
@@ -115,13 +161,13 @@ class _Trail:
         self._due = passed & np.isin(self._passes, PASSES)
         return bool(self._due.any())
 
-    def surface(self, epoch: Epoch) -> tuple[int, int]:
+    def surface(self, believed: Believed) -> tuple[int, int]:
         """Return how many of the voxels are SURFACE, and how many there are."""
-        return round(len(self._centres) * surface_share(epoch, self._centres)), len(self._centres)
+        return int(believed.is_surface(self._centres).sum()), len(self._centres)
 
-    def look(self, epoch: Epoch) -> None:
+    def look(self, believed: Believed) -> None:
         """Look at the voxels that have just been passed by one of the numbers of scans."""
-        is_surface = epoch.status(self._centres[self._due], reach_m=0.0) == Status.SURFACE
+        is_surface = believed.is_surface(self._centres[self._due])
         for passes, surface in zip(self._passes[self._due].tolist(), is_surface, strict=True):
             before, count = self.left.get(passes, (0, 0))
             self.left[passes] = (before + int(surface), count + 1)
@@ -166,32 +212,37 @@ class _Record:
             if number != STANDING:
                 self._hits[number].append(points[chosen])
 
-    def trails(self, epoch: Epoch) -> list[_Trail]:
+    def trails(self) -> list[_Trail]:
         """Return what the things alone have left so far."""
-        standing = self._standing()
+        standing, voxel_m = self._standing(), self._settings.field.leaf_m
         found = []
         for number, name in enumerate(self._names):
             if number in self._on:
                 keys = np.setdiff1d(self._on[number].keys(), standing)
-                centres = voxel_centres(keys, epoch.voxel_m)
+                centres = voxel_centres(keys, voxel_m)
                 keys = keys[self._episode.standing.scene.sdf(centres) > _CLEAR_M]
-                middles = _middles(keys, np.concatenate(self._hits[number]), epoch.voxel_m)
-                found.append(_Trail(name, voxel_centres(keys, epoch.voxel_m), middles))
+                middles = _middles(keys, np.concatenate(self._hits[number]), voxel_m)
+                found.append(_Trail(name, voxel_centres(keys, voxel_m), middles))
         return found
 
-    def kept(self, epoch: Epoch) -> dict[str, float]:
+    def kept(self, believed: Believed) -> dict[str, float]:
         """Return the share of voxels that is SURFACE, of what stands and of thin things alone."""
-        voxel_m = epoch.voxel_m
-        kept = {"static": surface_share(epoch, voxel_centres(self._standing(), voxel_m))}
+        voxel_m = self._settings.field.leaf_m
+        kept = {"static": _share(believed, voxel_centres(self._standing(), voxel_m))}
         if self._episode.thin:
             others = np.concatenate([one.keys() for one in self._on.values()])
             alone = np.setdiff1d(self._on_thin.keys(), others)
-            kept["thin things"] = surface_share(epoch, voxel_centres(alone, voxel_m))
+            kept["thin things"] = _share(believed, voxel_centres(alone, voxel_m))
         return kept
 
     def _standing(self) -> Longs:
         standing = self._on[STANDING].keys()
         return np.union1d(standing, self._on_thin.keys()) if self._episode.thin else standing
+
+
+def _share(believed: Believed, centres: Doubles) -> float:
+    """Return the share of voxels that is surface; all, where there are none."""
+    return float(believed.is_surface(centres).mean()) if len(centres) else 1.0
 
 
 def _middles(keys: Longs, hits: Doubles, voxel_m: float) -> Doubles:

@@ -40,6 +40,7 @@ class Episode:
     busy_scans: int  # as many at first; then all things have left
     lane: Doubles  # [L, 2, 3] ways that are free once they have left, metres
     thin: tuple[Solid, ...] = ()  # standing things thinner than a voxel
+    preset: str = "street"  # of the settings of its map
     rain: float = 0.0  # share of the returns of the busy scans that come from drops in mid air
 
     @property

@@ -87,13 +87,13 @@ def _room_with_people(scans: int) -> Episode:
 
     def things(time_s: float) -> Things:
         return {
-            "walking": _person(-1.6 + 0.5 * time_s, 1.1),
-            "standing": _person(1.4, -1.2),
-            "moved box": [box((-1.5, -1.2, 0.25), (0.3, 0.2, 0.25), 0.3)],
+            "walking": _person(-1.6 + 0.5 * time_s, 1.95),
+            "standing": _person(1.4, -1.9),
+            "moved box": [box((-1.5, -1.8, 0.25), (0.3, 0.2, 0.25), 0.3)],
         }
 
     lane = straight_lane((-1.5, 1.5), 1.1, _ROBOT_Z_M)
-    return Episode("room", standing, things, _BUSY_SCANS, lane)
+    return Episode("room", standing, things, _BUSY_SCANS, lane, preset="indoor")
 
 
 def _along(scans: int, start: float, step: float, y: float, sway: float) -> Doubles:

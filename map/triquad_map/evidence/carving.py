@@ -32,18 +32,14 @@ from triquad_map.evidence.observed import (
 )
 from triquad_map.evidence.seen_voxels import SeenVoxels
 
-_SPREAD_SHARE = 0.8
-_LEAST_RADIUS, _GREATEST_RADIUS = 0.15, 0.5
-"""The disc's radius: a share of the ends' spread, between these, in voxels."""
+_LEAST_SPREAD = 0.15
+"""Standard deviation of the ends in a voxel along each axis, at least, in voxels."""
 
-_GRAZING = 0.05
-"""Cosine between ray and normal below which a ray must end deeper behind the surface."""
+_ROUGHNESS = 0.1
+"""Standard deviation of the surface's height above its plane, with the rays' own, in voxels."""
 
 _LEAST_COSINE = 0.01
-_DEPTH, _GRAZING_DEPTH = 0.2, 0.5  # voxels behind the surface
-
-_KNOWN_ENDS = 8
-"""The number of rays that ended on a plane from which only rays that cross it count."""
+_DEPTH = 0.2  # voxels behind the plane in which a ray that crosses it ends, at least
 
 
 class Passing(NamedTuple):
@@ -56,27 +52,41 @@ class Passing(NamedTuple):
 
 
 @kernel(inline="always")
-def _crosses(ray: Passing, corner: Voxel, voxel: ObservedVoxel) -> bool:
-    """Return whether a ray crosses the disc of the surface in a voxel at its least ``corner``."""
+def _crosses(ray: Passing, corner: Voxel, voxel: ObservedVoxel) -> float:
+    """Return the chance that a ray would have ended on the surface in a voxel, were it there.
+
+    The ends in it are taken to lie about their mean as a Gaussian: in the plane of their normal,
+    or all around where none is known.
+    """
     way, mean, normal = ray.way, voxel.mean, voxel.normal
     to_x = corner[0] + mean[0] - ray.start[0]
     to_y = corner[1] + mean[1] - ray.start[1]
     to_z = corner[2] + mean[2] - ray.start[2]
     along = to_x * way[0] + to_y * way[1] + to_z * way[2]
-    radius = _LEAST_RADIUS
+    variance, farther = _LEAST_SPREAD**2, 0.0
     if is_flat(voxel):
         facing = way[0] * normal[0] + way[1] * normal[1] + way[2] * normal[2]
         if abs(facing) < _LEAST_COSINE:
-            return False
+            return 0.0
         along = (to_x * normal[0] + to_y * normal[1] + to_z * normal[2]) / facing
-        depth = _DEPTH if abs(facing) >= _GRAZING else _GRAZING_DEPTH
-        if (ray.clear - along) * abs(facing) < depth:
-            return False
-        radius = min(max(_SPREAD_SHARE * np.sqrt(voxel.spread), _LEAST_RADIUS), _GREATEST_RADIUS)
+        if (ray.clear - along) * abs(facing) < _DEPTH:
+            return 0.0
+        variance = max(variance, 0.5 * float(voxel.spread))
+        farther = (_ROUGHNESS / facing) ** 2
     if not 0 <= along <= ray.clear:
-        return False
+        return 0.0
     off_x, off_y, off_z = along * way[0] - to_x, along * way[1] - to_y, along * way[2] - to_z
-    return bool(off_x * off_x + off_y * off_y + off_z * off_z <= radius * radius)
+    square = off_x * off_x + off_y * off_y + off_z * off_z
+    if farther == 0:
+        return float(np.exp(-0.5 * square / variance))
+    # In the plane, where the ray crosses it is the less sure in its own direction, the more it
+    # grazes.
+    ahead = (off_x * way[0] + off_y * way[1] + off_z * way[2]) ** 2 / max(1 - facing**2, 1e-6)
+    exponent = ahead / (variance + farther) + max(square - ahead, 0.0) / variance
+    return float(np.sqrt(variance / (variance + farther)) * np.exp(-0.5 * exponent))
+
+
+_UNLIKELY = 0.05  # chance of a crossing below which a ray says nothing
 
 
 @inner_kernel()
@@ -92,25 +102,32 @@ def note_passes(
         if row == 0:
             continue
         voxel = observed.voxels[row]
-        crossing = _crosses(ray, voxel_of(row, seen, observed), voxel)
-        if not crossing and voxel.ends >= _KNOWN_ENDS and is_flat(voxel):
+        chance = _crosses(ray, voxel_of(row, seen, observed), voxel)
+        if chance < _UNLIKELY:
             continue
         if voxel.hit_scan == ray.scan:
-            voxel.earlier_passes += 1
-            voxel.earlier_misses += crossing
+            # The share of the scan's rays that ended there is the hit.
+            before = voxel.crossed / (voxel.ended + voxel.crossed)
+            voxel.crossed += chance
+            more = voxel.crossed / (voxel.ended + voxel.crossed) - before
+            voxel.hits -= more
+            voxel.earlier_misses += more
             continue
-        voxel.passes += 1
-        voxel.misses += crossing
         if voxel.passed_scan != ray.scan:
             voxel.passed_scan = ray.scan
-            voxel.pass_scans += 1
+            if voxel.misses == 0:
+                voxel.missed_since = ray.scan
+            voxel.crossed = 0
             passed[0] += 1
             passed[passed[0]] = row
+        # Rays of one scan are no independent witnesses: together they count as one at most.
+        voxel.misses += chance * (1 - voxel.crossed)
+        voxel.crossed += chance * (1 - voxel.crossed)
 
 
 _NO_ROOM = -2
 
-_CLEAR_SHARE = 0.9
+_CLEAR_SHARE = 0.95
 """The share of a ray that may show that a surface is not there: beyond, rays graze the ground."""
 
 

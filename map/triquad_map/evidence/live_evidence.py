@@ -11,24 +11,17 @@ from triquad_format.records.region import Evidence as EvidenceRecord
 from triquad_map.compiled.team import Split, in_one
 from triquad_map.compiled.voxel_index import VoxelIndex, with_room
 from triquad_map.evidence.carving import Reach, mark_crossed
-from triquad_map.evidence.contradictions import (
-    Disbelief,
-    doubted,
-    middles,
-    take_back,
-)
+from triquad_map.evidence.contradictions import Belief, take_back
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.evidence.growth import EvidenceSize, NewEnds, new_blocks, new_ends
 from triquad_map.evidence.observations import Observations
 from triquad_map.evidence.observed import Sighting
 from triquad_map.evidence.ray_surfels import ray_surfels
 from triquad_map.evidence.seen_voxels import SeenVoxels, mark_ends
-from triquad_map.surface import SampleField, Surfels
+from triquad_map.surface import Surfels
 
 _MIN_CAPACITY = 256
 
-_FIELD_FREE = 0.3
-"""A field of more voxels than this, where a surface was seen, shows none."""
 
 
 class Marks(NamedTuple):
@@ -143,28 +136,18 @@ class LiveEvidence:
                 self._make_room(more=True)
         return passed[1 : 1 + passed[0]]
 
-    def remove_contradicted(
-        self, passed: Ints, rule: Disbelief, field: SampleField | None = None
-    ) -> Longs:
+    def remove_contradicted(self, passed: Ints, belief: Belief) -> Longs:
         """Remove the surface of voxels that the rays of :meth:`carve` contradict.
 
         Args:
             passed: where these rays passed a surface.
-            rule: when a surface is removed.
-            field: in voxels; it has learnt from all rays around. With it, surface is removed that
-                rays crossed and that the field does not show either.
+            belief: when a surface is removed.
 
         Returns:
             These voxels [M, 3]; they are free.
         """
         self._frozen = None
-        seen, observed = self._seen, self._observations.arrays
-        if field is None:
-            return take_back(np.empty(0, np.int64), passed, seen, observed, rule)
-        rows = np.unique(doubted(passed, seen, observed, rule))
-        if len(rows):
-            rows = rows[field(middles(rows, seen, observed)).values > _FIELD_FREE]
-        return take_back(rows, np.empty(0, np.int32), seen, observed, rule)
+        return take_back(passed, self._seen, self._observations.arrays, belief)
 
     def mark_free(self, voxels: Doubles) -> None:
         """Record that ``voxels`` [N, 3] are free; those outside the region are left out."""

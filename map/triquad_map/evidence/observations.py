@@ -68,8 +68,8 @@ _DISC_ENDS, _DISC_SPREAD = 16.0, 0.15  # that a disc of the field stands for
 _FARTHEST_BESIDE = 0.75  # voxels from a voxel's middle to the disc of another one
 _OUTSIDE = 0.1  # voxels that a disc may reach out of its own voxel
 
-_RECORD = ("hits", "earlier_passes", "earlier_misses")
-"""The fields of a voxel's record that files keep."""
+_RECORD = ("hits", "earlier_misses", "earlier_misses")
+"""The fields of a voxel's record that files keep; passes are none but those that would have hit."""
 
 
 @kernel()

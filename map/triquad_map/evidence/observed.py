@@ -27,21 +27,24 @@ OBSERVED_VOXEL = np.dtype(
         ("ends", np.float32),  # rays that ended on the surface that is there now, up to a limit
         ("weight", np.float32),  # these rays, the near ones counting more
         ("sectors", np.int32),  # a bit for each eighth of the horizon it was seen from
-        ("hits", np.int32),  # scans of which rays ended there, whatever surface it was
+        ("hits", np.float32),  # scans' worth of rays that ended there, to MOST_SEEN with misses
         ("first_scan", np.int32),  # of which a ray ended on the surface that is there now
         ("hit_scan", np.int32),  # the last of which a ray ended there
-        ("passed_scan", np.int32),  # the last of which a ray passed, and none ended there
-        ("pass_scans", np.int32),  # such scans in a row
-        ("passes", np.int32),  # rays of theirs that passed
-        ("misses", np.int32),  # rays of theirs that crossed the surface
-        ("earlier_passes", np.int32),  # as these two, before the last hit
-        ("earlier_misses", np.int32),
+        ("passed_scan", np.int32),  # the last of which a ray may have crossed the surface
+        ("missed_since", np.int32),  # the first of these since the last hit
+        ("ended", np.float32),  # rays of the scan that hit it last
+        ("crossed", np.float32),  # rays of the scan that passed it last, by how surely they crossed
+        ("misses", np.float32),  # scans' worth of rays that crossed since the last hit
+        ("earlier_misses", np.float32),  # and of those before it
     ],
     align=True,
 )
 
 EIGHTHS = 8
 MOST_SCANS = 255
+
+MOST_SEEN = np.float32(50)
+"""Scans' worth of rays that a record counts: what was seen longer is no surer."""
 
 ObservedVoxel = Any
 """A record of OBSERVED_VOXEL."""
@@ -177,16 +180,22 @@ def _add_ray(voxel: ObservedVoxel, end: Vector, sighting: Sighting) -> None:
 def _begin_hit(voxel: ObservedVoxel, scan: int) -> None:
     """Count a scan of which a ray ended in a voxel: what passed before goes to its record."""
     if voxel.hit_scan == scan:
+        voxel.ended += 1
         return
     voxel.hit_scan = scan
-    voxel.hits += 1
+    voxel.ended = voxel.crossed = 0
     voxel.scans = min(voxel.scans + 1, MOST_SCANS)
     if voxel.ends > 0:  # else they passed while nothing was there
-        voxel.earlier_passes += voxel.passes
         voxel.earlier_misses += voxel.misses
     else:
         voxel.first_scan = scan
-    voxel.pass_scans = voxel.passes = voxel.misses = 0
+        voxel.hits = voxel.earlier_misses = 0
+    voxel.ended = 1
+    voxel.misses = 0
+    voxel.hits += 1
+    share = MOST_SEEN / max(np.float32(MOST_SEEN), voxel.hits + voxel.earlier_misses)
+    voxel.hits *= share
+    voxel.earlier_misses *= share
 
 
 @kernel(inline="always")

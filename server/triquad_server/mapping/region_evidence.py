@@ -5,10 +5,11 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from triquad_format.records.arrays import Bools, Doubles, Ints, Longs
+from triquad_format.records.arrays import Bools, Doubles, Longs
 from triquad_format.records.region import Evidence
 from triquad_map.compiled.voxel_index import empty_keys, thin
 from triquad_map.evidence.carving import Reach
+from triquad_map.evidence.contradictions import Belief
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.evidence.growth import EvidenceSize
 from triquad_map.evidence.live_evidence import LiveEvidence, Marks
@@ -50,7 +51,6 @@ class RegionEvidence:
         self._random = np.random.default_rng(seed)
         self._scans = 0  # scans in which the region was seen
         self._scans_learnt = 0  # of these, those before the field was trained last
-        self._passed: list[Ints] = []  # where rays passed a surface since the last epoch
         self._removed: list[Longs] = []  # voxels whose surface was removed since the last epoch
         self._surfels: SurfelMap | None = None  # of the last epoch
         self._fitted_to: int | None = None
@@ -94,8 +94,7 @@ class RegionEvidence:
         passed_farther = self.live.carve(origin, far_ends, reach._replace(free=0.0))
         passed = np.concatenate([passed, passed_farther])
         if len(passed):
-            self._passed.append(passed)
-            self._removed.append(self.live.remove_contradicted(passed, self._setup.disbelief))
+            self._removed.append(self.live.remove_contradicted(passed, Belief()))
         # Glass and black paint return nothing: these rays contradict no surface.
         open_ends = self._thinned(origin, self.voxels(rays.open_ends), _OPEN_THINNED_AT)
         self.live.carve(origin, open_ends, Reach(0.0))
@@ -122,11 +121,6 @@ class RegionEvidence:
             epoch: number of the epoch.
             is_settled: there is nothing to train on.
         """
-        if self._passed:
-            passed = np.concatenate(self._passed)
-            removed = self.live.remove_contradicted(passed, self._setup.disbelief, samples)
-            self._removed.append(removed)
-            self._passed.clear()
         evidence = self.live.freeze(self._setup.team.split)
         self._surfels = surfels = self._fitted_surfels(
             evidence, samples, version, epoch, is_settled=is_settled

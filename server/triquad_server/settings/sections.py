@@ -98,19 +98,12 @@ def check_robot_box(name: str, box: Box, leaf_m: float) -> None:
 
 
 class ChangeSettings(BaseModel):
-    """How quickly a surface is removed that rays pass through, in a world that changes."""
+    """Whether a surface is removed that rays pass through, in a world that changes."""
 
     model_config = SECTION
 
     static: bool = False
     """The world stands still: no surface is ever removed."""
-
-    scans: Annotated[int, Field(ge=1, le=1000)] = 3
-    """Scans in a row, at least, of which rays pass where a surface was, and none ends there."""
-
-    doubt: Annotated[float, Field(ge=1e-9, le=0.5)] = 0.01
-    """Largest probability of such rays if the surface were still there, by how often rays ended and
-    passed there before."""
 
 
 class TrainingSettings(BaseModel):

@@ -50,7 +50,7 @@ def test_errors_of_a_source_name_the_place_of_that_key(tmp_path: Path) -> None:
         ("scan.range_min_m=nan", ["scan.range_min_m = nan", "use 0 to 1000 (number)"]),
         ("scan.range_min_m=inf", ["scan.range_min_m = inf", "use 0 to 1000 (number)"]),
         ("training.batch=nan", ["training.batch = nan", "use 1 to 10000000 (integer)"]),
-        ("change.doubt=0", ["change.doubt = 0 is out of range: use 1e-09 to 0.5 (number)"]),
+        ("scan.thin_m=0", ["scan.thin_m = 0 is out of range", "0.001 to 10"]),
         ("change.static=maybe", ["change.static = 'maybe'", "use true or false"]),
     ],
 )

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_map.compiled.team import Team
-from triquad_map.evidence.contradictions import Disbelief
 
 from triquad_server.engine.gradient_sums import GradientSums
 from triquad_server.engine.memory import Memory
@@ -39,11 +38,6 @@ class RegionSetup:
             behind_m=self.scan.behind_m,
             half_side_m=self.field.region_side_m / 2,
         )
-
-    @property
-    def disbelief(self) -> Disbelief:
-        """Return when rays contradict a surface."""
-        return Disbelief.of(self.change.scans, self.change.doubt)
 
     def seeds(self, index: RegionIndex) -> tuple[int, int]:
         """Return seeds of a region's field and of its replay pool; no two regions share one."""
