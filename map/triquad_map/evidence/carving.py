@@ -1,8 +1,7 @@
 """Rays that carve: the voxels that they cross are free, surfaces that they pass contradicted.
 
-A ray contradicts a surface only where it crosses it: a disc around the middle of the ends in a
-voxel, as wide as they spread, far enough from where the ray ends itself. Where too little is known
-for a disc, a ray that passes the voxel counts as a weaker sign.
+A ray contradicts a surface only where it crosses it, far enough from where it ends itself, and by
+the chance that it would have ended there: the ends in a voxel lie about their mean as a Gaussian.
 
 Kernels stop where the index has no more room; the caller makes room and goes on.
 """
