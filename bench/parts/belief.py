@@ -8,7 +8,6 @@ import math
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -37,7 +36,7 @@ _PASSED_M = 0.06
 _BEYOND_M = 0.5  # that such a ray goes on
 _CLEAR_M = 0.35  # a voxel of a thing counts where nothing that stands is nearer
 _LANE_AFTER = 10  # scans of the empty place after which its lane is looked at
-_ROBOT_RADIUS_M = 0.4
+_ROBOT_RADIUS_M = 0.35
 
 
 def measure_belief(*, held: bool) -> list[Figure]:
@@ -100,17 +99,17 @@ class Believed:
 
     def blocked_m(self, lane: Doubles) -> int:
         """Return how many of the ways ``lane`` [L, 2, 3], a metre each, a robot cannot go."""
-        leaf_m, cube = self.settings.field.leaf_m, _cube(_ROBOT_RADIUS_M, self.settings)
+        leaf_m, ball = self.settings.field.leaf_m, _ball(_ROBOT_RADIUS_M, self.settings)
         steps = np.linspace(0.0, 1.0, math.ceil(1.0 / leaf_m))
         ways = lane[:, :1] + steps[:, None] * (lane[:, 1:] - lane[:, :1])
-        places = (ways[:, :, None] + cube).reshape(-1, 3)
+        places = (ways[:, :, None] + ball).reshape(-1, 3)
         return int(self.is_surface(places).reshape(len(lane), -1).any(axis=1).sum())
 
 
-def _cube(radius_m: float, settings: Settings) -> Doubles:
-    """Return points [N, 3] of a ball about the origin, one in each voxel."""
-    leaf_m = settings.field.leaf_m
-    reach = np.arange(-math.ceil(radius_m / leaf_m), math.ceil(radius_m / leaf_m) + 1) * leaf_m
+def _ball(radius_m: float, settings: Settings) -> Doubles:
+    """Return points [N, 3] of a ball about the origin, half a voxel apart."""
+    step_m = 0.5 * settings.field.leaf_m
+    reach = np.arange(-math.ceil(radius_m / step_m), math.ceil(radius_m / step_m) + 1) * step_m
     points = np.stack(np.meshgrid(reach, reach, reach), axis=-1).reshape(-1, 3)
     return np.asarray(points[np.linalg.norm(points, axis=1) <= radius_m])
 
@@ -198,7 +197,7 @@ class _Record:
     def add(self, scan: EpisodeScan) -> None:
         """Add a scan."""
         keys = end_keys(scan, self._settings)
-        on_thin: Any = False
+        on_thin = np.zeros(len(scan.points), np.bool_)
         if self._episode.thin:
             scene = type(self._episode.standing.scene)(
                 self._episode.thin, self._episode.standing.scene.bounds
