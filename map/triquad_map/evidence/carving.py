@@ -34,6 +34,10 @@ from triquad_map.evidence.seen_voxels import SeenVoxels
 _LEAST_SPREAD = 0.15
 """Standard deviation of the ends in a voxel along each axis, at least, in voxels."""
 
+_PRIOR_VARIANCE = 1 / 12
+_PRIOR_ENDS = 2
+"""What is known of that before any end: a surface fills its voxel, as sure as after two ends."""
+
 _ROUGHNESS = 0.1
 """Standard deviation of the surface's height above its plane, with the rays' own, in voxels."""
 
@@ -62,7 +66,10 @@ def _crosses(ray: Passing, corner: Voxel, voxel: ObservedVoxel) -> float:
     to_y = corner[1] + mean[1] - ray.start[1]
     to_z = corner[2] + mean[2] - ray.start[2]
     along = to_x * way[0] + to_y * way[1] + to_z * way[2]
-    variance, farther = _LEAST_SPREAD**2, 0.0
+    seen_along = 0.5 if is_flat(voxel) else 1 / 3  # of the spread, on each axis
+    total = _PRIOR_ENDS * _PRIOR_VARIANCE + voxel.ends * seen_along * float(voxel.spread)
+    variance = max(total / (_PRIOR_ENDS + voxel.ends), _LEAST_SPREAD**2)
+    farther = 0.0
     if is_flat(voxel):
         facing = way[0] * normal[0] + way[1] * normal[1] + way[2] * normal[2]
         if abs(facing) < _LEAST_COSINE:
@@ -70,7 +77,6 @@ def _crosses(ray: Passing, corner: Voxel, voxel: ObservedVoxel) -> float:
         along = (to_x * normal[0] + to_y * normal[1] + to_z * normal[2]) / facing
         if (ray.clear - along) * abs(facing) < _DEPTH:
             return 0.0
-        variance = max(variance, 0.5 * float(voxel.spread))
         farther = (_ROUGHNESS / facing) ** 2
     if not 0 <= along <= ray.clear:
         return 0.0

@@ -11,7 +11,8 @@ without ending say, and what the voxels around say:
   (Jeffreys' prior); its prediction of as many misses is a ratio of gamma functions. So a fence,
   hit and missed by turns, is a fence.
 - Around: a share of what is missed in the voxels around since this one was hit last, less as much
-  for each that was hit since then. Things come and go as a whole.
+  for each that was hit since then, but together no more than one can. Things come and go as a
+  whole.
 """
 
 import math
@@ -43,7 +44,7 @@ class Belief(NamedTuple):
     stray: float = 3.0  # how much less for each hit: one return in 20 is where nothing is
     leaves: float = -7.0  # that a surface has left, however often it was seen
     around: float = 0.5  # share of what each voxel around says
-    most: float = 5.0  # that a voxel around says, either way
+    most: float = 5.0  # that a voxel around says, and that all together say for the surface
 
 
 @inner_kernel()
@@ -60,6 +61,7 @@ def _is_vacant(row: int, seen: SeenVoxels, observed: Observed, belief: Belief) -
     """Return whether the surface of a voxel is more probably gone than there."""
     voxel = observed.voxels[row]
     odds = max(belief.vacant - belief.stray * voxel.scans, belief.leaves) + _missed(voxel)
+    beside = 0.0
     near = rows_around(row, 1, seen, observed)
     since = voxel.missed_since if voxel.misses > 0 else np.int32(1 << 30)
     for other in near:
@@ -72,10 +74,10 @@ def _is_vacant(row: int, seen: SeenVoxels, observed: Observed, belief: Belief) -
             continue
         if one.misses > 0:
             if one.missed_since > voxel.hit_scan:
-                odds += belief.around * min(_missed(one), belief.most)
+                beside += belief.around * min(_missed(one), belief.most)
         elif one.hit_scan >= since:
-            odds -= belief.around * belief.most
-    return odds > 0
+            beside -= belief.around * belief.most
+    return bool(odds + max(beside, -belief.most) > 0)
 
 
 @inner_kernel()
