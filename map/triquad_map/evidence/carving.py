@@ -55,7 +55,7 @@ class Passing(NamedTuple):
 
 
 @kernel(inline="always")
-def _crosses(ray: Passing, corner: Voxel, voxel: ObservedVoxel) -> float:
+def _crosses_disc(ray: Passing, corner: Voxel, voxel: ObservedVoxel) -> float:
     """Return the chance that a ray would have ended on the surface in a voxel, were it there.
 
     The ends in it are taken to lie about their mean as a Gaussian: in the plane of their normal,
@@ -89,6 +89,24 @@ def _crosses(ray: Passing, corner: Voxel, voxel: ObservedVoxel) -> float:
     ahead = (off_x * way[0] + off_y * way[1] + off_z * way[2]) ** 2 / max(1 - facing**2, 1e-6)
     exponent = ahead / (variance + farther) + max(square - ahead, 0.0) / variance
     return float(np.sqrt(variance / (variance + farther)) * np.exp(-0.5 * exponent))
+
+
+@kernel(inline="always")
+def _crosses(ray: Passing, corner: Voxel, voxel: ObservedVoxel) -> float:
+    """Return the chance that a ray would have ended in a voxel; few ends tell no sure normal."""
+    way, mean = ray.way, voxel.mean
+    to_x = corner[0] + mean[0] - ray.start[0]
+    to_y = corner[1] + mean[1] - ray.start[1]
+    to_z = corner[2] + mean[2] - ray.start[2]
+    along = to_x * way[0] + to_y * way[1] + to_z * way[2]
+    square = to_x * to_x + to_y * to_y + to_z * to_z - along * along
+    ball = 0.0
+    if 0 <= along <= ray.clear:
+        ball = float(np.exp(-0.5 * square / _LEAST_SPREAD**2))
+    if not is_flat(voxel):
+        return ball
+    known = voxel.ends / (voxel.ends + _PRIOR_ENDS)
+    return float(known * _crosses_disc(ray, corner, voxel) + (1 - known) * ball)
 
 
 _UNLIKELY = 0.05  # chance of a crossing below which a ray says nothing
