@@ -89,8 +89,8 @@ class Believed:
         """Take in a scan as a map does."""
         points = scan.points.astype(np.float32)
         rays = usable_rays(points, scan.world_from_sensor, self.settings.scan)
-        seen = self._region.scan_taken(rays, 0)
-        self._region.live.set_normals(seen.marks, self._normals.add(rays.ends, rays.origin))
+        seen = self._region.scan_seen(rays, 0)
+        self._region.scan_taken(seen, self._normals.add(rays.ends, rays.origin))
 
     def is_surface(self, centres: Doubles) -> Bools:
         """Return whether voxels with ``centres`` [N, 3] are taken to be surface."""

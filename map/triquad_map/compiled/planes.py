@@ -12,7 +12,7 @@ MOMENTS = 10
 
 _MIN_POINTS = 6
 _MAX_THICKNESS = 0.1  # of a plane: ratio of the least to the middle standard deviation
-_MIN_WIDTH = 0.1  # ratio of the middle to the greatest: less is a line, not a plane
+_MIN_WIDTH = 0.3  # ratio of the middle to the greatest: less is a line, not a plane
 
 
 @kernel(inline="always")
@@ -35,7 +35,7 @@ def add_points(m: Doubles, at: tuple[float, float, float], count: float) -> None
 def plane_normal(m: Doubles | tuple[float, ...], normal: Doubles) -> bool:
     """Return the unit normal, of either sign, of the plane of points with the moments ``m``.
 
-    False: they lie in none, and ``normal`` [3] means nothing.
+    False: they lie in none, and ``normal`` [3] means nothing. The plane holds their mean.
     """
     n = m[0]
     if n < _MIN_POINTS:

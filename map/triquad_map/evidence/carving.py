@@ -9,7 +9,7 @@ Kernels stop where the index has no more room; the caller makes room and goes on
 from typing import NamedTuple
 
 import numpy as np
-from triquad_format.records.arrays import Doubles, Ints
+from triquad_format.records.arrays import Doubles, Floats, Ints
 
 from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.voxel_index import (
@@ -31,18 +31,15 @@ from triquad_map.evidence.observed import (
 )
 from triquad_map.evidence.seen_voxels import SeenVoxels
 
-_LEAST_SPREAD = 0.15
-"""Standard deviation of the ends in a voxel along each axis, at least, in voxels."""
+_LEAST_SPREAD = 0.1
+"""Standard deviation of the ends in a voxel in any direction, at least, in voxels."""
 
-_PRIOR_VARIANCE = 1 / 12
-_PRIOR_ENDS = 2
-"""What is known of that before any end: a surface fills its voxel, as sure as after two ends."""
+_PRIOR_SPREAD, _PRIOR_ENDS = 0.15, 2.0
+"""The same before any end, in all directions, and as much as how many ends it weighs."""
 
-_ROUGHNESS = 0.1
-"""Standard deviation of the surface's height above its plane, with the rays' own, in voxels."""
-
-_LEAST_COSINE = 0.01
-_DEPTH = 0.2  # voxels behind the plane in which a ray that crosses it ends, at least
+_SAME_SURFACE, _SAME_SLOPE = 0.2, 0.03
+"""Standard deviations of the height, in voxels, and of the slope, of where a ray would end on the
+same plane farther on."""
 
 
 class Passing(NamedTuple):
@@ -50,63 +47,69 @@ class Passing(NamedTuple):
 
     start: Vector  # voxels
     way: Vector  # unit vector
-    clear: float  # voxels from the start, up to which it contradicts what it crosses
+    first: Vector  # unit vectors across it
+    second: Vector
+    length: float  # voxels from the start to its end
+    clear: float  # up to which it contradicts what it crosses
     scan: int  # number of its scan
 
 
 @kernel(inline="always")
-def _crosses_disc(ray: Passing, corner: Voxel, voxel: ObservedVoxel) -> float:
+def _crosses(ray: Passing, corner: Voxel, voxel: ObservedVoxel) -> float:
     """Return the chance that a ray would have ended on the surface in a voxel, were it there.
 
-    The ends in it are taken to lie about their mean as a Gaussian: in the plane of their normal,
-    or all around where none is known.
+    The ends in a voxel lie about their mean as a Gaussian: the chance is its density where the ray
+    passes nearest, as a share of the greatest. A ray that ends in the same plane says nothing.
     """
-    way, mean, normal = ray.way, voxel.mean, voxel.normal
+    way, mean, normal, spread = ray.way, voxel.mean, voxel.normal, voxel.spread
     to_x = corner[0] + mean[0] - ray.start[0]
     to_y = corner[1] + mean[1] - ray.start[1]
     to_z = corner[2] + mean[2] - ray.start[2]
     along = to_x * way[0] + to_y * way[1] + to_z * way[2]
-    seen_along = 0.5 if is_flat(voxel) else 1 / 3  # of the spread, on each axis
-    total = _PRIOR_ENDS * _PRIOR_VARIANCE + voxel.ends * seen_along * float(voxel.spread)
-    variance = max(total / (_PRIOR_ENDS + voxel.ends), _LEAST_SPREAD**2)
-    farther = 0.0
-    if is_flat(voxel):
-        facing = way[0] * normal[0] + way[1] * normal[1] + way[2] * normal[2]
-        if abs(facing) < _LEAST_COSINE:
-            return 0.0
-        along = (to_x * normal[0] + to_y * normal[1] + to_z * normal[2]) / facing
-        if (ray.clear - along) * abs(facing) < _DEPTH:
-            return 0.0
-        farther = (_ROUGHNESS / facing) ** 2
     if not 0 <= along <= ray.clear:
         return 0.0
-    off_x, off_y, off_z = along * way[0] - to_x, along * way[1] - to_y, along * way[2] - to_z
-    square = off_x * off_x + off_y * off_y + off_z * off_z
-    if farther == 0:
-        return float(np.exp(-0.5 * square / variance))
-    # In the plane, where the ray crosses it is the less sure in its own direction, the more it
-    # grazes.
-    ahead = (off_x * way[0] + off_y * way[1] + off_z * way[2]) ** 2 / max(1 - facing**2, 1e-6)
-    exponent = ahead / (variance + farther) + max(square - ahead, 0.0) / variance
-    return float(np.sqrt(variance / (variance + farther)) * np.exp(-0.5 * exponent))
+    first, second = ray.first, ray.second
+    u = to_x * first[0] + to_y * first[1] + to_z * first[2]
+    v = to_x * second[0] + to_y * second[1] + to_z * second[2]
+    if u * u + v * v > 1:
+        return 0.0
+    ends = float(voxel.ends)
+    share, prior = ends / (ends + _PRIOR_ENDS), _PRIOR_SPREAD**2 * _PRIOR_ENDS / (ends + _PRIOR_ENDS)
+    prior = prior + _LEAST_SPREAD**2 * share
+    uu = share * _across(spread, first, first) + prior
+    uv = share * _across(spread, first, second)
+    vv = share * _across(spread, second, second) + prior
+    square = (u * u * vv - 2 * u * v * uv + v * v * uu) / (uu * vv - uv * uv)
+    chance = np.exp(-0.5 * square)
+    if is_flat(voxel):
+        rest = ray.length - along
+        facing = way[0] * normal[0] + way[1] * normal[1] + way[2] * normal[2]
+        height = to_x * normal[0] + to_y * normal[1] + to_z * normal[2] - ray.length * facing
+        variance = _SAME_SURFACE**2 + (_SAME_SLOPE * rest) ** 2
+        # Only a surface that extends along the ray can be met farther on.
+        extends = share * _across(spread, way, way) * 12 + (1 - share)
+        chance *= 1 - min(extends, 1.0) * np.exp(-0.5 * height * height / variance)
+    return float(chance)
 
 
 @kernel(inline="always")
-def _crosses(ray: Passing, corner: Voxel, voxel: ObservedVoxel) -> float:
-    """Return the chance that a ray would have ended in a voxel; few ends tell no sure normal."""
-    way, mean = ray.way, voxel.mean
-    to_x = corner[0] + mean[0] - ray.start[0]
-    to_y = corner[1] + mean[1] - ray.start[1]
-    to_z = corner[2] + mean[2] - ray.start[2]
-    along = to_x * way[0] + to_y * way[1] + to_z * way[2]
-    square = to_x * to_x + to_y * to_y + to_z * to_z - along * along
-    ball = 0.0
-    if 0 <= along <= ray.clear:
-        ball = float(np.exp(-0.5 * square / _LEAST_SPREAD**2))
-    if not is_flat(voxel):
-        return ball
-    known = voxel.ends / (voxel.ends + _PRIOR_ENDS)
-    return float(known * _crosses_disc(ray, corner, voxel) + (1 - known) * ball)
+def _across(spread: Floats, one: Vector, other: Vector) -> float:
+    """Return the covariance of the ends of a voxel along two directions."""
+    x = spread[0] * other[0] + spread[1] * other[1] + spread[2] * other[2]
+    y = spread[1] * other[0] + spread[3] * other[1] + spread[4] * other[2]
+    z = spread[2] * other[0] + spread[4] * other[1] + spread[5] * other[2]
+    return float(one[0] * x + one[1] * y + one[2] * z)
+
+
+@kernel(inline="always")
+def _square_to(way: Vector) -> tuple[Vector, Vector]:
+    """Return two unit vectors at right angles to a unit vector and to each other."""
+    x, y, z = way
+    if abs(z) < 0.9:
+        size = np.sqrt(x * x + y * y)
+        return (-y / size, x / size, 0.0), (-x * z / size, -y * z / size, size)
+    size = np.sqrt(y * y + z * z)
+    return (0.0, -z / size, y / size), (size, -x * y / size, -x * z / size)
 
 
 _UNLIKELY = 0.05  # chance of a crossing below which a ray says nothing
@@ -149,10 +152,6 @@ def note_passes(
 
 
 _NO_ROOM = -2
-
-_CLEAR_SHARE = 0.95
-"""The share of a ray that may show that a surface is not there: beyond, rays graze the ground."""
-
 
 class Reach(NamedTuple):
     """The distance before their ends at which rays stop to show what they cross, in voxels."""
@@ -200,7 +199,7 @@ def _walk(
 
     The rows of voxels in which rays ended go to ``crossed``: recorded here, they slow each step.
     """
-    side, index, surface, masks = seen
+    side, index, _, masks = seen
     at, way = ray.start, ray.way
     x, y, z = int(np.floor(at[0])), int(np.floor(at[1])), int(np.floor(at[2]))
     step_x, apart_x, next_x = _crossing(at[0], way[0])
@@ -219,7 +218,7 @@ def _walk(
         if row >= 0:
             byte, bit = byte_of(x, y), bit_of(z)
             masks[row, byte] |= bit
-            if place and surface[row, byte] & bit and travelled < ray.clear:
+            if place and observed.ended[place, byte] & bit and travelled < ray.clear:
                 crossed[found] = observed.rows[place, byte << SHIFT | (z & LOW)]
                 found += 1
         if next_x <= next_y and next_x <= next_z:
@@ -267,8 +266,9 @@ def mark_crossed(
         if first > last:
             continue
         begin = (at[0] + first * way[0], at[1] + first * way[1], at[2] + first * way[2])
-        clear = min(length - reach.clear, _CLEAR_SHARE * length) - first
-        ray = Passing(begin, way, clear, reach.scan)
+        across = _square_to(way)
+        left = length - first
+        ray = Passing(begin, way, across[0], across[1], left, left - reach.clear, reach.scan)
         used, found = _walk(ray, last - first, seen, count, observed, crossed)
         if used == _NO_ROOM:
             return i, count

@@ -1,7 +1,5 @@
 """The evidence of rays in a region, while they go on to show more."""
 
-from typing import NamedTuple
-
 import numpy as np
 from triquad_format.records.arrays import Bools, Doubles, Ints, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
@@ -10,25 +8,17 @@ from triquad_format.records.region import Evidence as EvidenceRecord
 
 from triquad_map.compiled.team import Split, in_one
 from triquad_map.compiled.voxel_index import VoxelIndex, with_room
+from triquad_map.evidence.belief import Belief, Changes, believe
 from triquad_map.evidence.carving import Reach, mark_crossed
-from triquad_map.evidence.contradictions import Belief, take_back
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.evidence.growth import EvidenceSize, NewEnds, new_blocks, new_ends
 from triquad_map.evidence.observations import Observations
-from triquad_map.evidence.observed import Sighting
+from triquad_map.evidence.observed import Sighting, have_surface
 from triquad_map.evidence.ray_surfels import ray_surfels
-from triquad_map.evidence.seen_voxels import SeenVoxels, mark_ends
+from triquad_map.evidence.seen_voxels import SeenVoxels, mark
 from triquad_map.surface import Surfels
 
 _MIN_CAPACITY = 256
-
-
-
-class Marks(NamedTuple):
-    """The voxels in which the rays of a scan ended."""
-
-    new: Longs  # [M, 3] voxels in which there was no surface before
-    rows: Ints  # [N] of each ray's voxel, for what is recorded of them later
 
 
 class LiveEvidence:
@@ -63,35 +53,47 @@ class LiveEvidence:
         """Return about how many blocks rays from ``origin`` [3] to ``ends`` [N, 3] would add."""
         return new_blocks(origin, ends, self._seen)
 
-    def mark_surface(self, voxels: Doubles, sighting: Sighting | None = None) -> Marks:
-        """Record that rays ended at ``voxels`` [N, 3]; those outside the region are left out.
+    def mark_surface(self, voxels: Doubles) -> None:
+        """Record that there is surface in ``voxels`` [N, 3]; those outside are left out."""
+        self._mark("surface", voxels)
 
-        ``sighting`` says from where and when; without it they support the surface no better.
+    def record_ends(self, voxels: Doubles, sighting: Sighting) -> Ints:
+        """Record that rays ended at ``voxels`` [N, 3], and from where and when.
+
+        Returns:
+            The row of what is recorded of each ray's voxel; 0 outside the region.
         """
         self._frozen = None
-        new = np.empty((len(voxels), 3), np.int64)
-        done = found = 0
+        rows = np.empty(len(voxels), np.int32)
+        done = 0
         while done < len(voxels):
-            done, self._blocks.count, found = mark_ends(
-                voxels, done, self._seen, self._blocks.count, new, found
+            done, self._blocks.count = self._observations.record(
+                voxels, done, self._seen, self._blocks.count, sighting, rows
             )
             if done < len(voxels):
                 self._make_room(more=True)
-        if sighting is None:
-            return Marks(new[:found], np.zeros(len(voxels), np.int32))
-        return Marks(new[:found], self._observations.record(voxels, self._seen, sighting))
+        return rows
 
-    def set_normals(self, marks: Marks, normals: Doubles) -> None:
+    def believe(self, hit: Ints, passed: Ints, belief: Belief) -> Changes:
+        """Let surface come and go where rays of a scan ended and passed, by rows."""
+        self._frozen = None
+        return Changes(*believe(hit, passed, self._seen, self._observations.arrays, belief))
+
+    def is_surface(self, rows: Ints) -> Bools:
+        """Return whether there is surface in the voxels of ``rows`` [N]."""
+        return have_surface(rows, self._seen, self._observations.arrays)
+
+    def set_normals(self, rows: Ints, normals: Doubles) -> None:
         """Keep the unit ``normals`` [N, 3] of surfaces that were marked; NaN where unknown."""
-        self._observations.set_normals(marks.rows, normals)
+        self._observations.set_normals(rows, normals)
 
-    def first_seen_since(self, scan: int, marks: Marks) -> Bools:
+    def first_seen_since(self, scan: int, rows: Ints) -> Bools:
         """Return which rays [N] ended on a surface that was first seen in ``scan`` or later.
 
         Rays that ended outside the region did not.
         """
-        is_new: Bools = self._observations.arrays.voxels["first_scan"][marks.rows] >= scan
-        return is_new & (marks.rows > 0)
+        is_new: Bools = self._observations.arrays.voxels["first_scan"][rows] >= scan
+        return is_new & (rows > 0)
 
     def set_discs(self, voxels: Longs, surfels: Surfels) -> None:
         """Take from ``surfels`` [N] where the surface lies in ``voxels`` [N, 3].
@@ -136,29 +138,9 @@ class LiveEvidence:
                 self._make_room(more=True)
         return passed[1 : 1 + passed[0]]
 
-    def remove_contradicted(self, passed: Ints, belief: Belief) -> Longs:
-        """Remove the surface of voxels that the rays of :meth:`carve` contradict.
-
-        Args:
-            passed: where these rays passed a surface.
-            belief: when a surface is removed.
-
-        Returns:
-            These voxels [M, 3]; they are free.
-        """
-        self._frozen = None
-        return take_back(passed, self._seen, self._observations.arrays, belief)
-
     def mark_free(self, voxels: Doubles) -> None:
         """Record that ``voxels`` [N, 3] are free; those outside the region are left out."""
-        self._frozen = None
-        new = np.empty((len(voxels), 3), np.int64)
-        done = 0
-        while done < len(voxels):
-            free = self._seen._replace(surface=self._seen.free)
-            done, self._blocks.count, _ = mark_ends(voxels, done, free, self._blocks.count, new, 0)
-            if done < len(voxels):
-                self._make_room(more=True)
+        self._mark("free", voxels)
 
     def clear(self, low: Doubles, high: Doubles) -> None:
         """Forget the voxels whose centres lie between the corners ``low`` and ``high`` [3]."""
@@ -206,6 +188,16 @@ class LiveEvidence:
         )
         evidence._make_room()
         return evidence
+
+    def _mark(self, name: str, voxels: Doubles) -> None:
+        """Set the bits of ``voxels`` [N, 3] in one of the masks."""
+        self._frozen = None
+        done = 0
+        while done < len(voxels):
+            mask = getattr(self._seen, name)
+            done, self._blocks.count = mark(voxels, done, self._seen, mask, self._blocks.count)
+            if done < len(voxels):
+                self._make_room(more=True)
 
     def _make_room(self, more: bool = False) -> None:
         """Make room for as many blocks as the index has room for, or for ``more``."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
-from triquad_format.records.region import MARGIN_BITS, OUTCOME_BITS, surface_counts, used_blocks
+from triquad_format.records.region import BLOCK_BYTES, MARGIN_BITS, OUTCOME_BITS, surface_counts, used_blocks
 
 from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.team import Split
@@ -19,6 +19,7 @@ from triquad_map.evidence.observed import (
     MOST_SCANS,
     OBSERVED_VOXEL,
     Observed,
+    ObservedVoxel,
     Sighting,
     is_flat,
     record_ends,
@@ -64,7 +65,7 @@ _MIN_CAPACITY = 64
 _MIN_ROWS = 1024
 _LEAST_BLOCKS = 64  # whose support a thread of its own finds sooner
 _DISC = int(SurfelKind.DISC)
-_DISC_ENDS, _DISC_SPREAD = 16.0, 0.15  # that a disc of the field stands for
+_DISC_ENDS, _DISC_SPREAD = 16.0, 0.08  # that a disc of the field stands for
 _FARTHEST_BESIDE = 0.75  # voxels from a voxel's middle to the disc of another one
 _OUTSIDE = 0.1  # voxels that a disc may reach out of its own voxel
 
@@ -98,12 +99,21 @@ def _set_discs(
         for axis in range(3):
             voxel.mean[axis] = offsets[i, axis] + 0.5 if is_disc else np.nan
             voxel.normal[axis] = normals[i, axis] if is_disc else 0.0
-        voxel.spread = _DISC_SPREAD
+        _set_spread(voxel, _DISC_SPREAD)
         voxel.ends = _DISC_ENDS if is_disc else 0
     for i in range(len(voxels)):
         row = row_of(seen, observed, voxels[i, 0], voxels[i, 1], voxels[i, 2])
         if row != 0 and observed.voxels[row].ends == 0:
             _set_disc_beside(row, seen, observed)
+
+
+@inner_kernel()
+def _set_spread(voxel: ObservedVoxel, variance: float) -> None:
+    """Let the ends of a voxel lie in the plane of its normal, with a variance on each axis."""
+    x, y, z = voxel.normal
+    voxel.spread[0], voxel.spread[1], voxel.spread[2] = 1 - x * x, -x * y, -x * z
+    voxel.spread[3], voxel.spread[4], voxel.spread[5] = 1 - y * y, -y * z, 1 - z * z
+    voxel.spread *= np.float32(variance)
 
 
 @inner_kernel()
@@ -159,21 +169,26 @@ class Observations:
         places = with_room(self.arrays.places, blocks)
         self.arrays = self.arrays._replace(places=places)
 
-    def record(self, voxels: Doubles, seen: SeenVoxels, sighting: Sighting) -> Ints:
-        """Count rays that ended at ``voxels`` [N, 3], whose blocks are all in ``seen``.
+    def record(
+        self,
+        voxels: Doubles,
+        done: int,
+        seen: SeenVoxels,
+        blocks: int,
+        sighting: Sighting,
+        found: Ints,
+    ) -> tuple[int, int]:
+        """Count rays that ended at ``voxels`` [N, 3], of which some are ``done``.
 
-        Returns:
-            The row of each ray's voxel [N]; 0 outside the region.
+        The row of each ray's voxel goes to ``found`` [N]; 0 outside the region. Returns (rays done,
+        blocks in use); where ``seen`` has no more room, not all are done.
         """
-        found = np.empty(len(voxels), np.int32)
-        done = 0
-        while done < len(voxels):
-            done, self._places, self._rows = record_ends(
-                voxels, done, seen, sighting, self.arrays, self._places, self._rows, found
-            )
-            if done < len(voxels):
-                self._grow()
-        return found
+        arrays = self.arrays
+        done, blocks, self._places, self._rows = record_ends(
+            voxels, done, seen, blocks, sighting, arrays, self._places, self._rows, found
+        )
+        self._grow()
+        return done, blocks
 
     def set_normals(self, rows: Ints, normals: Doubles) -> None:
         """Keep the ``normals`` [N, 3] of the surface in ``rows`` [N]; NaN: as they were."""
@@ -222,6 +237,7 @@ class Observations:
         places = self.arrays.places[blocks]
         kept = np.unpackbits(surface[blocks], axis=1, bitorder="little")
         self.arrays.rows[places] *= kept
+        self.arrays.ended[places] &= surface[blocks]
 
     @classmethod
     def restore(
@@ -247,6 +263,7 @@ class Observations:
         )
         arrays.places[used] = np.arange(1, 1 + len(used))
         arrays.seen_s[places] = seen_s[used]
+        arrays.ended[places] = surface[used]
         arrays.rows[places][ended] = np.arange(1, 1 + len(levels))
         block, voxel = np.nonzero(ended)
         voxels = arrays.voxels[1 : 1 + len(levels)]
@@ -269,12 +286,13 @@ class Observations:
 
     def _grow(self) -> None:
         """Double what is full."""
-        places, rows, seen_s, voxels = self.arrays
+        places, rows, ended, seen_s, voxels = self.arrays
         if self._places == len(seen_s):
-            rows, seen_s = (with_room(array, 2 * len(seen_s)) for array in (rows, seen_s))
+            of_places = (rows, ended, seen_s)
+            rows, ended, seen_s = (with_room(array, 2 * len(seen_s)) for array in of_places)
         if self._rows == len(voxels):
             voxels = with_room(voxels, 2 * len(voxels))
-        self.arrays = Observed(places, rows, seen_s, voxels)
+        self.arrays = Observed(places, rows, ended, seen_s, voxels)
 
 
 def _arrays(blocks: int, places: int, rows: int) -> Observed:
@@ -283,6 +301,7 @@ def _arrays(blocks: int, places: int, rows: int) -> Observed:
     return Observed(
         places=np.zeros(blocks, np.int32),
         rows=np.zeros((places, _VOXELS), np.int32),
+        ended=np.zeros((places, BLOCK_BYTES), np.uint8),
         seen_s=np.zeros(places, np.int64),
         voxels=voxels,
     )

@@ -7,10 +7,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.records.arrays import Doubles, Ints, Longs
+from triquad_format.records.arrays import Bools, Bytes, Doubles, Ints, Longs
 
 from triquad_map.compiled.kernel import inner_kernel, kernel
-from triquad_map.compiled.voxel_index import LOW, SHIFT, bit_of, byte_of, find_block, unpack
+from triquad_map.compiled.voxel_index import (
+    LOW,
+    SHIFT,
+    bit_of,
+    block_key,
+    byte_of,
+    find_block,
+    is_inside,
+    make_row,
+    unpack,
+)
 from triquad_map.evidence.seen_voxels import SeenVoxels
 from triquad_map.surface import NEAR_M
 
@@ -23,7 +33,7 @@ OBSERVED_VOXEL = np.dtype(
         ("highest", np.uint8, 3),  # the last of these, on each axis
         ("scans", np.uint8),  # of which rays ended on the surface that is there now, to MOST_SCANS
         ("towards", np.float32, 3),  # from the last end to the sensor, voxels
-        ("spread", np.float32),  # mean squared distance of the ends from their mean, voxels
+        ("spread", np.float32, 6),  # covariance of the ends, voxels: xx, xy, xz, yy, yz, zz
         ("ends", np.float32),  # rays that ended on the surface that is there now, up to a limit
         ("weight", np.float32),  # these rays, the near ones counting more
         ("sectors", np.int32),  # a bit for each eighth of the horizon it was seen from
@@ -43,7 +53,7 @@ OBSERVED_VOXEL = np.dtype(
 EIGHTHS = 8
 MOST_SCANS = 255
 
-MOST_SEEN = np.float32(50)
+MOST_SEEN = np.float32(10)
 """Scans' worth of rays that a record counts: what was seen longer is no surer."""
 
 ObservedVoxel = Any
@@ -55,6 +65,7 @@ class Observed(NamedTuple):
 
     places: Ints  # [blocks] where in the next two a block of evidence stands; 0: nothing is known
     rows: Ints  # [places, voxels] the row of each voxel in ``voxels``; 0: no ray ended in it
+    ended: Bytes  # [places, BLOCK_BYTES] bits of these voxels
     seen_s: Longs  # [places] when the last ray ended in the block
     voxels: NDArray[np.void]  # [rows] OBSERVED_VOXEL; row 0 is of none
 
@@ -106,6 +117,15 @@ def has_surface(row: int, seen: SeenVoxels, observed: Observed) -> bool:
     owner = observed.voxels[row].owner
     block = owner >> (3 * SHIFT)
     return bool(seen.surface[block, owner >> SHIFT & (1 << (2 * SHIFT)) - 1] & bit_of(owner & LOW))
+
+
+@kernel()
+def have_surface(rows: Ints, seen: SeenVoxels, observed: Observed) -> Bools:
+    """Return whether the surface of each row [N] is believed; not outside the region."""
+    found = np.zeros(len(rows), np.bool_)
+    for i, row in enumerate(rows):
+        found[i] = row != 0 and has_surface(row, seen, observed)
+    return found
 
 
 @inner_kernel()
@@ -206,18 +226,22 @@ def _add_end(voxel: ObservedVoxel, end: Vector) -> None:
     if count == 1:
         for axis in range(3):
             mean[axis], normal[axis] = end[axis], 0
-        voxel.spread = 0
+        voxel.spread[:] = 0
     voxel.ends = count
-    squared = np.float32(0)
+    x, y, z = end[0] - mean[0], end[1] - mean[1], end[2] - mean[2]
     for axis in range(3):
         eighth = int(EIGHTHS * end[axis])
         voxel.lowest[axis] = min(voxel.lowest[axis], eighth)
         voxel.highest[axis] = max(voxel.highest[axis], eighth)
-        off = np.float32(end[axis]) - mean[axis]
-        step = off / count
-        mean[axis] += step
-        squared += off * (off - step)
-    voxel.spread += (squared - voxel.spread) / count
+        mean[axis] += np.float32(end[axis] - mean[axis]) / count
+    share = np.float32(1 - 1 / count)  # from the old mean to the new one
+    spread = voxel.spread
+    spread[0] += (np.float32(x * x) * share - spread[0]) / count
+    spread[1] += (np.float32(x * y) * share - spread[1]) / count
+    spread[2] += (np.float32(x * z) * share - spread[2]) / count
+    spread[3] += (np.float32(y * y) * share - spread[3]) / count
+    spread[4] += (np.float32(y * z) * share - spread[4]) / count
+    spread[5] += (np.float32(z * z) * share - spread[5]) / count
 
 
 @kernel()
@@ -225,27 +249,31 @@ def record_ends(
     voxels: Doubles,
     start: int,
     seen: SeenVoxels,
+    blocks: int,
     sighting: Sighting,
     observed: Observed,
     places: int,
     rows: int,
     found: Ints,
-) -> tuple[int, int, int]:
-    """Count rays that ended at ``voxels`` [N, 3]; returns (points done, places, rows in use).
+) -> tuple[int, int, int, int]:
+    """Count rays that ended at ``voxels`` [N, 3].
 
-    The row of each ray's voxel goes to ``found`` [N]; 0 outside the region.
+    Returns (points done, blocks, places, rows in use): not all are done where there is no room. The row of each ray's voxel goes to ``found`` [N]; 0 outside the region.
     """
     for i in range(start, len(voxels)):
         end = (voxels[i, 0], voxels[i, 1], voxels[i, 2])
         x, y, z = int(np.floor(end[0])), int(np.floor(end[1])), int(np.floor(end[2]))
-        block = find_block(seen.blocks, x, y, z, seen.side)
         found[i] = 0
-        if block < 0:  # outside the region
+        if not is_inside(x, y, z, seen.side):
             continue
+        block = make_row(seen.blocks, blocks, block_key(x, y, z))
+        if block < 0:
+            return i, blocks, places, rows
+        blocks = max(blocks, block + 1)
         place = observed.places[block]
         if place == 0:
             if places == len(observed.seen_s):
-                return i, places, rows
+                return i, blocks, places, rows
             place = places
             observed.places[block] = place
             places += 1
@@ -253,9 +281,10 @@ def record_ends(
         row = observed.rows[place, voxel]
         if row == 0:
             if rows == len(observed.voxels):
-                return i, places, rows
+                return i, blocks, places, rows
             row = rows
             observed.rows[place, voxel] = row
+            observed.ended[place, voxel >> SHIFT] |= bit_of(z)
             observed.voxels[row].owner = block << (3 * SHIFT) | voxel
             forget_ends(observed.voxels[row])
             rows += 1
@@ -265,4 +294,4 @@ def record_ends(
         _add_ray(known, end, sighting)
         _begin_hit(known, sighting.scan)
         _add_end(known, (end[0] - x, end[1] - y, end[2] - z))
-    return len(voxels), places, rows
+    return len(voxels), blocks, places, rows

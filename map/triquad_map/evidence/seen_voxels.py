@@ -38,14 +38,10 @@ class SeenVoxels(NamedTuple):
 
 
 @kernel()
-def mark_ends(
-    voxels: Doubles, start: int, seen: SeenVoxels, count: int, new: Longs, found: int
-) -> tuple[int, int, int]:
-    """Set the bits of the voxels with points, and collect those that were not set before.
-
-    Returns (points done, blocks in use, voxels collected).
-    """
-    masks = seen.surface
+def mark(
+    voxels: Doubles, start: int, seen: SeenVoxels, mask: Bytes, count: int
+) -> tuple[int, int]:
+    """Set the bits of the voxels with points; returns (points done, blocks in use)."""
     for i in range(start, len(voxels)):
         x = int(np.floor(voxels[i, 0]))
         y = int(np.floor(voxels[i, 1]))
@@ -54,14 +50,10 @@ def mark_ends(
             continue
         row = make_row(seen.blocks, count, block_key(x, y, z))
         if row < 0:
-            return i, count, found
+            return i, count
         count = max(count, row + 1)
-        byte, bit = byte_of(x, y), bit_of(z)
-        if not masks[row, byte] & bit:
-            masks[row, byte] |= bit
-            new[found, 0], new[found, 1], new[found, 2] = x, y, z
-            found += 1
-    return len(voxels), count, found
+        mask[row, byte_of(x, y)] |= bit_of(z)
+    return len(voxels), count
 
 
 class _Axis(NamedTuple):

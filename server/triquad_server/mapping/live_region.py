@@ -5,7 +5,7 @@ from triquad_format.records.arrays import Doubles
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.region import Region
 from triquad_map.evidence.growth import EvidenceSize
-from triquad_map.evidence.live_evidence import LiveEvidence, Marks
+from triquad_map.evidence.live_evidence import LiveEvidence
 from triquad_map.field.frozen_field import field_samples
 
 from triquad_server.engine.field_record import field_from_record, region_record
@@ -16,7 +16,7 @@ from triquad_server.epochs.epoch import FrozenRegion
 from triquad_server.intake.rays import ScanRays
 from triquad_server.mapping.map_snapshot import RegionSnapshot
 from triquad_server.mapping.memory_budget import RegionSize
-from triquad_server.mapping.region_evidence import RegionEvidence
+from triquad_server.mapping.region_evidence import RegionEvidence, SeenScan
 from triquad_server.mapping.replay.region_setup import RegionSetup
 from triquad_server.mapping.training.region_training import LEARNT_SCANS, RegionTraining
 
@@ -84,22 +84,20 @@ class LiveRegion:
         size = EvidenceSize(blocks, new.blocks, len(new.voxels))
         return RegionSize(size, self.field.growth_by(new.voxels))
 
-    def scan_seen(self, rays: ScanRays, stamp_s: int) -> Marks:
-        """Record what the rays of a scan show, and grow the field where they end."""
-        marks = self.evidence.scan_taken(rays, stamp_s)
-        # A leaf of the trees is the shadow of a voxel: where a ray ended before, nothing grows.
-        self.field.grow(marks.new)
+    def scan_seen(self, rays: ScanRays, stamp_s: int) -> SeenScan:
+        """Record what the rays of a scan show."""
         self.is_changed = True
-        return marks
+        return self.evidence.scan_seen(rays, stamp_s)
 
-    def scan_taken(self, rays: ScanRays, normals: Doubles, marks: Marks) -> None:
-        """Keep the rays of a scan for training, after :meth:`scan_seen`.
+    def scan_taken(self, rays: ScanRays, normals: Doubles, seen: SeenScan) -> None:
+        """Grow the field and keep the rays of a scan for training, after :meth:`scan_seen`.
 
         ``normals`` [N, 3] are those of the surface at the rays' ends, NaN where unknown.
         """
-        is_new = self.evidence.first_seen_within(LEARNT_SCANS, marks)
+        # A leaf of the trees is the shadow of a voxel: where surface was before, nothing grows.
+        self.field.grow(self.evidence.scan_taken(seen, normals))
+        is_new = self.evidence.first_seen_within(LEARNT_SCANS, seen.rows)
         self.training.scan_taken(rays, normals, is_new)
-        self.evidence.live.set_normals(marks, normals)
 
     def take_step(self) -> tuple[Loss, int]:
         """Take one optimiser step; return loss and samples. On a GPU, reading the loss waits."""

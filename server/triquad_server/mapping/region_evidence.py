@@ -5,14 +5,14 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from triquad_format.records.arrays import Bools, Doubles, Longs
+from triquad_format.records.arrays import Bools, Doubles, Ints, Longs
 from triquad_format.records.region import Evidence
 from triquad_map.compiled.voxel_index import empty_keys, thin
 from triquad_map.evidence.carving import Reach
-from triquad_map.evidence.contradictions import Belief
+from triquad_map.evidence.belief import Belief
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.evidence.growth import EvidenceSize
-from triquad_map.evidence.live_evidence import LiveEvidence, Marks
+from triquad_map.evidence.live_evidence import LiveEvidence
 from triquad_map.evidence.observed import Sighting
 from triquad_map.surface import SampleField, ShownByRays, nothing_shown
 from triquad_map.surfels.surfel_map import SurfelMap, first_surfels
@@ -30,6 +30,13 @@ _NEW_SCANS = 10
 _SURFELS_REFITTED = 8_000
 """The number of surfels that are fitted again with each epoch while the field is trained: some
 10 ms."""
+
+
+class SeenScan(NamedTuple):
+    """What a scan has shown."""
+
+    rows: Ints  # [N] of the voxel in which each ray ended; 0 outside the region
+    passed: Ints  # [P] of voxels that they may have crossed
 
 
 class PublishedEvidence(NamedTuple):
@@ -77,15 +84,15 @@ class RegionEvidence:
         """Return the voxel coordinates [N, 3] of points [N, 3], map frame."""
         return self._setup.field.leaf_coordinates(points - self._centre)
 
-    def scan_taken(self, rays: ScanRays, stamp_s: int) -> Marks:
-        """Record where rays ended and what they crossed, and remove surface that they contradict.
+    def scan_seen(self, rays: ScanRays, stamp_s: int) -> SeenScan:
+        """Record where rays ended and what they crossed.
 
         ``stamp_s`` is when the scan was taken, seconds since 1970.
         """
         self._scans += 1
         ends, origin = self.voxels(rays.ends), self.voxels(rays.origin[None])[0]
         leaf_m = self._setup.field.leaf_m
-        marks = self.live.mark_surface(ends, Sighting(origin, leaf_m, stamp_s, self._scans))
+        rows = self.live.record_ends(ends, Sighting(origin, leaf_m, stamp_s, self._scans))
         clear = math.inf if self._setup.change.static else _CLEAR_SHORT
         reach = Reach(_CARVE_SHORT, clear, self._scans)
         thinned = ends[thin(ends, 1.0, empty_keys(len(ends)))]
@@ -93,18 +100,27 @@ class RegionEvidence:
         passed = self.live.carve(origin, thinned, reach)
         passed_farther = self.live.carve(origin, far_ends, reach._replace(free=0.0))
         passed = np.concatenate([passed, passed_farther])
-        if len(passed):
-            self._removed.append(self.live.remove_contradicted(passed, Belief()))
         # Glass and black paint return nothing: these rays contradict no surface.
         open_ends = self._thinned(origin, self.voxels(rays.open_ends), _OPEN_THINNED_AT)
         self.live.carve(origin, open_ends, Reach(0.0))
         if rays.robot is not None:
             self.live.mark_free(self.voxels(rays.robot.voxel_centres(leaf_m)))
-        return marks
+        return SeenScan(rows, passed)
 
-    def first_seen_within(self, scans: int, marks: Marks) -> Bools:
+    def scan_taken(self, seen: SeenScan, normals: Doubles) -> Longs:
+        """Let surface come and go, after :meth:`scan_seen`; return the new voxels [M, 3].
+
+        ``normals`` [N, 3] are those of the surface at the rays' ends, NaN where unknown.
+        """
+        self.live.set_normals(seen.rows, normals)
+        changes = self.live.believe(seen.rows, seen.passed, Belief())
+        if len(changes.removed):
+            self._removed.append(changes.removed)
+        return changes.new
+
+    def first_seen_within(self, scans: int, rows: Ints) -> Bools:
         """Return which rays [N] of the last scan ended on a surface first seen in few scans."""
-        return self.live.first_seen_since(self._scans - scans + 1, marks)
+        return self.live.first_seen_since(self._scans - scans + 1, rows)
 
     def step_taken(self) -> None:
         """Record that the field was trained on what was seen so far."""

@@ -1,0 +1,167 @@
+"""The belief in the surface of a voxel: which appears once rays end there, and goes once they pass.
+
+The logarithm of the odds that nothing is there is the sum of what hits say, what rays that crossed
+without ending say, and what the voxels around say:
+
+- Hits: ``max(vacant - stray * (hits + vouched), leaves)``. Nearly all space is vacant, and a return
+  where nothing is may happen, but hardly again in the same voxel. Hits around vouch for it, all
+  together as one at most. However often a surface was seen, it may have left since.
+- Misses in a row since the last hit: how improbable they are while the surface is there. A voxel's
+  own record of hits and misses gives a beta distribution of the chance that a ray ends in it
+  (Jeffreys' prior); its prediction of as many misses is a ratio of gamma functions. So a fence,
+  hit and missed by turns, is a fence.
+- Around: a share of what is missed in the voxels around since this one was hit last, less as much
+  for each that was hit since then, but together no more than one can. Things come and go as a
+  whole.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from triquad_format.records.arrays import Ints, Longs
+
+from triquad_map.compiled.kernel import inner_kernel, kernel
+from triquad_map.compiled.voxel_index import SHIFT, bit_of, byte_of
+from triquad_map.evidence.observed import (
+    Observed,
+    ObservedVoxel,
+    forget_ends,
+    has_surface,
+    is_flat,
+    rows_around,
+    voxel_of,
+)
+from triquad_map.evidence.seen_voxels import SeenVoxels
+
+_PRIOR_HITS, _PRIOR_MISSES = 1.5, 0.5
+
+_SAME_SURFACE = 0.35
+"""Standard deviation of the height of a surface over the plane of one beside it, in voxels."""
+
+
+class Belief(NamedTuple):
+    """The numbers of the model, logarithms of odds."""
+
+    vacant: float = 5.0  # that nothing is in a voxel of which nothing was seen
+    stray: float = 4.0  # how much less for each hit: one return in 50 is where nothing is
+    leaves: float = -7.0  # that a surface has left, however often it was seen
+    vouched: float = 1.0  # share of the hits of each voxel around
+    around: float = 0.5  # share of what each voxel around says of misses
+    most: float = 5.0  # that a voxel around says, and that all together say for the surface
+
+
+class Changes(NamedTuple):
+    """The voxels whose surface came or went."""
+
+    new: Longs  # [M, 3]
+    removed: Longs  # [K, 3]
+
+
+@inner_kernel()
+def _missed(voxel: ObservedVoxel) -> float:
+    """Return how improbable the misses since the last hit are: minus the logarithm."""
+    a, b = voxel.hits + _PRIOR_HITS, voxel.earlier_misses + _PRIOR_MISSES
+    missed = math.lgamma(b + voxel.misses) - math.lgamma(b)
+    missed += math.lgamma(a + b) - math.lgamma(a + b + voxel.misses)
+    return -missed
+
+
+@inner_kernel()
+def _coupling(row: int, other: int, seen: SeenVoxels, observed: Observed) -> float:
+    """Return how likely the surfaces in two voxels belong together, by the planes of their ends."""
+    one, two = observed.voxels[row], observed.voxels[other]
+    x, y, z = voxel_of(row, seen, observed)
+    i, j, k = voxel_of(other, seen, observed)
+    dx = x - i + float(one.mean[0]) - float(two.mean[0])
+    dy = y - j + float(one.mean[1]) - float(two.mean[1])
+    dz = z - k + float(one.mean[2]) - float(two.mean[2])
+    if is_flat(two):
+        height = dx * two.normal[0] + dy * two.normal[1] + dz * two.normal[2]
+    elif is_flat(one):
+        height = dx * one.normal[0] + dy * one.normal[1] + dz * one.normal[2]
+    else:
+        height = 0.5 * np.sqrt(dx * dx + dy * dy + dz * dz)
+    return float(np.exp(-0.5 * (height / _SAME_SURFACE) ** 2))
+
+
+@inner_kernel()
+def _odds(
+    row: int, near: Ints, seen: SeenVoxels, observed: Observed, belief: Belief
+) -> float:
+    """Return the logarithm of the odds that there is no surface in a voxel.
+
+    ``near`` are the rows of voxels around it in which rays ended.
+    """
+    voxel = observed.voxels[row]
+    vouched = beside = 0.0
+    since = voxel.missed_since if voxel.misses > 0 else np.int32(1 << 30)
+    for other in near:
+        one = observed.voxels[other]
+        if one.misses > 0 and one.missed_since > voxel.hit_scan:
+            since = min(since, one.missed_since)
+    for other in near:
+        one = observed.voxels[other]
+        if other == row or one.ends == 0:
+            continue
+        weight = _coupling(row, np.int64(other), seen, observed)
+        if one.misses > 0:
+            if one.missed_since > voxel.hit_scan:
+                beside += weight * belief.around * min(_missed(one), belief.most)
+        else:
+            vouched += weight * belief.vouched * one.hits
+            if one.hit_scan >= since:
+                beside -= weight * belief.around * belief.most
+    hits = voxel.hits + (1.0 if is_flat(voxel) else min(vouched, 1.0))
+    odds = max(belief.vacant - belief.stray * hits, belief.leaves) + _missed(voxel)
+    return float(odds + max(beside, -belief.most))
+
+
+@kernel()
+def believe(
+    hit: Ints, passed: Ints, seen: SeenVoxels, observed: Observed, belief: Belief
+) -> tuple[Longs, Longs]:
+    """Let surface come and go in the rows that rays of the newest scan ``hit`` and ``passed``.
+
+    After each removal, those next to it that were not hit since are checked once more. Returns the
+    voxels [M, 3] that have surface now, and those [K, 3] that have none any more.
+    """
+    come = [voxel_of(0, seen, observed) for _ in range(0)]
+    gone = [voxel_of(0, seen, observed) for _ in range(0)]
+    waiting = [np.int64(row) for row in passed]
+    for row in hit:
+        if row != 0 and not has_surface(row, seen, observed):
+            waiting.append(np.int64(row))
+    while len(waiting):
+        row = waiting.pop()
+        voxel = observed.voxels[row]
+        if voxel.ends == 0:
+            continue
+        near = rows_around(row, 1, seen, observed)
+        odds = _odds(row, near, seen, observed, belief)
+        x, y, z = voxel_of(row, seen, observed)
+        block, byte, bit = voxel.owner >> (3 * SHIFT), byte_of(x, y), bit_of(z)
+        if odds <= 0:
+            if not seen.surface[block, byte] & bit:
+                seen.surface[block, byte] |= bit
+                come.append((x, y, z))
+            continue
+        if seen.surface[block, byte] & bit:
+            seen.surface[block, byte] &= ~bit
+            gone.append((x, y, z))
+            since = max(voxel.passed_scan, voxel.hit_scan + 1)
+            for other in near:
+                if observed.voxels[other].hit_scan < since and other != row:
+                    waiting.append(np.int64(other))
+            forget_ends(voxel)
+        elif odds >= belief.vacant:  # nothing is left of what hits said
+            forget_ends(voxel)
+    return _array(come), _array(gone)
+
+
+@inner_kernel()
+def _array(voxels: list[tuple[int, int, int]]) -> Longs:
+    found = np.empty((len(voxels), 3), np.int64)
+    for number, (x, y, z) in enumerate(voxels):
+        found[number, 0], found[number, 1], found[number, 2] = x, y, z
+    return found
