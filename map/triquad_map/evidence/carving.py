@@ -31,7 +31,7 @@ from triquad_map.evidence.observed import (
 )
 from triquad_map.evidence.seen_voxels import SeenVoxels
 
-_LEAST_SPREAD = 0.1
+_LEAST_SPREAD = 0.05
 """Standard deviation of the ends in a voxel in any direction, at least, in voxels."""
 
 _PRIOR_SPREAD, _PRIOR_ENDS = 0.15, 2.0
