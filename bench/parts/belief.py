@@ -90,7 +90,7 @@ class Believed:
         points = scan.points.astype(np.float32)
         rays = usable_rays(points, scan.world_from_sensor, self.settings.scan)
         seen = self._region.scan_seen(rays, 0)
-        self._region.scan_taken(seen, self._normals.add(rays.ends, rays.origin))
+        self._region.believe(seen, self._normals.add(rays.ends, rays.origin))
 
     def is_surface(self, centres: Doubles) -> Bools:
         """Return whether voxels with ``centres`` [N, 3] are taken to be surface."""

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from support.maps import small_world
+from support.maps.seen_scans import see
 from triquad_map.compiled.team import in_one
 from triquad_map.evidence.live_evidence import LiveEvidence
 from triquad_map.evidence.observed import Sighting
@@ -83,9 +84,9 @@ def seen_by_rays(ends, normal=None):
     """Evidence of one scan from above, and what its rays show of some voxels."""
     evidence = LiveEvidence(SIDE)
     sighting = Sighting(np.array([32.0, 32, 60]), 0.2, stamp_s=1, scan=1)
-    marks = evidence.mark_surface(ends, sighting)
+    rows = see(evidence, ends, sighting)
     normals = np.full(ends.shape, np.nan if normal is None else normal)
-    evidence.set_normals(marks, normals)
+    evidence.set_normals(rows, normals)
     return evidence
 
 

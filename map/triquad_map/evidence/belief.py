@@ -86,9 +86,7 @@ def _coupling(row: int, other: int, seen: SeenVoxels, observed: Observed) -> flo
 
 
 @inner_kernel()
-def _odds(
-    row: int, near: Ints, seen: SeenVoxels, observed: Observed, belief: Belief
-) -> float:
+def _odds(row: int, near: Ints, seen: SeenVoxels, observed: Observed, belief: Belief) -> float:
     """Return the logarithm of the odds that there is no surface in a voxel.
 
     ``near`` are the rows of voxels around it in which rays ended.
@@ -102,13 +100,13 @@ def _odds(
             since = min(since, one.missed_since)
     for other in near:
         one = observed.voxels[other]
-        if other == row or one.ends == 0:
+        if other == row:
             continue
         weight = _coupling(row, np.int64(other), seen, observed)
         if one.misses > 0:
             if one.missed_since > voxel.hit_scan:
                 beside += weight * belief.around * min(_missed(one), belief.most)
-        else:
+        elif one.ends > 0:
             vouched += weight * belief.vouched * one.hits
             if one.hit_scan >= since:
                 beside -= weight * belief.around * belief.most

@@ -74,7 +74,10 @@ def _crosses(ray: Passing, corner: Voxel, voxel: ObservedVoxel) -> float:
     if u * u + v * v > 1:
         return 0.0
     ends = float(voxel.ends)
-    share, prior = ends / (ends + _PRIOR_ENDS), _PRIOR_SPREAD**2 * _PRIOR_ENDS / (ends + _PRIOR_ENDS)
+    share, prior = (
+        ends / (ends + _PRIOR_ENDS),
+        _PRIOR_SPREAD**2 * _PRIOR_ENDS / (ends + _PRIOR_ENDS),
+    )
     prior = prior + _LEAST_SPREAD**2 * share
     uu = share * _across(spread, first, first) + prior
     uv = share * _across(spread, first, second)
@@ -152,6 +155,7 @@ def note_passes(
 
 
 _NO_ROOM = -2
+
 
 class Reach(NamedTuple):
     """The distance before their ends at which rays stop to show what they cross, in voxels."""

@@ -3,7 +3,7 @@
 import numpy as np
 from triquad_format.records.arrays import Bools, Doubles, Ints, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
-from triquad_format.records.region import BLOCK_BYTES
+from triquad_format.records.region import BLOCK_BYTES, surface_counts
 from triquad_format.records.region import Evidence as EvidenceRecord
 
 from triquad_map.compiled.team import Split, in_one
@@ -34,6 +34,14 @@ class LiveEvidence:
         self._seen = SeenVoxels(side, self._blocks.arrays, *masks)
         self._observations = Observations(_MIN_CAPACITY)
         self._frozen: FrozenEvidence | None = None  # until anything changes
+        self._surface: int | None = 0  # voxels with surface; None: to be counted
+
+    @property
+    def surface_voxels(self) -> int:
+        """The number of voxels with surface."""
+        if self._surface is None:
+            self._surface = int(surface_counts(self._seen.surface[: self._blocks.count]).sum())
+        return self._surface
 
     @property
     def size(self) -> EvidenceSize:
@@ -55,6 +63,7 @@ class LiveEvidence:
 
     def mark_surface(self, voxels: Doubles) -> None:
         """Record that there is surface in ``voxels`` [N, 3]; those outside are left out."""
+        self._surface = None
         self._mark("surface", voxels)
 
     def record_ends(self, voxels: Doubles, sighting: Sighting) -> Ints:
@@ -77,7 +86,10 @@ class LiveEvidence:
     def believe(self, hit: Ints, passed: Ints, belief: Belief) -> Changes:
         """Let surface come and go where rays of a scan ended and passed, by rows."""
         self._frozen = None
-        return Changes(*believe(hit, passed, self._seen, self._observations.arrays, belief))
+        before, observed = self.surface_voxels, self._observations.arrays
+        changes = Changes(*believe(hit, passed, self._seen, observed, belief))
+        self._surface = before + len(changes.new) - len(changes.removed)
+        return changes
 
     def is_surface(self, rows: Ints) -> Bools:
         """Return whether there is surface in the voxels of ``rows`` [N]."""
@@ -144,7 +156,7 @@ class LiveEvidence:
 
     def clear(self, low: Doubles, high: Doubles) -> None:
         """Forget the voxels whose centres lie between the corners ``low`` and ``high`` [3]."""
-        self._frozen = None
+        self._frozen = self._surface = None
         corners = self._blocks.cells() * BLOCK_VOXELS
         near = ((corners < high) & (corners + BLOCK_VOXELS > low)).all(axis=1)
         offsets = np.stack(np.meshgrid(*[np.arange(BLOCK_VOXELS)] * 3, indexing="ij"), -1)
@@ -178,7 +190,7 @@ class LiveEvidence:
         """Return the evidence of a record, of a region of ``side`` voxels."""
         evidence, frozen = cls(side), FrozenEvidence.from_record(side, record)
         evidence._blocks = VoxelIndex.of_cells(frozen.cells)
-        evidence._seen = frozen.seen
+        evidence._seen, evidence._surface = frozen.seen, None
         evidence._observations = Observations.restore(
             frozen.surface,
             frozen.levels,

@@ -9,7 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
-from triquad_format.records.region import BLOCK_BYTES, MARGIN_BITS, OUTCOME_BITS, surface_counts, used_blocks
+from triquad_format.records.region import (
+    BLOCK_BYTES,
+    MARGIN_BITS,
+    OUTCOME_BITS,
+    surface_counts,
+    used_blocks,
+)
 
 from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.team import Split

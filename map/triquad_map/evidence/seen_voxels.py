@@ -38,9 +38,7 @@ class SeenVoxels(NamedTuple):
 
 
 @kernel()
-def mark(
-    voxels: Doubles, start: int, seen: SeenVoxels, mask: Bytes, count: int
-) -> tuple[int, int]:
+def mark(voxels: Doubles, start: int, seen: SeenVoxels, mask: Bytes, count: int) -> tuple[int, int]:
     """Set the bits of the voxels with points; returns (points done, blocks in use)."""
     for i in range(start, len(voxels)):
         x = int(np.floor(voxels[i, 0]))

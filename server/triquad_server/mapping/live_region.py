@@ -1,5 +1,7 @@
 """One region of the live map: its field, its evidence and its training."""
 
+from dataclasses import replace
+
 import numpy as np
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.field_settings import RegionIndex
@@ -89,15 +91,22 @@ class LiveRegion:
         self.is_changed = True
         return self.evidence.scan_seen(rays, stamp_s)
 
-    def scan_taken(self, rays: ScanRays, normals: Doubles, seen: SeenScan) -> None:
-        """Grow the field and keep the rays of a scan for training, after :meth:`scan_seen`.
+    def believe(self, seen: SeenScan, normals: Doubles) -> None:
+        """Let surface come and go by what a scan has shown, and grow the field where it is new.
 
         ``normals`` [N, 3] are those of the surface at the rays' ends, NaN where unknown.
         """
         # A leaf of the trees is the shadow of a voxel: where surface was before, nothing grows.
-        self.field.grow(self.evidence.scan_taken(seen, normals))
+        self.field.grow(self.evidence.believe(seen, normals))
+
+    def scan_taken(self, rays: ScanRays, normals: Doubles, seen: SeenScan) -> None:
+        """Keep the rays of a scan for training, after :meth:`believe`."""
         is_new = self.evidence.first_seen_within(LEARNT_SCANS, seen.rows)
-        self.training.scan_taken(rays, normals, is_new)
+        # A return that is not believed, a drop of rain or the first of far things, teaches nothing.
+        ends_elsewhere = seen.rows == 0
+        used = ends_elsewhere | self.evidence.live.is_surface(seen.rows)
+        of_used = replace(rays, ends=rays.ends[used])
+        self.training.scan_taken(of_used, normals[used], is_new[used])
 
     def take_step(self) -> tuple[Loss, int]:
         """Take one optimiser step; return loss and samples. On a GPU, reading the loss waits."""

@@ -117,7 +117,7 @@ class LiveRegions:
 
     def share_out(self) -> None:
         """Let all places keep as many rays, and be trained on as many samples at most."""
-        voxels = [(region, region.size.evidence.voxels) for region in self]
+        voxels = [(region, region.evidence.live.surface_voxels) for region in self]
         self._share = FairShare.of(sum(count for _, count in voxels), self._setup.training)
         for region, count in voxels:
             region.training.limit(self._share, count)

@@ -166,9 +166,11 @@ class Mapper:
             lambda: [region.scan_seen(rays, stamp_s) for region in regions],
             lambda: self._normals.add(rays.ends, rays.origin),
         )
-        self.regions.share_out()  # by the voxels that are seen so far
-        for region, surface in zip(regions, seen, strict=True):
-            region.scan_taken(rays, normals, surface)
+        for region, shown in zip(regions, seen, strict=True):
+            region.believe(shown, normals)
+        self.regions.share_out()  # by the voxels that have surface so far
+        for region, shown in zip(regions, seen, strict=True):
+            region.scan_taken(rays, normals, shown)
 
     def train(self) -> None:
         """Take one optimiser step where most is to be learnt; do nothing once all is settled."""

@@ -8,8 +8,8 @@ import numpy as np
 from triquad_format.records.arrays import Bools, Doubles, Ints, Longs
 from triquad_format.records.region import Evidence
 from triquad_map.compiled.voxel_index import empty_keys, thin
-from triquad_map.evidence.carving import Reach
 from triquad_map.evidence.belief import Belief
+from triquad_map.evidence.carving import Reach
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.evidence.growth import EvidenceSize
 from triquad_map.evidence.live_evidence import LiveEvidence
@@ -107,7 +107,7 @@ class RegionEvidence:
             self.live.mark_free(self.voxels(rays.robot.voxel_centres(leaf_m)))
         return SeenScan(rows, passed)
 
-    def scan_taken(self, seen: SeenScan, normals: Doubles) -> Longs:
+    def believe(self, seen: SeenScan, normals: Doubles) -> Longs:
         """Let surface come and go, after :meth:`scan_seen`; return the new voxels [M, 3].
 
         ``normals`` [N, 3] are those of the surface at the rays' ends, NaN where unknown.

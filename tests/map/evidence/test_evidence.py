@@ -1,6 +1,7 @@
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.maps.seen_scans import see
 from triquad_format.records.status import Status
 from triquad_map.compiled.team import Work
 from triquad_map.evidence.carving import Reach
@@ -98,7 +99,7 @@ def test_support_rises_with_each_look_from_near_and_from_other_sides() -> None:
     def level_after(*origins: tuple[float, ...]) -> int:
         evidence = LiveEvidence(SIDE)
         for origin in origins:
-            evidence.mark_surface(ends[:1], Sighting(np.array(origin), 0.2, 1_000, scan=1))
+            see(evidence, ends[:1], Sighting(np.array(origin), 0.2, 1_000, scan=1))
         return int(evidence.freeze().levels[0])
 
     near, far = (25.0, 20.5, 20.5), (120.0, 20.5, 20.5)
@@ -115,7 +116,7 @@ def test_levels_and_times_survive_a_record() -> None:
     rng = np.random.default_rng(5)
     for stamp_s, origin in zip((6_000, 9_000), origins, strict=True):
         ends = rng.uniform(0, SIDE, (3_000, 3)) ** 2 / SIDE  # many in some blocks
-        evidence.mark_surface(ends, Sighting(origin, 0.2, stamp_s, scan=1))
+        see(evidence, ends, Sighting(origin, 0.2, stamp_s, scan=1))
     record = evidence.freeze().record()
     again = LiveEvidence.from_record(SIDE, record).freeze().record()
     np.testing.assert_array_equal(again.levels, record.levels)
@@ -123,7 +124,7 @@ def test_levels_and_times_survive_a_record() -> None:
     assert len(np.unique(record.levels)) > 2
     assert set(np.unique(record.seen_s)) == {6_000, 9_000}
     frozen = evidence.freeze()
-    evidence.mark_surface(ends, Sighting(origins[0], 0.2, 12_000, scan=2))
+    see(evidence, ends, Sighting(origins[0], 0.2, 12_000, scan=2))
     np.testing.assert_array_equal(frozen.record().seen_s, record.seen_s)
 
 
@@ -185,7 +186,7 @@ def test_threads_freeze_the_same_as_one() -> None:
         evidence = LiveEvidence(SIDE)
         for scan in range(1, 4):
             sighting = Sighting(np.full(3, 5.0 * scan), 0.2, scan, scan)
-            evidence.mark_surface(np.ascontiguousarray(ends[:: 2 * scan]), sighting)
+            see(evidence, np.ascontiguousarray(ends[:: 2 * scan]), sighting)
         return evidence
 
     def in_parts(count: int, work: Work, least: int = 0) -> None:

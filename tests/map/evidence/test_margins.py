@@ -5,11 +5,12 @@ from typing import NamedTuple
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.maps.seen_scans import see
 from triquad_format.records.arrays import Bools, Doubles
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import Evidence, seen_voxels
+from triquad_map.evidence.belief import Belief
 from triquad_map.evidence.carving import Reach
-from triquad_map.evidence.contradictions import Belief
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.evidence.live_evidence import LiveEvidence
 from triquad_map.evidence.observed import Sighting
@@ -37,7 +38,7 @@ def seen(ends: Doubles, scans: int = MANY) -> LiveEvidence:
     """Evidence of rays that ended there, in each of so many scans."""
     evidence = LiveEvidence(SIDE)
     for number in range(1, scans + 1):
-        evidence.mark_surface(ends, Sighting(np.zeros(3), 0.2, 1, scan=number))
+        see(evidence, ends, Sighting(np.zeros(3), 0.2, 1, scan=number))
     return evidence
 
 
@@ -69,7 +70,7 @@ def test_of_what_few_scans_saw_nothing_is_left_out() -> None:
     assert near(evidence, rest.points(rng)).all()
     beside = Wall((16.0, 30.0), (17.0, 34.0))
     for number in range(2, MANY):
-        evidence.mark_surface(beside.points(rng), Sighting(np.zeros(3), 0.2, 2, scan=number))
+        see(evidence, beside.points(rng), Sighting(np.zeros(3), 0.2, 2, scan=number))
     assert not near(evidence, rest.points(rng)).any()
     assert near(evidence, Wall((10.0, 30.0), (10.1, 34.0)).points(rng)).all()
 
@@ -142,7 +143,7 @@ def test_margins_outlast_a_restart(seed: int, count: int, scans: int) -> None:
     record = seen(ends, scans).record()
     restored = LiveEvidence.from_record(SIDE, record)
     np.testing.assert_array_equal(restored.record().margins, record.margins)
-    restored.mark_surface(ends, AGAIN)  # nothing is known to be wider
+    see(restored, ends, AGAIN)  # nothing is known to be wider
     np.testing.assert_array_equal(restored.record().margins, record.margins)
 
 
@@ -151,7 +152,7 @@ def test_new_rays_widen_what_was_seen_before_a_restart() -> None:
     wall, more = Wall((10.0, 30.0), (17.2, 34.0)), Wall((17.1, 30.0), (17.8, 34.0))
     restored = LiveEvidence.from_record(SIDE, seen(wall.points(rng)).record())
     assert not near(restored, Wall((17.5, 30.1), (17.8, 33.9)).points(rng)).any()
-    restored.mark_surface(more.points(rng), AGAIN)
+    see(restored, more.points(rng), AGAIN)
     assert near(restored, wall.points(rng)).all()
     assert near(restored, more.points(rng)).all()
 
@@ -163,9 +164,9 @@ def test_what_was_taken_back_is_forgotten() -> None:
     wide, narrow = Wall((11.0, 30.0), (16.8, 34.0)), Wall((11.0, 30.0), (16.2, 34.0))
 
     def scan(number: int, ends: Doubles) -> None:
-        evidence.mark_surface(ends, Sighting(sensor, 0.2, number, scan=number))
+        rows = evidence.record_ends(ends, Sighting(sensor, 0.2, number, scan=number))
         passed = evidence.carve(sensor, ends, Reach(0.5, 2.5, number))
-        evidence.remove_contradicted(passed, Belief())
+        evidence.believe(rows, passed, Belief())
 
     for number in range(1, 11):
         scan(number, wide.points(rng))

@@ -143,7 +143,7 @@ def test_all_regions_keep_as_many_rays_for_each_voxel_and_tell_what_they_discard
     assert mapper.figures().replay_share == 1.0
     take_in(mapper, *world(6).scans)
     assert mapper.figures().replay_share < 1.0
-    sizes = [(len(r.training.rays.pool), r.size.evidence.voxels) for r in mapper.regions]
+    sizes = [(len(r.training.rays.pool), r.evidence.live.surface_voxels) for r in mapper.regions]
     densities = [rays / voxels for rays, voxels in sizes if voxels > 100]
     assert len(densities) > 1
     assert max(densities) < 1.2 * min(densities)
@@ -155,6 +155,6 @@ def test_training_beyond_what_the_area_may_owe_is_discarded_and_told() -> None:
     few = {"max_budget_samples": 1000, "samples_per_voxel": 10.0}
     scan = world().scans[0]
     mapper = mapper_of(scan, chosen=settings(**few))
-    voxels = sum(region.size.evidence.voxels for region in mapper.regions)
+    voxels = sum(region.evidence.live.surface_voxels for region in mapper.regions)
     assert 0.99 * 10 * voxels < mapper.samples_left <= 10 * voxels
     assert mapper.figures().samples_discarded > 0

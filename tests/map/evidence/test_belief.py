@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.region import seen_voxels
+from triquad_map.evidence.belief import Belief
 from triquad_map.evidence.carving import Reach
-from triquad_map.evidence.contradictions import Belief
 from triquad_map.evidence.live_evidence import LiveEvidence
 from triquad_map.evidence.observations import outcome_counts
 from triquad_map.evidence.observed import Sighting
@@ -29,12 +29,11 @@ class Watched:
         """Take in rays that end at ``ends`` [N, 3]; returns how many voxels were taken back."""
         self.scans += 1
         sighting = Sighting(sensor, 0.2, self.scans, scan=self.scans)
-        marks = self.evidence.mark_surface(ends, sighting)
+        rows = self.evidence.record_ends(ends, sighting)
         passed = self.evidence.carve(sensor, ends, Reach(0.5, 2.5, self.scans))
-        gone = self.evidence.remove_contradicted(passed, Belief())
         if normal is not None:
-            self.evidence.set_normals(marks, np.tile(normal, (len(ends), 1)))
-        return len(gone)
+            self.evidence.set_normals(rows, np.tile(normal, (len(ends), 1)))
+        return len(self.evidence.believe(rows, passed, Belief()).removed)
 
     def believed(self, voxels: Doubles) -> float:
         """Share of ``voxels`` [N, 3] that are surface."""
@@ -96,8 +95,9 @@ def test_surface_is_new_for_some_scans_and_again_where_it_comes_back(
     def are_new() -> bool:
         watched.scans += 1
         sighting = Sighting(SENSOR, 0.2, watched.scans, scan=watched.scans)
-        marks = watched.evidence.mark_surface(wall[:5], sighting)
-        return bool(watched.evidence.first_seen_since(watched.scans - 2, marks).all())
+        rows = watched.evidence.record_ends(wall[:5], sighting)
+        watched.evidence.mark_surface(wall[:5])
+        return bool(watched.evidence.first_seen_since(watched.scans - 2, rows).all())
 
     assert [are_new() for _ in range(5)] == [True, True, True, False, False]
     while watched.believed(wall[:5]) > 0:
