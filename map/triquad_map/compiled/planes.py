@@ -12,7 +12,7 @@ MOMENTS = 10
 
 _MIN_POINTS = 6
 _MAX_THICKNESS = 0.1  # of a plane: ratio of the least to the middle standard deviation
-_MIN_WIDTH = 0.3  # ratio of the middle to the greatest: less is a line, not a plane
+_MIN_WIDTH = 0.1  # ratio of the middle to the greatest: less is a line, not a plane
 
 
 @kernel(inline="always")

@@ -22,10 +22,11 @@ import numpy as np
 from triquad_format.records.arrays import Ints, Longs
 
 from triquad_map.compiled.kernel import inner_kernel, kernel
-from triquad_map.compiled.voxel_index import SHIFT, bit_of, byte_of
+from triquad_map.compiled.voxel_index import LOW, SHIFT, bit_of
 from triquad_map.evidence.observed import (
     Observed,
     ObservedVoxel,
+    Voxel,
     forget_ends,
     has_surface,
     is_flat,
@@ -33,6 +34,8 @@ from triquad_map.evidence.observed import (
     voxel_of,
 )
 from triquad_map.evidence.seen_voxels import SeenVoxels
+
+_REACH = 2  # voxels around one that belong together with it
 
 _PRIOR_HITS, _PRIOR_MISSES = 1.5, 0.5
 
@@ -46,8 +49,7 @@ class Belief(NamedTuple):
     vacant: float = 5.0  # that nothing is in a voxel of which nothing was seen
     stray: float = 4.0  # how much less for each hit: one return in 50 is where nothing is
     leaves: float = -7.0  # that a surface has left, however often it was seen
-    vouched: float = 1.0  # share of the hits of each voxel around
-    around: float = 0.5  # share of what each voxel around says of misses
+    around: float = 0.3  # share of what each voxel around says
     most: float = 5.0  # that a voxel around says, and that all together say for the surface
 
 
@@ -86,13 +88,20 @@ def _coupling(row: int, other: int, seen: SeenVoxels, observed: Observed) -> flo
 
 
 @inner_kernel()
-def _odds(row: int, near: Ints, seen: SeenVoxels, observed: Observed, belief: Belief) -> float:
-    """Return the logarithm of the odds that there is no surface in a voxel.
+def _own_odds(voxel: ObservedVoxel, vouched: float, belief: Belief) -> float:
+    """Return the logarithm of the odds that a voxel has no surface, by its own record.
 
-    ``near`` are the rows of voxels around it in which rays ended.
+    What is ``vouched`` by those around counts as a part of a hit.
     """
+    hits = voxel.hits + vouched
+    return max(belief.vacant - belief.stray * hits, belief.leaves) + _missed(voxel)
+
+
+@inner_kernel()
+def _odds(row: int, near: Ints, seen: SeenVoxels, observed: Observed, belief: Belief) -> float:
+    """Return the same by what rays have shown around it, too, in the rows ``near``."""
     voxel = observed.voxels[row]
-    vouched = beside = 0.0
+    vouched = around = 0.0
     since = voxel.missed_since if voxel.misses > 0 else np.int32(1 << 30)
     for other in near:
         one = observed.voxels[other]
@@ -102,63 +111,92 @@ def _odds(row: int, near: Ints, seen: SeenVoxels, observed: Observed, belief: Be
         one = observed.voxels[other]
         if other == row:
             continue
-        weight = _coupling(row, np.int64(other), seen, observed)
+        coupling = _coupling(row, np.int64(other), seen, observed)
         if one.misses > 0:
             if one.missed_since > voxel.hit_scan:
-                beside += weight * belief.around * min(_missed(one), belief.most)
+                around += belief.around * coupling * min(_missed(one), belief.most)
         elif one.ends > 0:
-            vouched += weight * belief.vouched * one.hits
+            vouched += coupling * one.hits
             if one.hit_scan >= since:
-                beside -= weight * belief.around * belief.most
-    hits = voxel.hits + (1.0 if is_flat(voxel) else min(vouched, 1.0))
-    odds = max(belief.vacant - belief.stray * hits, belief.leaves) + _missed(voxel)
-    return float(odds + max(beside, -belief.most))
+                around -= belief.around * coupling * belief.most
+    own = _own_odds(voxel, 1.0 if is_flat(voxel) else min(vouched, 1.0), belief)
+    return float(own + max(around, -belief.most))
+
+
+@inner_kernel()
+def _bit(row: int, observed: Observed) -> tuple[int, int, int]:
+    """Return where the surface bit of a row is: block, byte and mask."""
+    owner = observed.voxels[row].owner
+    return owner >> (3 * SHIFT), owner >> SHIFT & (1 << (2 * SHIFT)) - 1, bit_of(owner & LOW)
+
+
+@inner_kernel()
+def _appear(
+    hit: Ints, seen: SeenVoxels, observed: Observed, belief: Belief, come: list[Voxel]
+) -> None:
+    """Let surface come in the rows ``hit`` where it has become probable."""
+    for row in hit:
+        if row == 0 or has_surface(row, seen, observed):
+            continue
+        voxel = observed.voxels[row]
+        # None around was missed since, so these can only speak for the surface.
+        if _own_odds(voxel, 1.0 if is_flat(voxel) else 0.0, belief) > 0:
+            near = rows_around(np.int64(row), _REACH, seen, observed)
+            if _odds(np.int64(row), near, seen, observed, belief) > 0:
+                continue
+        block, byte, bit = _bit(row, observed)
+        seen.surface[block, byte] |= bit
+        come.append(voxel_of(row, seen, observed))
+
+
+@inner_kernel()
+def _go(
+    waiting: list[int], seen: SeenVoxels, observed: Observed, belief: Belief, gone: list[Voxel]
+) -> None:
+    """Let surface go in the rows ``waiting``, and in those near by that were not hit since."""
+    while len(waiting):
+        row = waiting.pop()
+        voxel = observed.voxels[row]
+        if not has_surface(row, seen, observed):
+            # Nothing is left of what hits said: the next begins anew.
+            if voxel.ends > 0 and _own_odds(voxel, 0.0, belief) >= belief.vacant:
+                forget_ends(voxel)
+            continue
+        near = rows_around(row, _REACH, seen, observed)
+        if _odds(row, near, seen, observed, belief) <= 0:
+            continue
+        block, byte, bit = _bit(row, observed)
+        seen.surface[block, byte] &= ~bit
+        gone.append(voxel_of(row, seen, observed))
+        since = max(voxel.passed_scan, voxel.hit_scan + 1)
+        for other in near:
+            if observed.voxels[other].hit_scan < since and other != row:
+                waiting.append(np.int64(other))
+        forget_ends(voxel)
 
 
 @kernel()
 def believe(
     hit: Ints, passed: Ints, seen: SeenVoxels, observed: Observed, belief: Belief
 ) -> tuple[Longs, Longs]:
-    """Let surface come and go in the rows that rays of the newest scan ``hit`` and ``passed``.
+    """Let surface come in the rows ``hit`` by the newest scan, and go in those it ``passed``.
 
-    After each removal, those next to it that were not hit since are checked once more. Returns the
-    voxels [M, 3] that have surface now, and those [K, 3] that have none any more.
+    Returns the voxels [M, 3] that have surface now, and those [K, 3] that have none any more.
     """
     come = [voxel_of(0, seen, observed) for _ in range(0)]
     gone = [voxel_of(0, seen, observed) for _ in range(0)]
-    waiting = [np.int64(row) for row in passed]
-    for row in hit:
-        if row != 0 and not has_surface(row, seen, observed):
+    waiting = [np.int64(0) for _ in range(0)]
+    for row in passed:
+        # Those that are hardly missed go only after one near by.
+        if _own_odds(observed.voxels[row], 1.0, belief) > -belief.most:
             waiting.append(np.int64(row))
-    while len(waiting):
-        row = waiting.pop()
-        voxel = observed.voxels[row]
-        if voxel.ends == 0:
-            continue
-        near = rows_around(row, 1, seen, observed)
-        odds = _odds(row, near, seen, observed, belief)
-        x, y, z = voxel_of(row, seen, observed)
-        block, byte, bit = voxel.owner >> (3 * SHIFT), byte_of(x, y), bit_of(z)
-        if odds <= 0:
-            if not seen.surface[block, byte] & bit:
-                seen.surface[block, byte] |= bit
-                come.append((x, y, z))
-            continue
-        if seen.surface[block, byte] & bit:
-            seen.surface[block, byte] &= ~bit
-            gone.append((x, y, z))
-            since = max(voxel.passed_scan, voxel.hit_scan + 1)
-            for other in near:
-                if observed.voxels[other].hit_scan < since and other != row:
-                    waiting.append(np.int64(other))
-            forget_ends(voxel)
-        elif odds >= belief.vacant:  # nothing is left of what hits said
-            forget_ends(voxel)
+    _go(waiting, seen, observed, belief, gone)
+    _appear(hit, seen, observed, belief, come)
     return _array(come), _array(gone)
 
 
 @inner_kernel()
-def _array(voxels: list[tuple[int, int, int]]) -> Longs:
+def _array(voxels: list[Voxel]) -> Longs:
     found = np.empty((len(voxels), 3), np.int64)
     for number, (x, y, z) in enumerate(voxels):
         found[number, 0], found[number, 1], found[number, 2] = x, y, z

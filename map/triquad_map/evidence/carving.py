@@ -89,10 +89,29 @@ def _crosses(ray: Passing, corner: Voxel, voxel: ObservedVoxel) -> float:
         facing = way[0] * normal[0] + way[1] * normal[1] + way[2] * normal[2]
         height = to_x * normal[0] + to_y * normal[1] + to_z * normal[2] - ray.length * facing
         variance = _SAME_SURFACE**2 + (_SAME_SLOPE * rest) ** 2
+        ends_on_it = np.exp(-0.5 * height * height / variance)
+        crossing = _crosses_plane(ray, voxel, (to_x, to_y, to_z), facing, share, prior)
         # Only a surface that extends along the ray can be met farther on.
         extends = share * _across(spread, way, way) * 12 + (1 - share)
-        chance *= 1 - min(extends, 1.0) * np.exp(-0.5 * height * height / variance)
+        chance *= 1 - min(extends, 1.0) * (1 - crossing * (1 - ends_on_it))
     return float(chance)
+
+
+@kernel(inline="always")
+def _crosses_plane(
+    ray: Passing, voxel: ObservedVoxel, to: Vector, facing: float, share: float, prior: float
+) -> float:
+    """Return the density of the ends in a voxel where a ray crosses their plane."""
+    way, normal = ray.way, voxel.normal
+    if abs(facing) < 1e-3:
+        return 0.0
+    along = (to[0] * normal[0] + to[1] * normal[1] + to[2] * normal[2]) / facing
+    off = (along * way[0] - to[0], along * way[1] - to[1], along * way[2] - to[2])
+    square = off[0] * off[0] + off[1] * off[1] + off[2] * off[2]
+    if square < 1e-6:
+        return 1.0
+    variance = share * _across(voxel.spread, off, off) / square + prior
+    return float(np.exp(-0.5 * square / variance))
 
 
 @kernel(inline="always")

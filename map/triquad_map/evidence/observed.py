@@ -258,7 +258,8 @@ def record_ends(
 ) -> tuple[int, int, int, int]:
     """Count rays that ended at ``voxels`` [N, 3].
 
-    Returns (points done, blocks, places, rows in use): not all are done where there is no room. The row of each ray's voxel goes to ``found`` [N]; 0 outside the region.
+    The row of each ray's voxel goes to ``found`` [N]; 0 outside the region. Returns (points done,
+    blocks, places, rows in use); where there is no more room, not all points are done.
     """
     for i in range(start, len(voxels)):
         end = (voxels[i, 0], voxels[i, 1], voxels[i, 2])

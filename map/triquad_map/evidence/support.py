@@ -42,7 +42,7 @@ def _level(voxel: ObservedVoxel) -> int:
     level = 0
     while level < LEVELS - 1 and strength >= LEAST_STRENGTH * (1 << level):
         level += 1
-    return max(min(1, level), level - int(voxel.misses))
+    return max(min(1, level), level - int(voxel.misses + 0.5))
 
 
 @kernel(inline="always")

@@ -97,7 +97,9 @@ class LiveRegion:
         ``normals`` [N, 3] are those of the surface at the rays' ends, NaN where unknown.
         """
         # A leaf of the trees is the shadow of a voxel: where surface was before, nothing grows.
-        self.field.grow(self.evidence.believe(seen, normals))
+        new = self.evidence.believe(seen, normals)
+        self.field.grow(new)
+        self.training.surface_appeared(new)
 
     def scan_taken(self, rays: ScanRays, normals: Doubles, seen: SeenScan) -> None:
         """Keep the rays of a scan for training, after :meth:`believe`."""

@@ -145,7 +145,8 @@ def test_a_record_keeps_what_became_of_rays(rng: np.random.Generator) -> None:
     at_panel = voxels[:, 0] == int(WALL_X)
     fence, wall = (side & at_panel for side in (voxels[:, 1] > 129, voxels[:, 1] < 128))
     hits, _, misses = outcome_counts(record.outcomes).T
-    assert np.median(hits[fence]) == np.median(hits[wall]) == 8
+    assert np.median(hits[fence]) >= 4
+    assert np.median(hits[wall]) == 8
     # Of a scan six rays reach a voxel of the fence, and four of them go on.
     assert 0.5 <= np.median(misses[fence] / hits[fence]) <= 4
     assert not np.median(misses[wall])
@@ -205,7 +206,7 @@ def test_a_far_thing_goes_as_a_whole_though_rays_meet_nothing_above_it(
     """The back of a car, seen once: below rays reach the road behind it, above it is open sky."""
     watched, high, low = Watched(), np.array([1.5, 3.0, 4.5]), np.array([-3.0, -1.5, 0.0])
     back = lattice(rng, 180.5, np.concatenate([low, high]))
-    watched.scan(back)
+    watched.scan(back, np.array([1.0, 0, 0]))
     assert watched.believed(back) == 1.0
     for _ in range(10):
         watched.scan(behind(lattice(rng, 180.5, low), 240.0))

@@ -174,7 +174,8 @@ def test_what_was_taken_back_is_forgotten() -> None:
         ends = wide.points(rng)
         scan(number, sensor + (ends - sensor) * 4)
     assert not near(evidence, wide.points(rng)).any()
-    scan(31, np.array([[20.5, 14.05, 32.5]]))  # a single ray may have missed the rest
+    alone = np.array([[20.5, 14.05, 32.5]])  # a single ray may have missed the rest
+    see(evidence, alone, Sighting(sensor, 0.2, 31, scan=31))
     assert near(evidence, np.array([[20.5, 14.9, 32.5]])).all()
     for number in range(32, 41):
         scan(number, narrow.points(rng))

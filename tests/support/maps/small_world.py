@@ -96,6 +96,8 @@ def settle(mapper: Mapper) -> None:
 def damage(mapper: Mapper) -> None:
     """Have the field forget, and be trained for a step: what was not is not judged."""
     for region in mapper.regions:
+        if len(region.training.rays.pool) == 0:
+            continue
         region.field.thaw()  # what was published stays as it is
         values = region.field.features.values
         values += 0.5 * values.std() * np.random.default_rng(0).standard_normal(values.shape)

@@ -165,7 +165,7 @@ class MomentGrid:
         return rows
 
     def fill(self, normals: Doubles, points: Doubles) -> None:
-        """Add ``points`` [N, 3]; set those ``normals`` [N, 3] that are NaN where there is a plane."""
+        """Add ``points`` [N, 3]; set ``normals`` [N, 3] that are NaN to those of their planes."""
         rows = self.add(points)
         outdated = _outdated(rows, normals, self._moments, self._basis)
 

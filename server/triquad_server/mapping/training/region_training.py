@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 from triquad_format.records.arrays import Bools, Doubles, Longs
 from triquad_format.records.region import TrainingState
+from triquad_map.compiled.voxel_index import keys_of
 from triquad_map.evidence.live_evidence import LiveEvidence
 from triquad_map.surfels.surfel_map import SurfelMap
 from triquad_map.surfels.surfel_search import no_surfels
@@ -90,6 +91,7 @@ class RegionTraining:
         self._trainer = trainer_of(field, setup.sums, setup.team)
         self._unjudged_samples = 0  # samples that were trained since it was judged
         self._unjudged_rays = 0  # rays that were held out since
+        self._unlearnt: Longs = np.zeros(0, np.int64)  # keys of voxels whose surface was removed
         self._new_rays = 0  # that ended on new surface since the last scan that owed training
 
     @classmethod
@@ -137,6 +139,13 @@ class RegionTraining:
         """Keep as many rays and samples as is the share of ``voxels`` voxels with surface."""
         self.rays.limit(max(1, int(share.rays * voxels)))
         self.budget.limit(int(share.samples * voxels))
+
+    def surface_appeared(self, voxels: Longs) -> None:
+        """Forget what was taught of free space in voxels [M, 3] that have surface now."""
+        again = voxels[np.isin(keys_of(voxels), self._unlearnt)]
+        if len(again):
+            self._unlearnt = np.setdiff1d(self._unlearnt, keys_of(again))
+            self.rays.forget_ends(again)
 
     def scan_taken(self, rays: ScanRays, normals: Doubles, is_new: Bools) -> None:
         """Keep the rays of a scan, to be trained on.
@@ -203,6 +212,7 @@ class RegionTraining:
         """Forget the rays that ended in voxels, and have the field learn what is there now."""
         settings = self._setup.field
         self.rays.forget_ends(removed)
+        self._unlearnt = np.union1d(self._unlearnt, keys_of(removed))
         if len(removed) > _FEW_REMOVED:
             self._focus.release()
         else:
