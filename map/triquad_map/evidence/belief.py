@@ -114,7 +114,9 @@ def _odds(row: int, near: Ints, seen: SeenVoxels, observed: Observed, belief: Be
         coupling = _coupling(row, np.int64(other), seen, observed)
         if one.misses > 0:
             if one.missed_since > voxel.hit_scan:
-                around += belief.around * coupling * min(_missed(one), belief.most)
+                is_gone = not has_surface(np.int64(other), seen, observed)
+                says = belief.most if is_gone else min(_missed(one), belief.most)
+                around += belief.around * coupling * says
         elif one.ends > 0:
             vouched += coupling * one.hits
             if one.hit_scan >= since:
