@@ -24,12 +24,14 @@ _SENSOR_Z_M = 1.8
 
 def tuned_episodes(scans: int) -> list[Episode]:
     """Return the episodes to tune on; after the busy ones, ``scans`` scans of the empty place."""
-    return [_busy_street(scans), _room_with_people(scans), _street_in_rain(scans)]
+    streets = [_busy_street(scans), _street_in_rain(scans), _crossing(scans)]
+    parks = [_car_park(scans), _car_park_in_rain(scans)]
+    return [*streets, *parks, _room_with_people(scans), _tunnel(scans)]
 
 
 def held_episodes(scans: int) -> list[Episode]:
     """Return the episodes that are only scored, likewise."""
-    return [_crossing(scans), _car_park(scans), _tunnel(scans), _car_park_in_rain(scans)]
+    return [_yard(scans), _corridor(scans), _avenue_in_rain(scans)]
 
 
 def _car(x: float, y: float, yaw: float = 0.0, size: float = 1.0) -> list[Solid]:
@@ -230,3 +232,65 @@ def _tunnel(scans: int) -> Episode:
     lane = straight_lane((0.0, 20.0), 0.9, _ROBOT_Z_M)
     standing = SimulatedDrive(scene, sensor, poses, 14)
     return Episode("tunnel", standing, things, _BUSY_SCANS, lane, (rail,))
+
+
+def _yard(scans: int) -> Episode:
+    """A yard with racks and a mesh fence, 32 beams: a forklift turns, pallets and a van leave."""
+    racks = [box((x, 9.0, 1.6), (1.2, 0.5, 1.6)) for x in np.arange(-12.0, 13.0, 4.0)]
+    fence = tuple(cylinder((x, -9.0, 0.9), 0.012, 1.0) for x in np.arange(-14.0, 14.0, 0.15))
+    hall = box((0.0, 13.0, 3.0), (20.0, 1.5, 3.5), 0.04)
+    masts = [cylinder((x, -6.0, 3.0), 0.12, 3.5) for x in (-9.0, 7.0)]
+    bounds = np.array([[-24.0, -14.0, -1.0], [24.0, 16.0, 8.0]])
+    scene = Scene((half_space(0.0), hall, *racks, *fence, *masts), bounds)
+    sensor = Lidar(beams=32, columns=1200, elevation_min_deg=-25.0, noise_m=0.03)
+    poses = _to_and_fro(_BUSY_SCANS + scans, 22.0, 0.9, 0.5)
+
+    def things(time_s: float) -> Things:
+        yaw = 0.8 * time_s
+        at = (4.0 * math.cos(yaw), 5.0 + 1.5 * math.sin(yaw))
+        fork = [
+            box((*at, 0.8), (0.9, 0.55, 0.6), yaw, 0.05),
+            box((*at, 1.9), (0.4, 0.4, 0.3), yaw),
+        ]
+        pallets = [box((x, -3.5, 0.55), (0.6, 0.4, 0.5), 0.2) for x in (-5.0, 2.0, 9.0)]
+        van = [box((-9.0, 4.5, 1.2), (2.6, 1.0, 0.9), 0.15, 0.1)]
+        return {"forklift": fork, "pallets": pallets, "van": van}
+
+    lane = straight_lane((-11.0, 11.0), -3.5, _ROBOT_Z_M)
+    standing = SimulatedDrive(scene, sensor, poses, 21)
+    return Episode("yard", standing, things, _BUSY_SCANS, lane, fence)
+
+
+def _corridor(scans: int) -> Episode:
+    """A corridor with pillars indoors, 16 wide beams: a person waits, a trolley is pushed."""
+    walls = [box((0.0, side * 1.7, 1.3), (14.0, 0.2, 1.7)) for side in (-1, 1)]
+    ends = [box((side * 13.0, 0.0, 1.3), (0.3, 2.0, 1.7)) for side in (-1, 1)]
+    pillars = [box((x, 1.35, 1.3), (0.18, 0.18, 1.7)) for x in (-8.0, -2.0, 4.0, 10.0)]
+    ceiling = box((0.0, 0.0, 3.1), (14.0, 2.0, 0.3))
+    bounds = np.array([[-14.0, -2.0, -0.5], [14.0, 2.0, 3.0]])
+    scene = Scene((half_space(0.0), *walls, *ends, *pillars, ceiling), bounds)
+    sensor = Lidar(beams=16, columns=1024, elevation_min_deg=-35.0, elevation_max_deg=35.0)
+    poses = _to_and_fro(_BUSY_SCANS + scans, 14.0, 0.08, -0.4)
+    poses[:, 2, 3] = 1.1
+
+    def things(time_s: float) -> Things:
+        trolley = box((-6.0 + 1.2 * time_s, 0.7, 0.5), (0.4, 0.25, 0.4))
+        return {"waiting": _person(3.0, -1.1), "trolley": [trolley]}
+
+    lane = straight_lane((-6.0, 6.0), 0.6, _ROBOT_Z_M)
+    standing = SimulatedDrive(scene, sensor, poses, 22)
+    return Episode("corridor", standing, things, _BUSY_SCANS, lane, preset="indoor")
+
+
+def _avenue_in_rain(scans: int) -> Episode:
+    """Another street by 32 noisy beams, fast, while it rains and a car drives ahead."""
+    scene = street(11)
+    poses = drive(scene, _BUSY_SCANS + scans, 0.8)
+    sensor = Lidar(beams=32, columns=900, elevation_min_deg=-22.0, noise_m=0.03)
+
+    def things(time_s: float) -> Things:
+        return {"car ahead": _car(9.0 + 8.0 * time_s, -1.4)}
+
+    lane = straight_lane((4.0, 34.0), -1.6, _ROBOT_Z_M)
+    standing = SimulatedDrive(scene, sensor, poses, 23)
+    return Episode("avenue in rain", standing, things, _BUSY_SCANS, lane, rain=0.01)

@@ -4,15 +4,16 @@ The logarithm of the odds that nothing is there is the sum of what hits say, wha
 without ending say, and what the voxels around say:
 
 - Hits: ``max(vacant - stray * (hits + vouched), leaves)``. Nearly all space is vacant, and a return
-  where nothing is may happen, but hardly again in the same voxel. Hits around vouch for it, all
-  together as one at most. However often a surface was seen, it may have left since.
+  where nothing is may happen, but hardly again in the same voxel. A plane that it lies on vouches
+  for it, or hits around. However often a surface was seen, it may have left since.
 - Misses in a row since the last hit: how improbable they are while the surface is there. A voxel's
-  own record of hits and misses gives a beta distribution of the chance that a ray ends in it
-  (Jeffreys' prior); its prediction of as many misses is a ratio of gamma functions. So a fence,
-  hit and missed by turns, is a fence.
+  own record of hits and misses gives a beta distribution of the chance that a ray ends in it; its
+  prediction of as many misses is a ratio of gamma functions. So a fence, hit and missed by turns,
+  is a fence.
 - Around: a share of what is missed in the voxels around since this one was hit last, less as much
-  for each that was hit since then, but together no more than one can. Things come and go as a
-  whole.
+  for each that was hit since then. Things come and go as a whole.
+
+The formulas, and where each number comes from: ``docs/design.md``, "Surface comes and goes".
 """
 
 import math
@@ -35,9 +36,9 @@ from triquad_map.evidence.observed import (
 )
 from triquad_map.evidence.seen_voxels import SeenVoxels
 
-_REACH = 2  # voxels around one that belong together with it
+_REACH = 2  # voxels around one that may belong together with it
 
-_PRIOR_HITS, _PRIOR_MISSES = 1.5, 0.5
+_PRIOR_HITS, _PRIOR_MISSES = 1.5, 0.5  # scans: a ray that crosses a surface ends there, as a rule
 
 _SAME_SURFACE = 0.35
 """Standard deviation of the height of a surface over the plane of one beside it, in voxels."""
@@ -94,7 +95,7 @@ def _own_odds(voxel: ObservedVoxel, vouched: float, belief: Belief) -> float:
     What is ``vouched`` by those around counts as a part of a hit.
     """
     hits = voxel.hits + vouched
-    return max(belief.vacant - belief.stray * hits, belief.leaves) + _missed(voxel)
+    return float(max(belief.vacant - belief.stray * hits, belief.leaves) + _missed(voxel))
 
 
 @inner_kernel()

@@ -1,7 +1,7 @@
 """Rays that carve: the voxels that they cross are free, surfaces that they pass contradicted.
 
-A ray contradicts a surface only where it crosses it, far enough from where it ends itself, and by
-the chance that it would have ended there: the ends in a voxel lie about their mean as a Gaussian.
+A ray contradicts the surface in a voxel by the chance that it would have ended there: the ends in a
+voxel lie about their mean as a Gaussian. Near its own end a ray says nothing.
 
 Kernels stop where the index has no more room; the caller makes room and goes on.
 """
@@ -59,7 +59,8 @@ def _crosses(ray: Passing, corner: Voxel, voxel: ObservedVoxel) -> float:
     """Return the chance that a ray would have ended on the surface in a voxel, were it there.
 
     The ends in a voxel lie about their mean as a Gaussian: the chance is its density where the ray
-    passes nearest, as a share of the greatest. A ray that ends in the same plane says nothing.
+    passes nearest, as a share of the greatest. Where they extend along the ray, it must also cross
+    their plane, and not end on it.
     """
     way, mean, normal, spread = ray.way, voxel.mean, voxel.normal, voxel.spread
     to_x = corner[0] + mean[0] - ray.start[0]
@@ -73,12 +74,8 @@ def _crosses(ray: Passing, corner: Voxel, voxel: ObservedVoxel) -> float:
     v = to_x * second[0] + to_y * second[1] + to_z * second[2]
     if u * u + v * v > 1:
         return 0.0
-    ends = float(voxel.ends)
-    share, prior = (
-        ends / (ends + _PRIOR_ENDS),
-        _PRIOR_SPREAD**2 * _PRIOR_ENDS / (ends + _PRIOR_ENDS),
-    )
-    prior = prior + _LEAST_SPREAD**2 * share
+    share = float(voxel.ends) / (float(voxel.ends) + _PRIOR_ENDS)
+    prior = share * _LEAST_SPREAD**2 + (1 - share) * _PRIOR_SPREAD**2
     uu = share * _across(spread, first, first) + prior
     uv = share * _across(spread, first, second)
     vv = share * _across(spread, second, second) + prior

@@ -222,3 +222,52 @@ def test_a_wall_stays_where_rays_go_along_it(rng: np.random.Generator) -> None:
         y, z = SENSOR[1] + rng.uniform(4.9, 5.4, 300), SENSOR[2] + rng.uniform(-6, 6, 300)
         watched.scan(np.stack([np.full(300, 200.0), y, z], 1), sensor=sensor)
     assert watched.believed(wall) > 0.99
+
+
+def test_a_single_return_in_mid_air_is_no_surface_until_it_is_met_again() -> None:
+    watched, at = Watched(), np.array([[60.5, 128.5, 128.5]])
+    watched.scan(at)
+    assert watched.believed(at) == 0
+    assert watched.evidence.freeze().status(at, reach=0.0) == 0, "nor is it free"
+    watched.scan(at)
+    assert watched.believed(at) == 1
+
+
+def test_what_stands_is_surface_at_the_first_scan(rng: np.random.Generator) -> None:
+    watched, wall = Watched(), panel(rng, WALL_X)
+    watched.scan(wall)
+    assert watched.believed(wall) > 0.99
+
+
+def test_drops_of_rain_are_no_surface(rng: np.random.Generator) -> None:
+    """Before a wall, a return of a hundred comes from a drop; all of them fall elsewhere."""
+    watched, facing = Watched(), np.array([1.0, 0, 0])
+    drops = []
+    for _ in range(40):
+        ends = panel(rng, WALL_X, count=3000)
+        wet = rng.random(len(ends)) < 0.01
+        ends[wet] = SENSOR + (ends[wet] - SENSOR) * rng.uniform(0.2, 0.9, (int(wet.sum()), 1))
+        drops.append(ends[wet])
+        watched.scan(ends, facing)
+    assert watched.believed(np.concatenate(drops)) < 0.02
+    assert watched.believed(panel(rng, WALL_X, half=7.0)) > 0.99
+
+
+def test_the_ground_does_not_hold_what_stood_on_it(rng: np.random.Generator) -> None:
+    """A low box goes; the ground beneath it and around is met by every scan."""
+    watched, up = Watched(), np.array([0.0, 0, 1.0])
+    ground_z = SENSOR[2] - 8.6
+    front = np.array([[60.5, y, z] for y in np.arange(124.1, 132, 0.3) for z in (120.3, 121.2)])
+
+    def ground() -> Doubles:
+        x, y = rng.uniform(40, 90, 6000), SENSOR[1] + rng.uniform(-8, 8, 6000)
+        return np.stack([x, y, ground_z + rng.normal(0, 0.05, 6000)], 1)
+
+    for _ in range(5):
+        watched.scan(np.concatenate([ground(), front]))
+    assert watched.believed(front) == 1
+    for _ in range(10):
+        ends = ground()
+        watched.scan(ends, up)
+        watched.scan(behind(front + rng.normal(0, 0.05, front.shape), 120.0))
+    assert watched.believed(front) < 0.05
