@@ -137,17 +137,21 @@ def _bit(row: int, observed: Observed) -> tuple[int, int, int]:
 def _appear(
     hit: Ints, seen: SeenVoxels, observed: Observed, belief: Belief, come: list[Voxel]
 ) -> None:
-    """Let surface come in the rows ``hit`` where it has become probable."""
+    """Let surface come in the rows ``hit`` where it has become probable.
+
+    Where it has not, nothing is known: the rays that ended there have not shown that it is free.
+    """
     for row in hit:
         if row == 0 or has_surface(row, seen, observed):
             continue
         voxel = observed.voxels[row]
+        block, byte, bit = _bit(row, observed)
         # None around was missed since, so these can only speak for the surface.
         if _own_odds(voxel, 1.0 if is_flat(voxel) else 0.0, belief) > 0:
             near = rows_around(np.int64(row), _REACH, seen, observed)
             if _odds(np.int64(row), near, seen, observed, belief) > 0:
+                seen.free[block, byte] &= ~bit
                 continue
-        block, byte, bit = _bit(row, observed)
         seen.surface[block, byte] |= bit
         come.append(voxel_of(row, seen, observed))
 
