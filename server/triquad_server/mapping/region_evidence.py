@@ -104,7 +104,7 @@ class RegionEvidence:
         return marks
 
     def first_seen_within(self, scans: int, marks: Marks) -> Bools:
-        """Return which rays [N] of the last scan ended on a surface first seen in few scans."""
+        """Return which rays [N] ended on a surface first seen in the last ``scans`` scans."""
         return self.live.first_seen_since(self._scans - scans + 1, marks)
 
     def step_taken(self) -> None:
