@@ -126,10 +126,8 @@ class _Learner:
 
     def score(self, name: str) -> None:
         """Score the mesh of the map as it is."""
-        samples, self._samples = (
-            self.mapper.samples_trained - self._samples,
-            self.mapper.samples_trained,
-        )
+        samples = self.mapper.samples_trained - self._samples
+        self._samples = self.mapper.samples_trained
         settings = ScoreSettings(
             threshold_m=self._place.within_m, voxel_m=self._place.voxel_m, samples_max=_SCORED
         )

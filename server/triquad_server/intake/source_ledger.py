@@ -185,13 +185,13 @@ class SourceLedger:
 
     def metrics(self) -> dict[str, SourceMetrics]:
         """Return the scans of each source; of many, those heard of longest ago are merged."""
-        now = time.monotonic()
         listed: dict[str, ScanCounts] = {}
         for source, counts in self.by_source().items():
             if source == FORGOTTEN:
                 continue
             name = source if len(listed) < MAX_SOURCES_LISTED else FORGOTTEN
             listed[name] = listed.get(name, ScanCounts(sessions=0)).plus(counts)
+        now = time.monotonic()  # not before a scan that arrived meanwhile
         return {
             name: SourceMetrics(one.sessions, one.taken, one.refused, one.lost, now - one.heard_s)
             for name, one in listed.items()

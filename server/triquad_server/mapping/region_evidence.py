@@ -119,7 +119,7 @@ class RegionEvidence:
         return changes.new
 
     def first_seen_within(self, scans: int, rows: Ints) -> Bools:
-        """Return which rays [N] of the last scan ended on a surface first seen in few scans."""
+        """Return which rays [N] ended on a surface first seen in the last ``scans`` scans."""
         return self.live.first_seen_since(self._scans - scans + 1, rows)
 
     def step_taken(self) -> None:

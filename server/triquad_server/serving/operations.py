@@ -50,21 +50,25 @@ class Lane(Enum):
     """The lane of checkpoints and map files, which take seconds, one after the other."""
 
 
-_WORKERS = {
-    Lane.QUESTIONS: max(2, THREADS),
-    Lane.LONG_QUESTIONS: max(2, THREADS),
-    Lane.ADMINISTRATION: 2,
-    Lane.MESH: 1,
-    Lane.FILES: 1,
+@dataclass(frozen=True)
+class _LaneWorkers:
+    """The workers of a lane, and what they give way to."""
+
+    threads: int  # for questions, one for each core
+    niceness: int = 0  # that of mapping where the work is long
+    gives_way_s: float | None = None
+    """The seconds for which scans of a source that is about to lose some have to wait before these
+    workers give way: a planner does not wait for a source that floods, a long question does.
+    ``None``: they never do."""
+
+
+_LANES = {
+    Lane.QUESTIONS: _LaneWorkers(max(2, THREADS), gives_way_s=0.5),
+    Lane.LONG_QUESTIONS: _LaneWorkers(max(2, THREADS), NICENESS, gives_way_s=0.0),
+    Lane.ADMINISTRATION: _LaneWorkers(2),
+    Lane.MESH: _LaneWorkers(1, NICENESS),
+    Lane.FILES: _LaneWorkers(1, NICENESS),
 }
-"""The threads of each lane; for questions there is one for each core."""
-
-_UNHURRIED = (Lane.LONG_QUESTIONS, Lane.MESH, Lane.FILES)
-"""The lanes whose work is long, and done at the priority of mapping."""
-
-_GIVING_WAY = {Lane.QUESTIONS: 0.5, Lane.LONG_QUESTIONS: 0.0}
-"""The lanes that give way to sources which are about to lose scans, and for how many seconds these
-scans have waited: a planner does not wait for a source that floods, a long question does."""
 
 _LONG_BYTES = 32_768
 """A question of more bytes is long: some 2,700 points, which take a server 10 ms."""
@@ -155,13 +159,14 @@ class Operations:
 
     def _queue(self, lane: Lane, requests_each: int) -> RequestQueue[Request]:
         """Return a queue with workers, whose threads are started when they are needed."""
-        workers = _WORKERS[lane]
-        nice = NICENESS if lane in _UNHURRIED else 0
-        pool = ThreadPoolExecutor(workers + MOST_SENDING, lane.value, lower_priority, (nice,))
+        workers = _LANES[lane]
+        pool = ThreadPoolExecutor(
+            workers.threads + MOST_SENDING, lane.value, lower_priority, (workers.niceness,)
+        )
         self._pools.append(pool)
         return RequestQueue(
             lambda request: submit(pool, self._work, lane, request),
-            workers=workers,
+            workers=workers.threads,
             requests_each=requests_each,
             nbytes=_QUEUE_BYTES,
         )
@@ -195,8 +200,9 @@ class Operations:
     def _work(self, lane: Lane, request: Request) -> None:
         try:
             request.begin()
-            if lane in _GIVING_WAY:
-                self._give_way(_GIVING_WAY[lane])
+            waited_s = _LANES[lane].gives_way_s
+            if waited_s is not None:
+                self._give_way(waited_s)
             self._check(request)
             self._operations[request.key].answer(request)
         except RefusedError as error:

@@ -57,6 +57,12 @@ class RayTable(NamedTuple):
         """Return the ``chosen`` [N] rays, with all origins."""
         return RayTable(self.rows[chosen], self.origin_of[chosen], self.origins)
 
+    @property
+    def ends_newest_last(self) -> Floats:
+        """The end points [R, 3] of the rays, without the single samples, by the age of the rays."""
+        order = np.argsort(self.origin_of, kind="stable")[(self.origin_of < 0).sum() :]
+        return np.ascontiguousarray(self.rows[order, END : END + 3])
+
 
 class Placement(NamedTuple):
     """The placement of samples on their rays."""

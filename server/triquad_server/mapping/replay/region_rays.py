@@ -10,7 +10,7 @@ from triquad_map.field_fit import in_cube
 
 from triquad_server.mapping.replay.held_out import are_held_out
 from triquad_server.mapping.replay.kept_rays import KeptRays
-from triquad_server.mapping.replay.ray_table import END, RayTable, samples_alone
+from triquad_server.mapping.replay.ray_table import RayTable, samples_alone
 from triquad_server.mapping.replay.region_setup import RegionSetup
 from triquad_server.mapping.replay.replay_pool import ReplayPool
 from triquad_server.mapping.replay.replay_record import restored_rays
@@ -53,9 +53,7 @@ class RegionRays:
 
     def judging(self, newest: int) -> JudgingRays:
         """Return the rays that are held out and end in the region's cube, the ``newest`` marked."""
-        table = self.held_out.table
-        order = np.argsort(table.origin_of, kind="stable")
-        ends = np.ascontiguousarray(table.rows[order, END : END + 3])
+        ends = self.held_out.table.ends_newest_last
         are_new = np.arange(len(ends)) >= len(ends) - newest
         inside = in_cube(ends, self._settings)
         return JudgingRays(ends[inside], are_new[inside])
@@ -63,10 +61,7 @@ class RegionRays:
     @property
     def ends(self) -> Floats:
         """Return where the pool's rays end [N, 3], metres from the region's centre, newest last."""
-        table = self.pool.table
-        order = np.argsort(table.origin_of, kind="stable")[(table.origin_of < 0).sum() :]
-        ends: Floats = table.rows[order, END : END + 3]
-        return ends
+        return self.pool.table.ends_newest_last
 
     def keep(self, rays: RayTable) -> Bools:
         """Keep rays [N]; return which of them are held out."""

@@ -23,7 +23,6 @@ _LEAST_SHARE = 0.5
 _LEAST_RISE = 0.02
 """And as if by this much, in leaves: 4 mm at the default leaf."""
 
-
 _ROUNDS = 3
 """How often in a row places are learnt again before new rays have come. Else two places that make
 each other forget would do so for ever."""

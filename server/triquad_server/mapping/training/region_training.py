@@ -49,8 +49,8 @@ _NEW_SHARE = 0.01
 show what is still there, but teach little: so the map of a robot at rest settles while scans come,
 though single rays always end, by chance, where none has ended before."""
 
-VISITS = 5
-"""The samples per ray, on average, that can make a difference."""
+_SAMPLES_PER_RAY = 5
+"""The samples per kept ray, on average, that can make a difference."""
 
 _FEW_REMOVED = 32
 """If the surface of more voxels is removed, all of the region learns: rows that others use as well
@@ -229,7 +229,7 @@ class RegionTraining:
     @property
     def _is_to_be_judged(self) -> bool:
         if not self.is_settled:
-            enough = min(_JUDGED_AFTER_SAMPLES, VISITS * len(self.rays.pool))
+            enough = min(_JUDGED_AFTER_SAMPLES, _SAMPLES_PER_RAY * len(self.rays.pool))
             return self._unjudged_samples >= enough
         new = self._unjudged_rays >= _JUDGED_AFTER_SHARE * len(self.rays.held_out)
         return self._unjudged_samples > 0 or new
