@@ -3,9 +3,9 @@
 The logarithm of the odds that nothing is there is the sum of what hits say, what rays that crossed
 without ending say, and what the voxels around say:
 
-- Hits: ``max(vacant - stray * (hits + vouched), leaves)``. Nearly all space is vacant, and a return
-  where nothing is may happen, but hardly again in the same voxel. A plane that it lies on vouches
-  for it, or hits around. However often a surface was seen, it may have left since.
+- Hits: ``max(vacant - stray * (hits + company), leaves)``. Nearly all space is vacant, and a return
+  where nothing is may happen, but hardly again in the same voxel, nor with others of the scan near
+  by: these count as one hit more. However often a surface was seen, it may have left since.
 - Misses in a row since the last hit: how improbable they are while the surface is there. A voxel's
   own record of hits and misses gives a beta distribution of the chance that a ray ends in it; its
   prediction of as many misses is a ratio of gamma functions. So a fence, hit and missed by turns,
@@ -89,12 +89,9 @@ def _coupling(row: int, other: int, seen: SeenVoxels, observed: Observed) -> flo
 
 
 @inner_kernel()
-def _own_odds(voxel: ObservedVoxel, vouched: float, belief: Belief) -> float:
-    """Return the logarithm of the odds that a voxel has no surface, by its own record.
-
-    What is ``vouched`` by those around counts as a part of a hit.
-    """
-    hits = voxel.hits + vouched
+def _own_odds(voxel: ObservedVoxel, belief: Belief) -> float:
+    """Return the logarithm of the odds that a voxel has no surface, by its own record."""
+    hits = voxel.hits + (1.0 if voxel.company or is_flat(voxel) else 0.0)
     return float(max(belief.vacant - belief.stray * hits, belief.leaves) + _missed(voxel))
 
 
@@ -102,7 +99,7 @@ def _own_odds(voxel: ObservedVoxel, vouched: float, belief: Belief) -> float:
 def _odds(row: int, near: Ints, seen: SeenVoxels, observed: Observed, belief: Belief) -> float:
     """Return the same by what rays have shown around it, too, in the rows ``near``."""
     voxel = observed.voxels[row]
-    vouched = around = 0.0
+    around = 0.0
     since = voxel.missed_since if voxel.misses > 0 else np.int32(1 << 30)
     for other in near:
         one = observed.voxels[other]
@@ -112,18 +109,15 @@ def _odds(row: int, near: Ints, seen: SeenVoxels, observed: Observed, belief: Be
         one = observed.voxels[other]
         if other == row:
             continue
-        coupling = _coupling(row, np.int64(other), seen, observed)
-        if one.misses > 0:
-            if one.missed_since > voxel.hit_scan:
-                is_gone = not has_surface(np.int64(other), seen, observed)
-                says = belief.most if is_gone else min(_missed(one), belief.most)
-                around += belief.around * coupling * says
-        elif one.ends > 0:
-            vouched += coupling * one.hits
-            if one.hit_scan >= since:
-                around -= belief.around * coupling * belief.most
-    own = _own_odds(voxel, 1.0 if is_flat(voxel) else min(vouched, 1.0), belief)
-    return float(own + max(around, -belief.most))
+        if one.misses > 0 and one.missed_since > voxel.hit_scan:
+            is_gone = not has_surface(np.int64(other), seen, observed)
+            says = belief.most if is_gone else min(_missed(one), belief.most)
+        elif one.misses == 0 and one.ends > 0 and one.hit_scan >= since:
+            says = -belief.most
+        else:
+            continue
+        around += belief.around * _coupling(row, np.int64(other), seen, observed) * says
+    return float(_own_odds(voxel, belief) + max(around, -belief.most))
 
 
 @inner_kernel()
@@ -144,14 +138,10 @@ def _appear(
     for row in hit:
         if row == 0 or has_surface(row, seen, observed):
             continue
-        voxel = observed.voxels[row]
         block, byte, bit = _bit(row, observed)
-        # None around was missed since, so these can only speak for the surface.
-        if _own_odds(voxel, 1.0 if is_flat(voxel) else 0.0, belief) > 0:
-            near = rows_around(np.int64(row), _REACH, seen, observed)
-            if _odds(np.int64(row), near, seen, observed, belief) > 0:
-                seen.free[block, byte] &= ~bit
-                continue
+        if _own_odds(observed.voxels[row], belief) > 0:
+            seen.free[block, byte] &= ~bit
+            continue
         seen.surface[block, byte] |= bit
         come.append(voxel_of(row, seen, observed))
 
@@ -166,7 +156,7 @@ def _go(
         voxel = observed.voxels[row]
         if not has_surface(row, seen, observed):
             # Nothing is left of what hits said: the next begins anew.
-            if voxel.ends > 0 and _own_odds(voxel, 0.0, belief) >= belief.vacant:
+            if voxel.ends > 0 and _own_odds(voxel, belief) >= belief.vacant:
                 forget_ends(voxel)
             continue
         near = rows_around(row, _REACH, seen, observed)
@@ -195,7 +185,7 @@ def believe(
     waiting = [np.int64(0) for _ in range(0)]
     for row in passed:
         # Those that are hardly missed go only after one near by.
-        if _own_odds(observed.voxels[row], 1.0, belief) > -belief.most:
+        if _own_odds(observed.voxels[row], belief) > -belief.most:
             waiting.append(np.int64(row))
     _go(waiting, seen, observed, belief, gone)
     _appear(hit, seen, observed, belief, come)

@@ -10,6 +10,7 @@ from triquad_map.compiled.team import Split, in_one
 from triquad_map.compiled.voxel_index import VoxelIndex, with_room
 from triquad_map.evidence.belief import Belief, Changes, believe
 from triquad_map.evidence.carving import Reach, mark_crossed
+from triquad_map.evidence.company import have_company
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.evidence.growth import EvidenceSize, NewEnds, new_blocks, new_ends
 from triquad_map.evidence.observations import Observations
@@ -74,10 +75,11 @@ class LiveEvidence:
         """
         self._frozen = None
         rows = np.empty(len(voxels), np.int32)
+        company = have_company(voxels - sighting.origin)
         done = 0
         while done < len(voxels):
             done, self._blocks.count = self._observations.record(
-                voxels, done, self._seen, self._blocks.count, sighting, rows
+                voxels, company, done, self._seen, self._blocks.count, sighting, rows
             )
             if done < len(voxels):
                 self._make_room(more=True)

@@ -32,6 +32,7 @@ OBSERVED_VOXEL = np.dtype(
         ("lowest", np.uint8, 3),  # eighths of the voxel in which any of its rays ended, and
         ("highest", np.uint8, 3),  # the last of these, on each axis
         ("scans", np.uint8),  # of which rays ended on the surface that is there now, to MOST_SCANS
+        ("company", np.bool_),  # a ray of a scan ended there, and others near by
         ("towards", np.float32, 3),  # from the last end to the sensor, voxels
         ("spread", np.float32, 6),  # covariance of the ends, voxels: xx, xy, xz, yy, yz, zz
         ("ends", np.float32),  # rays that ended on the surface that is there now, up to a limit
@@ -78,6 +79,7 @@ Vector = tuple[float, float, float]
 def forget_ends(voxel: ObservedVoxel) -> None:
     """Forget all rays that ended in a voxel."""
     voxel.weight = voxel.ends = voxel.scans = 0
+    voxel.company = False
     voxel.sectors = 0
     for axis in range(3):
         voxel.lowest[axis], voxel.highest[axis] = EIGHTHS - 1, 0
@@ -247,6 +249,7 @@ def _add_end(voxel: ObservedVoxel, end: Vector) -> None:
 @kernel()
 def record_ends(
     voxels: Doubles,
+    company: Bools,
     start: int,
     seen: SeenVoxels,
     blocks: int,
@@ -256,7 +259,7 @@ def record_ends(
     rows: int,
     found: Ints,
 ) -> tuple[int, int, int, int]:
-    """Count rays that ended at ``voxels`` [N, 3].
+    """Count rays that ended at ``voxels`` [N, 3], some of them in ``company`` [N].
 
     The row of each ray's voxel goes to ``found`` [N]; 0 outside the region. Returns (points done,
     blocks, places, rows in use); where there is no more room, not all points are done.
@@ -294,5 +297,6 @@ def record_ends(
         known = observed.voxels[row]
         _add_ray(known, end, sighting)
         _begin_hit(known, sighting.scan)
+        known.company |= company[i]
         _add_end(known, (end[0] - x, end[1] - y, end[2] - z))
     return len(voxels), blocks, places, rows

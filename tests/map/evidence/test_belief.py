@@ -249,7 +249,7 @@ def test_drops_of_rain_are_no_surface(rng: np.random.Generator) -> None:
         ends[wet] = SENSOR + (ends[wet] - SENSOR) * rng.uniform(0.2, 0.9, (int(wet.sum()), 1))
         drops.append(ends[wet])
         watched.scan(ends, facing)
-    assert watched.believed(np.concatenate(drops)) < 0.05
+    assert watched.believed(np.concatenate(drops)) < 0.02
     assert watched.believed(panel(rng, WALL_X, half=7.0)) > 0.99
 
 
