@@ -14,6 +14,7 @@ class Stop(Enum):
 
     ASKED = "asked to"
     INTERNAL_ERROR = "by an internal error"
+    NO_MEMORY = "as the system gives no more memory"
 
 
 Stops = queue.SimpleQueue[Stop]

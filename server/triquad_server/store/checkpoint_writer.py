@@ -18,6 +18,7 @@ from triquad_server.store.store import Store
 _log = logging.getLogger(__name__)
 
 _NO_STORE = "the server was started without a store: the map is not kept"
+_NO_MEMORY = "a checkpoint was not written: the system gives no more memory"
 
 
 class CheckpointWriter:
@@ -107,29 +108,35 @@ class CheckpointWriter:
         A checkpoint that ``undoes`` something is written even if nothing changed.
 
         Raises:
-            StoreError: it cannot be written, or there is no store.
+            StoreError: it cannot be written, for lack of memory too, or there is no store.
+            MapperStoppedError: mapping has ended.
         """
         if self._store is None:
             raise StoreError(_NO_STORE)
         with self._writing:
-            base, last = self._store.base_epoch, self.last
-            snapshot = self._mapper.call(lambda mapper: mapper.snapshot_since(base))
-            # The base is the last checkpoint, as long as its file and parts are there.
-            if not undoes and last is not None and last.epoch == snapshot.epoch.number == base:
-                return last
-            started = time.monotonic()
             try:
-                changes = snapshot.changes()
-                del snapshot  # the records have all of it, and memory is shortest now
-                info = self._store.write(changes, undoes)
+                return self._write(self._store, undoes)
             except Exception as error:
                 self._metrics = replace(self._metrics, failed=self._metrics.failed + 1)
-                if isinstance(error, StoreError):
-                    self.error = str(error)
-                    _log.error("%s", error)
-                raise
-            self._record(info, time.monotonic() - started)
-            return info
+                if not isinstance(error, (StoreError, MemoryError)):
+                    raise
+                self.error = _NO_MEMORY if isinstance(error, MemoryError) else str(error)
+                _log.error("%s", self.error)
+                raise StoreError(self.error) from error
+
+    def _write(self, store: Store, undoes: str) -> CheckpointInfo:
+        """Do as :meth:`write`; an error is not recorded yet."""
+        base, last = store.base_epoch, self.last
+        snapshot = self._mapper.call(lambda mapper: mapper.snapshot_since(base))
+        # The base is the last checkpoint, as long as its file and parts are there.
+        if not undoes and last is not None and last.epoch == snapshot.epoch.number == base:
+            return last
+        started = time.monotonic()
+        changes = snapshot.changes()
+        del snapshot  # the records have all of it, and memory is shortest now
+        info = store.write(changes, undoes)
+        self._record(info, time.monotonic() - started)
+        return info
 
     def _record(self, info: CheckpointInfo, took_s: float) -> None:
         """Record that a checkpoint was written."""
@@ -148,7 +155,7 @@ class CheckpointWriter:
     def _write_if_changed(self) -> None:
         try:
             self.write()
-        except StoreError:
+        except (StoreError, MapperStoppedError):
             return  # the status and the log report it
         except Exception:
             self.error = "an internal error of the server; its log has the details"

@@ -1,5 +1,6 @@
 """The thread that owns the live map."""
 
+import queue
 import threading
 import time
 from collections.abc import Iterator
@@ -24,6 +25,7 @@ from triquad_server.mapping import publish_schedule
 from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
+from triquad_server.process.stop import Stop, Stops
 from triquad_server.settings import ServiceSettings, StoreSettings
 from triquad_server.store.checkpoint_writer import CheckpointWriter
 from triquad_server.store.resets import Resets
@@ -40,7 +42,7 @@ class Mapping:
     mapper: Mapper
     settings: ServiceSettings = SETTINGS
     scans: ScanQueue = field(default_factory=lambda: ScanQueue(8))
-    failed: Event = field(default_factory=Event)
+    stops: Stops = field(default_factory=queue.SimpleQueue)
 
     def __post_init__(self) -> None:
         self.epochs = EpochHistory(self.mapper.publish(), self.settings)
@@ -49,12 +51,12 @@ class Mapping:
             self.scans,
             self.epochs,
             self.settings.publish_period_s,
-            self.failed.set,
+            self.stops.put,
         )
 
-    def ended(self) -> str:
-        """Why the thread takes no more commands, once it does not."""
-        assert self.failed.wait(servers.WAIT_S)
+    def ended(self, why: Stop = Stop.INTERNAL_ERROR) -> str:
+        """What the thread says to commands, once it has ended for that reason."""
+        assert self.stops.get(timeout=servers.WAIT_S) is why
         with pytest.raises(MapperStoppedError) as refused:
             self.thread.call(lambda mapper: mapper.settled)
         return str(refused.value)
@@ -148,14 +150,18 @@ def test_however_much_is_flushed_epochs_keep_a_distance(monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize(
-    ("error", "log"),
-    [(RuntimeError("a defect"), "internal error"), (MemoryError("4 MiB"), "no more memory")],
+    ("error", "why", "text"),
+    [
+        (RuntimeError("a defect"), Stop.INTERNAL_ERROR, "internal error"),
+        (MemoryError("4 MiB"), Stop.NO_MEMORY, "no more memory"),
+    ],
 )
 def test_a_scan_that_fails_midway_ends_the_mapping_and_no_epoch_shows_it(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
     error: Exception,
-    log: str,
+    why: Stop,
+    text: str,
 ) -> None:
     def fail(*_: object) -> None:
         raise error
@@ -165,8 +171,9 @@ def test_a_scan_that_fails_midway_ends_the_mapping_and_no_epoch_shows_it(
         before = mapping.epochs.newest
         mapping.scans.put(servers.scan(0))
         mapping.thread.wake()
-        assert "internal error" in mapping.ended()
-        assert log in caplog.text
+        assert text in mapping.ended(why)
+        assert text in caplog.text
+        assert ("Traceback" in caplog.text) == (why is Stop.INTERNAL_ERROR)
         assert mapping.epochs.newest is before
         assert not mapping.scans.ledger.outcome("lidar", 7, 0).done, "it is not told as taken"
 
