@@ -155,6 +155,8 @@ class Mapper:
             )
         except ScanRefusedError:
             raise
+        except MemoryError as error:
+            raise ScanRefusedError("no_memory", "the system gives no more memory") from error
         except Exception as error:
             _log.exception("a scan of %s could not be read", source or "no source")
             text = f"internal error of the server: {error!r}"

@@ -178,6 +178,8 @@ class Operations:
             return
         try:
             self._take(key, query)
+        except MemoryError:
+            _log.error("a request on %s could not be received: there is no memory", key)
         except Exception:  # the next one may be answered
             _log.exception("a request on %s could not be received", key)
 

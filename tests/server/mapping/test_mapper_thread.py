@@ -178,18 +178,25 @@ def test_a_scan_that_fails_midway_ends_the_mapping_and_no_epoch_shows_it(
         assert not mapping.scans.ledger.outcome("lidar", 7, 0).done, "it is not told as taken"
 
 
-def test_a_scan_that_cannot_be_read_for_a_defect_is_refused_and_mapping_goes_on(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [(ZeroDivisionError("a defect"), "internal"), (MemoryError("4 MiB"), "no_memory")],
+)
+def test_a_scan_that_cannot_be_read_here_is_refused_and_mapping_goes_on(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, reason: str
 ) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
     with running(Mapper("test", settings(), "cpu")) as mapping:
         with monkeypatch.context() as patched:
-            patched.setattr(mapper_module, "usable_rays", lambda *_, **__: 1 // 0)
+            patched.setattr(mapper_module, "usable_rays", fail)
             mapping.scans.put(servers.scan(0))
             mapping.thread.wake()
             while not (reply := mapping.scans.ledger.outcome("lidar", 7, 0)).done:
                 time.sleep(0.01)
         assert (reply.taken, reply.refused) == (0, 1)
-        assert mapping.scans.dropped == {"internal": 1}
+        assert mapping.scans.dropped == {reason: 1}
         mapping.scans.put(servers.scan(1))
         mapping.thread.wake()
         while mapping.thread.call(lambda mapper: mapper.scans_taken) == 0:
