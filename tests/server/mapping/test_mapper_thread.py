@@ -236,3 +236,22 @@ def test_a_checkpoint_takes_one_epoch_however_fast_the_map_changes(tmp_path: Pat
                 assert info.epoch <= before + 1
                 assert mapping.epochs.newest.number == info.epoch
             thread.pause()
+
+
+def test_a_checkpoint_for_which_there_is_no_memory_is_refused_and_the_next_is_written(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def fail(*_: object) -> None:
+        raise MemoryError("4 MiB")
+
+    store = Store(tmp_path, "test", StoreSettings())
+    with closing(store), running(learning_mapper()) as mapping:
+        checkpoints = CheckpointWriter(mapping.thread, store, 0.0, None)
+        with monkeypatch.context() as patched:
+            patched.setattr(store, "write", fail)
+            with pytest.raises(RefusedError, match="store: .*no more memory"):
+                checkpoints.answer(CheckpointRequest())
+        assert checkpoints.error is not None
+        assert checkpoints.metrics().failed == 1
+        assert checkpoints.answer(CheckpointRequest()) == checkpoints.last
+        assert checkpoints.error is None
