@@ -13,7 +13,7 @@ from triquad_map.compiled.team import lower_priority
 
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.history import EpochHistory
-from triquad_server.errors import ScanRefusedError
+from triquad_server.errors import NO_MEMORY, ScanRefusedError
 from triquad_server.intake.rays import ScanRays
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.mapping.command_queue import Command, CommandQueue
@@ -141,7 +141,7 @@ class MapperThread:
             self._publish()
         except MemoryError as error:
             ended += f", {Stop.NO_MEMORY.value}"
-            _log.critical("the system gives no more memory: mapping ends, %s", error)
+            _log.critical("%s: mapping ends, %s", NO_MEMORY, error)
             self._failed(Stop.NO_MEMORY)
         except Exception:
             ended += f" {Stop.INTERNAL_ERROR.value}, see the server's log"

@@ -17,7 +17,7 @@ from triquad_format.wire.limits import MAX_WAIT_S
 from triquad_format.wire.metrics_messages import QueueMetrics
 from triquad_map.compiled.team import THREADS, lower_priority
 
-from triquad_server.errors import MapperStoppedError
+from triquad_server.errors import NO_MEMORY, MapperStoppedError
 from triquad_server.process.threads import NICENESS, submit
 from triquad_server.serving.client_sessions import ClientSessions
 from triquad_server.serving.operation_counts import OperationCounts
@@ -213,7 +213,7 @@ class Operations:
         except MapperStoppedError as error:
             request.refuse("busy", f"the server is stopping: {error}")
         except MemoryError as error:
-            request.refuse("busy", f"the system gives no more memory: {error}")
+            request.refuse("busy", f"{NO_MEMORY}: {error}")
         except Exception as error:
             request.fail(error)
         finally:

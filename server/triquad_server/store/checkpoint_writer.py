@@ -10,7 +10,12 @@ from triquad_format.wire.messages import CheckpointInfo, CheckpointRequest
 from triquad_format.wire.metrics_messages import CheckpointMetrics
 from triquad_map.compiled.team import lower_priority
 
-from triquad_server.errors import LastCheckpointError, MapperStoppedError, StoreError
+from triquad_server.errors import (
+    NO_MEMORY,
+    LastCheckpointError,
+    MapperStoppedError,
+    StoreError,
+)
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.process.threads import NICENESS
 from triquad_server.store.store import Store
@@ -18,7 +23,6 @@ from triquad_server.store.store import Store
 _log = logging.getLogger(__name__)
 
 _NO_STORE = "the server was started without a store: the map is not kept"
-_NO_MEMORY = "a checkpoint was not written: the system gives no more memory"
 
 
 class CheckpointWriter:
@@ -118,23 +122,25 @@ class CheckpointWriter:
                 return self._write(self._store, undoes)
             except Exception as error:
                 self._metrics = replace(self._metrics, failed=self._metrics.failed + 1)
-                if not isinstance(error, (StoreError, MemoryError)):
-                    raise
-                self.error = _NO_MEMORY if isinstance(error, MemoryError) else str(error)
-                _log.error("%s", self.error)
-                raise StoreError(self.error) from error
+                if isinstance(error, StoreError):
+                    self.error = str(error)
+                    _log.error("%s", self.error)
+                raise
 
     def _write(self, store: Store, undoes: str) -> CheckpointInfo:
         """Do as :meth:`write`; an error is not recorded yet."""
         base, last = store.base_epoch, self.last
-        snapshot = self._mapper.call(lambda mapper: mapper.snapshot_since(base))
-        # The base is the last checkpoint, as long as its file and parts are there.
-        if not undoes and last is not None and last.epoch == snapshot.epoch.number == base:
-            return last
-        started = time.monotonic()
-        changes = snapshot.changes()
-        del snapshot  # the records have all of it, and memory is shortest now
-        info = store.write(changes, undoes)
+        try:
+            snapshot = self._mapper.call(lambda mapper: mapper.snapshot_since(base))
+            # The base is the last checkpoint, as long as its file and parts are there.
+            if not undoes and last is not None and last.epoch == snapshot.epoch.number == base:
+                return last
+            started = time.monotonic()
+            changes = snapshot.changes()
+            del snapshot  # the records have all of it, and memory is shortest now
+            info = store.write(changes, undoes)
+        except MemoryError as error:
+            raise StoreError(f"a checkpoint was not written: {NO_MEMORY}") from error
         self._record(info, time.monotonic() - started)
         return info
 
