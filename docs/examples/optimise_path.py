@@ -81,7 +81,7 @@ async def optimise(options: argparse.Namespace) -> None:
         for bow_m, check in zip(BOWS_M, checks, strict=True):
             free = "free" if check.free() else "not free"
             print(
-                f"bow {bow_m:+.0f} m: {check.length_m:.2f} m, clearance {check.clearance_m:.2f} m, "
+                f"bow {bow_m:+.0f} m: {check.length_m:.2f} m, clearance {check.clearance_m:.3f} m, "
                 f"{free} in epoch {check.epoch}"
             )
         good = [number for number, check in enumerate(checks) if check.free()]

@@ -142,7 +142,7 @@ class Server:
 
         Raises:
             StoreError: the last checkpoint cannot be written.
-            ServerError: an internal error had stopped the server; the log has the details.
+            ServerError: the server had stopped by itself; the log has the details.
         """
         self._ask_to_stop()
         try:
@@ -150,8 +150,8 @@ class Server:
         finally:
             for client in list(self._clients):
                 client.close()
-        if why is Stop.INTERNAL_ERROR:
-            raise ServerError("an internal error had stopped the server; the log has the details")
+        if why is not Stop.ASKED:
+            raise ServerError(f"the server had stopped, {why.value}; the log has the details")
 
 
 def serve(

@@ -2,6 +2,9 @@
 
 from triquad_format.errors import TriquadError
 
+NO_MEMORY = "the system gives no more memory"
+"""The words of the server for that, in its log and to clients."""
+
 
 class ServerError(TriquadError):
     """An error that keeps the server from starting or from doing its work."""

@@ -151,6 +151,9 @@ class Heartbeat:
                 self._health.warnings.check()
                 status = self._health.status()
                 self._publisher.put(codec.encode(status))
+            except MemoryError:
+                _log.error("the status could not be published: there is no memory")
+                continue
             except Exception:
                 _log.exception("the status could not be published")
                 continue

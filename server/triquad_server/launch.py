@@ -139,7 +139,7 @@ def _open(options: LaunchOptions, stops: Stops, starting: Report, stack: ExitSta
         restored=restored.info if restored else None,
         teams=teams,
     )
-    service = Service(session, served, settings, failed=lambda: stops.put(Stop.INTERNAL_ERROR))
+    service = Service(session, served, settings, failed=stops.put)
     stack.enter_context(closing(service))
     if monitoring is not None:
         stack.enter_context(monitoring.showing(service.metrics))

@@ -35,6 +35,7 @@ from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_queries import TileQueries
 from triquad_server.mesh.update_queries import MAX_REQUEST_BYTES, UpdateQueries
 from triquad_server.monitoring.metrics import Metrics
+from triquad_server.process.stop import Stop
 from triquad_server.process.threads import Teams
 from triquad_server.queries.change_queries import ChangeQueries
 from triquad_server.queries.client_queries import MAX_QUESTION_BYTES, QUESTIONS
@@ -68,9 +69,9 @@ class Service:
         session: zenoh.Session,
         served: ServedMap,
         settings: Settings,
-        failed: Callable[[], None] = lambda: None,
+        failed: Callable[[Stop], None] = lambda _: None,
     ) -> None:
-        """Begin to serve; ``failed`` is called if mapping stops by an internal error."""
+        """Begin to serve; ``failed`` is called with the reason if an error ends mapping."""
         self.session = session
         self._served = served
         self._settings = settings
@@ -110,7 +111,7 @@ class Service:
         """
         self._parts.close()
 
-    def _open(self, failed: Callable[[], None]) -> None:
+    def _open(self, failed: Callable[[Stop], None]) -> None:
         """Open the parts, in the reverse of the order in which they have to be closed."""
         self._parts.callback(self._operations.close)
         self._mapper = self._open_mapper(failed)
@@ -197,7 +198,7 @@ class Service:
         alive = keys.alive_key(health.map_name, health.server)
         self._parts.callback(self.session.liveliness().declare_token(alive).undeclare)
 
-    def _open_mapper(self, failed: Callable[[], None]) -> MapperThread:
+    def _open_mapper(self, failed: Callable[[Stop], None]) -> MapperThread:
         warnings, trails = self._warnings, self._trails
         mapper = MapperThread(
             self._served.mapper,

@@ -1,7 +1,6 @@
 """The client for event loops: many calls at a time, cancelled and closed in the midst of them."""
 
 import asyncio
-import inspect
 import subprocess
 import sys
 import threading
@@ -288,24 +287,3 @@ def test_a_program_that_forgets_to_close_its_client_ends(endpoint: str, forgotte
     assert done.stdout == "(7,)\n", done.stderr
     assert done.returncode == (3 if forgotten == "error" else 0), done.stderr
     assert "Traceback" not in done.stderr
-
-
-@pytest.mark.parametrize(
-    ("blocking", "awaited"),
-    [
-        (triquad_client.Client, AsyncClient),
-        (triquad_client.PinnedMap, triquad_client.AsyncPinnedMap),
-        (triquad_client.SyncedMap, triquad_client.AsyncSyncedMap),
-        (triquad_client.MeshWatch, triquad_client.AsyncMeshWatch),
-    ],
-)
-def test_both_clients_are_asked_alike(blocking: type, awaited: type) -> None:
-    def methods(kind: type) -> dict[str, list[tuple[str, object]]]:
-        return {
-            name: [(one.name, one.default) for one in inspect.signature(method).parameters.values()]
-            for name, method in inspect.getmembers(kind, inspect.isfunction)
-            if not name.startswith("_")
-        }
-
-    assert methods(awaited) == methods(blocking)
-    assert all(inspect.getdoc(getattr(awaited, name)) for name in methods(awaited))

@@ -1,9 +1,10 @@
-"""What was asked for is there, for type checkers too: mypy checks this file, strictly.
+"""What was asked for is there, of both clients and for type checkers: mypy checks this file.
 
 Words that do not exist are errors twice over: mypy tells where such a comment is not needed.
 """
 
 import asyncio
+import inspect
 from collections.abc import Iterator
 from pathlib import Path
 from typing import get_args
@@ -116,3 +117,24 @@ def test_the_words_for_unknown_space_are_known_and_no_others(server: triquad_ser
             segments.free("wall")  # type: ignore[arg-type]
         with pytest.raises(ValueError, match="wall"):
             way.free("wall")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("blocking", "awaited"),
+    [
+        (triquad_client.Client, AsyncClient),
+        (triquad_client.PinnedMap, AsyncPinnedMap),
+        (triquad_client.SyncedMap, AsyncSyncedMap),
+        (triquad_client.MeshWatch, triquad_client.AsyncMeshWatch),
+    ],
+)
+def test_both_clients_are_asked_alike(blocking: type, awaited: type) -> None:
+    def methods(kind: type) -> dict[str, list[tuple[str, object]]]:
+        return {
+            name: [(one.name, one.default) for one in inspect.signature(method).parameters.values()]
+            for name, method in inspect.getmembers(kind, inspect.isfunction)
+            if not name.startswith("_")
+        }
+
+    assert methods(awaited) == methods(blocking)
+    assert all(inspect.getdoc(getattr(awaited, name)) for name in methods(awaited))

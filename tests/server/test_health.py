@@ -1,7 +1,8 @@
 """Whether mapping goes on, as a supervisor is told."""
 
+import queue
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from threading import Event, Thread
 
@@ -14,6 +15,7 @@ from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.mapping.thread_time import ThreadTime
+from triquad_server.process.stop import Stop, Stops
 from triquad_server.settings import ServiceSettings, Settings
 from triquad_server.store.checkpoint_writer import CheckpointWriter
 
@@ -31,12 +33,12 @@ class Clock:
 
 @contextmanager
 def running(
-    mapper: Mapper, clock: Clock, failed: Event | None = None
+    mapper: Mapper, clock: Clock, failed: Callable[[Stop], None] = lambda _: None
 ) -> Iterator[tuple[MapperThread, Health]]:
     """A mapper's thread without a store, and its health."""
     scans = ScanQueue(8)
     epochs = EpochHistory(mapper.publish(), ServiceSettings())
-    thread = MapperThread(mapper, scans, epochs, 0.5, (failed or Event()).set)
+    thread = MapperThread(mapper, scans, epochs, 0.5, failed)
     thread.time = ThreadTime(clock)
     health = Health(
         map_name="test",
@@ -123,9 +125,9 @@ def test_mapping_that_was_stopped_by_an_error_is_a_problem() -> None:
     mapper = FailingMapper("test", settings(samples_per_ray=1000.0), "cpu")
     scan = world(1).scans[0]
     mapper.ingest(scan.points, scan.world_from_sensor)
-    failed = Event()
-    with running(mapper, Clock(), failed) as (thread, health):
-        assert failed.wait(servers.WAIT_S)
+    stops: Stops = queue.SimpleQueue()
+    with running(mapper, Clock(), stops.put) as (thread, health):
+        assert stops.get(timeout=servers.WAIT_S) is Stop.INTERNAL_ERROR
     problem = health.mapping_problem()
     assert problem is not None
     assert "internal error" in problem

@@ -1,6 +1,6 @@
 """What a browser shows of a server: the mesh, the robot, and the answers to questions.
 
-All tests look at one page, in their order: each leaves it as it was.
+All tests look at one page. Each leaves it as it was, so that any of them may run alone.
 """
 
 import re
@@ -49,6 +49,29 @@ def looked(show: Show) -> Iterator[Looked]:
         show(LiveSource(watching, endpoint)) as page,
     ):
         yield Looked(page, client)
+
+
+@pytest.fixture
+def mapped(looked: Looked) -> Looked:
+    """The same page, which shows the mesh of the sphere alone."""
+    page, client = looked
+    if client.status().regions == 0:
+        publish_sphere(client)
+        wait_until_settled(client)
+    hide_scans(page)
+    wait_until_drawn(page)
+    return looked
+
+
+def publish_sphere(client: Client) -> None:
+    for _ in range(2):
+        client.publish_scan(sphere(30_000), np.eye(4), source="roof")
+    client.flush(WAIT_S)
+
+
+def hide_scans(page: Page) -> None:
+    for name in ("Trail", "Newest scan"):
+        page.get_by_role("checkbox", name=name).uncheck()
 
 
 def scene(page: Page) -> Bytes:
@@ -115,9 +138,7 @@ def test_a_map_is_watched_from_its_first_scan(looked: Looked) -> None:
     expect(page.get_by_text("default at tcp/")).to_be_visible()
     expect(page.get_by_text("0 scans taken")).to_be_visible()
     assert drawn_share(page) == 0.0
-    for _ in range(2):
-        client.publish_scan(sphere(30_000), np.eye(4), source="roof")
-    client.flush(WAIT_S)
+    publish_sphere(client)
     expect(page.get_by_text("roof: 2 scans, now at 0.0, 0.0, 0.0 m")).to_be_visible()
     expect(page.get_by_text("2 scans taken, 0 waiting")).to_be_visible()
     wait_until_drawn(page)
@@ -125,15 +146,14 @@ def test_a_map_is_watched_from_its_first_scan(looked: Looked) -> None:
     # The camera frames all there is.
     drawn = np.argwhere(scene(page).min(axis=-1) < 200)
     assert np.ptp(drawn, axis=0).min() > 100
-    for name in ("Trail", "Newest scan"):
-        page.get_by_role("checkbox", name=name).uncheck()
+    hide_scans(page)
     wait_until(page, lambda: share_where(page, is_orange) < 5e-5, "neither is drawn")
     expect(page.get_by_text("height, m")).to_be_visible()
     expect(page.get_by_text("≥ 4")).to_be_visible()
 
 
-def test_colours_are_those_that_are_chosen(looked: Looked) -> None:
-    page, client = looked
+def test_colours_are_those_that_are_chosen(mapped: Looked) -> None:
+    page, client = mapped
     wait_until_settled(client)
     wait_until(page, partial(_is_still, page), "the mesh has come")
     before = scene(page)
@@ -156,8 +176,8 @@ def _is_still(page: Page) -> bool:
     return bool((scene(page) == before).all())
 
 
-def test_a_slice_shows_distances_lines_and_what_is_unknown(looked: Looked) -> None:
-    page, far = looked.page, DISTANCE_COLOURS(1.0)[:3]
+def test_a_slice_shows_distances_lines_and_what_is_unknown(mapped: Looked) -> None:
+    page, far = mapped.page, DISTANCE_COLOURS(1.0)[:3]
     assert share_of(page, UNKNOWN) < 0.001
     page.get_by_label("Show slice").check()
     expect(page.get_by_text("distance to the nearest surface, m")).to_be_visible()
@@ -174,8 +194,8 @@ def test_a_slice_shows_distances_lines_and_what_is_unknown(looked: Looked) -> No
     expect(page.get_by_text("distance to the nearest surface, m")).to_be_hidden()
 
 
-def test_the_border_of_unknown_space_is_drawn_and_goes(looked: Looked) -> None:
-    page = looked.page
+def test_the_border_of_unknown_space_is_drawn_and_goes(mapped: Looked) -> None:
+    page = mapped.page
     before = share_where(page, is_pink)
     page.get_by_label("Show border").check()
     expect(page.get_by_text("between free and unknown space")).to_be_visible()
@@ -184,8 +204,8 @@ def test_the_border_of_unknown_space_is_drawn_and_goes(looked: Looked) -> None:
     wait_until(page, lambda: share_where(page, is_pink) <= before + 0.001, "nothing is pink")
 
 
-def test_a_click_asks_the_map(looked: Looked) -> None:
-    page, client = looked
+def test_a_click_asks_the_map(mapped: Looked) -> None:
+    page, client = mapped
     control(page, "Raised by (m)").fill("0.75")
     raised = page.get_by_role("row", name="raised by")
     click_until(page, (480, 380), raised.is_visible, "a surface was met")
@@ -202,8 +222,8 @@ def test_a_click_asks_the_map(looked: Looked) -> None:
     wait_until(page, lambda: share_where(page, is_magenta) == 0, "the marker is gone")
 
 
-def test_a_path_is_laid_checked_and_blocked_as_the_map_goes_on(looked: Looked) -> None:
-    page, client = looked
+def test_a_path_is_laid_checked_and_blocked_as_the_map_goes_on(mapped: Looked) -> None:
+    page, client = mapped
     control(page, "Raised by (m)").fill("2.5")
     choose(page, "A click", "adds to the path")
     control(page, "Radius (m)").fill("0.1")
@@ -252,9 +272,9 @@ def _shown_point(page: Page) -> list[float] | None:
     return _position(page) if raised.is_visible() and "2.50 m" in raised.inner_text() else None
 
 
-def test_nothing_is_drawn_after_a_reset(looked: Looked) -> None:
-    looked.client.reset()
-    wait_until(looked.page, lambda: drawn_share(looked.page) == 0.0, "nothing is drawn")
+def test_nothing_is_drawn_after_a_reset(mapped: Looked) -> None:
+    mapped.client.reset()
+    wait_until(mapped.page, lambda: drawn_share(mapped.page) == 0.0, "nothing is drawn")
 
 
 @pytest.mark.long

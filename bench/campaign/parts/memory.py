@@ -24,7 +24,7 @@ _SPACING_M = 9.0
 _PLACES = 8
 _MOST_ROOM_BYTES = 48 * 2**20
 _SQUEEZE_S = 3.0
-_OUT_OF_MEMORY = "the system gives no more memory"  # what a server logs that ends for that
+_OUT_OF_MEMORY = "no more memory: mapping ends"  # what a server logs that ends for that
 
 
 @dataclass

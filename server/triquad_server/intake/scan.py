@@ -48,6 +48,8 @@ class ScanIntake:
         self._queue.receive(len(sample.payload))
         try:
             self._receive(str(sample.key_expr), sample.payload)
+        except MemoryError as error:
+            self._drop("no_memory", str(sample.key_expr), error)
         except Exception:
             self._queue.drop("internal")
             _log.exception("a scan on %s could not be received", sample.key_expr)

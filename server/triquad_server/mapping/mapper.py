@@ -11,7 +11,7 @@ from triquad_server.engine.gradient_sums import GradientSums
 from triquad_server.engine.memory import memory_on
 from triquad_server.engine.trainer import Loss
 from triquad_server.epochs.epoch import Epoch
-from triquad_server.errors import ScanRefusedError
+from triquad_server.errors import NO_MEMORY, ScanRefusedError
 from triquad_server.intake.rays import ScanRays, usable_rays
 from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.live_regions import LiveRegions
@@ -155,6 +155,8 @@ class Mapper:
             )
         except ScanRefusedError:
             raise
+        except MemoryError as error:
+            raise ScanRefusedError("no_memory", NO_MEMORY) from error
         except Exception as error:
             _log.exception("a scan of %s could not be read", source or "no source")
             text = f"internal error of the server: {error!r}"

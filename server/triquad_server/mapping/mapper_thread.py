@@ -13,7 +13,7 @@ from triquad_map.compiled.team import lower_priority
 
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.history import EpochHistory
-from triquad_server.errors import ScanRefusedError
+from triquad_server.errors import NO_MEMORY, ScanRefusedError
 from triquad_server.intake.rays import ScanRays
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.mapping.command_queue import Command, CommandQueue
@@ -21,6 +21,7 @@ from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.progress import Progress, map_fit
 from triquad_server.mapping.publish_schedule import PublishSchedule
 from triquad_server.mapping.thread_time import Activity, ThreadTime
+from triquad_server.process.stop import Stop
 from triquad_server.process.threads import NICENESS
 
 
@@ -54,7 +55,7 @@ class MapperThread:
         scans: ScanQueue,
         epochs: EpochHistory,
         period_s: float,
-        failed: Callable[[], None],
+        failed: Callable[[Stop], None],
         listeners: MapListeners | None = None,
     ) -> None:
         """Make the thread, which begins with :meth:`start`.
@@ -64,7 +65,7 @@ class MapperThread:
             scans: from where scans are taken.
             epochs: where epochs are published.
             period_s: between two epochs while the map changes.
-            failed: called where an internal error ends the thread.
+            failed: called with the reason where an error ends the thread.
             listeners: functions that are called with scans and epochs.
         """
         self._mapper = mapper
@@ -138,13 +139,14 @@ class MapperThread:
                 self._wake.clear()  # before what it told of is looked at, the end among it
             self._run_commands()
             self._publish()
-        except Exception as error:
-            ended = "the mapper has stopped: internal error, see the server's log"
-            if isinstance(error, MemoryError):
-                _log.critical("the system gives no more memory: mapping ends, %s", error)
-            else:
-                _log.exception("the mapper was stopped by an internal error")
-            self._failed()
+        except MemoryError as error:
+            ended += f", {Stop.NO_MEMORY.value}"
+            _log.critical("%s: mapping ends, %s", NO_MEMORY, error)
+            self._failed(Stop.NO_MEMORY)
+        except Exception:
+            ended += f" {Stop.INTERNAL_ERROR.value}, see the server's log"
+            _log.exception("the mapper was stopped by an internal error")
+            self._failed(Stop.INTERNAL_ERROR)
         finally:
             self._commands.end(ended)
 

@@ -6,6 +6,8 @@ import threading
 from contextlib import suppress
 from enum import Enum
 
+from triquad_server.errors import NO_MEMORY
+
 _log = logging.getLogger("triquad_server")
 
 
@@ -14,6 +16,7 @@ class Stop(Enum):
 
     ASKED = "asked to"
     INTERNAL_ERROR = "by an internal error"
+    NO_MEMORY = f"as {NO_MEMORY}"
 
 
 Stops = queue.SimpleQueue[Stop]

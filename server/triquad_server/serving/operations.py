@@ -17,6 +17,7 @@ from triquad_format.wire.limits import MAX_WAIT_S
 from triquad_format.wire.metrics_messages import QueueMetrics
 from triquad_map.compiled.team import THREADS, lower_priority
 
+from triquad_server.errors import NO_MEMORY, MapperStoppedError
 from triquad_server.process.threads import NICENESS, submit
 from triquad_server.serving.client_sessions import ClientSessions
 from triquad_server.serving.operation_counts import OperationCounts
@@ -177,6 +178,8 @@ class Operations:
             return
         try:
             self._take(key, query)
+        except MemoryError:
+            _log.error("a request on %s could not be received: there is no memory", key)
         except Exception:  # the next one may be answered
             _log.exception("a request on %s could not be received", key)
 
@@ -207,6 +210,10 @@ class Operations:
             self._operations[request.key].answer(request)
         except RefusedError as error:
             request.refuse(error.code, error.message)
+        except MapperStoppedError as error:
+            request.refuse("busy", f"the server is stopping: {error}")
+        except MemoryError as error:
+            request.refuse("busy", f"{NO_MEMORY}: {error}")
         except Exception as error:
             request.fail(error)
         finally:

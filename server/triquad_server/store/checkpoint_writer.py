@@ -10,7 +10,12 @@ from triquad_format.wire.messages import CheckpointInfo, CheckpointRequest
 from triquad_format.wire.metrics_messages import CheckpointMetrics
 from triquad_map.compiled.team import lower_priority
 
-from triquad_server.errors import LastCheckpointError, MapperStoppedError, StoreError
+from triquad_server.errors import (
+    NO_MEMORY,
+    LastCheckpointError,
+    MapperStoppedError,
+    StoreError,
+)
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.process.threads import NICENESS
 from triquad_server.store.store import Store
@@ -107,29 +112,37 @@ class CheckpointWriter:
         A checkpoint that ``undoes`` something is written even if nothing changed.
 
         Raises:
-            StoreError: it cannot be written, or there is no store.
+            StoreError: it cannot be written, for lack of memory too, or there is no store.
+            MapperStoppedError: mapping has ended.
         """
         if self._store is None:
             raise StoreError(_NO_STORE)
         with self._writing:
-            base, last = self._store.base_epoch, self.last
+            try:
+                return self._write(self._store, undoes)
+            except Exception as error:
+                self._metrics = replace(self._metrics, failed=self._metrics.failed + 1)
+                if isinstance(error, StoreError):
+                    self.error = str(error)
+                    _log.error("%s", self.error)
+                raise
+
+    def _write(self, store: Store, undoes: str) -> CheckpointInfo:
+        """Do as :meth:`write`; an error is not recorded yet."""
+        base, last = store.base_epoch, self.last
+        try:
             snapshot = self._mapper.call(lambda mapper: mapper.snapshot_since(base))
             # The base is the last checkpoint, as long as its file and parts are there.
             if not undoes and last is not None and last.epoch == snapshot.epoch.number == base:
                 return last
             started = time.monotonic()
-            try:
-                changes = snapshot.changes()
-                del snapshot  # the records have all of it, and memory is shortest now
-                info = self._store.write(changes, undoes)
-            except Exception as error:
-                self._metrics = replace(self._metrics, failed=self._metrics.failed + 1)
-                if isinstance(error, StoreError):
-                    self.error = str(error)
-                    _log.error("%s", error)
-                raise
-            self._record(info, time.monotonic() - started)
-            return info
+            changes = snapshot.changes()
+            del snapshot  # the records have all of it, and memory is shortest now
+            info = store.write(changes, undoes)
+        except MemoryError as error:
+            raise StoreError(f"a checkpoint was not written: {NO_MEMORY}") from error
+        self._record(info, time.monotonic() - started)
+        return info
 
     def _record(self, info: CheckpointInfo, took_s: float) -> None:
         """Record that a checkpoint was written."""
@@ -148,7 +161,7 @@ class CheckpointWriter:
     def _write_if_changed(self) -> None:
         try:
             self.write()
-        except StoreError:
+        except (StoreError, MapperStoppedError):
             return  # the status and the log report it
         except Exception:
             self.error = "an internal error of the server; its log has the details"

@@ -105,6 +105,8 @@ def test_where_memory_runs_out_it_ends_and_the_last_checkpoint_counts(store, arg
                     client.publish_scan(servers.sphere(20_000, 30.0), pose)
                     client.flush(5.0)
         assert server.wait() != 0
+    assert "Traceback" not in server.log
+    assert "internal error" not in server.log
     assert_kept(store, before)
 
 

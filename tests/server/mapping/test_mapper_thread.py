@@ -1,5 +1,6 @@
 """The thread that owns the live map."""
 
+import queue
 import threading
 import time
 from collections.abc import Iterator
@@ -24,6 +25,7 @@ from triquad_server.mapping import publish_schedule
 from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
+from triquad_server.process.stop import Stop, Stops
 from triquad_server.settings import ServiceSettings, StoreSettings
 from triquad_server.store.checkpoint_writer import CheckpointWriter
 from triquad_server.store.resets import Resets
@@ -40,7 +42,7 @@ class Mapping:
     mapper: Mapper
     settings: ServiceSettings = SETTINGS
     scans: ScanQueue = field(default_factory=lambda: ScanQueue(8))
-    failed: Event = field(default_factory=Event)
+    stops: Stops = field(default_factory=queue.SimpleQueue)
 
     def __post_init__(self) -> None:
         self.epochs = EpochHistory(self.mapper.publish(), self.settings)
@@ -49,12 +51,12 @@ class Mapping:
             self.scans,
             self.epochs,
             self.settings.publish_period_s,
-            self.failed.set,
+            self.stops.put,
         )
 
-    def ended(self) -> str:
-        """Why the thread takes no more commands, once it does not."""
-        assert self.failed.wait(servers.WAIT_S)
+    def ended(self, why: Stop = Stop.INTERNAL_ERROR) -> str:
+        """What the thread says to commands, once it has ended for that reason."""
+        assert self.stops.get(timeout=servers.WAIT_S) is why
         with pytest.raises(MapperStoppedError) as refused:
             self.thread.call(lambda mapper: mapper.settled)
         return str(refused.value)
@@ -148,14 +150,18 @@ def test_however_much_is_flushed_epochs_keep_a_distance(monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize(
-    ("error", "log"),
-    [(RuntimeError("a defect"), "internal error"), (MemoryError("4 MiB"), "no more memory")],
+    ("error", "why", "text"),
+    [
+        (RuntimeError("a defect"), Stop.INTERNAL_ERROR, "internal error"),
+        (MemoryError("4 MiB"), Stop.NO_MEMORY, "no more memory"),
+    ],
 )
 def test_a_scan_that_fails_midway_ends_the_mapping_and_no_epoch_shows_it(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
     error: Exception,
-    log: str,
+    why: Stop,
+    text: str,
 ) -> None:
     def fail(*_: object) -> None:
         raise error
@@ -165,24 +171,32 @@ def test_a_scan_that_fails_midway_ends_the_mapping_and_no_epoch_shows_it(
         before = mapping.epochs.newest
         mapping.scans.put(servers.scan(0))
         mapping.thread.wake()
-        assert "internal error" in mapping.ended()
-        assert log in caplog.text
+        assert text in mapping.ended(why)
+        assert text in caplog.text
+        assert ("Traceback" in caplog.text) == (why is Stop.INTERNAL_ERROR)
         assert mapping.epochs.newest is before
         assert not mapping.scans.ledger.outcome("lidar", 7, 0).done, "it is not told as taken"
 
 
-def test_a_scan_that_cannot_be_read_for_a_defect_is_refused_and_mapping_goes_on(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [(ZeroDivisionError("a defect"), "internal"), (MemoryError("4 MiB"), "no_memory")],
+)
+def test_a_scan_that_cannot_be_read_here_is_refused_and_mapping_goes_on(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, reason: str
 ) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
     with running(Mapper("test", settings(), "cpu")) as mapping:
         with monkeypatch.context() as patched:
-            patched.setattr(mapper_module, "usable_rays", lambda *_, **__: 1 // 0)
+            patched.setattr(mapper_module, "usable_rays", fail)
             mapping.scans.put(servers.scan(0))
             mapping.thread.wake()
             while not (reply := mapping.scans.ledger.outcome("lidar", 7, 0)).done:
                 time.sleep(0.01)
         assert (reply.taken, reply.refused) == (0, 1)
-        assert mapping.scans.dropped == {"internal": 1}
+        assert mapping.scans.dropped == {reason: 1}
         mapping.scans.put(servers.scan(1))
         mapping.thread.wake()
         while mapping.thread.call(lambda mapper: mapper.scans_taken) == 0:
@@ -222,3 +236,22 @@ def test_a_checkpoint_takes_one_epoch_however_fast_the_map_changes(tmp_path: Pat
                 assert info.epoch <= before + 1
                 assert mapping.epochs.newest.number == info.epoch
             thread.pause()
+
+
+def test_a_checkpoint_for_which_there_is_no_memory_is_refused_and_the_next_is_written(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def fail(*_: object) -> None:
+        raise MemoryError("4 MiB")
+
+    store = Store(tmp_path, "test", StoreSettings())
+    with closing(store), running(learning_mapper()) as mapping:
+        checkpoints = CheckpointWriter(mapping.thread, store, 0.0, None)
+        with monkeypatch.context() as patched:
+            patched.setattr(store, "write", fail)
+            with pytest.raises(RefusedError, match="store: .*no more memory"):
+                checkpoints.answer(CheckpointRequest())
+        assert checkpoints.error is not None
+        assert checkpoints.metrics().failed == 1
+        assert checkpoints.answer(CheckpointRequest()) == checkpoints.last
+        assert checkpoints.error is None

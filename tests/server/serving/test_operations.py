@@ -1,12 +1,17 @@
-"""Each operation has a lane: what is long keeps nobody waiting whose question is short."""
+"""Each operation has a lane: what is long keeps nobody waiting whose question is short.
+
+What keeps a server from answering is told to who waits.
+"""
 
 import threading
 from contextlib import closing
 
 import numpy as np
-from support.servers import MAP, WAIT_S, free_endpoint, raw_session
+import pytest
+from support.servers import MAP, WAIT_S, RawPeer, free_endpoint, raw_session
 from triquad_format.wire import codec, keys
-from triquad_format.wire.messages import SdfReply, SdfRequest
+from triquad_format.wire.messages import ErrorReply, SdfReply, SdfRequest
+from triquad_server.errors import MapperStoppedError
 from triquad_server.serving.operations import Operations
 from triquad_server.settings import ServiceSettings
 
@@ -47,3 +52,31 @@ def test_short_questions_are_answered_while_any_number_of_long_ones_are_worked_a
         assert not end.is_set()
         end.set()
         assert all(reply.ok is not None for replies in waiting for reply in replies)
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "text"),
+    [
+        (MapperStoppedError("the mapper has stopped"), "busy", "the mapper has stopped"),
+        (MemoryError("4 MiB"), "busy", "the system gives no more memory: 4 MiB"),
+        (ZeroDivisionError("a defect"), "internal", "a defect"),
+    ],
+)
+def test_who_is_not_answered_is_told_why_and_defects_alone_leave_a_traceback(
+    caplog: pytest.LogCaptureFixture, error: Exception, code: str, text: str
+) -> None:
+    def fail(_: SdfRequest) -> SdfReply:
+        raise error
+
+    endpoint = free_endpoint()
+    with (
+        raw_session("peer", listen=endpoint) as session,
+        closing(Operations(session, MAP, ServiceSettings())) as operations,
+        raw_session(connect=endpoint) as client,
+    ):
+        operations.serve(keys.SDF, SdfRequest, fail)
+        refusal = RawPeer(client).ask(keys.SDF, question(SHORT))
+    assert isinstance(refusal, ErrorReply)
+    assert refusal.code == code
+    assert text in refusal.message
+    assert ("Traceback" in caplog.text) == (code == "internal")
