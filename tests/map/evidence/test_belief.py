@@ -241,14 +241,13 @@ def test_what_stands_is_surface_at_the_first_scan(rng: np.random.Generator) -> N
 
 def test_drops_of_rain_are_no_surface(rng: np.random.Generator) -> None:
     """Before a wall, a return of a hundred comes from a drop; all of them fall elsewhere."""
-    watched, facing = Watched(), np.array([1.0, 0, 0])
-    drops = []
+    watched, drops = Watched(), []
     for _ in range(40):
         ends = panel(rng, WALL_X, count=3000)
         wet = rng.random(len(ends)) < 0.01
         ends[wet] = SENSOR + (ends[wet] - SENSOR) * rng.uniform(0.2, 0.9, (int(wet.sum()), 1))
         drops.append(ends[wet])
-        watched.scan(ends, facing)
+        watched.scan(ends)
     assert watched.believed(np.concatenate(drops)) < 0.02
     assert watched.believed(panel(rng, WALL_X, half=7.0)) > 0.99
 
@@ -266,7 +265,7 @@ def test_the_ground_does_not_hold_what_stood_on_it(rng: np.random.Generator) -> 
     for _ in range(5):
         watched.scan(np.concatenate([ground(), front]))
     assert watched.believed(front) == 1
-    for _ in range(10):
+    for _ in range(15):
         ends = ground()
         watched.scan(ends, up)
         watched.scan(behind(front + rng.normal(0, 0.05, front.shape), 120.0))
