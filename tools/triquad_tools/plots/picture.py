@@ -15,8 +15,8 @@ from triquad_map.height_scale import HeightScale
 
 from triquad_tools.mapfiles.meshfile import meshed
 from triquad_tools.mapfiles.source import Box, NothingLeftError, SourceMap
+from triquad_tools.plots.colours import HEIGHTS
 from triquad_tools.plots.mesh_view import draw_faces, view_along
-from triquad_tools.plots.plan import HEIGHTS, extend
 
 BACKGROUND = (0.93, 0.94, 0.95)
 """The sRGB colour of the background."""
@@ -57,7 +57,9 @@ def draw_mesh(title: str, mesh: Mesh, path: Path) -> None:
     heights = HeightScale.around(used[:, 2])
     view = view_along(used, mesh.vertices[mesh.faces])
     least_m, most_m = float(used[:, 2].min()), float(used[:, 2].max())
-    beyond = extend(least_m < heights.low_m, most_m > heights.high_m)
+    # A scale ends in an arrow where there are values beyond.
+    arrows = (("neither", "max"), ("min", "both"))
+    beyond = arrows[least_m < heights.low_m][most_m > heights.high_m]
     note = f"{len(mesh.faces):,} faces, from z = {least_m:.2f} to {most_m:.2f} m"
     with rc_context({"font.size": 15}):
         figure = Figure((_WIDE / 100, _HIGH / 100), 100, facecolor=BACKGROUND)
