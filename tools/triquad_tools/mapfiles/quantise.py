@@ -87,18 +87,6 @@ def quantise(record: MapRecord, max_error_m: float) -> QuantisedMap:
     return QuantisedMap(packed, field_change(record, packed, _MEASURE_SEED))
 
 
-def dequantised(record: MapRecord) -> MapRecord:
-    """Return the map with float32 features where it has integers; it answers as before."""
-    return _with_tables(
-        record,
-        lambda table: (
-            table
-            if table.scale is None
-            else dataclasses.replace(table, features=table.vectors(), scale=None)
-        ),
-    )
-
-
 def field_change(before: MapRecord, after: MapRecord, seed: int) -> FieldChange:
     """Return how far distances moved between two maps that have the same regions and evidence."""
     return _changes(before, seed)(after)
