@@ -6,7 +6,6 @@ import triquad_client
 from support import servers
 from support.recordings.kitti_folder import write_folder
 from triquad_tools.commands import evaluate, replay
-from triquad_tools.simulation.street import street_drive
 
 SCANS = 9
 EVERY = 3  # withheld
@@ -96,26 +95,6 @@ def test_a_map_is_scored_at_withheld_scans(server, sphere_folder, tmp_path, caps
     assert none["sdf_median_m"] is None
 
 
-def test_a_map_of_a_street_is_scored_against_it(capsys, tmp_path):
-    drive = street_drive(1, 1)
-    with servers.running_service() as endpoint:
-        with triquad_client.connect(endpoint) as client:
-            for scan in drive:
-                client.publish_scan(scan.points, scan.world_from_sensor)
-            client.flush()
-            client.download_map(tmp_path / "map.triquad")
-        scores = _evaluate(capsys, "map", endpoint, "--street", 1, "--scans", 1)
-    assert scores["street"]["near_surface_ratio"] > 0.9
-    assert scores["street"]["houses_unknown_ratio"] > 0.9
-    assert scores["street"]["sdf_error_m"] < 0.3
-    assert scores["mesh"]["samples"] > 0
-    arguments = ["map", str(tmp_path / "map.triquad"), "--street", "1", "--scans", "1"]
-    assert evaluate.main(arguments) == 0
-    output = capsys.readouterr().out
-    assert "houses UNKNOWN" in output
-    assert "F-score" in output  # a file has a mesh, too
-
-
 def test_input_that_cannot_be_used_is_refused(tmp_path, capsys, sphere_folder):
     def refusal(*arguments):
         assert evaluate.main([str(argument) for argument in arguments]) == 2
@@ -127,11 +106,12 @@ def test_input_that_cannot_be_used_is_refused(tmp_path, capsys, sphere_folder):
     mesh = _plate(tmp_path / "plate.ply", (0, 1), (0, 1), 0.0)
     cloud = tmp_path / "cloud.ply"
     triquad_client.Mesh(_grid(), np.empty((0, 3), np.int32), epoch=1).save(cloud)
-    assert "no such file" in refusal("mesh", tmp_path / "no.ply", "--street", 1)
+    assert "no such file" in refusal("mesh", tmp_path / "no.ply", "--reference", cloud)
     assert "has no faces" in refusal("mesh", cloud, "--reference", cloud)
     assert "no.ply" in refusal("mesh", mesh, "--reference", tmp_path / "no.ply")
     assert "holds no trajectory" in refusal("mesh", mesh, "--reference", tmp_path)
-    assert "no such file" in refusal("map", tmp_path / "no.triquad", "--street", 1, "--scans", 1)
+    missing = tmp_path / "no.triquad"
+    assert "no such file" in refusal("map", missing, "--withheld", sphere_folder)
     assert "plate.ply" in refusal("map", mesh, "--withheld", sphere_folder)
     far_apart = ("map", mesh, "--withheld", sphere_folder, "--skip-every", SCANS + 1)
     assert f"--skip-every {SCANS + 1} withholds none of its {SCANS} scans" in refusal(*far_apart)
@@ -148,8 +128,7 @@ def test_a_server_that_cannot_be_reached_is_a_failure(capsys, sphere_folder):
     [
         (),
         ("mesh", "x.ply"),
-        ("mesh", "x.ply", "--street", "1", "--reference", "y.ply"),
-        ("mesh", "x.ply", "--street", "1", "--threshold", "0"),
+        ("mesh", "x.ply", "--reference", "y.ply", "--threshold", "0"),
         ("map", "x.triquad"),
         ("map", "x.triquad", "--withheld", "y", "--range-max", "inf"),
     ],

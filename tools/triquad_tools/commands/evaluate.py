@@ -9,28 +9,20 @@ from typing import Any
 import numpy as np
 from triquad_format.records.arrays import Doubles
 
-from triquad_tools.console.arguments import add_version, count, not_negative, positive, seed
+from triquad_tools.console.arguments import add_version, count, not_negative, positive
 from triquad_tools.console.command import OK, ToolError, run
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.report import Row, json_text, print_rows
 from triquad_tools.console.server_arguments import DEFAULT_MAP, add_config
-from triquad_tools.evaluation.map_scores import score_street, score_withheld, street_probes
-from triquad_tools.evaluation.metrics import (
-    STREET_VOXEL_M,
-    ScoreSettings,
-    score_against_cloud,
-    score_against_scene,
-    scored_box,
-)
-from triquad_tools.evaluation.score_rows import mesh_rows, street_rows, withheld_rows
+from triquad_tools.evaluation.metrics import ScoreSettings, score_mesh
+from triquad_tools.evaluation.score_rows import mesh_rows, withheld_rows
+from triquad_tools.evaluation.withheld_scores import score_withheld
 from triquad_tools.mapfiles.meshfile import read_mesh
 from triquad_tools.mapfiles.source import Access, open_map
 from triquad_tools.recordings.cloud import is_withheld, merged, world_points
 from triquad_tools.recordings.folders.cloud_folder import read_cloud_folder
-from triquad_tools.simulation.street import street_drive
 
 _COMMAND = "triquad-eval"
-_SEED = 0  # of the points that are drawn; scores can be repeated
 
 Results = dict[str, Any]
 
@@ -52,35 +44,17 @@ def _evaluate(options: argparse.Namespace) -> int:
 
 
 def _evaluate_mesh(options: argparse.Namespace) -> Results:
-    """Return scores of a mesh file against a cloud, a folder of scans or a simulated street."""
+    """Return scores of a mesh file against a cloud or a folder of scans."""
     mesh = read_mesh(options.mesh)
     if not len(mesh.faces):
         raise ToolError(f"{options.mesh}: has no faces; a cloud can only be a --reference")
     settings = ScoreSettings(options.threshold, accuracy_cut_m=2 * options.threshold)
-    if options.street is None:
-        reference = _reference(options.reference, settings.voxel_m, options.range_min)
-        return {"mesh": score_against_cloud(mesh, reference, settings)}
-    drive = street_drive(options.street, options.scans)
-    visible = drive.true_hits(settings.voxel_m)
-    return {"mesh": score_against_scene(mesh, drive.scene, visible, settings)}
+    reference = _reference(options.reference, settings.voxel_m, options.range_min)
+    return {"mesh": score_mesh(mesh, reference, settings)}
 
 
 def _evaluate_map(options: argparse.Namespace) -> Results:
-    """Return scores of a map against a simulated street, or at scans that were withheld from it."""
-    return _at_withheld(options) if options.street is None else _on_street(options)
-
-
-def _on_street(options: argparse.Namespace) -> Results:
-    drive, settings = street_drive(options.street, options.scans), ScoreSettings()
-    probes = street_probes(drive, np.random.default_rng(_SEED))
-    visible = drive.true_hits(STREET_VOXEL_M)
-    with open_map(options.target, Access(options.map, options.config)) as opened:
-        street = score_street(opened.query_sdf, probes)
-        mesh = opened.mesh(scored_box(visible, settings))
-    return {"street": street, "mesh": score_against_scene(mesh, drive.scene, visible, settings)}
-
-
-def _at_withheld(options: argparse.Namespace) -> Results:
+    """Return scores of a map at scans that were withheld from it."""
     folder = read_cloud_folder(options.withheld)
     every = options.skip_every
     indices = [i for i in range(len(folder)) if every == 0 or is_withheld(i, every)]
@@ -110,7 +84,6 @@ def _reference(path: Path, voxel_m: float, range_min_m: float) -> Doubles:
 
 _TABLES: dict[str, tuple[str, Callable[[Any], list[Row]]]] = {
     "mesh": ("Mesh", mesh_rows),
-    "street": ("Map, against the exact street", street_rows),
     "withheld": ("Map, at the points of withheld scans", withheld_rows),
 }
 
@@ -126,7 +99,7 @@ def _parser() -> argparse.ArgumentParser:
     mesh.set_defaults(evaluate=_evaluate_mesh)
     mesh.add_argument("mesh", type=Path, metavar="MESH", help=".ply or .glb")
     reference = "true surface points: a .ply file, or a folder of scans"
-    _add_truth(mesh, "--reference", reference)
+    _add_scans(mesh, "--reference", reference)
     near = "nearer than this is right; twice as far is an outlier (default: 0.1)"
     mesh.add_argument("--threshold", type=positive, default=0.1, metavar="M", help=near)
     of_map = kinds.add_parser("map", help="score a map file, or the map of a running server")
@@ -135,8 +108,7 @@ def _parser() -> argparse.ArgumentParser:
     add("target", metavar="MAP", help="map file, or endpoint of a server (tcp/HOST:PORT)")
     add("--map", default=DEFAULT_MAP, metavar="NAME", help="map of the server (default: default)")
     add_config(of_map)
-    unseen = "folder with scans that the map has not seen"
-    _add_truth(of_map, "--withheld", unseen)
+    _add_scans(of_map, "--withheld", "folder with scans that the map has not seen")
     every = "as given to triquad-replay: score at every Nth scan only (default: at all)"
     add("--skip-every", type=count, default=0, metavar="N", help=every)
     add("--range-max", type=positive, default=50.0, metavar="M", help="default: 50")
@@ -144,12 +116,9 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_truth(parser: argparse.ArgumentParser, flag: str, what: str) -> None:
-    truth = parser.add_mutually_exclusive_group(required=True)
-    truth.add_argument(flag, type=Path, metavar="PATH", help=what)
-    truth.add_argument("--street", type=seed, metavar="SEED", help="the simulated street")
+def _add_scans(parser: argparse.ArgumentParser, flag: str, what: str) -> None:
     add = parser.add_argument
-    add("--scans", type=count, default=60, metavar="N", help="of the street's drive (default: 60)")
+    add(flag, type=Path, required=True, metavar="PATH", help=what)
     nearer = "leave out nearer points of a folder's scans (default: 0)"
     add("--range-min", type=not_negative, default=0.0, metavar="M", help=nearer)
     add("--json", action="store_true", help="print JSON")

@@ -1,8 +1,8 @@
 """Scores as lines of tables."""
 
 from triquad_tools.console.report import Row, centimetres, percent
-from triquad_tools.evaluation.map_scores import StreetScores, WithheldScores
 from triquad_tools.evaluation.metrics import MeshScores
+from triquad_tools.evaluation.withheld_scores import WithheldScores
 
 _TRUSTED = "SURFACE points"  # those that a user would trust
 
@@ -17,18 +17,6 @@ def mesh_rows(scores: MeshScores) -> list[Row]:
         Row("completion ratio", percent(scores.completion_ratio)),
         Row("F-score", percent(scores.f_score), "of both ratios"),
         Row("outliers", percent(scores.outlier_ratio), "mesh beyond the accuracy cut"),
-    ]
-
-
-def street_rows(scores: StreetScores) -> list[Row]:
-    """Return the scores of a map of a street as lines of a table."""
-    return [
-        Row("SDF error", centimetres(scores.sdf_error_m), "mean, within 10 cm of the surface"),
-        Row("SDF error, median", centimetres(scores.sdf_error_median_m)),
-        Row("SDF error, 95 %", centimetres(scores.sdf_error_p95_m)),
-        Row("gradient angle", f"{scores.gradient_angle_deg:.1f} deg", "median"),
-        Row("of these SURFACE", percent(scores.near_surface_ratio)),
-        Row("houses UNKNOWN", percent(scores.houses_unknown_ratio), "deeper than 0.5 m in them"),
     ]
 
 
