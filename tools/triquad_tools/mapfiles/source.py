@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from triquad_format.mapfile.checkpoint_folder import checkpoint_at, checkpoint_files, map_folder
 from triquad_format.mapfile.parts.part import TRAINING_TOPICS
@@ -18,9 +17,6 @@ from triquad_map.stored_map import StoredMap
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
-
-if TYPE_CHECKING:  # slow to import
-    from triquad_client import Client, OfflineMap
 
 Box = Doubles
 """Opposite corners ``[2, 3]`` of a box, metres, map frame; the lower one first."""
@@ -69,21 +65,6 @@ def chosen_file(path: Path, when: str | None) -> Path:
 def is_endpoint(target: str) -> bool:
     """Return whether ``target`` is a Zenoh endpoint, and not the name of a file."""
     return _ENDPOINT.match(target) is not None
-
-
-def open_map(target: str, access: Access) -> "Client | OfflineMap":
-    """Return the map in the file ``target``, or that of the server at the endpoint ``target``.
-
-    Raises:
-        TriquadError: no server there has the map.
-        FormatError: the file cannot be read as a map.
-        OSError: it cannot be read at all.
-    """
-    import triquad_client
-
-    if is_endpoint(target):
-        return triquad_client.connect(target, access.map_name, config=access.config)
-    return triquad_client.open_map(target)
 
 
 @contextmanager
