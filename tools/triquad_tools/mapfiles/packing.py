@@ -37,13 +37,9 @@ def pack_map(source: SourceMap, path: Path, *, max_error_m: float | None, bytes_
 
 
 def _told(change: FieldChange) -> str:
-    surface, near, free, largest = (
-        f"{1e3 * metres:.2f} mm"
-        for metres in (change.surface_m, change.near_m, change.free_m, change.largest_m)
-    )
+    most, largest = (f"{1e3 * one:.2f} mm" for one in (change.quantile_m, change.largest_m))
     return (
-        f"  99 % of distances moved by less than {surface} at surface, {near} near it, {free} in "
-        f"free space; the most by {largest}\n"
+        f"  99 % of distances near surface moved by less than {most}, the most by {largest}\n"
         "  without training state: it does not fit rounded features"
     )
 
