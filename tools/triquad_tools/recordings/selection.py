@@ -11,8 +11,8 @@ from triquad_tools.console.command import ToolError
 from triquad_tools.console.lines import print_remark
 from triquad_tools.recordings.arguments import options_of
 from triquad_tools.recordings.cloud import points_in_range
-from triquad_tools.recordings.opening import open_recording
-from triquad_tools.recordings.recording import Recording, ScanEntry
+from triquad_tools.recordings.opening import Recording, open_recording
+from triquad_tools.recordings.recording import ScanEntry
 from triquad_tools.sensors.sweep import PosedScan
 
 
