@@ -7,7 +7,7 @@ from pathlib import Path
 
 from triquad_format.errors import DamagedMapFileError
 from triquad_format.mapfile.metadata import utc_time
-from triquad_format.mapfile.reader import MapFile
+from triquad_format.mapfile.reader import MapFile, read_map_file
 
 from triquad_tools.console.arguments import add_version, picture
 from triquad_tools.console.command import FAILED, OK, ToolError, complain, refuse, run
@@ -17,7 +17,7 @@ from triquad_tools.console.report import json_text
 from triquad_tools.console.server_arguments import DEFAULT_MAP, add_config
 from triquad_tools.mapfiles.diff import compare, difference, print_diff
 from triquad_tools.mapfiles.object_changes import object_changes, print_objects
-from triquad_tools.mapfiles.source import Access, SourceMap, is_endpoint, map_file, read_whole
+from triquad_tools.mapfiles.source import SourceMap, is_endpoint, map_file
 from triquad_tools.mapfiles.store_log import print_log, read_log
 from triquad_tools.mapfiles.summary import print_summary, summarise
 
@@ -92,10 +92,9 @@ def _show(options: argparse.Namespace) -> int:
     name, file = _read(options, str(options.files[0]))
     summary = summarise(file)
     if options.plot:
-        from triquad_tools.plots.picture import export_picture  # slow to import
+        from triquad_tools.mapping.output import export  # slow to import
 
-        source = SourceMap(file.record, file.manifest.stamp_ns or None)
-        export_picture(source, None, None, options.plot)
+        export(SourceMap(file.record, file.manifest.stamp_ns or None), options.plot)
     if options.json:
         print_line(json_text(summary))
     else:
@@ -144,9 +143,9 @@ def _diff(options: argparse.Namespace) -> int:
 
 def _read(options: argparse.Namespace, target: str) -> tuple[str, MapFile]:
     """Return the map of a file, a folder or a server, and what it is called."""
-    access = Access(options.map or DEFAULT_MAP, options.config)
-    with map_file(target, access, options.at) as path:
-        return target if is_endpoint(target) else str(path), read_whole(path)
+    map_name = options.map or DEFAULT_MAP
+    with map_file(target, map_name, options.config, when=options.at) as path:
+        return target if is_endpoint(target) else str(path), read_map_file(path)
 
 
 def _title(name: str, file: MapFile) -> str:

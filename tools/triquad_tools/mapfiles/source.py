@@ -9,7 +9,7 @@ from pathlib import Path
 
 from triquad_format.mapfile.checkpoint_folder import checkpoint_at, checkpoint_files, map_folder
 from triquad_format.mapfile.parts.part import TRAINING_TOPICS
-from triquad_format.mapfile.reader import MapFile, read_map_file
+from triquad_format.mapfile.reader import read_map_file
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.crop import crop_record, without_training
 from triquad_format.records.region import MapRecord
@@ -22,14 +22,6 @@ Box = Doubles
 """Opposite corners ``[2, 3]`` of a box, metres, map frame; the lower one first."""
 
 _ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws|unixsock-stream)/")
-
-
-@dataclass(frozen=True)
-class Access:
-    """The map and the credentials, where a target is a server."""
-
-    map_name: str
-    config: Path | None = None  # of Zenoh, with credentials
 
 
 class NothingLeftError(ToolError):
@@ -68,11 +60,14 @@ def is_endpoint(target: str) -> bool:
 
 
 @contextmanager
-def map_file(target: str, access: Access, when: str | None = None) -> Iterator[Path]:
+def map_file(
+    target: str, map_name: str, config: Path | None, *, when: str | None
+) -> Iterator[Path]:
     """Yield a map's file: ``target`` itself, a checkpoint of it, or a server's newest epoch.
 
-    What a server has is downloaded, with its training state, and deleted afterwards. ``when`` says
-    which checkpoint of a folder; see :func:`chosen_file`.
+    The map ``map_name`` of a server, which is reached with a Zenoh configuration ``config``, is
+    downloaded, with its training state, and deleted afterwards. ``when`` says which checkpoint of
+    a folder; see :func:`chosen_file`.
 
     Raises:
         ToolError: ``when`` is given, but ``target`` is no folder.
@@ -89,23 +84,10 @@ def map_file(target: str, access: Access, when: str | None = None) -> Iterator[P
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "map.triquad"
-        connected = triquad_client.connect(target, access.map_name, config=access.config)
+        connected = triquad_client.connect(target, map_name, config=config)
         with progress("downloading"), connected as client:
             client.download_map(path, training=True)
         yield path
-
-
-def read_whole(path: Path) -> MapFile:
-    """Return the map in a file, checked, with the parts in other files that it needs.
-
-    Raises:
-        ToolError: it is a folder.
-        MapFileError: it is not a map file, is damaged, lacks files, or needs a newer reader.
-        OSError: it cannot be read.
-    """
-    if path.is_dir():
-        raise ToolError(f"{path} is a folder: --log lists the checkpoints in it")
-    return read_map_file(path)
 
 
 def read_source(path: Path, box: Box | None, training: bool) -> SourceMap:
@@ -120,7 +102,7 @@ def read_source(path: Path, box: Box | None, training: bool) -> SourceMap:
     """
     source = None if box is None else _box(path, box, training)
     if source is None:
-        file = read_whole(path)
+        file = read_map_file(path)
         source = SourceMap(file.record, file.manifest.stamp_ns or None)
     return cropped(source, box, training)
 
