@@ -6,7 +6,6 @@ All tests look at one page, in their order: each leaves it as it was.
 import re
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, suppress
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +18,6 @@ from triquad_client import Client, Status, connect
 from triquad_format.records.arrays import Bytes
 from triquad_tools.console.command import ToolError
 from triquad_tools.plots.colours import BEHIND, DISTANCES, UNKNOWN
-from triquad_tools.recordings.publishing import wait_until_settled
 from triquad_tools.viewer.sources.live_source import LiveSource
 
 from bench.clients.browser import drawn_share, picture, wait_until, wait_until_drawn
@@ -129,30 +127,6 @@ def test_a_map_is_watched_from_its_first_scan(looked: Looked) -> None:
     wait_until(page, lambda: share_where(page, is_orange) < 5e-5, "neither is drawn")
     expect(page.get_by_text("height, m")).to_be_visible()
     expect(page.get_by_text("≥ 4")).to_be_visible()
-
-
-def test_colours_are_those_that_are_chosen(looked: Looked) -> None:
-    page, client = looked
-    wait_until_settled(client)
-    wait_until(page, partial(_is_still, page), "the mesh has come")
-    before = scene(page)
-
-    def most_differs() -> bool:
-        change = np.abs(scene(page).astype(np.int64) - before).max(axis=-1)
-        return bool((change[before.min(axis=-1) < 200] > 24).mean() > 0.5)
-
-    choose(page, "Colour", "confidence")
-    expect(page.get_by_text("confidence", exact=True).first).to_be_visible()
-    wait_until(page, most_differs, "colours are those of confidence")
-    choose(page, "Colour", "height")
-    wait_until(page, lambda: not most_differs(), "colours are those of heights")
-
-
-def _is_still(page: Page) -> bool:
-    """Whether the picture stays as it is for a second."""
-    before = scene(page)
-    page.wait_for_timeout(1000)
-    return bool((scene(page) == before).all())
 
 
 def test_a_slice_shows_distances_lines_and_what_is_unknown(looked: Looked) -> None:
