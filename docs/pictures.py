@@ -63,7 +63,7 @@ def height_slice(out: Path) -> None:
     extent, known = (0, 40, -12, 12), np.where(status == Status.UNKNOWN, np.nan, distance_m)
     upper.set_facecolor(UNKNOWN)
     shown = upper.imshow(known, DISTANCES, vmin=0, vmax=3, extent=extent, origin="lower")
-    figure.colorbar(shown, ax=upper, label="m to the nearest surface, 3 or more")
+    figure.colorbar(shown, ax=[upper, lower], label="m to the nearest surface, 3 or more")
     lower.imshow(status, ListedColormap([kinds[kind] for kind in sorted(kinds)]),
                  extent=extent, origin="lower", interpolation="none")  # fmt: skip
     patches = [Patch(facecolor=kinds[kind], edgecolor="k", label=kind.name) for kind in kinds]
