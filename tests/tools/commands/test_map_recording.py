@@ -17,8 +17,9 @@ from support.recordings.kitti_folder import write_folder
 from triquad_client import Status, open_map
 from triquad_format.mapfile.reader import read_map
 from triquad_tools.commands.map_recording import main
-from triquad_tools.mapfiles.meshfile import read_mesh
 from triquad_tools.mapping.output import write_output
+
+from bench.mesh_file import read_mesh
 
 COUNT = 8
 POSES = np.tile(np.eye(4), (COUNT, 1, 1))
@@ -126,7 +127,8 @@ def test_after_ctrl_c_the_same_command_goes_on(
     with mapping(*arguments, *LONG, until="training") as (process, said):
         process.send_signal(signal.SIGINT)
         assert process.wait(servers.WAIT_S) == 130
-    assert said[-1] == "triquad-map: interrupted; the same command goes on where it was\n"
+    words = "interrupted; the same command goes on where the map was saved last"
+    assert said[-1] == f"triquad-map: {words}\n"
     assert not output.exists()
     for other in ((), (*LONG, "--range-min", "0.1")):
         assert main([*arguments, *other]) == 2

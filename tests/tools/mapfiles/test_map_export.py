@@ -20,7 +20,8 @@ from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.tile_cache import tile_lattice
 from triquad_server.mesh.tile_queries import surface_tiles
 from triquad_tools.commands.pack import main
-from triquad_tools.mapfiles.meshfile import read_mesh
+
+from bench.mesh_file import read_mesh
 
 BOX = ["0.1", "-4.7", "-2", "12.3", "4.1", "3"]
 LOW, HIGH = np.array([0.1, -4.7, -2]), np.array([12.3, 4.1, 3])
@@ -134,5 +135,5 @@ def test_refusals(map_file, tmp_path, capsys):
     refused(".triquad, .ply, .glb, .obj, .stl, .png", "mesh.gltf")
     refused("--fill is of meshes that can mark it, .ply, .glb, .obj", "a.stl", "--fill", "1")
     refused("'6' is not a number in range: use 0 to 5", "mesh.ply", "--fill", "6")
-    refused("of map files", "mesh.ply", "--max-error", "2mm")
+    refused("of map files", "mesh.ply", "--max-error", "0.002")
     refused("nowhere is not a folder", "nowhere/mesh.ply")
