@@ -10,13 +10,18 @@ from triquad_client.mesh.mesh_files import GlbMesh, glb_bytes
 from triquad_format.records.arrays import Doubles
 
 from triquad_tools.viewer.mesh.overview_camera import OverviewCamera
-from triquad_tools.viewer.mesh.tile_colours import height_scale, lit_colours
+from triquad_tools.viewer.mesh.tile_colours import (
+    TileColours,
+    confidence_colours,
+    height_colours,
+    lit_colours,
+)
 from triquad_tools.viewer.mesh.tiles_in_view import TileName, TilesInView
 from triquad_tools.viewer.page.layer import Layer
-from triquad_tools.viewer.page.legends import ColourScale
 from triquad_tools.viewer.page.page import Page
 
 _PERIOD_S = 0.5
+_HEIGHT, _CONFIDENCE = "height", "confidence"
 _PIXELS = 4  # of a cell
 _ENOUGH = 200  # vertices of a tile, to know where it is
 
@@ -40,10 +45,11 @@ class MeshLayer(Layer):
         self._shown: dict[TileName, _DrawnTile] = {}
         self._replaced: list[viser.GlbHandle] = []  # they go a round later: nothing flickers
         with self.folder:
+            self._by = page.gui.add_dropdown("Colour", (_HEIGHT, _CONFIDENCE))
             self.add_text()
             self._pixels = page.gui.add_slider("Pixels per cell", 1, 20, 1, _PIXELS)
         page.client.camera.on_update(self.wake)
-        self.start(self._pixels)
+        self.start(self._by, self._pixels)
 
     def close(self) -> None:
         """Draw no more; remove what was drawn and the folder."""
@@ -76,19 +82,25 @@ class MeshLayer(Layer):
         if self.page.source.grows or not self._framed:
             self._camera.follow(points)
             self._framed = self._tiles.loaded
-        scale = height_scale(points[:, 2])
-        self.tell(scale.html)
+        colours = self._colours(points)
+        self.tell(colours.scale.html)
         for name, tile in wanted.items():
-            appearance = (scale.low, scale.high, tile.version)
+            appearance = (colours.scale.label, colours.scale.low, colours.scale.high, tile.version)
             drawn = self._shown.get(name)
             if drawn is None or drawn.appearance != appearance:
-                self._shown[name] = _DrawnTile(appearance, self._add(tile, scale))
+                self._shown[name] = _DrawnTile(appearance, self._add(tile, colours))
                 self._replaced += [drawn.handle] if drawn else []
         for name in self._shown.keys() - wanted.keys():
             self._replaced.append(self._shown.pop(name).handle)
 
-    def _add(self, tile: MeshTile, scale: ColourScale) -> viser.GlbHandle:
-        mesh = GlbMesh("tile", tile.vertices, tile.faces, lit_colours(scale, tile))
+    def _colours(self, points: Doubles) -> TileColours:
+        """Return the chosen colours, for a mesh with some ``points`` [N, 3]."""
+        if self._by.value == _CONFIDENCE:
+            return confidence_colours(self.page.source.queries)
+        return height_colours(points[:, 2])
+
+    def _add(self, tile: MeshTile, colours: TileColours) -> viser.GlbHandle:
+        mesh = GlbMesh("tile", tile.vertices, tile.faces, lit_colours(colours, tile))
         return self.page.scene.add_glb(
             self.node("tile"), glb_bytes([mesh]), position=self.page.in_scene(tile.origin),
             cast_shadow=False, receive_shadow=False,

@@ -1,9 +1,12 @@
 """The colours of the mesh, and how to have them unchanged in a browser."""
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_client.calls.queries import MapQueries
 from triquad_client.mesh.followed_mesh import MeshTile
 from triquad_format.records.arrays import Doubles
 from triquad_map.height_scale import GAMMA, HeightScale
@@ -15,6 +18,7 @@ from triquad_tools.viewer.page.legends import ColourScale
 _TOWARDS_SUN = np.array([-0.50, -0.58, 0.64]) / np.linalg.norm([-0.50, -0.58, 0.64])
 _SUN, _SKY = 0.55, 0.5
 _STEP_M = 0.5  # of the ends of the scale: it stays the same as the map grows a little
+_NEAR_M = 1.0  # around a vertex, where its surface is searched for
 
 # The browser's tone mapping, ACES Filmic as three.js has it, which viser cannot be asked to leave
 # out: a fit by Stephen Hill of the ACES reference and output transforms.
@@ -25,21 +29,40 @@ _FIT = (0.0245786, -0.000090537, 0.983729, 0.4329510, 0.238081)
 _BRIGHTEST = 0.98  # of what it lets through: white itself would have to be infinitely bright
 
 
-def height_scale(heights_m: NDArray[np.floating]) -> ColourScale:
-    """Return a scale for nearly all heights [N] of the map frame, to half a metre."""
+@dataclass(frozen=True)
+class TileColours:
+    """Colours of mesh tiles."""
+
+    scale: ColourScale
+    values: Callable[[MeshTile], NDArray[np.floating]]  # [V] places of the vertices on the scale
+
+
+def height_colours(heights_m: NDArray[np.floating]) -> TileColours:
+    """Colour by height in the map frame, on a scale for nearly all heights [N], to half a metre."""
     around = HeightScale.around(heights_m)
     low_m = math.floor(around.low_m / _STEP_M) * _STEP_M
     high_m = math.ceil(around.high_m / _STEP_M) * _STEP_M
-    return ColourScale("height, m", HEIGHTS, low_m, high_m, open_below=True, open_above=True)
+    return TileColours(
+        ColourScale("height, m", HEIGHTS, low_m, high_m, open_below=True, open_above=True),
+        values=lambda tile: tile.origin[2] + tile.vertices[:, 2],
+    )
 
 
-def lit_colours(scale: ColourScale, tile: MeshTile) -> Doubles:
+def confidence_colours(queries: MapQueries) -> TileColours:
+    """Colour by how much the rays have shown of the surface: the confidence of distances."""
+    return TileColours(
+        ColourScale("confidence", HEIGHTS, 0.0, 1.0),
+        values=lambda t: queries.query_distance(t.origin + t.vertices, _NEAR_M).confidence,
+    )
+
+
+def lit_colours(colours: TileColours, tile: MeshTile) -> Doubles:
     """Return linear colours [V, 3] for the browser, in the light of a sun and a bright sky.
 
     They are drawn without lights, which would cost a browser most of all.
     """
-    heights_m = tile.origin[2] + tile.vertices[:, 2].astype(np.float64)
-    places = (heights_m - scale.low) / (scale.high - scale.low)
+    scale = colours.scale
+    places = (np.asarray(colours.values(tile), np.float64) - scale.low) / (scale.high - scale.low)
     up = vertex_normals(tile.vertices.astype(np.float64), tile.faces)
     light = _SUN * np.maximum(up @ _TOWARDS_SUN, 0.0) + _SKY * (0.75 + 0.25 * up[:, 2])
     return before_tone_mapping(scale.colours(places)[:, :3] ** GAMMA * light[:, None])
