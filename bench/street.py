@@ -10,12 +10,12 @@ from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
 from triquad_tools.console.progress import progress
+from triquad_tools.evaluation.metrics import MeshScores, ScoreSettings, score_mesh
 from triquad_tools.sensors.sweep import PosedScan
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.street import street
 
 from bench.figures import seconds
-from bench.mesh_scores import MeshScores, ScoreSettings, score_mesh
 from bench.street_scores import (
     STREET_VOXEL_M,
     DrivenStreet,

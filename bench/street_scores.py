@@ -16,10 +16,9 @@ from triquad_format.records.arrays import Doubles
 from triquad_format.records.status import Status
 from triquad_map.view import FieldAnswer
 from triquad_tools.console.progress import progress
+from triquad_tools.evaluation.metrics import mean_or_nan
 from triquad_tools.simulation.lidar import SimulatedDrive, SimulatedScan
 from triquad_tools.simulation.scene import Scene
-
-from bench.mesh_scores import mean_or_nan
 
 STREET_VOXEL_M = 0.05
 """The spacing of the points of a street that completion asks for."""

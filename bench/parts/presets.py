@@ -9,6 +9,7 @@ import numpy as np
 from triquad_client import Mesh
 from triquad_format.records.arrays import Doubles
 from triquad_tools.console.progress import progress
+from triquad_tools.evaluation.metrics import MeshScores, ScoreSettings, score_mesh
 from triquad_tools.recordings.cloud import merged
 from triquad_tools.recordings.publishing import FLUSH_TIMEOUT_S, wait_until_settled
 from triquad_tools.sensors.sweep import PosedScan
@@ -17,7 +18,6 @@ from triquad_tools.simulation.street import street
 
 from bench.clients.served import served, stream
 from bench.figures import Figure
-from bench.mesh_scores import MeshScores, ScoreSettings, score_mesh
 from bench.scenes.room import room_by_camera, room_by_lidar
 from bench.scenes.tabletop import tabletop_by_camera
 

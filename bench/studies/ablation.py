@@ -16,11 +16,11 @@ from triquad_format.records.field_settings import ENCODINGS
 from triquad_server.settings import Settings
 from triquad_tools.console.arguments import count, positive, seed
 from triquad_tools.console.report import Row, print_rows
+from triquad_tools.evaluation.metrics import ScoreSettings, score_mesh
 from triquad_tools.simulation.lidar import SimulatedDrive
 from triquad_tools.simulation.street import street_drive
 
 from bench.figures import Figure
-from bench.mesh_scores import ScoreSettings, score_mesh
 from bench.street import settled_mapper
 from bench.street_scores import STREET_VOXEL_M, score_street, street_probes
 

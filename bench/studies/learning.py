@@ -20,13 +20,13 @@ from triquad_server.mapping.training.focus import Focus
 from triquad_server.mapping.training.slopes import Slopes
 from triquad_server.settings.loading import load_settings
 from triquad_tools.console.report import Row, print_rows
+from triquad_tools.evaluation.metrics import ScoreSettings, score_mesh
 from triquad_tools.recordings.cloud import merged
 from triquad_tools.sensors.sweep import PosedScan
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.street import street
 
 from bench.figures import Figure
-from bench.mesh_scores import ScoreSettings, score_mesh
 from bench.scenes.room import room_by_camera, room_by_lidar
 from bench.scenes.tabletop import tabletop_by_camera
 

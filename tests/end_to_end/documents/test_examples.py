@@ -15,10 +15,9 @@ from PIL import Image
 from scipy.spatial import cKDTree
 from support import servers
 from triquad_server.settings import Settings, TrainingSettings
+from triquad_tools.mapfiles.meshfile import read_mesh
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.street import street
-
-from bench.mesh_file import read_mesh
 
 DOCS = Path(__file__).parents[3] / "docs"
 EXAMPLES = DOCS / "examples"

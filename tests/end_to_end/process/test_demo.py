@@ -11,8 +11,7 @@ from triquad_tools.commands import demo
 from triquad_tools.demo import steps
 from triquad_tools.demo.probe import ProbeReport
 from triquad_tools.demo.results import DemoResults, Intake, broken_promises, table_rows
-
-from bench.mesh_file import read_mesh
+from triquad_tools.mapfiles.meshfile import read_mesh
 
 GOOD = DemoResults(
     seed=1,

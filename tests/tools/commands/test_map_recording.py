@@ -17,9 +17,8 @@ from support.recordings.kitti_folder import write_folder
 from triquad_client import Status, open_map
 from triquad_format.mapfile.reader import read_map
 from triquad_tools.commands.map_recording import main
+from triquad_tools.mapfiles.meshfile import read_mesh
 from triquad_tools.mapping.output import write_output
-
-from bench.mesh_file import read_mesh
 
 COUNT = 8
 POSES = np.tile(np.eye(4), (COUNT, 1, 1))

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import triquad_format
 
-COMMANDS = ("demo", "inspect", "keys", "pack", "replay", "top")
+COMMANDS = ("demo", "evaluate", "inspect", "keys", "pack", "replay", "top")
 WAIT_S = 60.0
 
 

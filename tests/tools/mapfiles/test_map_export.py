@@ -20,8 +20,7 @@ from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.tile_cache import tile_lattice
 from triquad_server.mesh.tile_queries import surface_tiles
 from triquad_tools.commands.pack import main
-
-from bench.mesh_file import read_mesh
+from triquad_tools.mapfiles.meshfile import read_mesh
 
 BOX = ["0.1", "-4.7", "-2", "12.3", "4.1", "3"]
 LOW, HIGH = np.array([0.1, -4.7, -2]), np.array([12.3, 4.1, 3])

@@ -1,5 +1,6 @@
 import numpy as np
-from triquad_tools.recordings.cloud import merged, points_in_range
+from triquad_tools.recordings.cloud import merged, points_in_range, world_points
+from triquad_tools.sensors.sweep import PosedScan
 
 
 def test_points_out_of_range_are_left_out() -> None:
@@ -7,6 +8,16 @@ def test_points_out_of_range_are_left_out() -> None:
     np.testing.assert_array_equal(points_in_range(points, 2.0), points[1:3])
     np.testing.assert_array_equal(points_in_range(points, 0.0), points)
     assert points_in_range(points, 2.0).dtype == np.float32
+
+
+def test_world_points_are_moved_by_the_pose_and_finite() -> None:
+    pose = np.eye(4)
+    pose[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    pose[:3, 3] = [100, 0, 5]
+    points = np.array([[2, 0, 0], [0.5, 0, 0], [np.inf, 0, 0]], np.float32)
+    scan = PosedScan(points, pose)
+    np.testing.assert_allclose(world_points(scan), [[100, 2, 5], [100, 0.5, 5]])
+    np.testing.assert_allclose(world_points(scan, range_min_m=1.0), [[100, 2, 5]])
 
 
 def test_merged_clouds_keep_one_point_per_voxel() -> None:

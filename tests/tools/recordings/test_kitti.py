@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from support.recordings.kitti_folder import write_folder
 from triquad_tools.console.command import ToolError
+from triquad_tools.recordings.cloud import world_points
 from triquad_tools.recordings.folders.cloud_folder import read_cloud_folder
 from triquad_tools.recordings.folders.scan_folder import ScanFolder
-from triquad_tools.sensors.sweep import moved
 
 DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
 IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0"
@@ -139,6 +139,6 @@ def test_real_scans_agree_in_the_world_frame() -> None:
     from scipy.spatial import cKDTree
 
     folder = _real("seosan01")
-    first, second = (moved(one.points, one.world_from_sensor) for one in folder.read([4, 5]))
+    first, second = map(world_points, folder.read([4, 5]))
     distances = cKDTree(first).query(second[::20])[0]
     assert np.median(distances) < 0.1

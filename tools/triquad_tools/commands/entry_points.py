@@ -51,6 +51,7 @@ def _leaving_on_interrupt(command: str) -> Iterator[None]:
 _run_with_server = partial(_run, extra="demo", needs=("numba", "foxglove_schemas_protobuf"))
 
 demo = partial(_run_with_server, "triquad-demo", "demo")
+evaluate = partial(_run, "triquad-eval", "evaluate")
 inspect = partial(_run, "triquad-inspect", "inspect")
 keys = partial(_run, "triquad-keys", "keys", extra="keys")
 map_recording = partial(_run_with_server, "triquad-map", "map_recording")

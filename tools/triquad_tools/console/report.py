@@ -99,6 +99,16 @@ def json_text(value: object, indent: int | None = 2) -> str:
     return json.dumps(_plain(value), indent=indent)
 
 
+def centimetres(metres: float) -> str:
+    """Return a length in centimetres, to a tenth of a millimetre."""
+    return f"{100.0 * metres:.2f} cm"
+
+
+def percent(share: float) -> str:
+    """Return a share in percent."""
+    return f"{100.0 * share:.2f} %"
+
+
 def _plain(value: object) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}

@@ -13,10 +13,11 @@ from triquad_format.records.region import MapRecord
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
+from triquad_tools.mapfiles.meshfile import MESH_SUFFIXES
 from triquad_tools.mapfiles.source import Box, NothingLeftError, SourceMap
 
 MAP_SUFFIX, PICTURE_SUFFIX = ".triquad", ".png"
-SUFFIXES = (MAP_SUFFIX, ".ply", ".glb", ".obj", ".stl", PICTURE_SUFFIX)
+SUFFIXES = (MAP_SUFFIX, *MESH_SUFFIXES, PICTURE_SUFFIX)
 
 
 def check_target(path: Path, *, force: bool) -> None:

@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles
 
+from triquad_tools.sensors.sweep import PosedScan, moved
+
 _MERGED_POINTS = 2_000_000  # fewer are not worth a merge
 
 
@@ -18,6 +20,13 @@ def points_in_range(points: NDArray[np.floating], range_min_m: float) -> NDArray
         return points
     kept: NDArray[np.floating] = points[np.linalg.norm(points, axis=1) >= range_min_m]
     return kept
+
+
+def world_points(scan: PosedScan, range_min_m: float = 0.0) -> Doubles:
+    """Return the finite points ``[N, 3]`` of a scan that are no nearer than this, world frame."""
+    points = points_in_range(scan.points, range_min_m)
+    points = points[np.isfinite(points).all(axis=1)]
+    return moved(points, scan.world_from_sensor)
 
 
 def thin(points: Doubles, voxel_m: float) -> Doubles:

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from triquad_client import Mesh
+
 from triquad_tools.console.command import ToolError
 
 MESH_SUFFIXES = (".ply", ".glb", ".obj", ".stl")

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import triquad_client
 from support.recordings.kitti_folder import write_folder
-
-from bench import evaluate
+from triquad_tools.commands import evaluate
 
 
 def _plate(path, x, y, z):
@@ -61,7 +60,7 @@ def test_input_that_cannot_be_used_is_refused(tmp_path, capsys):
         assert evaluate.main([str(argument) for argument in arguments]) == 2
         *before, error = capsys.readouterr().err.splitlines()
         assert all("looking through" in line for line in before)
-        assert error.startswith("bench.evaluate: ")
+        assert error.startswith("triquad-eval: ")
         return error
 
     mesh = _plate(tmp_path / "plate.ply", (0, 1), (0, 1), 0.0)

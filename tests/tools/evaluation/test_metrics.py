@@ -1,10 +1,9 @@
 import numpy as np
 import pytest
 from triquad_client import Mesh
+from triquad_tools.evaluation.metrics import ScoreSettings, score_mesh
 from triquad_tools.simulation.scene import Scene
 from triquad_tools.simulation.solids import half_space
-
-from bench.mesh_scores import ScoreSettings, score_mesh
 
 NOTHING = Mesh(np.empty((0, 3)), np.empty((0, 3), np.int64))
 BOUNDS = np.array([[0.0, 0.0, -1.0], [4.0, 2.0, 1.0]])

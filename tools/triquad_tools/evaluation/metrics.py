@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from triquad_client import Mesh
 from triquad_format.records.arrays import Doubles
+
 from triquad_tools.recordings.cloud import thin
 
 

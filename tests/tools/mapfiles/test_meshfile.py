@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from triquad_client import Mesh
 from triquad_tools.console.command import ToolError
-
-from bench.mesh_file import read_mesh
+from triquad_tools.mapfiles.meshfile import read_mesh
 
 TETRAHEDRON = Mesh(
     np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 3.0]]),
