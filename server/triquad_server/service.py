@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import zenoh
 from triquad_format.wire import keys
-from triquad_format.wire.mesh_messages import MeshRequest, TileListRequest, TileUpdatesRequest
+from triquad_format.wire.mesh_messages import MeshRequest, TileChangesRequest, TileListRequest
 from triquad_format.wire.messages import (
     CheckpointInfo,
     CheckpointRequest,
@@ -33,7 +33,6 @@ from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapListeners, MapperThread
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_queries import TileQueries
-from triquad_server.mesh.update_queries import MAX_REQUEST_BYTES, UpdateQueries
 from triquad_server.monitoring.metrics import Metrics
 from triquad_server.process.threads import Teams
 from triquad_server.queries.change_queries import ChangeQueries
@@ -169,15 +168,13 @@ class Service:
             serve(name, kind, answers.answer, lane, MAX_QUESTION_BYTES)
         changes = ChangeQueries(self._epochs, self._surface, health.server)
         sources = SourceQueries(self._trails, health.server)
-        mesh = TileQueries(self._epochs, tiles)
+        mesh = TileQueries(self._epochs, tiles, health.server)
         serve(keys.CHANGES, ChangesRequest, changes.changes)
         serve(keys.SOURCES, SourcesRequest, sources.sources)
-        serve(keys.TILE_LIST, TileListRequest, mesh.tiles)
-        serve(keys.MESH, MeshRequest, mesh.mesh, Lane.LONG_QUESTIONS)
+        serve(keys.TILE_LIST, TileListRequest, mesh.tiles, Lane.MESH)
+        serve(keys.TILE_CHANGES, TileChangesRequest, mesh.changes, Lane.MESH)
+        serve(keys.MESH, MeshRequest, mesh.mesh, Lane.MESH)
         serve(keys.MAP_CHUNK, MapChunkRequest, downloads.chunk, Lane.LONG_QUESTIONS)
-
-        updates = UpdateQueries(self._epochs, tiles, health.server)
-        serve(keys.TILE_UPDATES, TileUpdatesRequest, updates.updates, Lane.MESH, MAX_REQUEST_BYTES)
 
         flush = FlushQueries(self._scans.ledger, self._mapper.publish_soon, self._warnings.of)
         lane = Lane.ADMINISTRATION
