@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import zenoh
 from triquad_format.wire import keys
+from triquad_format.wire.limits import MAX_QUERY_POINTS, payload_limit
 from triquad_format.wire.mesh_messages import MeshRequest, TileChangesRequest, TileListRequest
 from triquad_format.wire.messages import (
     CheckpointInfo,
@@ -19,7 +20,7 @@ from triquad_format.wire.messages import (
 )
 from triquad_format.wire.metrics_messages import MetricsRequest
 from triquad_format.wire.query_messages import ChangesRequest, SourcesRequest
-from triquad_map.questions.answers import Answers
+from triquad_map.questions.answers import QUESTIONS, Answers
 
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.epochs.surface_history import CHANGES_KEPT, SurfaceHistory
@@ -36,7 +37,6 @@ from triquad_server.mesh.tile_queries import TileQueries
 from triquad_server.monitoring.metrics import Metrics
 from triquad_server.process.threads import Teams
 from triquad_server.queries.change_queries import ChangeQueries
-from triquad_server.queries.client_queries import MAX_QUESTION_BYTES, QUESTIONS
 from triquad_server.queries.source_queries import SourceQueries
 from triquad_server.serving.operations import Lane, Operations
 from triquad_server.settings import Settings
@@ -162,10 +162,10 @@ class Service:
     def _serve(self, tiles: TileCache, downloads: MapDownloads) -> None:
         """Answer the requests of clients from now on."""
         serve, health = self._operations.serve, self.health
-        answers = Answers(self._epochs.view)
-        for name, kind in QUESTIONS.items():
+        answers, max_bytes = Answers(self._epochs.view), payload_limit(MAX_QUERY_POINTS)
+        for name, question in QUESTIONS.items():
             lane = Lane.LONG_QUESTIONS if name == keys.GRID else Lane.QUESTIONS
-            serve(name, kind, answers.answer, lane, MAX_QUESTION_BYTES)
+            serve(name, question.request, answers.answer, lane, max_bytes)
         changes = ChangeQueries(self._epochs, self._surface, health.server)
         sources = SourceQueries(self._trails, health.server)
         mesh = TileQueries(self._epochs, tiles, health.server)
