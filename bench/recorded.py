@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from triquad_tools.console.lines import print_remark
-from triquad_tools.recordings.cloud import is_withheld, points_in_range
+from triquad_tools.recordings.cloud import points_in_range
 from triquad_tools.recordings.folders.cloud_folder import read_cloud_folder
 from triquad_tools.sensors.sweep import PosedScan
 
@@ -45,5 +45,5 @@ def recorded_scans(path: Path, scans: int | None = None) -> RecordedScans:
     for index, whole in zip(indices, folder.read(indices), strict=True):
         near = points_in_range(whole.points, _RANGE_MIN_M)
         scan = PosedScan(near, whole.world_from_sensor)
-        (withheld if is_withheld(index, _SKIP_EVERY) else mapped).append(scan)
+        (withheld if index % _SKIP_EVERY == _SKIP_EVERY - 1 else mapped).append(scan)
     return RecordedScans(tuple(mapped), tuple(withheld))

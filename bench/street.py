@@ -10,23 +10,19 @@ from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
 from triquad_tools.console.progress import progress
-from triquad_tools.evaluation.map_scores import (
-    DrivenStreet,
-    StreetProbes,
-    driven_street,
-    score_street,
-)
-from triquad_tools.evaluation.metrics import (
-    STREET_VOXEL_M,
-    MeshScores,
-    ScoreSettings,
-    score_against_scene,
-)
+from triquad_tools.evaluation.metrics import MeshScores, ScoreSettings, score_mesh
 from triquad_tools.sensors.sweep import PosedScan
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.street import street
 
 from bench.figures import seconds
+from bench.street_scores import (
+    STREET_VOXEL_M,
+    DrivenStreet,
+    StreetProbes,
+    driven_street,
+    score_street,
+)
 
 SCANS = 100
 LENGTH_M = 110.0  # so that the map has some 2 million parameters
@@ -45,7 +41,7 @@ class BenchStreet(DrivenStreet):
     def mesh_scores(self, mesh: Mesh) -> MeshScores:
         """Return scores of a mesh within the scene's bounds."""
         settings = ScoreSettings(samples_max=self.samples_max)
-        return score_against_scene(mesh, self.drive.scene, self.visible, settings=settings)
+        return score_mesh(mesh, self.visible, settings, self.drive.scene.sdf)
 
 
 def bench_street(seed: int) -> BenchStreet:

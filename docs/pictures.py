@@ -13,12 +13,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import trimesh
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from PIL import Image
+from triquad_client import Status, open_map
 from triquad_server import serve
+from triquad_tools.plots.colours import DISTANCES, FREE, UNKNOWN
 from triquad_tools.plots.mesh_view import draw_faces, view_along
 from triquad_tools.plots.picture import BACKGROUND, HEIGHT, WIDTH
 from triquad_tools.simulation.lidar import SimulatedDrive
@@ -29,6 +34,7 @@ IMAGES = Path(__file__).with_name("images")
 ROOT = IMAGES.parents[1]
 
 _WIDTH, _COLOURS = 1200, 256
+_CELL_M, _MAX_DISTANCE_M = 0.1, 3.0  # of the slice
 _DEMO, _STREET, _SCANS = "demo-out", 1, 25
 _AROUND_M = ((-1.0, -8.0, -1.0), (24.0, 8.0, 4.0))
 _BOX_HALF_M = (0.6, 0.5, 0.9)
@@ -46,15 +52,25 @@ def map_from_above(out: Path) -> None:
     _run("triquad-pack", f"{_DEMO}/map.triquad", out, "--force")
 
 
-def plan(out: Path) -> None:
-    """Plans of a map."""
-    _run("triquad-inspect", f"{_DEMO}/store", "--plot", out)
-
-
 def height_slice(out: Path) -> None:
     """Distance and status at one height."""
-    area = ("--box", 0, -12, 40, 12)
-    _run("triquad-inspect", f"{_DEMO}/map.triquad", "--slice", 1, *area, "--plot", out)
+    with open_map(ROOT / _DEMO / "map.triquad") as opened:
+        found = opened.query_grid(((0, -12, 1), (40, 12, 1)), _CELL_M, _MAX_DISTANCE_M)
+    distance_m, status = found.distance_m[:, :, 0].T, found.status[:, :, 0].T
+    kinds = {Status.FREE: FREE, Status.SURFACE: "#a3341f", Status.UNKNOWN: UNKNOWN}
+    figure = Figure((12, 11), layout="constrained")
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    extent, known = (0, 40, -12, 12), np.where(status == Status.UNKNOWN, np.nan, distance_m)
+    upper.set_facecolor(UNKNOWN)
+    shown = upper.imshow(known, DISTANCES, vmin=0, vmax=3, extent=extent, origin="lower")
+    figure.colorbar(shown, ax=[upper, lower], label="m to the nearest surface, 3 or more")
+    lower.imshow(status, ListedColormap([kinds[kind] for kind in sorted(kinds)]),
+                 extent=extent, origin="lower", interpolation="none")  # fmt: skip
+    patches = [Patch(facecolor=kinds[kind], edgecolor="k", label=kind.name) for kind in kinds]
+    lower.legend(handles=patches, loc="upper left", bbox_to_anchor=(0, -0.12), ncols=3)
+    lower.set(xlabel="x in m", ylabel="y in m")
+    upper.set_ylabel("y in m")
+    figure.savefig(out)
 
 
 def difference(out: Path) -> None:
@@ -90,7 +106,6 @@ def tradeoffs(out: Path) -> None:
 PICTURES: dict[str, Callable[[Path], None]] = {
     "street.png": street,
     "map.png": map_from_above,
-    "plan.png": plan,
     "slice.png": height_slice,
     "difference.png": difference,
     "preview.png": preview,

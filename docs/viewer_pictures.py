@@ -4,7 +4,6 @@
 """
 
 import io
-import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -13,8 +12,8 @@ from pathlib import Path
 from pictures import IMAGES, for_pages
 from PIL import Image
 from playwright.sync_api import Page
-from triquad_client import Client, connect
-from triquad_tools.demo.server import DemoServer
+from triquad_client import Client
+from triquad_server import serve
 from triquad_tools.recordings.publishing import wait_until_settled
 from triquad_tools.simulation.street import street_drive
 from triquad_tools.viewer.sources.live_source import LiveSource
@@ -55,9 +54,8 @@ def main() -> None:
 def street_page() -> Iterator[tuple[Client, Page]]:
     """A client of a server without a map, and the page of a viewer of it."""
     with (
-        tempfile.TemporaryDirectory() as folder,
-        DemoServer(Path(folder), _MAP) as server,
-        connect(server.endpoint, _MAP) as client,
+        serve(map=_MAP) as server,
+        server.client() as client,
         closing(Viewer(LiveSource(client, server.endpoint), "127.0.0.1", 0)) as viewer,
         running_browser() as browser,
         opened_page(browser, viewer.url) as page,

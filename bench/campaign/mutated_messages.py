@@ -11,7 +11,7 @@ from support import servers
 from support.operations import OPERATIONS
 from triquad_format.wire import codec, keys
 from triquad_format.wire.codec import Message
-from triquad_format.wire.mesh_messages import MeshRequest, TileListRequest, TileUpdatesRequest
+from triquad_format.wire.mesh_messages import MeshRequest, TileChangesRequest, TileListRequest
 from triquad_format.wire.messages import (
     CheckpointRequest,
     FlushRequest,
@@ -53,7 +53,6 @@ def good_requests() -> dict[str, list[Message]]:
     some = servers.sphere(20)
     way = some / np.linalg.norm(some, axis=1, keepdims=True)
     tiles = np.array([[-1, 0, 0], [0, 0, 0]], np.int32)
-    known = (np.zeros((1, 3), np.int32), np.zeros(1, np.int64))
     return {
         keys.SDF: [SdfRequest(_ORIGIN, some, True, 0)],
         keys.DISTANCE: [DistanceRequest(_ORIGIN, some, 5.0, True, True, 0)],
@@ -67,7 +66,7 @@ def good_requests() -> dict[str, list[Message]]:
         keys.SOURCES: [SourcesRequest("", 0, 10)],
         keys.TILE_LIST: [TileListRequest(*_BOX, 0)],
         keys.MESH: [MeshRequest(tiles, 0, level) for level in (0, 1, 2)],
-        keys.TILE_UPDATES: [TileUpdatesRequest(*_BOX, 0, "", 0, *known, 100_000)],
+        keys.TILE_CHANGES: [TileChangesRequest(*_BOX, 0, "", 0)],
         keys.STATUS: [StatusRequest()],
         keys.METRICS: [MetricsRequest()],
         keys.FLUSH: [FlushRequest("lidar", 7, 0, 0.2)],

@@ -14,9 +14,9 @@ from triquad_format.records.arrays import Doubles
 from triquad_format.records.region import MapRecord
 from triquad_tools.console.progress import progress
 from triquad_tools.demo.probe import Probe, ProbeReport
-from triquad_tools.demo.server import DemoServer
 from triquad_tools.sensors.sweep import PosedScan
 
+from bench.clients.server_process import ServerProcess
 from bench.figures import Figure
 from bench.street import BenchStreet
 
@@ -67,7 +67,7 @@ def served(record: MapRecord | None = None, arguments: Sequence[str] = ()) -> It
             store.mkdir(parents=True)
             write_map(record, store / f"epoch-{record.epoch:09d}.triquad")
         with (
-            DemoServer(folder, MAP, arguments) as server,
+            ServerProcess(folder, MAP, arguments) as server,
             connect(server.endpoint, MAP, timeout_s=_TIMEOUT_S) as client,
         ):
             yield Served(folder, server.endpoint, client)

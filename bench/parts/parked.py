@@ -10,7 +10,6 @@ import numpy as np
 from triquad_format.records.arrays import Doubles
 from triquad_server.settings import Settings
 from triquad_tools.console.progress import progress
-from triquad_tools.evaluation.map_scores import driven_street
 from triquad_tools.sensors.sweep import PosedScan
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.scene import Scene
@@ -19,6 +18,7 @@ from triquad_tools.simulation.street import street
 
 from bench.figures import Figure
 from bench.street import StreamedMap, learn_all, sdf_error_cm
+from bench.street_scores import driven_street
 
 _LENGTH_M, _DRIVEN, _STEP_M = 110.0, 40, 1.0
 _COLUMNS = 1024

@@ -9,7 +9,7 @@ import numpy as np
 from triquad_client import Mesh
 from triquad_format.records.arrays import Doubles
 from triquad_tools.console.progress import progress
-from triquad_tools.evaluation.metrics import MeshScores, ScoreSettings, score_against_scene
+from triquad_tools.evaluation.metrics import MeshScores, ScoreSettings, score_mesh
 from triquad_tools.recordings.cloud import merged
 from triquad_tools.recordings.publishing import FLUSH_TIMEOUT_S, wait_until_settled
 from triquad_tools.sensors.sweep import PosedScan
@@ -141,4 +141,4 @@ def _f_figures(place: Place, driven: _Driven, mesh: Mesh) -> list[Figure]:
 
 def _scores(place: Place, driven: _Driven, mesh: Mesh, within_m: float) -> MeshScores:
     settings = ScoreSettings(threshold_m=within_m, voxel_m=place.voxel_m)
-    return score_against_scene(mesh, driven.drive.scene, driven.visible, settings)
+    return score_mesh(mesh, driven.visible, settings, driven.drive.scene.sdf)

@@ -11,7 +11,6 @@ from triquad_client import Client
 from triquad_format.mapfile.reader import read_map
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
-from triquad_tools.evaluation.map_scores import score_street
 from triquad_tools.recordings.publishing import FLUSH_TIMEOUT_S, wait_until_settled
 
 from bench.clients.served import (
@@ -24,6 +23,7 @@ from bench.clients.served import (
 from bench.figures import Figure, seconds
 from bench.parts.core import seen_points
 from bench.street import BenchStreet
+from bench.street_scores import score_street
 
 _SOON_S = 2.0  # after the last scan
 _SETTLE_LIMIT_S = 300.0

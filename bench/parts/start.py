@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from triquad_client import connect
 from triquad_format.records.arrays import Floats
-from triquad_tools.demo.server import DemoServer
 
 from bench.clients.served import MAP
+from bench.clients.server_process import ServerProcess
 from bench.figures import Figure
 
 _STARTS = 5
@@ -41,7 +41,7 @@ class _Start:
         variables = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "kernels")}
         started = time.monotonic()
         with tempfile.TemporaryDirectory(dir=folder) as name:
-            server = DemoServer(Path(name), MAP, ["--device", "cpu"], variables=variables)
+            server = ServerProcess(Path(name), MAP, ["--device", "cpu"], variables=variables)
             self.ready_s = time.monotonic() - started
             with server, connect(server.endpoint, MAP, timeout_s=_TIMEOUT_S) as client:
                 client.publish_scan(_sphere(), np.eye(4))

@@ -12,10 +12,10 @@ from triquad_map.questions.distance import DistanceOptions, Distances, distances
 from triquad_map.questions.spheres import spheres
 from triquad_map.surface import level_confidence
 from triquad_map.view import MapView
-from triquad_tools.evaluation.map_scores import DrivenStreet
 from triquad_tools.simulation.scene import Scene
 
 from bench.figures import Figure
+from bench.street_scores import DrivenStreet
 
 REACH_M = 5.0
 _NEAR_M = 0.3  # gradients are scored beyond

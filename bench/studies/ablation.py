@@ -16,13 +16,13 @@ from triquad_format.records.field_settings import ENCODINGS
 from triquad_server.settings import Settings
 from triquad_tools.console.arguments import count, positive, seed
 from triquad_tools.console.report import Row, print_rows
-from triquad_tools.evaluation.map_scores import score_street, street_probes
-from triquad_tools.evaluation.metrics import STREET_VOXEL_M, ScoreSettings, score_against_scene
+from triquad_tools.evaluation.metrics import ScoreSettings, score_mesh
 from triquad_tools.simulation.lidar import SimulatedDrive
 from triquad_tools.simulation.street import street_drive
 
 from bench.figures import Figure
 from bench.street import settled_mapper
+from bench.street_scores import STREET_VOXEL_M, score_street, street_probes
 
 
 def measure_ablation(seed: int, scans: int, step_m: float) -> list[Figure]:
@@ -39,7 +39,7 @@ def _variant(encoding: str, drive: SimulatedDrive) -> list[Figure]:
     field = score_street(epoch.query, street_probes(drive, np.random.default_rng(0)))
     with OfflineMap(epoch.record()) as opened:
         visible = drive.true_hits(STREET_VOXEL_M)
-        mesh = score_against_scene(opened.mesh(), drive.scene, visible, ScoreSettings())
+        mesh = score_mesh(opened.mesh(), visible, ScoreSettings(), drive.scene.sdf)
     return [
         Figure(f"{encoding}: parameters", epoch.parameters / 1e6, "M"),
         Figure(f"{encoding}: training samples", mapper.samples_trained / 1e6, "M"),

@@ -20,7 +20,7 @@ from triquad_server.mapping.training.focus import Focus
 from triquad_server.mapping.training.slopes import Slopes
 from triquad_server.settings.loading import load_settings
 from triquad_tools.console.report import Row, print_rows
-from triquad_tools.evaluation.metrics import ScoreSettings, score_against_scene
+from triquad_tools.evaluation.metrics import ScoreSettings, score_mesh
 from triquad_tools.recordings.cloud import merged
 from triquad_tools.sensors.sweep import PosedScan
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
@@ -132,7 +132,7 @@ class _Learner:
             threshold_m=self._place.within_m, voxel_m=self._place.voxel_m, samples_max=_SCORED
         )
         with OfflineMap(self.mapper.publish().record()) as opened:
-            scores = score_against_scene(opened.mesh(), self._drive.scene, self._visible, settings)
+            scores = score_mesh(opened.mesh(), self._visible, settings, self._drive.scene.sdf)
         self.figures += [
             Figure(f"{name}: samples", samples / 1e6, "M"),
             Figure(f"{name}: F-score", 100 * scores.f_score, "%"),

@@ -75,7 +75,7 @@ class Client(
             InvalidInputError: an argument cannot be used, or ``known`` is of another level.
         """
         most = self._connection.max_download_bytes
-        followed = FollowedMesh.initial(bounds, level, max_bytes_per_s, known, max_bytes=most)
+        followed = FollowedMesh.initial(bounds, level, known, max_bytes=most)
         return MeshWatch(self._connection, followed, max_bytes_per_s)
 
     def sync(self, bounds: Bounds, path: str | Path, accept_emptier: bool = False) -> SyncedMap:

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 
 import zenoh
 from triquad_format.wire import keys
-from triquad_format.wire.mesh_messages import MeshRequest, TileListRequest, TileUpdatesRequest
+from triquad_format.wire.limits import MAX_QUERY_POINTS, payload_limit
+from triquad_format.wire.mesh_messages import MeshRequest, TileChangesRequest, TileListRequest
 from triquad_format.wire.messages import (
     CheckpointInfo,
     CheckpointRequest,
@@ -19,7 +20,7 @@ from triquad_format.wire.messages import (
 )
 from triquad_format.wire.metrics_messages import MetricsRequest
 from triquad_format.wire.query_messages import ChangesRequest, SourcesRequest
-from triquad_map.questions.answers import Answers
+from triquad_map.questions.answers import QUESTIONS, Answers
 
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.epochs.surface_history import CHANGES_KEPT, SurfaceHistory
@@ -33,12 +34,10 @@ from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapListeners, MapperThread
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_queries import TileQueries
-from triquad_server.mesh.update_queries import MAX_REQUEST_BYTES, UpdateQueries
 from triquad_server.monitoring.metrics import Metrics
 from triquad_server.process.stop import Stop
 from triquad_server.process.threads import Teams
 from triquad_server.queries.change_queries import ChangeQueries
-from triquad_server.queries.client_queries import MAX_QUESTION_BYTES, QUESTIONS
 from triquad_server.queries.source_queries import SourceQueries
 from triquad_server.serving.operations import Lane, Operations
 from triquad_server.settings import Settings
@@ -164,21 +163,19 @@ class Service:
     def _serve(self, tiles: TileCache, downloads: MapDownloads) -> None:
         """Answer the requests of clients from now on."""
         serve, health = self._operations.serve, self.health
-        answers = Answers(self._epochs.view)
-        for name, kind in QUESTIONS.items():
+        answers, max_bytes = Answers(self._epochs.view), payload_limit(MAX_QUERY_POINTS)
+        for name, question in QUESTIONS.items():
             lane = Lane.LONG_QUESTIONS if name == keys.GRID else Lane.QUESTIONS
-            serve(name, kind, answers.answer, lane, MAX_QUESTION_BYTES)
+            serve(name, question.request, answers.answer, lane, max_bytes)
         changes = ChangeQueries(self._epochs, self._surface, health.server)
         sources = SourceQueries(self._trails, health.server)
-        mesh = TileQueries(self._epochs, tiles)
+        mesh = TileQueries(self._epochs, tiles, health.server)
         serve(keys.CHANGES, ChangesRequest, changes.changes)
         serve(keys.SOURCES, SourcesRequest, sources.sources)
-        serve(keys.TILE_LIST, TileListRequest, mesh.tiles)
-        serve(keys.MESH, MeshRequest, mesh.mesh, Lane.LONG_QUESTIONS)
+        serve(keys.TILE_LIST, TileListRequest, mesh.tiles, Lane.MESH)
+        serve(keys.TILE_CHANGES, TileChangesRequest, mesh.changes, Lane.MESH)
+        serve(keys.MESH, MeshRequest, mesh.mesh, Lane.MESH)
         serve(keys.MAP_CHUNK, MapChunkRequest, downloads.chunk, Lane.LONG_QUESTIONS)
-
-        updates = UpdateQueries(self._epochs, tiles, health.server)
-        serve(keys.TILE_UPDATES, TileUpdatesRequest, updates.updates, Lane.MESH, MAX_REQUEST_BYTES)
 
         flush = FlushQueries(self._scans.ledger, self._mapper.publish_soon, self._warnings.of)
         lane = Lane.ADMINISTRATION

@@ -26,13 +26,14 @@ TIMEOUT_S = 9.0
 MOST_BYTES = 2**20
 ANY_VALUE = {
     "/tiles",
+    "/tiles, shorter",
     "/stamp_ns",
     "/last_checkpoint/stamp_ns",
     "/sources/default/newest/stamp_ns",
     "/sources/default/newest/points, shorter",
 }
 # These are replies of these kinds once more, and take longer.
-REPEATED = ("filled mesh", "sdf of epoch", "sources again", "watch again", "copy")
+REPEATED = ("filled mesh", "sdf of epoch", "sources again", "watch again", "watched tiles", "copy")
 CHANGED = [name for name in QUESTIONS if name not in REPEATED]
 
 
@@ -160,28 +161,29 @@ with triquad_client.connect({server.endpoint!r}) as client:
     assert list(tmp_path.iterdir()) == []
 
 
-def updates(*tiles: bytes) -> Callable[[str, bytes], bytes]:
-    """The lie that these tiles changed."""
-    index = [(number, 0, 0) for number in range(len(tiles))]
-    return told(
-        keys.TILE_UPDATES,
-        lambda body: body.update(
-            tiles=packed(index, "<i4"),
-            versions=packed(np.ones(len(tiles)), "<i8"),
-            sizes=packed([len(tile) for tile in tiles], "<i8"),
-            data=b"".join(tiles),
-        ),
-    )
+def watched(count: int, tile: bytes) -> Callable[[str, bytes], bytes]:
+    """The lie that so many tiles changed, and are all like this one."""
+    index = [(number, 0, 0) for number in range(count)]
+    changed = {"tiles": packed(index, "<i4"), "changed": packed(np.ones(count), "<i8")}
+    list_lie = told(keys.TILE_CHANGES, lambda body: body.update(changed))
+
+    def fill(body: Body) -> None:
+        asked = body["sizes"]["shape"][0]
+        body.update(sizes=packed([len(tile)] * asked, "<i8"), data=tile * asked)
+
+    tile_lie = told(keys.MESH, fill)
+    return lambda asked, honest: tile_lie(asked, list_lie(asked, honest))
 
 
 def test_a_watch_holds_no_more_than_the_client_takes(server: HostileServer) -> None:
-    count = 1000
-    server.lie = updates(*[TILE] * count)
+    count = 32
+    server.lie = watched(count, TILE)
     with (
         triquad_client.connect(server.endpoint, max_download_bytes=count * 48) as client,
         client.watch_mesh() as watch,
     ):
         assert watch.next(0.0) is not None
+        assert len(watch.tiles) == count
     with (
         triquad_client.connect(server.endpoint, max_download_bytes=count * 48 - 1) as client,
         client.watch_mesh() as watch,
@@ -194,7 +196,7 @@ def test_a_watch_holds_no_more_than_the_client_takes(server: HostileServer) -> N
 def test_a_tile_of_a_few_bytes_that_would_fill_the_memory_is_not_made(
     server: HostileServer,
 ) -> None:
-    server.lie = updates((2**25).to_bytes(4, "little") * 2 + TILE[8:])
+    server.lie = watched(1, (2**25).to_bytes(4, "little") * 2 + TILE[8:])
     with (
         triquad_client.connect(server.endpoint, max_download_bytes=MOST_BYTES) as client,
         client.watch_mesh() as watch,

@@ -1,13 +1,12 @@
 """Who wants the server's memory does not get it: real processes, measured by the system."""
 
-import threading
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
 import triquad_client
 from support import servers
-from support.requests import tile_updates
+from support.requests import tile_changes
 from support.servers import RawPeer, ServerProcess
 from triquad_format.wire import codec, keys
 
@@ -51,29 +50,10 @@ def test_spheres_all_around_fill_the_map_and_no_more(server: ServerProcess) -> N
 
 
 def test_junk_in_a_request_for_tiles_is_refused(server: ServerProcess) -> None:
-    body = codec.encode(tile_updates())
+    body = codec.encode(tile_changes())
     assert body[0] == 0xDE or body[0] & 0xF0 == 0x80
     junk = b"\xa1j\xc6" + (12_000_000).to_bytes(4, "big") + bytes(12_000_000)
     fields = body[0] & 0x0F
     payload = bytes([0x80 | (fields + 1)]) + body[1:] + junk
     with servers.raw_session(connect=server.endpoint) as session:
-        assert RawPeer(session).refusal(keys.TILE_UPDATES, payload) == "too_large"
-
-
-def test_followers_that_ask_at_once_take_little(server: ServerProcess) -> None:
-    """Each of 64 names as many tiles as it may."""
-    before = server.resident_bytes
-    known = np.arange(300_000, dtype=np.int32).reshape(-1, 3)
-    versions = np.ones(len(known), np.int64)
-    payload = codec.encode(tile_updates(known=known, known_versions=versions))
-    with servers.raw_session(connect=server.endpoint) as session:
-        done = threading.Semaphore(0)
-        key = keys.operation_key(servers.MAP, keys.TILE_UPDATES)
-
-        for _ in range(64):
-            session.get(key, lambda _: done.release(), payload=payload, timeout=30)
-        for _ in range(60):
-            assert done.acquire(timeout=servers.WAIT_S)
-        grown = server.resident_bytes - before
-    print(f"grown by {grown / 1e6:.0f} MB")
-    assert grown < 250_000_000
+        assert RawPeer(session).refusal(keys.TILE_CHANGES, payload) == "too_large"

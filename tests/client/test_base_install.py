@@ -111,7 +111,7 @@ def test_a_map_file_is_written_with_previews_where_they_can_be_made(map_with_pre
     [
         ("demo", (), "numba is missing: install triquad[demo]"),
         ("evaluate", (), "scipy is missing: install triquad[tools]"),
-        ("inspect", ("MAP", "--plot", "plan.png"), "matplotlib is missing: install triquad[tools]"),
+        ("inspect", ("MAP", "--plot", "map.png"), "numba is missing: pip install 'triquad[fast]'"),
         ("pack", ("MAP", "mesh.ply"), "numba is missing: pip install 'triquad[fast]'"),
     ],
 )

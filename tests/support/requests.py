@@ -3,19 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
-from triquad_format.wire.mesh_messages import TileUpdatesRequest
+from triquad_format.wire.mesh_messages import TileChangesRequest
 
 
-def tile_updates(**changes: object) -> TileUpdatesRequest:
+def tile_changes(**changes: object) -> TileChangesRequest:
     """A good request for all of a map's mesh, but for ``changes``."""
-    good = TileUpdatesRequest(
-        minimum=np.full(3, -np.inf),
-        maximum=np.full(3, np.inf),
-        level=0,
-        server="",
-        revision=0,
-        known=np.zeros((0, 3), np.int32),
-        known_versions=np.zeros(0, np.int64),
-        max_bytes=1_000_000,
-    )
+    everywhere = np.full(3, -np.inf), np.full(3, np.inf)
+    good = TileChangesRequest(*everywhere, level=0, server="", since=0)
     return replace(good, **changes)  # type: ignore[arg-type]

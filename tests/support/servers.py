@@ -3,6 +3,7 @@
 import os
 import queue
 import resource
+import socket
 import subprocess
 import sys
 import threading
@@ -31,7 +32,6 @@ from triquad_server.settings import Settings, TrainingSettings
 from triquad_server.store.restore import ValidCheckpoint
 from triquad_server.store.store import Store
 from triquad_server.warm_up import warm_up
-from triquad_tools.demo.server import free_endpoint
 
 MAP = "default"
 WAIT_S = 120.0  # for what takes milliseconds unless something is broken
@@ -43,6 +43,18 @@ SMALL_TOML = (
     "[field]\ndepth = 7\n[training]\nbatch = 2048\nsamples_per_ray = 10.0\npool_bytes = 480000\n"
 )
 RADIUS_M = 4.0
+
+
+def free_port() -> int:
+    """A port of the loopback that nothing uses."""
+    with closing(socket.socket()) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def free_endpoint() -> str:
+    return f"tcp/127.0.0.1:{free_port()}"
 
 
 def sphere(count: int = 4000, radius_m: float = RADIUS_M) -> NDArray[np.float32]:

@@ -18,8 +18,7 @@ from support.servers import WAIT_S, learn, running_service, sphere
 from triquad_client import Client, Status, connect
 from triquad_format.records.arrays import Bytes
 from triquad_tools.console.command import ToolError
-from triquad_tools.plots.plan import UNKNOWN
-from triquad_tools.plots.slice_plan import BEHIND, DISTANCE_COLOURS
+from triquad_tools.plots.colours import BEHIND, DISTANCES, UNKNOWN
 from triquad_tools.recordings.publishing import wait_until_settled
 from triquad_tools.viewer.sources.live_source import LiveSource
 
@@ -177,7 +176,7 @@ def _is_still(page: Page) -> bool:
 
 
 def test_a_slice_shows_distances_lines_and_what_is_unknown(mapped: Looked) -> None:
-    page, far = mapped.page, DISTANCE_COLOURS(1.0)[:3]
+    page, far = mapped.page, DISTANCES(1.0)[:3]
     assert share_of(page, UNKNOWN) < 0.001
     page.get_by_label("Show slice").check()
     expect(page.get_by_text("distance to the nearest surface, m")).to_be_visible()

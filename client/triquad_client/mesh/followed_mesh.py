@@ -1,4 +1,4 @@
-"""The mesh of a box as a follower knows it: what it asks next, and what a reply makes of it."""
+"""The mesh of a box as a follower knows it: what it asks next, and what replies make of it."""
 
 import hashlib
 import math
@@ -10,9 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.errors import InvalidInputError, WireError
 from triquad_format.records.arrays import Doubles, Longs
-from triquad_format.wire.limits import MAX_KNOWN_TILES
-from triquad_format.wire.mesh_messages import TileUpdates, TileUpdatesRequest
-from triquad_format.wire.reply import MAX_COUNT
+from triquad_format.wire.mesh_messages import (
+    MeshReply,
+    MeshRequest,
+    TileChanges,
+    TileChangesRequest,
+)
 from triquad_format.wire.tile_codec import TileSurface, decode_tile, decoded_bytes
 from triquad_map.triangles import Triangles, joined
 
@@ -20,8 +23,6 @@ from triquad_client import checks
 from triquad_client.checks import Bounds
 from triquad_client.errors import BadReplyError, DownloadError
 from triquad_client.mesh.mesh import Mesh
-
-_REPLY_BYTES = 1_000_000
 
 TileIndex = tuple[int, int, int]
 
@@ -60,7 +61,7 @@ class KnownTiles:
 
 @dataclass(frozen=True)
 class MeshUpdate:
-    """The changes by one reply."""
+    """The changes of one step."""
 
     changed: tuple[TileIndex, ...]  # tiles that are new or different
     removed: tuple[TileIndex, ...]
@@ -76,23 +77,23 @@ class FollowedMesh:
     minimum: Doubles  # [3] metres, map frame
     maximum: Doubles  # [3]
     level: int
-    reply_bytes: int  # of the tiles of one reply, at most
     max_bytes: int  # of memory, for all tiles
     server: str = ""  # which reported all below
     tile_side_m: float = math.nan
     cell_m: float = math.nan
     tiles: Mapping[TileIndex, MeshTile] = field(default_factory=dict)
-    stale: frozenset[TileIndex] = frozenset()  # tiles of a server that is no more
-    revision: int = 0
-    epoch: int = 0
-    complete: bool = False  # the last reply left nothing to come
+    empty: Mapping[TileIndex, int] = field(default_factory=dict)  # versions of tiles without faces
+    stale: frozenset[TileIndex] = frozenset()  # tiles that go unless they come again
+    pending: tuple[TileIndex, ...] = ()  # tiles to be fetched, in this order
+    since: int = 0  # epoch as of which all tiles are known
+    epoch: int = 0  # up to which the changes are known
+    is_newest: bool = False  # that was the newest
 
     @classmethod
     def initial(
         cls,
         bounds: Bounds | None,
         level: int,
-        max_bytes_per_s: int | None,
         known: KnownTiles | None,
         *,
         max_bytes: int,
@@ -104,11 +105,7 @@ class FollowedMesh:
         """
         minimum, maximum = checks.box(bounds)
         checks.level_of_detail(level)
-        reply_bytes = _REPLY_BYTES
-        if max_bytes_per_s is not None:
-            limit = checks.count("max_bytes_per_s", max_bytes_per_s, MAX_COUNT, least=1)
-            reply_bytes = min(limit, reply_bytes)
-        empty = cls(minimum, maximum, level, reply_bytes, max_bytes)
+        empty = cls(minimum, maximum, level, max_bytes)
         if known is None:
             return empty
         if not isinstance(known, KnownTiles):
@@ -125,61 +122,93 @@ class FollowedMesh:
         }
         return replace(empty, server=known.server, tile_side_m=side_m, tiles=tiles)
 
-    def request(self) -> TileUpdatesRequest:
-        """Return what to ask."""
-        # Until all is known, the server has to know which tiles are; then the revision says it.
-        # Of more than may be named, the rest travels again.
-        known = [] if self.complete else list(self.known_tiles().tiles.values())[:MAX_KNOWN_TILES]
-        return TileUpdatesRequest(
-            minimum=self.minimum,
-            maximum=self.maximum,
-            level=self.level,
-            server=self.server,
-            revision=self.revision,
-            known=np.array([tile.index for tile in known], np.int32).reshape(-1, 3),
-            known_versions=np.array([tile.version for tile in known], np.int64),
-            max_bytes=self.reply_bytes,
-        )
+    @property
+    def complete(self) -> bool:
+        """True where nothing is left to be fetched."""
+        return self.is_newest and not self.pending
 
-    def after(self, reply: TileUpdates) -> "FollowedMesh":
-        """Return what is known after the reply to :meth:`request`.
+    def changes_request(self) -> TileChangesRequest:
+        """Return the question which tiles changed."""
+        return TileChangesRequest(self.minimum, self.maximum, self.level, self.server, self.since)
+
+    def told(self, reply: TileChanges) -> "FollowedMesh":
+        """Return what is known after the reply to :meth:`changes_request`.
 
         Raises:
-            BadReplyError: its parts do not fit together, or it contradicts the reply before.
-            DownloadError: it has more than may be kept.
+            BadReplyError: it contradicts the reply before.
         """
-        self._check_order(reply)
-        kept = sum(tile.nbytes for tile in self.tiles.values())
-        changed = _unpacked(reply, TileDecoder(self.max_bytes, kept))
-        old = frozenset(self.tiles) if reply.restart else self.stale
-        stale = old - changed.keys()
-        removed = {(x, y, z) for x, y, z in reply.removed.tolist()}
-        if reply.complete:
-            removed |= stale
-        tiles = {**self.tiles, **changed}
-        return replace(
+        is_same = reply.server == self.server
+        if is_same and reply.epoch < self.epoch:
+            raise BadReplyError(f"epoch {reply.epoch} comes after epoch {self.epoch}")
+        since, empty = (self.since, self.empty) if is_same else (0, {})
+        rows = zip(reply.tiles.tolist(), reply.changed.tolist(), strict=True)
+        changed = {(x, y, z): epoch for (x, y, z), epoch in rows}
+        stale = self.stale if is_same else frozenset(self.tiles)  # all of another run of it is void
+        if since == 0:  # all that there are were named
+            stale |= self.tiles.keys() - changed.keys()
+        known = {index: tile.version for index, tile in self.tiles.items() if index not in stale}
+        known |= empty
+        pending = [index for index, epoch in changed.items() if epoch > known.get(index, 0)]
+        pending.sort(key=lambda index: known.get(index, 0))  # first those that are not there at all
+        told = replace(
             self,
             server=reply.server,
             tile_side_m=reply.tile_side_m,
             cell_m=reply.cell_m,
-            tiles={index: tile for index, tile in tiles.items() if index not in removed},
-            stale=stale - removed,
-            revision=reply.revision,
+            empty=empty,
+            stale=stale,
+            pending=tuple(pending),
+            since=since,
             epoch=reply.epoch,
-            complete=reply.complete,
+            is_newest=reply.is_newest,
         )
+        return told._settled()
 
-    def _check_order(self, reply: TileUpdates) -> None:
-        """Refuse a reply that turns back, or that is of another server and does not say so."""
-        if reply.restart or not self.server:
-            return
-        if reply.server != self.server:
-            raise BadReplyError(f"server {reply.server!r} answers for server {self.server!r}")
-        if reply.revision < self.revision or reply.epoch < self.epoch:
-            raise BadReplyError(
-                f"revision {reply.revision} of epoch {reply.epoch} comes after revision "
-                f"{self.revision} of epoch {self.epoch}"
+    def fetched(self, asked: MeshRequest, reply: MeshReply) -> "FollowedMesh":
+        """Return what is known after the reply about some of the pending tiles.
+
+        Raises:
+            BadReplyError: its parts do not fit together.
+            DownloadError: it has more than may be kept.
+        """
+        new = self._unpacked(asked, reply)
+        tiles = {**self.tiles, **new}
+        empty = dict(self.empty)
+        for index, tile in new.items():
+            empty.pop(index, None)
+            if not len(tile.faces):
+                del tiles[index]
+                empty[index] = tile.version
+        pending = tuple(index for index in self.pending if index not in new)
+        after = replace(
+            self, tiles=tiles, empty=empty, stale=self.stale - new.keys(), pending=pending
+        )
+        return after._settled()
+
+    def _settled(self) -> "FollowedMesh":
+        """Return the same without stale tiles, once all is known that the server told of."""
+        if self.pending:
+            return self
+        tiles = {index: tile for index, tile in self.tiles.items() if index not in self.stale}
+        return replace(self, tiles=tiles, stale=frozenset(), since=self.epoch)
+
+    def _unpacked(self, asked: MeshRequest, reply: MeshReply) -> dict[TileIndex, MeshTile]:
+        """Return the tiles of a reply; errors as of :meth:`TileDecoder.decode`."""
+        decoder = TileDecoder(self.max_bytes, sum(tile.nbytes for tile in self.tiles.values()))
+        tiles: dict[TileIndex, MeshTile] = {}
+        decoded = decoder.decode(reply.sizes, reply.data)
+        rows = zip(decoded, asked.tiles.tolist(), reply.versions.tolist(), strict=True)
+        for tile, (x, y, z), version in rows:
+            tiles[x, y, z] = MeshTile(
+                index=(x, y, z),
+                version=version,
+                digest=hashlib.sha256(tile.data).hexdigest(),
+                size_bytes=len(tile.data),
+                origin=np.array((x, y, z)) * self.tile_side_m,
+                vertices=tile.surface.positions(self.cell_m),
+                faces=tile.surface.faces,
             )
+        return tiles
 
     def mesh(self) -> Mesh:
         """Return the tiles as one mesh, faces by their centroids within the bounds."""
@@ -229,20 +258,3 @@ class TileDecoder:
                 yield DecodedTile(part, decode_tile(part))
             except WireError as error:
                 raise BadReplyError(f"a tile of the reply: {error}") from error
-
-
-def _unpacked(updates: TileUpdates, decoder: TileDecoder) -> dict[TileIndex, MeshTile]:
-    """Return the tiles of a reply; errors as of :meth:`TileDecoder.decode`."""
-    tiles: dict[TileIndex, MeshTile] = {}
-    decoded = decoder.decode(updates.sizes, updates.data)
-    for row, (tile, (x, y, z)) in enumerate(zip(decoded, updates.tiles.tolist(), strict=True)):
-        tiles[x, y, z] = MeshTile(
-            index=(x, y, z),
-            version=int(updates.versions[row]),
-            digest=hashlib.sha256(tile.data).hexdigest(),
-            size_bytes=len(tile.data),
-            origin=np.array((x, y, z)) * updates.tile_side_m,
-            vertices=tile.surface.positions(updates.cell_m),
-            faces=tile.surface.faces,
-        )
-    return tiles

@@ -8,10 +8,13 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from types import MappingProxyType
 
+import numpy as np
 import zenoh
 from triquad_format.errors import TriquadError
 from triquad_format.wire import keys
-from triquad_format.wire.mesh_messages import TileUpdates
+from triquad_format.wire.limits import MAX_TILES_ASKED
+from triquad_format.wire.mesh_messages import MeshReply, MeshRequest, TileChanges
+from triquad_format.wire.reply import MAX_COUNT
 
 from triquad_client import checks
 from triquad_client.errors import ClosedError, RequestTimeoutError
@@ -25,7 +28,9 @@ from triquad_client.mesh.followed_mesh import (
 from triquad_client.mesh.mesh import Mesh
 from triquad_client.net.connection import Answering, Ask, cancellable
 
-_PAUSE_S = 0.25  # where nothing is new, until the server is asked again
+_PAUSE_S = 0.25  # until the server is asked again what is new
+_TILES_EACH = 32  # that are fetched at once, some in each request
+_BYTES_PER_TILE = 50_000  # as many tiles are fetched at once as take less than a second
 
 
 class _WatchClosedError(ClosedError):
@@ -49,7 +54,7 @@ class WatchedTiles(ABC):
 
     @property
     def complete(self) -> bool:
-        """True where the last reply left nothing waiting."""
+        """True where nothing was left to be fetched."""
         return self._now().complete
 
     @property
@@ -86,7 +91,13 @@ class MeshWatch(WatchedTiles):
         """Use :meth:`Client.watch_mesh`."""
         self._server = server
         self._followed = followed
-        self._max_bytes_per_s = max_bytes_per_s or math.inf
+        self._max_bytes_per_s: float = math.inf
+        self._tiles_each = _TILES_EACH
+        if max_bytes_per_s is not None:
+            limit = checks.count("max_bytes_per_s", max_bytes_per_s, MAX_COUNT, least=1)
+            self._max_bytes_per_s = limit
+            self._tiles_each = max(1, min(limit // _BYTES_PER_TILE, _TILES_EACH))
+        self._told_s = -math.inf  # monotonic: when the server last told which tiles changed
         self._ready_s = 0.0  # monotonic: until then, the bandwidth is used up
         self._changing = threading.Lock()
         self._closed = threading.Event()
@@ -124,8 +135,7 @@ class MeshWatch(WatchedTiles):
                     return update
                 if time.monotonic() >= ends:
                     break
-                asks_s = max(self._ready_s, time.monotonic() + _PAUSE_S)
-                self._wait_until(min(asks_s, ends), token)
+                self._wait_until(min(max(self._ready_s, self._asks_s()), ends), token)
         return None
 
     def catch_up(self, timeout_s: float = 60.0) -> None:
@@ -144,8 +154,7 @@ class MeshWatch(WatchedTiles):
                     return
                 if update is None or time.monotonic() > ends:
                     raise RequestTimeoutError(f"the mesh is not complete after {timeout_s:g} s")
-                if not update.changed:  # although there is something: the server is making it
-                    self._wait_until(min(time.monotonic() + _PAUSE_S, ends), token)
+                self._wait_until(min(self._asks_s(), ends), token)
 
     def mesh(self) -> Mesh:
         """Return the tiles as one mesh, faces by their centroids within the bounds."""
@@ -171,26 +180,40 @@ class MeshWatch(WatchedTiles):
             if self._closed.wait(min(left_s, _PAUSE_S)):
                 raise _WatchClosedError
 
+    def _asks_s(self) -> float:
+        """Return when to ask next, monotonic: at once where there is something to be fetched."""
+        return time.monotonic() + (0.0 if self._followed.pending else _PAUSE_S)
+
     def _update(self) -> MeshUpdate:
-        """Return what one reply changed: nothing where that of another call came first."""
-        before = self._followed
-        ask = Ask(keys.TILE_UPDATES, before.request(), TileUpdates, background=True)
-        reply = self._server.ask(ask)
-        after = before.after(reply)
+        """Return what one step changed: nothing where that of another call came first."""
+        before = followed = self._followed
+        if not before.pending or time.monotonic() >= self._told_s + _PAUSE_S:
+            ask = Ask(keys.TILE_CHANGES, before.changes_request(), TileChanges, background=True)
+            followed = before.told(self._server.ask(ask))
+            self._told_s = time.monotonic()
+        some = followed.pending[: self._tiles_each]
+        requests = [
+            MeshRequest(np.array(some[first : first + MAX_TILES_ASKED], np.int32), 0, before.level)
+            for first in range(0, len(some), MAX_TILES_ASKED)
+        ]
+        asks = (Ask(keys.MESH, request, MeshReply, background=True) for request in requests)
+        size = 0
+        for request, reply in zip(requests, self._server.replies(asks), strict=True):
+            followed = followed.fetched(request, reply)
+            size += len(reply.data)
         with self._changing:
             since_s = max(self._ready_s, time.monotonic())
-            self._ready_s = since_s + len(reply.data) / self._max_bytes_per_s
+            self._ready_s = since_s + size / self._max_bytes_per_s
             now = self._followed
-            if now is not before:  # by what is known now, the reply may be old
+            if now is not before:  # by what is known now, the replies may be old
                 return MeshUpdate((), (), now.epoch, complete=now.complete, size_bytes=0)
-            self._followed = after
-        removed = tuple(sorted(before.tiles.keys() - after.tiles.keys()))
+            self._followed = followed
         return MeshUpdate(
-            changed=tuple((x, y, z) for x, y, z in reply.tiles.tolist()),
-            removed=removed,
-            epoch=after.epoch,
-            complete=after.complete,
-            size_bytes=len(reply.data),
+            changed=tuple(index for index in some if index in followed.tiles),
+            removed=tuple(sorted(before.tiles.keys() - followed.tiles.keys())),
+            epoch=followed.epoch,
+            complete=followed.complete,
+            size_bytes=size,
         )
 
     @contextmanager

@@ -45,9 +45,6 @@ TILE_INDEX_LIMIT = 1_000_000
 MAX_TILES_ASKED = 8
 """Mesh tiles of one request, each of which takes a server some tens of milliseconds of one core."""
 
-MAX_KNOWN_TILES = 100_000
-"""Mesh tiles that a client may name as known when it asks what changed."""
-
 MAX_CELL_M = 1e3
 """Side of the cells of a mesh: no server makes them nearly as large."""
 

@@ -6,7 +6,6 @@ from typing import Annotated
 from triquad_format.wire.codec import MAX_MESSAGE_BYTES, Message
 from triquad_format.wire.limits import MAX_CELL_M, MAX_TILE_M, MIN_LENGTH_M, TILE_INDEX_LIMIT
 from triquad_format.wire.messages import (
-    Count,
     Epoch,
     Epochs,
     Integers,
@@ -39,8 +38,6 @@ class TileList(MapReply):
     tile_side_m: Annotated[float, within(MIN_LENGTH_M, MAX_TILE_M)]
     # [T, 3]: tile t covers [t, t + 1) * tile_side_m
     tiles: Annotated[TileIndices, _IN_RANGE]
-    # [T] the surface of each tile last changed in this epoch
-    changed: Annotated[Epochs, rows_of("tiles")]
 
 
 @dataclass(frozen=True)
@@ -48,7 +45,7 @@ class MeshRequest(Message):
     """The mesh of some tiles."""
 
     tiles: TileIndices  # [T, 3], 1 to MAX_TILES_ASKED
-    epoch: int
+    epoch: int  # 0: as they are followed, each made when its surface last changed
     level: int = 0  # of detail
     fill_m: float = 0.0  # how far from seen surface it is continued into unknown space; 0: not
 
@@ -64,37 +61,33 @@ class MeshReply(MapReply):
     data: bytes  # of all: triquad_format.wire.tile_codec
     # [F] of all faces, 1 where the surface was continued and no ray met it, else 0; None: was not
     # asked for
-    filled: Annotated[StatusCodes, within(0, 1)] | None = None
+    filled: Annotated[StatusCodes, within(0, 1)] | None
+    # [T] the epoch of which each tile is
+    versions: Annotated[Epochs, asked_by("tiles")]
 
 
 @dataclass(frozen=True)
-class TileUpdatesRequest(Message):
-    """Ask which mesh tiles in a box changed; answered at once."""
+class TileChangesRequest(Message):
+    """Ask in which mesh tiles of a box the surface changed since an epoch of a server."""
 
     minimum: Point
     maximum: Point  # of the box, map frame; an open side is infinite
     level: int  # of detail
-    server: str  # of the reply before, to which revision and known belong; empty at first
-    revision: int  # of the reply before: everything up to it is known; 0 at first
-    known: TileIndices  # [H, 3] tiles that are known whatever the revision
-    known_versions: Integers  # [H]
-    max_bytes: int  # of the reply's tiles; a single tile may have more
+    server: str  # of the reply before, whose epoch is ``since``; empty at first
+    since: int  # every tile of the box is known as of this epoch; 0: none is
 
 
 @dataclass(frozen=True)
-class TileUpdates(Message):
-    """Answer to :class:`TileUpdatesRequest`."""
+class TileChanges(Message):
+    """Answer to :class:`TileChangesRequest`."""
 
     server: Name
-    revision: Count  # for the next request
-    epoch: Epoch  # the tiles show this epoch, where complete
-    complete: bool  # nothing more is to come
-    restart: bool  # the request spoke of another server: what was known of it is void
+    epoch: Epoch  # up to which the changes are known, for the next request
+    is_newest: bool  # that is the newest epoch
     tile_side_m: Annotated[float, within(MIN_LENGTH_M, MAX_TILE_M)]
     cell_m: Annotated[float, within(MIN_LENGTH_M, MAX_CELL_M)]
-    tiles: Annotated[TileIndices, _IN_RANGE]  # [T, 3] that changed
-    versions: Annotated[Epochs, rows_of("tiles")]  # [T] epoch of which each is
-    # [T] bytes of each
-    sizes: Annotated[Integers, within(0, MAX_MESSAGE_BYTES), rows_of("tiles"), parts_of("data")]
-    data: bytes  # of all, one behind the other: triquad_format.wire.tile_codec
-    removed: Annotated[TileIndices, _IN_RANGE]  # [R, 3] that have no faces any more
+    # [T, 3] that changed after ``since``; where that is 0, or of another server, all that may have
+    # faces
+    tiles: Annotated[TileIndices, _IN_RANGE]
+    # [T] the surface of each last changed in this epoch
+    changed: Annotated[Epochs, rows_of("tiles")]

@@ -5,12 +5,14 @@ A server answers with this from its epochs, and a client from a map file: so the
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
 from triquad_format.errors import RefusedError
 from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.records.pose import is_rigid
+from triquad_format.wire import keys
 from triquad_format.wire.codec import Message
 from triquad_format.wire.limits import (
     MAX_DISTANCE_M,
@@ -191,16 +193,27 @@ class Answers:
         return _reply(AlignReply, answer)
 
 
-_ANSWERS: dict[type[Message], Callable[[Answers, Any], Message]] = {
-    SdfRequest: Answers.sdf,
-    DistanceRequest: Answers.distance,
-    SpheresRequest: Answers.spheres,
-    SegmentsRequest: Answers.segments,
-    RaysRequest: Answers.rays,
-    GroundRequest: Answers.ground,
-    GridRequest: Answers.grid,
-    AlignRequest: Answers.align,
+@dataclass(frozen=True)
+class Question:
+    """A question about the map: its message, and what makes the answer of it."""
+
+    request: type[Message]
+    answer: Callable[[Answers, Any], Message]
+
+
+QUESTIONS = {
+    keys.SDF: Question(SdfRequest, Answers.sdf),
+    keys.DISTANCE: Question(DistanceRequest, Answers.distance),
+    keys.SPHERES: Question(SpheresRequest, Answers.spheres),
+    keys.SEGMENTS: Question(SegmentsRequest, Answers.segments),
+    keys.RAYS: Question(RaysRequest, Answers.rays),
+    keys.GROUND: Question(GroundRequest, Answers.ground),
+    keys.GRID: Question(GridRequest, Answers.grid),
+    keys.ALIGN: Question(AlignRequest, Answers.align),
 }
+"""All questions about the map, by their operations."""
+
+_ANSWERS = {question.request: question.answer for question in QUESTIONS.values()}
 
 
 def _searched(what: str, origin: Doubles, offsets: Floats) -> Doubles:

@@ -1,23 +1,20 @@
 """Caches the mesh tiles of a map in transmitted form: made once, and the same for all clients."""
 
-import hashlib
 import threading
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
-from triquad_format.records.arrays import Doubles, Longs
+from triquad_format.records.arrays import Doubles
 from triquad_format.wire.limits import LEVELS
 from triquad_format.wire.tile_codec import encode_tile
 from triquad_map.compiled.team import THREADS, Team
 from triquad_map.composition.composed_view import ComposedView
-from triquad_map.mesh.mesher import mesh_tile
+from triquad_map.mesh.mesher import TileMesh, mesh_tile
 from triquad_map.mesh.tile_lattice import TileBorder, TileIndex, TileLattice
 
 from triquad_server.epochs.epoch import Epoch
-from triquad_server.mesh.answered_tiles import AnsweredTiles
 from triquad_server.mesh.surface_changes import SurfaceChanges
-from triquad_server.mesh.tile_level import CachedTile, TileBytes, TileDelta, TileLevel
+from triquad_server.mesh.tile_level import CachedTile, ShownTile, ShownTiles, TileKey, TileLevel
 from triquad_server.settings import MeshSettings
 
 
@@ -27,14 +24,21 @@ def tile_lattice(settings: MeshSettings, level: int) -> TileLattice:
     return finest.at_level(level)
 
 
+def _shown(mesh: TileMesh, view: ComposedView, *, marked: bool) -> ShownTile:
+    filled = mesh.filled if marked else mesh.filled[:0]
+    return ShownTile(view.epoch, encode_tile(mesh.surface), filled.astype(np.uint8))
+
+
 def _touch(first: TileIndex, second: TileIndex) -> bool:
     return all(abs(a - b) <= 1 for a, b in zip(first, second, strict=True))
 
 
 class TileCache:
-    """Makes tiles when they are requested, and keeps them until their surface changes.
+    """Makes tiles when they are requested, and keeps them.
 
-    One thread has tiles made and requests what is new; any thread may ask what changed.
+    Tiles that are followed are kept until their surface changes. They fit their neighbours, though
+    these may be of other epochs. One thread uses the cache, and shares the making of tiles with its
+    team; any thread may ask for its size.
     """
 
     def __init__(self, settings: MeshSettings, team: Team) -> None:
@@ -46,14 +50,12 @@ class TileCache:
         self._changes: SurfaceChanges | None = None
         self.epoch = -1  # number of the epoch of the last refresh
         self._view: ComposedView | None = None  # epoch from which tiles are made
-        self.revision = 0  # number of times that bytes of any tile came to differ
-        self._bytes = TileBytes(settings.cache_bytes)
-        self.answered = AnsweredTiles()  # those of queries, which need not fit their neighbours
+        self._shown = ShownTiles(settings.cache_bytes)
 
     @property
     def nbytes(self) -> int:
         """Return the bytes of the encoded tiles that are kept."""
-        return self._bytes.size + self.answered.nbytes
+        return self._shown.size
 
     def lattice(self, level: int) -> TileLattice:
         """Return where the tiles of a level lie."""
@@ -69,27 +71,45 @@ class TileCache:
                 self._record_changes(epoch)
                 self._view = epoch.with_split()
 
-    def changed(self, level: int, indices: NDArray[np.integer]) -> Longs:
-        """Return the epochs [T] when the surface of tiles [T, 3] last changed; 0: none was seen."""
+    def changed(self, level: int, low: Doubles, high: Doubles, since: int) -> dict[TileIndex, int]:
+        """Return :meth:`TileLevel.changed_since` of a level, as of the last refresh."""
         with self._lock:
-            tiles = self._levels[level]
-            epochs = [tiles.changed.get((x, y, z), 0) for x, y, z in indices.tolist()]
-        return np.array(epochs, np.int64)
+            return self._levels[level].changed_since(low, high, since)
 
-    def delta(
-        self, level: int, low: Doubles, high: Doubles, known_to: int, known: Mapping[TileIndex, int]
-    ) -> TileDelta:
-        """Return what is new in a box to a client that knows all up to revision ``known_to``.
+    def kept(self, level: int, index: TileIndex) -> ShownTile | None:
+        """Return a tile that shows the current surface; None if it has to be made, or made again.
 
-        The box has the corners ``low`` and ``high`` [3], metres, map frame; ``known`` are versions
-        of tiles that are known whatever the revision.
+        It has to be made again if its bytes were dropped.
         """
         with self._lock:
-            return self._levels[level].delta(
-                low, high, known_to=known_to, known=known, revision=self.revision
-            )
+            shown = self._shown.get(TileKey(level, index))
+            return None if self._levels[level].clean(index) is None else shown
 
-    def make_some(self, level: int, indices: Iterable[TileIndex]) -> list[TileIndex]:
+    def of_epoch(
+        self, view: ComposedView, level: int, indices: Sequence[TileIndex], fill_m: float
+    ) -> list[ShownTile]:
+        """Return tiles that are all of one epoch; those that are not kept are made in parallel.
+
+        Holes up to ``fill_m`` are filled. The view splits nothing: there are tiles for all cores.
+        """
+        found: dict[TileIndex, ShownTile] = {}
+
+        def work(first: int, last: int) -> None:
+            for index in indices[first:last]:
+                key = TileKey(level, index, view.epoch, fill_m)
+                with self._lock:
+                    kept = self._shown.get(key)
+                if kept is None:
+                    mesh = mesh_tile(view, index, self.lattice(level), fill_m=fill_m)
+                    kept = _shown(mesh, view, marked=fill_m > 0)
+                    with self._lock:
+                        self._shown.put(key, kept)
+                found[index] = kept
+
+        self._team.split(len(indices), work, least=1)
+        return [found[index] for index in indices]
+
+    def make_some(self, level: int, indices: Iterable[TileIndex]) -> dict[TileIndex, ShownTile]:
         """Make some tiles in parallel, one on each core, including the first of ``indices``.
 
         No two of them touch, so that none has to fit another that is not made yet.
@@ -100,15 +120,16 @@ class TileCache:
                 chosen.append(index)
             if len(chosen) == THREADS:
                 break
+        made: dict[TileIndex, ShownTile] = {}
 
         def work(first: int, last: int) -> None:
             for index in chosen[first:last]:
-                self.make(level, index)
+                made[index] = self.make(level, index)
 
         self._team.split(len(chosen), work, least=1)
-        return chosen
+        return made
 
-    def make(self, level: int, index: TileIndex) -> CachedTile:
+    def make(self, level: int, index: TileIndex) -> ShownTile:
         """Make a tile from the epoch of the last refresh, to fit its neighbours."""
         view = self._view
         assert view is not None, "refresh comes first"
@@ -117,32 +138,11 @@ class TileCache:
             borders = tiles.borders_around(index)
         around = TileBorder.joined(self._agreeing(tiles, index, borders=borders, view=view))
         mesh = mesh_tile(view, index, tiles.lattice, around=around)
-        data = encode_tile(mesh.surface)
-        digest = hashlib.sha256(data).digest()
+        shown = _shown(mesh, view, marked=False)
         with self._lock:
-            old = tiles.tiles.get(index)
-            if old is not None and old.digest == digest:
-                version, revision = old.version, old.revision
-            else:
-                self.revision += 1
-                version, revision = view.epoch, self.revision
-            tile = CachedTile(
-                index=index,
-                version=version,
-                revision=revision,
-                made=view.epoch,
-                empty=len(mesh.faces) == 0,
-                digest=digest,
-                border=mesh.border,
-            )
-            tiles.put(tile)
-            self._bytes.put((level, index), data)
-        return tile
-
-    def data(self, level: int, tile: CachedTile) -> bytes | None:
-        """Return the bytes of a tile; None if they were dropped, and it has to be made again."""
-        with self._lock:
-            return self._bytes.get((level, tile.index))
+            tiles.tiles[index] = CachedTile(view.epoch, len(mesh.faces) == 0, mesh.border)
+            self._shown.put(TileKey(level, index), shown)
+        return shown
 
     def _record_changes(self, epoch: Epoch) -> None:
         if self._changes is None:

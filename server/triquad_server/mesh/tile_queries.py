@@ -1,33 +1,49 @@
-"""Answers queries of mesh tiles, and of their list."""
+"""Answers queries of mesh tiles, of their list, and of those that changed."""
+
+import time
 
 import numpy as np
 from triquad_format.errors import RefusedError
 from triquad_format.records.arrays import Ints
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.wire.limits import MAX_FILL_M, MAX_TILES_ASKED, TILE_INDEX_LIMIT
-from triquad_format.wire.mesh_messages import MeshReply, MeshRequest, TileList, TileListRequest
-from triquad_format.wire.tile_codec import encode_tile
-from triquad_map.composition.composed_view import ComposedView
-from triquad_map.mesh.mesher import mesh_tile
-from triquad_map.mesh.tile_lattice import TileLattice, check_level
+from triquad_format.wire.mesh_messages import (
+    MeshReply,
+    MeshRequest,
+    TileChanges,
+    TileChangesRequest,
+    TileList,
+    TileListRequest,
+)
+from triquad_map.mesh.tile_lattice import TileIndex, TileLattice, check_level
 from triquad_map.questions.checks import check_box
 
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.history import EpochHistory
-from triquad_server.mesh.answered_tiles import AnsweredTile, TileRequest
 from triquad_server.mesh.tile_cache import TileCache
+from triquad_server.mesh.tile_level import ShownTile
 
 MAX_TILES = 1_000_000
 """The most tiles of one list."""
 
+_GIVE_WAY_S = 0.1  # seconds that the making of tiles waits for queries before each, at most
+_MAX_REFRESH_SHARE = 4
+"""Searches for changed tiles take at most one part in this many of the time."""
+
 
 class TileQueries:
-    """Answers mesh queries."""
+    """Answers mesh queries, one at a time.
 
-    def __init__(self, epochs: EpochHistory, cache: TileCache) -> None:
-        """Make the handler; ``cache`` knows when tiles changed."""
+    A client that follows the mesh asks which tiles changed, then for these, and after a while again
+    which changed. Tiles that are followed are made when they are first asked for.
+    """
+
+    def __init__(self, epochs: EpochHistory, cache: TileCache, server: str) -> None:
+        """Make the handler; ``server`` is the name that replies carry."""
         self._epochs = epochs
         self._cache = cache
+        self._server = server
+        self._next_refresh_s = 0.0  # monotonic
 
     def tiles(self, request: TileListRequest) -> TileList:
         """Return the tiles that meet the request's box.
@@ -44,13 +60,35 @@ class TileQueries:
         tiles = tiles[lattice.meets(tiles, request.minimum, request.maximum)]
         if len(tiles) > MAX_TILES:
             raise RefusedError("too_large", f"{len(tiles)} tiles: ask for a smaller box")
-        self._cache.refresh(epoch)
-        changed = self._cache.changed(request.level, tiles)
-        return TileList(
-            epoch=epoch.number,
+        return TileList(epoch.number, lattice.tile_side_m, tiles)
+
+    def changes(self, request: TileChangesRequest) -> TileChanges:
+        """Return in which tiles the surface changed.
+
+        Raises:
+            RefusedError: a field is out of range.
+        """
+        check_box(request.minimum, request.maximum)
+        check_level(request.level)
+        newest = self._epochs.newest
+        self._refresh(newest)
+        cache, lattice = self._cache, self._cache.lattice(request.level)
+        since = request.since if request.server == self._server else 0
+        if not 0 <= since <= cache.epoch:
+            raise RefusedError(
+                "bad_request",
+                f"since = {since} was never given by server {request.server!r}: use the epoch of "
+                "the reply before, or 0",
+            )
+        changed = cache.changed(request.level, request.minimum, request.maximum, since)
+        return TileChanges(
+            server=self._server,
+            epoch=cache.epoch,
+            is_newest=cache.epoch >= newest.number,
             tile_side_m=lattice.tile_side_m,
-            tiles=tiles,
-            changed=np.minimum(changed, epoch.number),
+            cell_m=lattice.cell_m,
+            tiles=np.array(list(changed), np.int32).reshape(-1, 3),
+            changed=np.array(list(changed.values()), np.int64),
         )
 
     def mesh(self, request: MeshRequest) -> MeshReply:
@@ -62,32 +100,45 @@ class TileQueries:
         _check_tiles(request.tiles)
         check_level(request.level)
         _check_fill(request.fill_m)
+        if request.epoch == 0 and request.fill_m > 0:
+            raise RefusedError("bad_request", "fill_m is for tiles of one epoch: name it")
+        indices = [(x, y, z) for x, y, z in request.tiles.tolist()]
+        if request.epoch == 0:
+            return self._reply(request, self._cache.epoch, self._followed(request.level, indices))
         epoch = self._epochs.get(request.epoch)
-        # In the answering thread alone: for a box full of tiles, other threads make more of them.
-        view, lattice = epoch.with_split(), self._cache.lattice(request.level)
-        tiles = [
-            self._tile(view, TileRequest(request.level, (x, y, z), request.fill_m), lattice)
-            for x, y, z in request.tiles.tolist()
-        ]
-        filled = np.concatenate([tile.filled for tile in tiles])
+        view = epoch.with_split()
+        tiles = self._cache.of_epoch(view, request.level, indices, request.fill_m)
+        return self._reply(request, epoch.number, tiles)
+
+    def _refresh(self, newest: Epoch) -> None:
+        """Find what changed, if there may be something and the time for it is there."""
+        started = time.monotonic()
+        if newest.number > self._cache.epoch and started >= self._next_refresh_s:
+            self._cache.refresh(newest)
+            now = time.monotonic()
+            self._next_refresh_s = now + _MAX_REFRESH_SHARE * (now - started)
+
+    def _followed(self, level: int, indices: list[TileIndex]) -> list[ShownTile]:
+        """Return tiles as they are followed; those that are out of date are made."""
+        if self._cache.epoch < 0:
+            self._cache.refresh(self._epochs.newest)
+        shown = {index: self._cache.kept(level, index) for index in indices}
+        while missing := [index for index, tile in shown.items() if tile is None]:
+            self._epochs.give_way(_GIVE_WAY_S)
+            shown.update(self._cache.make_some(level, missing))
+        return [tile for index in indices if (tile := shown[index]) is not None]
+
+    def _reply(self, request: MeshRequest, epoch: int, tiles: list[ShownTile]) -> MeshReply:
+        lattice = self._cache.lattice(request.level)
         return MeshReply(
-            epoch=epoch.number,
+            epoch=epoch,
             tile_side_m=lattice.tile_side_m,
             cell_m=lattice.cell_m,
             sizes=np.array([len(tile.data) for tile in tiles]),
             data=b"".join(tile.data for tile in tiles),
-            filled=filled if request.fill_m > 0 else None,
+            filled=np.concatenate([tile.filled for tile in tiles]) if request.fill_m > 0 else None,
+            versions=np.array([tile.version for tile in tiles]),
         )
-
-    def _tile(self, view: ComposedView, request: TileRequest, lattice: TileLattice) -> AnsweredTile:
-        """Return a tile as it was answered before, or make it."""
-        kept = self._cache.answered.get(view.epoch, request)
-        if kept is not None:
-            return kept
-        mesh = mesh_tile(view, request.index, lattice, fill_m=request.fill_m)
-        made = AnsweredTile(encode_tile(mesh.surface), mesh.filled.astype(np.uint8))
-        self._cache.answered.put(view.epoch, request, made)
-        return made
 
 
 def _check_tiles(tiles: Ints) -> None:

@@ -1,1 +1,1 @@
-"""The queries of clients: which operations there are, and their request handlers."""
+"""The answers to queries of what changed in a map, and of the sources of its scans."""

@@ -45,7 +45,7 @@ class Lane(Enum):
     """The lane of what takes no time: it is answered however many queries wait."""
 
     MESH = "mesh"
-    """The lane of the updates of those who follow the mesh; tiles are made one after the other."""
+    """The lane of the mesh: requests come one after the other, and all cores make their tiles."""
 
     FILES = "files"
     """The lane of checkpoints and map files, which take seconds, one after the other."""

@@ -19,7 +19,7 @@ from triquad_client import (
     KnownTiles,
 )
 from triquad_format.wire import codec, keys
-from triquad_format.wire.mesh_messages import TileUpdates, TileUpdatesRequest
+from triquad_format.wire.mesh_messages import TileChanges
 
 
 @pytest.fixture(scope="module")
@@ -31,15 +31,10 @@ def endpoint() -> Iterator[str]:
         yield endpoint
 
 
-def removed(index: int, revision: int) -> bytes:
-    """A reply without tiles, after which the tile ``(index, 0, 0)`` is gone."""
-    side_m, none = 1.6, np.zeros(0, np.int64)
-    return codec.encode(
-        TileUpdates(
-            "s", revision, revision, True, False, side_m, 0.1, np.zeros((0, 3), np.int32), none,
-            none, b"", np.array([[index, 0, 0]], np.int32),
-        )
-    )  # fmt: skip
+def left(index: int, epoch: int) -> bytes:
+    """A reply after which the tile ``(index, 0, 0)`` alone is there."""
+    tile, changed = np.array([[index, 0, 0]], np.int32), np.ones(1, np.int64)
+    return codec.encode(TileChanges("s", epoch, True, 1.6, 0.1, tile, changed))
 
 
 def known_tiles(endpoint: str) -> KnownTiles:
@@ -57,15 +52,14 @@ def test_an_old_reply_does_not_undo_what_a_later_one_told(endpoint: str) -> None
     came = threading.Event()
 
     def answer(query: zenoh.Query, key: str) -> None:
-        asks = codec.decode(TileUpdatesRequest, query.payload.to_bytes())
         if not first:
             first.append(query)
             came.set()
             return
         with query:
-            query.reply(key, removed(1 if asks.revision == 0 else 5, 2))
+            query.reply(key, left(0, 2))
 
-    with servers.answering({keys.TILE_UPDATES: answer}) as endpoint:
+    with servers.answering({keys.TILE_CHANGES: answer}) as endpoint:
 
         async def use(client: AsyncClient) -> None:
             async with client.watch_mesh(known=known) as watch:
@@ -75,8 +69,8 @@ def test_an_old_reply_does_not_undo_what_a_later_one_told(endpoint: str) -> None
                 assert late is not None
                 assert late.removed == ((1, 0, 0),)
                 with first[0] as query:
-                    key = keys.operation_key(servers.MAP, keys.TILE_UPDATES)
-                    query.reply(key, removed(0, 1))
+                    key = keys.operation_key(servers.MAP, keys.TILE_CHANGES)
+                    query.reply(key, left(1, 1))
                 assert await early is None
                 assert set(watch.tiles) == {(0, 0, 0)}
 
@@ -96,7 +90,7 @@ def test_any_number_of_watches_wait_at_a_time_until_they_are_closed() -> None:
         for query in held:
             query.drop()
 
-    with servers.answering({keys.TILE_UPDATES: lambda query, _: queries.put(query)}) as endpoint:
+    with servers.answering({keys.TILE_CHANGES: lambda query, _: queries.put(query)}) as endpoint:
         connected(endpoint, use, timeout_s=servers.WAIT_S)
 
 

@@ -1,17 +1,21 @@
 """Followers of the mesh that speak the wire protocol by hand."""
 
+import time
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
 import triquad_client
 from support import servers
-from support.requests import tile_updates
+from support.requests import tile_changes
 from support.watched_ball import SETTINGS, learn
 from triquad_client import Client
 from triquad_format.wire import codec, keys
 from triquad_format.wire.mesh_messages import (
-    TileUpdates,
+    MeshReply,
+    MeshRequest,
+    TileChanges,
+    TileChangesRequest,
 )
 from triquad_format.wire.messages import ErrorReply
 from triquad_format.wire.tile_codec import decode_tile
@@ -30,70 +34,53 @@ def client(endpoint: str) -> Iterator[Client]:
 
 
 @pytest.mark.parametrize(
-    ("changes", "code"),
-    [
-        ({"minimum": np.full(3, np.nan)}, "bad_request"),
-        ({"level": 7}, "bad_request"),
-        ({"revision": 10**12}, "bad_request"),
-        ({"max_bytes": 0}, "bad_request"),
-        ({"known_versions": np.ones(3, np.int64)}, "bad_request"),
-        (
-            {
-                "known": np.zeros((100_001, 3), np.int32),
-                "known_versions": np.zeros(100_001, np.int64),
-            },
-            "too_large",
-        ),
-    ],
+    "changes",
+    [{"minimum": np.full(3, np.nan)}, {"level": 7}],
 )
-def test_bad_requests_are_refused(endpoint: str, changes: dict[str, object], code: str) -> None:
+def test_bad_requests_are_refused(endpoint: str, changes: dict[str, object]) -> None:
     with servers.raw_session(connect=endpoint) as session:
         peer = servers.RawPeer(session)
-        assert peer.refusal(keys.TILE_UPDATES, tile_updates(**changes)) == code
-        assert isinstance(peer.ask(keys.TILE_UPDATES, codec.encode(tile_updates())), bytes)
+        assert peer.refusal(keys.TILE_CHANGES, tile_changes(**changes)) == "bad_request"
+        told = by_hand(peer, tile_changes())
+        beyond = tile_changes(server=told.server, since=10**12)
+        assert peer.refusal(keys.TILE_CHANGES, beyond) == "bad_request"
+        tile = np.zeros((1, 3), np.int32)
+        assert peer.refusal(keys.MESH, MeshRequest(tile, 0, fill_m=1.0)) == "bad_request"
+        none = np.zeros((0, 3), np.int32)
+        assert peer.refusal(keys.MESH, MeshRequest(none, 0)) == "bad_request"
 
 
-def tiles_by_hand(peer: servers.RawPeer, **changes: object) -> TileUpdates:
-    answer = peer.ask(keys.TILE_UPDATES, codec.encode(tile_updates(**changes)))
+def by_hand(peer: servers.RawPeer, request: TileChangesRequest) -> TileChanges:
+    answer = peer.ask(keys.TILE_CHANGES, codec.encode(request))
     assert not isinstance(answer, ErrorReply)
     assert answer is not None
-    return codec.decode(TileUpdates, answer)
+    return codec.decode(TileChanges, answer)
 
 
 def test_the_protocol_by_hand(client: Client, endpoint: str) -> None:
-    """As the document says: a cursor, small replies, tiles decoded by its words."""
+    """As the document says: what changed, then these tiles, decoded by its words."""
     learn(client)
     with servers.raw_session(connect=endpoint) as session:
         peer = servers.RawPeer(session)
         known: dict[tuple[int, int, int], bytes] = {}
-        versions: dict[tuple[int, int, int], int] = {}
-        reply = tiles_by_hand(peer, max_bytes=1)
-        while not reply.complete:
-            assert len(reply.tiles) <= 1, "more than max_bytes only where a tile is larger"
-            for (x, y, z), version in zip(
-                reply.tiles.tolist(), reply.versions.tolist(), strict=True
-            ):
-                known[x, y, z], versions[x, y, z] = reply.data, version
-            reply = tiles_by_hand(
-                peer,
-                max_bytes=1,
-                server=reply.server,
-                revision=reply.revision,
-                known=np.array(list(versions), np.int32).reshape(-1, 3),
-                known_versions=np.array(list(versions.values()), np.int64),
-            )
-        for x, y, z in reply.tiles.tolist():
+        while not (told := by_hand(peer, tile_changes())).is_newest:
+            time.sleep(0.1)
+        for (x, y, z), changed in zip(told.tiles.tolist(), told.changed.tolist(), strict=True):
+            request = MeshRequest(np.array([[x, y, z]], np.int32), 0)
+            answer = peer.ask(keys.MESH, codec.encode(request))
+            assert isinstance(answer, bytes)
+            reply = codec.decode(MeshReply, answer)
+            assert reply.versions[0] >= changed
             known[x, y, z] = reply.data
         with client.watch_mesh() as watch:
             watch.catch_up()
-            assert watch.tiles.keys() == known.keys()
-            for index, data in known.items():
-                surface = decode_tile(data)
-                tile = watch.tiles[index]
-                np.testing.assert_array_equal(surface.positions(0.1), tile.vertices)
-                np.testing.assert_array_equal(surface.faces, tile.faces)
-        later = tiles_by_hand(peer, server=reply.server, revision=reply.revision)
-        assert (later.complete, len(later.tiles), later.restart) == (True, 0, False)
-        strange = tiles_by_hand(peer, server="another", revision=10**6)
-        assert strange.restart
-        assert strange.server == reply.server
+            surfaces = {index: decode_tile(data) for index, data in known.items()}
+            assert watch.tiles.keys() == {i for i, s in surfaces.items() if len(s.faces)}
+            for index, tile in watch.tiles.items():
+                np.testing.assert_array_equal(surfaces[index].positions(0.1), tile.vertices)
+                np.testing.assert_array_equal(surfaces[index].faces, tile.faces)
+        later = by_hand(peer, tile_changes(server=told.server, since=told.epoch))
+        assert (later.is_newest, len(later.tiles)) == (True, 0)
+        strange = by_hand(peer, tile_changes(server="another", since=10**6))
+        assert strange.server == told.server
+        assert {tuple(tile) for tile in strange.tiles.tolist()} == watch.tiles.keys()

@@ -206,7 +206,7 @@ def test_a_server_that_does_not_answer_is_an_error_and_the_tiles_stay(learnt: Cl
         watch.catch_up()
         known = watch.known_tiles()
     silent: list[zenoh.Query] = []
-    answers = {keys.TILE_UPDATES: lambda query, _: silent.append(query)}
+    answers = {keys.TILE_CHANGES: lambda query, _: silent.append(query)}
     with (
         servers.answering(answers) as endpoint,
         triquad_client.connect(endpoint, timeout_s=0.5) as other,

@@ -37,8 +37,8 @@ def one_command(folder: Path, listen: str, *arguments: str) -> Iterator[servers.
 def test_one_command_serves_a_map_and_bridges(tmp_path: Path) -> None:
     """It says what it maps, is stopped by SIGTERM, and what it mapped is in the store."""
     endpoint = servers.free_endpoint()
-    (tmp_path / "ros2.toml").write_text('clouds = ["/points"]\nwait_s = 30.0\n')
-    with one_command(tmp_path, endpoint, "--settings", str(tmp_path / "ros2.toml")) as both:
+    (tmp_path / "ros2.args").write_text("--clouds\n/points\n--wait-s=30\n")
+    with one_command(tmp_path, endpoint, f"@{tmp_path / 'ros2.args'}") as both:
         with robot(endpoint, mode="peer") as r2:
             stand(r2, 0, 1)
             r2.cloud(0.5, servers.sphere())

@@ -231,7 +231,7 @@ def test_grids_go_with_the_robot(server: str) -> None:
 def test_a_mesh_that_nobody_takes_does_not_hold_up_grids(server: str) -> None:
     taken = threading.Event()
     grids: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
-    options = bridge_options(ros2.parsed(["--map-frame", "world"]))
+    options = bridge_options(ros2.parser().parse_args(["--map-frame", "world"]))
     with (
         triquad_client.connect(server) as client,
         servers.raw_session(connect=server) as session,

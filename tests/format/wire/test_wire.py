@@ -26,7 +26,7 @@ EXAMPLES = [
     SdfRequest(np.array([1e6, 2e6, 3.0]), POINTS, True, 0),
     SdfReply(5, np.array([0.5, np.nan], np.float32), np.array([1, 0], np.uint8), None),
     SdfReply(5, np.zeros(0, np.float32), np.zeros(0, np.uint8), np.zeros((0, 3), np.float32)),
-    TileList(2, 6.4, np.array([[-1, 0, 1]], np.int32), np.array([7], np.int64)),
+    TileList(2, 6.4, np.array([[-1, 0, 1]], np.int32)),
     StatusRequest(),
     STATUS,
     FlushReply(True, 1, 2, 3, None),

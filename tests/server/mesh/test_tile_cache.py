@@ -5,14 +5,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.maps.exact_maps import SETTINGS, exact_map, flat
-from support.maps.meshed_ground import EVERYWHERE, MESH, bump, ground, make_all, surfaces
+from support.maps.meshed_ground import (
+    EVERYWHERE,
+    MESH,
+    bump,
+    ground,
+    make_all,
+    shown,
+    surfaces,
+    to_make,
+)
 from triquad_format.records.region import seen_voxels
 from triquad_format.wire.limits import LEVELS
+from triquad_format.wire.tile_codec import decode_tile
 from triquad_map.mesh.tile_lattice import TileIndex
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.tile_cache import TileCache, tile_lattice
-from triquad_server.mesh.tile_level import TileBytes
+from triquad_server.mesh.tile_level import ShownTile, ShownTiles, TileKey
 from triquad_server.process.threads import Teams
 from triquad_server.settings import MeshSettings, Settings
 
@@ -20,7 +30,7 @@ TEAM = Teams().meshing
 
 
 def versions(cache: TileCache, level: int = 0) -> dict[TileIndex, int]:
-    return {tile.index: tile.version for tile in cache.delta(level, *EVERYWHERE, 0, {}).ready}
+    return {index: tile.version for index, tile in shown(cache, level).items()}
 
 
 @pytest.mark.parametrize("level", [0, LEVELS - 1])
@@ -87,87 +97,83 @@ def test_surface_that_is_forgotten_goes_and_everybody_is_told() -> None:
     cache.refresh(mapper.publish())
     make_all(cache)
     before = surfaces(cache)
-    known = cache.revision
+    known = cache.epoch
     mapper.reset(np.array([0.0, -50, -50]), np.array([200.0, 50, 50]))
     cache.refresh(mapper.publish())
     made = make_all(cache)
     side_m = cache.lattice(0).tile_side_m
     assert all((x + 1) * side_m > -0.5 for x, _, _ in made), "only what is near the box"
-    delta = cache.delta(0, *EVERYWHERE, known, {})
     far = {index for index in before if index[0] * side_m > 0.5}
     assert far
-    assert far <= {tile.index for tile in delta.ready if tile.empty}
+    told = cache.changed(0, *EVERYWHERE, known)
+    emptied = [cache.kept(0, index) for index in far & told.keys()]
+    assert len(emptied) == len(far)
+    assert not any(len(decode_tile(tile.data).faces) for tile in emptied if tile is not None)
     assert not far & set(surfaces(cache))
 
 
 def test_who_knows_everything_is_told_nothing() -> None:
     cache = TileCache(MESH, TEAM)
-    cache.refresh(ground(flat(0.3)))
+    first = ground(flat(0.3))
+    cache.refresh(first)
     make_all(cache)
-    delta = cache.delta(0, *EVERYWHERE, cache.revision, {})
-    assert (delta.ready, delta.removed, delta.to_make) == ([], [], [])
-    known = versions(cache)
-    delta = cache.delta(0, *EVERYWHERE, 0, known)
-    assert (delta.ready, delta.removed, delta.to_make) == ([], [], [])
-    index = min(known)
-    delta = cache.delta(0, *EVERYWHERE, 0, known | {index: 77, (500, 0, 0): 1})
-    assert [tile.index for tile in delta.ready] == [index]
-    assert delta.removed == [(500, 0, 0)]
+    assert cache.changed(0, *EVERYWHERE, first.number) == {}
+    second = bump(4.0, 0.05)
+    cache.refresh(second)
+    told = cache.changed(0, *EVERYWHERE, first.number)
+    assert 0 < len(told) < len(cache.changed(0, *EVERYWHERE, 0))
+    assert set(told.values()) == {second.number}
+    cache.refresh(first)  # an older one tells nothing
+    assert cache.changed(0, *EVERYWHERE, second.number) == {}
 
 
-def test_no_tile_is_made_again_before_all_were_made() -> None:
-    """While the whole map changes with each epoch, as it does in training, all of it appears."""
+def test_only_tiles_of_the_box_are_told_of() -> None:
     cache = TileCache(MESH, TEAM)
     cache.refresh(ground(flat(0.3)))
-    made: list[TileIndex] = []
-    for time in range(6):
-        made.append(cache.delta(0, *EVERYWHERE, 0, {}).to_make[0])
-        cache.make(0, made[-1])
-        cache.refresh(ground(flat(0.32 if time % 2 else 0.34)))
-    assert len(set(made)) == 6
-    # After all the others those come first that were made longest ago.
-    assert cache.delta(0, *EVERYWHERE, 0, {}).to_make[-6:] == made
+    told = cache.changed(0, np.array([0.2, 0.2, -9]), np.array([5.0, 5, 9]), 0)
+    assert told
+    assert all(x >= 0 and y >= 0 for x, y, _ in told)
 
 
 def test_tiles_whose_bytes_went_are_made_again_and_stay_the_same() -> None:
     cache = TileCache(MeshSettings(tile_cells=16, cache_bytes=2000), TEAM)
     epoch = ground(flat(0.3))
     cache.refresh(epoch)
-    made = make_all(cache)
-    ready = cache.delta(0, *EVERYWHERE, 0, {}).ready
-    kept = [data for tile in ready if (data := cache.data(0, tile)) is not None]
+    made = {index: cache.make(0, index) for index in to_make(cache)}
+    kept = [tile.data for index in made if (tile := cache.kept(0, index)) is not None]
     assert sum(map(len, kept)) <= 2000
-    gone = [tile for tile in ready if cache.data(0, tile) is None]
+    gone = [index for index in made if cache.kept(0, index) is None]
     assert len(gone) > len(made) / 4
-    revision = cache.revision
-    for tile in gone:
-        again = cache.make(0, tile.index)
-        assert (again.digest, again.version, again.revision) == (
-            tile.digest,
-            tile.version,
-            tile.revision,
-        )
-    assert cache.revision == revision
+    for index in gone:
+        again = cache.make(0, index)
+        assert (again.version, again.data) == (made[index].version, made[index].data)
+    assert cache.changed(0, *EVERYWHERE, epoch.number) == {}
 
 
-def test_when_tiles_changed_is_told_for_any_of_them() -> None:
-    cache = TileCache(MESH, TEAM)
-    first = ground(flat(0.3))
-    cache.refresh(first)
-    second = bump(4.0, 0.05)
-    cache.refresh(second)
-    cache.refresh(first)  # an older one tells nothing
-    asked = np.array([[2, 2, 0], [-2, -2, 0], [900, 0, 0]])
-    assert cache.changed(0, asked).tolist() == [second.number, first.number, 0]
+def test_tiles_that_are_unused_for_longest_are_dropped() -> None:
+    def tile(size: int) -> ShownTile:
+        return ShownTile(1, bytes(size), np.zeros(0, np.uint8))
 
-
-def test_bytes_that_are_unused_for_longest_are_dropped() -> None:
-    kept = TileBytes(limit=10)
-    kept.put((0, (1, 0, 0)), bytes(4))
-    kept.put((0, (2, 0, 0)), bytes(4))
-    assert kept.get((0, (1, 0, 0))) == bytes(4)
-    kept.put((0, (3, 0, 0)), bytes(4))
-    assert kept.get((0, (2, 0, 0))) is None
+    kept = ShownTiles(limit=10)
+    one, other, last = (TileKey(0, (x, 0, 0)) for x in range(3))
+    kept.put(one, tile(4))
+    kept.put(other, tile(4))
+    assert kept.get(one) is not None
+    kept.put(last, tile(4))
+    assert kept.get(other) is None
     assert kept.size == 8
-    kept.put((0, (1, 0, 0)), bytes(50))
-    assert (kept.get((0, (1, 0, 0))), kept.size) == (bytes(50), 50), "one may be larger"
+    kept.put(one, tile(50))
+    assert kept.get(one) is not None, "one may be larger"
+    assert kept.size == 50
+
+
+def test_tiles_of_an_epoch_are_kept_apart_from_those_that_are_followed() -> None:
+    cache = TileCache(MESH, TEAM)
+    view = ground(flat(0.3)).with_split()
+    first = cache.of_epoch(view, 0, [(0, 0, 0), (1, 0, 0)], 0.0)
+    again = cache.of_epoch(view, 0, [(1, 0, 0), (0, 0, 0)], 0.0)
+    assert [id(tile) for tile in again] == [id(tile) for tile in first[::-1]]
+    (filled,) = cache.of_epoch(view, 0, [(0, 0, 0)], 0.5)
+    assert filled is not first[0]
+    assert cache.kept(0, (0, 0, 0)) is None
+    assert cache.nbytes == sum(tile.nbytes for tile in (*first, filled))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.maps.exact_maps import flat
-from support.maps.meshed_ground import EVERYWHERE, MESH, bump, ground, make_all, surfaces
+from support.maps.meshed_ground import MESH, bump, ground, make_all, shown, surfaces, to_make
 from support.maps.small_world import settings, world
 from triquad_format.wire.limits import LEVELS
 from triquad_format.wire.tile_codec import TileSurface
@@ -138,15 +138,14 @@ def test_tiles_made_at_different_times_are_one_mesh(level: int) -> None:
     for epoch in epochs.values():
         cache.refresh(epoch)
         low, high = np.array([0.0, -8, -2]), np.array([10.0, 8, 6])
-        wanted = cache.delta(level, low, high, 0, {})
-        some_kept += len(wanted.ready)
-        while wanted.to_make:  # also those that no longer fit their new neighbours
-            for index in wanted.to_make[::-1]:
+        wanted = to_make(cache, level, (low, high))
+        some_kept += len(cache.changed(level, low, high, 0)) - len(wanted)
+        while wanted:  # also those that no longer fit their new neighbours
+            for index in wanted[::-1]:
                 cache.make(level, index)
-            wanted = cache.delta(level, low, high, 0, {})
+            wanted = to_make(cache, level, (low, high))
     assert some_kept > 50
-    ready = cache.delta(level, *EVERYWHERE, 0, {}).ready
-    assert len({tile.version for tile in ready}) > 3
+    assert len({tile.version for tile in shown(cache, level).values()}) > 3
 
     lattice = cache.lattice(level)
     whole = replace(lattice, cells=128)
@@ -172,10 +171,8 @@ def test_tiles_made_at_the_same_time_meet_as_those_made_one_by_one() -> None:
     for epoch in (ground(flat(0.3)), bump(4.0, 0.05), bump(3.0, 0.05)):
         epochs[epoch.number] = epoch
         together.refresh(epoch)
-        while to_make := together.delta(0, *EVERYWHERE, 0, {}).to_make:
-            made = together.make_some(0, to_make)
-            assert made[0] == to_make[0]
-            assert len(made) == len(set(made))
+        while missing := to_make(together):
+            assert missing[0] in together.make_some(0, missing)
         if len(epochs) == 1:
             alone.refresh(epoch)
             make_all(alone)

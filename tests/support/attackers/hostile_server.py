@@ -14,7 +14,6 @@ import zenoh
 from support import servers
 from support.operations import OPERATIONS
 from triquad_format.wire import codec, keys
-from triquad_tools.demo.server import free_endpoint
 
 Body = dict[str, Any]
 """A message as a msgpack map: what an encoder of messages would refuse, it can hold."""
@@ -75,7 +74,7 @@ def hostile_server() -> Iterator[HostileServer]:
         with triquad_client.connect(endpoint) as client:
             servers.learn(client, scans=3)
             client.settle(servers.WAIT_S)
-        server = HostileServer(free_endpoint(), real)
+        server = HostileServer(servers.free_endpoint(), real)
         session = declared.enter_context(servers.raw_session("router", listen=server.endpoint))
         for operation in OPERATIONS:
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import zenoh
+from support.servers import free_port
 from triquad_tools.credentials.certificates import Certificate
-from triquad_tools.demo.server import free_port
 
 
 def free_tls_endpoint() -> str:

@@ -10,6 +10,7 @@ from triquad_map.mesh.tile_lattice import TileIndex
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.tile_cache import TileCache
+from triquad_server.mesh.tile_level import ShownTile
 from triquad_server.settings import MeshSettings, Settings
 
 EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)
@@ -17,24 +18,35 @@ MESH = MeshSettings(tile_cells=16)
 _EPOCHS = iter(range(1, 1000))
 
 
+def to_make(
+    cache: TileCache, level: int = 0, box: tuple[NDArray[np.float64], ...] = EVERYWHERE
+) -> list[TileIndex]:
+    """The tiles in a box that do not show the current surface."""
+    low, high = box
+    changed = cache.changed(level, low, high, 0)
+    return sorted(index for index in changed if cache.kept(level, index) is None)
+
+
 def make_all(cache: TileCache, level: int = 0) -> list[TileIndex]:
     """Make what has to be made; returns it."""
     made: list[TileIndex] = []
-    while to_make := cache.delta(level, *EVERYWHERE, 0, {}).to_make:
-        for index in to_make:
+    while missing := to_make(cache, level):
+        for index in missing:
             cache.make(level, index)
-        made += to_make
+        made += missing
     return made
+
+
+def shown(cache: TileCache, level: int = 0) -> dict[TileIndex, ShownTile]:
+    """All tiles with faces that show the current surface."""
+    tiles = {index: cache.kept(level, index) for index in cache.changed(level, *EVERYWHERE, 0)}
+    return {index: tile for index, tile in tiles.items() if tile is not None}
 
 
 def surfaces(cache: TileCache, level: int = 0) -> dict[TileIndex, TileSurface]:
     """All tiles with faces, decoded."""
-    found = {}
-    for tile in cache.delta(level, *EVERYWHERE, 0, {}).ready:
-        assert not tile.empty, "a client without tiles is not sent empty ones"
-        data = cache.data(level, tile)
-        assert data is not None
-        found[tile.index] = decode_tile(data)
+    found = {index: decode_tile(tile.data) for index, tile in shown(cache, level).items()}
+    assert all(len(surface.faces) for surface in found.values()), "empty ones are not told of"
     return found
 
 

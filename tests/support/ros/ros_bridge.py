@@ -62,7 +62,7 @@ def bridging(endpoint: str, *arguments: object, router: str | None = None) -> It
 
     Nodes are at the server, or at a ``router``.
     """
-    parsed = ros2.parsed(list(map(str, arguments)))
+    parsed = ros2.parser().parse_args(list(map(str, arguments)))
     file: Path | None = parsed.config
     with (
         triquad_client.connect(endpoint, config=file) as client,

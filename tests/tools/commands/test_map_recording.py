@@ -126,7 +126,8 @@ def test_after_ctrl_c_the_same_command_goes_on(
     with mapping(*arguments, *LONG, until="training") as (process, said):
         process.send_signal(signal.SIGINT)
         assert process.wait(servers.WAIT_S) == 130
-    assert said[-1] == "triquad-map: interrupted; the same command goes on where it was\n"
+    words = "interrupted; the same command goes on where the map was saved last"
+    assert said[-1] == f"triquad-map: {words}\n"
     assert not output.exists()
     for other in ((), (*LONG, "--range-min", "0.1")):
         assert main([*arguments, *other]) == 2

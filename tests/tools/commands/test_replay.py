@@ -48,13 +48,6 @@ def test_all_scans_are_taken_and_learnt(server, replay, tmp_path, capsys):
         assert np.nanmedian(np.abs(client.query_sdf(servers.sphere()).sdf)) < 0.2
 
 
-def test_every_third_scan_is_withheld(server, replay, tmp_path, capsys):
-    before = _taken(server)
-    assert replay(_folder(tmp_path), "--skip-every", 3, "--source", "other") == 0
-    assert "4 scans published, 4 taken, " in capsys.readouterr().out
-    assert _taken(server) == before + 4
-
-
 @pytest.mark.parametrize("rate", ["200", "2x"])
 def test_scans_are_taken_at_a_pace(replay, tmp_path, capsys, rate):
     assert replay(_folder(tmp_path, 3), "--rate", rate) == 0
@@ -133,10 +126,8 @@ def test_input_that_cannot_be_used_is_refused(replay, tmp_path, capsys):
     assert replay(tmp_path / "nowhere") == 2
     assert "triquad-replay: " in capsys.readouterr().err
     folder = _folder(tmp_path / "scans")
-    assert replay(folder, "--skip-every", 1) == 2
-    assert "no scan is left of 6 in 0.5 s: see --start" in capsys.readouterr().err
     assert replay(folder, "--start", 7) == 2
-    assert "no scan is left of 6" in capsys.readouterr().err
+    assert "no scan is left of 6 in 0.5 s: see --start" in capsys.readouterr().err
     assert replay(folder, "--source", "a/b") == 2
     assert "'a/b' is not allowed" in capsys.readouterr().err
 
@@ -156,7 +147,7 @@ def test_a_server_that_cannot_be_reached_is_a_failure(replay, tmp_path, capsys):
         (),
         ("x", "--rate", "0"),
         ("x", "--rate", "fast"),
-        ("x", "--skip-every", "0"),
+        ("x", "--every", "0"),
         ("x", "--range-min", "nan"),
     ],
 )

@@ -1,11 +1,7 @@
 import numpy as np
 import pytest
 from triquad_client import Mesh
-from triquad_tools.evaluation.metrics import (
-    ScoreSettings,
-    score_against_cloud,
-    score_against_scene,
-)
+from triquad_tools.evaluation.metrics import ScoreSettings, score_mesh
 from triquad_tools.simulation.scene import Scene
 from triquad_tools.simulation.solids import half_space
 
@@ -27,7 +23,7 @@ def _grid(z: float = 0.0) -> np.ndarray:
 
 
 def test_parallel_planes_score_their_distance_against_a_scene() -> None:
-    scores = score_against_scene(_plate(4.0, 2.0, 0.05), GROUND, _grid(), ScoreSettings())
+    scores = score_mesh(_plate(4.0, 2.0, 0.05), _grid(), ScoreSettings(), GROUND.sdf)
     assert scores.accuracy_m == pytest.approx(0.05, abs=1e-9)
     assert scores.accuracy_median_m == pytest.approx(0.05, abs=1e-9)
     assert scores.completion_m == pytest.approx(0.05, abs=0.002)
@@ -41,8 +37,8 @@ def test_samples_beyond_the_cut_are_left_out_and_counted() -> None:
     both = Mesh(np.vstack([near.vertices, far.vertices]), np.vstack([near.faces, far.faces + 4]))
     visible = np.vstack([_grid(), [[2.0, 1.0, 1.0]]])  # opens the bounding box upwards
     for scores in (
-        score_against_scene(both, GROUND, visible, ScoreSettings()),
-        score_against_cloud(both, visible, ScoreSettings()),
+        score_mesh(both, visible, ScoreSettings(), GROUND.sdf),
+        score_mesh(both, visible, ScoreSettings()),
     ):
         assert scores.accuracy_m == pytest.approx(0.02, abs=0.005)
         assert scores.accuracy_ratio == 1.0
@@ -51,7 +47,7 @@ def test_samples_beyond_the_cut_are_left_out_and_counted() -> None:
 
 def test_half_a_mesh_completes_half_the_truth() -> None:
     settings = ScoreSettings(completion_cut_m=0.5)
-    scores = score_against_scene(_plate(2.0, 2.0, 0.0), GROUND, _grid(), settings)
+    scores = score_mesh(_plate(2.0, 2.0, 0.0), _grid(), settings, GROUND.sdf)
     assert scores.accuracy_m == pytest.approx(0.0, abs=1e-9)
     assert scores.accuracy_ratio == 1.0
     assert scores.completion_ratio == pytest.approx(2.1 / 4.0, abs=0.01)
@@ -63,24 +59,24 @@ def test_half_a_mesh_completes_half_the_truth() -> None:
 
 def test_settings_are_heeded() -> None:
     settings = ScoreSettings(threshold_m=0.04, voxel_m=0.1, accuracy_cut_m=0.3)
-    scores = score_against_scene(_plate(4.0, 2.0, 0.25), GROUND, _grid(), settings)
+    scores = score_mesh(_plate(4.0, 2.0, 0.25), _grid(), settings, GROUND.sdf)
     assert scores.accuracy_m == pytest.approx(0.25)
     assert scores.accuracy_ratio == 0.0
     assert scores.references == 40 * 20
     assert scores.samples == pytest.approx(800, rel=0.15)
     few = ScoreSettings(samples_max=100)
-    assert score_against_cloud(_plate(4.0, 2.0, 0.0), _grid(), few).samples <= 100
+    assert score_mesh(_plate(4.0, 2.0, 0.0), _grid(), few).samples <= 100
 
 
 def test_an_empty_mesh_scores_nothing() -> None:
-    scores = score_against_cloud(NOTHING, _grid(), ScoreSettings())
+    scores = score_mesh(NOTHING, _grid(), ScoreSettings())
     assert np.isnan(scores.accuracy_m)
     assert scores.completion_m == 2.0
     assert (scores.completion_ratio, scores.f_score, scores.samples) == (0.0, 0.0, 0)
-    exact = score_against_scene(NOTHING, GROUND, _grid(), ScoreSettings())
+    exact = score_mesh(NOTHING, _grid(), ScoreSettings(), GROUND.sdf)
     assert (exact.completion_ratio, exact.f_score, exact.samples) == (0.0, 0.0, 0)
 
 
 def test_scores_without_a_truth_are_refused() -> None:
     with pytest.raises(ValueError, match="no reference points"):
-        score_against_cloud(_plate(1.0, 1.0, 0.0), np.empty((0, 3)), ScoreSettings())
+        score_mesh(_plate(1.0, 1.0, 0.0), np.empty((0, 3)), ScoreSettings())

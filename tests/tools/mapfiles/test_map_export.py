@@ -134,5 +134,5 @@ def test_refusals(map_file, tmp_path, capsys):
     refused(".triquad, .ply, .glb, .obj, .stl, .png", "mesh.gltf")
     refused("--fill is of meshes that can mark it, .ply, .glb, .obj", "a.stl", "--fill", "1")
     refused("'6' is not a number in range: use 0 to 5", "mesh.ply", "--fill", "6")
-    refused("of map files", "mesh.ply", "--max-error", "2mm")
+    refused("of map files", "mesh.ply", "--max-error", "0.002")
     refused("nowhere is not a folder", "nowhere/mesh.ply")

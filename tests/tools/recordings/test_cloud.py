@@ -1,17 +1,11 @@
 import numpy as np
-from triquad_tools.recordings.cloud import is_withheld, merged, points_in_range, world_points
+from triquad_tools.recordings.cloud import merged, points_in_range, world_points
 from triquad_tools.sensors.sweep import PosedScan
-
-
-def test_the_last_of_every_few_scans_is_withheld() -> None:
-    assert [i for i in range(9) if is_withheld(i, 3)] == [2, 5, 8]
-    assert not any(is_withheld(i, 0) for i in range(9))
-    assert all(is_withheld(i, 1) for i in range(3))
 
 
 def test_points_out_of_range_are_left_out() -> None:
     points = np.array([[1, 0, 0], [0, 3, 0], [0, 0, -9], [np.nan, 0, 0]], np.float32)
-    np.testing.assert_array_equal(points_in_range(points, 2.0, 5.0), points[1:2])
+    np.testing.assert_array_equal(points_in_range(points, 2.0), points[1:3])
     np.testing.assert_array_equal(points_in_range(points, 0.0), points)
     assert points_in_range(points, 2.0).dtype == np.float32
 

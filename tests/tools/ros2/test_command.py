@@ -1,23 +1,18 @@
-"""The options of ``triquad-ros2`` and its file of settings."""
+"""The options of ``triquad-ros2`` and files of them."""
 
 from pathlib import Path
 
 import pytest
 from support import servers
 from triquad_tools.commands import ros2
-from triquad_tools.commands.ros2 import bridge_options
-from triquad_tools.console.command import BAD_INPUT, FAILED, ToolError
+from triquad_tools.commands.ros2 import bridge_options, parser
+from triquad_tools.console.command import BAD_INPUT, FAILED
 
 
-def of_file(folder: Path, text: str, *arguments: str) -> list[str]:
-    file = folder / "ros2.toml"
-    file.write_text(text)
-    return ["--settings", str(file), *arguments]
-
-
-def test_settings_of_a_file_are_options_and_the_command_line_goes_before(tmp_path: Path) -> None:
-    text = 'clouds = ["/a", "/b"]\nmap_frame = "/odom"\ngrid_height_m = -1.5\ndepth_stride = 4\n'
-    found = bridge_options(ros2.parsed(of_file(tmp_path, text, "--depth-stride", "8")))
+def test_a_file_stands_for_arguments(tmp_path: Path) -> None:
+    file = tmp_path / "robot.args"
+    file.write_text("--clouds\n/a\n/b\n--map-frame=/odom\n--grid-height-m=-1.5\n--depth-stride=4\n")
+    found = bridge_options(parser().parse_args([f"@{file}", "--depth-stride", "8"]))
     assert found.topics.clouds == ("/a", "/b")
     assert (found.scans.map_frame, found.scans.depth_stride) == ("odom", 8)
     assert found.grid.height_m == -1.5
@@ -25,21 +20,8 @@ def test_settings_of_a_file_are_options_and_the_command_line_goes_before(tmp_pat
 
 def test_the_domain_is_that_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", "42")
-    assert bridge_options(ros2.parsed([])).topics.domain == 42
-    assert bridge_options(ros2.parsed(["--domain", "7"])).topics.domain == 7
-
-
-@pytest.mark.parametrize(
-    ("text", "reason"),
-    [
-        ("colour = 3\n", "colour is no setting"),
-        ('serve = ["x"]\n', "serve is no setting"),
-        ("clouds = [\n", "ros2.toml: "),
-    ],
-)
-def test_a_file_with_other_things_in_it_is_refused(tmp_path: Path, text: str, reason: str) -> None:
-    with pytest.raises(ToolError, match=reason):
-        ros2.parsed(of_file(tmp_path, text))
+    assert bridge_options(parser().parse_args([])).topics.domain == 42
+    assert bridge_options(parser().parse_args(["--domain", "7"])).topics.domain == 7
 
 
 @pytest.mark.parametrize(

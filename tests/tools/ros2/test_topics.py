@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from support.ros.ros_messages import RosMessages
-from triquad_tools.commands.ros2 import bridge_options, parsed
+from triquad_tools.commands.ros2 import bridge_options, parser
 from triquad_tools.ros2.attachment import ATTACHMENT, SequenceGaps
 from triquad_tools.ros2.output.markers import Action, Marker
 from triquad_tools.ros2.topic_choice import Role, TopicChoice
@@ -79,7 +79,7 @@ def test_tokens_that_say_nothing_of_topics_are_left_alone(token: str) -> None:
 
 
 def choice(*arguments: str) -> TopicChoice:
-    return bridge_options(parsed(arguments)).topics
+    return bridge_options(parser().parse_args(arguments)).topics
 
 
 def test_options_choose_topics_with_and_without_slashes() -> None:

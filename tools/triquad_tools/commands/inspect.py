@@ -1,4 +1,4 @@
-"""``triquad-inspect``: what maps hold, whether their files are valid, how they differ, slices."""
+"""``triquad-inspect``: what maps hold, whether their files are valid, and how they differ."""
 
 import argparse
 from collections.abc import Sequence
@@ -7,9 +7,9 @@ from pathlib import Path
 
 from triquad_format.errors import DamagedMapFileError
 from triquad_format.mapfile.metadata import utc_time
-from triquad_format.mapfile.reader import MapFile
+from triquad_format.mapfile.reader import MapFile, read_map_file
 
-from triquad_tools.console.arguments import add_version, picture, positive
+from triquad_tools.console.arguments import add_version, picture
 from triquad_tools.console.command import FAILED, OK, ToolError, complain, refuse, run
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.progress import progress
@@ -17,18 +17,11 @@ from triquad_tools.console.report import json_text
 from triquad_tools.console.server_arguments import DEFAULT_MAP, add_config
 from triquad_tools.mapfiles.diff import compare, difference, print_diff
 from triquad_tools.mapfiles.object_changes import object_changes, print_objects
-from triquad_tools.mapfiles.source import (
-    Access,
-    chosen_file,
-    is_endpoint,
-    map_file,
-    read_whole,
-)
+from triquad_tools.mapfiles.source import SourceMap, is_endpoint, map_file
 from triquad_tools.mapfiles.store_log import print_log, read_log
 from triquad_tools.mapfiles.summary import print_summary, summarise
 
 _COMMAND = "triquad-inspect"
-_CELL_M = 0.1
 _TILE_LEAVES = 32  # along the side of a tile in which differences are counted
 
 
@@ -41,8 +34,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=_COMMAND,
-        description="Show what a map file holds, a folder's history, how two maps differ, or a "
-        "slice of a map. Map files are read in full and checked.",
+        description="Show what a map file holds, a folder's history, or how two maps differ. Map "
+        "files are read in full and checked.",
         epilog="Exit status: 0 valid, also where maps differ; 1 damaged, or the server failed; "
         "2 not readable (missing, or of a newer version), or wrong usage.",
     )
@@ -61,52 +54,37 @@ def _parser() -> argparse.ArgumentParser:
     add("--at", metavar="EPOCH_OR_TIME", help=at + "2026-01-31T12:00:00Z")
     add("--log", action="store_true", help="list the checkpoints in the folder FILE")
     add("--diff", action="store_true", help="compare two map files, A and B")
-    plot = "draw a plan of the map(s), or the slice"
+    plot = "draw a picture of the map, or plans of the difference"
     add("--plot", type=picture, metavar="OUT.png", help=plot)
     add("--json", action="store_true", help="print JSON")
-    add = parser.add_argument_group("slices").add_argument
-    height = "draw distance and status at this height, metres, into --plot"
-    add("--slice", type=float, metavar="Z", help=height)
-    sides = ("WEST", "SOUTH", "EAST", "NORTH")
-    box = "what it shows, metres, map frame (default: all that a file has seen)"
-    add("--box", type=float, nargs=4, metavar=sides, help=box)
-    add("--cell", type=positive, metavar="M", help=f"side of its cells (default: {_CELL_M:g})")
     add_version(parser)
     return parser
 
 
 def _check_usage(options: argparse.Namespace) -> None:
     """Refuse what does not go together."""
-    given, plot, sliced = len(options.files), options.plot, options.slice is not None
-    many = options.log or options.diff
+    given = len(options.files)
     problems = {
         "--log and --diff exclude each other": options.log and options.diff,
         f"--diff compares two map files: {given} given": options.diff and given != 2,
         f"only --diff takes more than one file: {given} given": not options.diff and given > 1,
-        "--at is for one map, not for --log or --diff": options.at and many,
-        "--slice needs --plot OUT.png": sliced and not plot,
-        "--slice excludes --log, --diff and --json": sliced and (many or options.json),
-        "--box and --cell go with --slice": (options.box or options.cell) and not sliced,
+        "--at is for one map, not for --log or --diff": (
+            options.at and (options.log or options.diff)
+        ),
         "--map and --config are of a server, and none is given": (
             (options.map or options.config)
             and not any(is_endpoint(str(path)) for path in options.files)
         ),
-        "--plot is for map files, not for --log": options.log and plot,
+        "--plot is for map files, not for --log": options.log and options.plot,
     }
     refuse(problems)
 
 
 def _inspect(options: argparse.Namespace) -> int:
     _check_usage(options)
-    if options.slice is not None:
-        return _slice(options)
     if options.log:
         return _log(options)
     return _diff(options) if options.diff else _show(options)
-
-
-def _access(options: argparse.Namespace) -> Access:
-    return Access(options.map or DEFAULT_MAP, options.config)
 
 
 def _show(options: argparse.Namespace) -> int:
@@ -114,25 +92,13 @@ def _show(options: argparse.Namespace) -> int:
     name, file = _read(options, str(options.files[0]))
     summary = summarise(file)
     if options.plot:
-        from triquad_tools.plots.map_plan import draw_map  # slow to import
+        from triquad_tools.mapping.output import export  # slow to import
 
-        draw_map(_title(name, file), file.record, options.plot)
+        export(SourceMap(file.record, file.manifest.stamp_ns or None), options.plot)
     if options.json:
         print_line(json_text(summary))
     else:
         print_summary(name, summary)
-    return OK
-
-
-def _slice(options: argparse.Namespace) -> int:
-    """Draw one layer of a map, of a file or of a server."""
-    from triquad_tools.plots.slice_plan import SliceOptions, draw_slice  # slow to import
-
-    wanted = SliceOptions(options.slice, options.box, options.cell or _CELL_M)
-    target = str(options.files[0])
-    if not is_endpoint(target):
-        target = str(chosen_file(Path(target), options.at))
-    draw_slice(target, _access(options), wanted, path=options.plot)
     return OK
 
 
@@ -177,8 +143,9 @@ def _diff(options: argparse.Namespace) -> int:
 
 def _read(options: argparse.Namespace, target: str) -> tuple[str, MapFile]:
     """Return the map of a file, a folder or a server, and what it is called."""
-    with map_file(target, _access(options), options.at) as path:
-        return target if is_endpoint(target) else str(path), read_whole(path)
+    map_name = options.map or DEFAULT_MAP
+    with map_file(target, map_name, options.config, when=options.at) as path:
+        return target if is_endpoint(target) else str(path), read_map_file(path)
 
 
 def _title(name: str, file: MapFile) -> str:

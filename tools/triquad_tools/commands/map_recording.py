@@ -1,7 +1,7 @@
 """``triquad-map``: a recording in, a map out."""
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -10,7 +10,6 @@ from triquad_server.device import choose_device
 from triquad_server.errors import StoreError
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.process.threads import Teams
-from triquad_server.settings import Settings
 from triquad_server.settings.loading import PRESETS, load_settings
 from triquad_server.warm_up import warm_up
 
@@ -18,7 +17,7 @@ from triquad_tools.console.arguments import add_version
 from triquad_tools.console.command import OK, ToolError, run
 from triquad_tools.console.lines import print_line, print_remark
 from triquad_tools.console.progress import progress
-from triquad_tools.mapping.mapping_run import MappingRun, stop_requests
+from triquad_tools.mapping.mapping_run import MappingRun
 from triquad_tools.mapping.output import SUFFIXES, check_target, write_output
 from triquad_tools.mapping.unfinished import UnfinishedMap, mapping_key
 from triquad_tools.recordings.arguments import add_recording
@@ -30,7 +29,7 @@ _COMMAND = "triquad-map"
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool: 0 done, 1 nothing could be written, 2 bad input, 130 interrupted."""
     work = partial(_map, _parser().parse_args(argv))
-    interrupted = "interrupted; the same command goes on where it was"
+    interrupted = "interrupted; the same command goes on where the map was saved last"
     return run(_COMMAND, work, failures=(StoreError,), interrupted=interrupted)
 
 
@@ -41,17 +40,15 @@ def _map(options: argparse.Namespace) -> int:
     device = choose_device(options.device)
     selection = open_selected(options)
     key = mapping_key(selection, settings)
-    with (
-        stop_requests() as stop,
-        closing(UnfinishedMap(output, key)) as unfinished,
-        closing(Teams()) as teams,
-    ):
-        _prepare(settings, device, teams, stop=stop.is_set)
+    with closing(UnfinishedMap(output, key)) as unfinished, closing(Teams()) as teams:
+        # The first time all kernels are compiled, which takes half a minute or more.
+        with progress("preparing") as report:
+            warm_up(settings, device, teams, report=lambda stage: report(0.0, stage))
         mapper = unfinished.resumed(settings, device, teams)
         taken = unfinished.scans_taken
         if taken:
             print_line(f"going on after scan {taken}, from {unfinished.folder}")
-        mapping = MappingRun(mapper, unfinished, settings, stop=stop.is_set)
+        mapping = MappingRun(mapper, unfinished, settings)
         mapping.take(selection, taken)
         _check_result(mapper, mapping, selection)
         mapping.settle()  # which saves the map, should the output not be written
@@ -68,22 +65,6 @@ def _map(options: argparse.Namespace) -> int:
     unfinished.remove()
     print_line(f"{output}: {written}")
     return OK
-
-
-def _prepare(settings: Settings, device: str, teams: Teams, *, stop: Callable[[], bool]) -> None:
-    """Have all kernels compiled, which takes half a minute or more the first time.
-
-    Raises:
-        KeyboardInterrupt: the user wants to stop.
-    """
-    with progress("preparing") as report:
-
-        def begin(stage: str) -> None:
-            if stop():
-                raise KeyboardInterrupt
-            report(0.0, stage)
-
-        warm_up(settings, device, teams, report=begin)
 
 
 def _check_result(mapper: Mapper, mapping: MappingRun, selection: Selection) -> None:

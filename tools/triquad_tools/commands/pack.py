@@ -13,10 +13,10 @@ from triquad_format.mapfile.parts.part import EVIDENCE, REGION, TRAINING, VERTIC
 from triquad_format.recovery.recovered_map import Loss, RecoveredMap, recover
 from triquad_format.wire.limits import MAX_FILL_M
 
-from triquad_tools.console.arguments import add_version, error_limit, within
+from triquad_tools.console.arguments import add_version, within
 from triquad_tools.console.command import FAILED, OK, ToolError, refuse, run
 from triquad_tools.console.lines import print_line
-from triquad_tools.mapfiles.packing import DTYPES, pack_map
+from triquad_tools.mapfiles.packing import pack_map
 from triquad_tools.mapfiles.source import (
     Box,
     NothingLeftError,
@@ -33,6 +33,7 @@ _DAMAGE = (DamagedMapFileError, NothingLeftError)
 _MARKED = (".ply", ".glb", ".obj")  # meshes that can show which faces fill holes
 _PLANES = ("XY", "XZ", "YZ")
 _CELL_RANGE_M = (0.01, 10.0)
+_ERROR_RANGE_M = (1e-5, 0.1)
 _MARGIN_M = 3.2  # so far around its box a map is needed for a mesh of cells of 0.2 m
 _MARGIN_CELLS = 16  # or of larger ones
 
@@ -69,12 +70,9 @@ def _add_source(add: _Add) -> None:
 
 
 def _add_content(add: _Add) -> None:
-    add("--precision", choices=tuple(DTYPES), help="of features (default: as in IN)")
-    error = (
-        "features as coarse integers as move 99 %% of distances by less than this, such as 2mm; "
-    )
-    error += "drops training state"
-    add("--max-error", type=error_limit, metavar="LENGTH", help=error)
+    error = "features as coarse integers as move 99 %% of distances by less than this, such as "
+    error += "0.002; drops training state"
+    add("--max-error", type=partial(within, *_ERROR_RANGE_M), metavar="M", help=error)
     corners = ("XMIN", "YMIN", "ZMIN", "XMAX", "YMAX", "ZMAX")
     box = "keep what answers in this box need, metres, map frame; only that is read, unless IN has "
     box += "training state that is kept"
@@ -115,16 +113,12 @@ def _pack(options: argparse.Namespace) -> int:
 def _check_usage(options: argparse.Namespace) -> None:
     """Refuse options that do not go together."""
     suffix = options.output.suffix
-    rounds = options.precision or options.max_error
     problems = {
         f"{options.input} is a server: give its store, or what client.download_map saved": (
             is_endpoint(str(options.input))
         ),
-        f"--precision and --max-error are of map files: {suffix} has none": (
-            rounds and suffix != MAP_SUFFIX
-        ),
-        f"--max-error makes integers: leave out --precision {options.precision}": (
-            options.max_error and options.precision
+        f"--max-error is of map files: {suffix} has none": (
+            options.max_error and suffix != MAP_SUFFIX
         ),
         "--cell is of meshes: a map file has none": options.cell and suffix == MAP_SUFFIX,
         f"--fill is of meshes that can mark it, {', '.join(_MARKED)}": (
@@ -151,7 +145,6 @@ def _pack_map(options: argparse.Namespace, path: Path) -> int:
     written = pack_map(
         source,
         options.output,
-        precision=options.precision,
         max_error_m=options.max_error,
         bytes_before=_bytes_of(path),
     )

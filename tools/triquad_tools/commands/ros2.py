@@ -7,10 +7,9 @@ import re
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from functools import partial
-from pathlib import Path
 
 from triquad_client import Client, ConnectError, UnknownMapError, connect
 
@@ -31,11 +30,6 @@ from triquad_tools.ros2.session import open_session
 from triquad_tools.ros2.topic_choice import TF_POSES, TopicChoice
 from triquad_tools.sensors.ros.header import frame_name
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
 _COMMAND = "triquad-ros2"
 _RETRY_S = 0.5  # while the server starts
 _TELL_S = 30.0  # after which the log says why it cannot be reached, and again
@@ -47,24 +41,10 @@ _log = logging.getLogger("triquad_ros2")
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool: 0 stopped, 1 the server failed, 2 wrong usage; with --serve, as the server."""
     start_log("ros2")
-    return run(_COMMAND, partial(_run, sys.argv[1:] if argv is None else argv))
+    return run(_COMMAND, partial(_run, parser().parse_args(argv)))
 
 
-def parsed(argv: Sequence[str]) -> argparse.Namespace:
-    """Return the options of a command line, over those of the file of settings that it names.
-
-    Raises:
-        ToolError: the file is no TOML, or a name in it is not that of an option.
-    """
-    parser = _parser()
-    options = parser.parse_args(argv)
-    if options.settings is None:
-        return options
-    return parser.parse_args([*_of_file(options.settings, options), *argv])
-
-
-def _run(argv: Sequence[str]) -> int:
-    options = parsed(argv)
+def _run(options: argparse.Namespace) -> int:
     asked = bridge_options(options)
     server: ServerProcess | None = None
     by_signal = FAILED
@@ -157,33 +137,18 @@ def bridge_options(options: argparse.Namespace) -> BridgeOptions:
     )
 
 
-def _of_file(path: Path, known: argparse.Namespace) -> Iterator[str]:
-    """Yield the settings of a file, as arguments."""
-    try:
-        settings = tomllib.loads(path.read_text())
-    except ValueError as error:
-        raise ToolError(f"{path}: {error}") from error
-    for name, value in settings.items():
-        if name not in vars(known) or name in ("settings", "serve"):
-            raise ToolError(f"{path}: {name} is no setting: see triquad-ros2 --help")
-        option = f"--{name.replace('_', '-')}"
-        if isinstance(value, list):
-            yield option
-            yield from map(str, value)
-        else:
-            yield f"{option}={value}"
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line; ``@FILE`` stands for what a file has, line by line."""
+    made = argparse.ArgumentParser(
         prog=_COMMAND,
+        fromfile_prefix_chars="@",
         description="Map the clouds and depth images of a robot with ROS 2 (rmw_zenoh or "
         "zenoh-bridge-ros2dds), and publish the map's mesh and an occupancy grid to it: "
-        "docs/guides/ros2.md.",
+        "docs/guides/ros2.md. @FILE stands for the arguments in a file, one a line.",
         epilog="Exit status: 0 stopped by Ctrl-C or SIGTERM, 1 there is no such server, 2 wrong "
         "usage; with --serve, that of triquad-server where it is not 0.",
     )
-    add = parser.add_argument
+    add = made.add_argument
     add(
         "--serve",
         nargs=argparse.REMAINDER,
@@ -191,17 +156,16 @@ def _parser() -> argparse.ArgumentParser:
         help="run a map server, too, which is the router of the nodes; what follows are arguments "
         "of triquad-server, such as --store maps --preset indoor",
     )
-    add("--settings", type=Path, metavar="FILE", help="TOML: options by their names, as map_frame")
     add(
         "--router",
         metavar="ENDPOINT",
         help="of the nodes (default: that of --config or --serve, or tcp/127.0.0.1:7447)",
     )
-    add_server(parser)
-    _add_topics(parser.add_argument_group("what is taken in"))
-    _add_outputs(parser.add_argument_group("what is published, while somebody subscribes"))
-    add_version(parser)
-    return parser
+    add_server(made)
+    _add_topics(made.add_argument_group("what is taken in"))
+    _add_outputs(made.add_argument_group("what is published, while somebody subscribes"))
+    add_version(made)
+    return made
 
 
 def _add_topics(group: argparse._ArgumentGroup) -> None:

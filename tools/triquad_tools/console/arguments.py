@@ -2,14 +2,10 @@
 
 import argparse
 import math
-import re
 from functools import partial
 from pathlib import Path
 
 import triquad_format
-
-_PER_METRE = {"mm": 1000.0, "cm": 100.0, "m": 1.0}
-_LEAST_ERROR_M, _LARGEST_ERROR_M = 1e-5, 0.1
 
 
 def add_version(parser: argparse.ArgumentParser) -> None:
@@ -47,19 +43,6 @@ def picture(text: str) -> Path:
         kind = "it is a folder" if path.is_dir() else "its folder does not exist"
         raise argparse.ArgumentTypeError(f"{text}: {kind}")
     return path
-
-
-def error_limit(text: str) -> float:
-    """Return a length with its unit, such as ``2mm``, in metres: 0.01 mm to 10 cm."""
-    match = re.fullmatch(r"([0-9]*\.?[0-9]+)(mm|cm|m)", text)
-    if match is None:
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not a length with its unit: use 2mm, 0.2cm or 0.002m"
-        )
-    metres = float(match[1]) / _PER_METRE[match[2]]
-    if not _LEAST_ERROR_M <= metres <= _LARGEST_ERROR_M:
-        raise argparse.ArgumentTypeError(f"{text} is out of range: use 0.01mm to 10cm")
-    return metres
 
 
 def whole(least: int, most: int | None, text: str) -> int:

@@ -28,25 +28,12 @@ def progress(title: str, total: float | None = None) -> AbstractContextManager[R
 @contextmanager
 def _bar(title: str, total: float | None) -> Iterator[Report]:
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        Progress,
-        SpinnerColumn,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich.markup import escape
+    from rich.progress import Progress, TextColumn
 
-    columns = (
-        SpinnerColumn(),
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}", markup=False),
-    )
+    columns = *Progress.get_default_columns(), TextColumn("{task.fields[note]}", markup=False)
     with Progress(*columns, console=Console(stderr=True)) as bars:
-        task = bars.add_task(printable(title), total=total, note="")
+        task = bars.add_task(escape(printable(title)), total=total, note="")
 
         def report(done: float, note: str) -> None:
             bars.update(task, completed=done, note=printable(note))

@@ -1,12 +1,13 @@
 """The measurements of the demonstration, as a table, and the promises about them."""
 
+import math
 from dataclasses import dataclass
 
+from triquad_format.wire.messages import FieldFit
+
+from triquad_tools.console.amounts import millimetres
 from triquad_tools.console.report import Row
 from triquad_tools.demo.probe import ProbeReport
-from triquad_tools.evaluation.map_scores import StreetScores
-from triquad_tools.evaluation.metrics import MeshScores
-from triquad_tools.evaluation.score_rows import mesh_rows, street_rows
 
 
 @dataclass(frozen=True)
@@ -30,39 +31,33 @@ class DemoResults:
     seed: int
     intake: Intake
     queries: ProbeReport
-    street: StreetScores
-    mesh: MeshScores
+    fit: FieldFit | None  # to rays that were never trained on; None: there are too few
     map_bytes: int  # of the map file
     parameters: int
+    faces: int  # of the mesh
 
 
 def broken_promises(results: DemoResults) -> list[str]:
-    """Return a line for each promise of the README that was not kept, with value and limit."""
-    street, intake, queries = results.street, results.intake, results.queries
-    at_least = {
-        "mesh F-score": (results.mesh.f_score, 0.95),
-        "houses UNKNOWN": (street.houses_unknown_ratio, 0.98),
-    }
+    """Return a line for each promise that was not kept, with value and limit."""
+    intake, queries, fit = results.intake, results.queries, results.fit
     at_most = {
-        "SDF error (m)": (street.sdf_error_m, 0.02),
-        "gradient angle (deg)": (street.gradient_angle_deg, 12.0),
+        "error at held-out rays (m)": (math.nan if fit is None else fit.median_m, 0.01),
         "scans lost or refused": (intake.lost + intake.refused, 0),
         "query errors": (queries.errors, 0),
         "answers from an older epoch": (queries.epochs_backwards, 0),
     }
     return [
-        f"{name} is {value:.4g}; promised is {bound} {limit:g}"
-        for bound, sign, promises in (("at least", 1, at_least), ("at most", -1, at_most))
-        for name, (value, limit) in promises.items()
-        if not sign * value >= sign * limit  # NaN keeps no promise
+        f"{name} is {value:.4g}; promised is at most {limit:g}"
+        for name, (value, limit) in at_most.items()
+        if not value <= limit  # NaN keeps no promise
     ]
 
 
 def table_rows(results: DemoResults) -> list[Row]:
     """Return the results as lines of a table."""
-    intake, queries = results.intake, results.queries
+    intake, queries, fit = results.intake, results.queries, results.fit
     end = "until nothing was left to learn" if intake.settled else "cut off; still learning"
-    return [
+    rows = [
         Row(
             "scans taken in",
             f"{intake.taken / max(intake.seconds, 1e-9):.1f} /s",
@@ -79,11 +74,14 @@ def table_rows(results: DemoResults) -> list[Row]:
             f"median of {queries.queries:,} while training; 99 %: {queries.latency_p99_ms:.1f} ms, "
             f"longest {queries.latency_max_ms:.1f} ms, {queries.errors} errors",
         ),
-        *street_rows(results.street),
-        *(Row(f"mesh {row.name}", row.value, row.note) for row in mesh_rows(results.mesh)),
         Row(
             "map file",
             f"{results.map_bytes / 1e6:.2f} MB",
             f"{results.parameters / 1e6:.2f} M parameters",
         ),
+        Row("mesh", f"{results.faces:,}", "faces"),
     ]
+    if fit is not None:
+        note = f"90 % in {millimetres(fit.upper_m)}, of {fit.rays:,} rays that were never learnt"
+        rows.insert(3, Row("error at held-out rays", millimetres(fit.median_m), note))
+    return rows

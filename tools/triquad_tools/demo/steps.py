@@ -1,25 +1,19 @@
 """The steps of the demonstration, each against a running server."""
 
 import time
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from triquad_client import Client, Mesh, connect
+from triquad_client import Client, Mesh
+from triquad_format.records.arrays import Doubles
 
 from triquad_tools.console.progress import progress
-from triquad_tools.demo.probe import Probe, ProbeReport
-from triquad_tools.demo.results import Intake
-from triquad_tools.evaluation.map_scores import DrivenStreet, StreetScores, score_street
-from triquad_tools.evaluation.metrics import (
-    STREET_VOXEL_M,
-    MeshScores,
-    ScoreSettings,
-    score_against_scene,
-    scored_box,
-)
+from triquad_tools.demo.probe import Probe
+from triquad_tools.demo.results import DemoResults, Intake
 from triquad_tools.plots.picture import draw_mesh
 from triquad_tools.recordings.publishing import publish_all, wait_until_settled
+from triquad_tools.simulation.lidar import SimulatedDrive, SimulatedScan
 
 MAP = "demo"
 
@@ -28,55 +22,55 @@ _SETTLE_LIMIT_S = 70.0
 _QUERY_POINTS = 1_000
 
 
-@dataclass(frozen=True)
-class Learnt:
-    """The results of a server that integrated a street while it was queried."""
+def demonstrate(client: Client, endpoint: str, drive: SimulatedDrive, out: Path) -> DemoResults:
+    """Have a server learn a drive while another process asks it; leave the map in a folder.
 
-    intake: Intake
-    queries: ProbeReport
-
-
-@dataclass(frozen=True)
-class Scored:
-    """The map against the exact street."""
-
-    street: StreetScores
-    mesh: MeshScores
-    parameters: int
-
-
-def learn(endpoint: str, street: DrivenStreet) -> Learnt:
-    """Stream the scans and wait until they are learnt, while another process asks."""
-    points = np.random.default_rng(_SEED).permutation(street.probes.near)[:_QUERY_POINTS]
-    with connect(endpoint, MAP) as client, Probe(endpoint, MAP, points) as probe:
-        intake = _stream(client, street)
-        return Learnt(intake, probe.finish())
-
-
-def score(endpoint: str, street: DrivenStreet, out: Path) -> Scored:
-    """Compare the map with the exact street; leave the map, its mesh and a picture in a folder."""
-    settings, visible = ScoreSettings(), street.drive.true_hits(STREET_VOXEL_M)
-    with connect(endpoint, MAP) as client, progress("scoring") as report:
-        report(0.0, "distances")
-        field = score_street(client.query_sdf, street.probes)
-        report(0.0, "mesh")
-        surface = client.mesh(scored_box(visible, settings))
+    Raises:
+        ToolError, TriquadError, OSError: a step failed.
+    """
+    scans = _simulated(drive)
+    with Probe(endpoint, MAP, _asked(scans)) as probe:
+        intake = _learnt(client, scans)
+        queries = probe.finish()
+    with progress("fetching the map and its mesh"):
         client.download_map(out / "map.triquad")
-        parameters = client.status().parameters
-        report(0.0, "mesh against the exact surface")
-        scores = score_against_scene(surface, street.drive.scene, visible, settings)
-        report(0.0, f"{scores.samples:,} samples of the mesh")
+        surface = client.mesh(drive.scene.box)
     _draw(surface, out)
-    return Scored(field, scores, parameters)
+    status = client.status()
+    return DemoResults(
+        drive.seed,
+        intake,
+        queries,
+        status.fit,
+        map_bytes=(out / "map.triquad").stat().st_size,
+        parameters=status.parameters,
+        faces=len(surface.faces),
+    )
 
 
-def _stream(client: Client, street: DrivenStreet) -> Intake:
+def _simulated(drive: SimulatedDrive) -> list[SimulatedScan]:
+    scans: list[SimulatedScan] = []
+    with progress("simulating the drive", len(drive)) as report:
+        for scan in drive:
+            scans.append(scan)
+            report(len(scans), f"{len(scans)} of {len(drive)} scans")
+    return scans
+
+
+def _asked(scans: Sequence[SimulatedScan]) -> Doubles:
+    """Return points [N, 3] of surface along the drive, as a planner asks for."""
+    hits = np.concatenate([scan.true_hits for scan in scans])
+    return np.random.default_rng(_SEED).choice(hits, _QUERY_POINTS)
+
+
+def _learnt(client: Client, scans: Sequence[SimulatedScan]) -> Intake:
+    """Stream the scans and wait until they are learnt."""
     started = time.monotonic()
-    flush = publish_all(client, street.scans)
+    flush = publish_all(client, scans)
     taken_in = time.monotonic()
     status = wait_until_settled(client, _SETTLE_LIMIT_S)
     return Intake(
-        scans=len(street.scans),
+        scans=len(scans),
         taken=flush.taken,
         refused=flush.refused,
         lost=flush.lost,

@@ -6,6 +6,7 @@ bounding box are left out, and so are those farther from the truth than the accu
 count in ``outlier_ratio`` alone.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,10 +16,6 @@ from triquad_client import Mesh
 from triquad_format.records.arrays import Doubles
 
 from triquad_tools.recordings.cloud import thin
-from triquad_tools.simulation.scene import Scene
-
-STREET_VOXEL_M = 0.05
-"""The spacing of the points of a simulated street that completion asks for."""
 
 
 @dataclass(frozen=True)
@@ -48,47 +45,33 @@ class MeshScores:
     references: int  # points of the truth
 
 
-def score_against_cloud(mesh: Mesh, reference: Doubles, settings: ScoreSettings) -> MeshScores:
-    """Return scores of a mesh against a cloud ``[M, 3]`` of true surface points, metres.
-
-    The spacing of the cloud bounds the accuracy from below: a cloud of 3 cm spacing shows no
-    mesh as better than about 1.5 cm.
-    """
-    points = _thinned(reference, settings)
-    samples = _samples(mesh, points, settings)
-    distances = _nearest(points, samples, settings.accuracy_cut_m)
-    return _scores(distances, samples, points, settings)
-
-
-def score_against_scene(
-    mesh: Mesh, scene: Scene, visible: Doubles, settings: ScoreSettings
+def score_mesh(
+    mesh: Mesh,
+    reference: Doubles,
+    settings: ScoreSettings,
+    distance: Callable[[Doubles], Doubles] | None = None,
 ) -> MeshScores:
-    """Return scores of a mesh against an exact scene, without the floor that a cloud has.
+    """Return scores of a mesh.
+
+    The spacing of the reference bounds the accuracy from below: a cloud of 3 cm spacing shows no
+    mesh as better than about 1.5 cm.
 
     Args:
-        mesh: in the frame of the scene.
-        scene: gives the exact distance of each sample of the mesh.
-        visible: ``[M, 3]`` exact surface points that the sensor has seen, which the mesh should
-            have (see :meth:`triquad_tools.simulation.lidar.SimulatedDrive.true_hits`).
+        mesh: in the frame of the reference.
+        reference: ``[M, 3]`` true surface points, metres, which the mesh should have.
         settings: thresholds.
+        distance: returns how far points ``[N, 3]`` are from the truth, where that is known exactly;
+            ``None``: how far from the reference.
     """
-    points = _thinned(visible, settings)
-    samples = _samples(mesh, points, settings)
-    return _scores(np.abs(scene.sdf(samples)), samples, points, settings)
-
-
-def median_angle_deg(one: NDArray[np.floating], other: NDArray[np.floating]) -> float:
-    """Return the median of the angles between vectors ``[N, 3]``; NaN where there are none."""
-    lengths = np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
-    cosines = np.einsum("ni,ni->n", one, other) / np.maximum(lengths, 1e-12)
-    angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
-    return float(np.median(angles)) if len(angles) else float("nan")
-
-
-def _thinned(reference: Doubles, settings: ScoreSettings) -> Doubles:
     if len(reference) == 0:
         raise ValueError("no reference points to score against")
-    return thin(np.asarray(reference, np.float64), settings.voxel_m)
+    points = thin(np.asarray(reference, np.float64), settings.voxel_m)
+    samples = _samples(mesh, points, settings)
+    if distance is None:
+        distances = _nearest(points, samples, settings.accuracy_cut_m)
+    else:
+        distances = np.abs(distance(samples))
+    return _scores(distances, samples, points, settings)
 
 
 def _samples(mesh: Mesh, reference: Doubles, settings: ScoreSettings) -> Doubles:
@@ -101,12 +84,12 @@ def _samples(mesh: Mesh, reference: Doubles, settings: ScoreSettings) -> Doubles
     if count == 0:
         return np.empty((0, 3))
     samples = trimesh.sample.sample_surface(surface, count, seed=settings.seed)[0]
-    low, high = np.array(scored_box(reference, settings))
+    low, high = np.array(_scored_box(reference, settings))
     inside = ((samples >= low) & (samples <= high)).all(axis=1)
     return thin(samples[inside], settings.voxel_m)
 
 
-def scored_box(reference: Doubles, settings: ScoreSettings) -> tuple[list[float], list[float]]:
+def _scored_box(reference: Doubles, settings: ScoreSettings) -> tuple[list[float], list[float]]:
     """Return the lower and upper corner of the truth's box, in which a mesh is scored, metres.
 
     It is grown by the accuracy's cut: a level road is the very bottom of its box, and samples just

@@ -1,16 +1,12 @@
-"""Meshes in files, PLY, GLB, OBJ and STL: read, and written of a map."""
+"""Meshes in files, PLY, GLB, OBJ and STL."""
 
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from triquad_client import Mesh, OfflineMap
-from triquad_format.mapfile.durable_file import replacing
-from triquad_format.records.region import MapRecord
+from triquad_client import Mesh
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.console.progress import progress
-from triquad_tools.mapfiles.source import Box, NothingLeftError
 
 MESH_SUFFIXES = (".ply", ".glb", ".obj", ".stl")
 
@@ -43,39 +39,3 @@ def read_mesh(path: Path) -> Mesh:
     if path.suffix == ".glb":
         vertices = vertices @ _GLTF_FROM_MAP
     return Mesh(vertices, faces)
-
-
-def meshed(record: MapRecord, box: Box | None, cell_m: float | None, fill_m: float = 0.0) -> Mesh:
-    """Return the mesh of a map, with cells of side ``cell_m``, half a leaf where that is not given.
-
-    Given a box, it has the faces whose centroids lie in it. Surface is continued up to ``fill_m``
-    into unknown space.
-
-    Raises:
-        InvalidInputError: the mesh is too large, or a library is missing.
-    """
-    bounds = None if box is None else (box[0].tolist(), box[1].tolist())
-    with OfflineMap(record) as opened, progress("meshing", 1.0) as report:
-        return opened.mesh(
-            bounds, cell_m, lambda done, of: report(done / of, f"{done} blocks"), fill_m
-        )
-
-
-def export_mesh(
-    record: MapRecord, box: Box | None, cell_m: float | None, path: Path, fill_m: float = 0.0
-) -> str:
-    """Write the mesh of a map, see :func:`meshed`; return what was written.
-
-    Raises:
-        InvalidInputError: the mesh is too large, or a library is missing.
-        NothingLeftError: no surface was seen in the box.
-        OSError: the file cannot be written.
-    """
-    mesh = meshed(record, box, cell_m, fill_m)
-    if box is not None and len(mesh.faces) == 0:
-        raise NothingLeftError(f"{path} is not written: no surface was seen in the box of --crop")
-    packed = mesh.file_bytes(path.suffix)
-    with replacing(path) as stream:
-        stream.write(packed)
-    written = f"{len(packed):,} bytes, {len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces"
-    return written if mesh.filled is None else f"{written}, {mesh.filled.sum():,} of them filled"

@@ -6,33 +6,21 @@ from triquad_format.mapfile.writer import Previews, write_map
 from triquad_format.records.region import MapRecord
 
 from triquad_tools.console.lines import print_remark
-from triquad_tools.mapfiles.quantise import FieldChange, dequantised, quantise
+from triquad_tools.mapfiles.quantise import FieldChange, quantise
 from triquad_tools.mapfiles.source import SourceMap
 
-DTYPES = {"fp16": "<f2", "fp32": "<f4"}
-"""The ways to store features as floats."""
 
-
-def pack_map(
-    source: SourceMap,
-    path: Path,
-    *,
-    precision: str | None,
-    max_error_m: float | None,
-    bytes_before: int,
-) -> str:
+def pack_map(source: SourceMap, path: Path, *, max_error_m: float | None, bytes_before: int) -> str:
     """Write a map file; return its size, and how far distances moved.
 
     Args:
         source: the map.
         path: the file to write.
-        precision: features as floats of :data:`DTYPES`; ``None``: as they are.
-        max_error_m: features as integers within this error; ``None``: no new integers.
+        max_error_m: features as integers within this error; ``None``: as they are.
         bytes_before: to which the size is compared.
 
     Raises:
-        FormatError: integers change distances by more than the limit, or features do not fit the
-            dtype.
+        FormatError: integers change distances by more than the limit.
         OSError: the file cannot be written.
     """
     record, change = source.record, None
@@ -41,10 +29,7 @@ def pack_map(
             print_remark("triquad-pack: features are integers already: both errors add up")
         packed = quantise(record, max_error_m)
         record, change = packed.record, packed.change
-    elif precision is not None:
-        record = dequantised(record)
-    dtype = DTYPES[precision or _precision(record)]
-    stamp_ns = source.stamp_ns
+    stamp_ns, dtype = source.stamp_ns, _feature_dtype(record)
     previews = _previews(record, stamp_ns)
     info = write_map(record, path, feature_dtype=dtype, stamp_ns=stamp_ns, previews=previews)
     size = f"{info.bytes:,} bytes, {info.bytes / bytes_before:.0%} of {bytes_before:,}"
@@ -52,13 +37,9 @@ def pack_map(
 
 
 def _told(change: FieldChange) -> str:
-    surface, near, free, largest = (
-        f"{1e3 * metres:.2f} mm"
-        for metres in (change.surface_m, change.near_m, change.free_m, change.largest_m)
-    )
+    most, largest = (f"{1e3 * one:.2f} mm" for one in (change.quantile_m, change.largest_m))
     return (
-        f"  99 % of distances moved by less than {surface} at surface, {near} near it, {free} in "
-        f"free space; the most by {largest}\n"
+        f"  99 % of distances near surface moved by less than {most}, the most by {largest}\n"
         "  without training state: it does not fit rounded features"
     )
 
@@ -78,8 +59,7 @@ def _previews(record: MapRecord, stamp_ns: int | None) -> Previews | None:
     return previews_of(record, stamp_ns=stamp_ns)
 
 
-def _precision(record: MapRecord) -> str:
+def _feature_dtype(record: MapRecord) -> str:
     """Return what keeps all float features as they are."""
     tables = [table for region in record.regions for table in region.tables if len(table.codes)]
-    wide = any(table.features.dtype.str == DTYPES["fp32"] for table in tables)
-    return "fp32" if wide else "fp16"
+    return "<f4" if any(table.features.dtype.str == "<f4" for table in tables) else "<f2"

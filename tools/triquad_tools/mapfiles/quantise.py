@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from triquad_format.errors import FormatError
 from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.records.region import MAX_INTEGER, MapRecord, VertexTable, seen_voxels
@@ -26,25 +25,16 @@ _CLOSE, _AIM = 0.97, 0.985  # of the limit within that margin: where the search 
 _EVALUATIONS_MAX = 16
 _GROWTH_MAX = 8.0  # of the steps from one evaluation to the next
 
-_PROBES, _LEAST_PROBES = 20_000, 1_000  # points of each kind, and at least in each region
-_SURFACE_LEAVES = 1.0  # status SURFACE: half a leaf around the voxel's own half
-_NEAR_LEAVES = 1.5
-_FREE_LEAVES = 0.5
+_PROBES, _LEAST_PROBES = 40_000, 2_000  # points in all, and at least in each region
+_NEAR_LEAVES = 1.5  # of these points, from the middle of a surface voxel, on each axis
 
 
 @dataclass(frozen=True)
 class FieldChange:
-    """Magnitudes of the change of the distance, metres."""
+    """Magnitudes of the change of the distance near surface, metres."""
 
-    surface_m: float  # 99 % quantile where the status is SURFACE
-    near_m: float  # up to 1.5 leaves from the centre of a surface voxel, on each axis
-    free_m: float  # in voxels that a ray passed through
-    largest_m: float  # of all points
-
-    @property
-    def quantile_m(self) -> float:
-        """The largest of the three quantiles."""
-        return max(self.surface_m, self.near_m, self.free_m)
+    quantile_m: float  # what 99 of 100 keep below
+    largest_m: float
 
 
 @dataclass(frozen=True)
@@ -57,8 +47,6 @@ class QuantisedMap:
 
 def quantise(record: MapRecord, max_error_m: float) -> QuantisedMap:
     """Return the coarsest integer features of which 99 of 100 distances are off by ``max_error_m``.
-
-    The limit holds for each kind of points of :class:`FieldChange`.
 
     Args:
         record: the map; it may have integer features already, the error is from those.
@@ -87,18 +75,6 @@ def quantise(record: MapRecord, max_error_m: float) -> QuantisedMap:
     return QuantisedMap(packed, field_change(record, packed, _MEASURE_SEED))
 
 
-def dequantised(record: MapRecord) -> MapRecord:
-    """Return the map with float32 features where it has integers; it answers as before."""
-    return _with_tables(
-        record,
-        lambda table: (
-            table
-            if table.scale is None
-            else dataclasses.replace(table, features=table.vectors(), scale=None)
-        ),
-    )
-
-
 def field_change(before: MapRecord, after: MapRecord, seed: int) -> FieldChange:
     """Return how far distances moved between two maps that have the same regions and evidence."""
     return _changes(before, seed)(after)
@@ -106,39 +82,31 @@ def field_change(before: MapRecord, after: MapRecord, seed: int) -> FieldChange:
 
 def _changes(before: MapRecord, seed: int) -> Callable[[MapRecord], FieldChange]:
     """Return what measures how far the distances of other maps are from those of this one."""
-    kinds = probes(before, seed)
-    points = np.concatenate(kinds)
+    points = probes(before, seed)
     old = _distances(before, points)
-    ends = np.cumsum([len(kind) for kind in kinds])[:-1]
 
     def change(after: MapRecord) -> FieldChange:
         # Outside the cube of a region at the map's border there is no distance.
         moved = np.abs(np.nan_to_num(_distances(after, points) - old))
-        surface, near, free = map(_quantile, np.split(moved, ends))
-        return FieldChange(surface, near, free, largest_m=float(moved.max(initial=0.0)))
+        quantile_m = float(np.quantile(moved, 0.99)) if len(moved) else 0.0
+        return FieldChange(quantile_m, largest_m=float(moved.max(initial=0.0)))
 
     return change
 
 
-def probes(record: MapRecord, seed: int) -> list[Doubles]:
-    """Return random points [N, 3], map frame, metres, of each kind of :class:`FieldChange`.
-
-    There are none of a kind of which the evidence knows no voxel.
-    """
+def probes(record: MapRecord, seed: int) -> Doubles:
+    """Return random points [N, 3] near seen surface, map frame, metres."""
     rng, settings = np.random.default_rng(seed), record.settings
     count = max(_PROBES // max(len(record.regions), 1), _LEAST_PROBES)
     middle = (1 << (settings.depth - 1)) - 0.5
-    kinds: list[list[Doubles]] = [[np.zeros((0, 3))] for _ in range(3)]
+    parts = [np.zeros((0, 3))]
     for region in record.regions:
-        surface = seen_voxels(region.evidence, region.evidence.surface)
-        free = seen_voxels(region.evidence, region.evidence.free)
-        chosen = ((surface, _SURFACE_LEAVES), (surface, _NEAR_LEAVES), (free, _FREE_LEAVES))
-        for kind, (voxels, reach) in zip(kinds, chosen, strict=True):
-            if len(voxels):
-                leaves = voxels[rng.integers(len(voxels), size=count)] - middle
-                leaves = leaves + rng.uniform(-reach, reach, leaves.shape)
-                kind.append(leaves * settings.leaf_m + settings.region_centre(region.index))
-    return [np.concatenate(kind) for kind in kinds]
+        voxels = seen_voxels(region.evidence, region.evidence.surface)
+        if len(voxels):
+            leaves = voxels[rng.integers(len(voxels), size=count)] - middle
+            leaves = leaves + rng.uniform(-_NEAR_LEAVES, _NEAR_LEAVES, leaves.shape)
+            parts.append(leaves * settings.leaf_m + settings.region_centre(region.index))
+    return np.concatenate(parts)
 
 
 def _distances(record: MapRecord, points: Doubles) -> Floats:
@@ -165,7 +133,3 @@ def _rounded(table: VertexTable, step: float) -> VertexTable:
     scale = np.float32(max(wanted, least, float(np.finfo(np.float32).tiny)))
     integers = np.rint(vectors / scale).astype(np.int16)
     return dataclasses.replace(table, features=integers, scale=float(scale))
-
-
-def _quantile(values: NDArray[np.floating]) -> float:
-    return float(np.quantile(values, 0.99)) if len(values) else 0.0

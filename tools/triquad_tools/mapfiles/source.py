@@ -6,11 +6,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from triquad_format.mapfile.checkpoint_folder import checkpoint_at, checkpoint_files, map_folder
 from triquad_format.mapfile.parts.part import TRAINING_TOPICS
-from triquad_format.mapfile.reader import MapFile, read_map_file
+from triquad_format.mapfile.reader import read_map_file
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.crop import crop_record, without_training
 from triquad_format.records.region import MapRecord
@@ -19,21 +18,10 @@ from triquad_map.stored_map import StoredMap
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
 
-if TYPE_CHECKING:  # slow to import
-    from triquad_client import Client, OfflineMap
-
 Box = Doubles
 """Opposite corners ``[2, 3]`` of a box, metres, map frame; the lower one first."""
 
 _ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws|unixsock-stream)/")
-
-
-@dataclass(frozen=True)
-class Access:
-    """The map and the credentials, where a target is a server."""
-
-    map_name: str
-    config: Path | None = None  # of Zenoh, with credentials
 
 
 class NothingLeftError(ToolError):
@@ -71,27 +59,15 @@ def is_endpoint(target: str) -> bool:
     return _ENDPOINT.match(target) is not None
 
 
-def open_map(target: str, access: Access) -> "Client | OfflineMap":
-    """Return the map in the file ``target``, or that of the server at the endpoint ``target``.
-
-    Raises:
-        TriquadError: no server there has the map.
-        FormatError: the file cannot be read as a map.
-        OSError: it cannot be read at all.
-    """
-    import triquad_client
-
-    if is_endpoint(target):
-        return triquad_client.connect(target, access.map_name, config=access.config)
-    return triquad_client.open_map(target)
-
-
 @contextmanager
-def map_file(target: str, access: Access, when: str | None = None) -> Iterator[Path]:
+def map_file(
+    target: str, map_name: str, config: Path | None, *, when: str | None
+) -> Iterator[Path]:
     """Yield a map's file: ``target`` itself, a checkpoint of it, or a server's newest epoch.
 
-    What a server has is downloaded, with its training state, and deleted afterwards. ``when`` says
-    which checkpoint of a folder; see :func:`chosen_file`.
+    The map ``map_name`` of a server, which is reached with a Zenoh configuration ``config``, is
+    downloaded, with its training state, and deleted afterwards. ``when`` says which checkpoint of
+    a folder; see :func:`chosen_file`.
 
     Raises:
         ToolError: ``when`` is given, but ``target`` is no folder.
@@ -108,23 +84,10 @@ def map_file(target: str, access: Access, when: str | None = None) -> Iterator[P
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "map.triquad"
-        connected = triquad_client.connect(target, access.map_name, config=access.config)
+        connected = triquad_client.connect(target, map_name, config=config)
         with progress("downloading"), connected as client:
             client.download_map(path, training=True)
         yield path
-
-
-def read_whole(path: Path) -> MapFile:
-    """Return the map in a file, checked, with the parts in other files that it needs.
-
-    Raises:
-        ToolError: it is a folder.
-        MapFileError: it is not a map file, is damaged, lacks files, or needs a newer reader.
-        OSError: it cannot be read.
-    """
-    if path.is_dir():
-        raise ToolError(f"{path} is a folder: --log lists the checkpoints in it")
-    return read_map_file(path)
 
 
 def read_source(path: Path, box: Box | None, training: bool) -> SourceMap:
@@ -139,7 +102,7 @@ def read_source(path: Path, box: Box | None, training: bool) -> SourceMap:
     """
     source = None if box is None else _box(path, box, training)
     if source is None:
-        file = read_whole(path)
+        file = read_map_file(path)
         source = SourceMap(file.record, file.manifest.stamp_ns or None)
     return cropped(source, box, training)
 

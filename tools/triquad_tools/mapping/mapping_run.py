@@ -1,11 +1,7 @@
 """Making a map of a recording, scan by scan."""
 
-import signal
-import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 
 from triquad_server.errors import ScanRefusedError
 from triquad_server.intake.scan_queue import ScanQueue
@@ -20,57 +16,28 @@ from triquad_tools.recordings.selection import Selection
 _SAVE_PERIOD_S = 60.0
 
 
-@contextmanager
-def stop_requests() -> Iterator[threading.Event]:
-    """Let Ctrl-C and SIGTERM only set an event, so that no step is interrupted.
-
-    A second Ctrl-C raises KeyboardInterrupt.
-    """
-    asked = threading.Event()
-
-    def ask(*_: object) -> None:
-        asked.set()
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield asked
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
 class MappingRun:
-    """Integrates the scans of a recording and trains until nothing is left to learn."""
+    """Integrates the scans of a recording and trains until nothing is left to learn.
 
-    def __init__(
-        self,
-        mapper: Mapper,
-        unfinished: UnfinishedMap,
-        settings: Settings,
-        stop: Callable[[], bool],
-    ) -> None:
-        """``stop()`` is called between steps."""
+    What is done is saved each minute, from where an interrupted map goes on.
+    """
+
+    def __init__(self, mapper: Mapper, unfinished: UnfinishedMap, settings: Settings) -> None:
         self._mapper = mapper
         self._unfinished = unfinished
         self._warnings = ScanWarnings(ScanQueue(1), settings)
-        self._stop = stop
         self._next_save = time.monotonic() + _SAVE_PERIOD_S
         self.scans_taken = 0  # or refused: those that need not be taken again
         self.refusals: Counter[str] = Counter()
         self.last_refusal = ""
 
     def take(self, selection: Selection, start: int) -> None:
-        """Integrate the scans from number ``start`` on, and train between them.
-
-        Raises:
-            KeyboardInterrupt: the user wants to stop; all that was done is saved.
-        """
+        """Integrate the scans from number ``start`` on, and train between them."""
         self.scans_taken = start
         total, entries = len(selection), selection.entries
         with progress("mapping", total) as report:
             for scan in selection.scans(start):
-                self._between_steps()
+                self._save_now_and_then()
                 entry = entries[self.scans_taken]
                 try:
                     stamp_s = entry.stamp_ns // 1_000_000_000
@@ -86,27 +53,21 @@ class MappingRun:
                 report(self.scans_taken, f"{self.scans_taken} of {total} scans")
 
     def settle(self) -> None:
-        """Train until nothing is left to learn, and save the map.
-
-        Raises:
-            KeyboardInterrupt: the user wants to stop; all that was done is saved.
-        """
+        """Save the map, train until nothing is left to learn, and save it again."""
+        self._save()
         mapper = self._mapper
         total = mapper.samples_left
         with progress("training", total) as report:
             while not mapper.settled:
-                self._between_steps()
+                self._save_now_and_then()
                 mapper.train()
                 left = mapper.samples_left
                 report(total - left, f"{mapper.samples_trained / 1e6:.1f} M samples")
         self._save()
 
-    def _between_steps(self) -> None:
-        stop = self._stop()
-        if stop or time.monotonic() >= self._next_save:
+    def _save_now_and_then(self) -> None:
+        if time.monotonic() >= self._next_save:
             self._save()
-        if stop:
-            raise KeyboardInterrupt
 
     def _save(self) -> None:
         self._unfinished.save(self._mapper, self.scans_taken)

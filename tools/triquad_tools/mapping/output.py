@@ -4,13 +4,17 @@ import os
 import time
 from pathlib import Path
 
+from triquad_client import OfflineMap
+from triquad_format.mapfile.durable_file import replacing
+from triquad_format.mapfile.metadata import utc_time
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.crop import without_training
 from triquad_format.records.region import MapRecord
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.mapfiles.meshfile import MESH_SUFFIXES, export_mesh
-from triquad_tools.mapfiles.source import Box, SourceMap
+from triquad_tools.console.progress import progress
+from triquad_tools.mapfiles.meshfile import MESH_SUFFIXES
+from triquad_tools.mapfiles.source import Box, NothingLeftError, SourceMap
 
 MAP_SUFFIX, PICTURE_SUFFIX = ".triquad", ".png"
 SUFFIXES = (MAP_SUFFIX, *MESH_SUFFIXES, PICTURE_SUFFIX)
@@ -59,13 +63,35 @@ def export(
 ) -> str:
     """Write a mesh or a picture of a map; return what it is.
 
+    Args:
+        source: the map.
+        path: the file to write.
+        box: the mesh has the faces whose centroids lie in it; ``None``: all.
+        cell_m: side of its cells; ``None``: half a leaf.
+        fill_m: how far surface is continued into unknown space.
+
     Raises:
-        NothingLeftError: no surface was seen in the box.
+        NothingLeftError: no surface was seen in the box, or there is none to be drawn.
         InvalidInputError: the mesh is too large, or a library is missing.
         OSError: it cannot be written.
     """
-    if path.suffix != PICTURE_SUFFIX:
-        return export_mesh(source.record, box, cell_m, path, fill_m)
-    from triquad_tools.plots.picture import export_picture  # slow to import
+    record, is_picture = source.record, path.suffix == PICTURE_SUFFIX
+    bounds = None if box is None else (box[0].tolist(), box[1].tolist())
+    with OfflineMap(record) as opened, progress("meshing", 1.0) as report:
+        mesh = opened.mesh(
+            bounds, cell_m, lambda done, of: report(done / of, f"{done} blocks"), fill_m
+        )
+    if not len(mesh.faces) and (is_picture or box is not None):
+        where = "" if box is None else " in the box of --crop"
+        raise NothingLeftError(f"{path} is not written: no surface was seen{where}")
+    if is_picture:
+        from triquad_tools.plots.picture import draw_mesh  # slow to import
 
-    return export_picture(source, box, cell_m, path)
+        when = f", {utc_time(source.stamp_ns)}" if source.stamp_ns else ""
+        draw_mesh(f"map {record.name!r}, epoch {record.epoch}{when}", mesh, path)
+        return f"a picture of {len(mesh.faces):,} faces"
+    packed = mesh.file_bytes(path.suffix)
+    with replacing(path) as stream:
+        stream.write(packed)
+    written = f"{len(packed):,} bytes, {len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces"
+    return written if mesh.filled is None else f"{written}, {mesh.filled.sum():,} of them filled"

@@ -10,13 +10,10 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from triquad_client import Mesh
 from triquad_format.mapfile.durable_file import replacing
-from triquad_format.mapfile.metadata import utc_time
 from triquad_map.height_scale import HeightScale
 
-from triquad_tools.mapfiles.meshfile import meshed
-from triquad_tools.mapfiles.source import Box, NothingLeftError, SourceMap
+from triquad_tools.plots.colours import HEIGHTS
 from triquad_tools.plots.mesh_view import draw_faces, view_along
-from triquad_tools.plots.plan import HEIGHTS, extend
 
 BACKGROUND = (0.93, 0.94, 0.95)
 """The sRGB colour of the background."""
@@ -26,23 +23,6 @@ TOP, WIDTH, HEIGHT = 90, 1340, 740
 
 _WIDE, _HIGH = 1600, 900  # pixels of the whole picture
 _BAR = (1362 / _WIDE, 390 / _HIGH, 30 / _WIDE, 360 / _HIGH)  # left, bottom, width, height
-
-
-def export_picture(source: SourceMap, box: Box | None, cell_m: float | None, path: Path) -> str:
-    """Save a picture of a map, or of its part in a box; return what it shows.
-
-    Raises:
-        InvalidInputError: the mesh is too large, or a library is missing.
-        NothingLeftError: no surface was seen.
-        OSError: it cannot be written.
-    """
-    mesh = meshed(source.record, box, cell_m)
-    if not len(mesh.faces):
-        where = "" if box is None else " in the box of --crop"
-        raise NothingLeftError(f"{path} is not written: no surface was seen{where}")
-    when = f", {utc_time(source.stamp_ns)}" if source.stamp_ns else ""
-    draw_mesh(f"map {source.record.name!r}, epoch {source.record.epoch}{when}", mesh, path)
-    return f"a picture of {len(mesh.faces):,} faces"
 
 
 def draw_mesh(title: str, mesh: Mesh, path: Path) -> None:
@@ -57,7 +37,9 @@ def draw_mesh(title: str, mesh: Mesh, path: Path) -> None:
     heights = HeightScale.around(used[:, 2])
     view = view_along(used, mesh.vertices[mesh.faces])
     least_m, most_m = float(used[:, 2].min()), float(used[:, 2].max())
-    beyond = extend(least_m < heights.low_m, most_m > heights.high_m)
+    # A scale ends in an arrow where there are values beyond.
+    arrows = (("neither", "max"), ("min", "both"))
+    beyond = arrows[least_m < heights.low_m][most_m > heights.high_m]
     note = f"{len(mesh.faces):,} faces, from z = {least_m:.2f} to {most_m:.2f} m"
     with rc_context({"font.size": 15}):
         figure = Figure((_WIDE / 100, _HIGH / 100), 100, facecolor=BACKGROUND)

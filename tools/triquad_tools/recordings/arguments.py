@@ -41,8 +41,6 @@ def _add_choice(add: _Add) -> None:
     add("--start", type=not_negative, default=0.0, metavar="S", help="seconds after the first scan")
     add("--end", type=positive, metavar="S", help="seconds after the first scan")
     add("--every", type=count, default=1, metavar="N", help="take every Nth scan of each sensor")
-    withhold = "withhold every Nth scan, for triquad-eval --withheld"
-    add("--skip-every", type=count, default=0, metavar="N", help=withhold)
     nearer = "leave out nearer points: the vehicle's own body (default: 0)"
     add("--range-min", type=not_negative, default=0.0, metavar="M", help=nearer)
 

@@ -11,28 +11,20 @@ from triquad_tools.sensors.sweep import PosedScan, moved
 _MERGED_POINTS = 2_000_000  # fewer are not worth a merge
 
 
-def is_withheld(index: int, every: int) -> bool:
-    """Return whether scan ``index`` is kept back for testing: the last of each ``every`` scans."""
-    return every > 0 and index % every == every - 1
+def points_in_range(points: NDArray[np.floating], range_min_m: float) -> NDArray[np.floating]:
+    """Return the points ``[N, 3]``, sensor frame, that are no nearer than a limit above 0.
 
-
-def points_in_range(
-    points: NDArray[np.floating], range_min_m: float, range_max_m: float = np.inf
-) -> NDArray[np.floating]:
-    """Return the points ``[N, 3]``, sensor frame, whose ranges lie within both limits.
-
-    Points that are not finite are left out as soon as a limit is given.
+    Points without a range are left out as soon as there is a limit.
     """
-    if range_min_m <= 0.0 and not np.isfinite(range_max_m):
+    if range_min_m <= 0.0:
         return points
-    ranges = np.linalg.norm(points, axis=1)
-    kept: NDArray[np.floating] = points[(ranges >= range_min_m) & (ranges <= range_max_m)]
+    kept: NDArray[np.floating] = points[np.linalg.norm(points, axis=1) >= range_min_m]
     return kept
 
 
-def world_points(scan: PosedScan, range_min_m: float = 0.0, range_max_m: float = np.inf) -> Doubles:
-    """Return the finite points ``[N, 3]`` of a scan within limits of the range, world frame."""
-    points = points_in_range(scan.points, range_min_m, range_max_m)
+def world_points(scan: PosedScan, range_min_m: float = 0.0) -> Doubles:
+    """Return the finite points ``[N, 3]`` of a scan that are no nearer than this, world frame."""
+    points = points_in_range(scan.points, range_min_m)
     points = points[np.isfinite(points).all(axis=1)]
     return moved(points, scan.world_from_sensor)
 

@@ -8,9 +8,12 @@ from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.bag import find_bag
 from triquad_tools.recordings.folders.cloud_folder import is_cloud_folder, read_cloud_folder
 from triquad_tools.recordings.folders.depth_folder import is_depth_folder, read_depth_folder
+from triquad_tools.recordings.folders.scan_folder import ScanFolder
 from triquad_tools.recordings.options import ReadingOptions
-from triquad_tools.recordings.recording import Recording
 from triquad_tools.recordings.ros_recording import RosRecording
+
+Recording = RosRecording | ScanFolder
+"""A recording that was checked as a whole, so that its errors are known."""
 
 _FLAGS = {"transforms": "--transform", "deskew": "--no-deskew"}
 """The flags whose names are not those of the choices that they set."""

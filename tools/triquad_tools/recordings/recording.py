@@ -1,10 +1,6 @@
-"""Recordings: scans with poses, whatever kind of file or folder holds them."""
+"""What recordings tell of their content, whatever kind of file or folder holds them."""
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
-
-from triquad_tools.sensors.sweep import PosedScan
 
 DEFAULT_SOURCE = "default"
 """The source of recordings that name no sensor: the client's default, too."""
@@ -27,26 +23,3 @@ class Stream:
     count: int
     use: str  # in plain words: what is made of it, or why nothing
     frame: str = ""  # of the sensor, or parent and child of poses
-
-
-class Recording(Protocol):
-    """A recording that was checked as a whole, so that its errors are known."""
-
-    @property
-    def entries(self) -> Sequence[ScanEntry]:
-        """The scans that can be mapped, those of each source in the order of their stamps."""
-
-    @property
-    def streams(self) -> Sequence[Stream]:
-        """The streams that it holds."""
-
-    @property
-    def remarks(self) -> Sequence[str]:
-        """The problems: what is left out and why, and what to do about it, a line each."""
-
-    def read(self, indices: Sequence[int]) -> Iterator[PosedScan]:
-        """Return the scans of these numbers, which increase, one after the other.
-
-        Raises:
-            ToolError: a scan cannot be read.
-        """

@@ -10,9 +10,9 @@ import numpy as np
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.lines import print_remark
 from triquad_tools.recordings.arguments import options_of
-from triquad_tools.recordings.cloud import is_withheld, points_in_range
-from triquad_tools.recordings.opening import open_recording
-from triquad_tools.recordings.recording import Recording, ScanEntry
+from triquad_tools.recordings.cloud import points_in_range
+from triquad_tools.recordings.opening import Recording, open_recording
+from triquad_tools.recordings.recording import ScanEntry
 from triquad_tools.sensors.sweep import PosedScan
 
 
@@ -58,7 +58,7 @@ def open_selected(options: argparse.Namespace) -> Selection:
     if not indices:
         raise ToolError(
             f"{options.recording}: no scan is left of {len(entries)} in {length_s(entries):.1f} s: "
-            "see --start, --end, --every and --skip-every"
+            "see --start, --end and --every"
         )
     way = repr((options.recording.resolve(), reading, options.range_min))
     return Selection(recording, indices, options.range_min, way)
@@ -71,7 +71,7 @@ def length_s(entries: Sequence[ScanEntry]) -> float:
 
 
 def _chosen(entries: Sequence[ScanEntry], options: argparse.Namespace) -> list[int]:
-    """Return the numbers of scans within the times, every Nth of each sensor, not withheld."""
+    """Return the numbers of scans within the times, every Nth of each sensor."""
     first_ns = min(entry.stamp_ns for entry in entries)
     end_s = float("inf") if options.end is None else options.end
     before: Counter[str] = Counter()  # scans of each sensor
@@ -80,6 +80,6 @@ def _chosen(entries: Sequence[ScanEntry], options: argparse.Namespace) -> list[i
         nth = before[entry.source] % options.every == 0
         before[entry.source] += 1
         timely = options.start <= (entry.stamp_ns - first_ns) / 1e9 <= end_s
-        if nth and timely and not is_withheld(index, options.skip_every):
+        if nth and timely:
             chosen.append(index)
     return chosen

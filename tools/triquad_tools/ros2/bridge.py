@@ -44,7 +44,7 @@ class Bridge:
             parts.enter_context(closing(mesh))
             grid = GridPublisher(slices, client, options.grid)
             for output in (mesh, grid):
-                parts.enter_context(closing(MapThread(output, lambda: intake.place)))
+                parts.enter_context(closing(MapThread(output.publish, lambda: intake.place)))
             self._parts = parts.pop_all()
 
     def __enter__(self) -> "Bridge":

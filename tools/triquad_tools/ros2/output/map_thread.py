@@ -3,7 +3,6 @@
 import logging
 import threading
 from collections.abc import Callable
-from typing import Protocol
 
 from triquad_format.errors import TriquadError
 
@@ -15,23 +14,16 @@ PERIOD_S = 0.5  # between two rounds
 _RETRY_S = 5.0  # after an error
 
 
-class MapOutput(Protocol):
-    """Something of the map that is published while it has subscribers."""
-
-    def publish(self, place: Place) -> None:
-        """Publish what changed, for the robot at a place; return soon, also if there is more.
-
-        Raises:
-            TriquadError: the map server does not answer.
-        """
-
-
 class MapThread:
     """Has an output published again and again, until it is closed; it holds up no other."""
 
-    def __init__(self, output: MapOutput, place: Callable[[], Place | None]) -> None:
-        """``place`` returns where the robot is, None before that is known."""
-        self._output = output
+    def __init__(self, publish: Callable[[Place], None], place: Callable[[], Place | None]) -> None:
+        """``place`` returns where the robot is, None before that is known.
+
+        ``publish`` publishes what changed for a robot there, and returns soon, also if there is
+        more; it raises a TriquadError where the map server does not answer.
+        """
+        self._publish = publish
         self._place = place
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="ros2-map")
@@ -49,7 +41,7 @@ class MapThread:
             if place is None:
                 continue
             try:
-                self._output.publish(place)
+                self._publish(place)
             except TriquadError as error:
                 _log.warning("the map cannot be published now: %s", error)
                 pause_s = _RETRY_S

@@ -8,12 +8,8 @@ from triquad_tools.sensors.errors import NoScanError
 from triquad_tools.sensors.motion.frame_tree import STATIC, Transform
 from triquad_tools.sensors.ros.depth_camera import camera_topic, sweep_of_depth
 from triquad_tools.sensors.ros.point_cloud import sweep_of_cloud
-from triquad_tools.sensors.ros.transforms import (
-    transform_of_odometry,
-    transform_of_pose,
-    transforms_of_tf,
-)
-from triquad_tools.sensors.ros.type_store import ODOMETRY, POINT_CLOUD, POSE
+from triquad_tools.sensors.ros.transforms import transforms_of
+from triquad_tools.sensors.ros.type_store import POINT_CLOUD
 from triquad_tools.sensors.sweep import Sweep
 
 
@@ -65,19 +61,10 @@ class MessageReader:
         self, kind: str, message: Any, came_ns: int, *, static: bool = False
     ) -> list[Transform]:
         """Return the transforms of a message of transforms, ``static`` or not, or of a pose."""
-        if kind == ODOMETRY:
-            found = [transform_of_odometry(message)]
-        elif kind == POSE:
-            found = [transform_of_pose(message)]
-        else:
-            found = transforms_of_tf(message, static=static)
-        if kind in (ODOMETRY, POSE):
-            found = [replace(each, child=each.child or self._body_frame) for each in found]
-        if not self._by_arrival:
-            return found
-        return [
-            each if each.stamp_ns is STATIC else replace(each, stamp_ns=came_ns) for each in found
-        ]
+        found = transforms_of(kind, message, self._body_frame)
+        if static:
+            return [replace(each, stamp_ns=STATIC) for each in found]
+        return [replace(each, stamp_ns=came_ns) for each in found] if self._by_arrival else found
 
     def _camera(self, topic: str) -> Any:
         if topic not in self._cameras:

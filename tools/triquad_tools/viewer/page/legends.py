@@ -8,19 +8,21 @@ from dataclasses import dataclass
 from html import escape
 
 import numpy as np
-from matplotlib.colors import to_hex
+from matplotlib.colors import Colormap, to_hex
 from triquad_format.printable import printable_lines
-
-from triquad_tools.plots.plan import Scale
 
 _TICKS = 5
 _TEXT = "padding: 0.2em 1em; font-size: 0.8em; line-height: 1.4; overflow-wrap: anywhere"
 
 
 @dataclass(frozen=True)
-class ColourScale(Scale):
-    """Colours for values, whose label has the unit; what is beyond has those of the ends."""
+class ColourScale:
+    """Colours for values from ``low`` to ``high``; what is beyond has those of the ends."""
 
+    label: str  # with the unit
+    colours: Colormap
+    low: float
+    high: float
     open_below: bool = False  # there may be values below
     open_above: bool = False
 

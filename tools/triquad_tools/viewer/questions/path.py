@@ -9,8 +9,7 @@ from triquad_client.calls.queries import MapQueries
 from triquad_format.records.arrays import Doubles
 from triquad_format.wire.limits import MAX_DISTANCE_M
 
-from triquad_tools.plots.plan import UNKNOWN
-from triquad_tools.plots.slice_plan import BEHIND
+from triquad_tools.plots.colours import BEHIND, UNKNOWN
 from triquad_tools.viewer.page.layer import Layer
 from triquad_tools.viewer.page.legends import lines_html, table_html
 

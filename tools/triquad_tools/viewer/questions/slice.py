@@ -12,8 +12,7 @@ from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats
 from triquad_format.records.status import Status
 from viser.transforms import SO3
 
-from triquad_tools.plots.plan import UNKNOWN
-from triquad_tools.plots.slice_plan import BEHIND, DISTANCE_COLOURS
+from triquad_tools.plots.colours import BEHIND, DISTANCES, UNKNOWN
 from triquad_tools.viewer.page.legends import ColourScale, lines_html, text_html
 from triquad_tools.viewer.page.page import Focus, Page
 from triquad_tools.viewer.questions.cell_box import CellBox
@@ -60,7 +59,7 @@ class Slice:
     def legend(self) -> str:
         """The meaning of its colours and lines."""
         label = "distance to the nearest surface, m"
-        scale = ColourScale(label, DISTANCE_COLOURS, 0.0, self.most_m, open_above=True)
+        scale = ColourScale(label, DISTANCES, 0.0, self.most_m, open_above=True)
         return scale.html + lines_html(
             ("#000000", "the surface itself"),
             ("#ffffff", f"white: every {_line_distances(self.most_m)[1]:g} m from it"),
@@ -155,7 +154,7 @@ def _picture(distance_m: Floats, known: Bools, max_distance_m: float) -> Bytes:
     figure = Figure((columns * _PIXELS / _DPI, rows * _PIXELS / _DPI), _DPI)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), frameon=False)
     axes.set_axis_off()
-    colours = DISTANCE_COLOURS(distance_m.astype(np.float64) / max_distance_m)[..., :3]
+    colours = DISTANCES(distance_m.astype(np.float64) / max_distance_m)[..., :3]
     colours[~known] = to_rgb(UNKNOWN)
     axes.imshow(colours, origin="lower", aspect="auto", interpolation="nearest")
     if known.any():

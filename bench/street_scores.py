@@ -1,9 +1,12 @@
-"""Scores of a map that is asked for distances: against an exact street, and at withheld scans.
+"""Scores of a map of an exact street, which answers as a file or a server does.
 
-``docs/tools.md`` defines every figure. What is asked, a file or a server, is a callable here.
+Asked are points near surface that the lidar truly hit: the hits, one per 10 cm voxel, moved along
+the exact normal by a random -10 to +10 cm, wherever the exact distance is known. The truth is the
+exact signed distance there, not the offset. Points deeper than 0.5 m in houses, where no ray can
+have been, have to be ``UNKNOWN``.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,11 +15,13 @@ from triquad_client import SdfResult
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.status import Status
 from triquad_map.view import FieldAnswer
-
 from triquad_tools.console.progress import progress
-from triquad_tools.evaluation.metrics import mean_or_nan, median_angle_deg
+from triquad_tools.evaluation.metrics import mean_or_nan
 from triquad_tools.simulation.lidar import SimulatedDrive, SimulatedScan
 from triquad_tools.simulation.scene import Scene
+
+STREET_VOXEL_M = 0.05
+"""The spacing of the points of a street that completion asks for."""
 
 NEAR_M = 0.1  # distances are scored up to this far from the surface
 HOUSE_MARGIN_M = 0.5  # deeper than this in a house nothing can be seen
@@ -63,19 +68,6 @@ class StreetScores:
     house_points: int
 
 
-@dataclass(frozen=True)
-class WithheldScores:
-    """The scores of a map where withheld scans hit something; NaN without points."""
-
-    points: int
-    surface_ratio: float  # share with status SURFACE
-    unknown_ratio: float  # share with status UNKNOWN
-    sdf_median_m: float  # of the magnitude, over all points
-    sdf_p90_m: float
-    surface_sdf_median_m: float  # the same over the points with status SURFACE
-    surface_sdf_p90_m: float
-
-
 def street_probes(drive: SimulatedDrive, rng: np.random.Generator) -> StreetProbes:
     """Return points at which a map of ``drive`` is scored."""
     hits = drive.true_hits(PROBE_SPACING_M)
@@ -110,32 +102,11 @@ def score_street(query: MapQuery, probes: StreetProbes) -> StreetScores:
         sdf_error_m=mean_or_nan(errors),
         sdf_error_median_m=_quantile(errors, 0.5),
         sdf_error_p95_m=_quantile(errors, 0.95),
-        gradient_angle_deg=median_angle_deg(answer.gradient[known], probes.exact_gradient[known]),
+        gradient_angle_deg=_median_angle_deg(answer.gradient[known], probes.exact_gradient[known]),
         near_surface_ratio=mean_or_nan(answer.status == Status.SURFACE),
         near_points=len(probes.near),
         houses_unknown_ratio=mean_or_nan(houses.status == Status.UNKNOWN),
         house_points=len(probes.in_houses),
-    )
-
-
-def score_withheld(query: MapQuery, clouds: Iterable[Doubles]) -> WithheldScores:
-    """Return scores of a map at the points ``[N, 3]``, map frame, of scans that it never saw."""
-    distances = [np.empty(0, np.float32)]
-    statuses = [np.empty(0, np.uint8)]
-    for cloud in clouds:
-        answer = query(cloud)
-        distances.append(np.nan_to_num(np.abs(answer.sdf), nan=np.inf))
-        statuses.append(answer.status)
-    distance, status = np.concatenate(distances), np.concatenate(statuses)
-    on_surface = distance[status == Status.SURFACE]
-    return WithheldScores(
-        points=len(distance),
-        surface_ratio=mean_or_nan(status == Status.SURFACE),
-        unknown_ratio=mean_or_nan(status == Status.UNKNOWN),
-        sdf_median_m=_quantile(distance, 0.5),
-        sdf_p90_m=_quantile(distance, 0.9),
-        surface_sdf_median_m=_quantile(on_surface, 0.5),
-        surface_sdf_p90_m=_quantile(on_surface, 0.9),
     )
 
 
@@ -148,6 +119,13 @@ def _points_in_houses(scene: Scene, positions: Doubles, rng: np.random.Generator
     return drawn[scene.is_inside_house(drawn, HOUSE_MARGIN_M)][:_HOUSE_PROBES]
 
 
+def _median_angle_deg(one: NDArray[np.floating], other: NDArray[np.floating]) -> float:
+    """Return the median of the angles between vectors ``[N, 3]``; NaN where there are none."""
+    lengths = np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
+    cosines = np.einsum("ni,ni->n", one, other) / np.maximum(lengths, 1e-12)
+    angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
+    return _quantile(angles, 0.5)
+
+
 def _quantile(values: NDArray[np.floating], level: float) -> float:
-    # "lower" never blends with an infinite neighbour.
-    return float(np.quantile(values, level, method="lower")) if len(values) else float("nan")
+    return float(np.quantile(values, level)) if len(values) else float("nan")

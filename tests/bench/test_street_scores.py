@@ -4,16 +4,16 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from triquad_format.records.status import Status
-from triquad_tools.evaluation.map_scores import (
+from triquad_tools.simulation.scene import Scene
+from triquad_tools.simulation.street import street_drive
+
+from bench.street_scores import (
     HOUSE_MARGIN_M,
     NEAR_M,
     StreetProbes,
     score_street,
-    score_withheld,
     street_probes,
 )
-from triquad_tools.simulation.scene import Scene
-from triquad_tools.simulation.street import street_drive
 
 DRIVE = street_drive(3, 2)
 
@@ -76,19 +76,3 @@ def test_an_empty_map_scores_nothing(probes: StreetProbes) -> None:
     assert np.isnan([scores.sdf_error_m, scores.gradient_angle_deg]).all()
     assert scores.near_surface_ratio == 0.0
     assert scores.houses_unknown_ratio == 1.0
-
-
-def test_withheld_points_are_scored_over_all_clouds() -> None:
-    def query(points: np.ndarray, gradient: bool = False) -> Answer:
-        status = np.select([points[:, 0] < 5, points[:, 0] < 9], [2, 1], 0).astype(np.uint8)
-        return Answer(np.where(points[:, 0] < 9, -0.01 * points[:, 0], np.nan), status)
-
-    points = np.zeros((10, 3))
-    points[:, 0] = np.arange(10)
-    scores = score_withheld(query, [points[:3], points[:0], points[3:]])
-    assert scores.points == 10
-    assert (scores.surface_ratio, scores.unknown_ratio) == (0.5, 0.1)
-    assert scores.sdf_median_m == pytest.approx(0.04)
-    assert scores.sdf_p90_m == pytest.approx(0.08)
-    assert scores.surface_sdf_median_m == pytest.approx(0.02)
-    assert scores.surface_sdf_p90_m == pytest.approx(0.03)

@@ -7,13 +7,9 @@ from matplotlib.image import imread
 from support import servers
 from support.files.checkpoint_folder import write_checkpoints
 from support.maps.exact_maps import exact_map, flat, table
-from support.maps.map_records import random_record
 from triquad_format.mapfile.writer import write_map
-from triquad_map.height_scale import HEIGHT_STOPS
 from triquad_tools.commands.inspect import main
-from triquad_tools.plots.diff_plan import APPEARED, VANISHED
-from triquad_tools.plots.plan import FREE, UNKNOWN
-from triquad_tools.plots.slice_plan import SURFACE
+from triquad_tools.plots.colours import APPEARED, FREE, UNKNOWN, VANISHED
 
 
 def read_picture(path):
@@ -35,27 +31,13 @@ def test_what_is_not_known_has_a_colour_of_its_own(name):
     assert (np.diff(lightness) > 0).all() or (np.diff(lightness) < 0).all()
 
 
-def test_picture_of_a_map(tmp_path, capsys):
-    path, picture = tmp_path / "map.triquad", tmp_path / "map.png"
-    # A table on the ground shows in the colours of both heights.
-    record = exact_map(table(0.1, 1.1))
-    write_map(record, path, feature_dtype="<f4", stamp_ns=10**18)
-    assert main([str(path), "--plot", str(picture)]) == 0
-    assert "map 'ground'" in capsys.readouterr().out
-    pixels = read_picture(picture)
-    ground, top = (share(pixels, HEIGHT_STOPS[end]) for end in (0, -1))
-    assert top / ground == pytest.approx(4.0 / 96.0, rel=0.1)
-
-
-def test_a_folder_of_checkpoints_is_drawn_at_its_newest(tmp_path, capsys):
+def test_of_a_folder_of_checkpoints_the_newest_is_shown(tmp_path, capsys):
     write_checkpoints(tmp_path, (9, 12, 15))
-    picture = tmp_path / "a.png"
     for options, epoch in (((), 15), (("--at", "13"), 12)):
-        assert main([str(tmp_path), "--plot", str(picture), *options]) == 0
+        assert main([str(tmp_path), *options]) == 0
         output = capsys.readouterr().out
         assert f"epoch {epoch}," in output
         assert f"epoch-{epoch:09}" in output
-        assert read_picture(picture).shape[0] > 300
     assert main([str(tmp_path), "--at", "3"]) == 2
     assert main([str(tmp_path), "--log", "--at", "13"]) == 2
     assert "--at is for one map" in capsys.readouterr().err
@@ -72,20 +54,11 @@ def test_the_map_of_a_server_is_drawn(tmp_path, capsys):
             client.flush()
         assert main([endpoint, "--plot", str(picture)]) == 0
         assert f"{endpoint}: map 'default'" in capsys.readouterr().out
-        assert share(read_picture(picture), FREE) > 0.01
+        assert read_picture(picture).std() > 5
         assert main([endpoint, "--at", "1", "--plot", str(picture)]) == 2
         assert "leave out --at" in capsys.readouterr().err
     assert main([str(tmp_path), "--map", "other"]) == 2
     assert "--map and --config are of a server" in capsys.readouterr().err
-
-
-def test_pictures_of_maps_that_lack_something(tmp_path):
-    deltas = write_checkpoints(tmp_path, (9, 12))
-    write_map(random_record(indices=()), tmp_path / "empty.triquad")
-    write_map(random_record(1, training=False), tmp_path / "plain.triquad")
-    for path in (*deltas, tmp_path / "empty.triquad", tmp_path / "plain.triquad"):
-        assert main([str(path), "--plot", str(tmp_path / "a.png"), "--json"]) == 0
-        assert read_picture(tmp_path / "a.png").shape[0] > 300
 
 
 def test_picture_of_a_difference(tmp_path):
@@ -103,25 +76,3 @@ def test_picture_of_a_difference(tmp_path):
     assert shares[a, b][1] == pytest.approx(legend[1])
     assert shares[b, a][1] > 20 * legend[1]
     assert shares[b, a][0] == pytest.approx(legend[0])
-
-
-def test_picture_of_a_slice(tmp_path, capsys):
-    path, picture = tmp_path / "map.triquad", tmp_path / "slice.png"
-    write_map(exact_map(flat(0.1)), path, feature_dtype="<f4")
-    command = [str(path), "--plot", str(picture), "--slice"]
-    assert main([*command, "0.1"]) == 0
-    at_ground = read_picture(picture)
-    assert main([*command, "1.5", "--box", "-4", "-4", "4", "4", "--cell", "0.05"]) == 0
-    above = read_picture(picture)
-    assert share(at_ground, SURFACE) > 20 * share(above, SURFACE)
-    assert share(above, FREE) > 20 * share(at_ground, FREE)
-    assert main([*command, "1.5", "--box", "10.4", "10.4", "11", "11", "--cell", "0.05"]) == 0
-    unseen = read_picture(picture)  # though the distance to the ground seen beside it is known
-    distances, statuses = np.array_split(unseen, 2, axis=1)
-    assert share(distances, UNKNOWN) > 0.3
-    assert share(statuses, UNKNOWN) > 0.3
-    assert share(np.array_split(above, 2, axis=1)[0], UNKNOWN) < 0.01
-    assert main(["tcp/127.0.0.1:7447", "--plot", str(picture), "--slice", "1"]) == 2
-    assert "needs --box" in capsys.readouterr().err
-    assert main([str(path), "--slice", "1"]) == 2
-    assert "--slice needs --plot" in capsys.readouterr().err
