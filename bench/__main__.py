@@ -31,26 +31,26 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _bench(options: argparse.Namespace) -> int:
     """Measure the parts in turn; the figures of each are saved before the next begins."""
-    _compile()
+    _compile(options.device)
     for part in options.parts or PARTS:
         figures = PARTS[part](options)
-        today = datetime.date.today().isoformat()
+        today, where = datetime.date.today().isoformat(), machine(options.device)
         earlier = Result.read(options.results, part)
         remark = "" if earlier is None else earlier.remark
-        result = Result(part, today, machine(), options.seed, figures=figures, remark=remark)
+        result = Result(part, today, where, options.seed, figures=figures, remark=remark)
         print_rows(result.title, [Row(one.name, one.shown, one.verdict) for one in figures])
         result.write(options.results)
     write_page(options.results)
     return 0
 
 
-def _compile() -> None:
+def _compile(device: str) -> None:
     """Compile all kernels, so that no part but "start" meets a first start."""
     from triquad_server.settings import Settings  # slow to import
     from triquad_server.warm_up import warm_up
 
     with progress("compiling") as report:
-        warm_up(Settings(), "cpu", report=lambda stage: report(0.0, stage))
+        warm_up(Settings(), device, report=lambda stage: report(0.0, stage))
 
 
 @cache
@@ -61,7 +61,7 @@ def _street(number: int) -> BenchStreet:
 def _core(options: argparse.Namespace) -> list[Figure]:
     from bench.parts.core import measure_core
 
-    return measure_core(_street(options.seed))
+    return measure_core(_street(options.seed), options.device)
 
 
 def _server(options: argparse.Namespace) -> list[Figure]:
@@ -153,6 +153,12 @@ def _parser() -> argparse.ArgumentParser:
         default=2,
         metavar="N",
         help="of streets, rooms and tables (default: 2)",
+    )
+    add(
+        "--device",
+        choices=("cpu", "cuda"),
+        default="cpu",
+        help="what part core trains on (default: cpu)",
     )
     add(
         "--recorded",

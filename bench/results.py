@@ -56,11 +56,15 @@ def _figure(saved: dict[str, Any]) -> Figure:
     return Figure(**{**saved, "value": value})
 
 
-def machine() -> str:
-    """Return the machine in words."""
+def machine(device: str) -> str:
+    """Return the machine in words, and its GPU where that is what trained."""
     cpuinfo = Path("/proc/cpuinfo")
     found = re.search(r"model name\s*: (.*)", cpuinfo.read_text()) if cpuinfo.exists() else None
     name = found[1] if found else platform.processor() or platform.machine()
+    if device == "cuda":
+        import torch  # its import takes 200 MB
+
+        name = f"{torch.cuda.get_device_name()} beside {name}"
     return f"{name}, {os.cpu_count()} cores, Python {platform.python_version()}"
 
 

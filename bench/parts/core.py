@@ -30,10 +30,10 @@ _ROUNDS = 9
 _RATE = 1e-4  # of learning: so slow that the baseline leaves the field as it is
 
 
-def measure_core(made: BenchStreet) -> list[Figure]:
-    """Return figures of the map's core."""
+def measure_core(made: BenchStreet, device: str) -> list[Figure]:
+    """Return figures of the map's core, which trains on a device."""
     settings = Settings()
-    mapper = Mapper("bench", settings, "cpu")
+    mapper = Mapper("bench", settings, device)
     with progress("core", 4) as report:
         report(0, "taking in scans")
         ingest_s = [

@@ -18,7 +18,7 @@ from triquad_format.records.status import Status
 
 from triquad_map.compiled.team import MIN_SHARE, Split, in_one
 from triquad_map.evidence.evidence import FrozenEvidence
-from triquad_map.field.frozen_field import FieldEngine, FieldValues, in_grid
+from triquad_map.field.frozen_field import FieldValues, FrozenField, in_grid
 from triquad_map.surfels.surfel_map import SurfelMap
 from triquad_map.view import FieldAnswer
 
@@ -38,7 +38,7 @@ class MapRegion(Protocol):
         """[3] metres, map frame."""
 
     @property
-    def engine(self) -> FieldEngine:
+    def engine(self) -> FrozenField:
         """The engine that computes its field."""
 
     @property

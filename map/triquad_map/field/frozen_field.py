@@ -1,7 +1,7 @@
 """A field that answers from arrays which do not change, such as those of an epoch or of a file."""
 
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,21 +26,7 @@ class FieldValues:
     gradient: Floats
 
 
-class FieldEngine(Protocol):
-    """An engine that computes the field of one region."""
-
-    def evaluate(self, points: Floats, gradient: bool) -> FieldValues:
-        """Return the field at points [N, 3], metres from the region's centre."""
-
-    def evaluate_in_grid(self, axes: Floats, points: Longs) -> Floats:
-        """Return distances [N] at ``points`` [N, 3] of a grid, by their numbers on its ``axes``.
-
-        ``axes`` [3, S] are metres from the region's centre. Those of a point do not depend on which
-        others are asked for.
-        """
-
-
-class FrozenCompiledField:
+class FrozenField:
     """A field that answers from arrays, which nothing may change from then on."""
 
     def __init__(self, settings: FieldSettings, tree: FrozenQuadtree, arrays: FieldArrays) -> None:
@@ -58,7 +44,7 @@ class FrozenCompiledField:
         return FieldValues(logits * scale, gradients * scale)
 
     def evaluate_in_grid(self, axes: Floats, points: Longs) -> Floats:
-        """Return distances in a grid; see :class:`FieldEngine`. On the caller's thread."""
+        """Return distances in a grid; see :class:`FrozenField`. On the caller's thread."""
         logits = np.empty(len(points), np.float32)
         evaluate_in_grid(axes, points, self._field, logits)
         distances: Floats = logits * np.float32(self.settings.logit_scale_m)
@@ -71,7 +57,7 @@ def in_grid(axes: NDArray[_Float], points: Longs) -> NDArray[_Float]:
     return np.stack(places, axis=1)
 
 
-def recorded_field(settings: FieldSettings, region: Region) -> FrozenCompiledField:
+def recorded_field(settings: FieldSettings, region: Region) -> FrozenField:
     """Return the field of a region as a file has it."""
     tree = LiveQuadtree(settings)
     features = [np.zeros((1, settings.feature_size), np.float32)]  # row 0: absent vertices
@@ -85,10 +71,10 @@ def recorded_field(settings: FieldSettings, region: Region) -> FrozenCompiledFie
         tuple(np.ascontiguousarray(array, np.float32) for layer in layers for array in layer),
         np.asarray(region.frequencies, np.float32),
     )
-    return FrozenCompiledField(settings, tree.freeze(), arrays)
+    return FrozenField(settings, tree.freeze(), arrays)
 
 
-def field_samples(engine: FieldEngine, settings: FieldSettings, split: Split) -> SampleField:
+def field_samples(engine: FrozenField, settings: FieldSettings, split: Split) -> SampleField:
     """Return the field of a region in voxels, at its leaf coordinates."""
 
     def sample(voxels: Doubles) -> FieldSample:

@@ -6,9 +6,10 @@ from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.region import AXES, Mlp, Region, TrainingState, VertexTable
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.evidence.live_evidence import LiveEvidence
+from triquad_map.field.frozen_field import FrozenField
 
 from triquad_server.engine.live_field import LiveField
-from triquad_server.engine.memory import FrozenField, Memory
+from triquad_server.engine.memory import Memory
 
 _VARIANCE_BITS = 3  # that follow the first, in a checkpoint
 

@@ -8,10 +8,11 @@ import numpy as np
 from triquad_format.records.arrays import Bools, Floats, Ints, Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_map.field.field import FieldArrays
+from triquad_map.field.frozen_field import FrozenField
 from triquad_map.field.quadtree import LiveQuadtree
 
 from triquad_server.engine.initial_mlp import initial_mlp
-from triquad_server.engine.memory import FieldNumbers, FrozenField, Memory, Rows
+from triquad_server.engine.memory import FieldNumbers, Memory, Rows
 
 _SPARE = 4  # one spare row for each N rows, when rows are copied to larger arrays
 
@@ -218,8 +219,8 @@ class LiveField:
         return min(1.0, max(_MLP_HARDEST, _MLP_SOFT_STEPS / self.mlp_steps))
 
     def live_view(self) -> FrozenField:
-        """Return the field in its own memory: for its thread alone, and valid until it changes."""
-        return self.memory.field(self.settings, self.tree.freeze(), self.numbers)
+        """Return the field for its thread alone; from arrays, it is valid until it changes."""
+        return FrozenField(self.settings, self.tree.freeze(), self.arrays)
 
     def fix(self, rows: Bools | None) -> None:
         """From now on, keep the feature ``rows`` [N] and the MLP unchanged; None: train all.
@@ -230,10 +231,14 @@ class LiveField:
         self._vertices_fixed = 0 if rows is None else int(rows[1:].sum())
 
     def freeze(self) -> FrozenField:
-        """Return the field as it is now; both share their numbers until this one changes."""
-        mlp = tuple(part.freeze()[0] for part in self.mlp)
-        frozen = FieldNumbers(self.features.freeze(), mlp, self._frequencies)
-        return self.memory.field(self.settings, self.tree.freeze(), frozen)
+        """Return the field as it is now; in arrays, both share numbers until this one changes.
+
+        Compiled code answers wherever the field is trained: for the few thousand points of most
+        questions it takes less time than a GPU.
+        """
+        for part in (self.features, *self.mlp):
+            part.freeze()
+        return self.live_view()
 
     def thaw(self) -> None:
         """Before a step, make numbers of its own, which may be changed in place."""

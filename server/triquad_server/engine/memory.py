@@ -4,10 +4,6 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
-from triquad_format.records.field_settings import FieldSettings
-from triquad_map.field.field import FieldArrays
-from triquad_map.field.frozen_field import FieldEngine, FrozenCompiledField
-from triquad_map.field.quadtree import FrozenQuadtree, LiveQuadtree
 
 Array = NDArray[Any]
 
@@ -27,24 +23,8 @@ class FieldNumbers(NamedTuple):
     frequencies: Rows  # [m] of Fourier features, on coordinates normalised to [-1, 1]
 
 
-class FrozenField(FieldEngine, Protocol):
-    """A field that does not change any more; safe for any thread."""
-
-    @property
-    def settings(self) -> FieldSettings:
-        """The shape of the field."""
-
-    @property
-    def tree(self) -> LiveQuadtree | FrozenQuadtree:
-        """The vertices of the field."""
-
-    @property
-    def arrays(self) -> FieldArrays:
-        """The numbers of the field, which must not be changed."""
-
-
 class Memory(Protocol):
-    """Makes and copies what the numbers of fields are in, and answers from them."""
+    """Makes and copies what the numbers of fields are in."""
 
     @property
     def device(self) -> str:
@@ -59,14 +39,9 @@ class Memory(Protocol):
     def array(self, rows: Rows) -> Array:
         """Return rows as an array, which may share memory with them."""
 
-    def field(
-        self, settings: FieldSettings, tree: FrozenQuadtree, numbers: FieldNumbers
-    ) -> FrozenField:
-        """Return a field that answers from these numbers, with which it shares memory."""
-
 
 class ArrayMemory:
-    """Keeps numbers in arrays, which compiled code trains and answers from."""
+    """Keeps numbers in arrays, which compiled code trains."""
 
     device = "cpu"
 
@@ -83,12 +58,6 @@ class ArrayMemory:
     def array(self, rows: Array) -> Array:
         """Return the rows themselves."""
         return rows
-
-    def field(
-        self, settings: FieldSettings, tree: FrozenQuadtree, numbers: FieldNumbers
-    ) -> FrozenField:
-        """Return the compiled field."""
-        return FrozenCompiledField(settings, tree, FieldArrays(*numbers))
 
 
 def memory_on(device: str) -> Memory:

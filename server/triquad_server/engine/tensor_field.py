@@ -13,12 +13,12 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from triquad_format.records.arrays import Floats, Longs
+from triquad_format.records.arrays import Floats
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES
 from triquad_map.compiled.voxel_index import home_slot, longest_probe, morton_code
 from triquad_map.field.field import FieldArrays
-from triquad_map.field.frozen_field import FieldValues, in_grid
+from triquad_map.field.frozen_field import FieldValues
 from triquad_map.field.quadtree import (
     PLANE_BITS,
     FrozenQuadtree,
@@ -26,7 +26,7 @@ from triquad_map.field.quadtree import (
 )
 
 from triquad_server.engine.live_field import LiveField
-from triquad_server.engine.memory import Array, FieldNumbers
+from triquad_server.engine.memory import Array
 
 _CHUNK = 131_072  # points that tensors are made for at a time
 
@@ -159,10 +159,6 @@ class TensorField:
             np.concatenate([part.gradient for part in parts]),
         )
 
-    def evaluate_in_grid(self, axes: Floats, points: Longs) -> Floats:
-        """Evaluate distances in a grid; see :class:`FieldEngine`."""
-        return self.evaluate(in_grid(axes, points), gradient=False).sdf
-
     def sdf(self, points: Tensor) -> Tensor:
         """Return the signed distance [N] in metres; differentiable in the points."""
         corners = self.around(points)
@@ -238,9 +234,3 @@ class TensorMemory:
         """Return rows as an array; from another device, a copy, for which all work there ends."""
         array: Array = rows.cpu().numpy()
         return array
-
-    def field(
-        self, settings: FieldSettings, tree: FrozenQuadtree, numbers: FieldNumbers
-    ) -> TensorField:
-        """Return the field in tensors."""
-        return TensorField(settings, tree, FieldTensors(*numbers))

@@ -8,9 +8,9 @@ from triquad_format.records.arrays import Bools, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_map.compiled.team import Team
 from triquad_map.evidence.evidence import FrozenEvidence
+from triquad_map.field.frozen_field import FrozenField
 from triquad_map.surfels.surfel_map import surfel_voxels
 
-from triquad_server.engine.memory import FrozenField
 from triquad_server.epochs.epoch import FrozenRegion
 
 _KEY_BITS = 20  # bits of each coordinate of a voxel, or of a group, in its region

@@ -173,10 +173,9 @@ def test_in_a_grid_distances_are_those_of_its_points(settings: FieldSettings) ->
     points[:2000] = rng.integers(5, 40, (2000, 3))
     frozen = field.freeze()
     found = frozen.evaluate_in_grid(axes, points)
-    expected = frozen.evaluate(in_grid(axes, points), gradient=False).sdf
-    np.testing.assert_allclose(found, expected, atol=1e-5)
-    slow = in_tensors(field).evaluate_in_grid(axes, points)
-    np.testing.assert_allclose(found, slow, atol=1e-5)
+    for slow in (frozen, in_tensors(field)):
+        expected = slow.evaluate(in_grid(axes, points), gradient=False).sdf
+        np.testing.assert_allclose(found, expected, atol=1e-5)
     some = rng.permutation(3000)[:100]
     shifted = np.concatenate([axes[:, 7:], axes[:, :7]], axis=1)
     np.testing.assert_array_equal(

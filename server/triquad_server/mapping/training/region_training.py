@@ -8,12 +8,12 @@ from triquad_format.records.arrays import Bools, Doubles, Longs
 from triquad_format.records.region import TrainingState
 from triquad_map.compiled.voxel_index import keys_of
 from triquad_map.evidence.live_evidence import LiveEvidence
+from triquad_map.field.frozen_field import FrozenField
 from triquad_map.surfels.surfel_map import SurfelMap
 from triquad_map.surfels.surfel_search import no_surfels
 
 from triquad_server.engine.field_record import training_state
 from triquad_server.engine.live_field import LiveField
-from triquad_server.engine.memory import FrozenField
 from triquad_server.engine.trainer import Loss, trainer_of
 from triquad_server.intake.rays import ScanRays
 from triquad_server.mapping.replay.ray_table import rays_through, samples_alone
