@@ -13,6 +13,7 @@ import triquad_format
 from triquad_format.errors import FormatError
 from triquad_format.wire.endpoints import DEFAULT_ENDPOINT, full_endpoint
 
+from triquad_server.device import DEVICES
 from triquad_server.errors import (
     LastCheckpointError,
     ListenError,
@@ -164,7 +165,7 @@ def _parser() -> argparse.ArgumentParser:
         help="take the map back to an older checkpoint of the store, such as the one that is kept "
         "before a reset (triquad-inspect STORE --log lists them); what it was stays on disk",
     )
-    add("--device", choices=("auto", "cpu", "cuda"), default="auto", help="default: auto")
+    add("--device", choices=DEVICES, default="cpu", help="what it trains on (default: cpu)")
     _add_settings(parser.add_argument_group("settings (docs/settings.md)"))
     _add_network(parser.add_argument_group("network"))
     add(

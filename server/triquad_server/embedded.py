@@ -160,7 +160,7 @@ def serve(
     settings: "Settings | str | Path | None" = None,
     map: str = "default",  # noqa: A002 - the word of the command line and of the documentation
     listen: str | None = None,
-    device: Literal["auto", "cpu", "cuda"] = "auto",
+    device: Literal["cpu", "cuda"] = "cpu",
     restore: int | None = None,
 ) -> Server:
     """Start a map server within this program, and return once it serves.
@@ -176,7 +176,7 @@ def serve(
         map: name of the map.
         listen: where other processes reach it, ``HOST:PORT`` or an endpoint of Zenoh; ``None``: a
             free port of the loopback.
-        device: what it computes on; ``"auto"``: a GPU where there is one.
+        device: what it trains on; ``"cuda"``: a GPU.
         restore: the epoch of an older checkpoint of the store, to which the map is restored,
             such as ``client.reset().kept_epoch``; ``None``: the newest.
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from triquad_format.errors import SettingsError
 
-from triquad_server.device import choose_device
+from triquad_server.device import check_device
 from triquad_server.launch_options import LaunchOptions
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.net.configuration import Configuration, configuration
@@ -112,7 +112,7 @@ def opened(
 
 def _open(options: LaunchOptions, stops: Stops, starting: Report, stack: ExitStack) -> Service:
     """Open all parts of a server, to be closed by ``stack``."""
-    device = choose_device(options.device)
+    check_device(options.device)
     settings = options.settings
     network = configuration(options.network, options.map_name, settings)
     monitoring = _open_monitoring(settings, stack)
@@ -121,12 +121,12 @@ def _open(options: LaunchOptions, stops: Stops, starting: Report, stack: ExitSta
     if restored is not None:
         settings = _settings_of(restored, settings)
     teams = stack.enter_context(closing(Teams()))
-    warm_up(settings, device, teams, _before_each_step(stops, starting))
+    warm_up(settings, options.device, teams, _before_each_step(stops, starting))
     starting("opening the map")
     mapper = Mapper(
         options.map_name,
         settings,
-        device,
+        options.device,
         record=restored.record if restored else None,
         teams=teams,
     )
@@ -134,7 +134,7 @@ def _open(options: LaunchOptions, stops: Stops, starting: Report, stack: ExitSta
     served = ServedMap(
         name=options.map_name,
         mapper=mapper,
-        device=device,
+        device=options.device,
         store=store,
         restored=restored.info if restored else None,
         teams=teams,
@@ -144,7 +144,7 @@ def _open(options: LaunchOptions, stops: Stops, starting: Report, stack: ExitSta
     if monitoring is not None:
         stack.enter_context(monitoring.showing(service.metrics))
     _log_who_gets_in(network)
-    _log_ready(options, network, service.epoch, device)
+    _log_ready(options, network, service.epoch)
     return service
 
 
@@ -232,13 +232,13 @@ def _log_who_gets_in(network: Configuration) -> None:
         _log.info("access: programs of this machine; --listen tcp/0.0.0.0:7447 lets others connect")
 
 
-def _log_ready(options: LaunchOptions, network: Configuration, epoch: int, device: str) -> None:
+def _log_ready(options: LaunchOptions, network: Configuration, epoch: int) -> None:
     endpoints = ", ".join(network.listen) or f"a {network.mode} of {', '.join(network.connect)}"
     _log.info(
         "ready: map '%s' on %s, epoch %d, %s, store %s",
         options.map_name,
         endpoints,
         epoch,
-        device,
+        options.device,
         options.store or "none",
     )

@@ -18,7 +18,7 @@ class LaunchOptions:
     network: NetworkOptions
     settings: Settings
     store: Path | None
-    device: str  # "cpu", "cuda" or "auto"
+    device: str  # "cpu" or "cuda"
     restore: int | None = None  # the epoch that the map is restored to; None: the newest
 
     def __post_init__(self) -> None:

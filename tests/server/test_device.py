@@ -3,12 +3,12 @@
 import sys
 
 import pytest
-from triquad_server.device import choose_device
+from triquad_server.device import check_device
 from triquad_server.errors import ServerError
 
 
 def test_without_torch_a_gpu_is_refused_with_the_extra_that_has_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)  # as where it is not installed
     with pytest.raises(ServerError, match=r'pip install "triquad\[gpu\]"'):
-        choose_device("cuda")
-    assert choose_device("auto") == "cpu"
+        check_device("cuda")
+    check_device("cpu")

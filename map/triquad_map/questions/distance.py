@@ -15,7 +15,7 @@ from triquad_map.surface import DISC_RADIUS
 from triquad_map.view import NO_LENGTH_M, MapView, NearestSurface, asked
 
 # Arrays take numbers sooner than they take members of an enumeration.
-_SURFACE, _UNKNOWN = int(Status.SURFACE), int(Status.UNKNOWN)
+_FREE, _SURFACE, _UNKNOWN = int(Status.FREE), int(Status.SURFACE), int(Status.UNKNOWN)
 
 _FIELD_VOXELS = 0.5
 """The distance up to which the trained field counts alone, in voxels."""
@@ -172,7 +172,10 @@ def _join_field(
     value = field.sdf[usable].astype(np.float64)
     slope = _unit(field.gradient[usable].astype(np.float64))
     share = _surfel_share(view, distance[rows])
-    side = np.where(value < 0, -1.0, 1.0)
+    behind = value < 0
+    # Nowhere that rays passed and none ended: a field that is flat there may dip below zero.
+    behind[behind] = view.status(points[rows[behind]], reach_m=0.0) != _FREE
+    side = np.where(behind, -1.0, 1.0)
     # The field is no more than a bound where it saturates.
     value = np.clip(value, -high, distance[rows] + low)
     joined = share[:, None] * side[:, None] * gradient[rows] + (1 - share)[:, None] * slope

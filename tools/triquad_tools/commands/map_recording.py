@@ -6,7 +6,7 @@ from contextlib import closing
 from functools import partial
 from pathlib import Path
 
-from triquad_server.device import choose_device
+from triquad_server.device import DEVICES, check_device
 from triquad_server.errors import StoreError
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.process.threads import Teams
@@ -37,14 +37,14 @@ def _map(options: argparse.Namespace) -> int:
     output = options.output
     check_target(output, force=options.force)
     settings = load_settings(options.settings, options.set, preset=options.preset)
-    device = choose_device(options.device)
+    check_device(options.device)
     selection = open_selected(options)
     key = mapping_key(selection, settings)
     with closing(UnfinishedMap(output, key)) as unfinished, closing(Teams()) as teams:
         # The first time all kernels are compiled, which takes half a minute or more.
         with progress("preparing") as report:
-            warm_up(settings, device, teams, report=lambda stage: report(0.0, stage))
-        mapper = unfinished.resumed(settings, device, teams)
+            warm_up(settings, options.device, teams, report=lambda stage: report(0.0, stage))
+        mapper = unfinished.resumed(settings, options.device, teams)
         taken = unfinished.scans_taken
         if taken:
             print_line(f"going on after scan {taken}, from {unfinished.folder}")
@@ -102,7 +102,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="SECTION.KEY=VALUE",
         help="one setting, such as field.leaf_m=0.05, repeatable",
     )
-    add("--device", choices=("auto", "cpu", "cuda"), default="auto", help="default: auto")
+    add("--device", choices=DEVICES, default="cpu", help="what it trains on (default: cpu)")
     add("--training", action="store_true", help="keep what further training needs in the map file")
     add("--force", action="store_true", help="replace OUT where it exists")
     add_version(parser)
