@@ -84,7 +84,8 @@ def test_surfaces_stay_where_later_rays_return_nothing() -> None:
 
 def test_points_beyond_the_range_and_none_show_the_space_up_to_it() -> None:
     with servers.service_and_client(open_settings(short={"range_max_m": 8.0})) as client:
-        points, no_return = [[0, 0, 9], [0, 3e30, 0], [3, 0, 0]], [[0, -1, 0]]
+        near = [[3, 0, 0], [3, 0.1, 0], [3, 0, 0.1]]  # a single return were no surface yet
+        points, no_return = [[0, 0, 9], [0, 3e30, 0], *near], [[0, -1, 0]]
         client.publish_scan(points, POSE, source="short", no_return=no_return)
         asked = [[0, 0, 7.9], [0, 0, 8.5], [0, 7.9, 0], [3, 0, 0], [0, -7.9, 0], [0, -8.5, 0]]
         expected = [Status.FREE, Status.UNKNOWN, Status.FREE, Status.SURFACE]
@@ -146,7 +147,7 @@ def test_what_is_no_direction_is_refused_here(endpoint: str, no_return: Any, tex
 
 
 def test_an_organised_cloud_tells_its_empty_returns() -> None:
-    azimuth = np.radians(np.arange(0, 360, 60))
+    azimuth = np.radians(np.arange(0, 360, 5))
     elevation = np.radians([[-10.0], [60.0]])
     flat = np.cos(elevation)
     rays = np.stack(

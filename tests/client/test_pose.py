@@ -35,7 +35,8 @@ def test_a_scan_and_a_question_take_it() -> None:
     pose = Pose((10.0, 0, 0), (0, 0, np.sqrt(0.5), np.sqrt(0.5)))  # a quarter turn to the left
     with servers.service_and_client() as client:
         client.publish_scan(servers.sphere(), pose)
-        client.publish_scan([[6.0, 0, 0]], pose, source="far")
+        far = [[6.0, 0, 0], [6.0, 0.1, 0], [6.0, 0, 0.1]]
+        client.publish_scan(far, pose, source="far")
         client.settle(servers.WAIT_S)
         assert client.query_sdf([[10.0, 6.0, 0]]).status[0] == Status.SURFACE
         assert client.align(servers.sphere(500), pose).world_from_sensor.shape == (4, 4)

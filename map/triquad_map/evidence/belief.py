@@ -10,8 +10,8 @@ without ending say, and what the voxels around say:
   own record of hits and misses gives a beta distribution of the chance that a ray ends in it; its
   prediction of as many misses is a ratio of gamma functions. So a fence, hit and missed by turns,
   is a fence.
-- Around: a share of what is missed in the voxels around since this one was hit last, less as much
-  for each that was hit since then. Things come and go as a whole.
+- Around: a share of what two scans or more miss in the voxels around since this one was hit last,
+  less as much for each that was hit since then. Things come and go as a whole.
 
 The formulas, and where each number comes from: ``docs/design.md``, "Surface comes and goes".
 """
@@ -110,6 +110,8 @@ def _odds(row: int, near: Ints, seen: SeenVoxels, observed: Observed, belief: Be
         if other == row:
             continue
         if one.misses > 0 and one.missed_since > voxel.hit_scan:
+            if one.missed_since == one.passed_scan:
+                continue  # a single scan may have a wrong pose: it is one witness for all it misses
             is_gone = not has_surface(np.int64(other), seen, observed)
             says = belief.most if is_gone else min(_missed(one), belief.most)
         elif one.misses == 0 and one.ends > 0 and one.hit_scan >= since:

@@ -81,7 +81,7 @@ class LiveEvidence:
             done, self._blocks.count = self._observations.record(
                 voxels, company, done, self._seen, self._blocks.count, sighting, rows
             )
-            if done < len(voxels):
+            if self._blocks.count == self._blocks.capacity:
                 self._make_room(more=True)
         return rows
 

@@ -69,6 +69,20 @@ def test_a_wall_through_which_rays_pass_is_taken_back(rng: np.random.Generator) 
     assert (frozen.status(wall, reach=0.0) == 1).mean() > 0.99  # free
 
 
+def test_one_scan_with_a_wrong_pose_takes_no_wall_away(rng: np.random.Generator) -> None:
+    for scans in (2, 10):
+        watched, facing = Watched(), np.array([1.0, 0, 0])
+        for _ in range(scans):
+            watched.scan(panel(rng, WALL_X), facing)
+        before = watched.believed(panel(rng, WALL_X, half=7.0))
+        assert before > 0.95
+        watched.scan(behind(panel(rng, WALL_X), 120.0))
+        assert watched.believed(panel(rng, WALL_X, half=7.0)) > before - 0.02
+        for _ in range(8):
+            watched.scan(behind(panel(rng, WALL_X), 120.0))
+        assert watched.believed(panel(rng, WALL_X, half=7.0)) < 0.02
+
+
 def test_a_wall_that_rays_reach_stays_for_ever(rng: np.random.Generator) -> None:
     watched, facing = Watched(), np.array([1.0, 0, 0])
     for _ in range(100):
@@ -253,20 +267,21 @@ def test_drops_of_rain_are_no_surface(rng: np.random.Generator) -> None:
 
 
 def test_the_ground_does_not_hold_what_stood_on_it(rng: np.random.Generator) -> None:
-    """A low box goes; the ground beneath it and around is met by every scan."""
+    """A low box goes; the ground before it and where it stood is met by every scan."""
     watched, up = Watched(), np.array([0.0, 0, 1.0])
-    ground_z = SENSOR[2] - 8.6
-    front = np.array([[60.5, y, z] for y in np.arange(124.1, 132, 0.3) for z in (120.3, 121.2)])
+    ground_z, front_x = SENSOR[2] - 8.9, 60.5
 
-    def ground() -> Doubles:
-        x, y = rng.uniform(40, 90, 6000), SENSOR[1] + rng.uniform(-8, 8, 6000)
+    def ground(last_x: float) -> Doubles:
+        x, y = rng.uniform(40, last_x, 6000), SENSOR[1] + rng.uniform(-8, 8, 6000)
         return np.stack([x, y, ground_z + rng.normal(0, 0.05, 6000)], 1)
 
+    def front(count: int) -> Doubles:
+        y, z = SENSOR[1] + rng.uniform(-4, 4, count), rng.uniform(120, 122, count)
+        return np.stack([np.full(count, front_x), y, z], 1)
+
     for _ in range(5):
-        watched.scan(np.concatenate([ground(), front]))
-    assert watched.believed(front) == 1
-    for _ in range(15):
-        ends = ground()
-        watched.scan(ends, up)
-        watched.scan(behind(front + rng.normal(0, 0.05, front.shape), 120.0))
-    assert watched.believed(front) < 0.05
+        watched.scan(np.concatenate([ground(front_x), front(400)]))
+    assert watched.believed(front(400)) > 0.99
+    for _ in range(10):
+        watched.scan(ground(90.0), up)
+    assert watched.believed(front(400)) < 0.02
