@@ -87,16 +87,16 @@ def _file(options: argparse.Namespace) -> list[Figure]:
 
 
 def _moving(options: argparse.Namespace) -> list[Figure]:
-    from bench.parts.moving import measure_moving
-    from bench.parts.parked import measure_parked
-
-    return measure_moving(options.seed, options.recorded) + measure_parked(options.seed)
-
-
-def _belief(options: argparse.Namespace) -> list[Figure]:  # noqa: ARG001
     from bench.parts.belief import measure_belief
+    from bench.parts.parked import measure_parked
+    from bench.parts.revisited import measure_revisited
 
-    return measure_belief(held=False) + measure_belief(held=True)
+    return [
+        *measure_revisited(options.recorded),
+        *measure_belief(held=False),
+        *measure_belief(held=True),
+        *measure_parked(options.seed),
+    ]
 
 
 def _presets(options: argparse.Namespace) -> list[Figure]:
@@ -123,7 +123,6 @@ PARTS: dict[str, _Measure] = {
     "answers": _answers,
     "file": _file,
     "moving": _moving,
-    "belief": _belief,
     "presets": _presets,
     "start": _start,
     "viewer": _viewer,

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from triquad_tools.console.lines import print_remark
 from triquad_tools.recordings.cloud import points_in_range
 from triquad_tools.recordings.folders.cloud_folder import read_cloud_folder
 from triquad_tools.sensors.sweep import PosedScan
@@ -18,18 +17,6 @@ class RecordedScans:
 
     mapped: tuple[PosedScan, ...]
     withheld: tuple[PosedScan, ...]
-
-
-def check_recorded(part: str, folder: Path | None) -> None:
-    """Check a folder before all else, which takes minutes; report a part that has none.
-
-    Raises:
-        ToolError: it cannot be read.
-    """
-    if folder is None:
-        print_remark(f"{part}: recorded scans are left out: give --recorded FOLDER")
-    else:
-        read_cloud_folder(folder)
 
 
 def recorded_scans(path: Path, scans: int | None = None) -> RecordedScans:

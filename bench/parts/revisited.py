@@ -11,6 +11,7 @@ import numpy as np
 from triquad_format.records.arrays import Doubles
 from triquad_server.intake.rays import usable_rays
 from triquad_server.settings import Settings
+from triquad_tools.console.lines import print_remark
 from triquad_tools.console.progress import progress
 
 from bench.ended_voxels import (
@@ -35,8 +36,15 @@ class Revisited:
     error_m: float  # median distance from the surface of the points of withheld scans
 
 
-def revisited_figures(path: Path) -> list[Figure]:
-    """Return figures of a recorded folder, with contradicted surface removed and without."""
+def measure_revisited(path: Path | None) -> list[Figure]:
+    """Return figures of a recorded folder, with contradicted surface removed and without.
+
+    Raises:
+        ToolError: the folder cannot be read.
+    """
+    if path is None:
+        print_remark("moving: recorded scans are left out: give --recorded FOLDER")
+        return []
     scans, usual = recorded_scans(path), Settings()
     still = usual.model_copy(update={"change": usual.change.model_copy(update={"static": True})})
     found = revisit(scans, usual, path.name)

@@ -15,7 +15,7 @@ from triquad_tools.simulation.street import ROAD_HALF_WIDTH_M, street
 
 from bench.scenes.episodes import Episode, Things, straight_lane
 from bench.scenes.room import room_by_lidar
-from bench.scenes.traffic import thin_things
+from bench.scenes.thin_things import thin_things
 
 _BUSY_SCANS = 60
 _ROBOT_Z_M = 0.6

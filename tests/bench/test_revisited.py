@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
+from support.maps.episodes import box_on_a_street
 from support.recordings.kitti_folder import write_folder
 from triquad_server.settings import ChangeSettings, Settings
-from triquad_tools.simulation.lidar import Lidar
 
 from bench.parts.revisited import Revisited, revisit
 from bench.recorded import RecordedScans, recorded_scans
-from bench.scenes.traffic import street_traffic
 
 BUSY, SCANS = 4, 14  # things move in the first
 
@@ -18,8 +17,7 @@ pytestmark = pytest.mark.long
 @pytest.fixture(scope="module")
 def scans(tmp_path_factory: pytest.TempPathFactory) -> RecordedScans:
     path = tmp_path_factory.mktemp("recorded")
-    traffic = street_traffic(1, BUSY, SCANS, Lidar(beams=32, columns=512))
-    made = list(traffic)
+    made = list(box_on_a_street(BUSY, SCANS - BUSY))
     poses = np.array([scan.world_from_sensor for scan in made])
     write_folder(path, [scan.points for scan in made], poses, 100_000_000 * np.arange(SCANS))
     return recorded_scans(path)
