@@ -134,7 +134,7 @@ def test_two_servers_of_one_program_have_maps_of_their_own():
         ({"settings": {"scan": {}}}, SettingsError, "give a Settings record or a TOML file"),
         ({"map": "a/b"}, FormatError, "a/b"),
         ({"listen": "robot:http"}, FormatError, "'http' is not a port"),
-        ({"device": "gpu"}, ServerError, "use auto, cpu or cuda"),
+        ({"device": "gpu"}, ServerError, "use cpu or cuda"),
         ({"restore": 3}, ServerError, "needs the --store"),
     ],
 )
