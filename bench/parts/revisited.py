@@ -11,6 +11,7 @@ import numpy as np
 from triquad_format.records.arrays import Doubles
 from triquad_server.intake.rays import usable_rays
 from triquad_server.settings import Settings
+from triquad_tools.console.command import ToolError
 from triquad_tools.console.lines import print_remark
 from triquad_tools.console.progress import progress
 
@@ -40,12 +41,14 @@ def measure_revisited(path: Path | None) -> list[Figure]:
     """Return figures of a recorded folder, with contradicted surface removed and without.
 
     Raises:
-        ToolError: the folder cannot be read.
+        ToolError: the folder cannot be read, or has too few scans.
     """
     if path is None:
         print_remark("moving: recorded scans are left out: give --recorded FOLDER")
         return []
     scans, usual = recorded_scans(path), Settings()
+    if not scans.withheld:
+        raise ToolError(f"{path}: {len(scans.mapped)} scans are too few, as every 7th is withheld")
     still = usual.model_copy(update={"change": usual.change.model_copy(update={"static": True})})
     found = revisit(scans, usual, path.name)
     error_cm = 100 * found.error_m
