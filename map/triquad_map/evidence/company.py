@@ -29,7 +29,7 @@ def have_company(rays: Doubles) -> Bools:
     """Return which ends of ``rays`` [N, 3], voxels from the sensor, have others beside them."""
     reach = _SPACINGS * _spacing(rays, empty_keys(len(rays)))
     cells = VoxelIndex(max(16, len(rays)))
-    return _have_company(rays, reach, cells.arrays, *np.empty((2, len(rays)), np.int32))
+    return _have_company(rays, reach, cells.arrays, *np.empty((3, len(rays)), np.int32))
 
 
 @kernel()
@@ -56,29 +56,40 @@ def _cell(ray: Doubles, reach: float) -> tuple[int, int, int]:
 
 
 @kernel()
-def _have_company(rays: Doubles, reach: float, cells: Index, last: Ints, before: Ints) -> Bools:
-    """Count the others; ``last`` [N] of each cell and those ``before`` [N] each make its list."""
+def _have_company(
+    rays: Doubles, reach: float, cells: Index, own: Ints, last: Ints, before: Ints
+) -> Bools:
+    """Count the others of each ray, first in its ``own`` [N] cell, where most have enough.
+
+    ``last`` [N] of each cell and those ``before`` [N] each make its list.
+    """
     used = 0
     for i, ray in enumerate(rays):
         x, y, z = _cell(ray, reach)
         row = make_row(cells, used, pack(x, y, z))
         before[i] = last[row] if row < used else -1
-        last[row] = i
+        own[i], last[row] = row, i
         used = max(used, row + 1)
     found = np.zeros(len(rays), np.bool_)
     for i, ray in enumerate(rays):
-        square = ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2
-        square = max(reach**2 * square, _NEAREST**2)
+        square = max(reach**2 * (ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2), _NEAREST**2)
+        others = _count(rays, i, square, last[own[i]], before, -1)  # itself is none
         x, y, z = _cell(ray, reach)
-        others = -1  # itself
-        for dx in range(-1, 2):
-            for dy in range(-1, 2):
-                for dz in range(-1, 2):
-                    row = find_row(cells, pack(x + dx, y + dy, z + dz))
-                    j = last[row] if row >= 0 else np.int32(-1)
-                    while j >= 0 and others < _OTHERS:
-                        a, b, c = ray[0] - rays[j, 0], ray[1] - rays[j, 1], ray[2] - rays[j, 2]
-                        others += a * a + b * b + c * c <= square
-                        j = before[j]
+        for k in range(27):
+            if others >= _OTHERS:
+                break
+            row = find_row(cells, pack(x + k // 9 - 1, y + k // 3 % 3 - 1, z + k % 3 - 1))
+            if row >= 0 and row != own[i]:
+                others = _count(rays, i, square, last[row], before, others)
         found[i] = others >= _OTHERS
     return found
+
+
+@inner_kernel()
+def _count(rays: Doubles, i: int, square: float, j: int, before: Ints, others: int) -> int:
+    """Add those of a list, which begins with ray ``j``, to the others beside ray ``i``."""
+    while j >= 0 and others < _OTHERS:
+        a, b, c = rays[i, 0] - rays[j, 0], rays[i, 1] - rays[j, 1], rays[i, 2] - rays[j, 2]
+        others += a * a + b * b + c * c <= square
+        j = before[j]
+    return others
