@@ -103,7 +103,6 @@ def test_how_well_it_was_learnt_is_told(client):
     assert fit.median_m <= fit.upper_m < 0.1
     assert len(fit.worst) == len(fit.worst_median_m) <= 5
     assert (np.diff(fit.worst_median_m) <= 0).all()
-    assert fit.repairing == 0
 
 
 def test_connected_clients_are_listed(client, endpoint):

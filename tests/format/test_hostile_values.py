@@ -68,7 +68,7 @@ ASTRONOMIC = {"dtype": "|u1", "shape": [0, 2**39, 2**39], "data": b""}
 
 HOSTILE: dict[str, tuple[str, Edit]] = {
     "map: no version": (MAP, lambda b: b.pop("min_reader_version")),
-    "training: places": (TRAINING, set_field("places_repaired", 2**31)),
+    "training: too many steps": (TRAINING, set_field("mlp_steps", 2**31)),
     "map: epoch": (MAP, set_field("epoch", -1)),
     "map: another epoch": (MAP, set_field("epoch", 8)),
     "map: name": (MAP, set_field("name", "../etc")),

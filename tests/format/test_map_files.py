@@ -27,7 +27,6 @@ from support.maps.map_records import (
     assert_same,
     random_record,
     with_integers,
-    with_progress,
     with_rays,
     with_support,
 )
@@ -132,7 +131,7 @@ def test_round_trip_of_any_record(
     record = random_record(seed, settings=chosen, points=points, training=training, epoch=epoch)
     record = with_support(record if limit is None else with_integers(record, limit, seed))
     if training:
-        record = with_progress(with_rays(record, points), MapProgress(*progress))
+        record = dataclasses.replace(with_rays(record, points), progress=MapProgress(*progress))
     assert_read_back(record)
 
 

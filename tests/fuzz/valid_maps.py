@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from support.files import golden
@@ -10,7 +10,6 @@ from support.files.checkpoint_folder import write_record
 from support.maps.map_records import (
     random_record,
     with_integers,
-    with_progress,
     with_rays,
     with_support,
 )
@@ -63,7 +62,7 @@ def valid_maps(folder: Path) -> list[ValidMap]:
     trained = with_rays(with_support(random_record(settings=TINY, points=3)), rays=12)
     complete = {
         "plain": plain,
-        "training": with_progress(trained, MapProgress(60, 116_000_000, 0.25)),
+        "training": replace(trained, progress=MapProgress(60, 116_000_000, 0.25)),
         "integers": with_integers(plain),
     }
     maps = [_written(folder / kind, record) for kind, record in complete.items()]

@@ -138,8 +138,6 @@ def _check_training(settings: FieldSettings, region: Region, training: TrainingS
     _check_arrays("mlp variances", training.mlp_variances, _mlp_shapes(settings), low=0.0)
     _check_count("mlp steps", training.mlp_steps, 2**31)
     _check_count("training budget", training.budget_samples)
-    for name in ("places_repaired", "places_given_up"):
-        _check_count(name, getattr(training, name), 2**31)
     samples = len(training.sample_points)
     _check_floats("sample points", training.sample_points, (samples, 3))
     if np.abs(training.sample_points).max(initial=0) > settings.region_side_m:

@@ -121,8 +121,6 @@ class TrainingState:
     sample_labels: NDArray[np.floating]  # [S] signed distance, metres
     budget_samples: int  # training budget: samples still to be trained on; 0: all is learnt
     rays: ReplayRays = field(default_factory=no_rays)
-    places_repaired: int = 0  # that had forgotten what they knew, and were trained again
-    places_given_up: int = 0  # that had, and that training did not mend
 
 
 @dataclass(frozen=True)

@@ -127,9 +127,6 @@ class FieldFit(Message):
     upper_m: Length  # what 90 % of them keep below
     worst: FinitePoints  # [K, 3] map frame, metres: centres of the places with the largest medians
     worst_median_m: Annotated[Lengths, rows_of("worst")]  # [K]
-    repairing: Count  # places that have forgotten and are being trained again
-    repaired: Count  # places that were, so far
-    given_up: Count  # and places that training did not mend
 
 
 @dataclass(frozen=True)

@@ -38,9 +38,8 @@ class Progress:
 
 def map_fit(regions: Iterable[LiveRegion]) -> FieldFit | None:
     """Return how well regions fit, as they were judged last; ``None`` where none was."""
-    judgements = [(region.centre, region.training.judgement) for region in regions]
-    judged = [(centre, judgement.fit) for centre, judgement in judgements if judgement.fit]
-    fit = field_fit.map_fit(judged)
+    fits = [(region.centre, region.training.fit) for region in regions]
+    fit = field_fit.map_fit([(centre, of_region) for centre, of_region in fits if of_region])
     if fit is None:
         return None
     return FieldFit(
@@ -49,7 +48,4 @@ def map_fit(regions: Iterable[LiveRegion]) -> FieldFit | None:
         upper_m=fit.upper_m,
         worst=fit.worst,
         worst_median_m=fit.worst_median_m.astype(np.float32),
-        repairing=sum(judgement.repairing for _, judgement in judgements),
-        repaired=sum(judgement.repairs.done for _, judgement in judgements),
-        given_up=sum(judgement.repairs.given_up for _, judgement in judgements),
     )

@@ -47,7 +47,6 @@ counter   triquad_samples_trained_total        metrics.samples_trained          
 gauge     triquad_samples_left                 status.samples_left                                  Training samples until nothing is left to learn
 counter   triquad_samples_discarded_total      status.samples_discarded                             Training samples left out, beyond what the mapped area may need
 gauge     triquad_held_out_median_metres       status.fit.median_m                                  Median of how far from zero the field is where rays end that it is not trained on
-gauge     triquad_places_repairing             status.fit.repairing                                 Places that fit such rays worse than they did, and are trained again
 gauge     triquad_settled                      status.settled                                       1 where nothing is left to learn and the newest epoch shows all; else 0
 gauge     triquad_loss                         status.loss                                          Recent training loss
 counter   triquad_mapper_seconds_total         metrics.mapper_s.{activity}                          Time of the thread that maps, by activity

@@ -77,36 +77,12 @@ def test_a_map_is_judged_before_anything_is_trained(restarted: Mapper) -> None:
     assert now.rays == pytest.approx(live.rays, rel=0.01)
     assert now.median_m == pytest.approx(live.median_m, abs=5e-4)
     assert now.upper_m == pytest.approx(live.upper_m, abs=2e-3)
-    assert now.repairing == 0
 
 
-def test_what_is_forgotten_after_a_restart_is_found_repaired_and_counted(restarted: Mapper) -> None:
+def test_what_the_field_forgets_after_a_restart_is_told(restarted: Mapper) -> None:
     before, before_m = map_fit(restarted.regions), surface_error(restarted.publish(), world(SCANS))
-    assert before is not None
     damage(restarted)
     settle(restarted)
     forgetful_m = surface_error(restarted.publish(), world(SCANS))
-    forgetful = map_fit(restarted.regions)
-    assert not restarted.settled
-    assert forgetful.repairing > 0
-    assert forgetful.median_m > 1.2 * before.median_m
+    assert map_fit(restarted.regions).median_m > 1.2 * before.median_m
     assert forgetful_m > 1.2 * before_m
-    settle_all(restarted)
-    after, after_m = map_fit(restarted.regions), surface_error(restarted.publish(), world(SCANS))
-    assert after.repaired > 0
-    for worse, again, at_first in (
-        (forgetful.median_m, after.median_m, before.median_m),
-        (forgetful_m, after_m, before_m),
-    ):
-        assert again - at_first < 0.4 * (worse - at_first), "most of it is learnt again"
-    again = Mapper("test", settings(), "cpu", restarted.changes_since(None).record)
-    assert map_fit(again.regions).repaired == after.repaired
-
-
-def settle_all(mapper: Mapper) -> None:
-    """Train until nothing is left to learn, nor to be learnt again."""
-    settle(mapper)
-    mapper.publish()
-    while not mapper.settled:
-        settle(mapper)
-        mapper.publish()

@@ -10,7 +10,6 @@ from pathlib import Path
 from support.maps.map_records import (
     SMALL,
     random_record,
-    with_progress,
     with_rays,
     with_support,
 )
@@ -32,7 +31,7 @@ def golden_records() -> dict[str, MapRecord]:
     indices = ((0, 0, 0), (-1, 2, 0))
     record = random_record(2024, indices=indices, points=12, name="golden", epoch=42)
     record = with_rays(with_support(record), 40)
-    record = with_progress(record, MapProgress(60, 116_000_000, 0.25))
+    record = dataclasses.replace(record, progress=MapProgress(60, 116_000_000, 0.25))
     wide = dataclasses.replace(SMALL, depth=9)
     plain = random_record(2025, settings=wide, training=False, name="golden", epoch=44)
     return {

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records import morton
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings, RegionIndex
-from triquad_format.records.map_progress import MapProgress
 from triquad_format.records.region import (
     AXES,
     BLOCK_BYTES,
@@ -226,16 +225,6 @@ def _rays(rng: np.random.RandomState, settings: FieldSettings, count: int) -> Re
     origin_of = rng.randint(0, 300, count, np.int64).astype(np.int32)
     slopes = rng.randint(0, 256, count, np.int64).astype(np.uint8)
     return ReplayRays(ends, origin_of, slopes, origins=_floats(rng, 300, 3))
-
-
-def with_progress(record: MapRecord, progress: MapProgress) -> MapRecord:
-    """The record, which has training state, of a map that has come so far and forgot at times."""
-    regions = []
-    for region in record.regions:
-        assert region.training is not None
-        training = dataclasses.replace(region.training, places_repaired=3, places_given_up=1)
-        regions.append(dataclasses.replace(region, training=training))
-    return dataclasses.replace(record, regions=tuple(regions), progress=progress)
 
 
 def assert_same(have: object, want: object, where: str = "record") -> None:

@@ -6,7 +6,7 @@ import pytest
 from mcap.reader import make_reader
 from support.files.checkpoint_folder import FIRST, HOUR_NS, START_NS, map_at, write_checkpoints
 from support.files.mapfile_edit import file_bytes, rewritten
-from support.maps.map_records import SMALL, assert_same, random_record, with_progress
+from support.maps.map_records import SMALL, assert_same, random_record
 from triquad_format.mapfile.parts.part import REGION, PartKey
 from triquad_format.mapfile.reader import read_map, read_map_file
 from triquad_format.mapfile.writer import write_map
@@ -35,7 +35,7 @@ def test_tool_packs(map_file, tmp_path, capsys):
 
 
 def test_a_packed_map_still_tells_what_it_was_made_of(tmp_path):
-    record = with_progress(random_record(1), MapProgress(60, 116_000_000, 0.25))
+    record = dataclasses.replace(random_record(1), progress=MapProgress(60, 116_000_000, 0.25))
     write_map(record, tmp_path / "in.triquad")
     out = tmp_path / "out.triquad"
     options = ["--crop", "-4", "-4", "-4", "4", "4", "4", "--no-training"]

@@ -219,8 +219,6 @@ def _pack_training(
         "samples": len(training.sample_points),
         "rays": len(training.rays),
         "origins": pack_array(training.rays.origins),
-        "places_repaired": training.places_repaired,
-        "places_given_up": training.places_given_up,
     }
     yield _region_part(PartKey(TRAINING, region.index), fields)
     moments = (training.table_means, training.table_variances, training.table_steps)

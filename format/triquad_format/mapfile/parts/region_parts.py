@@ -180,8 +180,6 @@ class RegionParts:
             sample_labels=labels,
             budget_samples=head.count("training_budget"),
             rays=self._rays(head),
-            places_repaired=head.count("places_repaired"),
-            places_given_up=head.count("places_given_up"),
         )
 
     def _rays(self, head: PartBody) -> ReplayRays:

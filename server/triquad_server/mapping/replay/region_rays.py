@@ -1,7 +1,5 @@
 """The kept rays of a region: those to train on, and those to judge its field with."""
 
-from typing import NamedTuple
-
 import numpy as np
 from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
 from triquad_format.records.region import TrainingState
@@ -14,13 +12,6 @@ from triquad_server.mapping.replay.ray_table import RayTable, samples_alone
 from triquad_server.mapping.replay.region_setup import RegionSetup
 from triquad_server.mapping.replay.replay_pool import ReplayPool
 from triquad_server.mapping.replay.replay_record import restored_rays
-
-
-class JudgingRays(NamedTuple):
-    """Rays that judge a field."""
-
-    ends: Floats  # [N, 3] metres from the region's centre
-    are_new: Bools  # [N]
 
 
 class RegionRays:
@@ -51,12 +42,12 @@ class RegionRays:
             np.concatenate([trained.origins, held.origins]),
         )
 
-    def judging(self, newest: int) -> JudgingRays:
-        """Return the rays that are held out and end in the region's cube, the ``newest`` marked."""
+    @property
+    def judging_ends(self) -> Floats:
+        """Return where rays that are held out end [N, 3] in the region's cube, metres from its
+        centre."""
         ends = self.held_out.table.ends_newest_last
-        are_new = np.arange(len(ends)) >= len(ends) - newest
-        inside = in_cube(ends, self._settings)
-        return JudgingRays(ends[inside], are_new[inside])
+        return ends[in_cube(ends, self._settings)]
 
     @property
     def ends(self) -> Floats:

@@ -5,7 +5,6 @@ from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_map.compiled.team import Team
 from triquad_map.compiled.voxel_index import Index, VoxelIndex
-from triquad_map.field_fit import place_keys
 
 from triquad_server.engine.live_field import Batch
 from triquad_server.mapping.replay.kept_rays import KeptRays
@@ -22,7 +21,7 @@ _NONE = np.zeros(0, np.int64)
 
 
 class ReplayPool:
-    """Keeps rays of one region, some of which can be oversampled."""
+    """Keeps rays of one region, and draws samples on them."""
 
     def __init__(
         self, placement: Placement, settings: FieldSettings, seed: int, team: Team
@@ -34,7 +33,6 @@ class ReplayPool:
         self._rng = np.random.default_rng(seed)
         self.kept = KeptRays(settings, self._rng)
         self._fresh = _NONE  # places of the newest
-        self._oversampled = _NONE
         self._blocks: Index | None = None  # in which the rays end that are drawn on at random
         self._focused: Longs | None = None  # their places; None: to be found
 
@@ -49,13 +47,11 @@ class ReplayPool:
     def add(self, new: RayTable, fresh: bool = True) -> None:
         """Take in rays; if ``fresh``, they become the newest."""
         places = self.kept.add(new)
-        if len(self._oversampled) or self._focused is not None:
+        if self._focused is not None:
             is_other = np.zeros(len(self), np.bool_)
             is_other[places] = True
-            self._oversampled = self._oversampled[~is_other[self._oversampled]]
-            if self._focused is not None:
-                kept = self._focused[~is_other[self._focused]]
-                self._focused = np.concatenate([kept, self._ending_in_blocks(places)])
+            kept = self._focused[~is_other[self._focused]]
+            self._focused = np.concatenate([kept, self._ending_in_blocks(places)])
         if fresh:
             self._fresh = places
 
@@ -70,24 +66,9 @@ class ReplayPool:
         in_focus = self._in_focus()
         return len(self) if in_focus is None else len(in_focus)
 
-    def oversample(self, places: Longs) -> int:
-        """From now on, draw some samples in ``places`` [P] on request; return their rays."""
-        self._oversampled = _NONE
-        if len(places):
-            ends = self.table.rows[:, END : END + 3]
-            self._oversampled = np.flatnonzero(np.isin(place_keys(ends, self._settings), places))
-        return len(self._oversampled)
-
-    def draw(self, count: int, fresh: int, oversampled: int = 0) -> Batch:
-        """Draw ``count`` samples on rays at random.
-
-        ``fresh`` of them are on the newest, ``oversampled`` in the places that are oversampled.
-        """
-        places = self._at_random(count, fresh)
-        if oversampled and len(self._oversampled):
-            rows = self._rng.integers(len(self._oversampled), size=min(oversampled, count - fresh))
-            places[fresh : fresh + oversampled] = self._oversampled[rows]
-        return self.draw_on(places)
+    def draw(self, count: int, fresh: int) -> Batch:
+        """Draw ``count`` samples on rays at random, ``fresh`` of them on the newest."""
+        return self.draw_on(self._at_random(count, fresh))
 
     def draw_on(self, places: Longs) -> Batch:
         """Draw a sample on each of the rays of :attr:`table` at ``places`` [N]."""
@@ -127,7 +108,6 @@ class ReplayPool:
         """Drop the rays that end in ``voxels`` [N, 3]."""
         self.kept.forget_ends(voxels)
         self._fresh = self._fresh[self._fresh < len(self)]
-        self._oversampled = self._oversampled[self._oversampled < len(self)]
         self._focused = None
 
     def _at_random(self, count: int, fresh: int) -> Longs:
@@ -157,5 +137,5 @@ class ReplayPool:
 
     def _select_none(self) -> None:
         """Forget the selected places, since rays have others now."""
-        self._fresh = self._oversampled = _NONE
+        self._fresh = _NONE
         self._focused = None

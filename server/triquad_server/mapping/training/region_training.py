@@ -1,7 +1,4 @@
-"""Training of one region of the live map: what it still has to learn, and has forgotten."""
-
-import logging
-from dataclasses import replace
+"""Training of one region of the live map: what it still has to learn, and how well it fits."""
 
 import numpy as np
 from triquad_format.records.arrays import Bools, Doubles, Longs
@@ -9,6 +6,7 @@ from triquad_format.records.region import TrainingState
 from triquad_map.compiled.voxel_index import keys_of
 from triquad_map.evidence.live_evidence import LiveEvidence
 from triquad_map.field.frozen_field import FrozenField
+from triquad_map.field_fit import PlaceFits, Places
 from triquad_map.surfels.surfel_map import SurfelMap
 from triquad_map.surfels.surfel_search import no_surfels
 
@@ -20,11 +18,8 @@ from triquad_server.mapping.replay.ray_table import rays_through, samples_alone
 from triquad_server.mapping.replay.region_rays import RegionRays
 from triquad_server.mapping.replay.region_setup import RegionSetup
 from triquad_server.mapping.training.focus import Focus
-from triquad_server.mapping.training.judgement import Judgement, Repairs
 from triquad_server.mapping.training.slopes import Slopes
 from triquad_server.mapping.training.training_budget import FairShare, TrainingBudget
-
-_log = logging.getLogger(__name__)
 
 _SAMPLES_PER_VOXEL = 16  # samples that teach the free space of a removed surface
 _VISITS = 4  # times that each of them is trained on
@@ -85,7 +80,7 @@ class RegionTraining:
         self._random = np.random.default_rng([seed, 1])  # other numbers than those of the pool
         self.rays = rays or RegionRays(setup, seed)
         self.budget = TrainingBudget(setup.training)
-        self.judgement = Judgement(setup.field, Repairs())
+        self.fit: PlaceFits | None = None  # to the rays that are held out, as judged last
         self._focus = Focus(field, evidence, self.rays.pool)
         self._slopes = Slopes(field, self.rays.pool)
         self._trainer = trainer_of(field, setup.sums, setup.team)
@@ -104,12 +99,10 @@ class RegionTraining:
         centre: Doubles,
         seed: int,
     ) -> "RegionTraining":
-        """Continue as recorded; what the field forgets is judged by its values now."""
+        """Continue as recorded."""
         rays = RegionRays.restored(state, setup, seed)
         training = cls(field, evidence, setup, centre, seed, rays)
         training.budget.restore(state.budget_samples, len(rays.pool))
-        repairs = Repairs(state.places_repaired, state.places_given_up)
-        training.judgement = Judgement(setup.field, repairs)
         training._judge(field.freeze())
         return training
 
@@ -158,7 +151,7 @@ class RegionTraining:
         if self.is_settled:
             self._focus.narrow()
         self._new_rays += int(is_new.sum())
-        shows_new = self._new_rays > _NEW_SHARE * len(is_new) or self.judgement.repairing > 0
+        shows_new = self._new_rays > _NEW_SHARE * len(is_new)
         if shows_new:
             self._new_rays = 0
         ends = rays.ends[is_new & shows_new] - self._centre
@@ -176,7 +169,7 @@ class RegionTraining:
         self._focus.apply(self.batch)
         pool = self.rays.pool
         step = self.budget.next_step(self.batch, pool.rays_drawn_on)
-        loss = self._trainer.train(pool.draw(step.samples, step.fresh, step.repair), step.rates)
+        loss = self._trainer.train(pool.draw(step.samples, step.fresh), step.rates)
         self.budget.spend(step)
         self._unjudged_samples += step.samples
         self._slopes.after(step)
@@ -186,7 +179,7 @@ class RegionTraining:
         """Use a published epoch: its ``field``, its ``surfels``, and voxels ``removed`` [M, 3].
 
         These had surface in the epoch before, and have none now. The field is judged from time to
-        time, and learns again what it has forgotten.
+        time.
         """
         if len(removed):
             self._unlearn(removed, surfels)
@@ -202,11 +195,7 @@ class RegionTraining:
 
     def state(self) -> TrainingState:
         """Return what training needs beyond the field, rays and samples, as copies."""
-        return replace(
-            training_state(self._field, self.budget.samples),
-            places_repaired=self.judgement.repairs.done,
-            places_given_up=self.judgement.repairs.given_up,
-        )
+        return training_state(self._field, self.budget.samples)
 
     def _unlearn(self, removed: Longs, surfels: SurfelMap) -> None:
         """Forget the rays that ended in voxels, and have the field learn what is there now."""
@@ -235,14 +224,12 @@ class RegionTraining:
         return self._unjudged_samples > 0 or new
 
     def _judge(self, field: FrozenField) -> None:
-        """Find where the field has forgotten what it knew, and have it learnt again."""
-        rays = self.rays.judging(newest=self._unjudged_rays)
+        """Find how well the field fits the rays that are held out: it should be zero at their ends.
+
+        The error there includes the sensor's noise.
+        """
         self._unjudged_samples = self._unjudged_rays = 0
-        if len(rays.ends) == 0:
-            return
-        sdf = field.evaluate(rays.ends, gradient=False).sdf
-        again = self.judgement.judge(rays.ends, sdf, rays.are_new)
-        if len(again):
-            _log.info("%d places fit rays worse than before, and are learnt again", len(again))
-            self._focus.release()
-        self.budget.repair(self.rays.pool.oversample(again))
+        ends = self.rays.judging_ends
+        if len(ends):
+            sdf = field.evaluate(ends, gradient=False).sdf
+            self.fit = PlaceFits.of(Places.of(ends, self._setup.field), sdf)

@@ -39,8 +39,6 @@ _COOLDOWN = 8.0  # samples left per ray below which the learning rate falls
 _COOLDOWN_SHARE = 0.5
 """It does not fall before less than this share of the most that may be left is left: else, where
 little may be, it would begin low."""
-_REPAIR_SHARE = 0.5  # share of a batch that is drawn where the field has forgotten
-_REPAIR_VISITS = 16  # samples on each ray there
 
 
 class Step(NamedTuple):
@@ -48,7 +46,6 @@ class Step(NamedTuple):
 
     samples: int
     fresh: int  # of them, on rays of the newest scan
-    repair: int  # of them, in places that have forgotten
     rates: Rates
 
 
@@ -61,8 +58,6 @@ class TrainingBudget:
         self.discarded = 0  # samples so far beyond the limit of what may be left
         self._most = 0  # limit of what may be left
         self._fresh = 0  # of the samples, those that are to be on rays of the newest scan
-        self._repair = 0  # of the samples, those in places that have forgotten
-        self._new_rays = 0  # since nothing was left
 
     @property
     def learns_newest(self) -> bool:
@@ -71,9 +66,6 @@ class TrainingBudget:
 
     def add(self, rays: int) -> None:
         """Add new rays to learn from."""
-        if self.samples == 0:
-            self._new_rays = 0
-        self._new_rays += rays
         samples = int(rays * self._settings.samples_per_ray)
         self._fresh = int(samples * self._settings.fresh_share)
         self.samples += samples
@@ -87,7 +79,6 @@ class TrainingBudget:
     def restore(self, samples: int, rays: int) -> None:
         """Go on with ``samples`` from a record, on ``rays`` rays."""
         self.samples = samples if rays else 0
-        self._new_rays = rays
 
     def limit(self, most: int) -> None:
         """From now on, at most ``most`` samples are left."""
@@ -96,12 +87,6 @@ class TrainingBudget:
         self.samples -= too_many
         self.discarded += too_many
 
-    def repair(self, rays: int) -> None:
-        """Learn again the ``rays`` rays in places that have forgotten, and nothing else."""
-        self._repair = _REPAIR_VISITS * rays
-        needed = int(self._repair / _REPAIR_SHARE)
-        self.samples = max(self.samples, min(needed, self._most))
-
     def clear(self) -> None:
         """Leave nothing to learn."""
         self.samples = 0
@@ -109,29 +94,19 @@ class TrainingBudget:
     def next_step(self, count: int, kept_rays: int) -> Step:
         """Return a step of ``count`` samples, where ``kept_rays`` rays are kept."""
         settings = self._settings
-        rates = Rates(
-            settings.learning_rate * self._cooling(kept_rays),
-            young_rate=settings.learning_rate * self._cooling(min(self._new_rays, kept_rays)),
-        )
         return Step(
             count,
             fresh=min(self._fresh, int(count * settings.fresh_share)),
-            repair=min(self._repair, int(count * _REPAIR_SHARE)),
-            rates=rates,
+            rates=Rates(settings.learning_rate * self._cooling(kept_rays)),
         )
 
     def spend(self, step: Step) -> None:
         """Record that a step was taken."""
-        self._repair -= step.repair
         self.samples = max(0, self.samples - step.samples)
         # A tiny share gives no batch a whole sample: the rest ends with the budget.
         self._fresh = self._fresh - step.fresh if self.samples else 0
 
-    def _cooling(self, rays: int) -> float:
-        """Return the share of the learning rate: it falls with the budget, so the field settles.
-
-        It falls the later, the fewer the ``rays`` are from which there is something to learn: so
-        what is new learns quickly where much has settled.
-        """
-        enough = max(1.0, min(_COOLDOWN * rays, _COOLDOWN_SHARE * self._most))
+    def _cooling(self, kept_rays: int) -> float:
+        """Return the share of the learning rate: it falls with the budget, so the field settles."""
+        enough = max(1.0, min(_COOLDOWN * kept_rays, _COOLDOWN_SHARE * self._most))
         return min(1.0, max(_LEAST_RATE, (self.samples / enough) ** 2))
