@@ -29,9 +29,6 @@ little where it ends."""
 MARGIN_STEP = 0.25
 """Margins of voxels, beyond which no ray ended, are given in steps of as many voxels."""
 
-OUTSIDE = 0.5
-"""The most that a surfel reaches out of its voxel, in voxels."""
-
 SMOOTHING = 0.3
 """Surfels that are farther than the nearest by less than this, in voxels, count in the direction:
 on a wall many are nearly as near, and each is a little off."""
