@@ -31,9 +31,6 @@ from triquad_map.view import NearestSurface
 
 _NEVER = -1
 
-_UNLEARNT_REFITTED = 4_000
-"""The most surfels fitted that rays alone show, with each epoch: there are few."""
-
 _FITTED_AT_ONCE = 32_768  # each takes half a kilobyte meanwhile
 
 _AROUND = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -185,10 +182,9 @@ class SurfelMap:
         most: int | None,
         by_rays: ShownByRays = nothing_shown,
     ) -> "SurfelMap":
-        """Return the surfels of a later epoch: new ones are fitted, and of the others the oldest.
+        """Return the surfels of a later epoch: new ones are fitted, and those that rays alone show.
 
-        At most ``most`` of the others are fitted; ``None``: all. Those that rays alone show are
-        whatever ``most`` is, since further rays show them better.
+        Of the others at most ``most`` are fitted, the oldest; ``None``: all.
         """
         places = self._fitted.places
         if not np.array_equal(places.surface, evidence.surface):
@@ -238,25 +234,17 @@ def _beside(surfels: Surfels, voxels: Longs, gone: Longs) -> Rows:
 
 
 def _outdated(fitted: _Fitted, most: int | None) -> Rows:
-    """Return what was never fitted, and at most ``most`` of the rest, those longest ago.
+    """Return what is new or rays alone show, and at most ``most`` of the rest, the oldest.
 
-    What the field has still to learn goes first: so it takes over soon after it has.
+    Further rays show the former better, and the field takes over soon after it has learnt it.
     """
     if most is None:
         return np.arange(len(fitted.epochs))
-    never = fitted.epochs == _NEVER
-    unlearnt = ~never & (fitted.surfels.kinds >= SurfelKind.RAY_DISC)
-    first = _oldest(fitted, unlearnt, _UNLEARNT_REFITTED)
-    rest = _oldest(fitted, ~never & ~unlearnt, max(0, most - len(first)))
-    return np.concatenate([np.flatnonzero(never), first, rest])
-
-
-def _oldest(fitted: _Fitted, chosen: Bools, most: int) -> Rows:
-    """Return at most ``most`` of the ``chosen`` [S] surfels, those that were fitted longest ago."""
-    rows = np.flatnonzero(chosen)
-    if len(rows) <= most:
-        return rows
-    return rows[np.argpartition(fitted.epochs[rows], most)[:most]]
+    due = (fitted.epochs == _NEVER) | (fitted.surfels.kinds >= SurfelKind.RAY_DISC)
+    rest = np.flatnonzero(~due)
+    if len(rest) > most:
+        rest = rest[np.argpartition(fitted.epochs[rest], most)[:most]]
+    return np.concatenate([np.flatnonzero(due), rest])
 
 
 def _fitted_again(
