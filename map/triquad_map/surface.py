@@ -53,9 +53,6 @@ LEVELS = MAX_LEVEL + 1
 NEAR_M = 10.0
 """The range at which a ray counts half as much as at the sensor."""
 
-SECTORS_COUNTED = 5
-"""The most of the eight sectors of the horizon that count for a surface seen from them."""
-
 LEAST_STRENGTH = 0.25
 """The strength of level 1; each further level is twice as strong."""
 
