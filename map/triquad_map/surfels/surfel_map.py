@@ -182,9 +182,9 @@ class SurfelMap:
         most: int | None,
         by_rays: ShownByRays = nothing_shown,
     ) -> "SurfelMap":
-        """Return the surfels of a later epoch: new ones are fitted, and those that rays alone show.
+        """Return the surfels of a later epoch: new ones are fitted, and of the others the oldest.
 
-        Of the others at most ``most`` are fitted, the oldest; ``None``: all.
+        At most ``most`` are fitted of those that rays alone show, and of the rest; ``None``: all.
         """
         places = self._fitted.places
         if not np.array_equal(places.surface, evidence.surface):
@@ -234,17 +234,25 @@ def _beside(surfels: Surfels, voxels: Longs, gone: Longs) -> Rows:
 
 
 def _outdated(fitted: _Fitted, most: int | None) -> Rows:
-    """Return what is new or rays alone show, and at most ``most`` of the rest, the oldest.
+    """Return what was never fitted, and at most ``most`` of the rest, those longest ago.
 
-    Further rays show the former better, and the field takes over soon after it has learnt it.
+    At most as many more are what the field has still to learn: further rays show it better, and
+    the field takes over soon after it has learnt it.
     """
     if most is None:
         return np.arange(len(fitted.epochs))
-    due = (fitted.epochs == _NEVER) | (fitted.surfels.kinds >= SurfelKind.RAY_DISC)
-    rest = np.flatnonzero(~due)
-    if len(rest) > most:
-        rest = rest[np.argpartition(fitted.epochs[rest], most)[:most]]
-    return np.concatenate([np.flatnonzero(due), rest])
+    never = fitted.epochs == _NEVER
+    unlearnt = ~never & (fitted.surfels.kinds >= SurfelKind.RAY_DISC)
+    groups = [_oldest(fitted, group, most) for group in (unlearnt, ~never & ~unlearnt)]
+    return np.concatenate([np.flatnonzero(never), *groups])
+
+
+def _oldest(fitted: _Fitted, chosen: Bools, most: int) -> Rows:
+    """Return at most ``most`` of the ``chosen`` [S] surfels, those that were fitted longest ago."""
+    rows = np.flatnonzero(chosen)
+    if len(rows) <= most:
+        return rows
+    return rows[np.argpartition(fitted.epochs[rows], most)[:most]]
 
 
 def _fitted_again(
