@@ -69,6 +69,17 @@ def test_where_the_field_has_not_learnt_what_rays_saw_they_count(kind, height):
     np.testing.assert_allclose(surfels.offsets[0], (0, 0, 0.3), atol=1e-6)
 
 
+def test_where_the_field_is_flat_rays_count():
+    def flat(points):
+        return FieldSample(np.zeros(len(points), np.float32), np.zeros((len(points), 3)))
+
+    shown = by_rays(SurfelKind.RAY_DISC, 0.3)
+    surfels = fit_surfels(
+        np.array([[5, 6, 7]]), flat, lambda asked: np.zeros(len(asked), bool), shown
+    )
+    assert surfels.kinds[0] == SurfelKind.RAY_DISC
+
+
 def test_the_field_takes_over_once_it_has_learnt_the_surface():
     voxels, shown = np.array([[30, 30, 30]]), by_rays(SurfelKind.RAY_DISC, 0.3)
     field = plane(np.array([0.0, 0, 1]), 30.75)

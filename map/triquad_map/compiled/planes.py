@@ -11,8 +11,12 @@ from triquad_map.compiled.kernel import inner_kernel, kernel
 MOMENTS = 10
 
 _MIN_POINTS = 6
-_MAX_THICKNESS = 0.1  # of a plane: ratio of the least to the middle standard deviation
-_MIN_WIDTH = 0.1  # ratio of the middle to the greatest: less is a line, not a plane
+"""The number of points that tell a plane. With 4, one normal in 40 of things on a table is off by
+more than 20 degrees, with 6 one in 1,000."""
+
+_FLAT = 0.1
+"""The share of an extent, a standard deviation, below which the next smaller one is none: a plane
+has two extents, and no third. Greater: rounder things have normals, and fewer surfaces do."""
 
 
 @kernel(inline="always")
@@ -56,7 +60,7 @@ def plane_normal(m: Doubles | tuple[float, ...], normal: Doubles) -> bool:
     greatest = mean + 2 * spread * np.cos(angle)
     least = mean + 2 * spread * np.cos(angle + 2 * np.pi / 3)
     middle = 3 * mean - greatest - least
-    if least > _MAX_THICKNESS**2 * middle or middle < _MIN_WIDTH**2 * greatest:
+    if least > _FLAT**2 * middle or middle < _FLAT**2 * greatest:
         return False
     # The eigenvector is orthogonal to the rows of (A - least I): take their longest cross product.
     rows = ((xx - least, xy, xz), (xy, yy - least, yz), (xz, yz, zz - least))

@@ -24,32 +24,34 @@ def ray_surfels(voxels: Longs, since: int, seen: SeenVoxels, observed: Observed)
 
 @inner_kernel()
 def _normal_around(
-    voxel: Longs, row: int, seen: SeenVoxels, observed: Observed, normal: Doubles
+    voxel: Longs, since: int, seen: SeenVoxels, observed: Observed, normal: Doubles
 ) -> bool:
     """Return the normal of the ends in a voxel and those around it; False where they are not flat.
 
-    Only those count that rays have ended in since they did here, and not much more often: a floor
-    does not, on which something was put.
+    Only those count that rays first ended in since ``since``, too: a floor does not, on which
+    something was put.
     """
-    here = observed.voxels[row]
-    since, most = here.hit_scan - here.hits, 2 * here.hits + 1
     moments = np.zeros(MOMENTS)
     for i in range(-1, 2):
         for j in range(-1, 2):
             for k in range(-1, 2):
                 near = row_of(seen, observed, voxel[0] + i, voxel[1] + j, voxel[2] + k)
                 other = observed.voxels[near]
-                if near == 0 or other.ends == 0:
+                if near == 0 or other.ends == 0 or other.first_scan < since:
                     continue
-                if other.hit_scan > since and other.hits <= most:
-                    at = (i + other.mean[0], j + other.mean[1], k + other.mean[2])
-                    add_points(moments, at, other.ends)
+                at = (i + other.mean[0], j + other.mean[1], k + other.mean[2])
+                add_points(moments, at, other.ends)
     return bool(plane_normal(moments, normal))
 
 
 @inner_kernel()
 def _set_normal(
-    voxel: Longs, row: int, seen: SeenVoxels, observed: Observed, normal: Doubles
+    voxel: Longs,
+    row: int,
+    since: int,
+    seen: SeenVoxels,
+    observed: Observed,
+    normal: Doubles,
 ) -> bool:
     """Set the normal of the surface in a voxel, to the sensor; False: it is the way there."""
     towards = observed.voxels[row].towards
@@ -57,7 +59,7 @@ def _set_normal(
     for axis in range(3):
         normal[axis] = observed.voxels[row].normal[axis]
         is_known = is_known or normal[axis] != 0
-    if not is_known and not _normal_around(voxel, row, seen, observed, normal):
+    if not is_known and not _normal_around(voxel, since, seen, observed, normal):
         length = max(np.sqrt(_product(towards, towards)), 1e-6)
         for axis in range(3):
             normal[axis] = towards[axis] / length
@@ -91,6 +93,6 @@ def _fill(
         here = observed.voxels[row]
         if row == 0 or here.ends == 0 or here.first_scan < since:
             continue
-        is_flat = _set_normal(voxels[i], row, seen, observed, normal)
+        is_flat = _set_normal(voxels[i], row, since, seen, observed, normal)
         kinds[i] = _RAY_DISC if is_flat else _RAY_POINT
         offsets[i], normals[i] = here.mean - np.float32(0.5), normal

@@ -21,7 +21,7 @@ from triquad_map.compiled.lanes import prefetch_row
 from triquad_map.compiled.voxel_index import LOW, SHIFT, byte_of, find_block, is_set, unpack
 from triquad_map.evidence.observed import EIGHTHS, Observed, ObservedVoxel, Voxel
 from triquad_map.evidence.seen_voxels import SeenVoxels
-from triquad_map.surface import LEAST_STRENGTH, LEVELS, MARGIN_STEP, SECTORS_COUNTED
+from triquad_map.surface import LEAST_STRENGTH, LEVELS, MARGIN_STEP
 
 
 class Support(NamedTuple):
@@ -34,11 +34,14 @@ class Support(NamedTuple):
 
 @kernel(inline="always")
 def _level(voxel: ObservedVoxel) -> int:
-    """Return the level of a voxel; each scan in a row that contradicts it takes one off."""
+    """Return the level of a voxel; each scan in a row that contradicts it takes one off.
+
+    Each further eighth of the horizon from which it was seen counts half as much as the first.
+    """
     sectors = 0
     for sector in range(8):
         sectors += voxel.sectors >> sector & 1
-    strength = voxel.weight * (0.5 + 0.5 * min(SECTORS_COUNTED, max(1, sectors)))
+    strength = voxel.weight * 0.5 * (1 + sectors)
     level = 0
     while level < LEVELS - 1 and strength >= LEAST_STRENGTH * (1 << level):
         level += 1

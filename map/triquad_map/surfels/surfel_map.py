@@ -31,9 +31,6 @@ from triquad_map.view import NearestSurface
 
 _NEVER = -1
 
-_UNLEARNT_REFITTED = 4_000
-"""The most surfels fitted that rays alone show, with each epoch: there are few."""
-
 _FITTED_AT_ONCE = 32_768  # each takes half a kilobyte meanwhile
 
 _AROUND = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -187,8 +184,7 @@ class SurfelMap:
     ) -> "SurfelMap":
         """Return the surfels of a later epoch: new ones are fitted, and of the others the oldest.
 
-        At most ``most`` of the others are fitted; ``None``: all. Those that rays alone show are
-        whatever ``most`` is, since further rays show them better.
+        At most ``most`` are fitted of those that rays alone show, and of the rest; ``None``: all.
         """
         places = self._fitted.places
         if not np.array_equal(places.surface, evidence.surface):
@@ -240,15 +236,15 @@ def _beside(surfels: Surfels, voxels: Longs, gone: Longs) -> Rows:
 def _outdated(fitted: _Fitted, most: int | None) -> Rows:
     """Return what was never fitted, and at most ``most`` of the rest, those longest ago.
 
-    What the field has still to learn goes first: so it takes over soon after it has.
+    At most as many more are what the field has still to learn: further rays show it better, and
+    the field takes over soon after it has learnt it.
     """
     if most is None:
         return np.arange(len(fitted.epochs))
     never = fitted.epochs == _NEVER
     unlearnt = ~never & (fitted.surfels.kinds >= SurfelKind.RAY_DISC)
-    first = _oldest(fitted, unlearnt, _UNLEARNT_REFITTED)
-    rest = _oldest(fitted, ~never & ~unlearnt, max(0, most - len(first)))
-    return np.concatenate([np.flatnonzero(never), first, rest])
+    groups = [_oldest(fitted, group, most) for group in (unlearnt, ~never & ~unlearnt)]
+    return np.concatenate([np.flatnonzero(never), *groups])
 
 
 def _oldest(fitted: _Fitted, chosen: Bools, most: int) -> Rows:
