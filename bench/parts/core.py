@@ -75,7 +75,7 @@ def seen_points(epoch: Epoch, made: BenchStreet, rng: np.random.Generator) -> Do
 def _training(region: LiveRegion) -> list[Figure]:
     learning = region.training
     trainer = TensorTrainer(region.field)
-    rates = Rates(_RATE)
+    rates = Rates(_RATE, young_rate=_RATE)
     rng = np.random.default_rng(0)
 
     def baseline() -> None:

@@ -6,17 +6,17 @@ changes by::
     mean     += (1 - mean_decay) * (g - mean)
     variance += (1 - variance_decay) * (g**2 - variance)
     m, v      = mean / (1 - mean_decay**t), variance / (1 - variance_decay**t)
-    value    -= learning_rate * m / (sqrt(v) + EPSILON)
+    value    -= learning_rate(t) * m / (sqrt(v) + EPSILON)
 
 Steps are counted row by row, so that the moments of a row that is new or seldom touched are
-corrected for its own age.
+corrected for its own age. A row's learning rate falls with its age, too: what is learnt hardens.
 """
 
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from triquad_format.records.arrays import Bools, Floats, Ints
+from triquad_format.records.arrays import Bools, Doubles, Floats, Ints
 from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.lanes import prefetch_row
 from triquad_map.compiled.team import THREADS, Team, share
@@ -34,7 +34,7 @@ from triquad_map.field.field import (
 )
 
 from triquad_server.engine.gradient_sums import GradientSums, Touched
-from triquad_server.engine.live_field import Batch, LiveField, Parameter, Rates
+from triquad_server.engine.live_field import LAST_AGE, Batch, LiveField, Parameter, Rates
 
 EPSILON = 1e-10
 
@@ -67,9 +67,9 @@ class CompiledRates(NamedTuple):
     def of(cls, rates: Rates) -> "CompiledRates":
         """Return these rates at all ages."""
         mean_decay, variance_decay = rates.mean_decay, rates.variance_decay
-        mean_scales, variance_scales = _corrections(mean_decay, variance_decay)
-        learning_rate = np.float32(rates.learning_rate)
-        return cls(mean_decay, variance_decay, learning_rate * mean_scales, variance_scales)
+        ages, mean_scales, variance_scales = _corrections(mean_decay, variance_decay)
+        learning_rates = rates.by_age(ages).astype(np.float32)
+        return cls(mean_decay, variance_decay, learning_rates * mean_scales, variance_scales)
 
 
 def _parameter_rows(parameter: Parameter) -> ParameterRows:
@@ -84,12 +84,13 @@ def _parameter_rows(parameter: Parameter) -> ParameterRows:
 
 
 @lru_cache(maxsize=4)
-def _corrections(mean_decay: float, variance_decay: float) -> tuple[Floats, Floats]:
-    """Return the scales of mean and variance at each age, until they no longer change."""
+def _corrections(mean_decay: float, variance_decay: float) -> tuple[Doubles, Floats, Floats]:
+    """Return the ages, and the scales of mean and variance at each, until they no longer change."""
     slowest = max(mean_decay, variance_decay)
     count = min(_MAX_CORRECTED, 1 + int(np.log(_NEGLIGIBLE) / np.log(slowest)))
-    ages = np.arange(1.0, count + 1)
+    ages = np.arange(1.0, max(count, LAST_AGE) + 1)
     return (
+        ages,
         (1 / (1 - mean_decay**ages)).astype(np.float32),
         (1 / (1 - variance_decay**ages)).astype(np.float32),
     )

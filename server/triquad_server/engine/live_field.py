@@ -91,14 +91,32 @@ class Rates(NamedTuple):
     """The rates at which values and moments follow the gradients."""
 
     learning_rate: float
+    young_rate: float
+    """The learning rate of rows that took few steps yet; at least that of the others."""
     mean_decay: float = 0.9  # beta1 of Adam, in [0, 1), as is the next
     variance_decay: float = 0.99  # beta2
 
+    def by_age(self, ages: Rows) -> Rows:
+        """Return learning rates, shaped as ``ages``, of rows that took that many steps: one at
+        least.
+        """
+        shares = (_SOFT_STEPS / ages).clip(_HARDEST, 1)
+        young = (_YOUNG_STEPS / ages).clip(0, 1) ** 2
+        return self.learning_rate * shares + (self.young_rate - self.learning_rate) * young
+
+
+_SOFT_STEPS, _HARDEST = 800, 0.1
+"""The steps for which a row of features learns at the full rate (after n times as many, at an n-th
+of it), and the least share of the rate. So learnt values move little where others are trained."""
+
+LAST_AGE = int(_SOFT_STEPS / _HARDEST)  # from here on, no rate falls any more
+
+_YOUNG_STEPS = 200
+"""The steps for which a row learns at the rate of young ones; after n times as many, what is above
+the others' rate is down to ``1 / n**2`` of it."""
 
 _MLP_SOFT_STEPS, _MLP_HARDEST = 300, 0.02
-"""The steps for which an MLP learns at the full rate (after n times as many, at an n-th of it), and
-the least share of the rate. All places of a region share it: so what is learnt moves little where
-others are trained."""
+"""The same of the MLP, which applies in addition to the above: all places of a region share it."""
 
 
 class LiveField:
@@ -196,7 +214,7 @@ class LiveField:
         self.features.append(features)
 
     def next_mlp_share(self) -> float:
-        """Count a step of the MLP; return its share of the learning rate, which falls with them."""
+        """Count a step of the MLP; return its share of the rates, falling faster than features'."""
         self.mlp_steps += 1
         return min(1.0, max(_MLP_HARDEST, _MLP_SOFT_STEPS / self.mlp_steps))
 

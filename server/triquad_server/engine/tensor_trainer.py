@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from triquad_server.engine.compiled_trainer import EPSILON
-from triquad_server.engine.live_field import Batch, LiveField, Parameter, Rates
+from triquad_server.engine.live_field import LAST_AGE, Batch, LiveField, Parameter, Rates
 from triquad_server.engine.tensor_field import Corners, FieldTensors, TensorField
 
 
@@ -71,7 +71,9 @@ class TensorTrainer:
     def _step_mlp(self, mlp: tuple[Tensor, ...], rates: Rates) -> None:
         first_row = torch.zeros(1, dtype=torch.int64, device=self._tensor_field.device)
         share = self._field.next_mlp_share()
-        mlp_rates = rates._replace(learning_rate=share * rates.learning_rate)
+        mlp_rates = rates._replace(
+            learning_rate=share * rates.learning_rate, young_rate=share * rates.young_rate
+        )
         for parameter, weight in zip(self._field.mlp, mlp, strict=True):
             assert weight.grad is not None
             tensors = ParameterTensors.of(parameter)
@@ -125,5 +127,5 @@ def _change(means: Tensor, variances: Tensor, steps: Tensor, rates: Rates) -> Te
     age = steps.to(means.dtype).reshape(-1, *[1] * (means.dim() - 1))
     mean = means / (1 - rates.mean_decay**age)
     deviation = (variances / (1 - rates.variance_decay**age)).sqrt_()
-    change: Tensor = rates.learning_rate * mean / (deviation + EPSILON)
+    change: Tensor = rates.by_age(age.clamp(max=LAST_AGE)) * mean / (deviation + EPSILON)
     return change
