@@ -39,9 +39,12 @@ _STEPS = 3
 same distances to a hundredth of a voxel."""
 
 _LONGEST_STEP = 0.5
-"""The longest of them on each axis, in voxels, and the most that may be left of the way. Where the
-field saturates, longer ones miss the surface: on a sparsely seen street distances are off by a
-sixth more."""
+"""The longest of them on each axis, in voxels. Where the field saturates, longer ones miss the
+surface: on a sparsely seen street distances are off by a sixth more."""
+
+_ON_SURFACE = 0.15
+"""The most, in voxels, that the field may be where the steps lead, for a surface to be there: where
+it is flat in the free space of a corner, it comes near zero without crossing it."""
 
 _FLATTEST = 0.3
 """A field that is flatter than this, as a slope, was not trained there, and shows no surface. With
@@ -139,7 +142,7 @@ def _surfels_of_field(voxels: Longs, field: SampleField, seen: Seen) -> Surfels:
         points = points + np.clip(steps, -_LONGEST_STEP, _LONGEST_STEP)
     at_end = field(points)
     steepness = np.linalg.norm(at_end.gradients, axis=1)
-    on_surface = (np.abs(at_end.values) < _LONGEST_STEP) & (steepness > _FLATTEST)
+    on_surface = (np.abs(at_end.values) < _ON_SURFACE) & (steepness > _FLATTEST)
     there = np.floor(points).astype(np.int64)
     away = np.abs(there - voxels).max(axis=1, initial=0)
     is_shown = on_surface & (away <= 1)
