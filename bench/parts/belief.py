@@ -17,8 +17,8 @@ from triquad_server.engine.gradient_sums import GradientSums
 from triquad_server.engine.memory import memory_on
 from triquad_server.intake.rays import usable_rays
 from triquad_server.mapping.region_evidence import RegionEvidence
+from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.mapping.replay.normals import SurfaceNormals
-from triquad_server.mapping.replay.region_setup import RegionSetup
 from triquad_server.process.threads import Teams
 from triquad_server.settings import Settings
 from triquad_server.settings.loading import load_settings

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.status import Status
-from triquad_map.mesh.mesher import mesh_tile
+from triquad_map.mesh.tile_mesh import mesh_tile
 from triquad_server.engine.live_field import Batch, Rates
 from triquad_server.engine.tensor_field import FieldTensors, TensorField
 from triquad_server.engine.tensor_trainer import TensorTrainer

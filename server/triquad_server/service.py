@@ -24,9 +24,8 @@ from triquad_map.questions.answers import QUESTIONS, Answers
 
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.epochs.surface_history import CHANGES_KEPT, SurfaceHistory
-from triquad_server.health import Health, Heartbeat
 from triquad_server.intake.flush import FlushQueries
-from triquad_server.intake.scan import ScanIntake
+from triquad_server.intake.scan_intake import ScanIntake
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.intake.source_trails import SourceTrails
@@ -39,6 +38,7 @@ from triquad_server.process.stop import Stop
 from triquad_server.process.threads import Teams
 from triquad_server.queries.change_queries import ChangeQueries
 from triquad_server.queries.source_queries import SourceQueries
+from triquad_server.server_status import Health, Heartbeat
 from triquad_server.serving.operations import Lane, Operations
 from triquad_server.settings import Settings
 from triquad_server.store.checkpoint_writer import CheckpointWriter

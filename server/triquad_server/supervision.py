@@ -9,8 +9,8 @@ from triquad_format.errors import WireError
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import ErrorReply, RequestOrigin, SdfRequest
 
-from triquad_server.health import STUCK_S
 from triquad_server.process.service_manager import ServiceManager
+from triquad_server.server_status import STUCK_S
 from triquad_server.service import Service
 
 _log = logging.getLogger(__name__)

@@ -19,7 +19,7 @@ import numpy as np
 from numba.core.dispatcher import Dispatcher
 from support.servers import service_and_client, sphere
 from triquad_client import Client
-from triquad_server import health
+from triquad_server import server_status
 from triquad_tools.recordings.publishing import wait_until_settled
 
 _NEVER_S = 1e6
@@ -60,7 +60,7 @@ class Recorder:
 def files_by_operation() -> dict[str, set[str]]:
     """The files that each operation passes through."""
     recorder = Recorder()
-    health.STATUS_PERIOD_S = _NEVER_S
+    server_status.STATUS_PERIOD_S = _NEVER_S
     threading.setprofile(recorder)
     sys.setprofile(recorder)
     try:

@@ -5,8 +5,8 @@ from collections.abc import Callable
 from triquad_format.errors import InvalidInputError
 from triquad_format.records.arrays import Doubles
 from triquad_map.composition.composed_view import ComposedView
-from triquad_map.mesh.mesher import mesh_tile
 from triquad_map.mesh.tile_lattice import TileIndex, TileLattice
+from triquad_map.mesh.tile_mesh import mesh_tile
 from triquad_map.triangles import TileJoin
 
 from triquad_client.mesh.mesh import Mesh

@@ -19,7 +19,7 @@ from triquad_server.intake.rays import ScanRays
 from triquad_server.mapping.map_snapshot import RegionSnapshot
 from triquad_server.mapping.memory_budget import RegionSize
 from triquad_server.mapping.region_evidence import RegionEvidence, SeenScan
-from triquad_server.mapping.replay.region_setup import RegionSetup
+from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.mapping.training.region_training import LEARNT_SCANS, RegionTraining
 
 

@@ -13,7 +13,7 @@ from triquad_server.errors import ScanRefusedError
 from triquad_server.intake.rays import ScanRays
 from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.memory_budget import NO_SIZE, MemoryBudget
-from triquad_server.mapping.replay.region_setup import RegionSetup
+from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.mapping.training.training_budget import FairShare
 
 

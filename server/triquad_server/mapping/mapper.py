@@ -17,8 +17,8 @@ from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.live_regions import LiveRegions
 from triquad_server.mapping.map_snapshot import MapChanges, MapSnapshot
 from triquad_server.mapping.progress import MapFigures
+from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.mapping.replay.normals import SurfaceNormals
-from triquad_server.mapping.replay.region_setup import RegionSetup
 from triquad_server.process.threads import Teams
 from triquad_server.settings import ANY_SOURCE, Settings
 

@@ -18,7 +18,7 @@ from triquad_map.surface import SampleField, ShownByRays, nothing_shown
 from triquad_map.surfels.surfel_map import SurfelMap, first_surfels
 
 from triquad_server.intake.rays import ScanRays
-from triquad_server.mapping.replay.region_setup import RegionSetup
+from triquad_server.mapping.region_setup import RegionSetup
 
 _CARVE_SHORT = 0.5  # voxels before its end up to which a ray shows free space
 _CLEAR_SHORT = 2.5  # voxels before its end up to which a ray shows that a surface is not there

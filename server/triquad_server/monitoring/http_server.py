@@ -14,9 +14,9 @@ from typing import Any
 from triquad_map.compiled.team import lower_priority
 
 from triquad_server.errors import ListenError, ServerError
-from triquad_server.health import Health
 from triquad_server.monitoring.metrics import Metrics
 from triquad_server.process.threads import NICENESS
+from triquad_server.server_status import Health
 from triquad_server.settings import MetricsSettings
 
 try:

@@ -10,9 +10,9 @@ from triquad_format.wire.metrics_messages import QueueMetrics, ServerMetrics
 from triquad_server.epochs.array_memory import bytes_by_part
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.surface_history import SurfaceHistory
-from triquad_server.health import Health
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.process.memory import resident_bytes
+from triquad_server.server_status import Health
 from triquad_server.serving.operation_counts import BOUNDS_S
 from triquad_server.serving.operations import Operations
 from triquad_server.store.download import MapDownloads

@@ -138,7 +138,7 @@ def test_each_cause_for_which_it_cannot_start_has_its_exit_code(store, arguments
 
 A_THREAD_ENDS = """
 from pathlib import Path
-from triquad_server.health import Heartbeat
+from triquad_server.server_status import Heartbeat
 
 def fail_later(heartbeat, status):
     if Path(__file__).with_name("fail").exists():

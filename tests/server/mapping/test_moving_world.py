@@ -13,7 +13,7 @@ from triquad_format.records.region import Region
 from triquad_format.records.status import Status
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.mesh.marching_cubes import centroids
-from triquad_map.mesh.mesher import mesh_tile
+from triquad_map.mesh.tile_mesh import mesh_tile
 from triquad_map.surfels.surfel_map import surfel_voxels
 from triquad_server.epochs.epoch import Epoch, FrozenRegion
 from triquad_server.mapping.mapper import Mapper

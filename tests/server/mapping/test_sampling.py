@@ -2,13 +2,13 @@ import numpy as np
 import pytest
 from triquad_server.engine.live_field import Batch
 from triquad_server.intake.rays import ScanRays
+from triquad_server.mapping.region_setup import FREE_FROM
 from triquad_server.mapping.replay.ray_table import (
     Placement,
     RayTable,
     draw_ordered_samples,
     rays_through,
 )
-from triquad_server.mapping.replay.region_setup import FREE_FROM
 from triquad_server.process.threads import Teams
 from triquad_server.settings import ScanSettings
 

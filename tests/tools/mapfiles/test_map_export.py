@@ -14,7 +14,7 @@ from triquad_client import Mesh
 from triquad_format.mapfile.reader import read_map
 from triquad_format.records.crop import crop_record
 from triquad_map.composition.recorded_view import RecordedView
-from triquad_map.mesh.mesher import mesh_tile
+from triquad_map.mesh.tile_mesh import mesh_tile
 from triquad_map.triangles import joined
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.tile_cache import tile_lattice

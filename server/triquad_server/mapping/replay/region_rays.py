@@ -6,10 +6,10 @@ from triquad_format.records.region import TrainingState
 from triquad_format.records.replay_rays import HELD_OUT
 from triquad_map.field_fit import in_cube
 
+from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.mapping.replay.held_out import are_held_out
 from triquad_server.mapping.replay.kept_rays import KeptRays
 from triquad_server.mapping.replay.ray_table import RayTable, samples_alone
-from triquad_server.mapping.replay.region_setup import RegionSetup
 from triquad_server.mapping.replay.replay_pool import ReplayPool
 from triquad_server.mapping.replay.replay_record import restored_rays
 

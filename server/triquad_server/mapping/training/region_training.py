@@ -14,9 +14,9 @@ from triquad_server.engine.field_record import training_state
 from triquad_server.engine.live_field import LiveField
 from triquad_server.engine.trainer import Loss, trainer_of
 from triquad_server.intake.rays import ScanRays
+from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.mapping.replay.ray_table import rays_through, samples_alone
 from triquad_server.mapping.replay.region_rays import RegionRays
-from triquad_server.mapping.replay.region_setup import RegionSetup
 from triquad_server.mapping.training.focus import Focus
 from triquad_server.mapping.training.slopes import Slopes
 from triquad_server.mapping.training.training_budget import FairShare, TrainingBudget

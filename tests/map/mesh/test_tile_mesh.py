@@ -5,7 +5,7 @@ from scipy.spatial import cKDTree
 from support.maps.small_world import settings, settled_epoch, world
 from triquad_client import OfflineMap
 from triquad_format.records.status import Status
-from triquad_map.mesh.mesher import TileMesh, mesh_tile
+from triquad_map.mesh.tile_mesh import TileMesh, mesh_tile
 from triquad_map.triangles import Triangles, joined
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper

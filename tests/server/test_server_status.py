@@ -9,13 +9,13 @@ from threading import Event, Thread
 from support import servers
 from support.maps.small_world import settings, world
 from triquad_server.epochs.history import EpochHistory
-from triquad_server.health import ENDLESS_S, STUCK_S, Health
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.mapping.thread_time import ThreadTime
 from triquad_server.process.stop import Stop, Stops
+from triquad_server.server_status import ENDLESS_S, STUCK_S, Health
 from triquad_server.settings import ServiceSettings, Settings
 from triquad_server.store.checkpoint_writer import CheckpointWriter
 
