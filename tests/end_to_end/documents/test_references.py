@@ -16,6 +16,7 @@ SOURCES = [
     (ROOT / package, path) for package in PACKAGES for path in (ROOT / package).rglob("*.py")
 ]
 IN_FULL = re.compile(r"\btriquad_(?:format|map|client|server|tools)(?:\.\w+)+")
+LINK = re.compile(r"\]\(([^)\s]+)\)")
 BY_ROLE = re.compile(r":(?:mod|func|class|meth|attr|data|exc):`~?([^`]*)`")
 
 
@@ -63,6 +64,28 @@ def test_docstrings_refer_to_what_there_is(known: set[str]) -> None:
         if name not in known and not known.issuperset(name.split("."))
     }
     assert missing == set()
+
+
+def anchors(page: str) -> set[str]:
+    """What links name the headings of a page by."""
+    headings = re.findall(r"^#+ (.*)$", page, re.MULTILINE)
+    words = (re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", heading).lower() for heading in headings)
+    return {re.sub(r"[^\w\- ]", "", word).replace(" ", "-") for word in words}
+
+
+def test_links_lead_to_pages_and_headings_that_there_are() -> None:
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    links = [(page, link) for page in pages for link in LINK.findall(page.read_text())]
+    lost = []
+    for page, link in links:
+        name, _, anchor = link.partition("#")
+        target = page.parent / name if name else page
+        if "://" in link or (target.exists() and not anchor):
+            continue
+        if not target.exists() or anchor not in anchors(target.read_text()):
+            lost.append((page.name, link))
+    assert len(links) > 100
+    assert lost == []
 
 
 def test_every_picture_is_made_by_make_pictures_and_shown_on_a_page(
