@@ -63,6 +63,8 @@ def test_late_joiners_hold_the_same_bytes(client: Client, endpoint: str) -> None
         for _ in range(2):
             learn(client, half(-1))
             early.catch_up()
+        client.settle(servers.WAIT_S)  # from then on all are of the same epoch
+        early.catch_up()
         slow.catch_up(servers.WAIT_S)
         with triquad_client.connect(endpoint) as other, other.watch_mesh() as late:
             late.catch_up()
@@ -156,6 +158,7 @@ def test_a_watch_that_waits_ends_when_something_comes(client: Client, endpoint: 
             assert other.status().map_name == servers.MAP
             learn(other, half(-1))
         assert all(future.result().changed for future in waiting)
+    client.settle(servers.WAIT_S)  # from then on all are of the same epoch
     for watch in watches:
         watch.catch_up()
     assert all(digests(watch) == digests(watches[0]) for watch in watches)
