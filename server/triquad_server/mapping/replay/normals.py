@@ -89,7 +89,7 @@ def _gather(row: int, cell_m: float, index: Index, moments: Floats) -> tuple[flo
 
 
 @kernel()
-def _estimate(rows: Longs, cell_m: float, index: Index, moments: Floats, known: Floats) -> None:
+def _estimate(rows: Ints, cell_m: float, index: Index, moments: Floats, known: Floats) -> None:
     """Set the ``known`` normals [cells, 3] of cells; NaN where the points lie in no plane."""
     normal = np.empty(3)
     for row in rows:
@@ -128,12 +128,9 @@ class MomentGrid:
     def fill(self, normals: Doubles, points: Doubles) -> None:
         """Add ``points`` [N, 3]; set ``normals`` [N, 3] that are NaN to those of their cells."""
         rows = self.add(points)
-        unknown = np.flatnonzero(np.isnan(normals[:, 0]))
-        rows = rows[unknown]
-        counts = self._moments[:, 0].take(rows)
-        is_outdated = np.zeros(self._cells.count, np.bool_)
-        is_outdated[rows[counts >= _RENEWAL * self._basis.take(rows)]] = True
-        outdated = np.flatnonzero(is_outdated)
+        unknown = np.isnan(normals[:, 0])
+        has_more = self._moments[rows, 0] >= _RENEWAL * self._basis[rows]
+        outdated = np.unique(rows[unknown & has_more])
         self._basis[outdated] = self._moments[outdated, 0]
 
         def work(first: int, last: int) -> None:
@@ -141,7 +138,7 @@ class MomentGrid:
             _estimate(part, self._cell_m, self._cells.arrays, self._moments, self._normals)
 
         self._team.split(len(outdated), work)
-        normals[unknown] = self._normals.take(rows, axis=0)
+        normals[unknown] = self._normals[rows[unknown]]
 
     def keep_nearest(self, place: Doubles, cells: int) -> None:
         """Keep the moments of the ``cells`` nearest to a ``place`` [3] only."""
