@@ -11,8 +11,6 @@ from triquad_map.compiled.kernel import inner_kernel, kernel
 MOMENTS = 10
 
 _MIN_POINTS = 6
-"""The number of points that tell a plane. With 4, one normal in 40 of things on a table is off by
-more than 20 degrees, with 6 one in 1,000."""
 
 _FLAT = 0.1
 """The share of an extent, a standard deviation, below which the next smaller one is none: a plane

@@ -20,15 +20,12 @@ from triquad_map.compiled.voxel_index import (
     with_room,
 )
 
-_FINE_LEAVES, _COARSE_LEAVES = 0.75, 2.5
-"""The sides of the cells, in leaves. Of the ends on two streets 73 and 69 % have normals; with a
-single grid it is 63 and 57 % at most."""
+_FINE_LEAVES, _COARSE_LEAVES = 0.75, 2.5  # sides of the cells
+_ON_PLANE = 0.25
+"""The height of a point over a plane above which it does not lie on it, as a share of a cell."""
 
-_RENEWAL = 2.0
-"""The factor by which a cell's points become more until its normal is estimated again. With 1,
-sparse scans take a third longer; with 4, normals are off by a tenth more."""
-
-_FULL = 65_536  # points of a cell, above which older ones count less: sums are of single precision
+_FULL = 65_536  # points of a cell, above which older ones count less
+_RENEWAL = 2.0  # factor by which a cell's points become more until its normal is estimated again
 
 
 @kernel()
@@ -89,14 +86,56 @@ def _gather(row: int, cell_m: float, index: Index, moments: Floats) -> tuple[flo
 
 
 @kernel()
-def _estimate(rows: Ints, cell_m: float, index: Index, moments: Floats, known: Floats) -> None:
-    """Set the ``known`` normals [cells, 3] of cells; NaN where the points lie in no plane."""
+def _outdated(rows: Ints, normals: Doubles, moments: Floats, basis: Floats) -> Ints:
+    """Return the cells of points without a normal that have far more points than at their last fit.
+
+    Their ``basis`` is updated.
+    """
+    outdated = np.empty(len(rows), np.int32)
+    count = 0
+    for i in range(len(rows)):
+        row = rows[i]
+        if np.isnan(normals[i, 0]) and moments[row, 0] >= _RENEWAL * basis[row]:
+            basis[row] = moments[row, 0]
+            outdated[count] = row
+            count += 1
+    return outdated[:count]
+
+
+@kernel()
+def _estimate(rows: Ints, cell_m: float, index: Index, moments: Floats, planes: Floats) -> None:
+    """Set the planes [cells, 4] of cells: normals, and their heights over the cells' centres.
+
+    NaN where there is no plane.
+    """
     normal = np.empty(3)
     for row in rows:
-        if not plane_normal(_gather(row, cell_m, index, moments), normal):
+        gathered = _gather(row, cell_m, index, moments)
+        if not plane_normal(gathered, normal):
             normal[:] = np.nan
+        height = 0.0
         for axis in range(3):
-            known[row, axis] = normal[axis]
+            planes[row, axis] = normal[axis]
+            height += normal[axis] * gathered[1 + axis]
+        planes[row, 3] = height / gathered[0]
+
+
+@kernel()
+def _adopt(
+    points: Doubles, rows: Ints, cell_m: float, index: Index, planes: Floats, normals: Doubles
+) -> None:
+    """Replace the ``normals`` [N, 3] that are NaN by those of the planes that the points lie on."""
+    for i in range(len(rows)):
+        if not np.isnan(normals[i, 0]):
+            continue
+        x, y, z = unpack(index.row_keys[rows[i]])
+        plane = planes[rows[i]]
+        height = (points[i, 0] - (x + 0.5) * cell_m) * plane[0]
+        height += (points[i, 1] - (y + 0.5) * cell_m) * plane[1]
+        height += (points[i, 2] - (z + 0.5) * cell_m) * plane[2]
+        if abs(height - plane[3]) <= _ON_PLANE * cell_m:
+            for axis in range(3):
+                normals[i, axis] = plane[axis]
 
 
 class MomentGrid:
@@ -107,7 +146,7 @@ class MomentGrid:
         self._cell_m = cell_m
         self._cells = VoxelIndex(1024)
         self._moments = np.zeros((1024, MOMENTS), np.float32)
-        self._normals = np.zeros((1024, 3), np.float32)
+        self._planes = np.zeros((1024, 4), np.float32)
         # Points in each cell when its normal was estimated.
         self._basis = np.zeros(1024, np.float32)
 
@@ -126,19 +165,16 @@ class MomentGrid:
         return rows
 
     def fill(self, normals: Doubles, points: Doubles) -> None:
-        """Add ``points`` [N, 3]; set ``normals`` [N, 3] that are NaN to those of their cells."""
+        """Add ``points`` [N, 3]; set ``normals`` [N, 3] that are NaN to those of their planes."""
         rows = self.add(points)
-        unknown = np.isnan(normals[:, 0])
-        has_more = self._moments[rows, 0] >= _RENEWAL * self._basis[rows]
-        outdated = np.unique(rows[unknown & has_more])
-        self._basis[outdated] = self._moments[outdated, 0]
+        outdated = _outdated(rows, normals, self._moments, self._basis)
 
         def work(first: int, last: int) -> None:
             part = outdated[first:last]
-            _estimate(part, self._cell_m, self._cells.arrays, self._moments, self._normals)
+            _estimate(part, self._cell_m, self._cells.arrays, self._moments, self._planes)
 
         self._team.split(len(outdated), work)
-        normals[unknown] = self._normals[rows[unknown]]
+        _adopt(points, rows, self._cell_m, self._cells.arrays, self._planes, normals)
 
     def keep_nearest(self, place: Doubles, cells: int) -> None:
         """Keep the moments of the ``cells`` nearest to a ``place`` [3] only."""
@@ -158,7 +194,7 @@ class MomentGrid:
     @property
     def nbytes(self) -> int:
         """The memory of the cells, with their spare room."""
-        arrays = (*self._cells.arrays, self._moments, self._normals, self._basis)
+        arrays = (*self._cells.arrays, self._moments, self._planes, self._basis)
         return sum(array.nbytes for array in arrays)
 
     def _centres(self) -> Doubles:
@@ -172,7 +208,7 @@ class MomentGrid:
         """Keep some rows, with as much room as the cells have."""
         capacity = self._cells.capacity
         self._moments = with_room(self._moments[rows], capacity)
-        self._normals = with_room(self._normals[rows], capacity)
+        self._planes = with_room(self._planes[rows], capacity)
         self._basis = with_room(self._basis[rows], capacity)
 
 
