@@ -24,10 +24,11 @@ from triquad_server.settings import Settings
 from triquad_server.settings.loading import load_settings
 from triquad_tools.console.progress import progress
 from triquad_tools.sensors.sweep import moved
+from triquad_tools.simulation.scene import Scene
 
 from bench.ended_voxels import EndedVoxels, end_keys, voxel_centres, voxel_keys
 from bench.figures import Figure
-from bench.scenes.episodes import STANDING, Episode, EpisodeScan
+from bench.scenes.episodes import STANDING, Episode, EpisodeScan, lies_on
 from bench.scenes.known_episodes import held_episodes, tuned_episodes
 
 _EMPTY_SCANS = 110  # of each place, once the things have left
@@ -199,10 +200,8 @@ class _Record:
         keys = end_keys(scan, self._settings)
         on_thin = np.zeros(len(scan.points), np.bool_)
         if self._episode.thin:
-            scene = type(self._episode.standing.scene)(
-                self._episode.thin, self._episode.standing.scene.bounds
-            )
-            on_thin = np.abs(scene.sdf(scan.true_hits)) < 1e-6
+            bounds = self._episode.standing.scene.bounds
+            on_thin = lies_on(Scene(self._episode.thin, bounds), scan.true_hits)
             self._on_thin.add(keys[on_thin])
         points = moved(scan.points, scan.world_from_sensor)
         for number in np.unique(scan.thing_of).tolist():

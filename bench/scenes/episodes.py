@@ -67,12 +67,13 @@ class Episode:
         made = drive.sensor.scan(scene, drive.poses[index], rng)
         thing_of = np.full(len(made.points), STANDING)
         for name, parts in things.items():
-            thing_of[_lies_on(Scene(tuple(parts), bounds), made.true_hits)] = names.index(name)
+            thing_of[lies_on(Scene(tuple(parts), bounds), made.true_hits)] = names.index(name)
         scan = EpisodeScan(**vars(made), thing_of=thing_of)
         return _rained_on(scan, self.rain, names, rng) if busy and self.rain else scan
 
 
-def _lies_on(scene: Scene, points: Doubles) -> np.ndarray:
+def lies_on(scene: Scene, points: Doubles) -> np.ndarray:
+    """Return which [N] of exact ``points`` [N, 3] lie on a scene's surface."""
     return np.abs(scene.sdf(points)) < _ON_SURFACE_M
 
 

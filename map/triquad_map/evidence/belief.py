@@ -20,7 +20,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from triquad_format.records.arrays import Ints, Longs
+from triquad_format.records.arrays import Bools, Ints, Longs
 
 from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.voxel_index import LOW, SHIFT, bit_of
@@ -29,7 +29,6 @@ from triquad_map.evidence.observed import (
     ObservedVoxel,
     Voxel,
     forget_ends,
-    has_surface,
     is_flat,
     rows_around,
     voxel_of,
@@ -59,6 +58,29 @@ class Changes(NamedTuple):
 
     new: Longs  # [M, 3]
     removed: Longs  # [K, 3]
+
+
+@inner_kernel()
+def _bit(row: int, observed: Observed) -> tuple[int, int, int]:
+    """Return where the surface bit of a row is: block, byte and mask."""
+    owner = observed.voxels[row].owner
+    return owner >> (3 * SHIFT), owner >> SHIFT & (1 << (2 * SHIFT)) - 1, bit_of(owner & LOW)
+
+
+@inner_kernel()
+def _has_surface(row: int, seen: SeenVoxels, observed: Observed) -> bool:
+    """Return whether the surface of a row is still believed."""
+    block, byte, bit = _bit(row, observed)
+    return bool(seen.surface[block, byte] & bit)
+
+
+@kernel()
+def have_surface(rows: Ints, seen: SeenVoxels, observed: Observed) -> Bools:
+    """Return whether the surface of each row [N] is believed; not outside the region."""
+    found = np.zeros(len(rows), np.bool_)
+    for i, row in enumerate(rows):
+        found[i] = row != 0 and _has_surface(row, seen, observed)
+    return found
 
 
 @inner_kernel()
@@ -112,7 +134,7 @@ def _odds(row: int, near: Ints, seen: SeenVoxels, observed: Observed, belief: Be
         if one.misses > 0 and one.missed_since > voxel.hit_scan:
             if one.missed_since == one.passed_scan:
                 continue  # a single scan may have a wrong pose: it is one witness for all it misses
-            is_gone = not has_surface(np.int64(other), seen, observed)
+            is_gone = not _has_surface(np.int64(other), seen, observed)
             says = belief.most if is_gone else min(_missed(one), belief.most)
         elif one.misses == 0 and one.ends > 0 and one.hit_scan >= since:
             says = -belief.most
@@ -120,13 +142,6 @@ def _odds(row: int, near: Ints, seen: SeenVoxels, observed: Observed, belief: Be
             continue
         around += belief.around * _coupling(row, np.int64(other), seen, observed) * says
     return float(_own_odds(voxel, belief) + max(around, -belief.most))
-
-
-@inner_kernel()
-def _bit(row: int, observed: Observed) -> tuple[int, int, int]:
-    """Return where the surface bit of a row is: block, byte and mask."""
-    owner = observed.voxels[row].owner
-    return owner >> (3 * SHIFT), owner >> SHIFT & (1 << (2 * SHIFT)) - 1, bit_of(owner & LOW)
 
 
 @inner_kernel()
@@ -138,7 +153,7 @@ def _appear(
     Where it has not, nothing is known: the rays that ended there have not shown that it is free.
     """
     for row in hit:
-        if row == 0 or has_surface(row, seen, observed):
+        if row == 0 or _has_surface(row, seen, observed):
             continue
         block, byte, bit = _bit(row, observed)
         if _own_odds(observed.voxels[row], belief) > 0:
@@ -156,7 +171,7 @@ def _go(
     while len(waiting):
         row = waiting.pop()
         voxel = observed.voxels[row]
-        if not has_surface(row, seen, observed):
+        if not _has_surface(row, seen, observed):
             # Nothing is left of what hits said: the next begins anew.
             if voxel.ends > 0 and _own_odds(voxel, belief) >= belief.vacant:
                 forget_ends(voxel)

@@ -8,13 +8,13 @@ from triquad_format.records.region import Evidence as EvidenceRecord
 
 from triquad_map.compiled.team import Split, in_one
 from triquad_map.compiled.voxel_index import VoxelIndex, with_room
-from triquad_map.evidence.belief import Belief, Changes, believe
+from triquad_map.evidence.belief import Belief, Changes, believe, have_surface
 from triquad_map.evidence.carving import Reach, mark_crossed
 from triquad_map.evidence.company import have_company
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.evidence.growth import EvidenceSize, NewEnds, new_blocks, new_ends
 from triquad_map.evidence.observations import Observations
-from triquad_map.evidence.observed import Sighting, have_surface
+from triquad_map.evidence.observed import Sighting
 from triquad_map.evidence.ray_surfels import ray_surfels
 from triquad_map.evidence.seen_voxels import SeenVoxels, mark
 from triquad_map.surface import Surfels

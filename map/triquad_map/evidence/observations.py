@@ -7,7 +7,7 @@ passed. So has a voxel of which nothing is known.
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Ints, Longs
+from triquad_format.records.arrays import Bools, Bytes, Doubles, Ints, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.region import (
     BLOCK_BYTES,
@@ -17,25 +17,21 @@ from triquad_format.records.region import (
     used_blocks,
 )
 
-from triquad_map.compiled.kernel import inner_kernel, kernel
+from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.team import Split
 from triquad_map.compiled.voxel_index import SHIFT, with_room
+from triquad_map.evidence.field_discs import set_discs
 from triquad_map.evidence.observed import (
     EIGHTHS,
     MOST_SCANS,
     OBSERVED_VOXEL,
     Observed,
-    ObservedVoxel,
     Sighting,
-    is_flat,
     record_ends,
-    row_of,
-    rows_around,
-    voxel_of,
 )
 from triquad_map.evidence.seen_voxels import SeenVoxels
 from triquad_map.evidence.support import Support, fill_support
-from triquad_map.surface import LEAST_STRENGTH, SurfelKind, Surfels
+from triquad_map.surface import LEAST_STRENGTH, Surfels
 
 _MOST_HITS = 8
 """A longer record is restored as one of this many hits, which new rays outweigh sooner."""
@@ -70,11 +66,6 @@ _VOXELS = BLOCK_VOXELS**3
 _MIN_CAPACITY = 64
 _MIN_ROWS = 1024
 _LEAST_BLOCKS = 64  # whose support a thread of its own finds sooner
-_DISC = int(SurfelKind.DISC)
-_DISC_ENDS, _DISC_SPREAD = 16.0, 0.08  # that a disc of the field stands for
-_FARTHEST_BESIDE = 0.75  # voxels from a voxel's middle to the disc of another one
-_OUTSIDE = 0.1  # voxels that a disc may reach out of its own voxel
-
 _RECORD = ("hits", "earlier_misses", "earlier_misses")
 """The fields of a voxel's record that files keep; passes are none but those that would have hit."""
 
@@ -85,70 +76,6 @@ def _set_normals(rows: Ints, normals: Doubles, observed: Observed) -> None:
         if row != 0 and not np.isnan(normals[i, 0]):
             for axis in range(3):
                 observed.voxels[row].normal[axis] = normals[i, axis]
-
-
-@kernel()
-def _set_discs(
-    voxels: Longs,
-    offsets: Floats,
-    normals: Floats,
-    kinds: Bytes,
-    seen: SeenVoxels,
-    observed: Observed,
-) -> None:
-    for i in range(len(voxels)):
-        row = row_of(seen, observed, voxels[i, 0], voxels[i, 1], voxels[i, 2])
-        voxel = observed.voxels[row]
-        if row == 0 or voxel.ends != 0:  # rays have shown since
-            continue
-        is_disc = kinds[i] == _DISC
-        for axis in range(3):
-            voxel.mean[axis] = offsets[i, axis] + 0.5 if is_disc else np.nan
-            voxel.normal[axis] = normals[i, axis] if is_disc else 0.0
-        _set_spread(voxel, _DISC_SPREAD)
-        voxel.ends = _DISC_ENDS if is_disc else 0
-    for i in range(len(voxels)):
-        row = row_of(seen, observed, voxels[i, 0], voxels[i, 1], voxels[i, 2])
-        if row != 0 and observed.voxels[row].ends == 0:
-            _set_disc_beside(row, seen, observed)
-
-
-@inner_kernel()
-def _set_spread(voxel: ObservedVoxel, variance: float) -> None:
-    """Let the ends of a voxel lie in the plane of its normal, with a variance on each axis."""
-    x, y, z = voxel.normal
-    voxel.spread[0], voxel.spread[1], voxel.spread[2] = 1 - x * x, -x * y, -x * z
-    voxel.spread[3], voxel.spread[4], voxel.spread[5] = 1 - y * y, -y * z, 1 - z * z
-    voxel.spread *= np.float32(variance)
-
-
-@inner_kernel()
-def _set_disc_beside(row: int, seen: SeenVoxels, observed: Observed) -> None:
-    """Take the disc of a voxel next to it for one that has none: the nearest to its middle.
-
-    The ends of noisy rays lie in voxels on both sides of a surface, and the disc in one of them.
-    """
-    voxel, corner = observed.voxels[row], voxel_of(row, seen, observed)
-    nearest = _FARTHEST_BESIDE
-    for near in rows_around(row, 1, seen, observed):
-        disc = observed.voxels[near]
-        normal, mean = disc.normal, disc.mean
-        if near == row or not is_flat(disc):
-            continue
-        beside = voxel_of(np.int64(near), seen, observed)
-        height = 0.0
-        for axis in range(3):
-            height += (corner[axis] + 0.5 - beside[axis] - mean[axis]) * normal[axis]
-        is_there = abs(height) < nearest
-        for axis in range(3):
-            foot = corner[axis] + 0.5 - height * normal[axis] - beside[axis]
-            is_there = is_there and -_OUTSIDE <= foot <= 1 + _OUTSIDE
-        if is_there:
-            nearest = abs(height)
-            for axis in range(3):
-                voxel.mean[axis] = 0.5 - height * normal[axis]
-                voxel.normal[axis] = normal[axis]
-            voxel.ends = _DISC_ENDS
 
 
 class Observations:
@@ -207,7 +134,7 @@ class Observations:
         Where there is no disc, it is the nearest one next to it, or else the next ray that ends
         there shows where the surface is.
         """
-        _set_discs(voxels, surfels.offsets, surfels.normals, surfels.kinds, seen, self.arrays)
+        set_discs(voxels, surfels.offsets, surfels.normals, surfels.kinds, seen, self.arrays)
 
     def support(self, surface: Bytes, split: Split) -> Support:
         """Return the support of each voxel set in ``surface`` [blocks, BLOCK_BYTES], in order."""

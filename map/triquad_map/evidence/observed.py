@@ -113,23 +113,6 @@ def voxel_of(row: int, seen: SeenVoxels, observed: Observed) -> Voxel:
     )
 
 
-@kernel()
-def has_surface(row: int, seen: SeenVoxels, observed: Observed) -> bool:
-    """Return whether the surface of a row is still believed."""
-    owner = observed.voxels[row].owner
-    block = owner >> (3 * SHIFT)
-    return bool(seen.surface[block, owner >> SHIFT & (1 << (2 * SHIFT)) - 1] & bit_of(owner & LOW))
-
-
-@kernel()
-def have_surface(rows: Ints, seen: SeenVoxels, observed: Observed) -> Bools:
-    """Return whether the surface of each row [N] is believed; not outside the region."""
-    found = np.zeros(len(rows), np.bool_)
-    for i, row in enumerate(rows):
-        found[i] = row != 0 and has_surface(row, seen, observed)
-    return found
-
-
 @inner_kernel()
 def rows_around(row: int, reach: int, seen: SeenVoxels, observed: Observed) -> Ints:
     """Return the rows of a row's voxel and those up to ``reach`` around it in which rays ended."""
@@ -205,14 +188,13 @@ def _begin_hit(voxel: ObservedVoxel, scan: int) -> None:
         voxel.ended += 1
         return
     voxel.hit_scan = scan
-    voxel.ended = voxel.crossed = 0
+    voxel.ended, voxel.crossed = 1, 0
     voxel.scans = min(voxel.scans + 1, MOST_SCANS)
     if voxel.ends > 0:  # else they passed while nothing was there
         voxel.earlier_misses += voxel.misses
     else:
         voxel.first_scan = scan
         voxel.hits = voxel.earlier_misses = 0
-    voxel.ended = 1
     voxel.misses = 0
     voxel.hits += 1
     share = MOST_SEEN / max(np.float32(MOST_SEEN), voxel.hits + voxel.earlier_misses)

@@ -44,7 +44,11 @@ class FrozenField:
         return FieldValues(logits * scale, gradients * scale)
 
     def evaluate_in_grid(self, axes: Floats, points: Longs) -> Floats:
-        """Return distances in a grid; see :class:`FrozenField`. On the caller's thread."""
+        """Return distances [N] at ``points`` [N, 3] of a grid, by their numbers on its ``axes``.
+
+        ``axes`` [3, S] are metres from the region's centre. Those of a point do not depend on which
+        others are asked for. On the caller's thread.
+        """
         logits = np.empty(len(points), np.float32)
         evaluate_in_grid(axes, points, self._field, logits)
         distances: Floats = logits * np.float32(self.settings.logit_scale_m)
