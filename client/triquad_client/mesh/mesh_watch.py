@@ -97,7 +97,7 @@ class MeshWatch(WatchedTiles):
             limit = checks.count("max_bytes_per_s", max_bytes_per_s, MAX_COUNT, least=1)
             self._max_bytes_per_s = limit
             self._tiles_each = max(1, min(limit // _BYTES_PER_TILE, _TILES_EACH))
-        self._told_s = -math.inf  # monotonic: when the server last told which tiles changed
+        self._told_s = -math.inf  # monotonic: when the server was last asked which tiles changed
         self._ready_s = 0.0  # monotonic: until then, the bandwidth is used up
         self._changing = threading.Lock()
         self._closed = threading.Event()
@@ -145,12 +145,12 @@ class MeshWatch(WatchedTiles):
             RequestTimeoutError: that was not all of it.
             ClosedError: the watch was closed.
         """
-        ends = checks.deadline(timeout_s)
+        started, ends = time.monotonic(), checks.deadline(timeout_s)
         with self._cancelled_by_close() as token:
             while True:
                 self._wait_until(min(self._ready_s, ends), token)
                 update = self._update() if time.monotonic() >= self._ready_s else None
-                if update is not None and update.complete:
+                if update is not None and update.complete and self._told_s >= started:
                     return
                 if update is None or time.monotonic() > ends:
                     raise RequestTimeoutError(f"the mesh is not complete after {timeout_s:g} s")
@@ -187,10 +187,11 @@ class MeshWatch(WatchedTiles):
     def _update(self) -> MeshUpdate:
         """Return what one step changed: nothing where that of another call came first."""
         before = followed = self._followed
-        if not before.pending or time.monotonic() >= self._told_s + _PAUSE_S:
+        told_s = self._told_s
+        if not before.pending or time.monotonic() >= told_s + _PAUSE_S:
+            told_s = time.monotonic()
             ask = Ask(keys.TILE_CHANGES, before.changes_request(), TileChanges, background=True)
             followed = before.told(self._server.ask(ask))
-            self._told_s = time.monotonic()
         some = followed.pending[: self._tiles_each]
         requests = [
             MeshRequest(np.array(some[first : first + MAX_TILES_ASKED], np.int32), 0, before.level)
@@ -207,7 +208,7 @@ class MeshWatch(WatchedTiles):
             now = self._followed
             if now is not before:  # by what is known now, the replies may be old
                 return MeshUpdate((), (), now.epoch, complete=now.complete, size_bytes=0)
-            self._followed = followed
+            self._followed, self._told_s = followed, told_s
         return MeshUpdate(
             changed=tuple(index for index in some if index in followed.tiles),
             removed=tuple(sorted(before.tiles.keys() - followed.tiles.keys())),

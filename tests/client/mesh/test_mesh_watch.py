@@ -98,6 +98,17 @@ def test_of_known_tiles_only_the_difference_travels(client: Client) -> None:
         assert {index for index in whole if index[0] >= 1} <= gone
 
 
+def test_catching_up_sees_what_changed_while_tiles_were_left_to_fetch(client: Client) -> None:
+    learn(client)
+    quarter = ((0.2, 0.2, -9), (9, 9, 9))  # a few more tiles than are fetched at once
+    with client.watch_mesh(quarter) as watch:
+        assert watch.next(servers.WAIT_S).changed
+        assert not watch.complete
+        client.reset()
+        watch.catch_up()
+        assert not watch.tiles
+
+
 def test_levels_are_the_same_surface_with_fewer_faces(learnt: Client) -> None:
     faces = []
     for level in range(3):
