@@ -50,6 +50,10 @@ _FLATTEST = 0.3
 """A field that is flatter than this, as a slope, was not trained there, and shows no surface. With
 less, more voxels have discs, and distances are off by more at most."""
 
+_LEARNT = 0.1
+"""The field has learnt the surface in a voxel where it is no more than this off, in voxels, at the
+mean of the ends there."""
+
 LEVELS = MAX_LEVEL + 1
 
 NEAR_M = 10.0
@@ -99,11 +103,12 @@ SampleField = Callable[[Doubles], FieldSample]
 Seen = Callable[[Longs], Bools]
 """A function that returns whether rays ended in voxels [N, 3]."""
 
-ShownByRays = Callable[[Longs], Surfels]
-"""The surfels of voxels [N, 3] by what rays alone have shown; NONE where that is not known."""
+ShownByRays = Callable[[Longs, int], Surfels]
+"""The surfels of voxels [N, 3] by what rays alone have shown; NONE where that is not known, or no
+ray ended there since the scan of that number."""
 
 
-def nothing_shown(voxels: Longs) -> Surfels:
+def nothing_shown(voxels: Longs, _since: int = 0) -> Surfels:
     """Return no surfels, as of a map from a file: where in voxels rays ended is not known."""
     offsets, normals = np.zeros((2, len(voxels), 3), np.float32)
     return Surfels(offsets, normals, np.full(len(voxels), SurfelKind.NONE, np.uint8))
@@ -114,16 +119,15 @@ def fit_surfels(
 ) -> Surfels:
     """Return surfels of ``voxels`` [N, 3]: the field's, or where it shows no surface, the rays'."""
     surfels = _surfels_of_field(voxels, field, seen)
-    is_inside = (surfels.kinds == SurfelKind.DISC) & (np.abs(surfels.offsets) <= 0.5).all(axis=1)
-    rows = np.flatnonzero(~is_inside)
-    shown = by_rays(voxels[rows])
-    known = np.flatnonzero(shown.kinds != SurfelKind.NONE)
-    rows = rows[known]
-    places = (voxels[rows] + 0.5 + shown.offsets[known]).astype(np.float64)
+    shown = by_rays(voxels, 0)
+    rows = np.flatnonzero(shown.kinds != SurfelKind.NONE)
+    places = (voxels[rows] + 0.5 + shown.offsets[rows]).astype(np.float64)
+    off, kinds = field(places).values, surfels.kinds[rows]
     # Next to a surface in the next voxel, noisy rays end on both sides of the border.
-    unlearnt = (surfels.kinds[rows] == SurfelKind.POINT) | (field(places).values > 0)
+    off[kinds == SurfelKind.NONE] = np.maximum(off[kinds == SurfelKind.NONE], 0)
+    unlearnt = rows[(kinds == SurfelKind.POINT) | (np.abs(off) > _LEARNT)]
     for name, array in vars(surfels).items():
-        array[rows[unlearnt]] = getattr(shown, name)[known[unlearnt]]
+        array[unlearnt] = getattr(shown, name)[unlearnt]
     return surfels
 
 

@@ -21,7 +21,7 @@ class NumberedRegion:
     def __init__(self, number: int, index: RegionIndex) -> None:
         self.index = index
         self.centre = FIELD.region_centre(index)
-        self.engine = self.evidence = self
+        self.field = self.evidence = self
         self.number = number
 
     def evaluate(self, points: np.ndarray, gradient: bool) -> FieldValues:

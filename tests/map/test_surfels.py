@@ -50,7 +50,7 @@ def test_where_the_field_shows_nothing_a_point_stands_for_what_was_seen():
 def by_rays(kind, offset):
     """What rays have shown of all voxels: a floor that lies so far above their middles."""
 
-    def shown(voxels):
+    def shown(voxels, _since=0):
         offsets, normals = np.zeros((2, len(voxels), 3), np.float32)
         offsets[:, 2], normals[:, 2] = offset, 1
         return Surfels(offsets, normals, np.full(len(voxels), kind, np.uint8))

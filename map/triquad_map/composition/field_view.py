@@ -17,8 +17,9 @@ from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.status import Status
 
 from triquad_map.compiled.team import MIN_SHARE, Split, in_one
+from triquad_map.composition.shown_field import RegionField
 from triquad_map.evidence.evidence import FrozenEvidence
-from triquad_map.field.frozen_field import FieldValues, FrozenField, in_grid
+from triquad_map.field.frozen_field import FieldValues, in_grid
 from triquad_map.surfels.surfel_map import SurfelMap
 from triquad_map.view import FieldAnswer
 
@@ -38,8 +39,8 @@ class MapRegion(Protocol):
         """[3] metres, map frame."""
 
     @property
-    def engine(self) -> FrozenField:
-        """The engine that computes its field."""
+    def field(self) -> RegionField:
+        """Its field."""
 
     @property
     def evidence(self) -> FrozenEvidence:
@@ -120,7 +121,7 @@ class FieldView:
         distances = np.empty(len(points), np.float32)
 
         def work(first: int, last: int) -> None:
-            distances[first:last] = region.engine.evaluate_in_grid(local, points[first:last])
+            distances[first:last] = region.field.evaluate_in_grid(local, points[first:last])
 
         self._split(len(points), work)
         return distances
@@ -249,7 +250,7 @@ class FieldView:
         values = FieldValues(np.full(len(points), np.nan, np.float32), slopes)
         for owned in owners.groups:
             local = (points[owned.points] - owned.region.centre).astype(np.float32)
-            _put(values, owned.points, owned.region.engine.evaluate(local, gradient))
+            _put(values, owned.points, owned.region.field.evaluate(local, gradient))
         if len(owners.shared):
             _put(values, owners.shared, self._blend(points[owners.shared], gradient))
         return values
@@ -269,7 +270,7 @@ class FieldView:
             inside = half - np.abs(offsets[mine])
             ramps = np.clip(inside / self._settings.overlap_m, 0, 1)
             weights = ramps.prod(axis=1)
-            values = region.engine.evaluate(offsets[mine].astype(np.float32), gradient)
+            values = region.field.evaluate(offsets[mine].astype(np.float32), gradient)
             weight_sum[mine] += weights
             value_sum[mine] += weights * values.sdf
             if gradient:

@@ -39,9 +39,9 @@ class RecordedRegion:
         settings = record.settings
         self.index = region.index
         self.centre = settings.region_centre(region.index)
-        self.engine = recorded_field(settings, region)
+        self.field = recorded_field(settings, region)
         self.evidence = FrozenEvidence.from_record(1 << settings.depth, region.evidence)
-        self._samples = field_samples(self.engine, settings, split)
+        self._samples = field_samples(self.field, settings, split)
         self._epoch = record.epoch
         self._fitting = threading.Lock()
         self._surfels: SurfelMap | None = None

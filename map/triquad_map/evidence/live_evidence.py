@@ -116,12 +116,13 @@ class LiveEvidence:
         """
         self._observations.set_discs(voxels, surfels, self._seen)
 
-    def ray_surfels(self, voxels: Longs, since: int) -> Surfels:
+    def ray_surfels(self, voxels: Longs, hit_since: int = 0, *, since: int) -> Surfels:
         """Return what rays alone show of surface that was first seen in scan ``since`` or later.
 
-        See :data:`triquad_map.surface.ShownByRays`.
+        Of voxels that were not hit since scan ``hit_since``, nothing is told. See
+        :data:`triquad_map.surface.ShownByRays`.
         """
-        return ray_surfels(voxels, since, self._seen, self._observations.arrays)
+        return ray_surfels(voxels, since, hit_since, self._seen, self._observations.arrays)
 
     def carve(self, origin: Doubles, ends: Doubles, reach: Reach) -> Ints:
         """Record the free space between ``origin`` [3] and ``ends`` [N, 3].

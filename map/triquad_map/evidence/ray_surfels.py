@@ -12,13 +12,16 @@ from triquad_map.surface import SurfelKind, Surfels, nothing_shown
 _RAY_DISC, _RAY_POINT = int(SurfelKind.RAY_DISC), int(SurfelKind.RAY_POINT)
 
 
-def ray_surfels(voxels: Longs, since: int, seen: SeenVoxels, observed: Observed) -> Surfels:
+def ray_surfels(
+    voxels: Longs, since: int, hit_since: int, seen: SeenVoxels, observed: Observed
+) -> Surfels:
     """Return the surfels of ``voxels`` [N, 3]; see :data:`triquad_map.surface.ShownByRays`.
 
     Only where rays first ended in scan ``since`` or later: of the rest the field has learnt.
     """
     surfels = nothing_shown(voxels)
-    _fill(voxels, since, seen, observed, surfels.offsets, surfels.normals, surfels.kinds)
+    shown = (surfels.offsets, surfels.normals, surfels.kinds)
+    _fill(voxels, since, hit_since, seen, observed, *shown)
     return surfels
 
 
@@ -81,6 +84,7 @@ def _product(one: Floats | Doubles, other: Floats) -> float:
 def _fill(
     voxels: Longs,
     since: int,
+    hit_since: int,
     seen: SeenVoxels,
     observed: Observed,
     offsets: Floats,
@@ -91,7 +95,7 @@ def _fill(
     for i in range(len(voxels)):
         row = row_of(seen, observed, voxels[i, 0], voxels[i, 1], voxels[i, 2])
         here = observed.voxels[row]
-        if row == 0 or here.ends == 0 or here.first_scan < since:
+        if row == 0 or here.ends == 0 or here.first_scan < since or here.hit_scan < hit_since:
             continue
         is_flat = _set_normal(voxels[i], row, since, seen, observed, normal)
         kinds[i] = _RAY_DISC if is_flat else _RAY_POINT

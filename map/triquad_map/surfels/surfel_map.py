@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Ints, Longs
-from triquad_format.records.field_settings import BLOCK_VOXELS
+from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
 from triquad_format.records.region import BLOCK_BYTES, surface_counts
 
 from triquad_map.compiled.kernel import kernel
@@ -25,6 +25,7 @@ from triquad_map.surface import (
     support_confidence,
 )
 from triquad_map.surfels.nearest_surface import RegionFrame, ShownSurfels, improve_nearest
+from triquad_map.surfels.ray_planes import put_planes, ray_planes
 from triquad_map.surfels.surfel_search import NearestSurfels, find_nearest
 from triquad_map.surfels.surfel_tree import TreeShape, surfel_tree, tree_shape
 from triquad_map.view import NearestSurface
@@ -147,6 +148,17 @@ class SurfelMap:
         places = fitted.places
         self._tree = surfel_tree(places.shape, voxels, fitted.surfels)
         kinds = fitted.surfels.kinds
+        self._planes = (
+            ray_planes(
+                evidence.seen.blocks,
+                places.surface,
+                places.starts,
+                fitted.surfels,
+                evidence.levels,
+            )
+            if (kinds >= SurfelKind.RAY_DISC).any()
+            else None
+        )
         self._shown = ShownSurfels(
             kinds,
             normals=fitted.surfels.normals,
@@ -174,6 +186,14 @@ class SurfelMap:
         """Improve ``nearest`` where a surfel lies nearer to ``points`` [N, 3] of the map frame."""
         improve_nearest(points, self._tree, self._shown, frame, nearest)
 
+    def put_planes(
+        self, settings: FieldSettings, points: Floats, sdf: Floats, gradients: Floats
+    ) -> None:
+        """Correct what a field says where it has not learnt the surface; :func:`put_planes`."""
+        if self._planes is not None:
+            middle = float(1 << (settings.depth - 1))
+            put_planes(points, settings.leaf_m, middle, self._planes, sdf, gradients)
+
     def updated(
         self,
         evidence: FrozenEvidence,
@@ -181,10 +201,12 @@ class SurfelMap:
         epoch: int,
         most: int | None,
         by_rays: ShownByRays = nothing_shown,
+        since: int = 0,
     ) -> "SurfelMap":
         """Return the surfels of a later epoch: new ones are fitted, and of the others the oldest.
 
         At most ``most`` are fitted of those that rays alone show, and of the rest; ``None``: all.
+        Those that rays alone show follow what ended there from the scan ``since`` on.
         """
         places = self._fitted.places
         if not np.array_equal(places.surface, evidence.surface):
@@ -192,6 +214,7 @@ class SurfelMap:
         voxels = places.voxels()
         fitted = _carried(self._fitted, places, voxels)
         rows = _outdated(fitted, most)
+        _follow_rays(fitted.surfels, voxels, by_rays, since)
         return _fitted_again(
             evidence, fitted, voxels, rows, field=field, by_rays=by_rays, epoch=epoch
         )
@@ -231,6 +254,15 @@ def _beside(surfels: Surfels, voxels: Longs, gone: Longs) -> Rows:
     rows = np.flatnonzero(surfels.kinds == SurfelKind.NONE)
     around = (gone[:, None] + _AROUND).reshape(-1, 3)
     return rows[np.isin(keys_of(voxels[rows]), keys_of(around))]
+
+
+def _follow_rays(surfels: Surfels, voxels: Longs, by_rays: ShownByRays, since: int) -> None:
+    """Let those that rays alone show be what they show now, where any ended ``since`` a scan."""
+    rows = np.flatnonzero(surfels.kinds >= SurfelKind.RAY_DISC)
+    shown = by_rays(voxels[rows], since)
+    known = shown.kinds != SurfelKind.NONE
+    for name, array in vars(surfels).items():
+        array[rows[known]] = getattr(shown, name)[known]
 
 
 def _outdated(fitted: _Fitted, most: int | None) -> Rows:

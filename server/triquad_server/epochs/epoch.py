@@ -10,6 +10,7 @@ from triquad_format.records.map_progress import MapProgress
 from triquad_format.records.region import MapRecord, Region
 from triquad_map.compiled.team import Split, in_one
 from triquad_map.composition.composed_view import ComposedView
+from triquad_map.composition.shown_field import ShownField
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.field.frozen_field import FrozenField
 from triquad_map.surfels.surfel_map import SurfelMap
@@ -32,6 +33,11 @@ class FrozenRegion:
     changed: int  # epoch of its last change
     live_bytes: Mapping[str, int]  # by part, memory of the live region in addition to this one
     buffers: Buffers  # memory of this one; other epochs may share it
+
+    @property
+    def field(self) -> ShownField:
+        """The field as it is shown while it is trained."""
+        return ShownField(self.engine, self.surfels)
 
     def record(self) -> Region:
         """Return the region as a map file holds it, without training state."""

@@ -113,7 +113,6 @@ class LiveRegion:
     def take_step(self) -> tuple[Loss, int]:
         """Take one optimiser step; return loss and samples. On a GPU, reading the loss waits."""
         taken = self.training.take_step()
-        self.evidence.step_taken()
         self.is_changed = True
         return taken
 

@@ -24,9 +24,6 @@ _CARVE_SHORT = 0.5  # voxels before its end up to which a ray shows free space
 _CLEAR_SHORT = 2.5  # voxels before its end up to which a ray shows that a surface is not there
 _FAR_THINNED_AT, _OPEN_THINNED_AT = 0.5, 0.25  # shares of the rays' length
 
-_NEW_SCANS = 10
-"""The number of scans, after a surface is first seen, that give the field time to learn it."""
-
 _SURFELS_REFITTED = 8_000
 """The number of surfels that are fitted again with each epoch while the field is trained: some
 10 ms."""
@@ -57,7 +54,8 @@ class RegionEvidence:
         self._centre = centre
         self._random = np.random.default_rng(seed)
         self._scans = 0  # scans in which the region was seen
-        self._scans_learnt = 0  # of these, those before the field was trained last
+        self._unlearnt_since = 1  # of these, the first since the field had learnt all
+        self._scans_published = 0  # of these, those that the last epoch shows
         self._removed: list[Longs] = []  # voxels whose surface was removed since the last epoch
         self._surfels: SurfelMap | None = None  # of the last epoch
         self._fitted_to: int | None = None
@@ -122,10 +120,6 @@ class RegionEvidence:
         """Return which rays [N] ended on a surface first seen in the last ``scans`` scans."""
         return self.live.first_seen_since(self._scans - scans + 1, rows)
 
-    def step_taken(self) -> None:
-        """Record that the field was trained on what was seen so far."""
-        self._scans_learnt = self._scans
-
     def published(
         self, samples: SampleField, version: int, epoch: int, *, is_settled: bool
     ) -> PublishedEvidence:
@@ -141,7 +135,10 @@ class RegionEvidence:
         self._surfels = surfels = self._fitted_surfels(
             evidence, samples, version, epoch, is_settled=is_settled
         )
+        if is_settled and self._fitted_to != version:
+            self._unlearnt_since = self._scans + 1
         self._fitted_to = version if is_settled else None
+        self._scans_published = self._scans
         if self._is_restored:
             self.live.set_discs(surfels.voxels(), surfels.surfels)
             self._is_restored = False
@@ -179,8 +176,8 @@ class RegionEvidence:
         shown: ShownByRays = nothing_shown
         if not is_settled or self._fitted_to == version:
             most = 0 if is_settled else _SURFELS_REFITTED
-            since = max(1, self._scans_learnt - _NEW_SCANS)  # and not from before a restart
-            shown = partial(self.live.ray_surfels, since=since)
+            shown = partial(self.live.ray_surfels, since=self._unlearnt_since)
         if self._surfels is None:
             return first_surfels(evidence, samples, epoch, shown)
-        return self._surfels.updated(evidence, samples, epoch, most=most, by_rays=shown)
+        new = self._scans_published + 1
+        return self._surfels.updated(evidence, samples, epoch, most, by_rays=shown, since=new)

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_map.compiled.team import Team
+from triquad_map.composition.shown_field import ShownField
 from triquad_map.evidence.evidence import FrozenEvidence
-from triquad_map.field.frozen_field import FrozenField
 from triquad_map.surfels.surfel_map import surfel_voxels
 
 from triquad_server.epochs.epoch import FrozenRegion
@@ -47,7 +47,7 @@ class _Recorded:
     """The surface of a region when its changes were last reported."""
 
     centre: Doubles  # [3] of the region, map frame
-    engine: FrozenField
+    field: ShownField
     evidence: FrozenEvidence
     voxels: _Voxels
     offsets: Floats  # [V] metres from each voxel's centre to the surface
@@ -82,7 +82,7 @@ class SurfaceChanges:
         found = [Changes(nothing, nothing)]
         for region in regions:
             old = before.pop(region.index, None)
-            if old and old.engine is region.engine and old.evidence is region.evidence:
+            if old and old.field == region.field and old.evidence is region.evidence:
                 self._recorded[region.index] = old
             else:
                 self._recorded[region.index], changes = self._compare(old, region)
@@ -128,7 +128,7 @@ class SurfaceChanges:
         keys = np.concatenate([gone, voxels.keys[places]])
         recorded = _Recorded(
             region.centre,
-            region.engine,
+            region.field,
             region.evidence,
             voxels,
             offsets=offsets,
@@ -166,7 +166,7 @@ class SurfaceChanges:
         def work(first: int, last: int) -> None:
             part = slice(first, last)
             local = (centres[part] - region.centre).astype(np.float32)
-            values = region.engine.evaluate(local, True)
+            values = region.field.evaluate(local, True)
             slope = np.maximum(np.linalg.norm(values.gradient, axis=1), 0.1)
             offsets[part] = np.clip(values.sdf / slope, -leaf_m, leaf_m)
 

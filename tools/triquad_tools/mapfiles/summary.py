@@ -186,7 +186,7 @@ def _fit(record: MapRecord) -> MapFit | None:
     with closing(view):
         for number, points in ends.items():
             region = view.region_views[number]
-            sdf = region.engine.evaluate(points, gradient=False).sdf
+            sdf = region.field.evaluate(points, gradient=False).sdf
             fits.append((region.centre, PlaceFits.of(Places.of(points, record.settings), sdf)))
     return map_fit(fits)
 
