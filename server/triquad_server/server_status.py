@@ -16,7 +16,7 @@ from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.process.memory import give_back_free, resident_bytes
-from triquad_server.serving.operation_counts import OperationCounts
+from triquad_server.serving.request import OperationCounts
 from triquad_server.store.checkpoint_writer import CheckpointWriter
 
 _log = logging.getLogger(__name__)

@@ -19,7 +19,7 @@ from triquad_format.wire.messages import (
     StatusRequest,
 )
 from triquad_format.wire.metrics_messages import MetricsRequest
-from triquad_format.wire.query_messages import ChangesRequest, SourcesRequest
+from triquad_format.wire.query_messages import ChangesRequest, GridRequest, SourcesRequest
 from triquad_map.questions.answers import QUESTIONS, Answers
 
 from triquad_server.epochs.history import EpochHistory
@@ -164,30 +164,30 @@ class Service:
         """Answer the requests of clients from now on."""
         serve, health = self._operations.serve, self.health
         answers, max_bytes = Answers(self._epochs.view), payload_limit(MAX_QUERY_POINTS)
-        for name, question in QUESTIONS.items():
-            lane = Lane.LONG_QUESTIONS if name == keys.GRID else Lane.QUESTIONS
-            serve(name, question.request, answers.answer, lane, max_bytes)
+        for question in QUESTIONS:
+            lane = Lane.LONG_QUESTIONS if question is GridRequest else Lane.QUESTIONS
+            serve(question, answers.answer, lane, max_bytes)
         changes = ChangeQueries(self._epochs, self._surface, health.server)
         sources = SourceQueries(self._trails, health.server)
         mesh = TileQueries(self._epochs, tiles, health.server)
-        serve(keys.CHANGES, ChangesRequest, changes.changes)
-        serve(keys.SOURCES, SourcesRequest, sources.sources)
-        serve(keys.TILE_LIST, TileListRequest, mesh.tiles, Lane.MESH)
-        serve(keys.TILE_CHANGES, TileChangesRequest, mesh.changes, Lane.MESH)
-        serve(keys.MESH, MeshRequest, mesh.mesh, Lane.MESH)
-        serve(keys.MAP_CHUNK, MapChunkRequest, downloads.chunk, Lane.LONG_QUESTIONS)
+        serve(ChangesRequest, changes.changes)
+        serve(SourcesRequest, sources.sources)
+        serve(TileListRequest, mesh.tiles, Lane.MESH)
+        serve(TileChangesRequest, mesh.changes, Lane.MESH)
+        serve(MeshRequest, mesh.mesh, Lane.MESH)
+        serve(MapChunkRequest, downloads.chunk, Lane.LONG_QUESTIONS)
 
         flush = FlushQueries(self._scans.ledger, self._mapper.publish_soon, self._warnings.of)
         lane = Lane.ADMINISTRATION
-        serve(keys.STATUS, StatusRequest, lambda _: health.status(), lane)
-        serve(keys.METRICS, MetricsRequest, lambda _: self.metrics.now(), lane)
-        serve(keys.FLUSH, FlushRequest, flush.answer, lane)
+        serve(StatusRequest, lambda _: health.status(), lane)
+        serve(MetricsRequest, lambda _: self.metrics.now(), lane)
+        serve(FlushRequest, flush.answer, lane)
 
         keep_resets = self._settings.store.keep_resets
         resets = Resets(self._mapper, health.checkpoints, keep_resets, self._trails)
-        serve(keys.CHECKPOINT, CheckpointRequest, health.checkpoints.answer, Lane.FILES)
-        serve(keys.RESET, ResetRequest, resets.answer, Lane.FILES)
-        serve(keys.MAP_INFO, MapInfoRequest, downloads.info, Lane.FILES)
+        serve(CheckpointRequest, health.checkpoints.answer, Lane.FILES)
+        serve(ResetRequest, resets.answer, Lane.FILES)
+        serve(MapInfoRequest, downloads.info, Lane.FILES)
 
     def _announce(self, health: Health) -> None:
         """Say that the server is there, until it closes."""

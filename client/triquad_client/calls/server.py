@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 from triquad_format.printable import printable
-from triquad_format.wire import keys
 from triquad_format.wire.messages import (
     CheckpointInfo,
     CheckpointRequest,
@@ -16,12 +15,7 @@ from triquad_format.wire.metrics_messages import MetricsRequest, ServerMetrics
 
 from triquad_client import checks
 from triquad_client.checks import Bounds
-from triquad_client.net.connection import Ask, Connection
-
-STATUS = Ask(keys.STATUS, StatusRequest(), ServerStatus)
-
-_SLOW_S = 60.0
-"""The least timeout of requests that write to the server's disk."""
+from triquad_client.net.connection import Connection
 
 
 class ServerCalls:
@@ -31,14 +25,14 @@ class ServerCalls:
 
     def status(self) -> ServerStatus:
         """Return how the server is doing."""
-        return self._connection.ask(STATUS)
+        return self._connection.ask(StatusRequest())
 
     def metrics(self) -> ServerMetrics:
         """Return how the server is doing, in figures: requests and their times, queues, memory.
 
         Counts and times only grow while a server runs: take the difference of two answers.
         """
-        return self._connection.ask(Ask(keys.METRICS, MetricsRequest(), ServerMetrics))
+        return self._connection.ask(MetricsRequest())
 
     def checkpoint(self) -> CheckpointInfo:
         """Have the server write the map to its store now.
@@ -46,8 +40,7 @@ class ServerCalls:
         Raises:
             RefusedError: ``store``, where it cannot be written.
         """
-        request = Ask(keys.CHECKPOINT, CheckpointRequest(), CheckpointInfo, min_timeout_s=_SLOW_S)
-        return self._connection.ask(request)
+        return self._connection.ask(CheckpointRequest())
 
     def reset(self, bounds: Bounds | None = None) -> ResetReply:
         """Forget what was learnt within ``bounds``.
@@ -65,7 +58,5 @@ class ServerCalls:
         Raises:
             RefusedError: ``store``, where the map as it is cannot be kept: nothing is forgotten.
         """
-        request = ResetRequest(*checks.box(bounds))
-        asked = Ask(keys.RESET, request, ResetReply, min_timeout_s=_SLOW_S)
-        reply = self._connection.ask(asked)
+        reply = self._connection.ask(ResetRequest(*checks.box(bounds)))
         return reply if reply.undo is None else replace(reply, undo=printable(reply.undo))

@@ -6,18 +6,16 @@ from dataclasses import dataclass
 import numpy as np
 from triquad_format.errors import InvalidInputError
 from triquad_format.records.arrays import Doubles, Longs
-from triquad_format.wire import keys
 from triquad_format.wire.limits import MAX_SAMPLE_POINTS
 from triquad_format.wire.query_messages import (
     ScanSample,
-    SourcesReply,
     SourcesRequest,
     SourceState,
 )
 
 from triquad_client import checks
 from triquad_client.errors import BadReplyError
-from triquad_client.net.connection import Ask, Connection
+from triquad_client.net.connection import Connection
 
 
 @dataclass(frozen=True)
@@ -84,7 +82,7 @@ class SourceCalls:
         limit = checks.count("max_points", max_points, MAX_SAMPLE_POINTS)
         known = since or SourceReport(server="", revision=0, sources={})
         request = SourcesRequest(server=known.server, revision=known.revision, max_points=limit)
-        reply = self._connection.ask(Ask(keys.SOURCES, request, SourcesReply, background=True))
+        reply = self._connection.ask(request)
         if reply.sources is not None:
             found = {name: _source(name, state) for name, state in reply.sources.items()}
             return SourceReport(reply.server, reply.revision, found)

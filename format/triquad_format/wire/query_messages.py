@@ -10,8 +10,25 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from triquad_format.wire.codec import ArraySpec, Message
-from triquad_format.wire.limits import MAX_DISTANCE_M, MAX_ITERATIONS, MAX_RANGE_M
+from triquad_format.wire import keys
+from triquad_format.wire.bounds import (
+    MAX_COUNT,
+    asked_by,
+    at_most_asked,
+    rigid_pose,
+    rows_of,
+    same_as_asked,
+    shape_asked_by,
+    within,
+)
+from triquad_format.wire.codec import ArraySpec, Message, Request
+from triquad_format.wire.limits import (
+    MAX_DISTANCE_M,
+    MAX_ITERATIONS,
+    MAX_RANGE_M,
+    MAX_SAMPLE_POINTS,
+    MIN_LENGTH_M,
+)
 from triquad_format.wire.messages import (
     Count,
     Epoch,
@@ -25,17 +42,8 @@ from triquad_format.wire.messages import (
     Pose,
     Positions,
     Statuses,
+    UpperCorner,
     Values,
-)
-from triquad_format.wire.reply import (
-    MAX_COUNT,
-    asked_by,
-    at_most_asked,
-    rigid_pose,
-    rows_of,
-    same_as_asked,
-    shape_asked_by,
-    within,
 )
 
 Flags = Annotated[NDArray[np.uint8], ArraySpec("|u1", (None,))]
@@ -49,19 +57,8 @@ UnitVectors = Annotated[Positions, within(-1.001, 1.001)]  # or zero
 Shares = Annotated[Values, within(0, 1)]
 TruthValues = Annotated[Flags, within(0, 1)]
 FiniteCorners = Annotated[Corners, within()]
+Reach = Annotated[float, within(MIN_LENGTH_M, MAX_DISTANCE_M)]  # of a search, metres
 PlacesAlong = Annotated[Values, within(0, 1.001 * MAX_RANGE_M), asked_by("starts")]
-
-
-@dataclass(frozen=True)
-class DistanceRequest(Message):
-    """True distances to the nearest seen surface, at any range."""
-
-    origin: Point  # metres, map frame
-    points: Positions  # [N, 3] metres, relative to origin
-    max_distance_m: float  # a surface is searched for up to here
-    surface_point: bool  # the nearest points of the surface are wanted, too
-    unknown_distance: bool  # so is the nearest unknown space
-    epoch: int
 
 
 @dataclass(frozen=True)
@@ -85,12 +82,14 @@ class DistanceReply(MapReply):
 
 
 @dataclass(frozen=True)
-class SpheresRequest(Message):
-    """Ask what spheres contain."""
+class DistanceRequest(Request[DistanceReply], operation=keys.DISTANCE):
+    """True distances to the nearest seen surface, at any range."""
 
     origin: Point  # metres, map frame
-    centres: Positions  # [N, 3] metres, relative to origin
-    radii_m: Values  # [N] metres
+    points: Positions  # [N, 3] metres, relative to origin
+    max_distance_m: Reach  # a surface is searched for up to here
+    surface_point: bool  # the nearest points of the surface are wanted, too
+    unknown_distance: bool  # so is the nearest unknown space
     epoch: int
 
 
@@ -102,14 +101,12 @@ class SpheresReply(MapReply):
 
 
 @dataclass(frozen=True)
-class SegmentsRequest(Message):
-    """Ask what a ball meets that moves along segments."""
+class SpheresRequest(Request[SpheresReply], operation=keys.SPHERES):
+    """Ask what spheres contain."""
 
     origin: Point  # metres, map frame
-    starts: Positions  # [N, 3] metres, relative to origin
-    ends: Positions  # [N, 3]
-    radius_m: float  # of the ball
-    max_distance_m: float  # clearance is searched for up to here
+    centres: Positions  # [N, 3] metres, relative to origin
+    radii_m: Annotated[Values, within(0, MAX_DISTANCE_M), rows_of("centres")]  # [N] metres
     epoch: int
 
 
@@ -129,14 +126,14 @@ class SegmentsReply(MapReply):
 
 
 @dataclass(frozen=True)
-class RaysRequest(Message):
-    """Ask how far rays reach."""
+class SegmentsRequest(Request[SegmentsReply], operation=keys.SEGMENTS):
+    """Ask what a ball meets that moves along segments."""
 
     origin: Point  # metres, map frame
     starts: Positions  # [N, 3] metres, relative to origin
-    directions: Positions  # [N, 3] unit vectors, map frame
-    max_range_m: float
-    through_unknown: bool  # unknown space does not stop them
+    ends: Annotated[Positions, rows_of("starts")]  # [N, 3]
+    radius_m: Annotated[float, within(0, MAX_DISTANCE_M)]  # of the ball
+    max_distance_m: Reach  # clearance is searched for up to here
     epoch: int
 
 
@@ -150,12 +147,14 @@ class RaysReply(MapReply):
 
 
 @dataclass(frozen=True)
-class GroundRequest(Message):
-    """The ground below points."""
+class RaysRequest(Request[RaysReply], operation=keys.RAYS):
+    """Ask how far rays reach."""
 
     origin: Point  # metres, map frame
-    points: Positions  # [N, 3] metres, relative to origin
-    max_drop_m: float  # the ground is searched for up to here
+    starts: Positions  # [N, 3] metres, relative to origin
+    directions: Annotated[Positions, rows_of("starts")]  # [N, 3] unit vectors, map frame
+    max_range_m: Annotated[float, within(MIN_LENGTH_M, MAX_RANGE_M)]
+    through_unknown: bool  # unknown space does not stop them
     epoch: int
 
 
@@ -174,13 +173,12 @@ class GroundReply(MapReply):
 
 
 @dataclass(frozen=True)
-class GridRequest(Message):
-    """Distance and status at the middles of a grid's cells."""
+class GroundRequest(Request[GroundReply], operation=keys.GROUND):
+    """The ground below points."""
 
-    corner: Point  # the grid's least corner, metres, map frame
-    cell_m: float
-    counts: Counts  # cells along x, y, z
-    max_distance_m: float
+    origin: Point  # metres, map frame
+    points: Positions  # [N, 3] metres, relative to origin
+    max_drop_m: Reach  # the ground is searched for up to here
     epoch: int
 
 
@@ -196,12 +194,13 @@ class GridReply(MapReply):
 
 
 @dataclass(frozen=True)
-class AlignRequest(Message):
-    """Find the pose of a scan near a guess."""
+class GridRequest(Request[GridReply], operation=keys.GRID):
+    """Distance and status at the middles of a grid's cells."""
 
-    points: Positions  # [N, 3] metres, sensor frame
-    world_from_sensor: Pose  # the guess
-    max_distance_m: float  # points farther from any surface do not count
+    corner: Annotated[Point, within()]  # the grid's least corner, metres, map frame
+    cell_m: Reach
+    counts: Annotated[Counts, within(1)]  # cells along x, y, z
+    max_distance_m: Reach
     epoch: int
 
 
@@ -220,13 +219,13 @@ class AlignReply(MapReply):
 
 
 @dataclass(frozen=True)
-class ChangesRequest(Message):
-    """Ask where surface appeared or vanished since an epoch."""
+class AlignRequest(Request[AlignReply], operation=keys.ALIGN):
+    """Find the pose of a scan near a guess."""
 
-    since: int  # number of an epoch; 0: the newest, after which nothing has changed yet
-    server: str  # of the reply or status that named it; empty where that is not known
-    minimum: Point
-    maximum: Point  # of the box that is of interest, map frame; an open side is infinite
+    points: Positions  # [N, 3] metres, sensor frame
+    world_from_sensor: Annotated[Pose, rigid_pose()]  # the guess
+    max_distance_m: Reach  # points farther from any surface do not count
+    epoch: int
 
 
 @dataclass(frozen=True)
@@ -245,12 +244,14 @@ class ChangesReply(MapReply):
 
 
 @dataclass(frozen=True)
-class SourcesRequest(Message):
-    """Ask where the sources of scans have been, and for the newest scan of each."""
+class ChangesRequest(Request[ChangesReply], operation=keys.CHANGES):
+    """Ask where surface appeared or vanished since an epoch."""
 
-    server: str  # of the reply before, to which revision belongs; empty at first
-    revision: int  # of the reply before, which is not sent again; 0 at first
-    max_points: int  # of each newest scan
+    # number of an epoch; 0: the newest, after which nothing has changed yet
+    since: Annotated[int, within(0)]
+    server: str  # of the reply or status that named it; empty where that is not known
+    minimum: Point
+    maximum: UpperCorner  # of the box that is of interest, map frame; an open side is infinite
 
 
 @dataclass(frozen=True)
@@ -282,3 +283,12 @@ class SourcesReply(Message):
     server: Name
     revision: Count  # for the next request
     sources: dict[Name, SourceState] | None  # all, by name; None: as in the reply before
+
+
+@dataclass(frozen=True)
+class SourcesRequest(Request[SourcesReply], operation=keys.SOURCES, background=True):
+    """Ask where the sources of scans have been, and for the newest scan of each."""
+
+    server: str  # of the reply before, to which revision belongs; empty at first
+    revision: int  # of the reply before, which is not sent again; 0 at first
+    max_points: Annotated[int, within(0, MAX_SAMPLE_POINTS)]  # of each newest scan

@@ -5,6 +5,7 @@ import time
 from collections import OrderedDict, deque
 from dataclasses import dataclass, field
 
+from triquad_format.wire.limits import MAX_SEQUENCE
 from triquad_format.wire.messages import FlushReply, Scan
 from triquad_format.wire.metrics_messages import SourceMetrics
 
@@ -12,8 +13,6 @@ MAX_SESSIONS = 1024
 """The number of publishers' sessions that are kept; the one heard of longest ago is removed."""
 
 MAX_SOURCES_LISTED = 64
-
-MAX_SEQUENCE = 2**48
 
 MAX_LEAP = 1_000_000
 """The most by which a sequence may lie above the last of its session: half a day of lost scans. One
@@ -96,7 +95,7 @@ class SourceLedger:
     def arrive(self, scan: Scan) -> str | None:
         """Record a scan's arrival; return the reason if its sequence or stamp refuses it."""
         with self._lock:
-            if not 0 <= scan.sequence < MAX_SEQUENCE:
+            if not 0 <= scan.sequence <= MAX_SEQUENCE:
                 return "bad_sequence"
             session = self._session(scan)
             if 0 <= session.arrived < scan.sequence - MAX_LEAP:

@@ -13,8 +13,8 @@ from triquad_server.epochs.surface_history import SurfaceHistory
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.process.memory import resident_bytes
 from triquad_server.server_status import Health
-from triquad_server.serving.operation_counts import BOUNDS_S
 from triquad_server.serving.operations import Operations
+from triquad_server.serving.request import BOUNDS_S
 from triquad_server.store.download import MapDownloads
 
 _MAX_SESSIONS = 1024  # that are listed

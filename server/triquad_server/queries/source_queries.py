@@ -1,7 +1,5 @@
 """Answers queries of where the sources of scans have been, and what they see."""
 
-from triquad_format.errors import RefusedError
-from triquad_format.wire.limits import MAX_SAMPLE_POINTS
 from triquad_format.wire.query_messages import SourcesReply, SourcesRequest
 
 from triquad_server.intake.source_trails import SourceTrails
@@ -19,15 +17,7 @@ class SourceQueries:
         self._server = server
 
     def sources(self, request: SourcesRequest) -> SourcesReply:
-        """Return all sources, if anything of them is new since the reply before.
-
-        Raises:
-            RefusedError: a field is out of range.
-        """
-        if not 0 <= request.max_points <= MAX_SAMPLE_POINTS:
-            raise RefusedError(
-                "bad_request", f"max_points = {request.max_points}: use 0 to {MAX_SAMPLE_POINTS}"
-            )
+        """Return all sources, if anything of them is new since the reply before."""
         revision = self._trails.revision  # first: what comes meanwhile is new the next time
         if (request.server, request.revision) == (self._server, revision):
             return SourcesReply(self._server, revision, None)
