@@ -142,7 +142,7 @@ def _open(options: LaunchOptions, stops: Stops, starting: Report, stack: ExitSta
     service = Service(session, served, settings, failed=stops.put)
     stack.enter_context(closing(service))
     if monitoring is not None:
-        stack.enter_context(monitoring.showing(service.metrics))
+        stack.enter_context(monitoring.showing(service.health))
     _log_who_gets_in(network)
     _log_ready(options, network, service.epoch)
     return service

@@ -33,7 +33,6 @@ from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapListeners, MapperThread
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_queries import TileQueries
-from triquad_server.monitoring.metrics import Metrics
 from triquad_server.process.stop import Stop
 from triquad_server.process.threads import Teams
 from triquad_server.queries.change_queries import ChangeQueries
@@ -124,7 +123,8 @@ class Service:
             map_name=self._served.name,
             server=secrets.token_hex(8),
             device=self._served.device,
-            operations=self._operations.counts,
+            session=self.session,
+            operations=self._operations,
             scans=self._scans,
             warnings=self._warnings,
             mapper=self._mapper,
@@ -134,14 +134,6 @@ class Service:
         )
         tiles = TileCache(self._settings.mesh, self._served.teams.meshing)
         downloads = MapDownloads(self._mapper, self._epochs, health.server)
-        self.metrics = Metrics(
-            health,
-            self.session,
-            self._surface,
-            tiles=tiles,
-            downloads=downloads,
-            operations=self._operations,
-        )
         self._open_checkpoints(checkpoints)
         self._serve(tiles, downloads)
         # Closed before the last checkpoint is written: it contains every reset that was answered.
@@ -180,7 +172,7 @@ class Service:
         flush = FlushQueries(self._scans.ledger, self._mapper.publish_soon, self._warnings.of)
         lane = Lane.ADMINISTRATION
         serve(StatusRequest, lambda _: health.status(), lane)
-        serve(MetricsRequest, lambda _: self.metrics.now(), lane)
+        serve(MetricsRequest, lambda _: health.metrics(), lane)
         serve(FlushRequest, flush.answer, lane)
 
         keep_resets = self._settings.store.keep_resets

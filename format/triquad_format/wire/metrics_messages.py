@@ -96,7 +96,6 @@ class ServerMetrics(Message):
     queues: dict[Name, QueueMetrics]
     sources: dict[Name, SourceMetrics]  # by name; "*" is of those there are too many of
     scan_bytes_received: Count
-    memory_bytes: dict[Name, Count]  # by part
     resident_bytes: Count  # memory of the whole process
     mapper_s: dict[Name, Duration]  # how the mapper's thread spent its time, by activity
     checkpoints: CheckpointMetrics

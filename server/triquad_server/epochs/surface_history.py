@@ -60,7 +60,6 @@ CHANGES_KEPT = 1_000_000
 """The number of changes of voxels' surface that are kept, for clients that request them: 13 bytes
 each."""
 
-_VOXEL_BYTES = 13  # three numbers of 32 bits, and whether it appeared
 _NO_VOXELS = np.zeros((0, 3), np.int32)
 
 
@@ -91,11 +90,6 @@ class SurfaceHistory:
                 forgotten = self._changes.popleft()
                 self._voxels -= len(forgotten.voxels)
                 self._oldest = forgotten.epoch
-
-    @property
-    def nbytes(self) -> int:
-        """The bytes of the changes that are kept."""
-        return self._voxels * _VOXEL_BYTES
 
     def between(self, since: int, until: int) -> VoxelChanges:
         """Return what differs between the epochs ``since`` and ``until``.

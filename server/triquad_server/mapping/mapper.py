@@ -108,7 +108,6 @@ class Mapper:
             rays_discarded=sum(one.rays.pool.kept.discarded for one in training),
             replay_share=self.regions.rays_share,
             map_bytes=self.regions.bytes_used,
-            normals_bytes=self._normals.nbytes,
         )
 
     def ingest(

@@ -38,7 +38,7 @@ class TileCache:
 
     Tiles that are followed are kept until their surface changes. They fit their neighbours, though
     these may be of other epochs. One thread uses the cache, and shares the making of tiles with its
-    team; any thread may ask for its size.
+    team.
     """
 
     def __init__(self, settings: MeshSettings, team: Team) -> None:
@@ -51,11 +51,6 @@ class TileCache:
         self.epoch = -1  # number of the epoch of the last refresh
         self._view: ComposedView | None = None  # epoch from which tiles are made
         self._shown = ShownTiles(settings.cache_bytes)
-
-    @property
-    def nbytes(self) -> int:
-        """Return the bytes of the encoded tiles that are kept."""
-        return self._shown.size
 
     def lattice(self, level: int) -> TileLattice:
         """Return where the tiles of a level lie."""

@@ -48,7 +48,7 @@ class ShownTiles:
     def __init__(self, limit: int) -> None:
         """Keep at most ``limit`` bytes, or a single tile that is larger."""
         self._limit = limit
-        self.size = 0  # bytes of the tiles that are kept
+        self._size = 0  # bytes of the tiles that are kept
         self._tiles: OrderedDict[TileKey, ShownTile] = OrderedDict()  # longest unused first
 
     def get(self, key: TileKey) -> ShownTile | None:
@@ -61,11 +61,11 @@ class ShownTiles:
     def put(self, key: TileKey, tile: ShownTile) -> None:
         """Keep a tile."""
         before = self._tiles.pop(key, None)
-        self.size += tile.nbytes - (0 if before is None else before.nbytes)
+        self._size += tile.nbytes - (0 if before is None else before.nbytes)
         self._tiles[key] = tile
-        while self.size > self._limit and len(self._tiles) > 1:
+        while self._size > self._limit and len(self._tiles) > 1:
             _, dropped = self._tiles.popitem(last=False)
-            self.size -= dropped.nbytes
+            self._size -= dropped.nbytes
 
 
 @dataclass(frozen=True)
