@@ -19,9 +19,11 @@ from triquad_format.wire.messages import (
     StatusRequest,
 )
 from triquad_format.wire.metrics_messages import MetricsRequest
-from triquad_format.wire.query_messages import ChangesRequest, GridRequest, SourcesRequest
+from triquad_format.wire.query_messages import ChangesRequest, GridRequest
+from triquad_format.wire.source_messages import SourcesRequest
 from triquad_map.questions.answers import QUESTIONS, Answers
 
+from triquad_server.epochs.change_queries import ChangeQueries
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.epochs.surface_history import CHANGES_KEPT, SurfaceHistory
 from triquad_server.intake.flush import FlushQueries
@@ -35,8 +37,6 @@ from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_queries import TileQueries
 from triquad_server.process.stop import Stop
 from triquad_server.process.threads import Teams
-from triquad_server.queries.change_queries import ChangeQueries
-from triquad_server.queries.source_queries import SourceQueries
 from triquad_server.server_status import Health, Heartbeat
 from triquad_server.serving.operations import Lane, Operations
 from triquad_server.settings import Settings
@@ -83,7 +83,8 @@ class Service:
             first, settings.service, older_bytes=settings.memory.epochs_bytes
         )
         self._surface = SurfaceHistory(first, CHANGES_KEPT)
-        self._trails = SourceTrails(first.field_settings.leaf_m)
+        self._name = secrets.token_hex(8)  # of this process
+        self._trails = SourceTrails(first.field_settings.leaf_m, self._name)
         self._parts = ExitStack()  # closed in reverse order of opening
         try:
             self._open(failed)
@@ -121,7 +122,7 @@ class Service:
         )
         self.health = health = Health(
             map_name=self._served.name,
-            server=secrets.token_hex(8),
+            server=self._name,
             device=self._served.device,
             session=self.session,
             operations=self._operations,
@@ -160,10 +161,9 @@ class Service:
             lane = Lane.LONG_QUESTIONS if question is GridRequest else Lane.QUESTIONS
             serve(question, answers.answer, lane, max_bytes)
         changes = ChangeQueries(self._epochs, self._surface, health.server)
-        sources = SourceQueries(self._trails, health.server)
         mesh = TileQueries(self._epochs, tiles, health.server)
         serve(ChangesRequest, changes.changes)
-        serve(SourcesRequest, sources.sources)
+        serve(SourcesRequest, self._trails.answer)
         serve(TileListRequest, mesh.tiles, Lane.MESH)
         serve(TileChangesRequest, mesh.changes, Lane.MESH)
         serve(MeshRequest, mesh.mesh, Lane.MESH)

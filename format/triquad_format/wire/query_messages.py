@@ -1,4 +1,4 @@
-"""The wire messages of questions about the map and its sources.
+"""The wire messages of questions about the map.
 
 All of a reply comes from one epoch. Flags are 0 or 1. What was not found has a flag that says so:
 no number stands for it.
@@ -14,25 +14,24 @@ from triquad_format.wire import keys
 from triquad_format.wire.bounds import (
     MAX_COUNT,
     asked_by,
-    at_most_asked,
     rigid_pose,
     rows_of,
     same_as_asked,
     shape_asked_by,
     within,
 )
-from triquad_format.wire.codec import ArraySpec, Message, Request
+from triquad_format.wire.codec import ArraySpec, Request
 from triquad_format.wire.limits import (
     MAX_DISTANCE_M,
     MAX_ITERATIONS,
     MAX_RANGE_M,
-    MAX_SAMPLE_POINTS,
     MIN_LENGTH_M,
 )
 from triquad_format.wire.messages import (
     Count,
     Epoch,
     Epochs,
+    FinitePoints,
     FinitePositions,
     Integers,
     Length,
@@ -50,13 +49,11 @@ Flags = Annotated[NDArray[np.uint8], ArraySpec("|u1", (None,))]
 Volume = Annotated[NDArray[np.float32], ArraySpec("<f4", (None, None, None))]
 StatusVolume = Annotated[NDArray[np.uint8], ArraySpec("|u1", (None, None, None))]
 Counts = Annotated[NDArray[np.int32], ArraySpec("<i4", (3,))]
-Corners = Annotated[NDArray[np.float64], ArraySpec("<f8", (None, 3))]
 Covariance = Annotated[NDArray[np.float64], ArraySpec("<f8", (6, 6))]
 
 UnitVectors = Annotated[Positions, within(-1.001, 1.001)]  # or zero
 Shares = Annotated[Values, within(0, 1)]
 TruthValues = Annotated[Flags, within(0, 1)]
-FiniteCorners = Annotated[Corners, within()]
 Reach = Annotated[float, within(MIN_LENGTH_M, MAX_DISTANCE_M)]  # of a search, metres
 PlacesAlong = Annotated[Values, within(0, 1.001 * MAX_RANGE_M), asked_by("starts")]
 
@@ -234,8 +231,8 @@ class ChangesReply(MapReply):
 
     server: Name
     since: Annotated[Epoch, same_as_asked("since")]
-    minimum: FiniteCorners  # [N, 3] metres, map frame
-    maximum: Annotated[FiniteCorners, rows_of("minimum")]  # [N, 3]
+    minimum: FinitePoints  # [N, 3] metres, map frame
+    maximum: Annotated[FinitePoints, rows_of("minimum")]  # [N, 3]
     # [N] 1: surface appeared, 0: it vanished
     appeared: Annotated[TruthValues, rows_of("minimum")]
     epochs: Annotated[Epochs, rows_of("minimum")]  # [N] of the newest change in each
@@ -252,43 +249,3 @@ class ChangesRequest(Request[ChangesReply], operation=keys.CHANGES):
     server: str  # of the reply or status that named it; empty where that is not known
     minimum: Point
     maximum: UpperCorner  # of the box that is of interest, map frame; an open side is infinite
-
-
-@dataclass(frozen=True)
-class ScanSample(Message):
-    """Some of the points of a scan that is in the map."""
-
-    stamp_ns: int  # nanoseconds since 1970, as its publisher said
-    world_from_sensor: Annotated[Pose, rigid_pose()]
-    # [N, 3] metres, map frame, relative to the sensor's position
-    points: Annotated[FinitePositions, at_most_asked("max_points")]
-    points_used: Count  # of the scan, by the map: N or more
-
-
-@dataclass(frozen=True)
-class SourceState(Message):
-    """One source of scans."""
-
-    scans: Count  # that were accepted into the map since the server heard of the source
-    trail: FiniteCorners  # [N, 3] metres, map frame: positions of the sensor, oldest first
-    # [N] the piece of the trail each is part of: rises where the sensor jumped
-    pieces: Annotated[Integers, within(0, MAX_COUNT), rows_of("trail")]
-    newest: ScanSample | None  # None: a reset forgot it, and no scan has come since
-
-
-@dataclass(frozen=True)
-class SourcesReply(Message):
-    """Answer to :class:`SourcesRequest`."""
-
-    server: Name
-    revision: Count  # for the next request
-    sources: dict[Name, SourceState] | None  # all, by name; None: as in the reply before
-
-
-@dataclass(frozen=True)
-class SourcesRequest(Request[SourcesReply], operation=keys.SOURCES, background=True):
-    """Ask where the sources of scans have been, and for the newest scan of each."""
-
-    server: str  # of the reply before, to which revision belongs; empty at first
-    revision: int  # of the reply before, which is not sent again; 0 at first
-    max_points: Annotated[int, within(0, MAX_SAMPLE_POINTS)]  # of each newest scan
