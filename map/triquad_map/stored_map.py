@@ -5,9 +5,9 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from numpy.typing import ArrayLike
-from triquad_format.mapfile.checkpoint import open_index
 from triquad_format.mapfile.container import RandomAccess
-from triquad_format.mapfile.index import FileBytes, named
+from triquad_format.mapfile.files import FileBytes, named
+from triquad_format.mapfile.index import open_index
 from triquad_format.mapfile.manifest import Entry, Manifest
 from triquad_format.mapfile.parts.part import (
     FIELD_TOPICS,

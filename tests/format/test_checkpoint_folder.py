@@ -10,7 +10,6 @@ import zstandard
 from support.files.checkpoint_folder import write_record
 from support.maps.map_records import random_record
 from triquad_format.errors import DamagedMapFileError, MapFileError, UnsupportedMapFileError
-from triquad_format.mapfile.checkpoint import MAGIC, read_checkpoint
 from triquad_format.mapfile.checkpoint_folder import (
     CheckpointFile,
     checkpoint_at,
@@ -20,6 +19,7 @@ from triquad_format.mapfile.checkpoint_folder import (
     map_folder,
     open_manifest,
 )
+from triquad_format.mapfile.index import MAGIC, read_checkpoint
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.recovery.recovered_map import recover

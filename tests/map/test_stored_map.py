@@ -7,7 +7,7 @@ from support.files import checkpoint_folder
 from support.files.mapfile_edit import edited, file_bytes, set_array, stored
 from support.maps.map_records import SMALL, assert_same, random_record
 from triquad_format.errors import DamagedMapFileError
-from triquad_format.mapfile.index import FileBytes
+from triquad_format.mapfile.files import FileBytes
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.crop import crop_record, without_training

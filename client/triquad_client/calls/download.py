@@ -4,8 +4,7 @@ import hashlib
 import shutil
 from pathlib import Path
 
-from triquad_format.mapfile.durable_file import replacing
-from triquad_format.mapfile.index import check_range
+from triquad_format.mapfile.files import check_range, replacing
 from triquad_format.wire.messages import MapChunkRequest, MapInfo, MapInfoRequest
 
 from triquad_client import checks

@@ -11,8 +11,8 @@ from datetime import datetime
 from pathlib import Path
 
 from triquad_format.errors import MapFileError
-from triquad_format.mapfile.checkpoint import open_index
-from triquad_format.mapfile.index import DAMAGED_SUFFIX, FileBytes, named
+from triquad_format.mapfile.files import DAMAGED_SUFFIX, FileBytes, named
+from triquad_format.mapfile.index import open_index
 from triquad_format.mapfile.manifest import Manifest
 
 _NAME = re.compile(r"epoch-([0-9]{9,19})\.(checkpoint|triquad)")

@@ -13,8 +13,7 @@ from pathlib import Path
 
 from triquad_format.errors import DamagedMapFileError
 from triquad_format.mapfile.container import MAX_STORED_BYTES, decompress
-from triquad_format.mapfile.durable_file import naming, sync_folder
-from triquad_format.mapfile.index import FileBytes
+from triquad_format.mapfile.files import FileBytes, naming, sync_folder
 from triquad_format.mapfile.manifest import Entry
 from triquad_format.mapfile.parts.part import MAX_PART_BYTES, Part
 from triquad_format.mapfile.writer import check_part, compressed

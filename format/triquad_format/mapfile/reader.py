@@ -5,8 +5,8 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from triquad_format.mapfile.checkpoint import open_index
-from triquad_format.mapfile.index import FileBytes, named
+from triquad_format.mapfile.files import FileBytes, named
+from triquad_format.mapfile.index import open_index
 from triquad_format.mapfile.manifest import Entry, Manifest
 from triquad_format.mapfile.parts.part import REGION, REGION_TOPICS
 from triquad_format.mapfile.parts.region_parts import RegionParts

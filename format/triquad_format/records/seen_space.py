@@ -27,15 +27,6 @@ def evidence_box(settings: FieldSettings, region: Region) -> Doubles | None:
     return settings.region_corner(region.index) + ends * (settings.leaf_m * BLOCK_VOXELS)
 
 
-def evidence_bounds(record: MapRecord) -> Doubles | None:
-    """Return the same box around all that rays have shown of a map."""
-    found = [evidence_box(record.settings, region) for region in record.regions]
-    boxes = [box for box in found if box is not None]
-    if not boxes:
-        return None
-    return np.array([np.min(boxes, axis=(0, 1)), np.max(boxes, axis=(0, 1))])
-
-
 def surface_voxels(record: MapRecord) -> Doubles:
     """Return middles [N, 3] of the voxels in which rays ended, metres, map frame."""
     settings, parts = record.settings, [np.empty((0, 3))]

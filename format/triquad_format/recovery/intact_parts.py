@@ -18,9 +18,9 @@ from triquad_format.errors import (
     TooLargeMapFileError,
     UnsupportedMapFileError,
 )
-from triquad_format.mapfile.checkpoint import CheckpointIndex, is_checkpoint
 from triquad_format.mapfile.container import chunk_messages, decompress
-from triquad_format.mapfile.index import FileBytes
+from triquad_format.mapfile.files import FileBytes
+from triquad_format.mapfile.index import CheckpointIndex, is_checkpoint
 from triquad_format.mapfile.manifest import Entry, Manifest, manifest_in, total_limit
 from triquad_format.mapfile.metadata import MAX_MAP_BYTES, MapFacts, unpack_facts
 from triquad_format.mapfile.parts.body import part_topic, unpack_body

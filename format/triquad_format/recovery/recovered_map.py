@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from triquad_format.errors import FormatError, MapFileError
-from triquad_format.mapfile.index import named
+from triquad_format.mapfile.files import named
 from triquad_format.mapfile.parts.part import (
     FIELD_TOPICS,
     REGION,

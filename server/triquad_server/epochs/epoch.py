@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
-from triquad_format.records.map_progress import MapProgress
-from triquad_format.records.region import MapRecord, Region
+from triquad_format.records.region import MapProgress, MapRecord, Region
 from triquad_map.compiled.team import Split, in_one
 from triquad_map.composition.composed_view import ComposedView
 from triquad_map.evidence.evidence import FrozenEvidence

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from triquad_format.errors import FormatError, TooLargeMapFileError, UnsupportedMapFileError
-from triquad_format.mapfile.checkpoint import read_checkpoint
 from triquad_format.mapfile.checkpoint_folder import checkpoint_files, checkpoint_name, set_aside
-from triquad_format.mapfile.durable_file import sync_folder
+from triquad_format.mapfile.files import sync_folder
+from triquad_format.mapfile.index import read_checkpoint
 from triquad_format.mapfile.part_files import PartFiles
 
 from triquad_server.settings import StoreSettings

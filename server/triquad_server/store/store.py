@@ -14,17 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.checkpoint import (
-    Checkpoint,
-    Restored,
-    read_checkpoint,
-    write_checkpoint,
-)
 from triquad_format.mapfile.checkpoint_folder import (
     checkpoint_files,
     checkpoint_name,
     checkpoint_of,
 )
+from triquad_format.mapfile.index import Checkpoint, Restored, read_checkpoint, write_checkpoint
 from triquad_format.mapfile.manifest import Entry, Manifest
 from triquad_format.mapfile.metadata import MapFacts
 from triquad_format.mapfile.part_files import NewParts, PartFiles

@@ -13,7 +13,7 @@ from support.files.growing_store import (
     paths,
 )
 from support.maps.map_records import assert_same
-from triquad_format.mapfile.checkpoint import read_checkpoint, write_checkpoint
+from triquad_format.mapfile.index import read_checkpoint, write_checkpoint
 from triquad_format.mapfile.part_files import PartFiles
 from triquad_format.mapfile.reader import read_map
 from triquad_server.settings import StoreSettings

@@ -11,7 +11,7 @@ from triquad_format.mapfile.parts.part import REGION, PartKey
 from triquad_format.mapfile.reader import read_map, read_map_file
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.crop import crop_record, without_training
-from triquad_format.records.map_progress import MapProgress
+from triquad_format.records.region import MapProgress
 from triquad_tools.commands.pack import main
 
 CUBE = tuple(itertools.product((0, 1), repeat=3))

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 from triquad_format.errors import DamagedMapFileError
-from triquad_format.mapfile.checkpoint import read_checkpoint
 from triquad_format.mapfile.checkpoint_folder import checkpoint_file, checkpoint_files, set_aside
+from triquad_format.mapfile.index import read_checkpoint
 from triquad_format.mapfile.parts.part import EVIDENCE, REGION, TRAINING, VERTICES
 from triquad_format.recovery.recovered_map import Loss, RecoveredMap, recover
 from triquad_format.wire.limits import MAX_FILL_M

@@ -19,7 +19,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from triquad_format.mapfile.durable_file import replacing
+from triquad_format.mapfile.files import replacing
 from triquad_format.wire.access_control import access_control
 from triquad_format.wire.roles import ROUTER, SERVER, Holder, Role, client_grants, server_grants
 

@@ -10,8 +10,7 @@ from triquad_format.mapfile.manifest import Entry
 from triquad_format.mapfile.reader import MapFile
 from triquad_format.records.arrays import Bytes, Doubles, Floats
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.map_progress import MapProgress
-from triquad_format.records.region import MapRecord, Region
+from triquad_format.records.region import MapProgress, MapRecord, Region
 from triquad_format.records.replay_rays import are_held_out
 from triquad_format.records.seen_space import evidence_box, owned_evidence
 from triquad_map.field_fit import MapFit, PlaceFits, Places, in_cube, map_fit

@@ -5,7 +5,7 @@ import time
 from pathlib import Path
 
 from triquad_client import OfflineMap
-from triquad_format.mapfile.durable_file import replacing
+from triquad_format.mapfile.files import replacing
 from triquad_format.mapfile.metadata import utc_time
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.crop import without_training

@@ -15,7 +15,6 @@ from triquad_format.mapfile.parts.part import (
     EVIDENCE,
     LEVEL_BITS,
     MOMENTS,
-    PREFIX,
     RAYS,
     REGION,
     SAMPLE_COLUMNS,
@@ -54,8 +53,6 @@ from triquad_format.wire.codec import pack_array
 
 SAMPLES_PER_PART = 1 << 17
 RAYS_PER_PART = 1 << 21
-
-_MIN_SEAM_BYTES = 512  # a block of its own costs some bytes
 
 
 def pack_part(key: PartKey, body: Mapping[str, object]) -> Part:
@@ -255,34 +252,3 @@ def _pack_rays(region: Region, rays: ReplayRays) -> Iterator[Part]:
                 "slopes": pack_array(rays.slopes[rows]),
             }
             yield _region_part(PartKey(RAYS, region.index, plane=number, cell=cell), fields)
-
-
-def seams(part: Part) -> list[int]:
-    """Return offsets in a valid part's payload at which byte planes of its arrays begin and end.
-
-    Where zeros come before zeros, they may be some bytes too small, which costs nothing.
-    """
-    if not part.key.topic.startswith(PREFIX):
-        return []
-    offsets: list[int] = []
-    at = 0
-    for data, planes in _binaries(msgpack.unpackb(part.payload)):
-        size = len(data)
-        if size >= _MIN_SEAM_BYTES:
-            at = part.payload.index(data[:_MIN_SEAM_BYTES], at)
-            step = size // planes if size >= planes * _MIN_SEAM_BYTES else size
-            offsets.extend(range(at, at + size + 1, step))
-            at += size
-    return offsets
-
-
-def _binaries(value: object) -> Iterator[tuple[bytes, int]]:
-    """Yield each binary in a body, and its number of byte planes, in the payload's order."""
-    if isinstance(value, bytes):
-        yield value, 1
-    elif isinstance(value, dict) and isinstance(value.get("data"), bytes):
-        shuffled = value["dtype"] in ("|u1", "|i1") and value["shape"]
-        yield value["data"], value["shape"][0] if shuffled else 1
-    elif isinstance(value, (dict, list)):
-        for item in value.values() if isinstance(value, dict) else value:
-            yield from _binaries(item)
