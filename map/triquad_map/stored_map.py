@@ -19,7 +19,7 @@ from triquad_format.mapfile.parts.part import (
     vertex_reach,
 )
 from triquad_format.mapfile.reader import assemble
-from triquad_format.records.crop import LeafBox, check_box, leaf_box, whole_region
+from triquad_format.records.leaf_box import LeafBox, check_box, leaf_box, whole_region
 from triquad_format.records.record_check import check_record
 from triquad_format.records.region import MapRecord
 
@@ -79,7 +79,7 @@ class StoredMap:
     def box(self, minimum: ArrayLike, maximum: ArrayLike) -> MapRecord:
         """Return the part of the map that answers in a box, without training state.
 
-        It has whole squares and cubes: :func:`triquad_format.records.crop.crop_record` takes off
+        It has whole squares and cubes: :func:`triquad_tools.mapfiles.crop.crop_record` takes off
         what the box does not need.
 
         Args:

@@ -10,8 +10,8 @@ from triquad_format.errors import DamagedMapFileError
 from triquad_format.mapfile.files import FileBytes
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
-from triquad_format.records.crop import crop_record, without_training
 from triquad_map.stored_map import StoredMap
+from triquad_tools.mapfiles.crop import crop_record, without_training
 
 WIDE = dataclasses.replace(SMALL, depth=11, feature_levels=4)
 """A region of 512 m: 8 squares of 64 m along each side."""

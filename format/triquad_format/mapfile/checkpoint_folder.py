@@ -7,7 +7,6 @@ as ``epoch-<number>.triquad``, such as a backup, counts as a checkpoint, too.
 import re
 from contextlib import closing
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 
 from triquad_format.errors import MapFileError
@@ -104,48 +103,3 @@ def checkpoint_of(folder: Path, epoch: int) -> CheckpointFile:
     there = ", ".join(str(file.epoch) for file in files[:_LISTED]) or "none"
     more = ", ..." if len(files) > _LISTED else ""
     raise MapFileError(f"{folder} holds no checkpoint of epoch {epoch}; there are: {there}{more}")
-
-
-def checkpoint_at(folder: Path, when: str) -> CheckpointFile:
-    """Return the newest checkpoint that is not after ``when``.
-
-    Args:
-        folder: the folder of checkpoints.
-        when: number of an epoch, or a time as in RFC 3339 (local time where it has no offset).
-
-    Raises:
-        MapFileError: ``when`` is neither, or there is no such checkpoint; the text says which
-            there are.
-        OSError: the folder or a file cannot be read.
-    """
-    files = checkpoint_files(folder)
-    found = [file for file in files if _is_by(file, when)]
-    epochs = f"epochs {files[-1].epoch} to {files[0].epoch}" if files else "nothing"
-    if not found:
-        raise MapFileError(f"{folder} holds no checkpoint of {when} or before, but {epochs}")
-    if _is_epoch(when) and int(when) > files[0].epoch:
-        raise MapFileError(
-            f"{folder} holds {epochs}, not {when}; a time is written as 2026-01-31T12:00:00Z"
-        )
-    return max(found)
-
-
-def _is_epoch(when: str) -> bool:
-    return when.isascii() and when.isdigit() and len(when) < 20
-
-
-def _is_by(file: CheckpointFile, when: str) -> bool:
-    if _is_epoch(when):
-        return file.epoch <= int(when)
-    try:
-        limit_s = datetime.fromisoformat(when.replace("Z", "+00:00")).timestamp()
-    except ValueError as error:
-        raise MapFileError(
-            f"{when!r} is neither the number of an epoch nor a time such as 2026-01-31T12:00:00Z"
-        ) from error
-    try:
-        manifest = open_manifest(file)
-    except MapFileError:
-        return False
-    # Times are shown in whole seconds: what is shown must find its checkpoint.
-    return 0 < manifest.stamp_ns // 10**9 <= limit_s

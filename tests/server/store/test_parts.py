@@ -24,11 +24,11 @@ from triquad_format.mapfile.checkpoint_folder import checkpoint_files, open_mani
 from triquad_format.mapfile.part_files import PartFiles
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
-from triquad_format.recovery.recovered_map import recover
 from triquad_map.stored_map import StoredMap
 from triquad_server.errors import StoreError
 from triquad_server.settings import StoreSettings
 from triquad_server.store.store import Store
+from triquad_tools.mapfiles.recovered_map import recover
 
 
 @pytest.fixture
