@@ -17,7 +17,7 @@ from triquad_server.epochs.history import EpochHistory
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper_thread import MapperThread
-from triquad_server.process.memory import give_back_free, resident_bytes
+from triquad_server.process.resources import give_back_free, resident_bytes
 from triquad_server.serving.operations import Operations
 from triquad_server.serving.request import BOUNDS_S
 from triquad_server.store.checkpoint_writer import CheckpointWriter

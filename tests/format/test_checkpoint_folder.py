@@ -16,10 +16,9 @@ from triquad_format.mapfile.checkpoint_folder import (
     checkpoint_files,
     checkpoint_name,
     map_folder,
-    open_manifest,
 )
 from triquad_format.mapfile.index import MAGIC, read_checkpoint
-from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.reader import open_manifest, read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_map.stored_map import StoredMap
 from triquad_tools.mapfiles.recovered_map import recover

@@ -103,7 +103,7 @@ def test_total_limit_holds_while_writing(monkeypatch: pytest.MonkeyPatch, tmp_pa
 @pytest.mark.parametrize(
     ("limit", "most", "message"),
     [
-        ("writer.MAX_PART_BYTES", 200, "at most 200"),
+        ("parts.pack.MAX_PART_BYTES", 200, "at most 200"),
         ("manifest.MAX_ENTRIES", 0, "at most"),
         ("manifest.total_limit", lambda _: 1000, "in a file of"),  # an attack, to readers
     ],

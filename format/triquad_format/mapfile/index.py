@@ -1,7 +1,7 @@
 """The parts of a map file, or of a checkpoint, each read when it is asked for.
 
-A checkpoint is a small file that lists the parts of a map at one epoch. These lie next to it, in
-the folder of :mod:`triquad_format.mapfile.part_files`. The file is one line that says what it is,
+A checkpoint is a small file that lists the parts of a map at one epoch, which lie in a folder next
+to it: :mod:`triquad_format.mapfile.checkpoint_folder`. It is one line that says what the file is,
 the SHA-256 of the rest, and a zstd frame with the manifest.
 """
 
@@ -14,6 +14,7 @@ from pathlib import Path
 import zstandard
 
 from triquad_format.errors import DamagedMapFileError, MapFileError
+from triquad_format.mapfile.checkpoint_folder import PartFiles
 from triquad_format.mapfile.container import RandomAccess, decompress, read_end, read_message
 from triquad_format.mapfile.files import FileBytes, named, replacing
 from triquad_format.mapfile.manifest import (
@@ -32,7 +33,6 @@ from triquad_format.mapfile.metadata import (
     manifest_place,
     utc_time,
 )
-from triquad_format.mapfile.part_files import PartFiles
 from triquad_format.mapfile.parts.body import PartBody, unpack_body
 from triquad_format.mapfile.parts.part import (
     MANIFEST,

@@ -10,20 +10,17 @@ from typing import BinaryIO, cast
 from mcap.writer import Writer
 
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.container import METADATA_NAME, compress
+from triquad_format.mapfile.container import METADATA_NAME
 from triquad_format.mapfile.files import replacing
 from triquad_format.mapfile.manifest import Entry, Manifest, pack_manifest
 from triquad_format.mapfile.metadata import MapFacts, pack_facts, pack_metadata
-from triquad_format.mapfile.parts.pack import pack_part, pack_record
+from triquad_format.mapfile.parts.pack import check_part, compressed, pack_part, pack_record
 from triquad_format.mapfile.parts.part import (
-    EVIDENCE,
     MAP,
-    MAX_PART_BYTES,
     MESSAGE_ENCODING,
     PREVIEW,
     PREVIEW_ENCODING,
     PREVIEW_SCHEMA,
-    REGION,
     Part,
     PartKey,
 )
@@ -113,16 +110,6 @@ def write_parts(
         return writer.write(parts, stamp_ns)
 
 
-def compressed(part: Part) -> bytes:
-    """Return a part's payload as the zstd frame that files hold.
-
-    Features and moments are noise but for their high bytes, on which level 1 is as good as level 19
-    and better than level 3; masks and codes shrink by a fifth to level 12.
-    """
-    level = {EVIDENCE: 12, REGION: 3}.get(part.key.topic, 1)
-    return compress(part.payload, level)
-
-
 class _Counted:
     """Counts and digests what is written to a stream, which need not be able to seek."""
 
@@ -209,12 +196,3 @@ class _PartsWriter:
                 encoding = PREVIEW_ENCODING
             self._channels[topic] = self._mcap.register_channel(topic, encoding, schema)
         return self._channels[topic]
-
-
-def check_part(part: Part) -> None:
-    """Raise :class:`FormatError` for a part that is too large to be read."""
-    if len(part.payload) > MAX_PART_BYTES:
-        raise FormatError(
-            f"the part {part.key.topic} has {len(part.payload)} bytes; "
-            f"a map file holds parts of at most {MAX_PART_BYTES}",
-        )

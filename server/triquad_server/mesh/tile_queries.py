@@ -18,8 +18,7 @@ from triquad_map.mesh.tile_lattice import TileIndex, TileLattice
 
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.history import EpochHistory
-from triquad_server.mesh.tile_cache import TileCache
-from triquad_server.mesh.tile_level import ShownTile
+from triquad_server.mesh.tile_cache import ShownTile, TileCache
 
 MAX_TILES = 1_000_000
 """The most tiles of one list."""

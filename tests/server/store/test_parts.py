@@ -20,9 +20,8 @@ from support.files.growing_store import (
 )
 from support.maps.map_records import assert_same, random_record
 from triquad_format.errors import DamagedMapFileError, MapFileError
-from triquad_format.mapfile.checkpoint_folder import checkpoint_files, open_manifest
-from triquad_format.mapfile.part_files import PartFiles
-from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.checkpoint_folder import PartFiles, checkpoint_files
+from triquad_format.mapfile.reader import open_manifest, read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_map.stored_map import StoredMap
 from triquad_server.errors import StoreError
@@ -55,7 +54,7 @@ def test_what_did_not_change_is_neither_encoded_nor_written(store, monkeypatch):
     first = grown(1, 1)
     store.write(changes(first))
     before = {path: path.stat() for path in parts_of(paths(store)[1])}
-    monkeypatch.setattr("triquad_format.mapfile.part_files.compressed", None)
+    monkeypatch.setattr("triquad_format.mapfile.checkpoint_folder.compressed", None)
     store.write(changes(dataclasses.replace(first, epoch=2), only=ROW[:3]))
     assert {path: path.stat() for path in parts_of(paths(store)[2])} == before
     assert_same(read_map(paths(store)[2]), dataclasses.replace(first, epoch=2))

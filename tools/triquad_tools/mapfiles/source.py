@@ -13,10 +13,9 @@ from triquad_format.mapfile.checkpoint_folder import (
     CheckpointFile,
     checkpoint_files,
     map_folder,
-    open_manifest,
 )
 from triquad_format.mapfile.parts.part import TRAINING_TOPICS
-from triquad_format.mapfile.reader import read_map_file
+from triquad_format.mapfile.reader import open_manifest, read_map_file
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.region import MapRecord
 from triquad_map.stored_map import StoredMap
