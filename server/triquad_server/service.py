@@ -23,13 +23,11 @@ from triquad_format.wire.query_messages import ChangesRequest, GridRequest
 from triquad_format.wire.source_messages import SourcesRequest
 from triquad_map.questions.answers import QUESTIONS, Answers
 
-from triquad_server.epochs.change_queries import ChangeQueries
 from triquad_server.epochs.history import EpochHistory
-from triquad_server.epochs.surface_history import CHANGES_KEPT, SurfaceHistory
-from triquad_server.intake.flush import FlushQueries
-from triquad_server.intake.scan_intake import ScanIntake
-from triquad_server.intake.scan_queue import ScanQueue
+from triquad_server.epochs.surface_history import CHANGES_KEPT, ChangeQueries, SurfaceHistory
+from triquad_server.intake.scan_queue import ScanIntake, ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
+from triquad_server.intake.source_ledger import FlushQueries
 from triquad_server.intake.source_trails import SourceTrails
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapListeners, MapperThread

@@ -7,8 +7,7 @@ from triquad_format.wire import limits
 from triquad_format.wire.bounds import check_question
 from triquad_format.wire.messages import FlushReply, FlushRequest
 from triquad_server.intake import source_ledger
-from triquad_server.intake.flush import ARRIVAL_GRACE_S, FlushQueries
-from triquad_server.intake.source_ledger import SourceLedger
+from triquad_server.intake.source_ledger import ARRIVAL_GRACE_S, FlushQueries, SourceLedger
 
 
 @pytest.fixture
