@@ -20,6 +20,7 @@ from triquad_format.wire.metrics_messages import (
     SourceMetrics,
     TimeHistogram,
 )
+from triquad_format.wire.source_messages import NewestScan, ScanSource, SourceReport
 from triquad_map.questions.align import Alignment
 from triquad_map.questions.distance import Distances, Unknown, UnknownSpaceError
 from triquad_map.questions.grid import Grid
@@ -40,7 +41,6 @@ from triquad_client.calls.changes import ChangedBox, ChangeKind, ChangeReport
 from triquad_client.calls.point_queries import SdfResult
 from triquad_client.calls.queries import MapQueries, PinnedMap
 from triquad_client.calls.scans import FlushReport
-from triquad_client.calls.sources import NewestScan, ScanSource, SourceReport
 from triquad_client.checks import Bounds
 from triquad_client.client import Client, connect
 from triquad_client.depth_image import Intrinsics, depth_points

@@ -5,9 +5,9 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from numpy.typing import ArrayLike
-from triquad_format.mapfile.checkpoint import open_index
 from triquad_format.mapfile.container import RandomAccess
-from triquad_format.mapfile.index import FileBytes, named
+from triquad_format.mapfile.files import FileBytes, named
+from triquad_format.mapfile.index import open_index
 from triquad_format.mapfile.manifest import Entry, Manifest
 from triquad_format.mapfile.parts.part import (
     FIELD_TOPICS,
@@ -19,7 +19,7 @@ from triquad_format.mapfile.parts.part import (
     vertex_reach,
 )
 from triquad_format.mapfile.reader import assemble
-from triquad_format.records.crop import LeafBox, check_box, leaf_box, whole_region
+from triquad_format.records.leaf_box import LeafBox, check_box, leaf_box, whole_region
 from triquad_format.records.record_check import check_record
 from triquad_format.records.region import MapRecord
 
@@ -79,7 +79,7 @@ class StoredMap:
     def box(self, minimum: ArrayLike, maximum: ArrayLike) -> MapRecord:
         """Return the part of the map that answers in a box, without training state.
 
-        It has whole squares and cubes: :func:`triquad_format.records.crop.crop_record` takes off
+        It has whole squares and cubes: :func:`triquad_tools.mapfiles.crop.crop_record` takes off
         what the box does not need.
 
         Args:

@@ -13,14 +13,13 @@ import triquad_format
 from triquad_format.errors import FormatError
 from triquad_format.wire.endpoints import DEFAULT_ENDPOINT, full_endpoint
 
-from triquad_server.device import DEVICES
 from triquad_server.errors import (
     LastCheckpointError,
     ListenError,
     ServerError,
     StoreError,
 )
-from triquad_server.process.installed import require_libraries
+from triquad_server.process.installed import DEVICES, require_libraries
 from triquad_server.process.log import LOG_FORMATS, TEXT, start_log
 
 _PROGRAM = "triquad-server"
@@ -87,7 +86,7 @@ def _exit_code(options: argparse.Namespace) -> int:
 def _run(options: argparse.Namespace) -> int:
     require_libraries()
     from triquad_server.launch_options import LaunchOptions
-    from triquad_server.net.configuration import NetworkOptions
+    from triquad_server.network import NetworkOptions
     from triquad_server.process.stop import Stop, Stops
     from triquad_server.settings.loading import load_settings, settings_toml
 

@@ -187,7 +187,7 @@ def serve(
     """
     require_libraries()
     from triquad_server.launch_options import LaunchOptions
-    from triquad_server.net.configuration import NetworkOptions
+    from triquad_server.network import NetworkOptions
 
     loaded = _loaded(settings)
     folder = None if store is None else Path(store)

@@ -10,13 +10,11 @@ from typing import TYPE_CHECKING
 
 from triquad_format.errors import SettingsError
 
-from triquad_server.device import check_device
 from triquad_server.launch_options import LaunchOptions
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.net.configuration import Configuration, configuration
-from triquad_server.net.session import open_session
-from triquad_server.process.memory import give_back_early
-from triquad_server.process.open_files import allow_open_files
+from triquad_server.network import Configuration, configuration, open_session
+from triquad_server.process.installed import check_device
+from triquad_server.process.resources import allow_open_files, give_back_early
 from triquad_server.process.service_manager import ServiceManager
 from triquad_server.process.stop import Stop, Stops, wait_for_stop
 from triquad_server.process.threads import Teams
@@ -142,7 +140,7 @@ def _open(options: LaunchOptions, stops: Stops, starting: Report, stack: ExitSta
     service = Service(session, served, settings, failed=stops.put)
     stack.enter_context(closing(service))
     if monitoring is not None:
-        stack.enter_context(monitoring.showing(service.metrics))
+        stack.enter_context(monitoring.showing(service.health))
     _log_who_gets_in(network)
     _log_ready(options, network, service.epoch)
     return service

@@ -6,7 +6,7 @@ from pathlib import Path
 from triquad_format.wire.keys import check_name
 
 from triquad_server.errors import ServerError
-from triquad_server.net.configuration import NetworkOptions
+from triquad_server.network import NetworkOptions
 from triquad_server.settings import Settings
 
 

@@ -1,4 +1,4 @@
-"""Reports the server's status, published once a second, and whether it works."""
+"""Reports the server's status, published once a second, its figures, and whether it works."""
 
 import logging
 import threading
@@ -6,17 +6,20 @@ import time
 from collections import Counter
 from dataclasses import dataclass, field
 
+import numpy as np
 import triquad_format
 import zenoh
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import ServerStatus
+from triquad_format.wire.metrics_messages import QueueMetrics, ServerMetrics
 
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper_thread import MapperThread
-from triquad_server.process.memory import give_back_free, resident_bytes
-from triquad_server.serving.operation_counts import OperationCounts
+from triquad_server.process.resources import give_back_free, resident_bytes
+from triquad_server.serving.operations import Operations
+from triquad_server.serving.request import BOUNDS_S
 from triquad_server.store.checkpoint_writer import CheckpointWriter
 
 _log = logging.getLogger(__name__)
@@ -26,16 +29,18 @@ STUCK_S = 120.0  # longer waits of the mapper's thread are a fault
 ENDLESS_S = 1800.0  # longer than the checkpoint of a large map takes
 
 _BEATS_PER_LOG_LINE = 5
+_MAX_SESSIONS = 1024  # that are listed
 
 
 @dataclass(frozen=True)
 class Health:
-    """Collects the status of the server from its parts."""
+    """Collects the status and the figures of the server from its parts."""
 
     map_name: str
     server: str  # a name of this process
     device: str
-    operations: dict[str, OperationCounts]
+    session: zenoh.Session
+    operations: Operations
     scans: ScanQueue
     warnings: ScanWarnings
     mapper: MapperThread
@@ -49,7 +54,7 @@ class Health:
         epoch = self.epochs.newest
         progress = self.mapper.progress
         refused: Counter[str] = Counter()  # of all operations, by error code
-        for counts in self.operations.copy().values():
+        for counts in self.operations.counts.copy().values():
             refused.update(counts.refused())
         return ServerStatus(
             map_name=self.map_name,
@@ -82,6 +87,34 @@ class Health:
             rays_discarded=progress.map.rays_discarded,
             replay_share=progress.map.replay_share,
             samples_discarded=progress.map.samples_discarded,
+        )
+
+    def metrics(self) -> ServerMetrics:
+        """Return the figures as they are now."""
+        kept, scans = self.epochs.kept(), self.scans
+        transports = self.session.info.transports()[:_MAX_SESSIONS]
+        return ServerMetrics(
+            server=self.server,
+            uptime_s=time.monotonic() - self.started_s,
+            problem=self.problem(),
+            epoch=kept.epochs[-1].number,
+            epoch_age_s=kept.newest_age_s,
+            epochs_kept=len(kept.epochs),
+            epochs_pinned=kept.pinned,
+            bounds_s=np.array(BOUNDS_S),
+            operations={name: one.metrics() for name, one in self.operations.counts.copy().items()},
+            queues={
+                "scans": QueueMetrics(len(scans), scans.limit),
+                **self.operations.queue_metrics,
+            },
+            sources=scans.ledger.metrics(),
+            scan_bytes_received=scans.received_bytes,
+            resident_bytes=resident_bytes(),
+            mapper_s=self.mapper.time.spent_s(),
+            checkpoints=self.checkpoints.metrics(),
+            # Not the whole id: a program that knows it can ask in the name of that client.
+            sessions={str(one.zid)[:8]: str(one.whatami) for one in transports},
+            samples_trained=self.mapper.progress.own_samples_trained,
         )
 
     def mapping_problem(self, stuck_s: float = STUCK_S) -> str | None:

@@ -19,25 +19,22 @@ from triquad_format.wire.messages import (
     StatusRequest,
 )
 from triquad_format.wire.metrics_messages import MetricsRequest
-from triquad_format.wire.query_messages import ChangesRequest, SourcesRequest
+from triquad_format.wire.query_messages import ChangesRequest, GridRequest
+from triquad_format.wire.source_messages import SourcesRequest
 from triquad_map.questions.answers import QUESTIONS, Answers
 
 from triquad_server.epochs.history import EpochHistory
-from triquad_server.epochs.surface_history import CHANGES_KEPT, SurfaceHistory
-from triquad_server.intake.flush import FlushQueries
-from triquad_server.intake.scan_intake import ScanIntake
-from triquad_server.intake.scan_queue import ScanQueue
+from triquad_server.epochs.surface_history import CHANGES_KEPT, ChangeQueries, SurfaceHistory
+from triquad_server.intake.scan_queue import ScanIntake, ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
+from triquad_server.intake.source_ledger import FlushQueries
 from triquad_server.intake.source_trails import SourceTrails
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapListeners, MapperThread
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_queries import TileQueries
-from triquad_server.monitoring.metrics import Metrics
 from triquad_server.process.stop import Stop
 from triquad_server.process.threads import Teams
-from triquad_server.queries.change_queries import ChangeQueries
-from triquad_server.queries.source_queries import SourceQueries
 from triquad_server.server_status import Health, Heartbeat
 from triquad_server.serving.operations import Lane, Operations
 from triquad_server.settings import Settings
@@ -84,7 +81,8 @@ class Service:
             first, settings.service, older_bytes=settings.memory.epochs_bytes
         )
         self._surface = SurfaceHistory(first, CHANGES_KEPT)
-        self._trails = SourceTrails(first.field_settings.leaf_m)
+        self._name = secrets.token_hex(8)  # of this process
+        self._trails = SourceTrails(first.field_settings.leaf_m, self._name)
         self._parts = ExitStack()  # closed in reverse order of opening
         try:
             self._open(failed)
@@ -122,9 +120,10 @@ class Service:
         )
         self.health = health = Health(
             map_name=self._served.name,
-            server=secrets.token_hex(8),
+            server=self._name,
             device=self._served.device,
-            operations=self._operations.counts,
+            session=self.session,
+            operations=self._operations,
             scans=self._scans,
             warnings=self._warnings,
             mapper=self._mapper,
@@ -134,14 +133,6 @@ class Service:
         )
         tiles = TileCache(self._settings.mesh, self._served.teams.meshing)
         downloads = MapDownloads(self._mapper, self._epochs, health.server)
-        self.metrics = Metrics(
-            health,
-            self.session,
-            self._surface,
-            tiles=tiles,
-            downloads=downloads,
-            operations=self._operations,
-        )
         self._open_checkpoints(checkpoints)
         self._serve(tiles, downloads)
         # Closed before the last checkpoint is written: it contains every reset that was answered.
@@ -164,30 +155,29 @@ class Service:
         """Answer the requests of clients from now on."""
         serve, health = self._operations.serve, self.health
         answers, max_bytes = Answers(self._epochs.view), payload_limit(MAX_QUERY_POINTS)
-        for name, question in QUESTIONS.items():
-            lane = Lane.LONG_QUESTIONS if name == keys.GRID else Lane.QUESTIONS
-            serve(name, question.request, answers.answer, lane, max_bytes)
+        for question in QUESTIONS:
+            lane = Lane.LONG_QUESTIONS if question is GridRequest else Lane.QUESTIONS
+            serve(question, answers.answer, lane, max_bytes)
         changes = ChangeQueries(self._epochs, self._surface, health.server)
-        sources = SourceQueries(self._trails, health.server)
         mesh = TileQueries(self._epochs, tiles, health.server)
-        serve(keys.CHANGES, ChangesRequest, changes.changes)
-        serve(keys.SOURCES, SourcesRequest, sources.sources)
-        serve(keys.TILE_LIST, TileListRequest, mesh.tiles, Lane.MESH)
-        serve(keys.TILE_CHANGES, TileChangesRequest, mesh.changes, Lane.MESH)
-        serve(keys.MESH, MeshRequest, mesh.mesh, Lane.MESH)
-        serve(keys.MAP_CHUNK, MapChunkRequest, downloads.chunk, Lane.LONG_QUESTIONS)
+        serve(ChangesRequest, changes.changes)
+        serve(SourcesRequest, self._trails.answer)
+        serve(TileListRequest, mesh.tiles, Lane.MESH)
+        serve(TileChangesRequest, mesh.changes, Lane.MESH)
+        serve(MeshRequest, mesh.mesh, Lane.MESH)
+        serve(MapChunkRequest, downloads.chunk, Lane.LONG_QUESTIONS)
 
         flush = FlushQueries(self._scans.ledger, self._mapper.publish_soon, self._warnings.of)
         lane = Lane.ADMINISTRATION
-        serve(keys.STATUS, StatusRequest, lambda _: health.status(), lane)
-        serve(keys.METRICS, MetricsRequest, lambda _: self.metrics.now(), lane)
-        serve(keys.FLUSH, FlushRequest, flush.answer, lane)
+        serve(StatusRequest, lambda _: health.status(), lane)
+        serve(MetricsRequest, lambda _: health.metrics(), lane)
+        serve(FlushRequest, flush.answer, lane)
 
         keep_resets = self._settings.store.keep_resets
         resets = Resets(self._mapper, health.checkpoints, keep_resets, self._trails)
-        serve(keys.CHECKPOINT, CheckpointRequest, health.checkpoints.answer, Lane.FILES)
-        serve(keys.RESET, ResetRequest, resets.answer, Lane.FILES)
-        serve(keys.MAP_INFO, MapInfoRequest, downloads.info, Lane.FILES)
+        serve(CheckpointRequest, health.checkpoints.answer, Lane.FILES)
+        serve(ResetRequest, resets.answer, Lane.FILES)
+        serve(MapInfoRequest, downloads.info, Lane.FILES)
 
     def _announce(self, health: Health) -> None:
         """Say that the server is there, until it closes."""

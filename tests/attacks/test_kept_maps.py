@@ -13,8 +13,8 @@ import triquad_client
 import triquad_server
 from support import servers
 from triquad_client import Client, RefusedError
-from triquad_format.mapfile.checkpoint import Checkpoint
 from triquad_format.mapfile.checkpoint_folder import checkpoint_files
+from triquad_format.mapfile.index import Checkpoint
 from triquad_format.mapfile.reader import read_map, read_map_file
 from triquad_format.mapfile.writer import MapFileInfo
 from triquad_server.settings import StoreSettings

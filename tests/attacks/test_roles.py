@@ -20,11 +20,11 @@ from support.ros.ros_robot import RmwZenoh, Robot
 from support.servers import SMALL_TOML, WAIT_S, server_process, sphere
 from triquad_client.errors import ConnectError, NoReplyError, UnknownMapError
 from triquad_format.wire import keys
-from triquad_format.wire.roles import ROUTER, SERVER, Holder, Role
 from triquad_tools.commands import inspect, top
 from triquad_tools.console.command import FAILED, OK
 from triquad_tools.credentials.certificates import Authority
 from triquad_tools.credentials.key_folder import KeyFolder
+from triquad_tools.credentials.roles import ROUTER, SERVER, Holder, Role
 
 DAYS = 1.0
 PATHS = ("server", "router")

@@ -9,8 +9,8 @@ import triquad_client
 from support import servers
 from support.attackers.role_files import free_tls_endpoint, opened
 from triquad_client.errors import ConnectError
-from triquad_format.wire.roles import SERVER, Holder, Role
 from triquad_tools.credentials.key_folder import KeyFolder
+from triquad_tools.credentials.roles import SERVER, Holder, Role
 
 DAYS = 1.0
 

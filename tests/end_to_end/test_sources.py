@@ -15,7 +15,7 @@ from triquad_client import (
 )
 from triquad_format.records.arrays import Doubles
 from triquad_format.wire import keys
-from triquad_format.wire.query_messages import SourcesRequest
+from triquad_format.wire.source_messages import SourcesRequest
 
 BOX = ((2.5, -1, -1), (3.5, 1, 1))
 
@@ -71,7 +71,7 @@ def test_the_newest_scan_lies_in_the_map_frame(client):
     np.testing.assert_array_equal(newest.position_m, [9000, -7, 0])
     assert 0 < len(newest.points) == newest.points_used <= 500
     sent = servers.sphere(500) @ pose(9000.0, -7)[:3, :3].T + (9000.0, -7, 0)
-    apart = np.linalg.norm(newest.points[:, None] - sent, axis=2).min(axis=1)
+    apart = np.linalg.norm(newest.points_m[:, None] - sent, axis=2).min(axis=1)
     assert apart.max() < 1e-5
     some = client.sources(max_points=100).sources["default"].newest
     assert len(np.unique(some.points, axis=0)) == len(some.points) == 100

@@ -10,20 +10,19 @@ import zstandard
 from support.files.checkpoint_folder import write_record
 from support.maps.map_records import random_record
 from triquad_format.errors import DamagedMapFileError, MapFileError, UnsupportedMapFileError
-from triquad_format.mapfile.checkpoint import MAGIC, read_checkpoint
 from triquad_format.mapfile.checkpoint_folder import (
     CheckpointFile,
-    checkpoint_at,
     checkpoint_file,
     checkpoint_files,
     checkpoint_name,
     map_folder,
-    open_manifest,
 )
-from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.index import MAGIC, read_checkpoint
+from triquad_format.mapfile.reader import open_manifest, read_map
 from triquad_format.mapfile.writer import write_map
-from triquad_format.recovery.recovered_map import recover
 from triquad_map.stored_map import StoredMap
+from triquad_tools.mapfiles.recovered_map import recover
+from triquad_tools.mapfiles.source import checkpoint_at
 
 NOON_NS = 1_767_268_800 * 10**9  # 2026-01-01T12:00:00Z
 HOUR_NS = 3600 * 10**9

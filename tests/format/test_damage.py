@@ -46,7 +46,7 @@ from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_parts
 from triquad_format.records.record_check import check_record
 from triquad_format.records.region import MapRecord
-from triquad_format.recovery.recovered_map import recover
+from triquad_tools.mapfiles.recovered_map import recover
 
 CAMPAIGN = os.environ.get("TRIQUAD_FUZZ")
 COUNT = int(CAMPAIGN or 20)

@@ -14,9 +14,9 @@ from support.files.mapfile_edit import (
 from support.maps.map_records import SMALL, assert_same, evidence_of, random_record, with_support
 from triquad_format.mapfile.parts.part import EVIDENCE
 from triquad_format.mapfile.reader import read_map
-from triquad_format.records.crop import crop_record
 from triquad_format.records.region import seen_voxels
 from triquad_map.evidence.observations import outcome_codes
+from triquad_tools.mapfiles.crop import crop_record
 
 CUBES = dataclasses.replace(SMALL, depth=9)
 """Two cubes to a side."""

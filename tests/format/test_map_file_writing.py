@@ -14,8 +14,7 @@ from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records import morton
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.map_progress import MapProgress
-from triquad_format.records.region import MAX_INTEGER, MapRecord
+from triquad_format.records.region import MAX_INTEGER, MapProgress, MapRecord
 
 
 def with_table(record: MapRecord, **changes: Any) -> MapRecord:
@@ -93,9 +92,10 @@ def test_total_limit_holds_while_writing(monkeypatch: pytest.MonkeyPatch, tmp_pa
     write_map(random_record(17), path)
     size = path.stat().st_size
     for limit in (2000, size - 1):
-        monkeypatch.setattr("triquad_format.mapfile.writer.MAX_MAP_BYTES", limit)
-        with pytest.raises(FormatError, match=f"at most {limit}"):
+        monkeypatch.setattr("triquad_format.mapfile.manifest.MAX_MAP_BYTES", limit)
+        with pytest.raises(FormatError, match=f"limit of {limit} bytes"):
             write_map(random_record(18), path)
+    monkeypatch.undo()
     assert_same(read_map(path), random_record(17))
     assert len(list(tmp_path.iterdir())) == 1
 
@@ -103,9 +103,9 @@ def test_total_limit_holds_while_writing(monkeypatch: pytest.MonkeyPatch, tmp_pa
 @pytest.mark.parametrize(
     ("limit", "most", "message"),
     [
-        ("writer.MAX_PART_BYTES", 200, "at most 200"),
+        ("parts.pack.MAX_PART_BYTES", 200, "at most 200"),
         ("manifest.MAX_ENTRIES", 0, "at most"),
-        ("writer.total_limit", lambda _: 1000, "attack"),  # as readers would take it for
+        ("manifest.total_limit", lambda _: 1000, "in a file of"),  # an attack, to readers
     ],
 )
 def test_what_readers_would_refuse_is_not_written(

@@ -35,8 +35,7 @@ from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import MapFileInfo, write_map
 from triquad_format.records import morton
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.map_progress import MapProgress
-from triquad_format.records.region import AXES, MAX_INTEGER, MapRecord
+from triquad_format.records.region import AXES, MAX_INTEGER, MapProgress, MapRecord
 
 
 def assert_read_back(record: MapRecord, data: bytes | None = None) -> None:

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.maps import small_world
 from triquad_format.wire import codec
+from triquad_format.wire.bounds import check_answers
 from triquad_format.wire.messages import SdfRequest
 from triquad_format.wire.query_messages import (
     AlignRequest,
@@ -22,7 +23,6 @@ from triquad_format.wire.query_messages import (
     SegmentsRequest,
     SpheresRequest,
 )
-from triquad_format.wire.reply import check_answers
 from triquad_map.questions.answers import Answers
 
 _POINTS = 60

@@ -16,8 +16,7 @@ from support.maps.map_records import (
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.map_progress import MapProgress
-from triquad_format.records.region import MapRecord
+from triquad_format.records.region import MapProgress, MapRecord
 from triquad_map.preview import previews_of
 from triquad_map.stored_map import StoredMap
 

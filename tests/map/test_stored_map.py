@@ -7,11 +7,11 @@ from support.files import checkpoint_folder
 from support.files.mapfile_edit import edited, file_bytes, set_array, stored
 from support.maps.map_records import SMALL, assert_same, random_record
 from triquad_format.errors import DamagedMapFileError
-from triquad_format.mapfile.index import FileBytes
+from triquad_format.mapfile.files import FileBytes
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
-from triquad_format.records.crop import crop_record, without_training
 from triquad_map.stored_map import StoredMap
+from triquad_tools.mapfiles.crop import crop_record, without_training
 
 WIDE = dataclasses.replace(SMALL, depth=11, feature_levels=4)
 """A region of 512 m: 8 squares of 64 m along each side."""

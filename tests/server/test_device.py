@@ -3,8 +3,8 @@
 import sys
 
 import pytest
-from triquad_server.device import check_device
 from triquad_server.errors import ServerError
+from triquad_server.process.installed import check_device
 
 
 def test_without_torch_a_gpu_is_refused_with_the_extra_that_has_it(monkeypatch):

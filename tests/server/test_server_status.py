@@ -5,7 +5,9 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from threading import Event, Thread
+from typing import cast
 
+import zenoh
 from support import servers
 from support.maps.small_world import settings, world
 from triquad_server.epochs.history import EpochHistory
@@ -16,6 +18,7 @@ from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.mapping.thread_time import ThreadTime
 from triquad_server.process.stop import Stop, Stops
 from triquad_server.server_status import ENDLESS_S, STUCK_S, Health
+from triquad_server.serving.operations import Operations
 from triquad_server.settings import ServiceSettings, Settings
 from triquad_server.store.checkpoint_writer import CheckpointWriter
 
@@ -44,7 +47,8 @@ def running(
         map_name="test",
         server="s",
         device="cpu",
-        operations={},
+        session=cast(zenoh.Session, None),  # no figures are asked for
+        operations=cast(Operations, None),
         scans=scans,
         warnings=ScanWarnings(scans, Settings()),
         mapper=thread,

@@ -84,7 +84,6 @@ METRICS = ServerMetrics(
         "camera": SourceMetrics(1, 345, 0, 12, 0.2),
     },
     scan_bytes_received=8_000_000_000,
-    memory_bytes={"evidence": 120_000_000, "fields": 44_000_000},
     resident_bytes=612_000_000,
     mapper_s={"train": 8000.0, "idle": 3000.0},
     checkpoints=CheckpointMetrics(14, 0, 0.31, 32.0),

@@ -25,8 +25,7 @@ from triquad_format.wire.codec import Message
 from triquad_format.wire.messages import ErrorReply, FlushReply, FlushRequest, Scan
 from triquad_format.wire.zenoh_config import QUIET, put
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.net.configuration import NetworkOptions, configuration
-from triquad_server.net.session import open_session
+from triquad_server.network import NetworkOptions, configuration, open_session
 from triquad_server.service import ServedMap, Service
 from triquad_server.settings import Settings, TrainingSettings
 from triquad_server.store.restore import ValidCheckpoint

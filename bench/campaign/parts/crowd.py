@@ -52,8 +52,8 @@ def _use_honestly(endpoint: str) -> None:
 def _beside_the_map(endpoint: str) -> int:
     """Return the memory of the server without the map, which the crowd's scans enlarge."""
     with triquad_client.connect(endpoint) as client:
-        metrics = client.metrics()
-    return metrics.resident_bytes - sum(metrics.memory_bytes.values())
+        status = client.status()
+    return status.memory_bytes - status.map_bytes
 
 
 def _round(turn: Turn, endpoint: str, kinds: Sequence[str]) -> None:

@@ -20,8 +20,8 @@ from support.maps.map_records import assert_same
 from triquad_format.errors import FormatError
 from triquad_format.records.record_check import check_record
 from triquad_format.records.region import MapRecord
-from triquad_format.recovery.recovered_map import recover
 from triquad_tools.commands import inspect
+from triquad_tools.mapfiles.recovered_map import recover
 
 from bench.campaign.turn import Turn
 

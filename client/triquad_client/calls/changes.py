@@ -3,12 +3,11 @@
 from dataclasses import dataclass
 from enum import Enum
 
-from triquad_format.wire import keys
 from triquad_format.wire.query_messages import ChangesReply, ChangesRequest
 
 from triquad_client import checks
 from triquad_client.checks import Bounds
-from triquad_client.net.connection import Ask, Connection
+from triquad_client.net.connection import Connection
 
 Corner = tuple[float, float, float]
 
@@ -72,8 +71,7 @@ class ChangeCalls:
             epoch, server = since.epoch, since.server
         else:
             epoch, server = checks.chosen_epoch(since, "since"), ""
-        request = ChangesRequest(epoch, server, *checks.box(bounds))
-        reply = self._connection.ask(Ask(keys.CHANGES, request, ChangesReply))
+        reply = self._connection.ask(ChangesRequest(epoch, server, *checks.box(bounds)))
         return ChangeReport(reply.epoch, reply.since, reply.server, boxes=_boxes(reply))
 
 

@@ -4,17 +4,12 @@ import hashlib
 import shutil
 from pathlib import Path
 
-from triquad_format.mapfile.durable_file import replacing
-from triquad_format.mapfile.index import check_range
-from triquad_format.wire import keys
-from triquad_format.wire.messages import MapChunk, MapChunkRequest, MapInfo, MapInfoRequest
+from triquad_format.mapfile.files import check_range, replacing
+from triquad_format.wire.messages import MapChunkRequest, MapInfo, MapInfoRequest
 
 from triquad_client import checks
 from triquad_client.errors import DownloadError
-from triquad_client.net.connection import Ask, Connection, retried
-
-_PREPARE_S = 120.0
-"""The server writes the file before it answers."""
+from triquad_client.net.connection import Connection, retried
 
 _BLOCK_BYTES = 2**23
 
@@ -25,10 +20,7 @@ def newest_file(connection: Connection, training: bool = False) -> MapInfo:
     Raises:
         DownloadError: it is larger than this client takes.
     """
-    request, max_bytes = MapInfoRequest(training), connection.max_download_bytes
-    info = connection.ask(
-        Ask(keys.MAP_INFO, request, MapInfo, background=True, min_timeout_s=_PREPARE_S)
-    )
+    info, max_bytes = connection.ask(MapInfoRequest(training)), connection.max_download_bytes
     if info.bytes > max_bytes:
         raise DownloadError(
             f"the server announces a map file of {info.bytes} bytes, more than the {max_bytes} "
@@ -55,27 +47,24 @@ class RemoteBytes:
         Raises:
             DamagedMapFileError: the file does not have as many.
             RefusedError: ``chunk_gone``, where the server does not keep the file any more.
-            DownloadError: other bytes came than were asked for, or it is too much in all.
+            DownloadError: it is too much in all.
         """
         check_range(offset, length, self.size)
         if self.bytes_read + length > self._max_bytes:
             raise DownloadError(f"{self.name} names more than {self._max_bytes} bytes to be read")
         end = offset + length
         starts = range(offset, end, self._info.chunk_bytes)
-        chunks = list(self._connection.replies(self._ask(at, end) for at in starts))
-        for chunk, start in zip(chunks, starts, strict=True):
-            if chunk.offset != start:
-                raise DownloadError(f"chunk at {chunk.offset} came, not {start}")
+        chunks = self._connection.replies(self._request(at, end) for at in starts)
+        data = b"".join(chunk.data for chunk in chunks)
         self.bytes_read += length
-        return b"".join(chunk.data for chunk in chunks)
+        return data
 
     def close(self) -> None:
         """Do nothing: only the connection is open, which is not this object's."""
 
-    def _ask(self, offset: int, end: int) -> Ask[MapChunk]:
+    def _request(self, offset: int, end: int) -> MapChunkRequest:
         length = min(self._info.chunk_bytes, end - offset)
-        request = MapChunkRequest(self._info.sha256, offset, length)
-        return Ask(keys.MAP_CHUNK, request, MapChunk, background=True)
+        return MapChunkRequest(self._info.sha256, offset, length)
 
 
 class DownloadCalls:

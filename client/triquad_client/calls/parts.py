@@ -6,11 +6,12 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 from triquad_format.records.arrays import Doubles, Floats
+from triquad_format.wire.codec import Request
 from triquad_format.wire.messages import MapReply
 
 from triquad_client import checks
 from triquad_client.errors import BadReplyError
-from triquad_client.net.connection import NEWEST, Answering, Ask, retried
+from triquad_client.net.connection import NEWEST, Answering, retried
 
 _ORIGIN_SAMPLE = 1000  # points
 
@@ -88,7 +89,7 @@ class Asking:
 
     def _in_parts(
         self,
-        request: Callable[[Part], Ask[MapReplyT]],
+        request: Callable[[Part], Request[MapReplyT]],
         places: Doubles,
         *,
         most: int,

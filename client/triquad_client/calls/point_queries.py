@@ -7,17 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from triquad_format.wire import keys
 from triquad_format.wire.limits import MAX_QUERY_POINTS, MAX_SEARCHES
-from triquad_format.wire.messages import SdfReply, SdfRequest
-from triquad_format.wire.query_messages import (
-    DistanceReply,
-    DistanceRequest,
-    GridReply,
-    GridRequest,
-    SpheresReply,
-    SpheresRequest,
-)
+from triquad_format.wire.messages import SdfRequest
+from triquad_format.wire.query_messages import DistanceRequest, GridRequest, SpheresRequest
 from triquad_map.questions.distance import Distances, Unknown, UnknownLike, with_unknown
 from triquad_map.questions.grid import Grid
 from triquad_map.questions.spheres import Spheres
@@ -26,7 +18,7 @@ from triquad_map.view import FieldAnswer
 from triquad_client import checks
 from triquad_client.calls.parts import Asking, Part
 from triquad_client.checks import Bounds
-from triquad_client.net.connection import NEWEST, Answering, Ask, retried
+from triquad_client.net.connection import NEWEST, Answering, retried
 
 
 @dataclass(frozen=True)
@@ -54,9 +46,8 @@ class PointQueries(Asking):
         """
         wanted, checked = checks.flag("gradient", gradient), checks.query_points(points)
 
-        def request(part: Part) -> Ask[SdfReply]:
-            message = SdfRequest(part.origin, part.offsets(checked), wanted, epoch=part.epoch)
-            return Ask(keys.SDF, message, SdfReply)
+        def request(part: Part) -> SdfRequest:
+            return SdfRequest(part.origin, part.offsets(checked), wanted, epoch=part.epoch)
 
         answered = self._in_parts(request, checked, most=MAX_QUERY_POINTS, at_epoch=at_epoch)
         return SdfResult(**answered.joined(asked_for={"gradient": wanted}))
@@ -91,12 +82,11 @@ class PointQueries(Asking):
         with_distance = with_distance or policy is not Unknown.FREE
         reach_m = checks.within("max_distance_m", max_distance_m)
 
-        def request(part: Part) -> Ask[DistanceReply]:
+        def request(part: Part) -> DistanceRequest:
             offsets = part.offsets(checked)
-            message = DistanceRequest(
+            return DistanceRequest(
                 part.origin, offsets, reach_m, with_point, with_distance, part.epoch
             )
-            return Ask(keys.DISTANCE, message, DistanceReply)
 
         answered = self._in_parts(request, checked, most=MAX_SEARCHES, at_epoch=at_epoch)
         asked_for = {"surface_point": with_point}
@@ -113,10 +103,9 @@ class PointQueries(Asking):
         checked = checks.query_points(centres)
         radii = checks.radii(radii_m, len(checked))
 
-        def request(part: Part) -> Ask[SpheresReply]:
+        def request(part: Part) -> SpheresRequest:
             offsets = part.offsets(checked)
-            message = SpheresRequest(part.origin, offsets, radii[part.rows], epoch=part.epoch)
-            return Ask(keys.SPHERES, message, SpheresReply)
+            return SpheresRequest(part.origin, offsets, radii[part.rows], epoch=part.epoch)
 
         answered = self._in_parts(request, checked, most=MAX_SEARCHES, at_epoch=at_epoch)
         return Spheres(**answered.joined())
@@ -141,11 +130,10 @@ class PointQueries(Asking):
         blocks = grid_blocks(shape.counts)
         firsts = np.array([block.first for block in blocks])
 
-        def request(part: Part) -> Ask[GridReply]:
+        def request(part: Part) -> GridRequest:
             (block,) = blocks[part.rows]
             counts = np.array(block.counts, np.int32)
-            message = GridRequest(part.origin, shape.cell_m, counts, reach_m, epoch=part.epoch)
-            return Ask(keys.GRID, message, GridReply)
+            return GridRequest(part.origin, shape.cell_m, counts, reach_m, epoch=part.epoch)
 
         corners = shape.corner + firsts * shape.cell_m
         answered = self._in_parts(request, corners, most=1, at_epoch=at_epoch)
@@ -180,6 +168,6 @@ def pin_newest(server: Answering) -> int:
 
     def epoch_of(epoch: int) -> int:
         request = SdfRequest(np.zeros(3), np.zeros((0, 3), np.float32), False, epoch)
-        return server.ask(Ask(keys.SDF, request, SdfReply)).epoch
+        return server.ask(request).epoch
 
     return retried("epoch_gone", lambda: epoch_of(epoch_of(NEWEST)))

@@ -13,13 +13,18 @@ from triquad_format.errors import FormatError, InvalidInputError, RefusedError
 from triquad_format.printable import printable
 from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.wire import keys
-from triquad_format.wire.messages import FlushReply, FlushRequest, Scan, ServerStatus
+from triquad_format.wire.messages import (
+    FlushReply,
+    FlushRequest,
+    Scan,
+    ServerStatus,
+    StatusRequest,
+)
 
 from triquad_client import checks
-from triquad_client.calls.server import STATUS
 from triquad_client.depth_image import Intrinsics, depth_points
 from triquad_client.errors import InvalidScanError, RequestTimeoutError
-from triquad_client.net.connection import Ask, Connection
+from triquad_client.net.connection import Connection
 from triquad_client.pose import PoseLike, rigid_pose
 
 _log = logging.getLogger("triquad_client")
@@ -177,7 +182,7 @@ class ScanCalls:
         # A status that overtakes the last scan would say that there is nothing left to learn.
         while not self._dealt_with_by(deadline):
             _check_time(deadline, timeout_s)
-        while not (now := self._connection.ask(STATUS)).settled:
+        while not (now := self._connection.ask(StatusRequest())).settled:
             _check_time(deadline, timeout_s)
             time.sleep(_SETTLE_PAUSE_S)
         return now
@@ -241,11 +246,8 @@ class ScanCalls:
         done: dict[str, FlushReply] = {}
         while True:
             waited_s = time.monotonic() - started
-            asks = [
-                Ask(keys.FLUSH, replace(request, waited_s=waited_s), FlushReply)
-                for request in requests
-            ]
-            replies = list(self._connection.replies(asks))
+            asked = (replace(request, waited_s=waited_s) for request in requests)
+            replies = list(self._connection.replies(asked))
             for request, reply in zip(requests, replies, strict=True):
                 if reply.done:
                     done[request.source] = reply

@@ -6,7 +6,6 @@
 import numpy as np
 from numpy.typing import ArrayLike
 from triquad_format.errors import InvalidInputError
-from triquad_format.wire import keys
 from triquad_format.wire.limits import (
     MAX_RANGE_M,
     MAX_SEARCHES,
@@ -14,13 +13,9 @@ from triquad_format.wire.limits import (
     SEGMENT_M_PER_SEARCH,
 )
 from triquad_format.wire.query_messages import (
-    AlignReply,
     AlignRequest,
-    GroundReply,
     GroundRequest,
-    RaysReply,
     RaysRequest,
-    SegmentsReply,
     SegmentsRequest,
 )
 from triquad_map.questions.align import FINE_POINTS, Alignment, thinned
@@ -30,7 +25,6 @@ from triquad_map.questions.segments import Polyline, Segments, along_polyline
 
 from triquad_client import checks
 from triquad_client.calls.parts import Asking, Part
-from triquad_client.net.connection import Ask
 from triquad_client.pose import PoseLike, rigid_pose
 
 _MOST_WAYS = 1_000
@@ -63,10 +57,9 @@ class WayQueries(Asking):
         ball_m = checks.within("radius_m", radius_m, least=0.0)
         reach_m = checks.within("max_distance_m", max_distance_m)
 
-        def request(part: Part) -> Ask[SegmentsReply]:
+        def request(part: Part) -> SegmentsRequest:
             begin, end = part.offsets(first), part.offsets(last)
-            message = SegmentsRequest(part.origin, begin, end, ball_m, reach_m, part.epoch)
-            return Ask(keys.SEGMENTS, message, SegmentsReply)
+            return SegmentsRequest(part.origin, begin, end, ball_m, reach_m, part.epoch)
 
         longest_m = float(np.linalg.norm(last - first, axis=1).max(initial=0.0))
         most = _ways_at_once(longest_m / SEGMENT_M_PER_SEARCH)
@@ -111,10 +104,9 @@ class WayQueries(Asking):
         reach_m = checks.within("max_range_m", max_range_m, MAX_RANGE_M)
         passes = checks.flag("through_unknown", through_unknown)
 
-        def request(part: Part) -> Ask[RaysReply]:
+        def request(part: Part) -> RaysRequest:
             begin, along = part.offsets(starts), ways[part.rows].astype(np.float32)
-            message = RaysRequest(part.origin, begin, along, reach_m, passes, part.epoch)
-            return Ask(keys.RAYS, message, RaysReply)
+            return RaysRequest(part.origin, begin, along, reach_m, passes, part.epoch)
 
         most = _ways_at_once(reach_m / RAY_M_PER_SEARCH)
         return RayRanges(**self._in_parts(request, starts, most=most, at_epoch=at_epoch).joined())
@@ -133,9 +125,8 @@ class WayQueries(Asking):
         checked = checks.query_points(points)
         drop_m = checks.within("max_drop_m", max_drop_m)
 
-        def request(part: Part) -> Ask[GroundReply]:
-            message = GroundRequest(part.origin, part.offsets(checked), drop_m, epoch=part.epoch)
-            return Ask(keys.GROUND, message, GroundReply)
+        def request(part: Part) -> GroundRequest:
+            return GroundRequest(part.origin, part.offsets(checked), drop_m, epoch=part.epoch)
 
         most = _ways_at_once(drop_m / RAY_M_PER_SEARCH)
         fields = self._in_parts(request, checked, most=most, at_epoch=at_epoch).joined()
@@ -162,7 +153,7 @@ class WayQueries(Asking):
         guess = rigid_pose(world_from_sensor_guess)
         reach_m = checks.within("max_distance_m", max_distance_m)
         request = AlignRequest(few, guess, reach_m, epoch)
-        return Alignment(**vars(self._server.ask(Ask(keys.ALIGN, request, AlignReply))))
+        return Alignment(**vars(self._server.ask(request)))
 
 
 def _ways_at_once(searches: float) -> int:

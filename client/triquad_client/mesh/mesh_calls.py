@@ -4,9 +4,8 @@ from collections.abc import Iterator
 
 import numpy as np
 from triquad_format.records.arrays import Bools, Ints
-from triquad_format.wire import keys
 from triquad_format.wire.limits import MAX_FILL_M
-from triquad_format.wire.mesh_messages import MeshReply, MeshRequest, TileList, TileListRequest
+from triquad_format.wire.mesh_messages import MeshReply, MeshRequest, TileListRequest
 from triquad_map.triangles import TileJoin
 
 from triquad_client import checks
@@ -14,7 +13,7 @@ from triquad_client.checks import Bounds
 from triquad_client.errors import BadReplyError
 from triquad_client.mesh.followed_mesh import TileDecoder
 from triquad_client.mesh.mesh import Mesh
-from triquad_client.net.connection import NEWEST, Ask, Connection, retried
+from triquad_client.net.connection import NEWEST, Connection, retried
 
 _TILES_EACH = 8
 """Tiles of one request: alone, a small one costs as much on its way as in the making. Where holes
@@ -41,23 +40,18 @@ class MeshCalls:
         request = TileListRequest(*box, NEWEST, level=level, fill_m=fill_m)
 
         def fetch() -> Mesh:
-            listed = self._connection.ask(Ask(keys.TILE_LIST, request, TileList, background=True))
+            listed = self._connection.ask(request)
             join = TileJoin(listed.tile_side_m, box, marked=fill_m > 0)
             decoder = TileDecoder(self._connection.max_download_bytes)
             firsts = range(0, len(listed.tiles), each)
             parts = [listed.tiles[first : first + each] for first in firsts]
-            asks = (_ask_mesh(tiles, listed.epoch, level, fill_m) for tiles in parts)
-            for tiles, reply in zip(parts, self._connection.replies(asks), strict=True):
+            asked = (MeshRequest(tiles, listed.epoch, level, fill_m) for tiles in parts)
+            for tiles, reply in zip(parts, self._connection.replies(asked), strict=True):
                 for tile in _decoded(reply, tiles, decoder, filled=fill_m > 0):
                     join.add(tile)
             return Mesh.of(join.mesh(), listed.epoch)
 
         return retried("epoch_gone", fetch)
-
-
-def _ask_mesh(tiles: Ints, epoch: int, level: int, fill_m: float) -> Ask[MeshReply]:
-    request = MeshRequest(tiles, epoch=epoch, level=level, fill_m=fill_m)
-    return Ask(keys.MESH, request, MeshReply, background=True)
 
 
 def _decoded(

@@ -11,10 +11,9 @@ from types import MappingProxyType
 import numpy as np
 import zenoh
 from triquad_format.errors import TriquadError
-from triquad_format.wire import keys
+from triquad_format.wire.bounds import MAX_COUNT
 from triquad_format.wire.limits import MAX_TILES_ASKED
-from triquad_format.wire.mesh_messages import MeshReply, MeshRequest, TileChanges
-from triquad_format.wire.reply import MAX_COUNT
+from triquad_format.wire.mesh_messages import MeshRequest
 
 from triquad_client import checks
 from triquad_client.errors import ClosedError, RequestTimeoutError
@@ -26,7 +25,7 @@ from triquad_client.mesh.followed_mesh import (
     TileIndex,
 )
 from triquad_client.mesh.mesh import Mesh
-from triquad_client.net.connection import Answering, Ask, cancellable
+from triquad_client.net.connection import Answering, cancellable
 
 _PAUSE_S = 0.25  # until the server is asked again what is new
 _TILES_EACH = 32  # that are fetched at once, some in each request
@@ -190,16 +189,14 @@ class MeshWatch(WatchedTiles):
         told_s = self._told_s
         if not before.pending or time.monotonic() >= told_s + _PAUSE_S:
             told_s = time.monotonic()
-            ask = Ask(keys.TILE_CHANGES, before.changes_request(), TileChanges, background=True)
-            followed = before.told(self._server.ask(ask))
+            followed = before.told(self._server.ask(before.changes_request()))
         some = followed.pending[: self._tiles_each]
         requests = [
             MeshRequest(np.array(some[first : first + MAX_TILES_ASKED], np.int32), 0, before.level)
             for first in range(0, len(some), MAX_TILES_ASKED)
         ]
-        asks = (Ask(keys.MESH, request, MeshReply, background=True) for request in requests)
         size = 0
-        for request, reply in zip(requests, self._server.replies(asks), strict=True):
+        for request, reply in zip(requests, self._server.replies(requests), strict=True):
             followed = followed.fetched(request, reply)
             size += len(reply.data)
         with self._changing:

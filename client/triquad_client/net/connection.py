@@ -6,16 +6,15 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar, cast
 
 import zenoh
 from triquad_format.errors import RefusedError, WireError
 from triquad_format.printable import printable
 from triquad_format.wire import codec, keys
-from triquad_format.wire.codec import Message
+from triquad_format.wire.bounds import check_answers
+from triquad_format.wire.codec import Message, Request
 from triquad_format.wire.messages import ErrorReply, RequestOrigin
-from triquad_format.wire.reply import check_answers
 
 from triquad_client.errors import (
     BadReplyError,
@@ -44,29 +43,14 @@ _cancellation: ContextVar[zenoh.CancellationToken | None] = ContextVar("cancella
 """The token that ends the requests of the running call."""
 
 
-@dataclass(frozen=True)
-class Ask(Generic[ReplyT]):
-    """A request.
-
-    Bulky ones go in the ``background``: a reply has the priority of its request, and a slow reader
-    of large replies must not delay the distance queries of others.
-    """
-
-    operation: str  # of triquad_format.wire.keys
-    message: Message
-    kind: type[ReplyT]  # of the reply
-    background: bool = False
-    min_timeout_s: float = 0.0  # waits that long for the reply, where the connection would not
-
-
 class Answering(ABC):
     """Answers requests."""
 
     @abstractmethod
-    def replies(self, asks: Iterable[Ask[ReplyT]]) -> Iterator[ReplyT]:
+    def replies(self, requests: Iterable[Request[ReplyT]]) -> Iterator[ReplyT]:
         """Yield the reply to each request, in their order."""
 
-    def ask(self, request: Ask[ReplyT]) -> ReplyT:
+    def ask(self, request: Request[ReplyT]) -> ReplyT:
         """Return the reply to one request."""
         return next(iter(self.replies([request])))
 
@@ -99,7 +83,7 @@ class Connection(Answering):
         """Close the session; closing twice does no harm. What is under way ends unanswered."""
         self._close()
 
-    def replies(self, asks: Iterable[Ask[ReplyT]]) -> Iterator[ReplyT]:
+    def replies(self, requests: Iterable[Request[ReplyT]]) -> Iterator[ReplyT]:
         """Yield the reply to each request, in their order; a few are under way at a time.
 
         Nothing of a reply is used before all of it was checked.
@@ -112,9 +96,9 @@ class Connection(Answering):
             ClosedError: the session was closed.
             ConnectError: it is broken.
         """
-        waiting: deque[tuple[Ask[ReplyT], Iterable[zenoh.Reply]]] = deque()
-        for ask in asks:
-            waiting.append((ask, self._send(ask)))
+        waiting: deque[tuple[Request[ReplyT], Iterable[zenoh.Reply]]] = deque()
+        for request in requests:
+            waiting.append((request, self._send(request)))
             if len(waiting) >= PARTS_IN_FLIGHT:
                 yield self._received(*waiting.popleft())
         while waiting:
@@ -152,16 +136,16 @@ class Connection(Answering):
         names = {str(reply.ok.key_expr).split("/")[1] for reply in replies if reply.ok}
         return sorted(filter(keys.is_name, names))
 
-    def _send(self, ask: Ask[Any]) -> Iterable[zenoh.Reply]:
-        timeout_s = self._timeout_s(ask)
+    def _send(self, request: Request[Any]) -> Iterable[zenoh.Reply]:
+        timeout_s = self._timeout_s(request)
         try:
             return self._session.get(
-                self._key(ask),
-                payload=codec.encode(ask.message),
-                encoding=keys.encoding(type(ask.message)),
+                self._key(request),
+                payload=codec.encode(request),
+                encoding=keys.encoding(type(request)),
                 attachment=codec.encode(RequestOrigin(self._id, timeout_s)),
                 timeout=timeout_s,
-                priority=zenoh.Priority.BACKGROUND if ask.background else zenoh.Priority.DATA,
+                priority=zenoh.Priority.BACKGROUND if request.background else zenoh.Priority.DATA,
                 congestion_control=zenoh.CongestionControl.BLOCK,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 cancellation_token=_cancellation.get(),
@@ -169,30 +153,30 @@ class Connection(Answering):
         except zenoh.ZError as error:
             raise self._broken(error) from error
 
-    def _received(self, ask: Ask[ReplyT], replies: Iterable[zenoh.Reply]) -> ReplyT:
+    def _received(self, request: Request[ReplyT], replies: Iterable[zenoh.Reply]) -> ReplyT:
         for reply in replies:
-            return self._read(ask, reply)
-        raise self._no_reply_error(ask)
+            return self._read(request, reply)
+        raise self._no_reply_error(request)
 
-    def _read(self, ask: Ask[ReplyT], reply: zenoh.Reply) -> ReplyT:
+    def _read(self, request: Request[ReplyT], reply: zenoh.Reply) -> ReplyT:
         try:
             if reply.ok is not None:
-                answer = codec.decode(ask.kind, reply.ok.payload.to_bytes())
-                check_answers(ask.message, answer)
-                return answer
+                answer = codec.decode(request.reply, reply.ok.payload.to_bytes())
+                check_answers(request, answer)
+                return cast(ReplyT, answer)
             payload = b"" if reply.err is None else reply.err.payload.to_bytes()
             if payload == b"Timeout":
                 raise RequestTimeoutError(
-                    f"no reply on {self._key(ask)} within {self._timeout_s(ask):g} s"
+                    f"no reply on {self._key(request)} within {self._timeout_s(request):g} s"
                 )
             reason = codec.decode(ErrorReply, payload)
         except WireError as error:
-            raise BadReplyError(f"reply on {self._key(ask)}: {error}") from error
+            raise BadReplyError(f"reply on {self._key(request)}: {error}") from error
         raise RefusedError(
             printable(reason.code, _MAX_REASON), printable(reason.message, _MAX_REASON)
         )
 
-    def _no_reply_error(self, ask: Ask[Any]) -> Exception:
+    def _no_reply_error(self, request: Request[Any]) -> Exception:
         """Return the error for a request that got no reply at all."""
         if self.is_closed:
             return closed_error()
@@ -208,17 +192,17 @@ class Connection(Answering):
             "access control forbids it (without roles to all but programs of the server's machine "
             "that connect to 127.0.0.1, with roles to all but those of an admin), or the server is "
             "stopping or older than this operation"
-            if ask.operation.startswith("admin/")
+            if request.operation.startswith("admin/")
             else "the server is stopping or older than this question, access control forbids the "
             "request, or a message exceeds a size limit"
         )
-        return NoReplyError(f"no reply on {self._key(ask)} although the map is there: {why}")
+        return NoReplyError(f"no reply on {self._key(request)} although the map is there: {why}")
 
-    def _key(self, ask: Ask[Any]) -> str:
-        return keys.operation_key(self.map_name, ask.operation)
+    def _key(self, request: Request[Any]) -> str:
+        return keys.operation_key(self.map_name, request.operation)
 
-    def _timeout_s(self, ask: Ask[Any]) -> float:
-        return max(self.timeout_s, ask.min_timeout_s)
+    def _timeout_s(self, request: Request[Any]) -> float:
+        return max(self.timeout_s, request.least_wait_s)
 
     def _broken(self, error: Exception) -> Exception:
         if self.is_closed:

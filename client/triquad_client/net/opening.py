@@ -8,8 +8,8 @@ from typing import Any
 import zenoh
 from triquad_format.errors import FormatError, InvalidInputError
 from triquad_format.wire import codec, keys
+from triquad_format.wire.bounds import MAX_COUNT
 from triquad_format.wire.endpoints import full_endpoint
-from triquad_format.wire.reply import MAX_COUNT
 from triquad_format.wire.zenoh_config import QUIET, fill, put
 
 from triquad_client import checks

@@ -13,6 +13,7 @@ from triquad_format.mapfile.reader import read_map_file
 from triquad_format.records.arrays import Bools, Doubles
 from triquad_format.records.region import MapRecord
 from triquad_format.records.seen_space import surface_voxels
+from triquad_format.wire.codec import Request
 from triquad_format.wire.limits import MAX_FILL_M
 from triquad_map.questions.answers import Answers
 from triquad_map.record_view import open_view
@@ -23,7 +24,7 @@ from triquad_client.calls.queries import MapQueries
 from triquad_client.checks import Bounds
 from triquad_client.errors import ClosedError
 from triquad_client.mesh.mesh import Mesh
-from triquad_client.net.connection import Answering, Ask, ReplyT
+from triquad_client.net.connection import Answering, ReplyT
 
 if TYPE_CHECKING:
     from triquad_map.composition.recorded_view import RecordedView
@@ -59,12 +60,9 @@ class LocalMap(Answering):
         if opened is not None:
             opened.close()
 
-    def replies(self, asks: Iterable[Ask[ReplyT]]) -> Iterator[ReplyT]:
+    def replies(self, requests: Iterable[Request[ReplyT]]) -> Iterator[ReplyT]:
         """Yield the reply to each request, one after the other."""
-        for ask in asks:
-            reply = self._answers.answer(ask.message)
-            assert isinstance(reply, ask.kind)
-            yield reply
+        return map(self._answers.answer, requests)
 
     @contextmanager
     def _epoch(self, number: int) -> Iterator[MapView]:

@@ -1,19 +1,30 @@
-"""A folder of checkpoints: the epochs of a map that can be read back.
+"""A folder of checkpoints: the epochs of a map that can be read back, and their parts.
 
 A server writes ``epoch-<number>.checkpoint``, which lists parts. A whole map file that is put there
-as ``epoch-<number>.triquad``, such as a backup, counts as a checkpoint, too.
+as ``epoch-<number>.triquad``, such as a backup, counts as a checkpoint, too. Each part is kept
+once, in a file named by its digest: one zstd frame, whose content is the payload of the part.
 """
 
+import contextlib
+import hashlib
+import os
 import re
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 
-from triquad_format.errors import MapFileError
-from triquad_format.mapfile.checkpoint import open_index
-from triquad_format.mapfile.index import DAMAGED_SUFFIX, FileBytes, named
-from triquad_format.mapfile.manifest import Manifest
+from triquad_format.errors import DamagedMapFileError, MapFileError
+from triquad_format.mapfile.container import MAX_STORED_BYTES, decompress
+from triquad_format.mapfile.files import DAMAGED_SUFFIX, FileBytes, naming, sync_folder
+from triquad_format.mapfile.manifest import Entry
+from triquad_format.mapfile.parts.pack import check_part, compressed
+from triquad_format.mapfile.parts.part import MAX_PART_BYTES, Part
+
+PARTS_NAME = "parts"
+"""The folder of the parts, in the folder of the checkpoints."""
+
+_PART_NAME = re.compile("[0-9a-f]{64}")
 
 _NAME = re.compile(r"epoch-([0-9]{9,19})\.(checkpoint|triquad)")
 
@@ -79,17 +90,6 @@ def map_folder(store: Path) -> Path:
     return maps[0]
 
 
-def open_manifest(file: CheckpointFile) -> Manifest:
-    """Return the manifest of a checkpoint; no part is read.
-
-    Raises:
-        MapFileError: the file is damaged, or needs a newer reader.
-        OSError: it cannot be read.
-    """
-    with closing(FileBytes(file.path)) as source, named(str(file.path)):
-        return open_index(source).manifest
-
-
 def checkpoint_of(folder: Path, epoch: int) -> CheckpointFile:
     """Return the checkpoint of an epoch.
 
@@ -106,46 +106,141 @@ def checkpoint_of(folder: Path, epoch: int) -> CheckpointFile:
     raise MapFileError(f"{folder} holds no checkpoint of epoch {epoch}; there are: {there}{more}")
 
 
-def checkpoint_at(folder: Path, when: str) -> CheckpointFile:
-    """Return the newest checkpoint that is not after ``when``.
+class PartFiles:
+    """Reads the parts of checkpoints."""
 
-    Args:
-        folder: the folder of checkpoints.
-        when: number of an epoch, or a time as in RFC 3339 (local time where it has no offset).
+    def __init__(self, folder: Path) -> None:
+        """Take the folder of the checkpoints."""
+        self.folder = folder / PARTS_NAME
+
+    def names(self) -> set[str]:
+        """Return the names of all parts that are there; none where there is no folder."""
+        with contextlib.suppress(FileNotFoundError):
+            return {name for name in os.listdir(self.folder) if _PART_NAME.fullmatch(name)}
+        return set()
+
+    def has(self, entry: Entry) -> bool:
+        """Return whether the part is there in its size; its content is not looked at."""
+        try:
+            return (self.folder / entry.name).stat().st_size == entry.stored
+        except OSError:
+            return False
+
+    def payload(self, entry: Entry) -> bytes:
+        """Return the payload of a part.
+
+        Raises:
+            DamagedMapFileError: it is missing, or is damaged.
+            OSError: it cannot be read.
+        """
+        with _named(entry.name), closing(FileBytes(self.folder / entry.name)) as file:
+            if file.size != entry.stored:
+                raise DamagedMapFileError(f"it has {file.size} bytes, not {entry.stored}")
+            return _content(file, entry.name, entry.size)
+
+    def check(self, name: str) -> int:
+        """Check the part of this name, and return the bytes of its file.
+
+        Raises:
+            DamagedMapFileError: it is missing, or is damaged.
+            OSError: it cannot be read.
+        """
+        with _named(name), closing(FileBytes(self.folder / name)) as file:
+            _content(file, name)
+            return file.size
+
+
+class NewParts:
+    """Writes parts of one checkpoint: each that is not there yet, and durably with the others."""
+
+    def __init__(self, folder: Path, epoch: int) -> None:
+        """Make the folder of parts, in that of the checkpoints, if need be.
+
+        Args:
+            folder: that of the checkpoints.
+            epoch: in which the parts changed.
+
+        Raises:
+            OSError: it cannot be made.
+        """
+        self._files = PartFiles(folder)
+        self._epoch = epoch
+        self._unfinished: dict[Path, Path] = {}  # names for good, by temporary ones
+        self._files.folder.mkdir(exist_ok=True)
+
+    def add(self, part: Part, known: Entry | None = None) -> Entry:
+        """Return the entry of a part, whose file is written unless an intact one is there.
+
+        ``known`` is what the key had in an earlier checkpoint, which is returned where it is equal
+        and its file is there in its size.
+
+        Raises:
+            FormatError: it is too large to be read.
+            OSError: it cannot be written.
+        """
+        check_part(part)
+        digest = hashlib.sha256(part.payload)
+        if known is not None and known.sha256 == digest.digest() and self._files.has(known):
+            return known
+        path = self._files.folder / digest.hexdigest()
+        # One that cannot be read is as good as one that is damaged.
+        with contextlib.suppress(DamagedMapFileError, OSError):
+            return self._entry(part, digest.digest(), stored=self._files.check(path.name))
+        frame = compressed(part)
+        temporary = path.with_name(f".{path.name}.tmp")
+        with naming(path):
+            temporary.write_bytes(frame)
+        self._unfinished[temporary] = path
+        return self._entry(part, digest.digest(), stored=len(frame))
+
+    def commit(self) -> None:
+        """Make all parts durable, and give them their names.
+
+        Raises:
+            OSError: one cannot be written.
+        """
+        # All were handed to the system before: it writes them together at the first sync.
+        for temporary, path in self._unfinished.items():
+            with naming(path), temporary.open("rb") as file:
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+        self._unfinished.clear()
+        sync_folder(self._files.folder)
+
+    def _entry(self, part: Part, digest: bytes, stored: int) -> Entry:
+        return Entry(
+            part.key,
+            size=len(part.payload),
+            sha256=digest,
+            epoch=self._epoch,
+            stored=stored,
+        )
+
+
+def _content(file: FileBytes, name: str, limit: int = MAX_PART_BYTES) -> bytes:
+    """Return the payload in the file of a part, of at most ``limit`` bytes.
 
     Raises:
-        MapFileError: ``when`` is neither, or there is no such checkpoint; the text says which
-            there are.
-        OSError: the folder or a file cannot be read.
+        DamagedMapFileError: it is not what the file's name says.
     """
-    files = checkpoint_files(folder)
-    found = [file for file in files if _is_by(file, when)]
-    epochs = f"epochs {files[-1].epoch} to {files[0].epoch}" if files else "nothing"
-    if not found:
-        raise MapFileError(f"{folder} holds no checkpoint of {when} or before, but {epochs}")
-    if _is_epoch(when) and int(when) > files[0].epoch:
-        raise MapFileError(
-            f"{folder} holds {epochs}, not {when}; a time is written as 2026-01-31T12:00:00Z"
-        )
-    return max(found)
+    if file.size > MAX_STORED_BYTES:
+        raise DamagedMapFileError(f"it has {file.size} bytes, and no part has as many")
+    payload = decompress(file.read(0, file.size), limit)
+    if hashlib.sha256(payload).hexdigest() != name:
+        raise DamagedMapFileError("its content is not what its name says")
+    return payload
 
 
-def _is_epoch(when: str) -> bool:
-    return when.isascii() and when.isdigit() and len(when) < 20
+@contextlib.contextmanager
+def _named(name: str) -> Iterator[None]:
+    """Name the part in what is raised.
 
-
-def _is_by(file: CheckpointFile, when: str) -> bool:
-    if _is_epoch(when):
-        return file.epoch <= int(when)
+    Raises:
+        DamagedMapFileError: the part is missing, or damaged.
+    """
     try:
-        limit_s = datetime.fromisoformat(when.replace("Z", "+00:00")).timestamp()
-    except ValueError as error:
-        raise MapFileError(
-            f"{when!r} is neither the number of an epoch nor a time such as 2026-01-31T12:00:00Z"
-        ) from error
-    try:
-        manifest = open_manifest(file)
-    except MapFileError:
-        return False
-    # Times are shown in whole seconds: what is shown must find its checkpoint.
-    return 0 < manifest.stamp_ns // 10**9 <= limit_s
+        yield
+    except FileNotFoundError as error:
+        raise DamagedMapFileError(f"{PARTS_NAME}/{name} is missing") from error
+    except DamagedMapFileError as error:
+        raise DamagedMapFileError(f"{PARTS_NAME}/{name}: {error}") from error

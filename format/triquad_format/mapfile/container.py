@@ -8,7 +8,7 @@ import contextlib
 import io
 import struct
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
@@ -43,6 +43,9 @@ it are compressed already."""
 
 _MAX_SUMMARY_BYTES = 64 * 2**20
 _MAX_METADATA_BYTES = 2**20
+_BLOCK_BYTES = 8192
+"""Content of a zstd block: maps are 4 % smaller with it than with blocks as large as may be."""
+
 _MAX_WINDOW_BYTES = 8 * 2**20
 """Memory that zstd may ask for besides its output; RFC 8878 has every decoder support it."""
 
@@ -163,8 +166,8 @@ def chunk_messages(data: bytes, where: int) -> list[bytes]:
     return [record.data for record in records if isinstance(record, Message)]
 
 
-def compress(data: bytes, seams: Sequence[int], level: int) -> bytes:
-    """Return one zstd frame in which a block ends at each seam.
+def compress(data: bytes, level: int) -> bytes:
+    """Return one zstd frame of small blocks.
 
     A block has one Huffman table: noise and numbers in one block compress badly.
 
@@ -174,10 +177,9 @@ def compress(data: bytes, seams: Sequence[int], level: int) -> bytes:
     with _parsing("what is to be compressed"):
         compressor = zstandard.ZstdCompressor(level=level).compressobj(size=len(data))
         pieces: list[bytes] = []
-        for first, last in zip([0, *seams], [*seams, len(data)], strict=True):
-            if last > first:
-                pieces.append(compressor.compress(data[first:last]))
-                pieces.append(compressor.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK))
+        for first in range(0, len(data), _BLOCK_BYTES):
+            pieces.append(compressor.compress(data[first : first + _BLOCK_BYTES]))
+            pieces.append(compressor.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK))
         return b"".join([*pieces, compressor.flush()])
 
 

@@ -1,103 +1,104 @@
-"""A map file opened by its end: its manifest at once, each part when it is asked for."""
+"""The parts of a map file, or of a checkpoint, each read when it is asked for.
 
-import contextlib
-import io
-import os
-import stat
+A checkpoint is a small file that lists the parts of a map at one epoch, which lie in a folder next
+to it: :mod:`triquad_format.mapfile.checkpoint_folder`. It is one line that says what the file is,
+the SHA-256 of the rest, and a zstd frame with the manifest.
+"""
+
+import hashlib
 import zlib
-from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 
-from triquad_format.errors import (
-    DamagedMapFileError,
-    FormatError,
-    MapFileError,
-    TooLargeMapFileError,
-)
+import zstandard
+
+from triquad_format.errors import DamagedMapFileError, MapFileError
+from triquad_format.mapfile.checkpoint_folder import PartFiles
 from triquad_format.mapfile.container import RandomAccess, decompress, read_end, read_message
-from triquad_format.mapfile.manifest import Entry, manifest_in
+from triquad_format.mapfile.files import FileBytes, named, replacing
+from triquad_format.mapfile.manifest import (
+    DIGEST_BYTES,
+    Entry,
+    Manifest,
+    manifest_in,
+    pack_manifest,
+)
 from triquad_format.mapfile.metadata import (
+    FORMAT_VERSION,
+    PRODUCER,
     check_agreement,
     check_map_part,
     check_readable,
     manifest_place,
+    utc_time,
 )
-from triquad_format.mapfile.parts.body import unpack_body
-from triquad_format.mapfile.parts.part import MANIFEST, MAP, PREFIX, REGION_TOPICS, PartKey
+from triquad_format.mapfile.parts.body import PartBody, unpack_body
+from triquad_format.mapfile.parts.part import (
+    MANIFEST,
+    MAP,
+    MAX_PART_BYTES,
+    PREFIX,
+    REGION_TOPICS,
+    PartKey,
+)
+from triquad_format.mapfile.writer import MapFileInfo
 
-DAMAGED_SUFFIX = ".damaged"
-"""Added to the names of files that are set aside."""
-
-_REMEDY = "triquad-pack --recover saves what is intact; an older checkpoint may be intact"
 _BLOCK_BYTES = 1 << 20
 
+MAGIC = b"triquad checkpoint\n"
 
-@contextlib.contextmanager
-def named(name: str) -> Iterator[None]:
-    """Put the file's name and, for damage, the remedy into what is raised.
+_LEVEL = 3  # of zstd; digests do not shrink
+
+
+@dataclass(frozen=True)
+class Restored:
+    """An older checkpoint that the map was restored to."""
+
+    epoch: int
+    as_epoch: int  # under which the map went on
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """The content of a checkpoint's file."""
+
+    manifest: Manifest
+    undoes: str = ""
+    """What going back to it undoes, such as a reset: so it stays longer. Empty: nothing."""
+
+    restored: Restored | None = None  # the last time that the map was restored
+
+
+def write_checkpoint(path: Path, checkpoint: Checkpoint) -> MapFileInfo:
+    """Write a checkpoint whose parts are there, all of it or nothing; return size and digest.
 
     Raises:
-        MapFileError: instead of any :class:`FormatError`, and where memory does not suffice.
+        FormatError: it lists more than it may, or the map is too large to be read.
+        OSError: it cannot be written.
     """
-    try:
-        yield
-    except FormatError as error:
-        if isinstance(error, MapFileError) and not isinstance(error, DamagedMapFileError):
-            raise type(error)(f"{name}: {error}") from error
-        raise DamagedMapFileError(f"{name} is damaged: {error}; {_REMEDY}") from error
-    except MemoryError as error:
-        raise TooLargeMapFileError(f"{name}: the map does not fit into memory") from error
+    checkpoint.manifest.check_total(checkpoint.manifest.stored_bytes)
+    more: dict[str, object] = {"producer": PRODUCER, "undoes": checkpoint.undoes}
+    if checkpoint.restored is not None:
+        more["restored"] = vars(checkpoint.restored)
+    part = pack_manifest(checkpoint.manifest, more)
+    frame = zstandard.ZstdCompressor(level=_LEVEL).compress(part.payload)
+    data = MAGIC + hashlib.sha256(frame).digest() + frame
+    with replacing(path) as file:
+        file.write(data)
+    digest = hashlib.sha256(data).hexdigest()
+    return MapFileInfo(len(data), digest, checkpoint.manifest.facts.epoch)
 
 
-def open_regular(path: Path) -> io.FileIO:
-    """Return a file for reading; a pipe or device, which could keep its reader waiting, is refused.
+def read_checkpoint(path: Path) -> Checkpoint | None:
+    """Return the content of a checkpoint's file; ``None`` where it is no checkpoint but a map file.
 
     Raises:
-        MapFileError: it is no regular file.
-        OSError: it cannot be opened.
+        MapFileError: it is damaged, or needs a newer reader.
+        OSError: it cannot be read.
     """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        os.close(descriptor)
-        raise MapFileError(f"{path} is not a regular file")
-    return io.FileIO(descriptor)
-
-
-class FileBytes:
-    """The bytes of a file; they stay readable while it is open, even where it is deleted."""
-
-    def __init__(self, path: Path) -> None:
-        """Open a file; errors are those of :func:`open_regular`."""
-        self.name = str(path)
-        self._stream = open_regular(path)
-        self.size = os.fstat(self._stream.fileno()).st_size
-
-    def read(self, offset: int, length: int) -> bytes:
-        """Read as :meth:`RandomAccess.read`; threads may read at the same time."""
-        check_range(offset, length, self.size)
-        data = os.pread(self._stream.fileno(), length, offset)
-        while len(data) < length:
-            more = os.pread(self._stream.fileno(), length - len(data), offset + len(data))
-            if not more:
-                raise DamagedMapFileError(f"it was cut to {offset + len(data)} bytes meanwhile")
-            data += more
-        return data
-
-    def drop_cached(self) -> None:
-        """Have the system read the file from its disk, not from what it has in memory of it."""
-        os.posix_fadvise(self._stream.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
-
-    def close(self) -> None:
-        """Close the file."""
-        self._stream.close()
-
-
-def check_range(offset: int, length: int, size: int) -> None:
-    """Raise :class:`DamagedMapFileError` unless the file's ``size`` bytes contain that range."""
-    if offset < 0 or length < 0 or offset + length > size:
-        raise DamagedMapFileError(
-            f"bytes {offset} to {offset + length} are needed, but it has {size}: it is incomplete"
-        )
+    with closing(FileBytes(path)) as source, named(str(path)):
+        return CheckpointIndex(source).checkpoint if is_checkpoint(source) else None
 
 
 class MapIndex:
@@ -165,3 +166,88 @@ class MapIndex:
         except DamagedMapFileError as error:
             raise DamagedMapFileError(f"{entry.key.topic:.80}: {error}") from error
         return data
+
+
+class CheckpointIndex:
+    """A checkpoint whose parts are read when they are asked for, as those of a map file are."""
+
+    def __init__(self, source: FileBytes) -> None:
+        """Read the file, which is closed with this index.
+
+        Raises:
+            MapFileError: it is no checkpoint, is damaged, or needs a newer reader.
+        """
+        self._source = source
+        self._parts = PartFiles(Path(source.name).parent)
+        begin = len(MAGIC) + DIGEST_BYTES
+        if not begin < source.size < MAX_PART_BYTES or not is_checkpoint(source):
+            raise DamagedMapFileError(f"it is no checkpoint, or is incomplete: {source.size} bytes")
+        frame = source.read(begin, source.size - begin)
+        if hashlib.sha256(frame).digest() != source.read(len(MAGIC), DIGEST_BYTES):
+            raise DamagedMapFileError("the list of its parts fails its checksum")
+        body = unpack_body(MANIFEST, decompress(frame))
+        self.manifest = manifest_in(body, source.size)
+        self.manifest.check_total(self.manifest.stored_bytes)
+        self.checkpoint = _checkpoint(self.manifest, body)
+        self.size = source.size + self.manifest.stored_bytes  # bytes, with all parts
+        self.metadata = {
+            "format_version": f"{FORMAT_VERSION}",
+            "producer": body.value("producer", str),
+        }
+        if self.manifest.stamp_ns:
+            self.metadata["created"] = utc_time(self.manifest.stamp_ns)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._source.close()
+
+    def check_unread(self) -> None:
+        """Do nothing: readers of the map use all of it."""
+
+    def payload(self, entry: Entry) -> bytes:
+        """Return the payload of a part; errors are those of :meth:`PartFiles.payload`.
+
+        Raises:
+            MapFileError: the checkpoint was deleted since it was opened, and the part with it.
+        """
+        try:
+            return self._parts.payload(entry)
+        except DamagedMapFileError as error:
+            if Path(self._source.name).exists():
+                raise
+            raise MapFileError(
+                "the server deleted this checkpoint while it was read: open a newer one"
+            ) from error
+
+    def missing(self) -> list[Entry]:
+        """Return the parts that are not there, or not in their size."""
+        return [entry for entry in self.manifest.entries if not self._parts.has(entry)]
+
+
+def open_index(source: RandomAccess) -> MapIndex | CheckpointIndex:
+    """Return the parts of a map file or, where the source is one, of a checkpoint.
+
+    Raises:
+        MapFileError: it is neither, is damaged, or needs a newer reader.
+    """
+    if isinstance(source, FileBytes) and is_checkpoint(source):
+        return CheckpointIndex(source)
+    return MapIndex(source)
+
+
+def is_checkpoint(source: FileBytes) -> bool:
+    """Return whether a file begins as checkpoints do."""
+    return source.read(0, min(len(MAGIC), source.size)) == MAGIC
+
+
+def _checkpoint(manifest: Manifest, body: PartBody) -> Checkpoint:
+    """Return what is listed besides the parts.
+
+    Raises:
+        FormatError: something of it is malformed.
+    """
+    restored = None
+    if body.has("restored"):
+        last = PartBody(MANIFEST, body.mapping("restored"))
+        restored = Restored(last.count("epoch"), last.count("as_epoch"))
+    return Checkpoint(manifest, body.value("undoes", str), restored)

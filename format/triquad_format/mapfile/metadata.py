@@ -21,8 +21,7 @@ from triquad_format.errors import (
 from triquad_format.mapfile.parts.body import PartBody, unpack_body
 from triquad_format.mapfile.parts.part import MANIFEST, MAP
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.map_progress import MapProgress
-from triquad_format.records.region import MapRecord
+from triquad_format.records.region import MapProgress, MapRecord
 from triquad_format.wire.keys import check_name
 
 FORMAT_VERSION = 1

@@ -5,8 +5,9 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from triquad_format.mapfile.checkpoint import open_index
-from triquad_format.mapfile.index import FileBytes, named
+from triquad_format.mapfile.checkpoint_folder import CheckpointFile
+from triquad_format.mapfile.files import FileBytes, named
+from triquad_format.mapfile.index import open_index
 from triquad_format.mapfile.manifest import Entry, Manifest
 from triquad_format.mapfile.parts.part import REGION, REGION_TOPICS
 from triquad_format.mapfile.parts.region_parts import RegionParts
@@ -46,6 +47,17 @@ def read_map_file(path: Path | str) -> MapFile:
         record = assemble(index.manifest, index.payload)
         check_record(record)
         return MapFile(record, index.metadata, index.size, index.manifest)
+
+
+def open_manifest(file: CheckpointFile) -> Manifest:
+    """Return the manifest of a checkpoint; no part is read.
+
+    Raises:
+        MapFileError: the file is damaged, or needs a newer reader.
+        OSError: it cannot be read.
+    """
+    with closing(FileBytes(file.path)) as source, named(str(file.path)):
+        return open_index(source).manifest
 
 
 def assemble(manifest: Manifest, payload_of: Callable[[Entry], bytes]) -> MapRecord:

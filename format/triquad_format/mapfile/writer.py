@@ -10,20 +10,17 @@ from typing import BinaryIO, cast
 from mcap.writer import Writer
 
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.container import METADATA_NAME, compress
-from triquad_format.mapfile.durable_file import replacing
-from triquad_format.mapfile.manifest import Entry, Manifest, pack_manifest, total_limit
-from triquad_format.mapfile.metadata import MAX_MAP_BYTES, MapFacts, pack_facts, pack_metadata
-from triquad_format.mapfile.parts.pack import pack_part, pack_record, seams
+from triquad_format.mapfile.container import METADATA_NAME
+from triquad_format.mapfile.files import replacing
+from triquad_format.mapfile.manifest import Entry, Manifest, pack_manifest
+from triquad_format.mapfile.metadata import MapFacts, pack_facts, pack_metadata
+from triquad_format.mapfile.parts.pack import check_part, compressed, pack_part, pack_record
 from triquad_format.mapfile.parts.part import (
-    EVIDENCE,
     MAP,
-    MAX_PART_BYTES,
     MESSAGE_ENCODING,
     PREVIEW,
     PREVIEW_ENCODING,
     PREVIEW_SCHEMA,
-    REGION,
     Part,
     PartKey,
 )
@@ -113,16 +110,6 @@ def write_parts(
         return writer.write(parts, stamp_ns)
 
 
-def compressed(part: Part) -> bytes:
-    """Return a part's payload as the zstd frame that files hold.
-
-    Features and moments are noise but for their high bytes, on which level 1 is as good as level 19
-    and better than level 3; masks and codes shrink by a fifth to level 12.
-    """
-    level = {EVIDENCE: 12, REGION: 3}.get(part.key.topic, 1)
-    return compress(part.payload, seams(part), level)
-
-
 class _Counted:
     """Counts and digests what is written to a stream, which need not be able to seek."""
 
@@ -158,7 +145,6 @@ class _PartsWriter:
         self._stamp_ns = stamp_ns
         self._preview_schema = preview_schema
         self._channels: dict[str, int] = {}
-        self._total = 0
 
     def write(self, parts: Iterable[Part], stamp_ns: int | None) -> MapFileInfo:
         """Write the file; the metadata has the time ``stamp_ns``, if it is given."""
@@ -171,7 +157,7 @@ class _PartsWriter:
         self._mcap.add_metadata(METADATA_NAME, metadata)
         self._mcap.finish()  # type: ignore[no-untyped-call]
         size = self._stream.size
-        check_totals(self._total, size)
+        manifest.check_total(size)
         return MapFileInfo(size, self._stream.digest.hexdigest(), self._facts.epoch)
 
     def _stored(self, part: Part) -> Entry:
@@ -190,8 +176,6 @@ class _PartsWriter:
         """Write a part; return where its chunk begins, and bytes up to the next."""
         topic = part.key.topic
         check_part(part)
-        self._total += len(part.payload)
-        _check_total(self._total)
         data = part.payload
         if topic != PREVIEW:
             data = compressed(part)
@@ -212,29 +196,3 @@ class _PartsWriter:
                 encoding = PREVIEW_ENCODING
             self._channels[topic] = self._mcap.register_channel(topic, encoding, schema)
         return self._channels[topic]
-
-
-def check_part(part: Part) -> None:
-    """Raise :class:`FormatError` for a part that is too large to be read."""
-    if len(part.payload) > MAX_PART_BYTES:
-        raise FormatError(
-            f"the part {part.key.topic} has {len(part.payload)} bytes; "
-            f"a map file holds parts of at most {MAX_PART_BYTES}",
-        )
-
-
-def check_totals(unpacked: int, stored: int) -> None:
-    """Raise :class:`FormatError` unless parts that take these bytes together can be read."""
-    _check_total(max(unpacked, stored))
-    if unpacked > total_limit(stored):
-        raise FormatError(
-            f"the map's parts shrink from {unpacked} to {stored} bytes: readers take that "
-            "for an attack"
-        )
-
-
-def _check_total(size: int) -> None:
-    if size > MAX_MAP_BYTES:
-        raise FormatError(
-            f"the map takes {size} bytes or more; a map file holds at most {MAX_MAP_BYTES}",
-        )

@@ -1,7 +1,5 @@
 """Cells of a lattice, named by integer coordinates."""
 
-from collections.abc import Iterator
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,14 +15,6 @@ def cells_of_boxes(first: Longs, last: Longs) -> tuple[Longs, NDArray[np.intp]]:
         cells.append(cell[inside])
         rows.append(inside)
     return np.concatenate(cells), np.concatenate(rows)
-
-
-def rows_by_cell(cells: Longs) -> Iterator[tuple[Longs, NDArray[np.intp]]]:
-    """Yield each different cell [3] of ``cells`` [N, 3], in order, with its ascending rows [K]."""
-    different, numbers = np.unique(cells, axis=0, return_inverse=True)
-    ends = np.cumsum(np.bincount(numbers.reshape(-1)))
-    rows = np.split(np.argsort(numbers.reshape(-1), kind="stable"), ends)
-    return zip(different, rows, strict=False)  # nothing is left behind the last end
 
 
 def cell_names(cells: Longs) -> Longs:

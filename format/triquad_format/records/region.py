@@ -5,16 +5,17 @@ level ``l`` a node has side ``2**(depth - l)`` leaves; vertex ``(a, b)`` of a pl
 ``(a, b) * 2**(depth - l)``. Evidence voxels have the side of a leaf.
 """
 
+import math
 from dataclasses import dataclass, field
 from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
 
+from triquad_format.errors import FormatError
 from triquad_format.records import morton
 from triquad_format.records.arrays import Bytes, Floats, Ints, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings, RegionIndex
-from triquad_format.records.map_progress import MapProgress
 from triquad_format.records.replay_rays import ReplayRays, no_rays
 
 AXES = ((0, 1), (0, 2), (1, 2))
@@ -139,6 +140,23 @@ class Region:
         """Learnable numbers: features, weights and biases."""
         features = sum(table.features.size for table in self.tables)
         return features + sum(array.size for array in (*self.mlp.weights, *self.mlp.biases))
+
+
+@dataclass(frozen=True)
+class MapProgress:
+    """The progress of a map. It goes on with the map, whichever process goes on with it."""
+
+    scans_taken: int = 0
+    samples_trained: int = 0
+    loss: float = 0.0  # recent training loss; 0 before any training
+
+    def check(self) -> None:
+        """Raise :class:`FormatError`, naming the field, unless the numbers are possible."""
+        for name in ("scans_taken", "samples_trained"):
+            if not 0 <= getattr(self, name) < 2**62:
+                raise FormatError(f"{name} = {getattr(self, name)} is not a count below 2**62")
+        if not (math.isfinite(self.loss) and self.loss >= 0):
+            raise FormatError(f"loss = {self.loss} is not a loss: use a finite number from 0 on")
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import numpy as np
 
 from triquad_format.records import morton
 from triquad_format.records.arrays import Doubles
-from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
+from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import Evidence, MapRecord, Region, masked, seen_voxels
 
 
@@ -13,27 +13,6 @@ def owned_evidence(settings: FieldSettings, region: Region) -> Evidence:
     blocks, mine = morton.decode(region.evidence.codes, 3), settings.owned_blocks
     owned = ((blocks >= mine.start) & (blocks < mine.stop)).all(axis=1, keepdims=True)
     return masked(region.evidence, np.where(owned, np.uint8(0xFF), np.uint8(0)))
-
-
-def evidence_box(settings: FieldSettings, region: Region) -> Doubles | None:
-    """Return the box [2, 3] around a region's evidence, to whole blocks, metres, map frame.
-
-    ``None`` where there is no evidence.
-    """
-    if not len(region.evidence.codes):
-        return None
-    blocks = morton.decode(region.evidence.codes, 3)
-    ends = np.stack([blocks.min(axis=0), blocks.max(axis=0) + 1])
-    return settings.region_corner(region.index) + ends * (settings.leaf_m * BLOCK_VOXELS)
-
-
-def evidence_bounds(record: MapRecord) -> Doubles | None:
-    """Return the same box around all that rays have shown of a map."""
-    found = [evidence_box(record.settings, region) for region in record.regions]
-    boxes = [box for box in found if box is not None]
-    if not boxes:
-        return None
-    return np.array([np.min(boxes, axis=(0, 1)), np.max(boxes, axis=(0, 1))])
 
 
 def surface_voxels(record: MapRecord) -> Doubles:

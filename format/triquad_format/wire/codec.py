@@ -13,7 +13,7 @@ import types
 import typing
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar, get_args, get_origin
+from typing import Any, ClassVar, Generic, TypeVar, get_args, get_origin
 
 import msgpack
 import numpy as np
@@ -38,6 +38,7 @@ _MAX_DIMENSIONS = 4
 _MAX_SIZE = 2**40  # of an array along one axis, and of all axes together
 
 MessageT = TypeVar("MessageT", bound="Message")
+ReplyT = TypeVar("ReplyT", bound="Message")
 
 
 class Message:
@@ -48,7 +49,28 @@ class Message:
     def forms(cls) -> dict[str, "Form"]:
         """Return how each field travels, by its name."""
         annotations = typing.get_type_hints(cls, include_extras=True)
-        return {name: _form(annotation) for name, annotation in annotations.items()}
+        fields = dataclasses.fields(typing.cast(Any, cls))
+        return {field.name: _form(annotations[field.name]) for field in fields}
+
+
+class Request(Message, Generic[ReplyT]):
+    """A message that a server answers; its class says what with, and on which key it travels.
+
+    Bulky ones go in the ``background``: a reply has the priority of its request, and a slow reader
+    of large replies must not delay the distance queries of others.
+    """
+
+    operation: ClassVar[str]  # of triquad_format.wire.keys
+    reply: ClassVar[type[Message]]
+    background: ClassVar[bool]
+    least_wait_s: ClassVar[float]  # the least time for which a client waits for the reply
+
+    def __init_subclass__(
+        cls, *, operation: str, background: bool = False, least_wait_s: float = 0.0
+    ) -> None:
+        super().__init_subclass__()
+        (cls.reply,) = get_args(cls.__dict__["__orig_bases__"][0])
+        cls.operation, cls.background, cls.least_wait_s = operation, background, least_wait_s
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,8 @@ import re
 from triquad_format.errors import FormatError
 from triquad_format.wire.codec import PROTOCOL_VERSION, Message
 
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+NAME = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}"
+"""The form of the name of a map or a source."""
 
 EVERY_MAP = "*"
 """The wildcard for a map's name in key expressions of all maps."""
@@ -41,7 +42,7 @@ RESET = "admin/reset"
 
 def is_name(name: str) -> bool:
     """Return whether a map or source can have this name."""
-    return _NAME.fullmatch(name) is not None
+    return re.fullmatch(NAME, name) is not None
 
 
 def check_name(kind: str, name: str) -> str:

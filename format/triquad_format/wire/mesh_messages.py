@@ -3,8 +3,18 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from triquad_format.wire.codec import MAX_MESSAGE_BYTES, Message
-from triquad_format.wire.limits import MAX_CELL_M, MAX_TILE_M, MIN_LENGTH_M, TILE_INDEX_LIMIT
+from triquad_format.wire import keys
+from triquad_format.wire.bounds import asked_by, parts_of, rows, rows_of, within
+from triquad_format.wire.codec import MAX_MESSAGE_BYTES, Message, Request
+from triquad_format.wire.limits import (
+    LEVELS,
+    MAX_CELL_M,
+    MAX_FILL_M,
+    MAX_TILE_M,
+    MAX_TILES_ASKED,
+    MIN_LENGTH_M,
+    TILE_INDEX_LIMIT,
+)
 from triquad_format.wire.messages import (
     Epoch,
     Epochs,
@@ -14,21 +24,12 @@ from triquad_format.wire.messages import (
     Point,
     StatusCodes,
     TileIndices,
+    UpperCorner,
 )
-from triquad_format.wire.reply import asked_by, parts_of, rows_of, within
 
 _IN_RANGE = within(-TILE_INDEX_LIMIT, TILE_INDEX_LIMIT)
-
-
-@dataclass(frozen=True)
-class TileListRequest(Message):
-    """Ask which mesh tiles meet a box of the map frame; an open side is infinite."""
-
-    minimum: Point
-    maximum: Point
-    epoch: int
-    level: int = 0  # of detail: cells are 2**level times as large as those of level 0
-    fill_m: float = 0.0  # tiles with surface that is continued up to so far, too
+Level = Annotated[int, within(0, LEVELS - 1)]  # of detail
+FillLength = Annotated[float, within(0, MAX_FILL_M)]
 
 
 @dataclass(frozen=True)
@@ -41,13 +42,14 @@ class TileList(MapReply):
 
 
 @dataclass(frozen=True)
-class MeshRequest(Message):
-    """The mesh of some tiles."""
+class TileListRequest(Request[TileList], operation=keys.TILE_LIST, background=True):
+    """Ask which mesh tiles meet a box of the map frame; an open side is infinite."""
 
-    tiles: TileIndices  # [T, 3], 1 to MAX_TILES_ASKED
-    epoch: int  # 0: as they are followed, each made when its surface last changed
-    level: int = 0  # of detail
-    fill_m: float = 0.0  # how far from seen surface it is continued into unknown space; 0: not
+    minimum: Point
+    maximum: UpperCorner
+    epoch: int
+    level: Level = 0  # of detail: cells are 2**level times as large as those of level 0
+    fill_m: FillLength = 0.0  # tiles with surface that is continued up to so far, too
 
 
 @dataclass(frozen=True)
@@ -67,14 +69,13 @@ class MeshReply(MapReply):
 
 
 @dataclass(frozen=True)
-class TileChangesRequest(Message):
-    """Ask in which mesh tiles of a box the surface changed since an epoch of a server."""
+class MeshRequest(Request[MeshReply], operation=keys.MESH, background=True):
+    """The mesh of some tiles."""
 
-    minimum: Point
-    maximum: Point  # of the box, map frame; an open side is infinite
-    level: int  # of detail
-    server: str  # of the reply before, whose epoch is ``since``; empty at first
-    since: int  # every tile of the box is known as of this epoch; 0: none is
+    tiles: Annotated[TileIndices, _IN_RANGE, rows(1, MAX_TILES_ASKED)]  # [T, 3]
+    epoch: int  # 0: as they are followed, each made when its surface last changed
+    level: Level = 0
+    fill_m: FillLength = 0.0  # how far from seen surface it is continued into unknown space; 0: not
 
 
 @dataclass(frozen=True)
@@ -91,3 +92,14 @@ class TileChanges(Message):
     tiles: Annotated[TileIndices, _IN_RANGE]
     # [T] the surface of each last changed in this epoch
     changed: Annotated[Epochs, rows_of("tiles")]
+
+
+@dataclass(frozen=True)
+class TileChangesRequest(Request[TileChanges], operation=keys.TILE_CHANGES, background=True):
+    """Ask in which mesh tiles of a box the surface changed since an epoch of a server."""
+
+    minimum: Point
+    maximum: UpperCorner  # of the box, map frame; an open side is infinite
+    level: Level
+    server: str  # of the reply before, whose epoch is ``since``; empty at first
+    since: int  # every tile of the box is known as of this epoch; 0: none is

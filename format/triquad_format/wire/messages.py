@@ -13,16 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triquad_format.errors import WireError
-from triquad_format.wire.codec import ArraySpec, Message, decode
-from triquad_format.wire.limits import MAX_CHUNK_BYTES
-from triquad_format.wire.reply import (
+from triquad_format.wire import keys
+from triquad_format.wire.bounds import (
     MAX_COUNT,
     asked_by,
+    corner_above,
     rows_of,
     same_as_asked,
     text,
     within,
 )
+from triquad_format.wire.codec import ArraySpec, Message, Request, decode
+from triquad_format.wire.limits import MAX_CHUNK_BYTES, MAX_SEQUENCE, WRITES_S
 
 MAX_ORIGIN_BYTES = 1024
 """A longer attachment is not read."""
@@ -37,7 +39,7 @@ Pose = Annotated[NDArray[np.float64], ArraySpec("<f8", (4, 4))]
 TileIndices = Annotated[NDArray[np.int32], ArraySpec("<i4", (None, 3))]
 Integers = Annotated[NDArray[np.int64], ArraySpec("<i8", (None,))]
 
-# What replies contain, within its bounds: triquad_format.wire.reply.
+# Fields with their bounds: triquad_format.wire.bounds.
 Count = Annotated[int, within(0, MAX_COUNT)]
 Epoch = Annotated[int, within(0, MAX_COUNT)]
 Epochs = Annotated[Integers, within(0, MAX_COUNT)]
@@ -48,6 +50,7 @@ FinitePositions = Annotated[Positions, within()]
 FinitePoints = Annotated[NDArray[np.float64], ArraySpec("<f8", (None, 3)), within()]
 Lengths = Annotated[Values, within(0)]
 Name = Annotated[str, text(256)]
+UpperCorner = Annotated[Point, corner_above("minimum")]
 Digest = Annotated[str, text(64, form="[0-9a-f]{64}")]  # SHA-256
 
 
@@ -78,16 +81,6 @@ class MapReply(Message):
 
 
 @dataclass(frozen=True)
-class SdfRequest(Message):
-    """Signed distance, status and, on request, gradient at points of the map frame."""
-
-    origin: Point  # metres, map frame
-    points: Positions  # [N, 3] metres, relative to origin
-    gradient: bool
-    epoch: int
-
-
-@dataclass(frozen=True)
 class SdfReply(MapReply):
     """Answer to :class:`SdfRequest`."""
 
@@ -99,8 +92,13 @@ class SdfReply(MapReply):
 
 
 @dataclass(frozen=True)
-class StatusRequest(Message):
-    """Ask how the server is doing."""
+class SdfRequest(Request[SdfReply], operation=keys.SDF):
+    """Signed distance, status and, on request, gradient at points of the map frame."""
+
+    origin: Point  # metres, map frame
+    points: Positions  # [N, 3] metres, relative to origin
+    gradient: bool
+    epoch: int
 
 
 @dataclass(frozen=True)
@@ -168,13 +166,8 @@ class ServerStatus(Message):
 
 
 @dataclass(frozen=True)
-class FlushRequest(Message):
-    """Ask whether the scan ``sequence`` of this source and session has been dealt with."""
-
-    source: str
-    session: int
-    sequence: int
-    waited_s: float  # how long ago this was first asked
+class StatusRequest(Request[ServerStatus], operation=keys.STATUS):
+    """Ask how the server is doing."""
 
 
 @dataclass(frozen=True)
@@ -190,16 +183,18 @@ class FlushReply(Message):
 
 
 @dataclass(frozen=True)
-class CheckpointRequest(Message):
-    """Write a checkpoint now; answered with :class:`CheckpointInfo` once it is on disk."""
+class FlushRequest(Request[FlushReply], operation=keys.FLUSH):
+    """Ask whether the scan ``sequence`` of this source and session has been dealt with."""
+
+    source: Annotated[str, text(64, form=keys.NAME)]
+    session: int
+    sequence: Annotated[int, within(0, MAX_SEQUENCE)]
+    waited_s: Duration  # how long ago this was first asked
 
 
 @dataclass(frozen=True)
-class ResetRequest(Message):
-    """Forget what was learnt within a box of the map frame; infinite sides are allowed."""
-
-    minimum: Point
-    maximum: Point
+class CheckpointRequest(Request[CheckpointInfo], operation=keys.CHECKPOINT, least_wait_s=WRITES_S):
+    """Write a checkpoint now; answered with :class:`CheckpointInfo` once it is on disk."""
 
 
 @dataclass(frozen=True)
@@ -212,10 +207,11 @@ class ResetReply(Message):
 
 
 @dataclass(frozen=True)
-class MapInfoRequest(Message):
-    """Prepare the newest epoch as a map file for download."""
+class ResetRequest(Request[ResetReply], operation=keys.RESET, least_wait_s=WRITES_S):
+    """Forget what was learnt within a box of the map frame; infinite sides are allowed."""
 
-    training: bool  # with the state that training needs to go on
+    minimum: Point
+    maximum: UpperCorner
 
 
 @dataclass(frozen=True)
@@ -230,20 +226,29 @@ class MapInfo(Message):
 
 
 @dataclass(frozen=True)
-class MapChunkRequest(Message):
-    """Bytes ``[offset, offset + length)`` of the map file with this digest."""
+class MapInfoRequest(
+    Request[MapInfo], operation=keys.MAP_INFO, background=True, least_wait_s=WRITES_S
+):
+    """Prepare the newest epoch as a map file for download."""
 
-    sha256: str
-    offset: int
-    length: int  # at most chunk_bytes are sent
+    training: bool  # with the state that training needs to go on
 
 
 @dataclass(frozen=True)
 class MapChunk(Message):
     """Answer to :class:`MapChunkRequest`."""
 
-    offset: Annotated[int, same_as_asked("offset")]
+    offset: Annotated[int, same_as_asked("offset", any_for=None)]
     data: Annotated[bytes, asked_by("length")]
+
+
+@dataclass(frozen=True)
+class MapChunkRequest(Request[MapChunk], operation=keys.MAP_CHUNK, background=True):
+    """Bytes ``[offset, offset + length)`` of the map file with this digest."""
+
+    sha256: str
+    offset: int
+    length: int  # at most chunk_bytes are sent
 
 
 @dataclass(frozen=True)

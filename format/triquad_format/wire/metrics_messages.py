@@ -11,16 +11,12 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from triquad_format.wire.codec import ArraySpec, Message
+from triquad_format.wire import keys
+from triquad_format.wire.bounds import MAX_COUNT, rows_of, within
+from triquad_format.wire.codec import ArraySpec, Message, Request
 from triquad_format.wire.messages import Count, Duration, Epoch, Integers, Name
-from triquad_format.wire.reply import MAX_COUNT, rows_of, within
 
 Seconds = Annotated[NDArray[np.float64], ArraySpec("<f8", (None,))]
-
-
-@dataclass(frozen=True)
-class MetricsRequest(Message):
-    """Ask how the server is doing, in figures."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +96,6 @@ class ServerMetrics(Message):
     queues: dict[Name, QueueMetrics]
     sources: dict[Name, SourceMetrics]  # by name; "*" is of those there are too many of
     scan_bytes_received: Count
-    memory_bytes: dict[Name, Count]  # by part
     resident_bytes: Count  # memory of the whole process
     mapper_s: dict[Name, Duration]  # how the mapper's thread spent its time, by activity
     checkpoints: CheckpointMetrics
@@ -143,3 +138,8 @@ def _quantile(bounds: NDArray[np.float64], counts: NDArray[np.int64], share: flo
     within = (wanted - (reached[bucket] - counts[bucket])) / counts[bucket]
     # Rounding must not take it beyond its bucket.
     return float(min(low + within * (bounds[bucket] - low), bounds[bucket]))
+
+
+@dataclass(frozen=True)
+class MetricsRequest(Request[ServerMetrics], operation=keys.METRICS):
+    """Ask how the server is doing, in figures."""

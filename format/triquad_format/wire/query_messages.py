@@ -1,4 +1,4 @@
-"""The wire messages of questions about the map and its sources.
+"""The wire messages of questions about the map.
 
 All of a reply comes from one epoch. Flags are 0 or 1. What was not found has a flag that says so:
 no number stands for it.
@@ -10,12 +10,28 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from triquad_format.wire.codec import ArraySpec, Message
-from triquad_format.wire.limits import MAX_DISTANCE_M, MAX_ITERATIONS, MAX_RANGE_M
+from triquad_format.wire import keys
+from triquad_format.wire.bounds import (
+    MAX_COUNT,
+    asked_by,
+    rigid_pose,
+    rows_of,
+    same_as_asked,
+    shape_asked_by,
+    within,
+)
+from triquad_format.wire.codec import ArraySpec, Request
+from triquad_format.wire.limits import (
+    MAX_DISTANCE_M,
+    MAX_ITERATIONS,
+    MAX_RANGE_M,
+    MIN_LENGTH_M,
+)
 from triquad_format.wire.messages import (
     Count,
     Epoch,
     Epochs,
+    FinitePoints,
     FinitePositions,
     Integers,
     Length,
@@ -25,43 +41,21 @@ from triquad_format.wire.messages import (
     Pose,
     Positions,
     Statuses,
+    UpperCorner,
     Values,
-)
-from triquad_format.wire.reply import (
-    MAX_COUNT,
-    asked_by,
-    at_most_asked,
-    rigid_pose,
-    rows_of,
-    same_as_asked,
-    shape_asked_by,
-    within,
 )
 
 Flags = Annotated[NDArray[np.uint8], ArraySpec("|u1", (None,))]
 Volume = Annotated[NDArray[np.float32], ArraySpec("<f4", (None, None, None))]
 StatusVolume = Annotated[NDArray[np.uint8], ArraySpec("|u1", (None, None, None))]
 Counts = Annotated[NDArray[np.int32], ArraySpec("<i4", (3,))]
-Corners = Annotated[NDArray[np.float64], ArraySpec("<f8", (None, 3))]
 Covariance = Annotated[NDArray[np.float64], ArraySpec("<f8", (6, 6))]
 
 UnitVectors = Annotated[Positions, within(-1.001, 1.001)]  # or zero
 Shares = Annotated[Values, within(0, 1)]
 TruthValues = Annotated[Flags, within(0, 1)]
-FiniteCorners = Annotated[Corners, within()]
+Reach = Annotated[float, within(MIN_LENGTH_M, MAX_DISTANCE_M)]  # of a search, metres
 PlacesAlong = Annotated[Values, within(0, 1.001 * MAX_RANGE_M), asked_by("starts")]
-
-
-@dataclass(frozen=True)
-class DistanceRequest(Message):
-    """True distances to the nearest seen surface, at any range."""
-
-    origin: Point  # metres, map frame
-    points: Positions  # [N, 3] metres, relative to origin
-    max_distance_m: float  # a surface is searched for up to here
-    surface_point: bool  # the nearest points of the surface are wanted, too
-    unknown_distance: bool  # so is the nearest unknown space
-    epoch: int
 
 
 @dataclass(frozen=True)
@@ -85,12 +79,14 @@ class DistanceReply(MapReply):
 
 
 @dataclass(frozen=True)
-class SpheresRequest(Message):
-    """Ask what spheres contain."""
+class DistanceRequest(Request[DistanceReply], operation=keys.DISTANCE):
+    """True distances to the nearest seen surface, at any range."""
 
     origin: Point  # metres, map frame
-    centres: Positions  # [N, 3] metres, relative to origin
-    radii_m: Values  # [N] metres
+    points: Positions  # [N, 3] metres, relative to origin
+    max_distance_m: Reach  # a surface is searched for up to here
+    surface_point: bool  # the nearest points of the surface are wanted, too
+    unknown_distance: bool  # so is the nearest unknown space
     epoch: int
 
 
@@ -102,14 +98,12 @@ class SpheresReply(MapReply):
 
 
 @dataclass(frozen=True)
-class SegmentsRequest(Message):
-    """Ask what a ball meets that moves along segments."""
+class SpheresRequest(Request[SpheresReply], operation=keys.SPHERES):
+    """Ask what spheres contain."""
 
     origin: Point  # metres, map frame
-    starts: Positions  # [N, 3] metres, relative to origin
-    ends: Positions  # [N, 3]
-    radius_m: float  # of the ball
-    max_distance_m: float  # clearance is searched for up to here
+    centres: Positions  # [N, 3] metres, relative to origin
+    radii_m: Annotated[Values, within(0, MAX_DISTANCE_M), rows_of("centres")]  # [N] metres
     epoch: int
 
 
@@ -129,14 +123,14 @@ class SegmentsReply(MapReply):
 
 
 @dataclass(frozen=True)
-class RaysRequest(Message):
-    """Ask how far rays reach."""
+class SegmentsRequest(Request[SegmentsReply], operation=keys.SEGMENTS):
+    """Ask what a ball meets that moves along segments."""
 
     origin: Point  # metres, map frame
     starts: Positions  # [N, 3] metres, relative to origin
-    directions: Positions  # [N, 3] unit vectors, map frame
-    max_range_m: float
-    through_unknown: bool  # unknown space does not stop them
+    ends: Annotated[Positions, rows_of("starts")]  # [N, 3]
+    radius_m: Annotated[float, within(0, MAX_DISTANCE_M)]  # of the ball
+    max_distance_m: Reach  # clearance is searched for up to here
     epoch: int
 
 
@@ -150,12 +144,14 @@ class RaysReply(MapReply):
 
 
 @dataclass(frozen=True)
-class GroundRequest(Message):
-    """The ground below points."""
+class RaysRequest(Request[RaysReply], operation=keys.RAYS):
+    """Ask how far rays reach."""
 
     origin: Point  # metres, map frame
-    points: Positions  # [N, 3] metres, relative to origin
-    max_drop_m: float  # the ground is searched for up to here
+    starts: Positions  # [N, 3] metres, relative to origin
+    directions: Annotated[Positions, rows_of("starts")]  # [N, 3] unit vectors, map frame
+    max_range_m: Annotated[float, within(MIN_LENGTH_M, MAX_RANGE_M)]
+    through_unknown: bool  # unknown space does not stop them
     epoch: int
 
 
@@ -174,13 +170,12 @@ class GroundReply(MapReply):
 
 
 @dataclass(frozen=True)
-class GridRequest(Message):
-    """Distance and status at the middles of a grid's cells."""
+class GroundRequest(Request[GroundReply], operation=keys.GROUND):
+    """The ground below points."""
 
-    corner: Point  # the grid's least corner, metres, map frame
-    cell_m: float
-    counts: Counts  # cells along x, y, z
-    max_distance_m: float
+    origin: Point  # metres, map frame
+    points: Positions  # [N, 3] metres, relative to origin
+    max_drop_m: Reach  # the ground is searched for up to here
     epoch: int
 
 
@@ -196,12 +191,13 @@ class GridReply(MapReply):
 
 
 @dataclass(frozen=True)
-class AlignRequest(Message):
-    """Find the pose of a scan near a guess."""
+class GridRequest(Request[GridReply], operation=keys.GRID):
+    """Distance and status at the middles of a grid's cells."""
 
-    points: Positions  # [N, 3] metres, sensor frame
-    world_from_sensor: Pose  # the guess
-    max_distance_m: float  # points farther from any surface do not count
+    corner: Annotated[Point, within()]  # the grid's least corner, metres, map frame
+    cell_m: Reach
+    counts: Annotated[Counts, within(1)]  # cells along x, y, z
+    max_distance_m: Reach
     epoch: int
 
 
@@ -220,13 +216,13 @@ class AlignReply(MapReply):
 
 
 @dataclass(frozen=True)
-class ChangesRequest(Message):
-    """Ask where surface appeared or vanished since an epoch."""
+class AlignRequest(Request[AlignReply], operation=keys.ALIGN):
+    """Find the pose of a scan near a guess."""
 
-    since: int  # number of an epoch; 0: the newest, after which nothing has changed yet
-    server: str  # of the reply or status that named it; empty where that is not known
-    minimum: Point
-    maximum: Point  # of the box that is of interest, map frame; an open side is infinite
+    points: Positions  # [N, 3] metres, sensor frame
+    world_from_sensor: Annotated[Pose, rigid_pose()]  # the guess
+    max_distance_m: Reach  # points farther from any surface do not count
+    epoch: int
 
 
 @dataclass(frozen=True)
@@ -235,8 +231,8 @@ class ChangesReply(MapReply):
 
     server: Name
     since: Annotated[Epoch, same_as_asked("since")]
-    minimum: FiniteCorners  # [N, 3] metres, map frame
-    maximum: Annotated[FiniteCorners, rows_of("minimum")]  # [N, 3]
+    minimum: FinitePoints  # [N, 3] metres, map frame
+    maximum: Annotated[FinitePoints, rows_of("minimum")]  # [N, 3]
     # [N] 1: surface appeared, 0: it vanished
     appeared: Annotated[TruthValues, rows_of("minimum")]
     epochs: Annotated[Epochs, rows_of("minimum")]  # [N] of the newest change in each
@@ -245,40 +241,11 @@ class ChangesReply(MapReply):
 
 
 @dataclass(frozen=True)
-class SourcesRequest(Message):
-    """Ask where the sources of scans have been, and for the newest scan of each."""
+class ChangesRequest(Request[ChangesReply], operation=keys.CHANGES):
+    """Ask where surface appeared or vanished since an epoch."""
 
-    server: str  # of the reply before, to which revision belongs; empty at first
-    revision: int  # of the reply before, which is not sent again; 0 at first
-    max_points: int  # of each newest scan
-
-
-@dataclass(frozen=True)
-class ScanSample(Message):
-    """Some of the points of a scan that is in the map."""
-
-    stamp_ns: int  # nanoseconds since 1970, as its publisher said
-    world_from_sensor: Annotated[Pose, rigid_pose()]
-    # [N, 3] metres, map frame, relative to the sensor's position
-    points: Annotated[FinitePositions, at_most_asked("max_points")]
-    points_used: Count  # of the scan, by the map: N or more
-
-
-@dataclass(frozen=True)
-class SourceState(Message):
-    """One source of scans."""
-
-    scans: Count  # that were accepted into the map since the server heard of the source
-    trail: FiniteCorners  # [N, 3] metres, map frame: positions of the sensor, oldest first
-    # [N] the piece of the trail each is part of: rises where the sensor jumped
-    pieces: Annotated[Integers, within(0, MAX_COUNT), rows_of("trail")]
-    newest: ScanSample | None  # None: a reset forgot it, and no scan has come since
-
-
-@dataclass(frozen=True)
-class SourcesReply(Message):
-    """Answer to :class:`SourcesRequest`."""
-
-    server: Name
-    revision: Count  # for the next request
-    sources: dict[Name, SourceState] | None  # all, by name; None: as in the reply before
+    # number of an epoch; 0: the newest, after which nothing has changed yet
+    since: Annotated[int, within(0)]
+    server: str  # of the reply or status that named it; empty where that is not known
+    minimum: Point
+    maximum: UpperCorner  # of the box that is of interest, map frame; an open side is infinite

@@ -11,10 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.errors import RefusedError
 from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
 from triquad_format.records.cells import cells_of_boxes
-from triquad_format.wire.limits import LEVELS
 
 from triquad_map.compiled.kernel import kernel
 
@@ -65,16 +63,6 @@ class TileLattice:
         """
         boxes = _each_once(_tile_boxes(low, high, margin_m, self.tile_side_m))
         return _each_once(cells_of_boxes(boxes[:, :3], boxes[:, 3:])[0])
-
-
-def check_level(level: int) -> None:
-    """Refuse a level of detail that there is not.
-
-    Raises:
-        RefusedError: there is no such level.
-    """
-    if not 0 <= level < LEVELS:
-        raise RefusedError("bad_request", f"level = {level} is out of range: use 0 to {LEVELS - 1}")
 
 
 def _each_once(rows: Longs) -> Longs:

@@ -5,17 +5,14 @@ A server answers with this from its epochs, and a client from a map file: so the
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from triquad_format.errors import RefusedError
 from triquad_format.records.arrays import Doubles, Floats
-from triquad_format.records.pose import is_rigid
-from triquad_format.wire import keys
-from triquad_format.wire.codec import Message
+from triquad_format.wire.codec import ReplyT, Request
 from triquad_format.wire.limits import (
-    MAX_DISTANCE_M,
+    MAX_POSITION_M,
     MAX_QUERY_POINTS,
     MAX_RANGE_M,
     MAX_SEARCHES,
@@ -40,7 +37,6 @@ from triquad_format.wire.query_messages import (
     SpheresRequest,
 )
 
-from triquad_map.questions import checks
 from triquad_map.questions.align import align
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.questions.grid import GridShape, grid
@@ -50,7 +46,7 @@ from triquad_map.questions.segments import segments
 from triquad_map.questions.spheres import spheres
 from triquad_map.view import MapView
 
-ReplyT = TypeVar("ReplyT", bound=Message)
+_DECIMALS = 5  # of positions, metres
 
 Views = Callable[[int], AbstractContextManager[MapView]]
 """The map of the epoch of some number, 0 for the newest, while it is asked."""
@@ -59,24 +55,26 @@ Views = Callable[[int], AbstractContextManager[MapView]]
 class Answers:
     """Answers questions; as many threads may ask as the views allow.
 
-    Whatever is asked for, :class:`RefusedError` says which argument is out of bounds.
+    Whatever is asked for, :class:`RefusedError` says which argument cannot be used.
     """
 
     def __init__(self, views: Views) -> None:
         self._view = views
 
-    def answer(self, request: Message) -> Message:
-        """Return the answer to a question of any kind.
+    def answer(self, request: Request[ReplyT]) -> ReplyT:
+        """Return the answer to a question of any kind, whose fields are within their bounds.
 
         Raises:
-            RefusedError: an argument is out of bounds, or its epoch is not kept.
+            RefusedError: it is too large, what it says does not go together, or its epoch is not
+                kept.
             KeyError: it is no question about the map.
         """
-        return _ANSWERS[type(request)](self, request)
+        reply: ReplyT = QUESTIONS[type(request)](self, request)
+        return reply
 
     def sdf(self, request: SdfRequest) -> SdfReply:
         """Return the trained field, and status."""
-        points = checks.points("point", request.origin, request.points, most=MAX_QUERY_POINTS)
+        points = _points("point", request.origin, request.points, most=MAX_QUERY_POINTS)
         with self._view(request.epoch) as view:
             answer = view.query(points, request.gradient)
             return _reply(SdfReply, answer, epoch=view.epoch)
@@ -84,8 +82,9 @@ class Answers:
     def distance(self, request: DistanceRequest) -> DistanceReply:
         """Return distances to the nearest surface."""
         points = _searched("point", request.origin, request.points)
-        reach_m = checks.within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M)
-        options = DistanceOptions(reach_m, request.surface_point, request.unknown_distance)
+        options = DistanceOptions(
+            request.max_distance_m, request.surface_point, request.unknown_distance
+        )
         with self._view(request.epoch) as view:
             answer = distances(view, points, options)
         return _reply(
@@ -98,14 +97,6 @@ class Answers:
     def spheres(self, request: SpheresRequest) -> SpheresReply:
         """Return what spheres contain."""
         centres = _searched("sphere", request.origin, request.centres)
-        checks.same_length(request.centres, "radii_m", request.radii_m)
-        good = (request.radii_m >= 0) & (request.radii_m <= MAX_DISTANCE_M)
-        if not good.all():
-            worst = int((~good).argmax())
-            raise RefusedError(
-                "bad_request",
-                f"radius {worst} is {request.radii_m[worst]}: use 0 to {MAX_DISTANCE_M:g} m",
-            )
         with self._view(request.epoch) as view:
             answer = spheres(view, centres, request.radii_m.astype(np.float64))
         return _reply(SpheresReply, answer)
@@ -113,10 +104,7 @@ class Answers:
     def segments(self, request: SegmentsRequest) -> SegmentsReply:
         """Return what a ball meets on segments."""
         starts = _searched("start", request.origin, request.starts)
-        checks.same_length(request.starts, "ends", request.ends)
         ends = _searched("end", request.origin, request.ends)
-        radius_m = checks.within("radius_m", request.radius_m, MAX_DISTANCE_M, least=0.0)
-        reach_m = checks.within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M)
         lengths = np.linalg.norm(ends - starts, axis=1)
         if lengths.max(initial=0.0) > MAX_RANGE_M:  # each step waits for the one before
             worst = int(lengths.argmax())
@@ -127,13 +115,14 @@ class Answers:
         total_m = float(lengths.sum())
         _check_count(total_m / SEGMENT_M_PER_SEARCH, f"segments of {total_m:.0f} m in all")
         with self._view(request.epoch) as view:
-            answer = segments(view, starts, ends, radius_m, max_distance_m=reach_m)
+            answer = segments(
+                view, starts, ends, request.radius_m, max_distance_m=request.max_distance_m
+            )
         return _reply(SegmentsReply, answer)
 
     def rays(self, request: RaysRequest) -> RaysReply:
         """Return how far rays reach."""
         starts = _searched("start", request.origin, request.starts)
-        checks.same_length(request.starts, "directions", request.directions)
         directions = request.directions.astype(np.float64)
         lengths = np.linalg.norm(directions, axis=1)
         bad = ~(np.abs(lengths - 1.0) < 1e-3)
@@ -142,7 +131,7 @@ class Answers:
             raise RefusedError(
                 "bad_request", f"direction {worst} has length {lengths[worst]:g}, not 1"
             )
-        reach_m = checks.within("max_range_m", request.max_range_m, MAX_RANGE_M)
+        reach_m = request.max_range_m
         _check_count(
             len(starts) * reach_m / RAY_M_PER_SEARCH, f"{len(starts)} rays of {reach_m:g} m"
         )
@@ -154,7 +143,7 @@ class Answers:
     def ground(self, request: GroundRequest) -> GroundReply:
         """Return what lies below points."""
         points = _searched("point", request.origin, request.points)
-        drop_m = checks.within("max_drop_m", request.max_drop_m, MAX_DISTANCE_M)
+        drop_m = request.max_drop_m
         _check_count(
             len(points) * drop_m / RAY_M_PER_SEARCH, f"{len(points)} points with {drop_m:g} m below"
         )
@@ -166,58 +155,62 @@ class Answers:
     def grid(self, request: GridRequest) -> GridReply:
         """Return distance and status at a grid's cells."""
         counts = (int(request.counts[0]), int(request.counts[1]), int(request.counts[2]))
-        cell_m = checks.within("cell_m", request.cell_m, MAX_DISTANCE_M)
-        if min(counts) < 1 or not np.isfinite(request.corner).all():
-            raise RefusedError(
-                "bad_request", f"not a grid: counts {counts}, corner {request.corner}"
-            )
-        shape = GridShape(request.corner, cell_m, counts)
+        shape = GridShape(request.corner, request.cell_m, counts)
         _check_count(shape.cells, f"{shape.cells} cells")
-        reach_m = checks.within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M)
         with self._view(request.epoch) as view:
-            answer = grid(view, shape, reach_m)
+            answer = grid(view, shape, request.max_distance_m)
         return _reply(GridReply, answer)
 
     def align(self, request: AlignRequest) -> AlignReply:
         """Return the pose of a scan near a guess."""
         _check_count(len(request.points), f"{len(request.points)} points")
-        if not is_rigid(request.world_from_sensor):
-            raise RefusedError(
-                "bad_request",
-                f"world_from_sensor is no rotation and translation: {request.world_from_sensor}",
-            )
-        reach_m = checks.within("max_distance_m", request.max_distance_m, MAX_DISTANCE_M)
         with self._view(request.epoch) as view:
             points = request.points.astype(np.float64)
-            answer = align(view, points, request.world_from_sensor, reach_m)
+            answer = align(view, points, request.world_from_sensor, request.max_distance_m)
         return _reply(AlignReply, answer)
 
 
-@dataclass(frozen=True)
-class Question:
-    """A question about the map: its message, and what makes the answer of it."""
-
-    request: type[Message]
-    answer: Callable[[Answers, Any], Message]
-
-
-QUESTIONS = {
-    keys.SDF: Question(SdfRequest, Answers.sdf),
-    keys.DISTANCE: Question(DistanceRequest, Answers.distance),
-    keys.SPHERES: Question(SpheresRequest, Answers.spheres),
-    keys.SEGMENTS: Question(SegmentsRequest, Answers.segments),
-    keys.RAYS: Question(RaysRequest, Answers.rays),
-    keys.GROUND: Question(GroundRequest, Answers.ground),
-    keys.GRID: Question(GridRequest, Answers.grid),
-    keys.ALIGN: Question(AlignRequest, Answers.align),
+QUESTIONS: dict[type[Request[Any]], Callable[[Answers, Any], Any]] = {
+    SdfRequest: Answers.sdf,
+    DistanceRequest: Answers.distance,
+    SpheresRequest: Answers.spheres,
+    SegmentsRequest: Answers.segments,
+    RaysRequest: Answers.rays,
+    GroundRequest: Answers.ground,
+    GridRequest: Answers.grid,
+    AlignRequest: Answers.align,
 }
-"""All questions about the map, by their operations."""
+"""All questions about the map, and what makes their answers."""
 
-_ANSWERS = {question.request: question.answer for question in QUESTIONS.values()}
+
+def _points(what: str, origin: Doubles, offsets: Floats, most: int) -> Doubles:
+    """Return the points [N, 3] at ``offsets`` [N, 3] from an origin [3], map frame.
+
+    Raises:
+        RefusedError: they are too many, or not all of them are places.
+    """
+    if len(offsets) > most:
+        raise RefusedError(
+            "too_large", f"{len(offsets)} points exceed the limit of {most}: split the request"
+        )
+    points = origin + offsets.astype(np.float64)
+    # Of NaN, neither is true.
+    if points.min(initial=0.0) >= -MAX_POSITION_M and points.max(initial=0.0) <= MAX_POSITION_M:
+        # Single precision from an origin is good to that. Unrounded, a point that somebody chose on
+        # a face of voxels would lie on one side or the other by what else is in the request.
+        rounded: Doubles = np.round(points, _DECIMALS)
+        return rounded
+    index = int((np.abs(points) <= MAX_POSITION_M).all(axis=1).argmin())
+    if not np.isfinite(points[index]).all():
+        raise RefusedError("bad_request", f"{what} {index} is not finite: {points[index]}")
+    raise RefusedError(
+        "bad_request",
+        f"{what} {index} is {points[index]}: use coordinates up to {MAX_POSITION_M:g} m",
+    )
 
 
 def _searched(what: str, origin: Doubles, offsets: Floats) -> Doubles:
-    return checks.points(what, origin, offsets, most=MAX_SEARCHES)
+    return _points(what, origin, offsets, most=MAX_SEARCHES)
 
 
 def _check_count(count: float, what: str) -> None:

@@ -1,13 +1,14 @@
-"""A published state of the map, and what it answers."""
+"""A published state of the map: what it answers, and the memory that it takes."""
 
 from collections import ChainMap
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
-from triquad_format.records.map_progress import MapProgress
-from triquad_format.records.region import MapRecord, Region
+from triquad_format.records.region import MapProgress, MapRecord, Region
 from triquad_map.compiled.team import Split, in_one
 from triquad_map.composition.composed_view import ComposedView
 from triquad_map.composition.shown_field import ShownField
@@ -16,7 +17,9 @@ from triquad_map.field.frozen_field import FrozenField
 from triquad_map.surfels.surfel_map import SurfelMap
 
 from triquad_server.engine.field_record import region_record
-from triquad_server.epochs.array_memory import Buffers
+
+Buffers = Mapping[int, int]
+"""The bytes of pieces of memory, by start address: arrays that share one count once."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +34,6 @@ class FrozenRegion:
     vertices: int
     parameters: int
     changed: int  # epoch of its last change
-    live_bytes: Mapping[str, int]  # by part, memory of the live region in addition to this one
     buffers: Buffers  # memory of this one; other epochs may share it
 
     @property
@@ -100,3 +102,45 @@ class Epoch(ComposedView):
         return MapRecord(
             self._name, self.number, self.field_settings, regions, progress=self.progress
         )
+
+
+def buffers_of(part: object) -> dict[int, int]:
+    """Return the memory of all arrays and tensors that a part of the program leads to.
+
+    It is an object, or containers of some, which must not change meanwhile; only those of classes
+    of this program are searched.
+    """
+    found: dict[int, int] = {}
+    visited: set[int] = set()
+    open_parts: list[Any] = [part]
+    while open_parts:
+        part = open_parts.pop()
+        if id(part) in visited:
+            continue
+        visited.add(id(part))
+        if isinstance(part, np.ndarray):
+            root = _root(part)
+            found[root.ctypes.data] = root.nbytes
+        elif hasattr(part, "untyped_storage"):  # a tensor, without need for torch
+            storage = part.untyped_storage()
+            found[storage.data_ptr()] = storage.nbytes()
+        else:
+            open_parts.extend(_within(part))
+    return found
+
+
+def _root(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    while isinstance(array.base, np.ndarray):
+        array = array.base
+    return array
+
+
+def _within(part: object) -> Iterable[object]:
+    """List the parts of a container or of an object of this program."""
+    if isinstance(part, (tuple, list)):
+        return part
+    if isinstance(part, dict):
+        return list(part.values())
+    if type(part).__module__.startswith("triquad_"):
+        return list(getattr(part, "__dict__", {}).values())
+    return ()

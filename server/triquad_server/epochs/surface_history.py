@@ -1,4 +1,4 @@
-"""Records where surface appeared and vanished, epoch by epoch, as far back as there is room."""
+"""Records where surface appeared and vanished, epoch by epoch, and tells it as boxes."""
 
 import threading
 from collections import deque
@@ -12,10 +12,19 @@ from triquad_format.errors import RefusedError
 from triquad_format.records.arrays import Bools, Bytes, Ints, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings, RegionIndex
 from triquad_format.records.region import BLOCK_BYTES
-from triquad_map.clusters import same_cells
+from triquad_format.wire.query_messages import ChangesReply, ChangesRequest
+from triquad_map.clusters import Boxes, same_cells, tight_boxes
 from triquad_map.compiled.voxel_index import cells_of
 
 from triquad_server.epochs.epoch import Epoch, FrozenRegion
+from triquad_server.epochs.history import EpochHistory
+
+MAX_BOXES = 256
+"""The most boxes of one reply. Where there would be more, voxels twice as far apart share one, and
+boxes may be twice as long, and so on."""
+
+_DECIMALS = 6  # of metres: further digits of a product mean nothing
+_LONGEST_VOXELS = 32  # 6.4 m with the default leaf
 
 
 @dataclass(frozen=True)
@@ -60,7 +69,6 @@ CHANGES_KEPT = 1_000_000
 """The number of changes of voxels' surface that are kept, for clients that request them: 13 bytes
 each."""
 
-_VOXEL_BYTES = 13  # three numbers of 32 bits, and whether it appeared
 _NO_VOXELS = np.zeros((0, 3), np.int32)
 
 
@@ -91,11 +99,6 @@ class SurfaceHistory:
                 forgotten = self._changes.popleft()
                 self._voxels -= len(forgotten.voxels)
                 self._oldest = forgotten.epoch
-
-    @property
-    def nbytes(self) -> int:
-        """The bytes of the changes that are kept."""
-        return self._voxels * _VOXEL_BYTES
 
     def between(self, since: int, until: int) -> VoxelChanges:
         """Return what differs between the epochs ``since`` and ``until``.
@@ -187,3 +190,95 @@ def _map_voxels(index: RegionIndex, keys: Longs, masks: Bytes, settings: FieldSe
     corner = np.rint(settings.region_corner(index) / settings.leaf_m).astype(np.int64)
     corners = (corner + cells[owned] * BLOCK_VOXELS).astype(np.int32)
     return corners[block] + np.stack(inner, axis=1, dtype=np.int32, casting="unsafe")
+
+
+class ChangeQueries:
+    """Answers what changed since an epoch."""
+
+    def __init__(self, epochs: EpochHistory, history: SurfaceHistory, server: str) -> None:
+        """Make the handler; ``server`` is the name that replies carry."""
+        self._epochs = epochs
+        self._history = history
+        self._server = server
+
+    def changes(self, request: ChangesRequest) -> ChangesReply:
+        """Return what changed in the request's box.
+
+        Raises:
+            RefusedError: it is not known what changed since then.
+        """
+        newest = self._epochs.newest
+        if request.server not in ("", self._server):
+            raise RefusedError(
+                "epoch_gone",
+                f"epoch {request.since} is one of server {request.server[:64]!r}, and this is "
+                f"{self._server!r}: it was restarted; ask for the map again, then for changes "
+                f"since its epoch, {newest.number} now or later",
+            )
+        since = request.since or newest.number
+        changes = self._history.between(since, newest.number)
+        inside = _inside(changes, request, newest)
+        return self._reply(_boxed(changes.part(inside)), since, newest)
+
+    def _reply(self, kinds: "list[_Boxed]", since: int, newest: Epoch) -> ChangesReply:
+        low, high = (
+            np.concatenate(corners) * newest.field_settings.leaf_m
+            for corners in zip(*((kind.boxes.low, kind.boxes.high) for kind in kinds), strict=True)
+        )
+        return ChangesReply(
+            epoch=newest.number,
+            server=self._server,
+            since=since,
+            minimum=low.round(_DECIMALS),
+            maximum=high.round(_DECIMALS),
+            appeared=np.concatenate([kind.appeared for kind in kinds]),
+            epochs=np.concatenate([kind.epochs for kind in kinds]),
+            voxels=np.concatenate([kind.counts for kind in kinds]),
+        )
+
+
+@dataclass(frozen=True)
+class _Boxed:
+    """The voxels that all appeared, or all vanished, and the boxes around them."""
+
+    voxels: VoxelChanges
+    boxes: Boxes
+
+    @property
+    def appeared(self) -> Bytes:
+        """Return 1 where surface appeared, 0 where it vanished, for each box."""
+        appeared = np.zeros(len(self.boxes.low), np.uint8)
+        appeared[self.boxes.box] = self.voxels.appeared
+        return appeared
+
+    @property
+    def epochs(self) -> Longs:
+        """Return the epoch of the newest change in each box."""
+        epochs = np.zeros(len(self.boxes.low), np.int64)
+        np.maximum.at(epochs, self.boxes.box, self.voxels.epochs)
+        return epochs
+
+    @property
+    def counts(self) -> Longs:
+        """Return the number of voxels in each box."""
+        return np.bincount(self.boxes.box, minlength=len(self.boxes.low)).astype(np.int64)
+
+
+def _boxed(changes: VoxelChanges) -> list[_Boxed]:
+    """Return boxes, few enough, around voxels that appeared, and around those that vanished."""
+    kinds = [changes.part(changes.appeared), changes.part(~changes.appeared)]
+    scale = 1
+    while True:
+        boxed = [
+            _Boxed(kind, tight_boxes(kind.voxels, _LONGEST_VOXELS, scale=scale)) for kind in kinds
+        ]
+        if sum(len(kind.boxes.low) for kind in boxed) <= MAX_BOXES:
+            return boxed
+        scale *= 2
+
+
+def _inside(changes: VoxelChanges, request: ChangesRequest, newest: Epoch) -> Bools:
+    """Return whether the middle of each voxel [N] lies in the request's box."""
+    middles = (changes.voxels + 0.5) * newest.field_settings.leaf_m
+    inside = (middles >= request.minimum) & (middles <= request.maximum)
+    return np.asarray(inside.all(axis=1))

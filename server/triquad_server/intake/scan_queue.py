@@ -1,16 +1,24 @@
-"""The queue of scans that wait for the mapper."""
+"""The intake of scans from the network, and their queue, in which they wait for the mapper."""
 
+import logging
 import threading
 import time
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import NamedTuple
 
+import zenoh
+from triquad_format.errors import FormatError, ProtocolVersionError, WireError
+from triquad_format.wire import codec, keys
+from triquad_format.wire.limits import payload_limit
 from triquad_format.wire.messages import Scan
 
+from triquad_server.errors import ScanRefusedError
 from triquad_server.fair_queue import FairQueue, Owner
-from triquad_server.intake.rays import ScanRays
+from triquad_server.intake.rays import ScanRays, check_count
 from triquad_server.intake.source_ledger import SourceLedger
+
+_log = logging.getLogger(__name__)
 
 MAX_SOURCES_WAITING = 64
 """The number of sources that may each have the full number of scans wait; more share that."""
@@ -58,11 +66,6 @@ class ScanQueue:
 
     def __len__(self) -> int:
         return len(self._scans) + self._in_hand
-
-    @property
-    def bytes_waiting(self) -> int:
-        """Return the bytes of the scans that wait."""
-        return self._scans.nbytes
 
     def put(self, scan: Scan) -> None:
         """Add a scan, unless its sequence or stamp refuses it."""
@@ -145,3 +148,78 @@ def _bytes_of(scan: Scan) -> int:
     return (
         _SCAN_BYTES + scan.points.nbytes + (0 if scan.no_return is None else scan.no_return.nbytes)
     )
+
+
+class ScanIntake:
+    """Receives scans from Zenoh, decodes them and puts them into the queue."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        map_name: str,
+        queue: ScanQueue,
+        *,
+        max_points: int,
+        arrived: Callable[[], None],
+    ) -> None:
+        """Begin to receive; ``arrived`` is called after each scan that was queued.
+
+        Scans of more than ``max_points`` points are refused here, before they wait.
+        """
+        self._max_points = max_points
+        self._queue = queue
+        self._arrived = arrived
+        # Decoded in the network's own threads: who sends too much is slowed down, and no other.
+        receive = zenoh.handlers.Callback(self._receive_safely, indirect=False)
+        self._subscriber = session.declare_subscriber(keys.all_scans_key(map_name), receive)
+
+    def close(self) -> None:
+        """Take no more scans."""
+        self._subscriber.undeclare()
+
+    def _receive_safely(self, sample: zenoh.Sample) -> None:
+        """Do as :meth:`_receive`; an internal error must not stop the intake of other scans."""
+        self._queue.receive(len(sample.payload))
+        try:
+            self._receive(str(sample.key_expr), sample.payload)
+        except MemoryError as error:
+            self._drop("no_memory", str(sample.key_expr), error)
+        except Exception:
+            self._queue.drop("internal")
+            _log.exception("a scan on %s could not be received", sample.key_expr)
+        self._arrived()
+
+    def _receive(self, key: str, payload: zenoh.ZBytes) -> None:
+        max_bytes = payload_limit(self._max_points)
+        if len(payload) > max_bytes:
+            self._drop("too_large", key, f"{len(payload)} bytes exceed {max_bytes}")
+            return
+        try:
+            scan = codec.decode(Scan, payload.to_bytes())
+        except ProtocolVersionError as error:
+            self._drop("bad_version", key, error)
+        except WireError as error:
+            self._drop("decode", key, error)
+        else:
+            self._enter(key, scan)
+
+    def _enter(self, key: str, scan: Scan) -> None:
+        """Put a decoded scan into the queue, if it is accepted."""
+        if key.rpartition("/")[2] != scan.source:
+            self._drop("key_source_mismatch", key, f"its source is {scan.source!r:.80}")
+            return
+        try:
+            keys.check_name("source", scan.source)
+        except FormatError as error:
+            self._drop("bad_source", key, error)
+            return
+        try:
+            check_count(scan.points, scan.no_return, self._max_points)
+        except ScanRefusedError as error:
+            self._queue.refuse(scan, error.reason, str(error))
+            return
+        self._queue.put(scan)
+
+    def _drop(self, reason: str, key: str, cause: object) -> None:
+        self._queue.drop(reason)
+        _log.debug("scan on %s dropped (%s): %s", key, reason, cause)

@@ -1,11 +1,13 @@
-"""Records what became of each scan, by source: taken, refused or lost."""
+"""Records what became of each scan, by source: taken, refused or lost; and answers who asks."""
 
 import threading
 import time
 from collections import OrderedDict, deque
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 
-from triquad_format.wire.messages import FlushReply, Scan
+from triquad_format.wire.limits import MAX_SEQUENCE
+from triquad_format.wire.messages import FlushReply, FlushRequest, Scan
 from triquad_format.wire.metrics_messages import SourceMetrics
 
 MAX_SESSIONS = 1024
@@ -13,11 +15,13 @@ MAX_SESSIONS = 1024
 
 MAX_SOURCES_LISTED = 64
 
-MAX_SEQUENCE = 2**48
-
 MAX_LEAP = 1_000_000
 """The most by which a sequence may lie above the last of its session: half a day of lost scans. One
 that lies farther ahead is forged or corrupt, and must not make those that follow seem old."""
+
+ARRIVAL_GRACE_S = 2.0
+"""A scan that has not arrived this many seconds after the first flush request, which travels the
+same way behind it, is lost."""
 
 FORGOTTEN = "*"
 """The name that stands for all forgotten sources where losses are listed."""
@@ -96,7 +100,7 @@ class SourceLedger:
     def arrive(self, scan: Scan) -> str | None:
         """Record a scan's arrival; return the reason if its sequence or stamp refuses it."""
         with self._lock:
-            if not 0 <= scan.sequence < MAX_SEQUENCE:
+            if not 0 <= scan.sequence <= MAX_SEQUENCE:
                 return "bad_sequence"
             session = self._session(scan)
             if 0 <= session.arrived < scan.sequence - MAX_LEAP:
@@ -228,3 +232,32 @@ def _of_stranger(source: str, sequence: int) -> FlushReply:
         "not let it publish as this source (a role names its sources), or the server was started "
         "again since",
     )
+
+
+class FlushQueries:
+    """Answers flush requests at once: a publisher asks again until all is done."""
+
+    def __init__(
+        self,
+        ledger: SourceLedger,
+        publish_soon: Callable[[], None],
+        warnings: Callable[[str], str | None] = lambda _: None,
+    ) -> None:
+        """Make the handler; ``publish_soon`` requests an epoch from the mapper.
+
+        ``warnings`` returns those about a source.
+        """
+        self._ledger = ledger
+        self._publish_soon = publish_soon
+        self._warnings = warnings
+
+    def answer(self, request: FlushRequest) -> FlushReply:
+        """Return what became of the scans of a session."""
+        scan = request.source, request.session, request.sequence
+        reply = self._ledger.outcome(*scan, overdue=request.waited_s >= ARRIVAL_GRACE_S)
+        if not reply.done:
+            if self._ledger.is_settled(*scan):
+                self._publish_soon()
+            return reply
+        lines = filter(None, (reply.warnings, self._warnings(request.source)))
+        return replace(reply, warnings="\n".join(lines) or None)

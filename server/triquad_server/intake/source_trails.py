@@ -11,7 +11,12 @@ from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Doubles
 from triquad_format.wire.limits import MAX_SAMPLE_POINTS
 from triquad_format.wire.messages import Scan
-from triquad_format.wire.query_messages import ScanSample, SourceState
+from triquad_format.wire.source_messages import (
+    NewestScan,
+    ScanSource,
+    SourceReport,
+    SourcesRequest,
+)
 
 from triquad_server.intake.rays import ScanRays
 
@@ -24,6 +29,9 @@ MAX_POSITIONS = 2048
 """The positions of a trail at most. Once it has that many, every second one is dropped, and from
 then on they are twice as far apart: all of the way remains visible. They take as much of a reply as
 the newest scan."""
+
+_MOST_POINTS = 100_000
+"""The points of the newest scans of all sources together, at most, in one reply."""
 
 _JUMP_LEAVES = 250.0
 """A sensor that is farther away than this from one scan to the next has not moved there: 50 m with
@@ -46,7 +54,7 @@ class _Source:
 
     spacing_m: float  # of the trail's places
     scans: int = 0
-    newest: ScanSample | None = None
+    newest: NewestScan | None = None
     trail: list[_Place] = field(default_factory=list)  # oldest first
 
     @property
@@ -55,7 +63,7 @@ class _Source:
         places = [place.position for place in self.trail]
         return np.array(places, np.float64).reshape(-1, 3)
 
-    def add(self, taken: ScanSample, jump_m: float) -> None:
+    def add(self, taken: NewestScan, jump_m: float) -> None:
         """Add the source's newest scan."""
         position = _position(taken)
         jumped = self.newest is None or math.dist(position, _position(self.newest)) > jump_m
@@ -90,20 +98,21 @@ class _Source:
             if not inside[row]
         ]
 
-    def state(self, max_points: int) -> SourceState:
+    def state(self, max_points: int) -> ScanSource:
         """Return the source as it is sent, with at most ``max_points`` of its newest scan."""
         newest = self.newest
         if newest is not None:
             newest = replace(newest, points=evenly(newest.points, max_points))
         pieces = np.array([place.piece for place in self.trail], np.int64)
-        return SourceState(self.scans, self.positions, pieces, newest)
+        return ScanSource(self.scans, self.positions, pieces, newest)
 
 
 class SourceTrails:
     """Keeps where each source has been, and its newest scan; one thread adds, any may query."""
 
-    def __init__(self, leaf_m: float) -> None:
-        """Begin with positions of a trail a leaf apart."""
+    def __init__(self, leaf_m: float, server: str = "") -> None:
+        """Begin with positions of a trail a leaf apart; ``server`` is the name in replies."""
+        self._server = server
         self._spacing_m = leaf_m
         self._jump_m = _JUMP_LEAVES * leaf_m
         self._lock = threading.Lock()
@@ -119,7 +128,7 @@ class SourceTrails:
             self._sources[scan.source] = source
             if len(self._sources) > MAX_SOURCES:
                 self._sources.popitem(last=False)
-            taken = ScanSample(
+            taken = NewestScan(
                 scan.stamp_ns,
                 scan.world_from_sensor,
                 points=points.astype(np.float32),
@@ -136,17 +145,17 @@ class SourceTrails:
                 if source.newest is None and not source.trail:
                     del self._sources[name]
 
-    def states(self, max_points: int = 0, max_points_in_all: int = 0) -> dict[str, SourceState]:
-        """Return all sources, by name.
-
-        Newest scans have at most ``max_points`` each, and all together ``max_points_in_all``.
-        """
+    def answer(self, request: SourcesRequest) -> SourceReport:
+        """Return all sources, if anything of them is new since the reply before."""
         with self._lock:
-            most = min(max_points, max_points_in_all // max(1, len(self._sources)))
-            return {name: source.state(most) for name, source in self._sources.items()}
+            if (request.server, request.revision) == (self._server, self.revision):
+                return SourceReport(self._server, self.revision, {})
+            most = min(request.max_points, _MOST_POINTS // max(1, len(self._sources)))
+            sources = {name: source.state(most) for name, source in self._sources.items()}
+            return SourceReport(self._server, self.revision, sources)
 
 
-def _position(taken: ScanSample) -> Doubles:
+def _position(taken: NewestScan) -> Doubles:
     """Return where the sensor was: [3] metres, map frame."""
     return taken.world_from_sensor[:3, 3]
 

@@ -13,8 +13,7 @@ from triquad_map.field.frozen_field import field_samples
 from triquad_server.engine.field_record import field_from_record, region_record
 from triquad_server.engine.live_field import LiveField, initial_field
 from triquad_server.engine.trainer import Loss
-from triquad_server.epochs.array_memory import buffers_of, bytes_by_part
-from triquad_server.epochs.epoch import FrozenRegion
+from triquad_server.epochs.epoch import FrozenRegion, buffers_of
 from triquad_server.intake.rays import ScanRays
 from triquad_server.mapping.map_snapshot import RegionSnapshot
 from triquad_server.mapping.memory_budget import RegionSize
@@ -133,12 +132,6 @@ class LiveRegion:
             samples, self.field.version, epoch, is_settled=is_settled
         )
         self.training.published(field, surfels, removed)
-        own = buffers_of((field, evidence, surfels))
-        live = {
-            "field": self.field,
-            "evidence": self.evidence.live,
-            "replay_pools": self.training.rays,
-        }
         self._published = FrozenRegion(
             index=self.index,
             centre=self.centre,
@@ -148,8 +141,7 @@ class LiveRegion:
             vertices=self.field.vertices,
             parameters=self.field.parameters,
             changed=epoch,
-            live_bytes=bytes_by_part(live, without=own),
-            buffers=own,
+            buffers=buffers_of((field, evidence, surfels)),
         )
         self.is_changed = False
         return self._published

@@ -4,8 +4,7 @@ import logging
 import math
 
 from triquad_format.records.arrays import Doubles, Floats
-from triquad_format.records.map_progress import MapProgress
-from triquad_format.records.region import MapRecord
+from triquad_format.records.region import MapProgress, MapRecord
 
 from triquad_server.engine.gradient_sums import GradientSums
 from triquad_server.engine.memory import memory_on
@@ -108,7 +107,6 @@ class Mapper:
             rays_discarded=sum(one.rays.pool.kept.discarded for one in training),
             replay_share=self.regions.rays_share,
             map_bytes=self.regions.bytes_used,
-            normals_bytes=self._normals.nbytes,
         )
 
     def ingest(

@@ -22,7 +22,6 @@ class MapFigures:
     rays_discarded: int = 0  # so far, that were replaced by others, or were too many
     replay_share: float = 1.0  # kept, of the rays that each place is to keep
     map_bytes: int = 0  # bytes of the map and its newest epoch, without rays; an estimate
-    normals_bytes: int = 0  # bytes of the moments of points, for normals of coming scans
 
 
 @dataclass(frozen=True)

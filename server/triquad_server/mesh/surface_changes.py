@@ -1,5 +1,6 @@
-"""Finds where the surface of a map changed, so that mesh tiles can be updated."""
+"""Finds where the surface of a map changed, and which mesh tiles are out of date by it."""
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,9 +10,14 @@ from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_map.compiled.team import Team
 from triquad_map.composition.shown_field import ShownField
 from triquad_map.evidence.evidence import FrozenEvidence
+from triquad_map.mesh.tile_lattice import TileBorder, TileIndex, TileLattice
 from triquad_map.surfels.surfel_map import surfel_voxels
 
 from triquad_server.epochs.epoch import FrozenRegion
+
+_AROUND = [
+    (x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) != (0, 0, 0)
+]
 
 _KEY_BITS = 20  # bits of each coordinate of a voxel, or of a group, in its region
 
@@ -172,6 +178,78 @@ class SurfaceChanges:
 
         self._team.split(len(centres), work)
         return offsets
+
+
+@dataclass(frozen=True)
+class CachedTile:
+    """A tile that was made; its bytes may be dropped, what neighbours need of it never is."""
+
+    made: int  # epoch of which it is
+    empty: bool  # without faces
+    border: TileBorder
+
+
+class TileLevel:
+    """Keeps the tiles of one level of detail, and when the surface of each changed."""
+
+    def __init__(self, lattice: TileLattice) -> None:
+        self.lattice = lattice
+        self.tiles: dict[TileIndex, CachedTile] = {}  # as they were last made
+        self.changed: dict[TileIndex, int] = {}  # epoch in which the surface last changed
+
+    def clean(self, index: TileIndex) -> CachedTile | None:
+        """Return the tile if it shows the current surface; None if it has to be made."""
+        tile = self.tiles.get(index)
+        return None if tile is None or tile.made < self.changed.get(index, 0) else tile
+
+    def touch(self, index: TileIndex, epoch: int) -> None:
+        """Record that the surface of a tile changed in ``epoch``."""
+        self.changed.pop(index, None)
+        self.changed[index] = epoch  # those that changed last are last
+
+    def record(self, changes: Changes, half_m: float, epoch: int) -> None:
+        """Record what changed in ``epoch``; voxels have sides of twice ``half_m``."""
+        low, high = changes.places - half_m, changes.places + half_m
+        touched = [
+            *self.lattice.tiles_meeting(low, high, self.lattice.margin_m).tolist(),
+            *self.lattice.tiles_meeting(changes.drifted, changes.drifted).tolist(),
+        ]
+        for x, y, z in touched:
+            self.touch((x, y, z), epoch)
+
+    def changed_since(self, low: Doubles, high: Doubles, since: int) -> dict[TileIndex, int]:
+        """Return when the surface of tiles changed: of those for which it did after ``since``.
+
+        They meet a box with the corners ``low`` and ``high`` [3], metres, map frame. Since epoch 0,
+        those that are known to have no faces are left out.
+        """
+        newest_first = itertools.takewhile(
+            lambda index: self.changed[index] > since, reversed(self.changed)
+        )
+        found = [index for index in newest_first if since or not self._is_empty(index)]
+        inside = self.lattice.meets(np.array(found, np.int64).reshape(-1, 3), low, high)
+        return {index: self.changed[index] for index in itertools.compress(found, inside)}
+
+    def _is_empty(self, index: TileIndex) -> bool:
+        tile = self.clean(index)
+        return tile is not None and tile.empty
+
+    def borders_around(self, index: TileIndex) -> dict[TileIndex, TileBorder]:
+        """Return the borders with which a tile has to agree, by their tiles, in its own lattice.
+
+        That is its own border if only its bytes were dropped, and those of all neighbours that show
+        the current surface: these agree with each other. The others will be made to fit it.
+        """
+        found: dict[TileIndex, TileBorder] = {}
+        own = self.clean(index)
+        if own is not None:
+            found[index] = own.border
+        for offset in _AROUND:
+            x, y, z = (a + b for a, b in zip(index, offset, strict=True))
+            neighbour = self.clean((x, y, z))
+            if neighbour is not None:
+                found[x, y, z] = neighbour.border.seen_from(offset, self.lattice.cells)
+        return found
 
 
 def _key(cells: Longs) -> Longs:

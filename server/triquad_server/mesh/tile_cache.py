@@ -1,10 +1,13 @@
 """Caches the mesh tiles of a map in transmitted form: made once, and the same for all clients."""
 
 import threading
+from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from triquad_format.records.arrays import Doubles
+from triquad_format.records.arrays import Bytes, Doubles
 from triquad_format.wire.limits import LEVELS
 from triquad_format.wire.tile_codec import encode_tile
 from triquad_map.compiled.team import THREADS, Team
@@ -13,9 +16,60 @@ from triquad_map.mesh.tile_lattice import TileBorder, TileIndex, TileLattice
 from triquad_map.mesh.tile_mesh import TileMesh, mesh_tile
 
 from triquad_server.epochs.epoch import Epoch
-from triquad_server.mesh.surface_changes import SurfaceChanges
-from triquad_server.mesh.tile_level import CachedTile, ShownTile, ShownTiles, TileKey, TileLevel
+from triquad_server.mesh.surface_changes import CachedTile, SurfaceChanges, TileLevel
 from triquad_server.settings import MeshSettings
+
+FOLLOWED = 0
+"""The epoch by which tiles are kept that are followed."""
+
+
+class TileKey(NamedTuple):
+    """What a tile in transmitted form is kept by."""
+
+    level: int  # of detail
+    tile: TileIndex
+    epoch: int = FOLLOWED  # all of which the tile is
+    fill_m: float = 0.0  # holes up to this length are filled
+
+
+@dataclass(frozen=True)
+class ShownTile:
+    """A tile in transmitted form."""
+
+    version: int  # epoch of which it is
+    data: bytes  # encoded by triquad_format.wire.tile_codec
+    filled: Bytes  # [F] 1 for each face that fills a hole; [0] where none was to be filled
+
+    @property
+    def nbytes(self) -> int:
+        """The bytes of memory that it takes."""
+        return len(self.data) + self.filled.nbytes
+
+
+class ShownTiles:
+    """Keeps tiles in memory; those unused for longest are dropped if there are too many."""
+
+    def __init__(self, limit: int) -> None:
+        """Keep at most ``limit`` bytes, or a single tile that is larger."""
+        self._limit = limit
+        self.size = 0  # bytes of the tiles that are kept
+        self._tiles: OrderedDict[TileKey, ShownTile] = OrderedDict()  # longest unused first
+
+    def get(self, key: TileKey) -> ShownTile | None:
+        """Return a tile; None if it was dropped."""
+        tile = self._tiles.get(key)
+        if tile is not None:
+            self._tiles.move_to_end(key)
+        return tile
+
+    def put(self, key: TileKey, tile: ShownTile) -> None:
+        """Keep a tile."""
+        before = self._tiles.pop(key, None)
+        self.size += tile.nbytes - (0 if before is None else before.nbytes)
+        self._tiles[key] = tile
+        while self.size > self._limit and len(self._tiles) > 1:
+            _, dropped = self._tiles.popitem(last=False)
+            self.size -= dropped.nbytes
 
 
 def tile_lattice(settings: MeshSettings, level: int) -> TileLattice:
@@ -38,7 +92,7 @@ class TileCache:
 
     Tiles that are followed are kept until their surface changes. They fit their neighbours, though
     these may be of other epochs. One thread uses the cache, and shares the making of tiles with its
-    team; any thread may ask for its size.
+    team.
     """
 
     def __init__(self, settings: MeshSettings, team: Team) -> None:
@@ -51,11 +105,6 @@ class TileCache:
         self.epoch = -1  # number of the epoch of the last refresh
         self._view: ComposedView | None = None  # epoch from which tiles are made
         self._shown = ShownTiles(settings.cache_bytes)
-
-    @property
-    def nbytes(self) -> int:
-        """Return the bytes of the encoded tiles that are kept."""
-        return self._shown.size
 
     def lattice(self, level: int) -> TileLattice:
         """Return where the tiles of a level lie."""

@@ -6,7 +6,6 @@ import numpy as np
 from triquad_format.errors import RefusedError
 from triquad_format.records.arrays import Ints
 from triquad_format.records.field_settings import BLOCK_VOXELS
-from triquad_format.wire.limits import MAX_FILL_M, MAX_TILES_ASKED, TILE_INDEX_LIMIT
 from triquad_format.wire.mesh_messages import (
     MeshReply,
     MeshRequest,
@@ -15,13 +14,11 @@ from triquad_format.wire.mesh_messages import (
     TileList,
     TileListRequest,
 )
-from triquad_map.mesh.tile_lattice import TileIndex, TileLattice, check_level
-from triquad_map.questions.checks import check_box
+from triquad_map.mesh.tile_lattice import TileIndex, TileLattice
 
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.history import EpochHistory
-from triquad_server.mesh.tile_cache import TileCache
-from triquad_server.mesh.tile_level import ShownTile
+from triquad_server.mesh.tile_cache import ShownTile, TileCache
 
 MAX_TILES = 1_000_000
 """The most tiles of one list."""
@@ -49,11 +46,8 @@ class TileQueries:
         """Return the tiles that meet the request's box.
 
         Raises:
-            RefusedError: a field is out of range, the epoch is gone, or the tiles are too many.
+            RefusedError: the epoch is gone, or the tiles are too many.
         """
-        check_box(request.minimum, request.maximum)
-        check_level(request.level)
-        _check_fill(request.fill_m)
         epoch = self._epochs.get(request.epoch)
         lattice = self._cache.lattice(request.level)
         tiles = surface_tiles(epoch, lattice, request.fill_m)
@@ -66,10 +60,8 @@ class TileQueries:
         """Return in which tiles the surface changed.
 
         Raises:
-            RefusedError: a field is out of range.
+            RefusedError: ``since`` was never given.
         """
-        check_box(request.minimum, request.maximum)
-        check_level(request.level)
         newest = self._epochs.newest
         self._refresh(newest)
         cache, lattice = self._cache, self._cache.lattice(request.level)
@@ -95,11 +87,8 @@ class TileQueries:
         """Return the meshes of some tiles.
 
         Raises:
-            RefusedError: a field is out of range, or the epoch is gone.
+            RefusedError: the epoch is gone, or none is given for tiles with filled holes.
         """
-        _check_tiles(request.tiles)
-        check_level(request.level)
-        _check_fill(request.fill_m)
         if request.epoch == 0 and request.fill_m > 0:
             raise RefusedError("bad_request", "fill_m is for tiles of one epoch: name it")
         indices = [(x, y, z) for x, y, z in request.tiles.tolist()]
@@ -138,35 +127,6 @@ class TileQueries:
             data=b"".join(tile.data for tile in tiles),
             filled=np.concatenate([tile.filled for tile in tiles]) if request.fill_m > 0 else None,
             versions=np.array([tile.version for tile in tiles]),
-        )
-
-
-def _check_tiles(tiles: Ints) -> None:
-    """Refuse indices [T, 3] of tiles that are out of range, and too many, or none.
-
-    Raises:
-        RefusedError: they are.
-    """
-    if not 1 <= len(tiles) <= MAX_TILES_ASKED:
-        raise RefusedError("bad_request", f"{len(tiles)} tiles: ask for 1 to {MAX_TILES_ASKED}")
-    beyond = (np.abs(tiles.astype(np.int64)) > TILE_INDEX_LIMIT).any(axis=1)
-    if beyond.any():
-        raise RefusedError(
-            "bad_request",
-            f"tile {tiles[beyond][0].tolist()} is out of range: "
-            f"use -{TILE_INDEX_LIMIT} to {TILE_INDEX_LIMIT}",
-        )
-
-
-def _check_fill(fill_m: float) -> None:
-    """Refuse a length up to which holes cannot be filled.
-
-    Raises:
-        RefusedError: it is not in the range.
-    """
-    if not 0 <= fill_m <= MAX_FILL_M:
-        raise RefusedError(
-            "bad_request", f"fill_m = {fill_m} is out of range: use 0 to {MAX_FILL_M:g}"
         )
 
 

@@ -14,7 +14,6 @@ from typing import Any
 from triquad_map.compiled.team import lower_priority
 
 from triquad_server.errors import ListenError, ServerError
-from triquad_server.monitoring.metrics import Metrics
 from triquad_server.process.threads import NICENESS
 from triquad_server.server_status import Health
 from triquad_server.settings import MetricsSettings
@@ -48,7 +47,7 @@ class MonitoringServer(socketserver.ThreadingTCPServer):
         Raises:
             ListenError: the port is taken, or cannot be listened on.
         """
-        self.shown: Metrics | str = "the server is starting: it restores its map and compiles code"
+        self.shown: Health | str = "the server is starting: it restores its map and compiles code"
         self._since_s: dict[socket.socket, float] = {}  # of open connections, monotonic
         where = (settings.address, settings.port)
         named = f"[{where[0]}]:{where[1]}" if ":" in where[0] else f"{where[0]}:{where[1]}"
@@ -65,9 +64,9 @@ class MonitoringServer(socketserver.ThreadingTCPServer):
         _log.info("metrics on http://%s/metrics, health on /healthz", named)
 
     @contextmanager
-    def showing(self, metrics: Metrics) -> Iterator[None]:
-        """Show the metrics of a server that has started; after the context, that it stops."""
-        self.shown = metrics
+    def showing(self, health: Health) -> Iterator[None]:
+        """Show the figures of a server that has started; after the context, that it stops."""
+        self.shown = health
         try:
             yield
         finally:
@@ -136,17 +135,17 @@ class _Handler(BaseHTTPRequestHandler):
         _log.debug("%s: " + format, self.address_string(), *args)
 
 
-def _page(path: str, shown: Metrics | str) -> tuple[int, str, str]:
+def _page(path: str, shown: Health | str) -> tuple[int, str, str]:
     """Return status, content type and text of what is at a path."""
     if path == "/healthz":
-        report = {"problem": shown} if isinstance(shown, str) else _health(shown.health)
+        report = {"problem": shown} if isinstance(shown, str) else _health(shown)
         code = 200 if report["problem"] is None else 503
         return code, "application/json", json.dumps(report) + "\n"
     if path != "/metrics":
         return 404, _TEXT, f"nothing is at {path!r:.200}: use /metrics or /healthz\n"
     if isinstance(shown, str):
         return 503, _TEXT, shown + "\n"
-    return 200, _TEXT, exposition(Figures(shown.health.status(), shown.now()))
+    return 200, _TEXT, exposition(Figures(shown.status(), shown.metrics()))
 
 
 def _health(health: Health) -> dict[str, object]:

@@ -53,7 +53,6 @@ counter   triquad_mapper_seconds_total         metrics.mapper_s.{activity}      
 gauge     triquad_map_memory_bytes             status.map_bytes                                     Memory of the map with its newest epoch
 gauge     triquad_map_memory_limit_bytes       status.map_max_bytes                                 Beyond this, scans are refused as map_full
 gauge     triquad_resident_memory_bytes        metrics.resident_bytes                               Memory of the process, with its libraries
-gauge     triquad_memory_bytes                 metrics.memory_bytes.{part}                          Memory of arrays, by part, with the room that they have to grow
 counter   triquad_checkpoints_total            metrics.checkpoints.{outcome:written+failed}         Checkpoints by outcome
 gauge     triquad_checkpoint_duration_seconds  metrics.checkpoints.last_duration_s                  How long writing the last checkpoint took
 gauge     triquad_checkpoint_age_seconds       metrics.checkpoints.age_s                            Time since the last checkpoint of this process was written

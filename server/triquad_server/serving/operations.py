@@ -1,6 +1,7 @@
 """The operations that a server answers: each has a key, and a lane with a queue and workers."""
 
 import logging
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -11,19 +12,15 @@ from typing import Any
 
 import zenoh
 from triquad_format.errors import RefusedError
-from triquad_format.wire import keys
-from triquad_format.wire.codec import Message
+from triquad_format.wire import codec, keys
 from triquad_format.wire.limits import MAX_WAIT_S
 from triquad_format.wire.metrics_messages import QueueMetrics
 from triquad_map.compiled.team import THREADS, lower_priority
 
 from triquad_server.errors import NO_MEMORY, MapperStoppedError
 from triquad_server.process.threads import NICENESS, submit
-from triquad_server.serving.client_sessions import ClientSessions
-from triquad_server.serving.operation_counts import OperationCounts
-from triquad_server.serving.refusal_sender import RefusalSender
-from triquad_server.serving.request import Request, RequestT, payload_size
-from triquad_server.serving.request_queue import MOST_SENDING, RequestQueue
+from triquad_server.serving.request import OperationCounts, Request, payload_size
+from triquad_server.serving.request_queue import MOST_SENDING, ClientSessions, RequestQueue
 from triquad_server.settings import ServiceSettings
 
 _log = logging.getLogger(__name__)
@@ -31,6 +28,14 @@ _log = logging.getLogger(__name__)
 _QUEUE_BYTES = 64_000_000  # of the requests of all clients that wait in a lane
 _PLAIN_BYTES = 16_384  # of a request that holds neither points nor tiles
 _STOPPING = "the server is stopping"
+
+_REFUSING_THREADS = 2
+
+_REFUSED_BYTES = 4_000_000
+"""The memory of requests that wait for these threads: beyond, large ones are refused by the
+network's thread, so that their sender waits for it and they take no memory."""
+
+_LARGE_BYTES = 65_536
 
 
 class Lane(Enum):
@@ -83,6 +88,39 @@ class _Operation:
     max_bytes: int
 
 
+class RefusalSender:
+    """Sends refusals in threads of its own: a client may delay the reply for seconds."""
+
+    def __init__(self) -> None:
+        self._threads = ThreadPoolExecutor(_REFUSING_THREADS, "refusals")
+        self._lock = threading.Lock()
+        self._waiting_bytes = 0
+
+    def send(self, request: Request, code: str, text: str) -> None:
+        """Refuse a request; ``code`` is one of ``ERROR_CODES``."""
+        size = request.size
+        with self._lock:
+            is_room = size <= _LARGE_BYTES or self._waiting_bytes + size <= _REFUSED_BYTES
+            if is_room:
+                self._waiting_bytes += size
+        if is_room:
+            submit(self._threads, self._refuse, request, code, text)
+        else:
+            request.refuse(code, text)
+
+    def close(self) -> None:
+        """Refuse what is left, and end."""
+        self._threads.shutdown()
+
+    def _refuse(self, request: Request, code: str, text: str) -> None:
+        size = request.size
+        try:
+            request.refuse(code, text)
+        finally:
+            with self._lock:
+                self._waiting_bytes -= size
+
+
 class Operations:
     """Receives the requests of one map, and has them handled: each is answered exactly once."""
 
@@ -118,18 +156,17 @@ class Operations:
 
     def serve(
         self,
-        name: str,
-        kind: type[RequestT],
-        answer: Callable[[RequestT], Message],
+        kind: type[codec.Request[codec.ReplyT]],
+        answer: Callable[[Any], codec.ReplyT],
         lane: Lane = Lane.QUESTIONS,
         max_bytes: int = _PLAIN_BYTES,
     ) -> None:
-        """Answer an operation from now on; ``answer`` returns the reply to a ``kind``, or refuses.
+        """Answer requests of a kind from now on; ``answer`` returns the reply, or refuses.
 
         Requests larger than ``max_bytes`` are refused.
         """
-        key = keys.operation_key(self._map_name, name)
-        counts = self.counts[name] = OperationCounts()
+        key = keys.operation_key(self._map_name, kind.operation)
+        counts = self.counts[kind.operation] = OperationCounts()
         self._operations[key] = _Operation(
             lambda request: request.answer(answer(request.read(kind))), counts, lane, max_bytes
         )
@@ -156,7 +193,6 @@ class Operations:
         for pool in self._pools:
             pool.shutdown()
         self._refusals.close()
-        self._sessions.close()
 
     def _queue(self, lane: Lane, requests_each: int) -> RequestQueue[Request]:
         """Return a queue with workers, whose threads are started when they are needed."""

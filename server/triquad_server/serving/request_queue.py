@@ -1,9 +1,14 @@
 """The queue of requests: client sessions take turns at a few workers."""
 
+import secrets
 import threading
+import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
+import zenoh
+from triquad_format.wire.messages import read_origin
 from triquad_format.wire.metrics_messages import QueueMetrics
 
 from triquad_server.fair_queue import FairQueue, Owner
@@ -23,6 +28,61 @@ _REPLY_BYTES = 32_000_000
 
 _SMALL_REPLY_BYTES = 262_144
 """The most bytes of a reply, such as a planner's, that is never refused."""
+
+
+_UNLINKED = ""
+"""The group of all clients that are not linked to the server itself: they take one turn together,
+since any name can be invented."""
+
+_GRACE_S = 0.5  # a request is handled for this much longer: its client's own time-out comes first
+_FRESH_S = 1.0  # so long a session may have left unnoticed
+
+
+@dataclass(frozen=True)
+class Source:
+    """The owner of a request, and the time until which its answer is waited for."""
+
+    owner: Owner
+    deadline_s: float  # monotonic
+
+
+class ClientSessions:
+    """Finds the session of a request; safe for any thread.
+
+    A client that is linked and names itself has turns of its own. Those that come through a
+    router, or give no name, share turns: Zenoh does not show from which link a request
+    came, but invented names are no links.
+    """
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._info = session.info
+        self.own_name = secrets.token_hex(16)  # in requests of the server to itself; known to none
+        self._linked = frozenset[str]()  # Zenoh ids at the other ends of links
+        self._read_s = 0.0  # when that was, monotonic
+
+    def source(self, query: zenoh.Query, longest_s: float) -> Source:
+        """Return a request's owner and deadline; no longer wait than ``longest_s`` is believed."""
+        attachment = query.attachment
+        origin = None if attachment is None else read_origin(attachment.to_bytes())
+        now = time.monotonic()
+        if origin is None:
+            return Source(Owner(_UNLINKED), now + longest_s)
+        # Written so that NaN counts as not given.
+        wait_s = origin.timeout_s if 0 <= origin.timeout_s <= longest_s else longest_s
+        group = origin.client if self._is_linked(origin.client) else _UNLINKED
+        return Source(Owner(group, origin.client), now + wait_s + _GRACE_S)
+
+    def have_left(self, owner: Owner) -> bool:
+        """Return whether the link to the client that sent a request is closed."""
+        return owner.group != _UNLINKED and not self._is_linked(owner.group)
+
+    def _is_linked(self, name: str) -> bool:
+        now = time.monotonic()
+        # A new client may send requests at once.
+        if name not in self._linked or now > self._read_s + _FRESH_S:
+            ids = (str(transport.zid) for transport in self._info.transports())
+            self._linked, self._read_s = frozenset((self.own_name, *ids)), now
+        return name in self._linked
 
 
 class Owned(Protocol):

@@ -38,12 +38,6 @@ class MapDownloads:
         self._lock = threading.Lock()
         self._files: OrderedDict[str, _MapBytes] = OrderedDict()
 
-    @property
-    def nbytes(self) -> int:
-        """Return the bytes of the files that are kept."""
-        with self._lock:
-            return sum(len(file.data) for file in self._files.values())
-
     def info(self, request: MapInfoRequest) -> MapInfo:
         """Return size and digest of the newest epoch's file, which is made unless it is there."""
         newest = self._epochs.newest

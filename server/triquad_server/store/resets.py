@@ -4,7 +4,6 @@ import logging
 
 from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import ResetReply, ResetRequest
-from triquad_map.questions.checks import check_box
 
 from triquad_server.errors import StoreError
 from triquad_server.intake.source_trails import SourceTrails
@@ -40,9 +39,8 @@ class Resets:
         """Forget what lies in the request's box, and reply once an epoch shows it.
 
         Raises:
-            RefusedError: it is not a box; or the map as it is could not be kept, and was not reset.
+            RefusedError: the map as it is could not be kept, and was not reset.
         """
-        check_box(request.minimum, request.maximum)
         emptied = self._mapper.call(lambda mapper: self._forget_empty(mapper, request))
         if emptied is not None:
             return ResetReply(emptied, undo="the map was empty before")

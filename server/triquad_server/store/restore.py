@@ -10,9 +10,9 @@ from triquad_format.errors import (
     TooLargeMapFileError,
     UnsupportedMapFileError,
 )
-from triquad_format.mapfile.checkpoint import Checkpoint, read_checkpoint
 from triquad_format.mapfile.checkpoint_folder import CheckpointFile, checkpoint_files
-from triquad_format.mapfile.index import DAMAGED_SUFFIX
+from triquad_format.mapfile.files import DAMAGED_SUFFIX
+from triquad_format.mapfile.index import Checkpoint, read_checkpoint
 from triquad_format.mapfile.reader import MapFile, read_map_file
 from triquad_format.records.region import MapRecord
 from triquad_format.wire.messages import CheckpointInfo

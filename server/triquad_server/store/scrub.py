@@ -8,10 +8,9 @@ from contextlib import closing
 from pathlib import Path
 
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.checkpoint import open_index
-from triquad_format.mapfile.checkpoint_folder import checkpoint_files
-from triquad_format.mapfile.index import FileBytes, named
-from triquad_format.mapfile.part_files import PartFiles
+from triquad_format.mapfile.checkpoint_folder import PartFiles, checkpoint_files
+from triquad_format.mapfile.files import FileBytes, named
+from triquad_format.mapfile.index import open_index
 from triquad_map.compiled.team import lower_priority
 
 from triquad_server.process.threads import NICENESS

@@ -14,20 +14,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.checkpoint import (
-    Checkpoint,
-    Restored,
-    read_checkpoint,
-    write_checkpoint,
-)
 from triquad_format.mapfile.checkpoint_folder import (
+    NewParts,
+    PartFiles,
     checkpoint_files,
     checkpoint_name,
     checkpoint_of,
 )
+from triquad_format.mapfile.index import Checkpoint, Restored, read_checkpoint, write_checkpoint
 from triquad_format.mapfile.manifest import Entry, Manifest
 from triquad_format.mapfile.metadata import MapFacts
-from triquad_format.mapfile.part_files import NewParts, PartFiles
 from triquad_format.mapfile.parts.pack import pack_region
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.record_check import check_record
@@ -37,14 +33,13 @@ from triquad_format.wire.messages import CheckpointInfo
 from triquad_server.errors import StoreError
 from triquad_server.mapping.map_snapshot import MapChanges
 from triquad_server.settings import StoreSettings
+from triquad_server.store.map_folder import StoreLock, delete_unneeded
 from triquad_server.store.restore import (
     ValidCheckpoint,
     check_countable,
     newest_valid,
     valid_checkpoint,
 )
-from triquad_server.store.retention import delete_unneeded
-from triquad_server.store.store_lock import StoreLock
 
 _log = logging.getLogger(__name__)
 

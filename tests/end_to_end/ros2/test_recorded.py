@@ -7,7 +7,7 @@ import pytest
 from support import servers
 from support.ros.ros_bridge import Bridged, bridging
 from support.ros.ros_robot import SECOND, T0, robot
-from triquad_client.calls.sources import ScanSource
+from triquad_client import ScanSource
 from triquad_tools.recordings.folders.cloud_folder import read_cloud_folder
 
 SEOSAN = Path(__file__).resolve().parents[4] / "shared" / "data" / "seosan01"
@@ -42,4 +42,4 @@ def test_scans_of_a_robot_are_those_of_the_client() -> None:
             by_robot = told(bridged)
     np.testing.assert_allclose(by_robot.trail, by_client.trail, atol=1e-6)
     assert len(by_robot.newest.points) > 1000
-    np.testing.assert_allclose(by_robot.newest.points, by_client.newest.points, atol=1e-3)
+    np.testing.assert_allclose(by_robot.newest.points_m, by_client.newest.points_m, atol=1e-3)

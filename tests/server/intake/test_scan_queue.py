@@ -254,7 +254,7 @@ def test_scans_that_wait_are_bounded_in_bytes_over_all_sources():
     queue.put(servers.scan(0))
     for sequence in range(50):
         queue.put(servers.scan(sequence, source="busy"))
-    assert queue.bytes_waiting <= 10 * nbytes
+    assert queue._scans.nbytes <= 10 * nbytes
     assert queue.ledger.lost().keys() == {"busy"}
     assert queue.take().source == "lidar"
 

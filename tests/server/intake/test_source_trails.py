@@ -4,6 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 from triquad_format.wire.messages import Scan
+from triquad_format.wire.source_messages import SourcesRequest
 from triquad_server.intake.rays import ScanRays
 from triquad_server.intake.source_trails import (
     MAX_POSITIONS,
@@ -21,12 +22,16 @@ def add(trails, position, source="lidar"):
     trails.add(scan, ScanRays(pose[:3, 3], pose[None, :3, 3] + (3.0, 0, 0), {}))
 
 
+def states(trails):
+    return trails.answer(SourcesRequest("", -1, 0)).sources
+
+
 def test_a_long_drive_remains_visible_as_a_whole():
     trails = SourceTrails(LEAF_M)
     steps = 5 * MAX_POSITIONS
     for step in range(steps):
         add(trails, (step * 0.3, 0, 0))
-    source = trails.states()["lidar"]
+    source = states(trails)["lidar"]
     trail, pieces = source.trail, source.pieces
     assert MAX_POSITIONS / 2 <= len(trail) <= MAX_POSITIONS
     assert trail[0, 0] == 0
@@ -56,14 +61,14 @@ def test_positions_of_a_piece_are_a_leaf_apart_and_no_jump(steps):
             taken += 1
         else:
             trails.forget(np.full(3, -values[0]), np.full(3, values[0]))
-    states = trails.states().values()
-    for source in states:
+    sources = states(trails).values()
+    for source in sources:
         apart = np.linalg.norm(np.diff(source.trail, axis=0), axis=1)
         joined = np.diff(source.pieces) == 0
         assert (np.diff(source.pieces) >= 0).all()
         assert (apart[joined] < 50 + LEAF_M).all()
         assert (apart[joined] >= LEAF_M).all()
-    assert sum(source.scans for source in states) <= taken
+    assert sum(source.scans for source in sources) <= taken
 
 
 def test_sources_that_somebody_invents_take_little_memory():
@@ -75,5 +80,5 @@ def test_sources_that_somebody_invents_take_little_memory():
         used, _ = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert len(trails.states()) == MAX_SOURCES
+    assert len(states(trails)) == MAX_SOURCES
     assert used < 4096 * MAX_SOURCES

@@ -15,8 +15,7 @@ from support.maps.small_world import (
 )
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
-from triquad_format.records.map_progress import MapProgress
-from triquad_format.records.region import MapRecord
+from triquad_format.records.region import MapProgress, MapRecord
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.progress import map_fit
 

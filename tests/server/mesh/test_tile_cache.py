@@ -21,8 +21,7 @@ from triquad_format.wire.tile_codec import decode_tile
 from triquad_map.mesh.tile_lattice import TileIndex
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mesh.tile_cache import TileCache, tile_lattice
-from triquad_server.mesh.tile_level import ShownTile, ShownTiles, TileKey
+from triquad_server.mesh.tile_cache import ShownTile, ShownTiles, TileCache, TileKey, tile_lattice
 from triquad_server.process.threads import Teams
 from triquad_server.settings import MeshSettings, Settings
 
@@ -176,4 +175,4 @@ def test_tiles_of_an_epoch_are_kept_apart_from_those_that_are_followed() -> None
     (filled,) = cache.of_epoch(view, 0, [(0, 0, 0)], 0.5)
     assert filled is not first[0]
     assert cache.kept(0, (0, 0, 0)) is None
-    assert cache.nbytes == sum(tile.nbytes for tile in (*first, filled))
+    assert cache._shown.size == sum(tile.nbytes for tile in (*first, filled))

@@ -1,13 +1,12 @@
 """A request is of a linked session where its name says so, and of one of all others where not."""
 
 import time
-from contextlib import closing
 
 import zenoh
 from support.servers import WAIT_S, free_endpoint, raw_session
 from triquad_format.wire import codec
 from triquad_format.wire.messages import RequestOrigin
-from triquad_server.serving.client_sessions import ClientSessions
+from triquad_server.serving.request_queue import ClientSessions
 
 
 class Query:
@@ -23,10 +22,8 @@ def group(sessions, name):
 
 def test_who_is_linked_has_turns_of_its_own_until_it_leaves():
     endpoint = free_endpoint()
-    with (
-        raw_session("peer", listen=endpoint) as session,
-        closing(ClientSessions(session)) as sessions,
-    ):
+    with raw_session("peer", listen=endpoint) as session:
+        sessions = ClientSessions(session)
         with raw_session(connect=endpoint) as client:
             name = str(client.info.zid())
             assert group(sessions, name) == name
@@ -41,7 +38,8 @@ def test_who_is_linked_has_turns_of_its_own_until_it_leaves():
 
 
 def test_what_the_server_asks_itself_has_turns_that_nobody_else_can_take():
-    with raw_session("peer") as session, closing(ClientSessions(session)) as sessions:
+    with raw_session("peer") as session:
+        sessions = ClientSessions(session)
         assert group(sessions, sessions.own_name) == sessions.own_name
 
 
@@ -49,7 +47,7 @@ def test_one_who_asks_before_its_link_is_known_has_turns_of_its_own():
     endpoint = free_endpoint()
     with raw_session("peer", listen=endpoint) as session:
         sessions = ClientSessions(session)
-        sessions.close()  # from now on, it knows of no link
+        assert group(sessions, "invented") == ""  # the links were read just now
         with raw_session(connect=endpoint) as client:
             name = str(client.info.zid())
             assert group(sessions, name) == name

@@ -44,7 +44,7 @@ def test_short_questions_are_answered_while_any_number_of_long_ones_are_worked_a
         closing(Operations(session, MAP, ServiceSettings())) as operations,
         raw_session(connect=endpoint) as client,
     ):
-        operations.serve(keys.SDF, SdfRequest, work, max_bytes=10**6)
+        operations.serve(SdfRequest, work, max_bytes=10**6)
         waiting = [client.get(key, payload=question(LONG), timeout=WAIT_S) for _ in range(8)]
         assert begun.acquire(timeout=WAIT_S)
         (reply,) = client.get(key, payload=question(SHORT), timeout=WAIT_S)
@@ -74,7 +74,7 @@ def test_who_is_not_answered_is_told_why_and_defects_alone_leave_a_traceback(
         closing(Operations(session, MAP, ServiceSettings())) as operations,
         raw_session(connect=endpoint) as client,
     ):
-        operations.serve(keys.SDF, SdfRequest, fail)
+        operations.serve(SdfRequest, fail)
         refusal = RawPeer(client).ask(keys.SDF, question(SHORT))
     assert isinstance(refusal, ErrorReply)
     assert refusal.code == code

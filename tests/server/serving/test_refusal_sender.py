@@ -3,8 +3,8 @@
 import threading
 
 from support.servers import WAIT_S
-from triquad_server.serving import refusal_sender as module
-from triquad_server.serving.refusal_sender import RefusalSender
+from triquad_server.serving import operations as module
+from triquad_server.serving.operations import RefusalSender
 
 
 class Request:
@@ -24,8 +24,8 @@ def test_large_requests_that_are_refused_do_not_pile_up_behind_who_reads_nothing
     reads, at_once = threading.Event(), threading.Event()
     at_once.set()
     sender = RefusalSender()
-    stuck = [Request(100, reads) for _ in range(module._THREADS)]
-    large = [Request(module._MOST_BYTES // 2 + 1, at_once) for _ in range(10)]
+    stuck = [Request(100, reads) for _ in range(module._REFUSING_THREADS)]
+    large = [Request(module._REFUSED_BYTES // 2 + 1, at_once) for _ in range(10)]
     for request in (*stuck, *large):
         sender.send(request, "too_large", "")
     assert sum(request.refused_by is None for request in large) == 1

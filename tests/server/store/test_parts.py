@@ -18,16 +18,16 @@ from support.files.growing_store import (
     paths,
     rot,
 )
-from support.maps.map_records import assert_same
+from support.maps.map_records import assert_same, random_record
 from triquad_format.errors import DamagedMapFileError, MapFileError
-from triquad_format.mapfile.part_files import PartFiles
-from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.checkpoint_folder import PartFiles, checkpoint_files
+from triquad_format.mapfile.reader import open_manifest, read_map
 from triquad_format.mapfile.writer import write_map
-from triquad_format.recovery.recovered_map import recover
 from triquad_map.stored_map import StoredMap
 from triquad_server.errors import StoreError
 from triquad_server.settings import StoreSettings
 from triquad_server.store.store import Store
+from triquad_tools.mapfiles.recovered_map import recover
 
 
 @pytest.fixture
@@ -54,7 +54,7 @@ def test_what_did_not_change_is_neither_encoded_nor_written(store, monkeypatch):
     first = grown(1, 1)
     store.write(changes(first))
     before = {path: path.stat() for path in parts_of(paths(store)[1])}
-    monkeypatch.setattr("triquad_format.mapfile.part_files.compressed", None)
+    monkeypatch.setattr("triquad_format.mapfile.checkpoint_folder.compressed", None)
     store.write(changes(dataclasses.replace(first, epoch=2), only=ROW[:3]))
     assert {path: path.stat() for path in parts_of(paths(store)[2])} == before
     assert_same(read_map(paths(store)[2]), dataclasses.replace(first, epoch=2))
@@ -215,9 +215,13 @@ def test_on_a_full_disk_nothing_is_lost_and_nothing_is_left(store, monkeypatch):
 def test_what_could_not_be_read_again_is_not_written(store, monkeypatch):
     drive(store, 1)
     before = sorted(store.folder.rglob("*"))
-    monkeypatch.setattr("triquad_format.mapfile.writer.MAX_MAP_BYTES", 200)
-    with pytest.raises(StoreError, match="000000003.checkpoint cannot be written: .* at most 200"):
-        store.write(changes(grown(3, 3)))
+    manifests = [open_manifest(file) for file in checkpoint_files(store.folder)]
+    most = max(sum(entry.size for entry in one.entries) for one in manifests) + 1000
+    monkeypatch.setattr("triquad_format.mapfile.manifest.MAX_MAP_BYTES", most)
+    larger = dataclasses.replace(random_record(3, indices=ROW, name="lab", points=300), epoch=3)
+    message = f"000000003.checkpoint cannot be written: .* limit of {most} bytes"
+    with pytest.raises(StoreError, match=message):
+        store.write(changes(larger))
     assert sorted(store.folder.rglob("*")) == before
 
 

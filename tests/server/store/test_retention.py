@@ -13,11 +13,11 @@ from support.files.growing_store import (
     paths,
 )
 from support.maps.map_records import assert_same
-from triquad_format.mapfile.checkpoint import read_checkpoint, write_checkpoint
-from triquad_format.mapfile.part_files import PartFiles
+from triquad_format.mapfile.checkpoint_folder import PartFiles
+from triquad_format.mapfile.index import read_checkpoint, write_checkpoint
 from triquad_format.mapfile.reader import read_map
 from triquad_server.settings import StoreSettings
-from triquad_server.store.retention import StoredCheckpoint, staying
+from triquad_server.store.map_folder import StoredCheckpoint, staying
 from triquad_server.store.store import Store
 
 

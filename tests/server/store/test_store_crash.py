@@ -5,9 +5,8 @@ from contextlib import closing, suppress
 
 from support.files.store_writer import KEPT, record_at, write_for_ever
 from support.maps.map_records import assert_same
-from triquad_format.mapfile.checkpoint_folder import checkpoint_files, open_manifest
-from triquad_format.mapfile.part_files import PartFiles
-from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.checkpoint_folder import PartFiles, checkpoint_files
+from triquad_format.mapfile.reader import open_manifest, read_map
 from triquad_server.settings import StoreSettings
 from triquad_server.store.store import Store
 

@@ -4,11 +4,10 @@ import dataclasses
 from pathlib import Path
 
 from support.maps.map_records import random_record
-from triquad_format.mapfile.checkpoint import Checkpoint, write_checkpoint
-from triquad_format.mapfile.checkpoint_folder import checkpoint_name
+from triquad_format.mapfile.checkpoint_folder import NewParts, checkpoint_name
+from triquad_format.mapfile.index import Checkpoint, write_checkpoint
 from triquad_format.mapfile.manifest import Entry, Manifest
 from triquad_format.mapfile.metadata import MapFacts
-from triquad_format.mapfile.part_files import NewParts
 from triquad_format.mapfile.parts.pack import pack_record
 from triquad_format.mapfile.parts.part import PartKey
 from triquad_format.records.region import MapRecord

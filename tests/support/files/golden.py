@@ -14,8 +14,7 @@ from support.maps.map_records import (
     with_support,
 )
 from triquad_format.mapfile.writer import write_map
-from triquad_format.records.map_progress import MapProgress
-from triquad_format.records.region import MapRecord
+from triquad_format.records.region import MapProgress, MapRecord
 
 FOLDER = Path(__file__).parents[2] / "golden"
 TRAINED, PLAIN = "map_v1.triquad", "map_v1_plain.triquad"

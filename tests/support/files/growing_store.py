@@ -5,8 +5,7 @@ import os
 from functools import cache, partial
 
 from support.maps.map_records import random_record
-from triquad_format.mapfile.checkpoint_folder import checkpoint_files
-from triquad_format.mapfile.part_files import PartFiles
+from triquad_format.mapfile.checkpoint_folder import PartFiles, checkpoint_files
 from triquad_format.mapfile.reader import read_map_file
 from triquad_format.records.field_settings import RegionIndex
 from triquad_server.mapping.map_snapshot import MapChanges

@@ -18,7 +18,8 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from numpy.typing import NDArray
 from triquad_format.errors import DamagedMapFileError, MapFileError
-from triquad_format.mapfile.index import MapIndex, check_range
+from triquad_format.mapfile.files import check_range
+from triquad_format.mapfile.index import MapIndex
 from triquad_format.mapfile.manifest import Manifest, pack_manifest
 from triquad_format.mapfile.metadata import MapFacts
 from triquad_format.mapfile.parts.pack import pack_record

@@ -9,8 +9,7 @@ from triquad_format.wire.tile_codec import TileSurface, decode_tile
 from triquad_map.mesh.tile_lattice import TileIndex
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mesh.tile_cache import TileCache
-from triquad_server.mesh.tile_level import ShownTile
+from triquad_server.mesh.tile_cache import ShownTile, TileCache
 from triquad_server.settings import MeshSettings, Settings
 
 EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)

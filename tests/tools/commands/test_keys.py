@@ -5,10 +5,10 @@ import pytest
 import zenoh
 from cryptography import x509
 from cryptography.x509.oid import ExtendedKeyUsageOID
-from triquad_format.wire.roles import Holder, Role
 from triquad_tools.commands import keys
 from triquad_tools.console.command import BAD_INPUT, OK
 from triquad_tools.credentials.key_folder import KeyFolder
+from triquad_tools.credentials.roles import Holder, Role
 
 WORLD = 0o077
 

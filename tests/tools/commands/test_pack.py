@@ -10,9 +10,9 @@ from support.maps.map_records import SMALL, assert_same, random_record
 from triquad_format.mapfile.parts.part import REGION, PartKey
 from triquad_format.mapfile.reader import read_map, read_map_file
 from triquad_format.mapfile.writer import write_map
-from triquad_format.records.crop import crop_record, without_training
-from triquad_format.records.map_progress import MapProgress
+from triquad_format.records.region import MapProgress
 from triquad_tools.commands.pack import main
+from triquad_tools.mapfiles.crop import crop_record, without_training
 
 CUBE = tuple(itertools.product((0, 1), repeat=3))
 

@@ -7,8 +7,8 @@ from support.files.mapfile_edit import file_bytes
 from support.maps.map_records import SMALL, assert_same, random_record
 from triquad_format.mapfile.parts.part import VERTICES
 from triquad_format.mapfile.reader import read_map
-from triquad_format.recovery.recovered_map import recover
 from triquad_tools.commands.pack import main
+from triquad_tools.mapfiles.recovered_map import recover
 
 SQUARES = dataclasses.replace(SMALL, depth=9)
 RECORD = random_record(5, settings=SQUARES, indices=((0, 0, 0), (1, 0, 0)), points=600)

@@ -12,7 +12,6 @@ from support.maps.map_records import random_record
 from support.maps.small_world import settings, settled_epoch
 from triquad_client import Mesh
 from triquad_format.mapfile.reader import read_map
-from triquad_format.records.crop import crop_record
 from triquad_map.composition.recorded_view import RecordedView
 from triquad_map.mesh.tile_mesh import mesh_tile
 from triquad_map.triangles import joined
@@ -20,6 +19,7 @@ from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.tile_cache import tile_lattice
 from triquad_server.mesh.tile_queries import surface_tiles
 from triquad_tools.commands.pack import main
+from triquad_tools.mapfiles.crop import crop_record
 from triquad_tools.mapfiles.meshfile import read_mesh
 
 BOX = ["0.1", "-4.7", "-2", "12.3", "4.1", "3"]

@@ -6,13 +6,12 @@ from datetime import datetime, timezone
 from functools import partial
 from pathlib import Path
 
-from triquad_format.wire.roles import Holder, Role
-
 from triquad_tools.console.arguments import add_version, positive, whole
 from triquad_tools.console.command import OK, run
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.report import print_columns
 from triquad_tools.credentials.key_folder import LISTENING, KeyFolder
+from triquad_tools.credentials.roles import Holder, Role
 
 _DAYS = 365.0
 _LAST_DOMAIN = 232  # of ROS 2

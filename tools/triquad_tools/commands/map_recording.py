@@ -6,9 +6,9 @@ from contextlib import closing
 from functools import partial
 from pathlib import Path
 
-from triquad_server.device import DEVICES, check_device
 from triquad_server.errors import StoreError
 from triquad_server.mapping.mapper import Mapper
+from triquad_server.process.installed import DEVICES, check_device
 from triquad_server.process.threads import Teams
 from triquad_server.settings.loading import PRESETS, load_settings
 from triquad_server.warm_up import warm_up

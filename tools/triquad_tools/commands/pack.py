@@ -7,16 +7,16 @@ from pathlib import Path
 
 import numpy as np
 from triquad_format.errors import DamagedMapFileError
-from triquad_format.mapfile.checkpoint import read_checkpoint
 from triquad_format.mapfile.checkpoint_folder import checkpoint_file, checkpoint_files, set_aside
+from triquad_format.mapfile.index import read_checkpoint
 from triquad_format.mapfile.parts.part import EVIDENCE, REGION, TRAINING, VERTICES
-from triquad_format.recovery.recovered_map import Loss, RecoveredMap, recover
 from triquad_format.wire.limits import MAX_FILL_M
 
 from triquad_tools.console.arguments import add_version, within
 from triquad_tools.console.command import FAILED, OK, ToolError, refuse, run
 from triquad_tools.console.lines import print_line
 from triquad_tools.mapfiles.packing import pack_map
+from triquad_tools.mapfiles.recovered_map import Loss, RecoveredMap, recover
 from triquad_tools.mapfiles.source import (
     Box,
     NothingLeftError,

@@ -175,10 +175,8 @@ def _rows(sample: Sample) -> Iterator[Sequence[str]]:
     for name, queue in metrics.queues.items():
         if queue.waiting:
             yield f"queue of {name}", f"{count(queue.waiting)} of {count(queue.limit)}"
-    memory = {"process": status.memory_bytes, "map": status.map_bytes, **metrics.memory_bytes}
-    for name, number in memory.items():
-        if number:
-            yield f"memory of {name}", size(number)
+    yield "memory of process", size(status.memory_bytes)
+    yield "memory of map", size(status.map_bytes)
 
 
 def _times(sample: Sample, name: str) -> Iterator[str]:

@@ -19,13 +19,20 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from triquad_format.mapfile.durable_file import replacing
+from triquad_format.mapfile.files import replacing
 from triquad_format.wire.access_control import access_control
-from triquad_format.wire.roles import ROUTER, SERVER, Holder, Role, client_grants, server_grants
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.credentials import configurations
 from triquad_tools.credentials.certificates import LOCAL_HOSTS, Authority, Certificate
+from triquad_tools.credentials.roles import (
+    ROUTER,
+    SERVER,
+    Holder,
+    Role,
+    client_grants,
+    server_grants,
+)
 
 LISTENING = (SERVER, ROUTER)
 """The roles that listen; each has a file of its own, whose name no client can have."""

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.records.arrays import Bytes, Doubles, Floats
-from triquad_format.records.cells import rows_by_cell
+from triquad_format.records.arrays import Bytes, Doubles, Floats, Longs
 from triquad_format.records.status import Status
 
 from triquad_tools.console.lines import print_line
@@ -206,3 +205,11 @@ def _share(count: int, of: int) -> str:
 
 def _centimetres(metres: float) -> str:
     return "-" if np.isnan(metres) else f"{100 * metres:.2f}"
+
+
+def rows_by_cell(cells: Longs) -> Iterator[tuple[Longs, NDArray[np.intp]]]:
+    """Yield each different cell [3] of ``cells`` [N, 3], in order, with its ascending rows [K]."""
+    different, numbers = np.unique(cells, axis=0, return_inverse=True)
+    ends = np.cumsum(np.bincount(numbers.reshape(-1)))
+    rows = np.split(np.argsort(numbers.reshape(-1), kind="stable"), ends)
+    return zip(different, rows, strict=False)  # nothing is left behind the last end

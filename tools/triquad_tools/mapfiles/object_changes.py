@@ -4,13 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from triquad_format.records.arrays import Doubles
-from triquad_format.records.cells import rows_by_cell
 from triquad_format.records.status import Status
 from triquad_map.clusters import clusters
 
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.report import print_columns
-from triquad_tools.mapfiles.diff import Comparison, Sighting
+from triquad_tools.mapfiles.diff import Comparison, Sighting, rows_by_cell
 
 LEAST_POINTS = 20
 """Clusters of fewer surface points are left out: noise makes them, too. These are 0.8 square metres

@@ -5,18 +5,24 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 
-from triquad_format.mapfile.checkpoint_folder import checkpoint_at, checkpoint_files, map_folder
+from triquad_format.errors import MapFileError
+from triquad_format.mapfile.checkpoint_folder import (
+    CheckpointFile,
+    checkpoint_files,
+    map_folder,
+)
 from triquad_format.mapfile.parts.part import TRAINING_TOPICS
-from triquad_format.mapfile.reader import read_map_file
+from triquad_format.mapfile.reader import open_manifest, read_map_file
 from triquad_format.records.arrays import Doubles
-from triquad_format.records.crop import crop_record, without_training
 from triquad_format.records.region import MapRecord
 from triquad_map.stored_map import StoredMap
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
+from triquad_tools.mapfiles.crop import crop_record, without_training
 
 Box = Doubles
 """Opposite corners ``[2, 3]`` of a box, metres, map frame; the lower one first."""
@@ -124,3 +130,48 @@ def _box(path: Path, box: Box, training: bool) -> SourceMap | None:
         if training and topics & set(TRAINING_TOPICS):
             return None
         return SourceMap(stored.box(box[0], box[1]), stored.manifest.stamp_ns or None)
+
+
+def checkpoint_at(folder: Path, when: str) -> CheckpointFile:
+    """Return the newest checkpoint that is not after ``when``.
+
+    Args:
+        folder: the folder of checkpoints.
+        when: number of an epoch, or a time as in RFC 3339 (local time where it has no offset).
+
+    Raises:
+        MapFileError: ``when`` is neither, or there is no such checkpoint; the text says which
+            there are.
+        OSError: the folder or a file cannot be read.
+    """
+    files = checkpoint_files(folder)
+    found = [file for file in files if _is_by(file, when)]
+    epochs = f"epochs {files[-1].epoch} to {files[0].epoch}" if files else "nothing"
+    if not found:
+        raise MapFileError(f"{folder} holds no checkpoint of {when} or before, but {epochs}")
+    if _is_epoch(when) and int(when) > files[0].epoch:
+        raise MapFileError(
+            f"{folder} holds {epochs}, not {when}; a time is written as 2026-01-31T12:00:00Z"
+        )
+    return max(found)
+
+
+def _is_epoch(when: str) -> bool:
+    return when.isascii() and when.isdigit() and len(when) < 20
+
+
+def _is_by(file: CheckpointFile, when: str) -> bool:
+    if _is_epoch(when):
+        return file.epoch <= int(when)
+    try:
+        limit_s = datetime.fromisoformat(when.replace("Z", "+00:00")).timestamp()
+    except ValueError as error:
+        raise MapFileError(
+            f"{when!r} is neither the number of an epoch nor a time such as 2026-01-31T12:00:00Z"
+        ) from error
+    try:
+        manifest = open_manifest(file)
+    except MapFileError:
+        return False
+    # Times are shown in whole seconds: what is shown must find its checkpoint.
+    return 0 < manifest.stamp_ns // 10**9 <= limit_s

@@ -5,16 +5,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.checkpoint import CheckpointIndex, open_index
 from triquad_format.mapfile.checkpoint_folder import (
     CheckpointFile,
+    PartFiles,
     checkpoint_files,
     map_folder,
     set_aside,
 )
-from triquad_format.mapfile.index import FileBytes, MapIndex, named
+from triquad_format.mapfile.files import FileBytes, named
+from triquad_format.mapfile.index import CheckpointIndex, MapIndex, open_index
 from triquad_format.mapfile.metadata import utc_time
-from triquad_format.mapfile.part_files import PartFiles
 
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.report import print_columns

@@ -8,12 +8,12 @@ import numpy as np
 from triquad_format.errors import NoCompiledCodeError
 from triquad_format.mapfile.manifest import Entry
 from triquad_format.mapfile.reader import MapFile
+from triquad_format.records import morton
 from triquad_format.records.arrays import Bytes, Doubles, Floats
-from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.map_progress import MapProgress
-from triquad_format.records.region import MapRecord, Region
+from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
+from triquad_format.records.region import MapProgress, MapRecord, Region
 from triquad_format.records.replay_rays import are_held_out
-from triquad_format.records.seen_space import evidence_box, owned_evidence
+from triquad_format.records.seen_space import owned_evidence
 from triquad_map.field_fit import MapFit, PlaceFits, Places, in_cube, map_fit
 from triquad_map.record_view import open_view
 
@@ -135,7 +135,7 @@ def _evidence(summary: MapSummary | RegionSummary) -> str:
 
 def _summarise_region(record: MapRecord, region: Region) -> RegionSummary:
     evidence = owned_evidence(record.settings, region)
-    box = evidence_box(record.settings, region)
+    box = _evidence_box(record.settings, region)
     voxel_m3 = record.settings.leaf_m**3
     return RegionSummary(
         index=region.index,
@@ -198,3 +198,15 @@ def _held_out_ends(region: Region, record: MapRecord) -> Floats:
     rays = region.training.rays
     ends = rays.ends_m(record.settings)[are_held_out(rays.ends)].astype(np.float32)
     return ends[in_cube(ends, record.settings)]
+
+
+def _evidence_box(settings: FieldSettings, region: Region) -> Doubles | None:
+    """Return the box [2, 3] around a region's evidence, to whole blocks, metres, map frame.
+
+    ``None`` where there is no evidence.
+    """
+    if not len(region.evidence.codes):
+        return None
+    blocks = morton.decode(region.evidence.codes, 3)
+    ends = np.stack([blocks.min(axis=0), blocks.max(axis=0) + 1])
+    return settings.region_corner(region.index) + ends * (settings.leaf_m * BLOCK_VOXELS)

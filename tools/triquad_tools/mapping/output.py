@@ -5,14 +5,14 @@ import time
 from pathlib import Path
 
 from triquad_client import OfflineMap
-from triquad_format.mapfile.durable_file import replacing
+from triquad_format.mapfile.files import replacing
 from triquad_format.mapfile.metadata import utc_time
 from triquad_format.mapfile.writer import write_map
-from triquad_format.records.crop import without_training
 from triquad_format.records.region import MapRecord
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
+from triquad_tools.mapfiles.crop import without_training
 from triquad_tools.mapfiles.meshfile import MESH_SUFFIXES
 from triquad_tools.mapfiles.source import Box, NothingLeftError, SourceMap
 

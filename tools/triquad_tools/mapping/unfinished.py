@@ -6,7 +6,7 @@ import shutil
 from contextlib import suppress
 from pathlib import Path
 
-from triquad_format.mapfile.durable_file import replacing
+from triquad_format.mapfile.files import replacing
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.process.threads import Teams
 from triquad_server.settings import Settings, StoreSettings

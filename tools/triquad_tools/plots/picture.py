@@ -9,7 +9,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from triquad_client import Mesh
-from triquad_format.mapfile.durable_file import replacing
+from triquad_format.mapfile.files import replacing
 from triquad_map.height_scale import HeightScale
 
 from triquad_tools.plots.colours import HEIGHTS

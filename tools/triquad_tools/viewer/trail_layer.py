@@ -3,8 +3,7 @@
 import numpy as np
 import viser
 from matplotlib.colors import to_rgb
-from triquad_client import Client, ServerStatus
-from triquad_client.calls.sources import ScanSource, SourceReport
+from triquad_client import Client, ScanSource, ServerStatus, SourceReport
 
 from triquad_tools.viewer.page.layer import Layer
 from triquad_tools.viewer.page.legends import problem_html, text_html
@@ -37,7 +36,7 @@ class TrailLayer(Layer):
         report = self._report = self._client.sources(since=self._report, max_points=_SCAN_POINTS)
         status = self._client.status()
         problems = (problem_html(text or "") for text in (status.store_error, status.warnings))
-        lines = (*_state(status), *map(_line, report.sources.values()))
+        lines = (*_state(status), *(_line(name, source) for name, source in report.sources.items()))
         self.tell(text_html("\n".join(lines)) + "".join(problems))
         wanted = (report.server, report.revision, self._trails.value, self._scans.value)
         if wanted == self._shown:
@@ -56,7 +55,7 @@ class TrailLayer(Layer):
             pieces = np.concatenate([np.stack([line[:-1], line[1:]], axis=1) for line in lines])
             marks.append(self.lines(pieces, colour, _LINE_PIXELS, "screen"))
         if source.newest is not None and self._scans.value:
-            points, light = self.page.in_scene(source.newest.points), np.array(to_rgb(colour))
+            points, light = self.page.in_scene(source.newest.points_m), np.array(to_rgb(colour))
             cloud = self.page.scene.add_point_cloud(
                 self.node("scan"), points, light, point_size=_POINT_M, precision="float32"
             )
@@ -72,9 +71,9 @@ def _state(status: ServerStatus) -> tuple[str, str]:
     return f"epoch {status.epoch}, {left}", f"{scans}, {dropped:,} refused, {lost:,} lost"
 
 
-def _line(source: ScanSource) -> str:
+def _line(name: str, source: ScanSource) -> str:
     """Return what the panel says of a source."""
     if source.newest is None:
-        return f"{source.name}: {source.scans:,} scans"
+        return f"{name}: {source.scans:,} scans"
     x, y, z = source.newest.position_m
-    return f"{source.name}: {source.scans:,} scans, now at {x:.1f}, {y:.1f}, {z:.1f} m"
+    return f"{name}: {source.scans:,} scans, now at {x:.1f}, {y:.1f}, {z:.1f} m"

@@ -1,6 +1,5 @@
 """The msgpack map of a part, read with every field checked."""
 
-import re
 import reprlib
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -22,8 +21,6 @@ from triquad_format.wire.codec import ArraySpec, unpack_array
 from triquad_format.wire.unpacking import unpacked
 
 _MAX_REGION_INDEX = 2**31 - 1
-_TOPIC = re.compile(rb"[\x80-\x8f]\xa5topic[\xa0-\xbf](/triquad/[a-z]+)")
-"""The beginning of a part: a short msgpack map, whose first key is ``topic``."""
 
 
 def unpack_body(topic: str, payload: bytes) -> "PartBody":
@@ -38,12 +35,6 @@ def unpack_body(topic: str, payload: bytes) -> "PartBody":
         raise DamagedMapFileError(f"{topic}: {error}") from error
     part.expect("topic", topic)
     return part
-
-
-def part_topic(payload: bytes) -> str | None:
-    """Return the topic that a part names first; ``None``: it is no part."""
-    match = _TOPIC.match(payload)
-    return None if match is None else match[1].decode()
 
 
 class PartBody:

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from triquad_format.records import morton
 from triquad_format.records.arrays import Bytes, Longs
-from triquad_format.records.crop import LeafBox, whole_region
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings, RegionIndex
+from triquad_format.records.leaf_box import LeafBox, whole_region
 from triquad_format.records.region import AXES, FLOATS, MAX_LEVEL
 
 PREFIX = "/triquad/"
@@ -100,11 +100,6 @@ def extent(settings: FieldSettings, key: PartKey) -> LeafBox:
         box.low[axes] = cell * CELL_LEAVES
         box.high[axes] = np.minimum((cell + 1) * CELL_LEAVES, 1 << settings.depth)
     return box
-
-
-def cells_at(leaves: Longs) -> set[int]:
-    """Return codes of the squares or cubes that contain places [N, 2 or 3], in leaf coordinates."""
-    return set(np.unique(morton.encode(leaves >> _LEAVES_LOG2)).tolist())
 
 
 @dataclass(frozen=True)

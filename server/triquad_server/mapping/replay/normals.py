@@ -191,12 +191,6 @@ class MomentGrid:
         """The number of cells in use."""
         return self._cells.count
 
-    @property
-    def nbytes(self) -> int:
-        """The memory of the cells, with their spare room."""
-        arrays = (*self._cells.arrays, self._moments, self._planes, self._basis)
-        return sum(array.nbytes for array in arrays)
-
     def _centres(self) -> Doubles:
         return np.asarray((self._cells.cells() + 0.5) * self._cell_m, np.float64)
 
@@ -240,11 +234,6 @@ class SurfaceNormals:
             grid.add(points)
             if grid.cells > self._max_cells:
                 grid.keep_nearest(points[-1], self._max_cells // 2)
-
-    @property
-    def nbytes(self) -> int:
-        """The memory of both grids."""
-        return sum(grid.nbytes for grid in self._grids)
 
     def forget(self, low: Doubles, high: Doubles) -> None:
         """Forget the surfaces between the corners ``low`` and ``high`` [3]."""

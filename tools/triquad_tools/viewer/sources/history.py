@@ -10,9 +10,9 @@ from triquad_format.mapfile.checkpoint_folder import (
     CheckpointFile,
     checkpoint_files,
     map_folder,
-    open_manifest,
 )
 from triquad_format.mapfile.metadata import utc_time
+from triquad_format.mapfile.reader import open_manifest
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.viewer.sources.stored_map import StoredMap

@@ -1,7 +1,8 @@
-"""The bounds of the fields of replies, and the check that the client makes of a reply.
+"""The bounds of the fields of messages, and the check of what came over the network.
 
 A field's annotation names its bounds next to its type, so that a message says all of it in one
-place. A server may be wrong or hostile: what does not answer the question is refused whole.
+place. Servers refuse a question that is out of bounds. A server may be wrong or hostile, too: what
+does not answer the question is refused whole.
 """
 
 import math
@@ -26,7 +27,7 @@ _RIGID_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class Exchange:
-    """A question and the reply to it: what the value of a field is compared with."""
+    """A question and the message that is checked: what the value of a field is compared with."""
 
     question: Message
     around: tuple[Message, ...]  # the messages that the field is in, innermost first
@@ -40,8 +41,12 @@ class Exchange:
 
     def rows(self, field: str) -> int:
         """Return the rows of an array that stands next to the field, or around it."""
+        return len(self.beside(field))
+
+    def beside(self, field: str) -> Any:
+        """Return the value of a field that stands next to the one that is checked, or around it."""
         holder = next(message for message in self.around if field in message.forms())
-        return len(getattr(holder, field))
+        return getattr(holder, field)
 
 
 @dataclass(frozen=True)
@@ -126,18 +131,18 @@ def shape_asked_by(field: str) -> Bound:
     return Bound(problem)
 
 
-def same_as_asked(field: str) -> Bound:
-    """Bound a number to that of the question, which may leave it to the server with 0."""
+def same_as_asked(field: str, *, any_for: int | None = 0) -> Bound:
+    """Bound a number to that of the question, which may leave it to the server with ``any_for``."""
 
     def problem(value: int, exchange: Exchange) -> str | None:
-        asked = getattr(exchange.question, field, 0)
-        return f"{value} came for {asked}" if asked and value != asked else None
+        asked = getattr(exchange.question, field, any_for)
+        return f"{value} came for {asked}" if value != asked != any_for else None
 
     return Bound(problem)
 
 
 def rows_of(field: str, more: int = 0) -> Bound:
-    """Bound rows to as many as another array of the reply has, and ``more``."""
+    """Bound rows to as many as another array of the message has, and ``more``."""
 
     def problem(value: Any, exchange: Exchange) -> str | None:
         count = exchange.rows(field) + more
@@ -156,6 +161,25 @@ def parts_of(field: str) -> Bound:
     return Bound(problem)
 
 
+def rows(least: int, most: int) -> Bound:
+    """Bound the number of rows of an array."""
+
+    def problem(value: Any, _: Exchange) -> str | None:
+        return None if least <= len(value) <= most else f"{len(value)} rows: use {least} to {most}"
+
+    return Bound(problem)
+
+
+def corner_above(field: str) -> Bound:
+    """Bound the corner of a box to lie nowhere below another one; both may be infinite."""
+
+    def problem(value: Any, exchange: Exchange) -> str | None:
+        low = exchange.beside(field)
+        return None if (low <= value).all() else f"not a box: from {low} to {value}"
+
+    return Bound(problem)
+
+
 def rigid_pose() -> Bound:
     """Bound a matrix to a rotation and a translation."""
     small = within(-1e12, 1e12)
@@ -169,6 +193,11 @@ def rigid_pose() -> Bound:
         return None if is_proper and off <= _RIGID_TOLERANCE else "it is no rigid pose"
 
     return Bound(problem)
+
+
+def check_question(question: Message) -> None:
+    """Raise :class:`WireError`, naming the field and its value, where it is out of bounds."""
+    check_answers(question, question)
 
 
 def check_answers(question: Message, reply: Message) -> None:

@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import triquad_server.net.configuration as network
+import triquad_server.network as network
 from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
 from triquad_server.errors import ServerError
-from triquad_server.net.configuration import Configuration, NetworkOptions
+from triquad_server.network import Configuration, NetworkOptions
 from triquad_server.settings import Settings
 
 SAFE = {

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-
 from triquad_format.errors import FormatError, MapFileError
-from triquad_format.mapfile.index import named
+from triquad_format.mapfile.files import named
 from triquad_format.mapfile.parts.part import (
+    CELL_LEAVES,
     FIELD_TOPICS,
     REGION,
     REGION_TOPICS,
@@ -21,17 +21,19 @@ from triquad_format.mapfile.parts.part import (
     TRAINING_TOPICS,
     VERTICES,
     PartKey,
-    cells_at,
     extent,
     vertex_reach,
 )
 from triquad_format.mapfile.parts.region_parts import RegionParts
-from triquad_format.records.arrays import Doubles
-from triquad_format.records.crop import LeafBox, status_voxels
+from triquad_format.records import morton
+from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
+from triquad_format.records.leaf_box import LeafBox
 from triquad_format.records.record_check import check_record
 from triquad_format.records.region import AXES, MapRecord, Region, masked, seen_voxels
-from triquad_format.recovery.intact_parts import IntactParts, intact_parts
+
+from triquad_tools.mapfiles.crop import status_voxels
+from triquad_tools.mapfiles.intact_parts import IntactParts, intact_parts
 
 STATUS_REACH_LEAVES = 2
 """Leaves beyond lost vertices in which a status may change: voxels that have an effect there are
@@ -156,11 +158,16 @@ def _missing_squares(
         shift = settings.depth - table.level
         nodes = np.unique(voxels[:, list(AXES[table.plane])] >> shift, axis=0)
         for corner in np.ndindex(2, 2):
-            squares = cells_at((nodes + corner) << shift)
+            squares = _squares_at((nodes + corner) << shift)
             needed |= {
                 PartKey(VERTICES, region.index, plane=table.plane, cell=cell) for cell in squares
             }
     return needed - payloads.keys()
+
+
+def _squares_at(leaves: Longs) -> set[int]:
+    """Return codes of the squares that contain places [N, 2], in leaf coordinates."""
+    return set(np.unique(morton.encode(leaves // CELL_LEAVES)).tolist())
 
 
 def _masked_where_lost(

@@ -1,4 +1,4 @@
-"""Measures this process's memory, and lets freed memory be returned to the system."""
+"""The memory and the open files of this process: how much there is, and may be."""
 
 import contextlib
 import ctypes
@@ -48,3 +48,13 @@ def give_back_free() -> None:
     if sys.platform == "linux":
         with contextlib.suppress(OSError, AttributeError):
             ctypes.CDLL(None).malloc_trim(0)
+
+
+def allow_open_files() -> None:
+    """Allow as many open files as the system permits.
+
+    Of the usual 1024, links that are opened and send nothing would leave none for checkpoints.
+    """
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with contextlib.suppress(ValueError, OSError):  # no more than there were
+        resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))

@@ -1,6 +1,8 @@
-"""The Zenoh configuration of a server: options first, then a file, then safe defaults."""
+"""The Zenoh session of a server. Of its configuration options come first, then a file, then safe
+defaults."""
 
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +14,7 @@ from triquad_format.wire.endpoints import DEFAULT_ENDPOINT, is_of_this_machine
 from triquad_format.wire.limits import MAX_QUERY_POINTS, payload_limit
 from triquad_format.wire.zenoh_config import QUIET, fill, is_set, put
 
-from triquad_server.errors import ServerError
+from triquad_server.errors import ListenError, ServerError
 from triquad_server.settings import Settings
 
 _CONNECT_MS = 5000  # a router that was started together with the server may need a moment
@@ -31,6 +33,16 @@ router."""
 _NO_SCOUTING = {"scouting/delay": 1}
 """How long a router waits for others as it starts [ms], 500 by default; without scouting, none
 come."""
+
+_ZENOH_THREADS = "(rx: (worker_threads: 4), tx: (worker_threads: 8))"
+"""The number of Zenoh's threads, in the form of its environment variable ``ZENOH_RUNTIME``.
+
+Zenoh gives up a client that takes nothing after five seconds, and the thread that sends to it then
+waits for any others that have something for it. By default all clients share one such thread:
+replies to others were late as well, and their links were closed in turn. Those that receive are
+more than the usual two for the same reason: many megabytes of one client must not come before all
+others.
+"""
 
 
 @dataclass(frozen=True)
@@ -93,7 +105,7 @@ def configuration(options: NetworkOptions, map_name: str, settings: Settings) ->
         return _configuration(options, _safe(map_name, settings))
     except (zenoh.ZError, ValueError, OSError) as error:
         file = "" if options.config_file is None else f" {options.config_file}"
-        raise ServerError(f"Zenoh configuration{file}: {first_line(error)}") from error
+        raise ServerError(f"Zenoh configuration{file}: {_first_line(error)}") from error
 
 
 def _configuration(options: NetworkOptions, safe: dict[str, Any]) -> Configuration:
@@ -149,6 +161,33 @@ def _max_message_bytes(scan_points: int) -> int:
     return max(largest, payload_limit(0) + scan_points * _SENSOR_POINT_BYTES)
 
 
-def first_line(error: Exception) -> str:
+def _first_line(error: Exception) -> str:
     """Return the text of an error without Zenoh's source locations."""
     return " ".join(str(error).split(" at /", 1)[0].split())
+
+
+def open_session(config: Configuration) -> zenoh.Session:
+    """Open a Zenoh session.
+
+    Raises:
+        ListenError: an endpoint cannot be listened on, or none to connect to answers.
+    """
+    os.environ.setdefault("ZENOH_RUNTIME", _ZENOH_THREADS)  # read once, by the first session
+    try:
+        return zenoh.open(config.zenoh)
+    except zenoh.ZError as error:
+        raise ListenError(_what_failed(config, _first_line(error))) from error
+
+
+def _what_failed(config: Configuration, reason: str) -> str:
+    if reason.startswith("Unable to connect"):
+        endpoints = ", ".join(config.connect)
+        return f"cannot connect to {endpoints}: {reason} Start a router there first."
+    remedy = "is another server running there? choose another endpoint with --listen"
+    if "TLS" in reason and "in use" not in reason:
+        remedy = "check the credentials of the Zenoh configuration: triquad-keys makes them"
+    elif "not supported" in reason:
+        remedy = "write --listen tcp/HOST:PORT"
+    elif "lookup address" in reason:
+        remedy = "give --listen an address of this machine, or 0.0.0.0 for all of them"
+    return f"cannot open {', '.join(config.listen)}: {reason} ({remedy})"

@@ -9,8 +9,7 @@ import pytest
 from support import servers
 from support.attackers.role_files import free_tls_endpoint
 from triquad_server.errors import ListenError
-from triquad_server.net.configuration import NetworkOptions, configuration
-from triquad_server.net.session import open_session
+from triquad_server.network import NetworkOptions, configuration, open_session
 from triquad_server.settings import Settings
 from triquad_tools.credentials.key_folder import KeyFolder
 

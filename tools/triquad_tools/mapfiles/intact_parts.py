@@ -18,12 +18,12 @@ from triquad_format.errors import (
     TooLargeMapFileError,
     UnsupportedMapFileError,
 )
-from triquad_format.mapfile.checkpoint import CheckpointIndex, is_checkpoint
 from triquad_format.mapfile.container import chunk_messages, decompress
-from triquad_format.mapfile.index import FileBytes
+from triquad_format.mapfile.files import FileBytes
+from triquad_format.mapfile.index import CheckpointIndex, is_checkpoint
 from triquad_format.mapfile.manifest import Entry, Manifest, manifest_in, total_limit
 from triquad_format.mapfile.metadata import MAX_MAP_BYTES, MapFacts, unpack_facts
-from triquad_format.mapfile.parts.body import part_topic, unpack_body
+from triquad_format.mapfile.parts.body import unpack_body
 from triquad_format.mapfile.parts.part import (
     MANIFEST,
     MAP,
@@ -39,6 +39,10 @@ _LEAST_BUDGET, _BUDGET_RATIO = 2**24, 8
 _CHUNK = re.compile(rb"\x06(.{4})\x00{4}.{28}(\x04\x00{3}zstd|\x00{4})(.{4})\x00{4}", re.DOTALL)
 """The head of a chunk record below 4 GiB: its length, then times, size, checksum, the name of its
 compression, and the length of what is stored."""
+
+
+_TOPIC = re.compile(rb"[\x80-\x8f]\xa5topic[\xa0-\xbf](/triquad/[a-z]+)")
+"""The beginning of a part: a short msgpack map, whose first key is ``topic``."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +78,7 @@ def intact_parts(path: Path) -> IntactParts:
         by_digest = {hashlib.sha256(payload).digest(): payload for payload in payloads}
         return _listed_parts(manifest, lambda entry: by_digest.get(entry.sha256))
     for payload in payloads:
-        if part_topic(payload) == MAP:
+        if _part_topic(payload) == MAP:
             facts = unpack_facts(unpack_body(MAP, payload))
             keyed = ((_own_key(payload), payload) for payload in payloads)
             return IntactParts(facts, {key: data for key, data in keyed if key is not None})
@@ -83,7 +87,7 @@ def intact_parts(path: Path) -> IntactParts:
 
 def _manifest(payloads: list[bytes]) -> Manifest | None:
     for payload in payloads:
-        if part_topic(payload) == MANIFEST:
+        if _part_topic(payload) == MANIFEST:
             try:
                 # A file that was cut lists parts for which it has no room: any size will do.
                 return manifest_in(unpack_body(MANIFEST, payload), MAX_MAP_BYTES)
@@ -113,7 +117,7 @@ def _listed_parts(manifest: Manifest, payload_of: Callable[[Entry], bytes | None
 
 def _own_key(payload: bytes) -> PartKey | None:
     """Return the key that a part of a region names itself."""
-    topic = part_topic(payload)
+    topic = _part_topic(payload)
     if topic not in REGION_TOPICS:
         return None
     with suppress(FormatError):
@@ -161,3 +165,9 @@ def _intact_messages(data: bytes) -> Iterator[bytes]:
         with suppress(FormatError):
             yield from chunk_messages(data[start:end], start)
             at = end
+
+
+def _part_topic(payload: bytes) -> str | None:
+    """Return the topic that a part names first; ``None``: it is no part."""
+    match = _TOPIC.match(payload)
+    return None if match is None else match[1].decode()

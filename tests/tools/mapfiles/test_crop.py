@@ -9,8 +9,9 @@ from support.maps.map_records import SMALL, assert_same, random_record, with_ray
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
-from triquad_format.records.crop import SLACK_LEAVES, crop_record
+from triquad_format.records.leaf_box import SLACK_LEAVES
 from triquad_map.composition.recorded_view import RecordedView
+from triquad_tools.mapfiles.crop import crop_record
 
 CUBE = tuple(itertools.product((0, 1), repeat=3))
 

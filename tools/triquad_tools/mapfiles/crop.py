@@ -1,16 +1,14 @@
-"""Boxes of a map: what lies in one, and a map cut down to one or freed of training state."""
+"""A map cut down to what lies in a box, or freed of training state."""
 
 import dataclasses
-from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
-from triquad_format.errors import FormatError
 from triquad_format.records import morton
-from triquad_format.records.arrays import Bytes, Doubles
-from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings, RegionIndex
+from triquad_format.records.arrays import Bytes
+from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
+from triquad_format.records.leaf_box import LeafBox, check_box, leaf_box, whole_region
 from triquad_format.records.region import (
     AXES,
     Evidence,
@@ -21,52 +19,10 @@ from triquad_format.records.region import (
     masked,
 )
 
-SLACK_LEAVES = 1 / 16
-"""Kept around a box: points are rounded to float32, at depth 15 by up to 1/128 of a leaf."""
-
 _Number = TypeVar("_Number", bound=np.number)
 
 _REACH_VOXELS = 0.5
 """A point is near a surface where one was seen this far away."""
-
-
-@dataclass(frozen=True)
-class LeafBox:
-    """A box in the leaf coordinates of one region."""
-
-    low: NDArray[np.floating]  # [3]
-    high: NDArray[np.floating]  # [3]
-
-    def meets(self, other: "LeafBox", slack: float = 0.0) -> bool:
-        """Return whether the two come as near as ``slack`` leaves on every axis."""
-        near = (self.low <= other.high + slack) & (self.high >= other.low - slack)
-        return bool(near.all())
-
-
-def whole_region(settings: FieldSettings) -> LeafBox:
-    """Return a region's cube."""
-    return LeafBox(np.zeros(3), np.full(3, float(1 << settings.depth)))
-
-
-def leaf_box(settings: FieldSettings, index: RegionIndex, low: Doubles, high: Doubles) -> LeafBox:
-    """Return the box between corners [3], metres, map frame, grown by what rounding may need."""
-    centre = settings.region_centre(index)
-    return LeafBox(
-        settings.leaf_coordinates(low - centre) - SLACK_LEAVES,
-        settings.leaf_coordinates(high - centre) + SLACK_LEAVES,
-    )
-
-
-def check_box(minimum: ArrayLike, maximum: ArrayLike) -> tuple[Doubles, Doubles]:
-    """Return the corners [3] of a box, metres, as arrays.
-
-    Raises:
-        FormatError: they are not finite, or not in order.
-    """
-    low, high = np.asarray(minimum, np.float64), np.asarray(maximum, np.float64)
-    if not (np.isfinite([low, high]).all() and (low < high).all()):
-        raise FormatError(f"a box from {low.tolist()} to {high.tolist()} holds nothing")
-    return low, high
 
 
 def crop_record(record: MapRecord, minimum: ArrayLike, maximum: ArrayLike) -> MapRecord:

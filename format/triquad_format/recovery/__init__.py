@@ -1,1 +1,0 @@
-"""The recovery of what is intact of a damaged file."""

@@ -1,1 +1,0 @@
-"""The Zenoh session, and its configuration."""

@@ -1,1 +1,0 @@
-"""The answers to queries of what changed in a map, and of the sources of its scans."""
