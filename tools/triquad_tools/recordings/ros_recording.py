@@ -2,7 +2,7 @@
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
-from typing import Any
+from dataclasses import replace
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.bag import Bag, Message
@@ -58,7 +58,6 @@ class RosRecording:
         self._poses: PoseSource | None = None
         self._placed: list[SeenCloud] = []
         self._left_out: dict[tuple[str, str], list[SeenCloud]] = defaultdict(list)
-        self._reasons: dict[tuple[str, str], str] = {}  # the first, by topic and its short key
         self._place_clouds(options)
 
     @property
@@ -95,29 +94,26 @@ class RosRecording:
         wanted = {(self._placed[i].topic, self._placed[i].number) for i in indices}
         topics = {topic for topic, _ in wanted}
         numbers: Counter[str] = Counter()
-        with self._bag.open() as opened:
-            connections = [c for c in opened.connections if c.topic in topics]
-            for message in opened.messages(connections):
-                topic = message.connection.topic
-                key = topic, numbers[topic]
-                numbers[topic] += 1
-                if key in wanted:
-                    wanted.discard(key)
-                    yield self._read(message, opened.decode(message))
+        for message in self._bag.messages(lambda connection: connection.topic in topics):
+            key = message.topic, numbers[message.topic]
+            numbers[message.topic] += 1
+            if key in wanted:
+                wanted.discard(key)
+                yield self._read(message)
         if wanted:
             raise ToolError(
                 f"{self._bag.path}: {len(wanted)} scans are no longer there; has it changed since "
                 "it was looked through?"
             )
 
-    def _read(self, message: Message, decoded: Any) -> PosedScan:
+    def _read(self, message: Message) -> PosedScan:
         assert self._poses is not None
-        topic, kind = message.connection.topic, message.connection.msgtype
+        decoded, came_ns = message.decoded(), message.recorded_ns
         try:
-            sweep = self._reader.sweep(topic, kind, decoded, message.recorded_ns)
+            sweep = self._reader.sweep(message.topic, message.kind, decoded, came_ns)
             return place(sweep, self._poses.frames, self._poses.target)
         except NoScanError as error:
-            raise ToolError(f"{self._bag.path}: a message on {topic}: {error}") from error
+            raise ToolError(f"{self._bag.path}: a message on {message.topic}: {error}") from error
 
     def _place_clouds(self, options: ReadingOptions) -> None:
         """Choose the poses, and find out which clouds they place."""
@@ -132,8 +128,8 @@ class RosRecording:
                 newest_ns[cloud.topic] = cloud.stamp_ns
                 self._placed.append(cloud)
             else:
-                self._left_out[cloud.topic, problem.reason].append(cloud)
-                self._reasons.setdefault((cloud.topic, problem.reason), str(problem))
+                left_out = replace(cloud, problem=problem)
+                self._left_out[cloud.topic, problem.reason].append(left_out)
 
     def _problem(self, cloud: SeenCloud, newest_ns: dict[str, int]) -> NoScanError | None:
         if cloud.problem is not None:
@@ -147,8 +143,7 @@ class RosRecording:
     def _left_out_line(self, topic: str, reason: str) -> str:
         clouds = self._left_out[topic, reason]
         of_topic = sum(cloud.topic == topic for cloud in self._content.clouds)
-        why = self._reasons[topic, reason]
-        line = f"{topic}: {len(clouds)} of {of_topic} are left out: {why}"
+        line = f"{topic}: {len(clouds)} of {of_topic} are left out: {clouds[0].problem}"
         if reason == "no_transform":
             return f"{line}; {_NO_TRANSFORM.format(frame=clouds[0].frame)}"
         if reason in _OF_TIME and not any(placed.topic == topic for placed in self._placed):
