@@ -4,14 +4,15 @@ import numpy as np
 import pytest
 from support.ros.ros_messages import RosMessages
 from triquad_tools.commands.ros2 import bridge_options, parser
-from triquad_tools.ros2.attachment import ATTACHMENT, SequenceGaps
-from triquad_tools.ros2.output.markers import Action, Marker
-from triquad_tools.ros2.topic_choice import Role, TopicChoice
+from triquad_tools.ros2.options import Role, TopicChoice
+from triquad_tools.ros2.output.mesh_publisher import Action, Marker
 from triquad_tools.ros2.topics import (
+    ATTACHMENT,
     Announcement,
     Delivery,
     End,
     Entity,
+    SequenceGaps,
     Topic,
     bridge_token,
     read_token,

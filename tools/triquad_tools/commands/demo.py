@@ -12,12 +12,10 @@ from pathlib import Path
 from triquad_server import serve
 
 from triquad_tools.console.arguments import add_version, count, port, seed
-from triquad_tools.console.command import FAILED, OK, ToolError, complain, run
-from triquad_tools.console.interrupts import sigterm_interrupts
+from triquad_tools.console.command import FAILED, OK, ToolError, complain, run, sigterm_interrupts
 from triquad_tools.console.lines import print_line, print_remark
 from triquad_tools.console.report import json_text, print_rows
-from triquad_tools.demo.results import DemoResults, broken_promises, table_rows
-from triquad_tools.demo.steps import MAP, demonstrate
+from triquad_tools.demo.steps import MAP, DemoResults, broken_promises, demonstrate, table_rows
 from triquad_tools.simulation.street import street_drive
 from triquad_tools.viewer.sources.live_source import LiveSource
 from triquad_tools.viewer.viewer import DEFAULT_PORT, Viewer

@@ -9,12 +9,11 @@ from triquad_format.errors import DamagedMapFileError
 from triquad_format.mapfile.metadata import utc_time
 from triquad_format.mapfile.reader import MapFile, read_map_file
 
-from triquad_tools.console.arguments import add_version, picture
+from triquad_tools.console.arguments import DEFAULT_MAP, add_config, add_version, picture
 from triquad_tools.console.command import FAILED, OK, ToolError, complain, refuse, run
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.progress import progress
 from triquad_tools.console.report import json_text
-from triquad_tools.console.server_arguments import DEFAULT_MAP, add_config
 from triquad_tools.mapfiles.diff import compare, difference, print_diff
 from triquad_tools.mapfiles.object_changes import object_changes, print_objects
 from triquad_tools.mapfiles.source import SourceMap, is_endpoint, map_file

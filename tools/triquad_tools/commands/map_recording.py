@@ -17,9 +17,8 @@ from triquad_tools.console.arguments import add_version
 from triquad_tools.console.command import OK, ToolError, run
 from triquad_tools.console.lines import print_line, print_remark
 from triquad_tools.console.progress import progress
-from triquad_tools.mapping.mapping_run import MappingRun
+from triquad_tools.mapping.mapping_run import MappingRun, UnfinishedMap, mapping_key
 from triquad_tools.mapping.output import SUFFIXES, check_target, write_output
-from triquad_tools.mapping.unfinished import UnfinishedMap, mapping_key
 from triquad_tools.recordings.arguments import add_recording
 from triquad_tools.recordings.selection import Selection, open_selected
 

@@ -8,12 +8,11 @@ from functools import partial
 
 from triquad_client import Client, FlushReport, connect
 
-from triquad_tools.console.arguments import add_version, positive
+from triquad_tools.console.arguments import DEFAULT_MAP, add_server, add_version, positive
 from triquad_tools.console.command import FAILED, OK, run
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.progress import progress
 from triquad_tools.console.report import print_columns
-from triquad_tools.console.server_arguments import DEFAULT_MAP, add_server
 from triquad_tools.recordings.arguments import add_recording, options_of
 from triquad_tools.recordings.opening import open_recording
 from triquad_tools.recordings.publishing import (

@@ -13,21 +13,27 @@ from functools import partial
 
 from triquad_client import Client, ConnectError, UnknownMapError, connect
 
-from triquad_tools.console.arguments import add_version, count, whole, within
-from triquad_tools.console.command import FAILED, OK, ToolError, run
-from triquad_tools.console.interrupts import sigterm_interrupts
-from triquad_tools.console.log import start_log
-from triquad_tools.console.server_arguments import DEFAULT_MAP, add_server
+from triquad_tools.console.arguments import (
+    DEFAULT_MAP,
+    add_server,
+    add_version,
+    count,
+    whole,
+    within,
+)
+from triquad_tools.console.command import FAILED, OK, ToolError, run, sigterm_interrupts
+from triquad_tools.console.lines import start_log
 from triquad_tools.ros2.bridge import Bridge
 from triquad_tools.ros2.options import (
     MAX_GRID_CELLS,
+    TF_POSES,
     BridgeOptions,
     ScanOptions,
     SliceShape,
+    TopicChoice,
 )
 from triquad_tools.ros2.server_process import ServerProcess
 from triquad_tools.ros2.session import open_session
-from triquad_tools.ros2.topic_choice import TF_POSES, TopicChoice
 from triquad_tools.sensors.ros.header import frame_name
 
 _COMMAND = "triquad-ros2"

@@ -21,12 +21,16 @@ from triquad_format.mapfile.metadata import utc_time
 from triquad_format.printable import printable
 
 from triquad_tools.console.amounts import count, duration, milliseconds, rate, size, within
-from triquad_tools.console.arguments import add_version, positive
-from triquad_tools.console.command import FAILED, OK, complain, run
-from triquad_tools.console.interrupts import sigterm_interrupts
+from triquad_tools.console.arguments import (
+    DEFAULT_MAP,
+    add_server,
+    add_version,
+    positive,
+    server_name,
+)
+from triquad_tools.console.command import FAILED, OK, complain, run, sigterm_interrupts
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.report import json_text
-from triquad_tools.console.server_arguments import DEFAULT_MAP, add_server, server_name
 
 _COMMAND = "triquad-top"
 _TIMEOUT_S = 5.0  # for connecting, and for each reply

@@ -9,11 +9,10 @@ from pathlib import Path
 
 import triquad_client
 
-from triquad_tools.console.arguments import add_version, port
+from triquad_tools.console.arguments import DEFAULT_MAP, add_server, add_version, port, server_name
 from triquad_tools.console.command import OK, complain, refuse, run
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.progress import progress
-from triquad_tools.console.server_arguments import DEFAULT_MAP, add_server, server_name
 from triquad_tools.viewer.sources.history import History, moment
 from triquad_tools.viewer.sources.live_source import LiveSource
 from triquad_tools.viewer.sources.map_source import MapSource

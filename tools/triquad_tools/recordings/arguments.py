@@ -9,7 +9,7 @@ from triquad_client.depth_image import Intrinsics
 from triquad_client.pose import Pose
 
 from triquad_tools.console.arguments import count, not_negative, positive
-from triquad_tools.recordings.options import ReadingOptions
+from triquad_tools.recordings.recording import ReadingOptions
 from triquad_tools.sensors.motion.frame_tree import STATIC, Transform
 from triquad_tools.sensors.ros.header import frame_name
 

@@ -9,7 +9,7 @@ from triquad_tools.recordings.bag import find_bag
 from triquad_tools.recordings.folders.cloud_folder import is_cloud_folder, read_cloud_folder
 from triquad_tools.recordings.folders.depth_folder import is_depth_folder, read_depth_folder
 from triquad_tools.recordings.folders.scan_folder import ScanFolder
-from triquad_tools.recordings.options import ReadingOptions
+from triquad_tools.recordings.recording import ReadingOptions
 from triquad_tools.recordings.ros_recording import RosRecording
 
 Recording = RosRecording | ScanFolder

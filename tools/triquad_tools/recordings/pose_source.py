@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.options import ReadingOptions
+from triquad_tools.recordings.recording import ReadingOptions
 from triquad_tools.recordings.ros_content import RosContent, SeenCloud
-from triquad_tools.sensors.errors import NoTransformError
 from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES, FrameTree
+from triquad_tools.sensors.sweep import NoTransformError
 
 TF = "tf"
 """Stands for all transforms, whatever their topics."""

@@ -6,17 +6,15 @@ from dataclasses import replace
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.bag import Bag, Message
-from triquad_tools.recordings.options import ReadingOptions
 from triquad_tools.recordings.pose_source import TF, PoseSource, choose_poses
-from triquad_tools.recordings.recording import ScanEntry, Stream
+from triquad_tools.recordings.recording import ReadingOptions, ScanEntry, Stream
 from triquad_tools.recordings.ros_content import RosContent, SeenCloud
-from triquad_tools.sensors.errors import NoScanError
 from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES
 from triquad_tools.sensors.motion.placing import place
 from triquad_tools.sensors.ros import type_store
 from triquad_tools.sensors.ros.header import source_of_topic
 from triquad_tools.sensors.ros.message_reader import MessageReader
-from triquad_tools.sensors.sweep import PosedScan
+from triquad_tools.sensors.sweep import NoScanError, PosedScan
 
 _CLOCKS = (
     "no cloud's stamp lies within the times of the poses: where they are of another clock, "

@@ -19,8 +19,8 @@ from triquad_format.wire.access_control import (
 )
 from triquad_format.wire.endpoints import DEFAULT_ENDPOINT, Locator, full_endpoint
 
-from triquad_tools.console.server_arguments import DEFAULT_MAP
-from triquad_tools.ros2.topic_choice import TopicChoice
+from triquad_tools.console.arguments import DEFAULT_MAP
+from triquad_tools.ros2.options import TopicChoice
 from triquad_tools.ros2.topics import bridge_key
 
 _PR_SET_PDEATHSIG = 1  # of prctl(2)

@@ -4,6 +4,7 @@ There are two ways to write them: that of rmw_zenoh (its docs/design.md), and th
 zenoh-bridge-ros2dds (its liveliness_mgt.rs).
 """
 
+import struct
 from dataclasses import dataclass
 from enum import Enum
 
@@ -152,3 +153,34 @@ def _dds_type(type_name: str) -> str:
 def _ros_type(dds_type: str) -> str:
     package, kind, _, name = dds_type.split("::")
     return f"{package}/{kind}/{name.removesuffix('_')}"
+
+
+ATTACHMENT = struct.Struct("<qqB16s")
+"""The attachment: number, time, length of the identity, identity of the publisher."""
+
+_MAX_PUBLISHERS = 256
+_MAX_MISSED = 2**20  # a larger step is of a publisher that was started again, or of wrong bytes
+
+
+class SequenceGaps:
+    """The last number of each publisher."""
+
+    def __init__(self) -> None:
+        self._last: dict[bytes, int] = {}
+
+    def missed(self, attachment: bytes) -> int:
+        """Return how many messages of its publisher are missing before one with this attachment.
+
+        An attachment in another form, as by old releases, is ignored, and so is a
+        number below 0 or one that is too far ahead.
+        """
+        if len(attachment) != ATTACHMENT.size:
+            return 0
+        number: int
+        number, _, _, publisher = ATTACHMENT.unpack(attachment)
+        if len(self._last) > _MAX_PUBLISHERS:
+            self._last.clear()
+        last = self._last.get(publisher, number - 1)
+        self._last[publisher] = number
+        missed = number - last - 1
+        return missed if 0 <= missed <= _MAX_MISSED and last >= 0 else 0

@@ -22,8 +22,8 @@ from triquad_tools.recordings.text_lines import (
     parse_stamp,
     read_lines,
 )
-from triquad_tools.sensors.errors import NoTransformError
 from triquad_tools.sensors.motion.frame_tree import FrameTree, Transform
+from triquad_tools.sensors.sweep import NoTransformError
 
 DEFAULT_PERIOD_NS = 100_000_000
 """The time between scans of a recording without times."""

@@ -13,21 +13,18 @@ import zenoh
 from triquad_client import Client, InvalidScanError
 from triquad_format.errors import TriquadError
 
-from triquad_tools.ros2.attachment import SequenceGaps
-from triquad_tools.ros2.intake.drop_log import DropLog
-from triquad_tools.ros2.intake.first_scan import FirstScan
+from triquad_tools.ros2.intake.drop_log import DropLog, FirstScan
 from triquad_tools.ros2.intake.message_queue import Arrival, MessageQueue, QueueLimits
 from triquad_tools.ros2.intake.motion import Motion
 from triquad_tools.ros2.intake.placement import Placed, Placement
 from triquad_tools.ros2.intake.scan_publisher import Place, ScanPublisher
 from triquad_tools.ros2.intake.topic_listener import TopicListener
 from triquad_tools.ros2.node import Node
-from triquad_tools.ros2.options import BridgeOptions
-from triquad_tools.ros2.topic_choice import TYPES, Role
-from triquad_tools.sensors.errors import NoScanError
+from triquad_tools.ros2.options import TYPES, BridgeOptions, Role
+from triquad_tools.ros2.topics import SequenceGaps
 from triquad_tools.sensors.ros.message_reader import MessageReader
 from triquad_tools.sensors.ros.type_store import decode_cdr
-from triquad_tools.sensors.sweep import Sweep
+from triquad_tools.sensors.sweep import NoScanError, Sweep
 
 _log = logging.getLogger("triquad_ros2")
 

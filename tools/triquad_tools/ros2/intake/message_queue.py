@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import zenoh
 
-from triquad_tools.ros2.topic_choice import Role
+from triquad_tools.ros2.options import Role
 
 
 @dataclass(frozen=True, eq=False)

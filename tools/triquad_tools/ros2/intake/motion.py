@@ -2,8 +2,8 @@
 
 from triquad_client.errors import InvalidScanError
 
-from triquad_tools.sensors.errors import NoScanError
 from triquad_tools.sensors.motion.frame_tree import STATIC, FrameTree, Transform
+from triquad_tools.sensors.sweep import NoScanError
 
 RESTART_NS = 10 * 10**9
 """Transforms that go back by more are of a simulation or a bag that was started again."""

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from triquad_tools.ros2.intake.motion import Motion
-from triquad_tools.sensors.errors import NoScanError, NoTransformError
 from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES
 from triquad_tools.sensors.motion.placing import place
-from triquad_tools.sensors.sweep import PosedScan, Sweep
+from triquad_tools.sensors.sweep import NoScanError, NoTransformError, PosedScan, Sweep
 
 _log = logging.getLogger("triquad_ros2")
 

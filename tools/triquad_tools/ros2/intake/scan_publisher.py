@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from triquad_client import Client
 from triquad_format.records.arrays import Doubles
 
-from triquad_tools.sensors.errors import NoScanError
 from triquad_tools.sensors.ros.header import source_of_topic
-from triquad_tools.sensors.sweep import PosedScan
+from triquad_tools.sensors.sweep import NoScanError, PosedScan
 
 MAX_TOPICS = 64
 """Topics of which scans are made at most."""

@@ -11,9 +11,8 @@ import zenoh
 import zenoh.ext
 
 from triquad_tools.ros2.intake.message_queue import Arrival
-from triquad_tools.ros2.node import Node
-from triquad_tools.ros2.token_watch import TokenWatch
-from triquad_tools.ros2.topic_choice import Feed, Role, TopicChoice
+from triquad_tools.ros2.node import Node, TokenWatch
+from triquad_tools.ros2.options import Feed, Role, TopicChoice
 from triquad_tools.ros2.topics import (
     ANY_HASH,
     Announcement,

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 
 import zenoh
 
-from triquad_tools.ros2.attachment import ATTACHMENT
-from triquad_tools.ros2.node import Node
-from triquad_tools.ros2.token_watch import TokenWatch
+from triquad_tools.ros2.node import Node, TokenWatch
 from triquad_tools.ros2.topics import (
+    ATTACHMENT,
     NO_HASH,
     Announcement,
     Delivery,

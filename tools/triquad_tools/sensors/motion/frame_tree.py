@@ -6,8 +6,8 @@ import numpy as np
 from triquad_client.pose import Pose, pose_matrices
 from triquad_format.records.arrays import Doubles, Longs
 
-from triquad_tools.sensors.errors import NoTransformError
 from triquad_tools.sensors.motion.track import Track
+from triquad_tools.sensors.sweep import NoTransformError
 
 STATIC = None
 """The stamp of a transform that always holds."""

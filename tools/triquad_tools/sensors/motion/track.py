@@ -7,7 +7,7 @@ import numpy as np
 from triquad_client.pose import pose_matrices
 from triquad_format.records.arrays import Doubles, Longs
 
-from triquad_tools.sensors.errors import NoTransformError
+from triquad_tools.sensors.sweep import NoTransformError
 
 MAX_GAP_S = 2.0
 """Nothing is interpolated between poses that lie farther apart."""

@@ -6,10 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Floats
 
-from triquad_tools.sensors.errors import NoScanError
 from triquad_tools.sensors.point_times import TIME_FIELDS, offsets_s
 from triquad_tools.sensors.ros.header import frame_name, stamp_ns
-from triquad_tools.sensors.sweep import Sweep
+from triquad_tools.sensors.sweep import NoScanError, Sweep
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """The types of the message's constants INT8 to FLOAT64."""

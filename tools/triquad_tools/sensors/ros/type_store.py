@@ -7,7 +7,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
-from triquad_tools.sensors.errors import NoScanError
+from triquad_tools.sensors.sweep import NoScanError
 
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 IMAGE = "sensor_msgs/msg/Image"
