@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
+from dataclasses import fields
 from functools import partial
 
 from triquad_client import Client, ConnectError, UnknownMapError, connect
@@ -28,7 +29,6 @@ from triquad_tools.ros2.options import (
     MAX_GRID_CELLS,
     TF_POSES,
     BridgeOptions,
-    ScanOptions,
     SliceShape,
     TopicChoice,
 )
@@ -122,25 +122,15 @@ def bridge_options(options: argparse.Namespace) -> BridgeOptions:
             f"a grid of {grid.side_m:g} m has {grid.cells} cells of {grid.cell_m:g} m along each "
             f"side: use at most {int(MAX_GRID_CELLS**0.5)}"
         )
-    return BridgeOptions(
-        TopicChoice.named(
-            options.domain,
-            options.namespace or "",
-            clouds=options.clouds,
-            depth=options.depth,
-            poses=options.poses,
-        ),
-        ScanOptions(
-            depth_stride=options.depth_stride,
-            body_frame=options.body_frame,
-            map_frame=options.map_frame,
-            by_arrival=options.clock == "arrival",
-            wait_s=options.wait_s,
-        ),
-        grid,
-        options.mesh_level,
-        options.mesh_bytes_per_s,
+    topics = TopicChoice.named(
+        options.domain,
+        options.namespace or "",
+        clouds=options.clouds,
+        depth=options.depth,
+        poses=options.poses,
     )
+    others = {field.name for field in fields(BridgeOptions)} - {"topics", "grid"}
+    return BridgeOptions(topics, grid, **{name: getattr(options, name) for name in others})
 
 
 def parser() -> argparse.ArgumentParser:

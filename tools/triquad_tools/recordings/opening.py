@@ -1,7 +1,5 @@
 """Finding out what kind of recording a path is."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 from triquad_tools.console.command import ToolError
@@ -19,45 +17,12 @@ _FLAGS = {"transforms": "--transform", "deskew": "--no-deskew"}
 """The flags whose names are not those of the choices that they set."""
 
 
-@dataclass(frozen=True)
-class _Reader:
-    """The reader of one kind of recording."""
-
-    kind: str  # in words, for messages
-    options: frozenset[str]  # the choices that mean something for this kind
-    is_of_kind: Callable[[Path], bool]  # whether a path that exists holds such a recording
-    read: Callable[[Path, ReadingOptions], Recording]
-
-
-def _read_bag(path: Path, options: ReadingOptions) -> Recording:
-    bag = find_bag(path)
-    assert bag is not None  # or another reader would have been chosen
-    return RosRecording(bag, options)
-
-
-_READERS = (
-    _Reader(
-        "a bag",
-        frozenset(
-            {"topics", "poses", "map_frame", "body_frame", "transforms", "recorder_clock", "stride"}
-        ),
-        lambda path: find_bag(path) is not None,
-        _read_bag,
-    ),
-    _Reader(
-        "a folder of depth images",
-        frozenset({"trajectory", "intrinsics", "units_per_metre", "stride"}),
-        is_depth_folder,
-        read_depth_folder,
-    ),
-    _Reader(
-        "a folder of clouds",
-        frozenset({"trajectory", "points_in", "deskew"}),
-        is_cloud_folder,
-        read_cloud_folder,
-    ),
-)
-"""All readers; the first whose kind a path is reads it."""
+_OF_BAGS = {
+    "topics", "poses", "map_frame", "body_frame", "transforms", "recorder_clock", "stride",
+}  # fmt: skip
+_OF_DEPTH = {"trajectory", "intrinsics", "units_per_metre", "stride"}
+_OF_CLOUDS = {"trajectory", "points_in", "deskew"}
+"""The choices that mean something for each kind of recording."""
 
 
 def open_recording(path: Path, options: ReadingOptions) -> Recording:
@@ -68,21 +33,25 @@ def open_recording(path: Path, options: ReadingOptions) -> Recording:
     """
     if not path.exists():
         raise ToolError(f"{path}: no such file or folder")
-    for reader in _READERS:
-        if reader.is_of_kind(path):
-            _refuse_others(path, reader, options)
-            return reader.read(path, options)
+    bag = find_bag(path)
+    if bag is not None:
+        _refuse_others(f"{path} is a bag", _OF_BAGS, options)
+        return RosRecording(bag, options)
+    if is_depth_folder(path):
+        _refuse_others(f"{path} is a folder of depth images", _OF_DEPTH, options)
+        return read_depth_folder(path, options)
+    if is_cloud_folder(path):
+        _refuse_others(f"{path} is a folder of clouds", _OF_CLOUDS, options)
+        return read_cloud_folder(path, options)
     raise ToolError(
         f"{path}: no recording that is understood: give a bag of ROS, an MCAP file, or a folder as "
         "docs/tools.md describes them"
     )
 
 
-def _refuse_others(path: Path, reader: _Reader, options: ReadingOptions) -> None:
+def _refuse_others(what: str, meaningful: set[str], options: ReadingOptions) -> None:
     """Refuse choices that are not for the kind of recording that was found."""
     for name in options.given:
-        if name not in reader.options:
+        if name not in meaningful:
             flag = _FLAGS.get(name, f"--{name.replace('_', '-')}")
-            raise ToolError(
-                f"{path} is {reader.kind}, for which {flag} means nothing: leave it out"
-            )
+            raise ToolError(f"{what}, for which {flag} means nothing: leave it out")

@@ -1,7 +1,7 @@
 """Options of the bridge."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
@@ -144,23 +144,12 @@ MAX_GRID_CELLS = 250_000
 
 
 @dataclass(frozen=True)
-class ScanOptions:
-    """Options for turning messages into scans."""
-
-    depth_stride: int = 2  # every how many rows and columns of a depth image one is taken
-    body_frame: str = "base_link"  # whose pose a topic of PoseStamped gives
-    map_frame: str = ""  # "": map, odom or world, the first that the transforms have
-    by_arrival: bool = False  # stamps are when messages arrived, not those of their headers
-    wait_s: float = 2.0  # for how long a scan waits for its transforms
-
-
-@dataclass(frozen=True)
 class SliceShape:
     """The slice of the map that is published as an occupancy grid."""
 
-    height_m: float = 0.5  # in the map frame
-    side_m: float = 40.0
-    cell_m: float = 0.1
+    height_m: float  # in the map frame
+    side_m: float
+    cell_m: float
 
     @property
     def cells(self) -> int:
@@ -178,8 +167,12 @@ class SliceShape:
 class BridgeOptions:
     """All options of the bridge."""
 
-    topics: TopicChoice = field(default_factory=TopicChoice)
-    scans: ScanOptions = field(default_factory=ScanOptions)
-    grid: SliceShape = field(default_factory=SliceShape)
-    mesh_level: int = 1  # of detail: cells are twice as large at each
-    mesh_bytes_per_s: int = 5_000_000  # of markers, at most
+    topics: TopicChoice
+    grid: SliceShape
+    depth_stride: int  # every how many rows and columns of a depth image one is taken
+    body_frame: str  # whose pose a topic of PoseStamped gives
+    map_frame: str  # "": map, odom or world, the first that the transforms have
+    clock: str  # stamps are when messages arrived ("arrival"), or those of their "header"
+    wait_s: float  # for how long a scan waits for its transforms
+    mesh_level: int  # of detail: cells are twice as large at each
+    mesh_bytes_per_s: int  # of markers, at most

@@ -74,8 +74,6 @@ class DropLog:
             return self._since.pop(kind)
 
 
-_log = logging.getLogger("triquad_ros2")
-
 AFTER_S = 10.0
 _MOST_LISTED = 20
 _USABLE = (POINT_CLOUD, IMAGE)

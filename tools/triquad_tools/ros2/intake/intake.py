@@ -46,19 +46,19 @@ class Intake:
         self, session: zenoh.Session, client: Client, options: BridgeOptions, node: Node
     ) -> None:
         """Begin to receive messages."""
-        frame = options.scans.map_frame
+        frame = options.map_frame
         self._start = Place(frame, np.zeros(3), stamp_ns=0) if frame else None
         self.drops = DropLog()
         self.scans = ScanPublisher(client)
         self._motion = Motion(from_topic=options.topics.poses is not None)
         self._reader = MessageReader(
-            stride=options.scans.depth_stride,
-            body_frame=options.scans.body_frame,
-            by_arrival=options.scans.by_arrival,
+            stride=options.depth_stride,
+            body_frame=options.body_frame,
+            by_arrival=options.clock == "arrival",
             max_points=MAX_POINTS,
         )
         self._placement = Placement(
-            self._motion, map_frame=frame, max_bytes=_WAITING_BYTES, timeout_s=options.scans.wait_s
+            self._motion, map_frame=frame, max_bytes=_WAITING_BYTES, timeout_s=options.wait_s
         )
         self._queue = MessageQueue(_SCANS_UNREAD, _OTHERS_UNREAD, self._pushed_out)
         self._gaps = SequenceGaps()

@@ -22,7 +22,6 @@ class Motion:
         self.body_parent: str | None = None  # in which frame that topic has the body
         self._from_topic = from_topic
         self._body: str | None = None
-        self._newest_ns: dict[str, int] = {}  # stamp by child, of those that move
 
     def add(self, transforms: list[Transform], *, is_body: bool) -> None:
         """Add transforms, or the pose of the body.
@@ -38,7 +37,8 @@ class Motion:
                 continue
             try:
                 self._check(transform)
-                self._restart(transform)
+                if transform.stamp_ns is not STATIC:
+                    self._forget_after(transform.child, transform.stamp_ns)
                 self.frames.add(transform)
             except (InvalidScanError, NoScanError) as error:
                 refusal = NoScanError("bad_transform", f"{transform.child[:_MAX_NAME]}: {error}")
@@ -47,24 +47,14 @@ class Motion:
 
     def forget_after(self, stamp_ns: int) -> None:
         """Remove poses from before time went back to a stamp."""
-        for child, newest_ns in list(self._newest_ns.items()):
-            if newest_ns > stamp_ns + RESTART_NS:
-                self._forget(child)
+        for child in self.frames.moving:
+            self._forget_after(child, stamp_ns)
 
-    def _restart(self, transform: Transform) -> None:
-        """Remove the poses of a frame whose time goes back."""
-        if transform.stamp_ns is STATIC:
-            self._newest_ns.pop(transform.child, None)
-            return
-        newest_ns = self._newest_ns.get(transform.child, transform.stamp_ns)
-        if transform.stamp_ns < newest_ns - RESTART_NS:
-            self._forget(transform.child)
-            newest_ns = transform.stamp_ns
-        self._newest_ns[transform.child] = max(newest_ns, transform.stamp_ns)
-
-    def _forget(self, child: str) -> None:
-        self.frames.forget(child)
-        self._newest_ns.pop(child, None)
+    def _forget_after(self, child: str, stamp_ns: int) -> None:
+        """Remove the poses of a frame whose time goes back to a stamp."""
+        newest_ns = self.frames.newest_ns(child)
+        if newest_ns is not None and newest_ns > stamp_ns + RESTART_NS:
+            self.frames.forget(child)
 
     def _check(self, transform: Transform) -> None:
         if max(len(transform.parent), len(transform.child)) > _MAX_NAME or not transform.child:

@@ -81,6 +81,12 @@ class FrameTree:
         tree._edges = {**self._edges, child: _Edge(parent, None, track)}
         return tree
 
+    def newest_ns(self, child: str) -> int | None:
+        """Return the stamp of the newest pose of a frame that moves in its parent."""
+        edge = self._edges.get(child)
+        is_moving = edge is not None and edge.standing is None and len(edge.track) > 0
+        return edge.track.span_ns[1] if edge is not None and is_moving else None
+
     def knows(self, child: str) -> bool:
         """Return whether a transform says where a frame is."""
         return child in self._edges
