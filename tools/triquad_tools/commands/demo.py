@@ -11,7 +11,7 @@ from pathlib import Path
 
 from triquad_server import serve
 
-from triquad_tools.console.arguments import add_version, count, port, seed
+from triquad_tools.console.arguments import command_parser, count, port, seed
 from triquad_tools.console.command import FAILED, OK, ToolError, complain, run, sigterm_interrupts
 from triquad_tools.console.lines import print_line, print_remark
 from triquad_tools.console.report import json_text, print_rows
@@ -78,8 +78,8 @@ def _beside_python(command: str) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=_COMMAND,
+    parser = command_parser(
+        _COMMAND,
         description="Map a simulated street with a real server, and ask it while it learns. Takes "
         "some minutes.",
         epilog="Exit status: 0 all is as promised, 1 something is not or failed, 2 wrong usage.",
@@ -91,5 +91,4 @@ def _parser() -> argparse.ArgumentParser:
     of_page = f"of that page ({DEFAULT_PORT})"
     add("--port", type=port, default=DEFAULT_PORT, metavar="N", help=of_page)
     add("--seed", type=seed, default=1, metavar="N", help="of the street (default: 1)")
-    add_version(parser)
     return parser

@@ -9,7 +9,7 @@ from triquad_format.errors import DamagedMapFileError
 from triquad_format.mapfile.metadata import utc_time
 from triquad_format.mapfile.reader import MapFile, read_map_file
 
-from triquad_tools.console.arguments import DEFAULT_MAP, add_config, add_version, picture
+from triquad_tools.console.arguments import DEFAULT_MAP, add_config, command_parser, picture
 from triquad_tools.console.command import FAILED, OK, ToolError, complain, refuse, run
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.progress import progress
@@ -31,8 +31,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=_COMMAND,
+    parser = command_parser(
+        _COMMAND,
         description="Show what a map file holds, a folder's history, or how two maps differ. Map "
         "files are read in full and checked.",
         epilog="Exit status: 0 valid, also where maps differ; 1 damaged, or the server failed; "
@@ -56,7 +56,6 @@ def _parser() -> argparse.ArgumentParser:
     plot = "draw a picture of the map, or plans of the difference"
     add("--plot", type=picture, metavar="OUT.png", help=plot)
     add("--json", action="store_true", help="print JSON")
-    add_version(parser)
     return parser
 
 

@@ -13,7 +13,7 @@ from triquad_server.process.threads import Teams
 from triquad_server.settings.loading import PRESETS, load_settings
 from triquad_server.warm_up import warm_up
 
-from triquad_tools.console.arguments import add_version
+from triquad_tools.console.arguments import command_parser
 from triquad_tools.console.command import OK, ToolError, run
 from triquad_tools.console.lines import print_line, print_remark
 from triquad_tools.console.progress import progress
@@ -83,8 +83,8 @@ def _check_result(mapper: Mapper, mapping: MappingRun, selection: Selection) -> 
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=_COMMAND,
+    parser = command_parser(
+        _COMMAND,
         description="Make a map of a recording, without a server or a network.",
         epilog="Exit status: 0 done; 1 the map could not be written; 2 wrong usage, or input of "
         "which nothing can be used; 130 interrupted: the same command then goes on where it was.",
@@ -104,5 +104,4 @@ def _parser() -> argparse.ArgumentParser:
     add("--device", choices=DEVICES, default="cpu", help="what it trains on (default: cpu)")
     add("--training", action="store_true", help="keep what further training needs in the map file")
     add("--force", action="store_true", help="replace OUT where it exists")
-    add_version(parser)
     return parser

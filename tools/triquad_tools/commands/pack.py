@@ -14,7 +14,7 @@ from triquad_format.records.region import VertexTable
 from triquad_format.recovery.recovered_map import Loss, RecoveredMap, recover
 from triquad_format.wire.limits import MAX_FILL_M
 
-from triquad_tools.console.arguments import add_version, within
+from triquad_tools.console.arguments import command_parser, within
 from triquad_tools.console.command import FAILED, OK, ToolError, refuse, run
 from triquad_tools.console.lines import print_line, print_remark
 from triquad_tools.mapfiles.quantise import quantise
@@ -47,8 +47,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=_COMMAND,
+    parser = command_parser(
+        _COMMAND,
         description="Rewrite a map file: smaller, cropped, an earlier epoch of it, what is intact "
         "of it, in the newest version, or as a mesh or a picture.",
         epilog="Exit status: 0 done; 1 IN is damaged (with --recover: something of it is lost), or "
@@ -57,7 +57,6 @@ def _parser() -> argparse.ArgumentParser:
     _add_source(parser.add_argument)
     _add_content(parser.add_argument)
     _add_target(parser.add_argument)
-    add_version(parser)
     return parser
 
 

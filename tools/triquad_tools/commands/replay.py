@@ -8,7 +8,7 @@ from functools import partial
 
 from triquad_client import Client, FlushReport, connect
 
-from triquad_tools.console.arguments import DEFAULT_MAP, add_server, add_version, positive
+from triquad_tools.console.arguments import DEFAULT_MAP, add_server, command_parser, positive
 from triquad_tools.console.command import FAILED, OK, run
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.progress import progress
@@ -125,8 +125,8 @@ def _summary(sent: _Sent, flush: FlushReport, refusals: dict[str, int]) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=_COMMAND,
+    parser = command_parser(
+        _COMMAND,
         description="Publish a recording to a map server. By default the server sets the pace, and "
         "no scan is lost.",
         epilog="Exit status: 0 all scans are in the map (--list: there are some to map), 1 some "
@@ -140,7 +140,6 @@ def _parser() -> argparse.ArgumentParser:
     rate = "scans a second, or 1x: as recorded, 2x: twice as fast; whatever the server takes"
     add("--rate", type=due_times, metavar="HZ|FACTORx", help=rate)
     add("--settle", action="store_true", help="wait until the server has learnt all of it")
-    add_version(parser)
     return parser
 
 

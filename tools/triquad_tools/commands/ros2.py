@@ -17,7 +17,7 @@ from triquad_client import Client, ConnectError, UnknownMapError, connect
 from triquad_tools.console.arguments import (
     DEFAULT_MAP,
     add_server,
-    add_version,
+    command_parser,
     count,
     whole,
     within,
@@ -135,15 +135,15 @@ def bridge_options(options: argparse.Namespace) -> BridgeOptions:
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line; ``@FILE`` stands for what a file has, line by line."""
-    made = argparse.ArgumentParser(
-        prog=_COMMAND,
-        fromfile_prefix_chars="@",
+    made = command_parser(
+        _COMMAND,
         description="Map the clouds and depth images of a robot with ROS 2 (rmw_zenoh or "
         "zenoh-bridge-ros2dds), and publish the map's mesh and an occupancy grid to it: "
         "docs/guides/ros2.md. @FILE stands for the arguments in a file, one a line.",
         epilog="Exit status: 0 stopped by Ctrl-C or SIGTERM, 1 there is no such server, 2 wrong "
         "usage; with --serve, that of triquad-server where it is not 0.",
     )
+    made.fromfile_prefix_chars = "@"
     add = made.add_argument
     add(
         "--serve",
@@ -160,7 +160,6 @@ def parser() -> argparse.ArgumentParser:
     add_server(made)
     _add_topics(made.add_argument_group("what is taken in"))
     _add_outputs(made.add_argument_group("what is published, while somebody subscribes"))
-    add_version(made)
     return made
 
 

@@ -24,7 +24,7 @@ from triquad_tools.console.amounts import count, duration, milliseconds, rate, s
 from triquad_tools.console.arguments import (
     DEFAULT_MAP,
     add_server,
-    add_version,
+    command_parser,
     positive,
     server_name,
 )
@@ -214,8 +214,8 @@ def _json_line(server: str, name: str, sample: Sample) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=_COMMAND,
+    parser = command_parser(
+        _COMMAND,
         description="Show how a map server is doing, as it goes, until Ctrl-C.",
         epilog="Exit status: 0 done, 1 there is no such server or it failed, 2 wrong usage, "
         "130 ended by Ctrl-C.",
@@ -225,5 +225,4 @@ def _parser() -> argparse.ArgumentParser:
     add("--interval", type=positive, default=1.0, metavar="S", help="seconds (default: 1)")
     add("--once", action="store_true", help="print one page as plain text, after one interval")
     add("--json", action="store_true", help="print an object of JSON a line, one each interval")
-    add_version(parser)
     return parser

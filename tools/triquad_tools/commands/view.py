@@ -9,7 +9,13 @@ from pathlib import Path
 
 import triquad_client
 
-from triquad_tools.console.arguments import DEFAULT_MAP, add_server, add_version, port, server_name
+from triquad_tools.console.arguments import (
+    DEFAULT_MAP,
+    add_server,
+    command_parser,
+    port,
+    server_name,
+)
 from triquad_tools.console.command import OK, complain, refuse, run
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.progress import progress
@@ -80,8 +86,8 @@ def _name(shown: StoredMap) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=_COMMAND,
+    parser = command_parser(
+        _COMMAND,
         description="Show a map in the browser: of a server, as it grows, or of a file.",
     )
     add = parser.add_argument
@@ -103,5 +109,4 @@ def _parser() -> argparse.ArgumentParser:
         "for more (addresses and the machine's host name are)",
     )
     add("--port", type=port, default=DEFAULT_PORT, metavar="PORT", help=f"default: {DEFAULT_PORT}")
-    add_version(parser)
     return parser

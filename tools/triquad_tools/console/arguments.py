@@ -9,10 +9,12 @@ import triquad_format
 from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
 
 
-def add_version(parser: argparse.ArgumentParser) -> None:
-    """Let a command print its version."""
+def command_parser(prog: str, description: str, epilog: str = "") -> argparse.ArgumentParser:
+    """Return the parser of a command, which can print its version."""
+    parser = argparse.ArgumentParser(prog, description=description, epilog=epilog)
     version = f"triquad {triquad_format.__version__}"
     parser.add_argument("--version", action="version", version=version)
+    return parser
 
 
 def positive(text: str) -> float:

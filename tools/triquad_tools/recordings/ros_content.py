@@ -89,7 +89,7 @@ class RosContent:
         topic, kind = message.topic, message.kind
         try:
             if kind == type_store.CAMERA_INFO:
-                self._reader.remember_camera(topic, decoded)
+                self._reader.cameras[topic] = decoded
             elif kind in (*_TRANSFORMS, *_POSES):
                 static, came_ns = topic.endswith("tf_static"), message.recorded_ns
                 for each in self._reader.transforms(kind, decoded, came_ns, static=static):

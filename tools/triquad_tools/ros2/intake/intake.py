@@ -135,7 +135,7 @@ class Intake:
             self._first_scan.came(topic_name)
         kind, message = _decoded(arrival)
         if role is Role.CAMERA_INFO:
-            self._reader.remember_camera(topic_name, message)
+            self._reader.cameras[topic_name] = message
         elif role.brings_scans:
             self._place(topic_name, self._reader.sweep(topic_name, kind, message, came_ns))
         else:

@@ -37,26 +37,23 @@ class _Waiting:
     is_over: bool = False  # time went back before its stamp, so its transforms come no more
 
 
+@dataclass
 class Placement:
     """Places sweeps in the map frame, those of each topic in the order in which they came."""
 
-    def __init__(self, motion: Motion, *, map_frame: str, max_bytes: int, timeout_s: float) -> None:
-        """``motion`` is extended by others meanwhile, on the same thread.
+    motion: Motion  # which others extend meanwhile, on the same thread
+    map_frame: str  # without one it is chosen, once, as the transforms come
+    max_bytes: int  # of all sweeps that wait
+    timeout_s: float  # for how long each waits
 
-        Without a ``map_frame`` it is chosen, once, as the transforms come. Sweeps wait for
-        ``timeout_s`` each, and no more than ``max_bytes`` together.
-        """
-        self.map_frame = map_frame
-        self._motion = motion
-        self._max_bytes = max_bytes
-        self._timeout_s = timeout_s
+    def __post_init__(self) -> None:
         self._waiting: dict[str, deque[_Waiting]] = {}
-        self._warned = bool(map_frame)  # that there is a better frame; not where it was chosen
+        self._warned = bool(self.map_frame)  # that there is a better frame; not where it was chosen
         self._choose_s: float | None = None  # when the map frame is chosen at the latest
 
     def add(self, topic_name: str, sweep: Sweep, now_s: float) -> None:
         """Have a sweep placed; if too many are pending, the oldest are dropped."""
-        entry = _Waiting(topic_name, sweep, sweep.span_ns, now_s + self._timeout_s)
+        entry = _Waiting(topic_name, sweep, sweep.span_ns, now_s + self.timeout_s)
         self._waiting.setdefault(topic_name, deque()).append(entry)
         self._keep_within_limit(now_s)
 
@@ -77,7 +74,7 @@ class Placement:
     def _keep_within_limit(self, now_s: float) -> None:
         """Give up the oldest sweeps where all together are too large."""
         entries = [entry for entries in self._waiting.values() for entry in entries]
-        excess = sum(entry.sweep.memory_bytes for entry in entries) - self._max_bytes
+        excess = sum(entry.sweep.memory_bytes for entry in entries) - self.max_bytes
         for entry in sorted(entries, key=lambda entry: entry.give_up_s):
             if excess <= 0:
                 return
@@ -112,7 +109,7 @@ class Placement:
                 "choose the topic of the sensor itself with --clouds",
             )
         # Asked first, since it is quick, and most that wait will wait on.
-        frames = self._motion.frames
+        frames = self.motion.frames
         frames.poses(target, frame, np.array(entry.needs_ns, np.int64))
         scan = place(entry.sweep, frames, target)
         if not self.map_frame:
@@ -123,7 +120,7 @@ class Placement:
 
     def _warn_of_better_frame(self) -> None:
         """Warn, once, if a better frame to map in appeared too late."""
-        better = self._motion.frames.fixed_frame(self.map_frame)
+        better = self.motion.frames.fixed_frame(self.map_frame)
         if better != self.map_frame and not self._warned:
             self._warned = True
             _log.warning(
@@ -136,9 +133,9 @@ class Placement:
 
     def _best_frame(self, frame: str, now_s: float) -> str:
         """Return the frame to map in, as far as is known by now."""
-        if self._motion.body_parent is not None:
-            return self._motion.body_parent
-        found = self._motion.frames.fixed_frame(frame)
+        if self.motion.body_parent is not None:
+            return self.motion.body_parent
+        found = self.motion.frames.fixed_frame(frame)
         if found not in ROOT_NAMES:
             above = "no transform names it" if found == frame else f"it is in {found!r}"
             raise NoTransformError(
@@ -147,7 +144,7 @@ class Placement:
                 late=True,
             )
         if self._choose_s is None:
-            self._choose_s = now_s + min(_CHOICE_S, self._timeout_s / 2)
+            self._choose_s = now_s + min(_CHOICE_S, self.timeout_s / 2)
         if found != ROOT_NAMES[0] and now_s < self._choose_s:
             raise NoTransformError("no_transform", f"no frame above {found!r} yet", late=True)
         return found

@@ -4,6 +4,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -33,28 +34,23 @@ _SUBSCRIPTION = Delivery(reliable=False)  # which suits every publisher
 _HISTORY = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=100)
 
 
+@dataclass
 class TopicListener:
     """Forwards what arrives on all wanted topics."""
 
-    def __init__(
-        self,
-        session: zenoh.Session,
-        choice: TopicChoice,
-        node: Node,
-        arrived: Callable[[Arrival], None],
-    ) -> None:
-        """``arrived`` is called with each message, from several threads, and must not wait."""
-        self._session = session
-        self._choice = choice
-        self._node = node
-        self._arrived = arrived
+    session: zenoh.Session
+    choice: TopicChoice
+    node: Node
+    arrived: Callable[[Arrival], None]  # called from several threads, and must not wait
+
+    def __post_init__(self) -> None:
         self._lock = threading.Lock()
         self._closed = False
         self._subscribers: dict[str, Any] = {}  # by key
         self._found: set[Announcement] = set()
-        for feed in choice.feeds():
+        for feed in self.choice.feeds():
             self._open(feed)
-        self._watch = TokenWatch(session, choice.domain, End.PUBLISHER, self._find)
+        self._watch = TokenWatch(self.session, self.choice.domain, End.PUBLISHER, self._find)
 
     @property
     def found(self) -> list[Topic]:
@@ -78,21 +74,21 @@ class TopicListener:
             receive = partial(self._receive, feed)
             self._subscribers[feed.key] = (
                 zenoh.ext.declare_advanced_subscriber(
-                    self._session, feed.key, receive, history=_HISTORY
+                    self.session, feed.key, receive, history=_HISTORY
                 )
                 if feed.role is Role.TF_STATIC
-                else self._session.declare_subscriber(feed.key, receive)
+                else self.session.declare_subscriber(feed.key, receive)
             )
 
     def _receive(self, feed: Feed, sample: zenoh.Sample) -> None:
         name = feed.topic_name or rmw_topic_name(str(sample.key_expr))
         attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
-        self._arrived(Arrival(feed.role, name, sample.payload, time.time_ns(), attachment))
+        self.arrived(Arrival(feed.role, name, sample.payload, time.time_ns(), attachment))
 
     def _find(self, announcement: Announcement) -> None:
         """Handle a topic that is published."""
         topic = announcement.topic
-        role = self._choice.wants(topic)
+        role = self.choice.wants(topic)
         if role is Role.TF_STATIC and announcement.type_hash == ANY_HASH:
             self._ask_old_bridges(topic.name)
         with self._lock:
@@ -107,12 +103,12 @@ class TopicListener:
         else:
             # Drivers that publish only while there is a subscriber learn it from this.
             what = Announcement(End.SUBSCRIPTION, topic, announcement.type_hash)
-            self._node.announce(what, _SUBSCRIPTION)
+            self.node.announce(what, _SUBSCRIPTION)
 
     def _ask_old_bridges(self, topic_name: str) -> None:
         """Fetch what bridges up to 1.5 published before anybody subscribed."""
         feed = Feed(Role.TF_STATIC, old_bridge_cache(topic_name), topic_name)
-        replies = self._session.get(
+        replies = self.session.get(
             feed.key,
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,

@@ -64,17 +64,16 @@ def height_colours(points: Doubles) -> Floats:
 TileIndex = tuple[int, int, int]
 
 
+@dataclass
 class MeshPublisher:
     """Follows the mesh of the map while it has subscribers."""
 
-    def __init__(
-        self, publisher: TopicPublisher, client: Client, level: int, bytes_per_s: int
-    ) -> None:
-        """``level`` is of detail; of markers, ``bytes_per_s`` are sent at most."""
-        self._publisher = publisher
-        self._client = client
-        self._level = level
-        self._bytes_per_s = bytes_per_s
+    publisher: TopicPublisher
+    client: Client
+    level: int  # of detail
+    bytes_per_s: int  # of markers, at most
+
+    def __post_init__(self) -> None:
         self._numbers: dict[TileIndex, int] = {}  # of the markers of tiles
         self._watch: MeshWatch | None = None  # while there are subscribers
         self._pending: dict[TileIndex, None] = {}  # whose markers are to be sent, in this order
@@ -82,15 +81,15 @@ class MeshPublisher:
 
     def publish(self, place: Place) -> None:
         """Send markers of what changed, as many as may be sent at a time."""
-        self._left_bytes = min(self._left_bytes, 0) + PERIOD_S * self._bytes_per_s
-        if not self._publisher.is_followed:
+        self._left_bytes = min(self._left_bytes, 0) + PERIOD_S * self.bytes_per_s
+        if not self.publisher.is_followed:
             self.close()
             return
         if self._watch is None:
-            self._watch = self._client.watch_mesh(level=self._level)
+            self._watch = self.client.watch_mesh(level=self.level)
             # A bridge before this one may have left some.
-            self._publisher.put(Marker(place.map_frame, 0, Action.DELETE_ALL).payload())
-        if self._publisher.has_newcomers():
+            self.publisher.put(Marker(place.map_frame, 0, Action.DELETE_ALL).payload())
+        if self.publisher.has_newcomers():
             self._pending.update(dict.fromkeys(self._watch.tiles))
         while self._left_bytes > 0:
             if not self._pending:
@@ -101,7 +100,7 @@ class MeshPublisher:
             index = next(iter(self._pending))
             del self._pending[index]
             payload = self._marker(index, self._watch.tiles.get(index), place.map_frame).payload()
-            self._publisher.put(payload)
+            self.publisher.put(payload)
             self._left_bytes -= len(payload)
 
     def close(self) -> None:

@@ -1,8 +1,9 @@
 """The map of a file, shown without a server."""
 
 import time
-from collections.abc import Mapping
-from functools import lru_cache
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -47,7 +48,12 @@ class StoredMap:
         self, level: int, bounds: Bounds | None = None, before: TileFollower | None = None
     ) -> "StoredTiles":
         """Make the mesh tiles of a level that meet ``bounds``."""
-        return StoredTiles(self, level, bounds, {} if before is None else before.tiles)
+        known, wanted = {} if before is None else before.tiles, self.indices(level, bounds)
+        return StoredTiles(
+            partial(self.tile, level),
+            waiting=[index for index in wanted if index not in known],
+            tiles={index: known[index] for index in wanted if index in known},
+        )
 
     def indices(self, level: int, bounds: Bounds | None) -> list[TileIndex]:
         """Return the tiles that meet a box and may have faces."""
@@ -68,33 +74,24 @@ class StoredMap:
         )
 
 
+@dataclass
 class StoredTiles:
     """Mesh tiles of a map file within a box, which are made bit by bit."""
 
-    def __init__(
-        self,
-        stored: StoredMap,
-        level: int,
-        bounds: Bounds | None,
-        known: Mapping[TileIndex, MeshTile],
-    ) -> None:
-        self._stored = stored
-        self._level = level
-        wanted = stored.indices(level, bounds)
-        self._waiting = [index for index in wanted if index not in known]  # the next one last
-        self.tiles = {index: known[index] for index in wanted if index in known}
-        """The tiles with faces that are made, by their indices."""
+    make: Callable[[TileIndex], MeshTile]
+    waiting: list[TileIndex]  # to be made, the next one last
+    tiles: dict[TileIndex, MeshTile]  # with faces, that are made
 
     @property
     def complete(self) -> bool:
         """Whether all tiles are made."""
-        return not self._waiting
+        return not self.waiting
 
     def next(self, timeout_s: float) -> None:
         """Make tiles for as long, and no less than a tenth of a second."""
         ends_s = time.monotonic() + max(timeout_s, _WAIT_S)
-        while self._waiting and time.monotonic() < ends_s:
-            tile = self._stored.tile(self._level, self._waiting.pop())
+        while self.waiting and time.monotonic() < ends_s:
+            tile = self.make(self.waiting.pop())
             if len(tile.faces):
                 self.tiles[tile.index] = tile
 
