@@ -38,15 +38,15 @@ def _map(options: argparse.Namespace) -> int:
     settings = load_settings(options.settings, options.set, preset=options.preset)
     check_device(options.device)
     selection = open_selected(options)
-    key = mapping_key(selection, settings)
-    with closing(UnfinishedMap(output, key)) as unfinished, closing(Teams()) as teams:
+    unfinished = UnfinishedMap(output, mapping_key(selection, settings))
+    with closing(Teams()) as teams:
         # The first time all kernels are compiled, which takes half a minute or more.
         with progress("preparing") as report:
             warm_up(settings, options.device, teams, report=lambda stage: report(0.0, stage))
         mapper = unfinished.resumed(settings, options.device, teams)
         taken = unfinished.scans_taken
         if taken:
-            print_line(f"going on after scan {taken}, from {unfinished.folder}")
+            print_line(f"going on after scan {taken}, from {unfinished.path}")
         mapping = MappingRun(mapper, unfinished, settings)
         mapping.take(selection, taken)
         _check_result(mapper, mapping, selection)
@@ -58,7 +58,7 @@ def _map(options: argparse.Namespace) -> int:
             )
         except OSError as error:
             raise StoreError(
-                f"{output} cannot be written: {error}; the map is in {unfinished.folder}: the same "
+                f"{output} cannot be written: {error}; the map is in {unfinished.path}: the same "
                 "command writes it once there is room"
             ) from error
     unfinished.remove()

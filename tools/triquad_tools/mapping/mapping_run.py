@@ -1,144 +1,99 @@
 """Making a map of a recording, scan by scan."""
 
 import hashlib
-import json
-import shutil
+import os
 import time
 from collections import Counter
-from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
-from triquad_format.mapfile.durable_file import replacing
-from triquad_server.errors import ScanRefusedError
+from triquad_format.errors import FormatError
+from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.writer import write_map
+from triquad_format.records.region import MapRecord
+from triquad_server.errors import ScanRefusedError, StoreError
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.process.threads import Teams
-from triquad_server.settings import Settings, StoreSettings
-from triquad_server.store.store import Store
+from triquad_server.settings import Settings
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
 from triquad_tools.recordings.selection import Selection
 
 MAP_NAME = "recording"
-_POSITIONS = "positions.json"
+_SAVE_PERIOD_S, _SAVE_SHARE = 60.0, 0.05  # at least, and of the time: a large map takes seconds
 _SECTIONS = {"field", "scan", "change", "training", "sources"}  # that a map depends on
-_KEEP = StoreSettings(period_s=0.0, keep=2)
+_KEY_DIGITS = 40  # the name of a map has 64 characters at most, and the number of scans follows
 
 
 def mapping_key(selection: Selection, settings: Settings) -> str:
-    """Return a key that identifies the scans, poses and settings of an unfinished map."""
+    """Return a key that identifies the scans, poses and settings; it can be the name of a map."""
     digest = hashlib.sha256(settings.model_dump_json(include=_SECTIONS).encode())
     digest.update(selection.way.encode())
     for entry in selection.entries:
         digest.update(f"{entry.stamp_ns} {entry.source}\n".encode())
-    return digest.hexdigest()
+    return digest.hexdigest()[:_KEY_DIGITS]
 
 
 class UnfinishedMap:
-    """The folder next to the output that holds a map while it is made. Close it."""
+    """The map file next to the output that holds a map while it is made.
+
+    Its map has the key for a name, and the number of scans that are in it.
+    """
 
     def __init__(self, output: Path, key: str) -> None:
-        """Lock the folder, which is made if need be.
+        """Read what is there of an earlier run.
 
         Raises:
-            ToolError: it holds a map of another recording or other settings, or is not ours.
-            StoreError: it cannot be written to, or another process makes a map in it.
+            ToolError: it is of another recording or other settings, or is not ours.
         """
-        self.folder = output.with_name(f"{output.name}.part")
-        self._key = key
-        self._positions = self.folder / _POSITIONS
-        self._check_ours()
-        self._store = Store(self.folder, MAP_NAME, _KEEP)
+        self.path = output.with_name(f"{output.name}.part")
         self.scans_taken = 0
-        self._taken_by: dict[str, int] = {}  # scans by epoch
-        try:
-            if self._positions.exists():
-                self._read_positions()
-            else:
-                self._write_positions()
-        except BaseException:
-            self._store.close()
-            raise
-
-    def close(self) -> None:
-        """Unlock the folder; what is in it stays, unless nothing was saved yet."""
-        self._store.close()
-        if not self._taken_by:
-            self.remove()
-
-    def remove(self) -> None:
-        """Delete the folder, once it is closed: the map is finished."""
-        shutil.rmtree(self.folder / MAP_NAME)
-        self._positions.unlink()
-        with suppress(OSError):  # other files in the folder are kept
-            self.folder.rmdir()
+        self._key = key
+        self._record: MapRecord | None = None
+        if os.path.lexists(self.path):
+            self._read()
 
     def resumed(self, settings: Settings, device: str, teams: Teams) -> Mapper:
-        """Return a mapper that goes on with the map, which has taken :attr:`scans_taken` scans.
-
-        Raises:
-            StoreError: there are checkpoints, but none can be read.
-        """
-        newest = self._store.newest()
-        if newest is not None:
-            epoch = str(newest.record.epoch)
-            if epoch not in self._taken_by:
-                raise ToolError(
-                    f"{self.folder}: {_POSITIONS} says nothing of epoch {epoch}; delete the folder "
-                    "to begin again"
-                )
-            self.scans_taken = self._taken_by[epoch]
-        record = None if newest is None else newest.record
+        """Return a mapper that goes on with the map, which has taken :attr:`scans_taken` scans."""
+        record, self._record = self._record, None
         mapper = Mapper(MAP_NAME, settings, device, record=record, teams=teams)
-        # What comes from now on is of a later epoch than the checkpoint.
         mapper.publish()
         return mapper
 
     def save(self, mapper: Mapper, scans_taken: int) -> None:
-        """Write a checkpoint from which the map can go on.
+        """Write the map, from which another run can go on.
 
         Raises:
-            StoreError: it cannot be written; the one before is untouched.
+            StoreError: it cannot be written; what was saved before is untouched.
         """
-        known = self._store.base_epoch
-        changes = mapper.changes_since(known)
-        # First: a checkpoint without its position would be of no use.
-        self._taken_by[str(changes.record.epoch)] = scans_taken
-        self._write_positions()
-        if changes.record.epoch != known:
-            self._store.write(changes)
-
-    def _check_ours(self) -> None:
-        """Refuse to write to, and later to delete, files that are not ours."""
-        if self.folder.is_symlink():
-            raise ToolError(f"{self.folder} is a link; remove it, or give OUT another name")
-        if self.folder.is_dir() and any(self.folder.iterdir()) and not self._positions.is_file():
-            raise ToolError(
-                f"{self.folder} holds something else; move it away, or give OUT another name"
-            )
-
-    def _write_positions(self) -> None:
-        text = json.dumps({"key": self._key, "scans_taken": self._taken_by})
-        with replacing(self._positions) as stream:
-            stream.write(text.encode())
-
-    def _read_positions(self) -> None:
-        path = self._positions
+        record = replace(mapper.changes_since(None).record, name=f"{self._key}.{scans_taken}")
         try:
-            read = json.loads(path.read_text())
-            key, self._taken_by = read["key"], dict(read["scans_taken"])
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
-            raise ToolError(f"{path} is damaged; delete {self.folder} to begin again") from error
-        if key != self._key:
+            write_map(record, self.path)
+        except OSError as error:
+            raise StoreError(f"{self.path} cannot be written: {error}") from error
+
+    def remove(self) -> None:
+        """Delete the file: the map is finished."""
+        self.path.unlink(missing_ok=True)
+
+    def _read(self) -> None:
+        try:
+            record = read_map(self.path)
+        except (FormatError, OSError) as error:
             raise ToolError(
-                f"{self.folder} holds an unfinished map of another recording, or with other "
+                f"{self.path} holds something else; move it away, or give OUT another name "
+                f"({error})"
+            ) from error
+        key, _, scans_taken = record.name.partition(".")
+        if key != self._key or not scans_taken.isdecimal():
+            raise ToolError(
+                f"{self.path} holds an unfinished map of another recording, or with other "
                 "flags or settings: give the same to go on with it, or delete it to begin again"
             )
-
-
-_SAVE_PERIOD_S = 60.0
+        self._record, self.scans_taken = replace(record, name=MAP_NAME), int(scans_taken)
 
 
 class MappingRun:
@@ -195,5 +150,7 @@ class MappingRun:
             self._save()
 
     def _save(self) -> None:
+        started_s = time.monotonic()
         self._unfinished.save(self._mapper, self.scans_taken)
-        self._next_save = time.monotonic() + _SAVE_PERIOD_S
+        ended_s = time.monotonic()
+        self._next_save = ended_s + max(_SAVE_PERIOD_S, (ended_s - started_s) / _SAVE_SHARE)

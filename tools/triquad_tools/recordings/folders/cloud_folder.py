@@ -13,7 +13,7 @@ from triquad_tools.recordings.folders.point_file import POINT_SUFFIXES, check_po
 from triquad_tools.recordings.folders.scan_folder import PlacedFile, ScanFolder, check_all
 from triquad_tools.recordings.folders.trajectory import SENSOR, WORLD, Trajectory
 from triquad_tools.recordings.recording import ReadingOptions, Stream
-from triquad_tools.recordings.text_lines import parse_rigid, parse_stamp, read_lines
+from triquad_tools.recordings.text_lines import parse_rigid, parse_stamps, read_lines
 from triquad_tools.sensors.motion.placing import place
 from triquad_tools.sensors.point_times import offsets_s
 from triquad_tools.sensors.sweep import NoTransformError, PosedScan, Sweep, moved
@@ -136,9 +136,7 @@ def read_times(folder: Path, scans: int) -> list[int] | None:
     path = folder / "times.txt"
     if not path.is_file():
         return None
-    stamps: list[int] = []
-    for where, text in read_lines(path):
-        stamps.append(parse_stamp(where, text, earliest_ns=stamps[-1] if stamps else 0))
+    stamps = parse_stamps(read_lines(path))
     if len(stamps) != scans:
         raise ToolError(f"{path}: {len(stamps)} times for {scans} scans")
     return stamps

@@ -14,7 +14,7 @@ from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.folders.file_poses import in_order, place_files
 from triquad_tools.recordings.folders.scan_folder import PlacedFile, ScanFolder, check_all
 from triquad_tools.recordings.recording import ReadingOptions, Stream
-from triquad_tools.recordings.text_lines import parse_stamp, read_lines
+from triquad_tools.recordings.text_lines import parse_stamps, read_lines
 from triquad_tools.sensors.sweep import PosedScan
 
 INTRINSICS_NAMES = ("camera_intrinsic.json", "intrinsic.json", "camera_primesense.json")
@@ -175,18 +175,17 @@ def _read_scan(camera: Camera, units: float, stride: int, file: PlacedFile) -> P
 def _listed(folder: Path) -> _Images:
     """Return the images that TUM lists: a line for each, its time and its path."""
     paths: list[Path] = []
-    stamps: list[int] = []
-    for place, text in read_lines(folder / _LIST_NAME):
-        stamp, *name = text.split(maxsplit=1)
+    lines = read_lines(folder / _LIST_NAME)
+    for place, text in lines:
+        _, *name = text.split(maxsplit=1)
         if not name:
             raise ToolError(f"{place}: {text!r} where a line is the time of an image and its path")
-        stamps.append(parse_stamp(place, stamp, stamps[-1] if stamps else 0))
         paths.append(folder / name[0])
         if not paths[-1].is_file():
             raise ToolError(f"{place}: {paths[-1]}: no such file")
     if not paths:
         raise ToolError(f"{folder / _LIST_NAME}: lists no images")
-    return _Images(paths, stamps, _TUM_UNITS_PER_M)
+    return _Images(paths, parse_stamps(lines), _TUM_UNITS_PER_M)
 
 
 def _found(folder: Path) -> _Images:
