@@ -12,7 +12,7 @@ from pathlib import Path
 from triquad_server import serve
 
 from triquad_tools.console.arguments import command_parser, count, port, seed
-from triquad_tools.console.command import FAILED, OK, ToolError, complain, run, sigterm_interrupts
+from triquad_tools.console.command import FAILED, OK, ToolError, complain, run
 from triquad_tools.console.lines import print_line, print_remark
 from triquad_tools.console.report import json_text, print_rows
 from triquad_tools.demo.steps import MAP, DemoResults, broken_promises, demonstrate, table_rows
@@ -26,13 +26,8 @@ _COMMAND = "triquad-demo"
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool: 0 all is as promised, 1 something is not or failed, 2 wrong usage."""
     work = partial(_demo, _parser().parse_args(argv))
-    with sigterm_interrupts():
-        return run(
-            _COMMAND,
-            work,
-            failures=(ToolError, OSError),
-            interrupted="interrupted; the server is stopped",
-        )
+    interrupted = "interrupted; the server is stopped"
+    return run(_COMMAND, work, failures=(ToolError, OSError), interrupted=interrupted)
 
 
 def _demo(options: argparse.Namespace) -> int:

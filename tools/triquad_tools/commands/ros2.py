@@ -22,7 +22,7 @@ from triquad_tools.console.arguments import (
     whole,
     within,
 )
-from triquad_tools.console.command import FAILED, OK, ToolError, run, sigterm_interrupts
+from triquad_tools.console.command import FAILED, OK, ToolError, run
 from triquad_tools.console.lines import start_log
 from triquad_tools.ros2.bridge import Bridge
 from triquad_tools.ros2.options import (
@@ -55,7 +55,7 @@ def _run(options: argparse.Namespace) -> int:
     server: ServerProcess | None = None
     by_signal = FAILED
     try:
-        with sigterm_interrupts(), ExitStack() as stack:
+        with ExitStack() as stack:
             if options.serve is not None:
                 server = stack.enter_context(ServerProcess(options.serve, asked.topics))
             _bridge(options, asked, server)

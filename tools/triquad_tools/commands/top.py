@@ -28,7 +28,7 @@ from triquad_tools.console.arguments import (
     positive,
     server_name,
 )
-from triquad_tools.console.command import FAILED, OK, complain, run, sigterm_interrupts
+from triquad_tools.console.command import FAILED, OK, complain, run
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.report import json_text
 
@@ -92,7 +92,7 @@ def _top(options: argparse.Namespace) -> int:
     can_draw = sys.stdout.isatty() and os.environ.get("TERM") != "dumb"
     title = f"map {name} at {server}"
     reached = connect(options.connect, name, timeout_s=_TIMEOUT_S, config=options.config)
-    with sigterm_interrupts(), reached as client:
+    with reached as client:
         samples = _samples(client, options.interval)
         if options.once or not (options.json or can_draw):
             samples = itertools.islice(samples, 1, 2)

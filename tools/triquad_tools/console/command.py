@@ -17,13 +17,12 @@ INTERRUPTED = 130
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Let Ctrl-C raise ``KeyboardInterrupt``, and end the process where it is pressed again.
+    """Let Ctrl-C and SIGTERM raise ``KeyboardInterrupt``, and the second one end the process.
 
     Imports, finalisers and callbacks of the compiler may swallow the first one, or fail for a
     reason of their own: whatever fails after it was interrupted.
     """
-    in_main = threading.current_thread() is threading.main_thread()
-    if not in_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
     pressed = threading.Event()
@@ -34,7 +33,10 @@ def interruptible() -> Iterator[None]:
         pressed.set()
         raise KeyboardInterrupt
 
-    signal.signal(signal.SIGINT, interrupt)
+    handlers = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}
+    for each, handler in handlers.items():
+        if handler is not signal.SIG_IGN:  # as for what a shell runs in the background
+            signal.signal(each, interrupt)
     try:
         yield
     except Exception as error:
@@ -42,21 +44,8 @@ def interruptible() -> Iterator[None]:
             raise KeyboardInterrupt from error
         raise
     finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-@contextmanager
-def sigterm_interrupts() -> Iterator[None]:
-    """Let SIGTERM raise KeyboardInterrupt, as SIGINT does: then servers are stopped, too."""
-
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
+        for each, handler in handlers.items():
+            signal.signal(each, handler)
 
 
 OK, FAILED, BAD_INPUT = 0, 1, 2

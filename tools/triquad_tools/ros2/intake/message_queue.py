@@ -34,33 +34,6 @@ class QueueLimits:
     nbytes: int
 
 
-class _Line:
-    """Messages in the order in which they came; where they are too many, the oldest go."""
-
-    def __init__(self, limits: QueueLimits) -> None:
-        self._limits = limits
-        self._messages: deque[Arrival] = deque()
-        self._bytes = 0  # of these
-
-    def __len__(self) -> int:
-        return len(self._messages)
-
-    def put(self, arrival: Arrival) -> list[Arrival]:
-        """Add a message; return those that go for it."""
-        self._messages.append(arrival)
-        self._bytes += arrival.nbytes
-        gone = []
-        while len(self) > self._limits.messages or self._bytes > self._limits.nbytes:
-            gone.append(self.take())
-        return gone
-
-    def take(self) -> Arrival:
-        """Remove the oldest message and return it."""
-        arrival = self._messages.popleft()
-        self._bytes -= arrival.nbytes
-        return arrival
-
-
 class MessageQueue:
     """Scans, and other messages, which go first: transforms must not wait behind large clouds."""
 
@@ -68,26 +41,38 @@ class MessageQueue:
         self, scans: QueueLimits, others: QueueLimits, dropped: Callable[[Arrival], None]
     ) -> None:
         """``dropped`` is called with each message that nobody will read."""
-        self._scans = _Line(scans)
-        self._others = _Line(others)
+        self._limits = {True: scans, False: others}  # by whether they bring scans
+        self._waiting: dict[bool, deque[Arrival]] = {True: deque(), False: deque()}
+        self._bytes = {True: 0, False: 0}  # of these
         self._dropped = dropped
         self._changed = threading.Condition()
         self._closed = False
 
     def put(self, arrival: Arrival) -> None:
-        """Add a message; never waits."""
+        """Add a message; where they are too many, the oldest go. Never waits."""
+        is_scan = arrival.role.brings_scans
+        line, limits = self._waiting[is_scan], self._limits[is_scan]
+        gone = []
         with self._changed:
-            dropped = (self._scans if arrival.role.brings_scans else self._others).put(arrival)
+            line.append(arrival)
+            self._bytes[is_scan] += arrival.nbytes
+            while len(line) > limits.messages or self._bytes[is_scan] > limits.nbytes:
+                gone.append(self._oldest(is_scan))
             self._changed.notify()
-        for each in dropped:
+        for each in gone:
             self._dropped(each)
 
     def take(self, timeout_s: float) -> Arrival | None:
         """Return the message to read next; None if none comes in time, or the queue is closed."""
         with self._changed:
-            self._changed.wait_for(lambda: self._closed or self._others or self._scans, timeout_s)
-            line = self._others or self._scans
-            return None if self._closed or not line else line.take()
+            others, scans = self._waiting[False], self._waiting[True]
+            self._changed.wait_for(lambda: self._closed or others or scans, timeout_s)
+            return None if self._closed or not (others or scans) else self._oldest(not others)
+
+    def _oldest(self, is_scan: bool) -> Arrival:
+        arrival = self._waiting[is_scan].popleft()
+        self._bytes[is_scan] -= arrival.nbytes
+        return arrival
 
     def close(self) -> None:
         """Give out no more messages."""
