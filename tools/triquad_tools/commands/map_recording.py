@@ -20,7 +20,7 @@ from triquad_tools.console.progress import progress
 from triquad_tools.mapping.mapping_run import MappingRun, UnfinishedMap, mapping_key
 from triquad_tools.mapping.output import SUFFIXES, check_target, write_output
 from triquad_tools.recordings.arguments import add_recording
-from triquad_tools.recordings.selection import Selection, open_selected
+from triquad_tools.recordings.opening import Selection, open_selected
 
 _COMMAND = "triquad-map"
 

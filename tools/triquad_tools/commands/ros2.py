@@ -24,7 +24,7 @@ from triquad_tools.console.arguments import (
 )
 from triquad_tools.console.command import FAILED, OK, ToolError, run
 from triquad_tools.console.lines import start_log
-from triquad_tools.ros2.bridge import Bridge
+from triquad_tools.ros2.bridge import Bridge, open_session
 from triquad_tools.ros2.options import (
     MAX_GRID_CELLS,
     TF_POSES,
@@ -33,7 +33,6 @@ from triquad_tools.ros2.options import (
     TopicChoice,
 )
 from triquad_tools.ros2.server_process import ServerProcess
-from triquad_tools.ros2.session import open_session
 from triquad_tools.sensors.ros.header import frame_name
 
 _COMMAND = "triquad-ros2"

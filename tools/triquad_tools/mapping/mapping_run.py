@@ -20,7 +20,7 @@ from triquad_server.settings import Settings
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
-from triquad_tools.recordings.selection import Selection
+from triquad_tools.recordings.opening import Selection
 
 MAP_NAME = "recording"
 _SAVE_PERIOD_S, _SAVE_SHARE = 60.0, 0.05  # at least, and of the time: a large map takes seconds

@@ -1,14 +1,24 @@
 """Finding out what kind of recording a path is."""
 
+import argparse
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from triquad_tools.console.command import ToolError
+from triquad_tools.console.lines import print_remark
+from triquad_tools.recordings.arguments import options_of
 from triquad_tools.recordings.bag import find_bag
+from triquad_tools.recordings.cloud import points_in_range
 from triquad_tools.recordings.folders.cloud_folder import is_cloud_folder, read_cloud_folder
 from triquad_tools.recordings.folders.depth_folder import is_depth_folder, read_depth_folder
 from triquad_tools.recordings.folders.scan_folder import ScanFolder
-from triquad_tools.recordings.recording import ReadingOptions
+from triquad_tools.recordings.recording import ReadingOptions, ScanEntry
 from triquad_tools.recordings.ros_recording import RosRecording
+from triquad_tools.sensors.sweep import PosedScan
 
 Recording = RosRecording | ScanFolder
 """A recording that was checked as a whole, so that its errors are known."""
@@ -55,3 +65,72 @@ def _refuse_others(what: str, meaningful: set[str], options: ReadingOptions) -> 
         if name not in meaningful:
             flag = _FLAGS.get(name, f"--{name.replace('_', '-')}")
             raise ToolError(f"{what}, for which {flag} means nothing: leave it out")
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Some scans of a recording, without points that are too near."""
+
+    recording: Recording
+    indices: Sequence[int]
+    range_min_m: float
+    way: str  # in which it is read: another one may give other scans
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    @property
+    def entries(self) -> list[ScanEntry]:
+        """The time and sensor of each scan."""
+        entries = self.recording.entries
+        return [entries[index] for index in self.indices]
+
+    def scans(self, start: int = 0) -> Iterator[PosedScan]:
+        """Yield the scans from number ``start`` on, one after the other."""
+        for scan in self.recording.read(self.indices[start:]):
+            points = points_in_range(np.asarray(scan.points, np.float32), self.range_min_m)
+            yield PosedScan(points, scan.world_from_sensor)
+
+
+def open_selected(options: argparse.Namespace) -> Selection:
+    """Return the recording of the arguments and the scans they choose; its remarks are printed.
+
+    Raises:
+        ToolError: it cannot be read, or no scan is left to map.
+    """
+    reading = options_of(options)
+    recording = open_recording(options.recording, reading)
+    for remark in recording.remarks:
+        print_remark(f"{options.recording}: {remark}")
+    entries = recording.entries
+    if not entries:
+        raise ToolError(f"{options.recording}: nothing of it can be mapped")
+    indices = _chosen(entries, options)
+    if not indices:
+        raise ToolError(
+            f"{options.recording}: no scan is left of {len(entries)} in {length_s(entries):.1f} s: "
+            "see --start, --end and --every"
+        )
+    way = repr((options.recording.resolve(), reading, options.range_min))
+    return Selection(recording, indices, options.range_min, way)
+
+
+def length_s(entries: Sequence[ScanEntry]) -> float:
+    """Return the seconds between the first and the last of some scans."""
+    stamps = [entry.stamp_ns for entry in entries]
+    return (max(stamps) - min(stamps)) / 1e9
+
+
+def _chosen(entries: Sequence[ScanEntry], options: argparse.Namespace) -> list[int]:
+    """Return the numbers of scans within the times, every Nth of each sensor."""
+    first_ns = min(entry.stamp_ns for entry in entries)
+    end_s = float("inf") if options.end is None else options.end
+    before: Counter[str] = Counter()  # scans of each sensor
+    chosen: list[int] = []
+    for index, entry in enumerate(entries):
+        nth = before[entry.source] % options.every == 0
+        before[entry.source] += 1
+        timely = options.start <= (entry.stamp_ns - first_ns) / 1e9 <= end_s
+        if nth and timely:
+            chosen.append(index)
+    return chosen
