@@ -3,7 +3,7 @@
 import pytest
 import zenoh
 from triquad_tools.ros2.intake.drop_log import LOG_PERIOD_S, DropLog
-from triquad_tools.ros2.intake.message_queue import Arrival, MessageQueue, QueueLimits
+from triquad_tools.ros2.intake.topic_listener import Arrival, MessageQueue, QueueLimits
 from triquad_tools.ros2.options import Role
 
 

@@ -145,10 +145,9 @@ def _pack_map(options: argparse.Namespace, path: Path) -> int:
     told = ""
     if options.max_error is not None:
         source, told = _quantised(source, options.max_error)
-    size, before = (
-        write_map_file(source, options.output, feature_dtype=_dtype(source)),
-        _bytes_of(path),
-    )
+    size = write_map_file(source, options.output, feature_dtype=_dtype(source))
+    checkpoint = read_checkpoint(path)
+    before = path.stat().st_size + (checkpoint.manifest.stored_bytes if checkpoint else 0)
     print_line(f"{options.output}: {size:,} bytes, {size / before:.0%} of {before:,}{told}")
     return OK if complete else FAILED
 
@@ -174,13 +173,6 @@ def _dtype(source: SourceMap) -> str:
 
 def _tables(source: SourceMap) -> list[VertexTable]:
     return [table for region in source.record.regions for table in region.tables]
-
-
-def _bytes_of(path: Path) -> int:
-    """Return the bytes of a map file, or of a checkpoint with its parts."""
-    checkpoint = read_checkpoint(path)
-    parts = 0 if checkpoint is None else checkpoint.manifest.stored_bytes
-    return path.stat().st_size + parts
 
 
 def _export(options: argparse.Namespace, path: Path) -> int:

@@ -34,7 +34,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _view(options: argparse.Namespace) -> int:
-    _check_usage(options)
+    server = options.connect or options.map or options.config
+    refuse(
+        {"--connect, --map and --config are for a server, not for a file": options.file and server}
+    )
     with (
         _shown(options) as shown,
         closing(
@@ -44,14 +47,6 @@ def _view(options: argparse.Namespace) -> int:
         print_line(f"open {viewer.url} in a browser; Ctrl-C ends it")
         threading.Event().wait()
     return OK
-
-
-def _check_usage(options: argparse.Namespace) -> None:
-    """Refuse what does not go together."""
-    server = options.connect or options.map or options.config
-    refuse(
-        {"--connect, --map and --config are for a server, not for a file": options.file and server}
-    )
 
 
 @contextmanager

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 from triquad_client import Client, Mesh
-from triquad_format.records.arrays import Doubles
 from triquad_format.wire.messages import FieldFit
 
 from triquad_tools.console.amounts import millimetres
@@ -111,7 +110,10 @@ def demonstrate(client: Client, endpoint: str, drive: SimulatedDrive, out: Path)
         ToolError, TriquadError, OSError: a step failed.
     """
     scans = _simulated(drive)
-    with Probe(endpoint, MAP, _asked(scans)) as probe:
+    # Of surface along the drive, as a planner asks for.
+    hits = np.concatenate([scan.true_hits for scan in scans])
+    asked = np.random.default_rng(_SEED).choice(hits, _QUERY_POINTS)
+    with Probe(endpoint, MAP, asked) as probe:
         intake = _learnt(client, scans)
         queries = probe.finish()
     with progress("fetching the map and its mesh"):
@@ -137,12 +139,6 @@ def _simulated(drive: SimulatedDrive) -> list[SimulatedScan]:
             scans.append(scan)
             report(len(scans), f"{len(scans)} of {len(drive)} scans")
     return scans
-
-
-def _asked(scans: Sequence[SimulatedScan]) -> Doubles:
-    """Return points [N, 3] of surface along the drive, as a planner asks for."""
-    hits = np.concatenate([scan.true_hits for scan in scans])
-    return np.random.default_rng(_SEED).choice(hits, _QUERY_POINTS)
 
 
 def _learnt(client: Client, scans: Sequence[SimulatedScan]) -> Intake:

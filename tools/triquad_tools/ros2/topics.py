@@ -100,16 +100,6 @@ class Delivery:
     latched: bool = False  # later subscribers get the last ones too: TRANSIENT_LOCAL
     depth: int = 10
 
-    @property
-    def of_rmw(self) -> str:
-        """Return the text of rmw_zenoh, which leaves out its defaults."""
-        return f"{'' if self.reliable else 2}:{1 if self.latched else ''}:,{self.depth}:,:,:,,"
-
-    def of_bridge(self, type_hash: str) -> str:
-        """Return the text of a bridge, with the user data that DDS nodes expect since Iron."""
-        kinds = f":{int(self.reliable)}:{int(self.latched)}:0,{self.depth}"
-        return f"{kinds}:typehash={type_hash};"
-
 
 @dataclass(frozen=True)
 class Entity:
@@ -133,15 +123,19 @@ def rmw_token(domain: int, entity: Entity, what: Announcement, delivery: Deliver
     """Return the token that says to nodes of rmw_zenoh what :func:`read_token` reads."""
     name = what.topic.name.replace("/", "%")
     type_key = f"{_dds_type(what.topic.type_name)}/{what.type_hash}"
+    # Defaults are left out.
+    kinds = f"{'' if delivery.reliable else 2}:{1 if delivery.latched else ''}"
     prefix = entity.rmw_prefix(domain, what.end.value)
-    return f"{prefix}/{name}/{type_key}/{delivery.of_rmw}"
+    return f"{prefix}/{name}/{type_key}/{kinds}:,{delivery.depth}:,:,:,,"
 
 
 def bridge_token(session_id: str, what: Announcement, delivery: Delivery) -> str:
     """Return the token that says to bridges what :func:`read_token` reads."""
     key = bridge_key(what.topic.name).replace("/", "§")
     type_key = what.topic.type_name.replace("/", "§")
-    qos = delivery.of_bridge(what.type_hash)
+    kinds = f":{int(delivery.reliable)}:{int(delivery.latched)}:0,{delivery.depth}"
+    # DDS nodes since Iron expect the hash.
+    qos = f"{kinds}:typehash={what.type_hash};"
     return f"@/{session_id}/@ros2_lv/{what.end.value}/{key}/{type_key}/{qos}"
 
 

@@ -123,7 +123,7 @@ def read_depth_folder(folder: Path, options: ReadingOptions) -> ScanFolder:
         ToolError: there is no trajectory, no common time or no intrinsics, an image is missing,
             damaged or no depth image, or does not fit to the camera.
     """
-    images = _listed(folder) if (folder / _LIST_NAME).is_file() else _found(folder)
+    images = _images(folder)
     camera = choose_camera(folder, options.intrinsics)
     placed = place_files(folder, options.trajectory, images.paths, images.stamps_ns)
     for path, pixels in zip(images.paths, check_all(images.paths, read_depth), strict=True):
@@ -172,8 +172,11 @@ def _read_scan(camera: Camera, units: float, stride: int, file: PlacedFile) -> P
     return PosedScan(points, file.world_from_sensor)
 
 
-def _listed(folder: Path) -> _Images:
-    """Return the images that TUM lists: a line for each, its time and its path."""
+def _images(folder: Path) -> _Images:
+    """Return the images that TUM lists with their times, or that lie where Open3D has them."""
+    if not (folder / _LIST_NAME).is_file():
+        found = in_order((folder / _FOLDER_NAME).glob("*.png"))
+        return _Images(found, None, _OPEN3D_UNITS_PER_M)
     paths: list[Path] = []
     lines = read_lines(folder / _LIST_NAME)
     for place, text in lines:
@@ -186,8 +189,3 @@ def _listed(folder: Path) -> _Images:
     if not paths:
         raise ToolError(f"{folder / _LIST_NAME}: lists no images")
     return _Images(paths, parse_stamps(lines), _TUM_UNITS_PER_M)
-
-
-def _found(folder: Path) -> _Images:
-    """Return the images as Open3D has them: all that lie in a folder."""
-    return _Images(in_order((folder / _FOLDER_NAME).glob("*.png")), None, _OPEN3D_UNITS_PER_M)

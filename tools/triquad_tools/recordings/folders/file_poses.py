@@ -135,13 +135,12 @@ def in_order(paths: Iterable[Path]) -> list[Path]:
 
     Hidden files are left out: macOS adds one to each that it copies.
     """
-    shown = (path for path in paths if not path.name.startswith("."))
-    return sorted(shown, key=lambda path: _key(path.name))
 
+    def key(path: Path) -> list[tuple[int, str]]:
+        parts = _NUMBERS.split(path.name)
+        return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
-def _key(name: str) -> list[tuple[int, str]]:
-    parts = _NUMBERS.split(name)
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
+    return sorted((path for path in paths if not path.name.startswith(".")), key=key)
 
 
 def stamps_of_names(paths: Sequence[Path]) -> list[int] | None:
@@ -156,15 +155,13 @@ def stamps_of_names(paths: Sequence[Path]) -> list[int] | None:
     unit_ns = next(10 ** (9 - places) for places in _PLACES if places >= longest)
     stamps: list[int] = []
     for path, pair in zip(paths, pairs, strict=True):
-        stamp = _stamp_of(path.stem) if pair is None else _stamp_of_pair(pair, unit_ns)
+        stamp = (
+            _stamp_of(path.stem) if pair is None else int(pair[1]) * 10**9 + int(pair[2]) * unit_ns
+        )
         if stamp is None:
             return None
         stamps.append(stamp)
     return stamps
-
-
-def _stamp_of_pair(pair: re.Match[str], unit_ns: int) -> int:
-    return int(pair[1]) * 10**9 + int(pair[2]) * unit_ns
 
 
 def _stamp_of(stem: str) -> int | None:

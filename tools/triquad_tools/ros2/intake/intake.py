@@ -14,11 +14,14 @@ from triquad_client import Client, InvalidScanError
 from triquad_format.errors import TriquadError
 
 from triquad_tools.ros2.intake.drop_log import DropLog, FirstScan
-from triquad_tools.ros2.intake.message_queue import Arrival, MessageQueue, QueueLimits
-from triquad_tools.ros2.intake.motion import Motion
-from triquad_tools.ros2.intake.placement import Placed, Placement
+from triquad_tools.ros2.intake.placement import Motion, Placed, Placement
 from triquad_tools.ros2.intake.scan_publisher import Place, ScanPublisher
-from triquad_tools.ros2.intake.topic_listener import TopicListener
+from triquad_tools.ros2.intake.topic_listener import (
+    Arrival,
+    MessageQueue,
+    QueueLimits,
+    TopicListener,
+)
 from triquad_tools.ros2.node import Node
 from triquad_tools.ros2.options import TYPES, BridgeOptions, Role
 from triquad_tools.ros2.topics import SequenceGaps
@@ -60,7 +63,11 @@ class Intake:
         self._placement = Placement(
             self._motion, map_frame=frame, max_bytes=_WAITING_BYTES, timeout_s=options.wait_s
         )
-        self._queue = MessageQueue(_SCANS_UNREAD, _OTHERS_UNREAD, self._pushed_out)
+        self._queue = MessageQueue(
+            _SCANS_UNREAD,
+            _OTHERS_UNREAD,
+            lambda gone: self.drops.add(gone.topic_name, "pushed_out", "too many messages wait"),
+        )
         self._gaps = SequenceGaps()
         self._gaps_lock = threading.Lock()
         self._first_scan = FirstScan(options.topics, time.monotonic())
@@ -96,9 +103,6 @@ class Intake:
             self.drops.add(arrival.topic_name, "too_large", text)
         else:
             self._queue.put(arrival)
-
-    def _pushed_out(self, arrival: Arrival) -> None:
-        self.drops.add(arrival.topic_name, "pushed_out", "too many messages wait")
 
     def _run(self) -> None:
         while not self._stopping.is_set():

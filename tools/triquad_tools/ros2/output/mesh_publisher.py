@@ -42,15 +42,10 @@ class Marker:
         writer.numbers("<f8", 0, 0, 0, 0, 0, 0, 1, 1, 1, 1)  # pose and scale
         writer.numbers("<f4", 1, 1, 1, 1).numbers("<u4", 0, 0).numbers("u1", False)
         writer.sequence(self.corners.astype("<f8")).sequence(height_colours(self.corners))
-        return self._without_texture(writer).payload()
-
-    @staticmethod
-    def _without_texture(writer: CdrWriter) -> CdrWriter:
-        """Write texture, text and mesh file, of which there are none."""
-        nothing = np.empty(0, np.uint8)
+        nothing = np.empty(0, np.uint8)  # of texture, text and mesh file
         writer.text("").numbers("<u4", 0, 0).text("").text("").sequence(nothing)
         writer.sequence(nothing).text("").text("")
-        return writer.text("").sequence(nothing).numbers("u1", False)
+        return writer.text("").sequence(nothing).numbers("u1", False).payload()
 
 
 def height_colours(points: Doubles) -> Floats:

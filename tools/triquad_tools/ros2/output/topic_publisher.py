@@ -51,7 +51,9 @@ class TopicPublisher:
         self._keys: dict[str, _Key] = {}
         self._came = threading.Event()  # a subscriber did
         self._open_rmw(self._hash)
-        self._open_bridge()
+        if self._open(bridge_key(self.topic.name), None):
+            what = Announcement(End.PUBLISHER, self.topic, self._hash)
+            self.node.announce_to_bridges(what, self.delivery)
         self._watch = TokenWatch(self.session, self.domain, End.SUBSCRIPTION, self._appeared)
 
     def close(self) -> None:
@@ -97,11 +99,6 @@ class TopicPublisher:
         if self._open(key, hashlib.blake2b(key.encode(), digest_size=16).digest()):
             what = Announcement(End.PUBLISHER, self.topic, type_hash)
             self.node.announce(what, self.delivery)
-
-    def _open_bridge(self) -> None:
-        if self._open(bridge_key(self.topic.name), None):
-            what = Announcement(End.PUBLISHER, self.topic, self._hash)
-            self.node.announce_to_bridges(what, self.delivery)
 
     def _open(self, key: str, identity: bytes | None) -> bool:
         """Publish under a key from now on; return False if that is done already."""

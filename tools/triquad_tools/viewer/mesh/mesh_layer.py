@@ -145,7 +145,12 @@ class MeshLayer(Layer):
         if self.page.source.grows or not self._framed:
             self._camera.follow(points)
             self._framed = self._tiles.loaded
-        colours = self._colours(points)
+        by_confidence = self._by.value == _CONFIDENCE
+        colours = (
+            confidence_colours(self.page.source.queries)
+            if by_confidence
+            else height_colours(points[:, 2])
+        )
         self.tell(colours.scale.html)
         for name, tile in wanted.items():
             appearance = (colours.scale.label, colours.scale.low, colours.scale.high, tile.version)
@@ -155,12 +160,6 @@ class MeshLayer(Layer):
                 self._replaced += [drawn.handle] if drawn else []
         for name in self._shown.keys() - wanted.keys():
             self._replaced.append(self._shown.pop(name).handle)
-
-    def _colours(self, points: Doubles) -> TileColours:
-        """Return the chosen colours, for a mesh with some ``points`` [N, 3]."""
-        if self._by.value == _CONFIDENCE:
-            return confidence_colours(self.page.source.queries)
-        return height_colours(points[:, 2])
 
     def _add(self, tile: MeshTile, colours: TileColours) -> viser.GlbHandle:
         mesh = GlbMesh("tile", tile.vertices, tile.faces, lit_colours(colours, tile))
