@@ -80,9 +80,8 @@ def _check_usage(options: argparse.Namespace) -> None:
 
 def _inspect(options: argparse.Namespace) -> int:
     _check_usage(options)
-    if options.log:
-        return _log(options)
-    return _diff(options) if options.diff else _show(options)
+    work = _log if options.log else _diff if options.diff else _show
+    return work(options)
 
 
 def _show(options: argparse.Namespace) -> int:

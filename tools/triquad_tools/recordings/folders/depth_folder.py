@@ -179,6 +179,7 @@ def _images(folder: Path) -> _Images:
         return _Images(found, None, _OPEN3D_UNITS_PER_M)
     paths: list[Path] = []
     lines = read_lines(folder / _LIST_NAME)
+    stamps = parse_stamps(lines)
     for place, text in lines:
         _, *name = text.split(maxsplit=1)
         if not name:
@@ -188,4 +189,4 @@ def _images(folder: Path) -> _Images:
             raise ToolError(f"{place}: {paths[-1]}: no such file")
     if not paths:
         raise ToolError(f"{folder / _LIST_NAME}: lists no images")
-    return _Images(paths, parse_stamps(lines), _TUM_UNITS_PER_M)
+    return _Images(paths, stamps, _TUM_UNITS_PER_M)
