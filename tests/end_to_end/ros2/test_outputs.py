@@ -24,8 +24,8 @@ from triquad_tools.commands import ros2
 from triquad_tools.commands.ros2 import bridge_options
 from triquad_tools.ros2.bridge import Bridge
 from triquad_tools.ros2.intake.scan_publisher import Place
-from triquad_tools.ros2.output.map_thread import PERIOD_S
 from triquad_tools.ros2.output.mesh_publisher import MeshPublisher
+from triquad_tools.ros2.output.topic_publisher import PERIOD_S
 from triquad_tools.ros2.topics import End, read_token
 
 MARKER = "visualization_msgs/msg/Marker"

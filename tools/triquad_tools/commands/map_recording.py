@@ -17,7 +17,7 @@ from triquad_tools.console.arguments import command_parser
 from triquad_tools.console.command import OK, ToolError, run
 from triquad_tools.console.lines import print_line, print_remark
 from triquad_tools.console.progress import progress
-from triquad_tools.mapping.mapping_run import MappingRun, UnfinishedMap, mapping_key
+from triquad_tools.mapping.mapping_run import MAP_NAME, MappingRun, mapping_key, read_unfinished
 from triquad_tools.mapping.output import SUFFIXES, check_target, write_output
 from triquad_tools.recordings.arguments import add_recording
 from triquad_tools.recordings.opening import Selection, open_selected
@@ -38,17 +38,20 @@ def _map(options: argparse.Namespace) -> int:
     settings = load_settings(options.settings, options.set, preset=options.preset)
     check_device(options.device)
     selection = open_selected(options)
-    unfinished = UnfinishedMap(output, mapping_key(selection, settings))
+    key, part = mapping_key(selection, settings), output.with_name(f"{output.name}.part")
+    unfinished = read_unfinished(part, key)
     with closing(Teams()) as teams:
         # The first time all kernels are compiled, which takes half a minute or more.
         with progress("preparing") as report:
             warm_up(settings, options.device, teams, report=lambda stage: report(0.0, stage))
-        mapper = unfinished.resumed(settings, options.device, teams)
+        mapper = Mapper(MAP_NAME, settings, options.device, record=unfinished.record, teams=teams)
+        mapper.publish()
         taken = unfinished.scans_taken
+        del unfinished  # a map need not be in memory twice
         if taken:
-            print_line(f"going on after scan {taken}, from {unfinished.path}")
-        mapping = MappingRun(mapper, unfinished, settings)
-        mapping.take(selection, taken)
+            print_line(f"going on after scan {taken}, from {part}")
+        mapping = MappingRun(mapper, settings, part, key, taken)
+        mapping.take(selection)
         _check_result(mapper, mapping, selection)
         mapping.settle()  # which saves the map, should the output not be written
         record = mapper.changes_since(None).record
@@ -58,10 +61,10 @@ def _map(options: argparse.Namespace) -> int:
             )
         except OSError as error:
             raise StoreError(
-                f"{output} cannot be written: {error}; the map is in {unfinished.path}: the same "
+                f"{output} cannot be written: {error}; the map is in {part}: the same "
                 "command writes it once there is room"
             ) from error
-    unfinished.remove()
+    part.unlink()
     print_line(f"{output}: {written}")
     return OK
 

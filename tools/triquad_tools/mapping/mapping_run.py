@@ -4,7 +4,7 @@ import hashlib
 import os
 import time
 from collections import Counter
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from triquad_format.errors import FormatError
@@ -15,7 +15,6 @@ from triquad_server.errors import ScanRefusedError, StoreError
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.process.threads import Teams
 from triquad_server.settings import Settings
 
 from triquad_tools.console.command import ToolError
@@ -37,86 +36,61 @@ def mapping_key(selection: Selection, settings: Settings) -> str:
     return digest.hexdigest()[:_KEY_DIGITS]
 
 
+@dataclass(frozen=True)
 class UnfinishedMap:
-    """The map file next to the output that holds a map while it is made.
+    """What an earlier run has saved."""
 
-    Its map has the key for a name, and the number of scans that are in it.
+    record: MapRecord | None = None
+    scans_taken: int = 0  # or refused: those that need not be taken again
+
+
+def read_unfinished(path: Path, key: str) -> UnfinishedMap:
+    """Return what an interrupted run left in a file; nothing where there is none.
+
+    Raises:
+        ToolError: it is of another recording or other settings, or is not ours.
     """
-
-    def __init__(self, output: Path, key: str) -> None:
-        """Read what is there of an earlier run.
-
-        Raises:
-            ToolError: it is of another recording or other settings, or is not ours.
-        """
-        self.path = output.with_name(f"{output.name}.part")
-        self.scans_taken = 0
-        self._key = key
-        self._record: MapRecord | None = None
-        if os.path.lexists(self.path):
-            self._read()
-
-    def resumed(self, settings: Settings, device: str, teams: Teams) -> Mapper:
-        """Return a mapper that goes on with the map, which has taken :attr:`scans_taken` scans."""
-        record, self._record = self._record, None
-        mapper = Mapper(MAP_NAME, settings, device, record=record, teams=teams)
-        mapper.publish()
-        return mapper
-
-    def save(self, mapper: Mapper, scans_taken: int) -> None:
-        """Write the map, from which another run can go on.
-
-        Raises:
-            StoreError: it cannot be written; what was saved before is untouched.
-        """
-        record = replace(mapper.changes_since(None).record, name=f"{self._key}.{scans_taken}")
-        try:
-            write_map(record, self.path)
-        except OSError as error:
-            raise StoreError(f"{self.path} cannot be written: {error}") from error
-
-    def remove(self) -> None:
-        """Delete the file: the map is finished."""
-        self.path.unlink(missing_ok=True)
-
-    def _read(self) -> None:
-        try:
-            record = read_map(self.path)
-        except (FormatError, OSError) as error:
-            raise ToolError(
-                f"{self.path} holds something else; move it away, or give OUT another name "
-                f"({error})"
-            ) from error
-        key, _, scans_taken = record.name.partition(".")
-        if key != self._key or not scans_taken.isdecimal():
-            raise ToolError(
-                f"{self.path} holds an unfinished map of another recording, or with other "
-                "flags or settings: give the same to go on with it, or delete it to begin again"
-            )
-        self._record, self.scans_taken = replace(record, name=MAP_NAME), int(scans_taken)
+    if not os.path.lexists(path):
+        return UnfinishedMap()
+    try:
+        record = read_map(path)
+    except (FormatError, OSError) as error:
+        raise ToolError(
+            f"{path} holds something else; move it away, or give OUT another name ({error})"
+        ) from error
+    own_key, _, scans_taken = record.name.partition(".")
+    if own_key != key or not scans_taken.isdecimal():
+        raise ToolError(
+            f"{path} holds an unfinished map of another recording, or with other flags or "
+            "settings: give the same to go on with it, or delete it to begin again"
+        )
+    return UnfinishedMap(replace(record, name=MAP_NAME), int(scans_taken))
 
 
 class MappingRun:
     """Integrates the scans of a recording and trains until nothing is left to learn.
 
-    What is done is saved each minute, from where an interrupted map goes on.
+    What is done is saved each minute, from where an interrupted map goes on: in a map file whose
+    map has the key for a name, and the number of scans that are in it.
     """
 
-    def __init__(self, mapper: Mapper, unfinished: UnfinishedMap, settings: Settings) -> None:
+    def __init__(
+        self, mapper: Mapper, settings: Settings, unfinished: Path, key: str, scans_taken: int
+    ) -> None:
         self._mapper = mapper
         self._unfinished = unfinished
+        self._key = key
         self._warnings = ScanWarnings(ScanQueue(1), settings)
-        self._next_save = time.monotonic() + _SAVE_PERIOD_S
-        self.scans_taken = 0  # or refused: those that need not be taken again
+        self._next_save_s = time.monotonic() + _SAVE_PERIOD_S
+        self.scans_taken = scans_taken  # or refused
         self.refusals: Counter[str] = Counter()
         self.last_refusal = ""
 
-    def take(self, selection: Selection, start: int) -> None:
-        """Integrate the scans from number ``start`` on, and train between them."""
-        self.scans_taken = start
+    def take(self, selection: Selection) -> None:
+        """Integrate the scans that are left, and train between them."""
         total, entries = len(selection), selection.entries
         with progress("mapping", total) as report:
-            for scan in selection.scans(start):
+            for scan in selection.scans(self.scans_taken):
                 self._save_now_and_then()
                 entry = entries[self.scans_taken]
                 try:
@@ -146,11 +120,16 @@ class MappingRun:
         self._save()
 
     def _save_now_and_then(self) -> None:
-        if time.monotonic() >= self._next_save:
+        if time.monotonic() >= self._next_save_s:
             self._save()
 
     def _save(self) -> None:
+        """Write the map; where it cannot be written, what was saved before is untouched."""
         started_s = time.monotonic()
-        self._unfinished.save(self._mapper, self.scans_taken)
+        record = self._mapper.changes_since(None).record
+        try:
+            write_map(replace(record, name=f"{self._key}.{self.scans_taken}"), self._unfinished)
+        except OSError as error:
+            raise StoreError(f"{self._unfinished} cannot be written: {error}") from error
         ended_s = time.monotonic()
-        self._next_save = ended_s + max(_SAVE_PERIOD_S, (ended_s - started_s) / _SAVE_SHARE)
+        self._next_save_s = ended_s + max(_SAVE_PERIOD_S, (ended_s - started_s) / _SAVE_SHARE)

@@ -10,8 +10,7 @@ from triquad_format.errors import InvalidInputError
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
 from triquad_tools.recordings.bag import Bag, Message
-from triquad_tools.sensors.motion.frame_tree import STATIC, FrameTree, Transform
-from triquad_tools.sensors.motion.track import Track
+from triquad_tools.sensors.motion.frame_tree import STATIC, FrameTree, Track, Transform
 from triquad_tools.sensors.ros import type_store
 from triquad_tools.sensors.ros.depth_camera import is_depth
 from triquad_tools.sensors.ros.message_reader import MessageReader

@@ -17,9 +17,8 @@ from triquad_tools.ros2.intake.intake import Intake
 from triquad_tools.ros2.node import Node
 from triquad_tools.ros2.options import BridgeOptions
 from triquad_tools.ros2.output.grid_publisher import GridPublisher
-from triquad_tools.ros2.output.map_thread import MapThread
 from triquad_tools.ros2.output.mesh_publisher import MeshPublisher
-from triquad_tools.ros2.output.topic_publisher import TopicPublisher
+from triquad_tools.ros2.output.topic_publisher import MapThread, TopicPublisher
 from triquad_tools.ros2.topics import Delivery, Topic
 from triquad_tools.sensors.ros.type_store import MARKER, OCCUPANCY_GRID
 

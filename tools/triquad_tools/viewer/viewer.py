@@ -13,7 +13,7 @@ from triquad_format.errors import TriquadError
 from triquad_tools.console.command import ToolError
 from triquad_tools.viewer.allowed_origins import serving_only
 from triquad_tools.viewer.mesh.mesh_layer import MeshLayer
-from triquad_tools.viewer.page.legends import problem_html, text_html
+from triquad_tools.viewer.page.legends import text_html
 from triquad_tools.viewer.page.page import Page
 from triquad_tools.viewer.questions.clicks import Clicks
 from triquad_tools.viewer.questions.slice import SliceQuestion
@@ -25,45 +25,28 @@ from triquad_tools.viewer.time_panel import TimePanel
 from triquad_tools.viewer.trail_layer import TrailLayer
 
 
-class BrowserSession:
-    """The scene and the panel of one browser, from when it opens the page until it leaves."""
+def open_page(client: viser.ClientHandle, shown: MapSource | History) -> ExitStack:
+    """Build the page of one browser; return what ends it.
 
-    def __init__(self, client: viser.ClientHandle, shown: MapSource | History) -> None:
-        self._client = client
-        _prepare(client)
-        self._title = client.gui.add_html("")
-        self._shown_problems = client.gui.add_html("")
-        self._problems: dict[str, str] = {}  # by part of the page
-        self._parts = ExitStack()
-        try:
-            self._show(shown)
-        except TriquadError as error:
-            self._tell("page", str(error))
-        except Exception:
-            self.close()
-            raise
-
-    def close(self) -> None:
-        """Handle a browser that has left."""
-        self._parts.close()
-
-    def _show(self, shown: MapSource | History) -> None:
-        """Build the page; of a history, each browser chooses its own moment."""
-        source = shown.newest() if isinstance(shown, History) else shown
-        self._title.content = text_html(source.title)
-        page = Page(self._client, source, self._tell)
+    Of a history, each browser chooses its own moment.
+    """
+    _prepare(client)
+    title, page, parts = client.gui.add_html(""), Page(client), ExitStack()
+    try:
+        page.source = source = shown.newest() if isinstance(shown, History) else shown
+        title.content = text_html(source.title)
         if isinstance(shown, History):
-            self._parts.callback(TimePanel(page, shown).close)
+            parts.callback(TimePanel(page, shown).close)
         for part in (MeshLayer, SliceQuestion, UnknownSpace, Clicks):
-            self._parts.callback(part(page).close)
+            parts.callback(part(page).close)
         if isinstance(source, LiveSource):
-            self._parts.callback(TrailLayer(page, source.client).close)
-
-    def _tell(self, part: str, problem: str) -> None:
-        """Show the problem of a part; with an empty text it has none any more."""
-        self._problems[part] = problem
-        different = dict.fromkeys(filter(None, list(self._problems.values())))
-        self._shown_problems.content = problem_html("\n".join(different))
+            parts.callback(TrailLayer(page, source.client).close)
+    except TriquadError as error:
+        page.failed("page", str(error))
+    except Exception:
+        parts.close()
+        raise
+    return parts
 
 
 def _prepare(client: viser.ClientHandle) -> None:
@@ -112,7 +95,7 @@ class Viewer:
         """
         _check_address(host)
         self._shown = shown
-        self._sessions: dict[int, BrowserSession] = {}
+        self._sessions: dict[int, ExitStack] = {}  # what ends the page of a browser
         self._closed = False
         self._changing = threading.Lock()
         self._opened = threading.Event()
@@ -146,7 +129,7 @@ class Viewer:
             self._server.stop()
 
     def _enter(self, client: viser.ClientHandle) -> None:
-        session = BrowserSession(client, self._shown)
+        session = open_page(client, self._shown)
         with self._changing:
             # A browser may leave meanwhile: callbacks run at the same time, in any order.
             left = self._closed or client.client_id not in self._server.get_clients()

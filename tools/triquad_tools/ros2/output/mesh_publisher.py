@@ -8,8 +8,7 @@ from triquad_client import Client, MeshTile, MeshWatch
 from triquad_format.records.arrays import Doubles, Floats
 
 from triquad_tools.ros2.intake.scan_publisher import Place
-from triquad_tools.ros2.output.map_thread import PERIOD_S
-from triquad_tools.ros2.output.topic_publisher import TopicPublisher
+from triquad_tools.ros2.output.topic_publisher import PERIOD_S, TopicPublisher
 from triquad_tools.sensors.ros.type_store import CdrWriter
 
 _TRIANGLE_LIST = 11

@@ -2,7 +2,6 @@
 
 import math
 import threading
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +9,7 @@ import viser
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles, Floats
 
+from triquad_tools.viewer.page.legends import problem_html
 from triquad_tools.viewer.sources.map_source import MapSource
 
 _GRID_M = 100.0
@@ -26,15 +26,15 @@ class Focus(NamedTuple):
 class Page:
     """The page that its parts draw on; for several threads."""
 
-    def __init__(
-        self, client: viser.ClientHandle, source: MapSource, failed: Callable[[str, str], None]
-    ) -> None:
-        """``failed`` gets a part and its problem; an empty text: none any more."""
+    source: MapSource
+    """The map, which a part may replace: all others go on with the new one."""
+
+    def __init__(self, client: viser.ClientHandle) -> None:
         self.client = client
         self.scene = client.scene
         self.gui = client.gui
-        self.source = source  # which a part may replace: all others go on with the new one
-        self.failed = failed
+        self._shown_problems = client.gui.add_html("")
+        self._problems: dict[str, str] = {}  # by part of the page
         # [3] metres, map frame: the zero of the scene, near the first point that is drawn, since a
         # browser computes in single precision: half a metre in coordinates as large as UTM's
         self._origin: Doubles | None = None
@@ -52,6 +52,12 @@ class Page:
         """Return points [..., 3] of the scene in the map frame."""
         origin = np.zeros(3) if self._origin is None else self._origin
         return np.asarray(points, np.float64) + origin
+
+    def failed(self, part: str, problem: str) -> None:
+        """Show the problem of a part; with an empty text it has none any more."""
+        self._problems[part] = problem
+        different = dict.fromkeys(filter(None, list(self._problems.values())))
+        self._shown_problems.content = problem_html("\n".join(different))
 
     @property
     def eye(self) -> Doubles:
