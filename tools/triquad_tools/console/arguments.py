@@ -8,6 +8,8 @@ from pathlib import Path
 import triquad_format
 from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
 
+DEFAULT_MAP = "default"
+
 
 def command_parser(prog: str, description: str, epilog: str = "") -> argparse.ArgumentParser:
     """Return the parser of a command, which can print its version."""
@@ -68,9 +70,6 @@ seed = partial(whole, 0, None)
 
 port = partial(whole, 0, 65_535)
 """Returns a port to listen on; 0: any that is free."""
-
-
-DEFAULT_MAP = "default"
 
 
 def add_server(parser: argparse.ArgumentParser) -> None:

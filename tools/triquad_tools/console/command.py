@@ -14,6 +14,13 @@ from triquad_tools.console.lines import print_remark
 INTERRUPTED = 130
 """The exit status of shells: 128 and the number of SIGINT."""
 
+OK, FAILED, BAD_INPUT = 0, 1, 2
+NOBODY_READS = 141
+"""The status of shells: 128 and the number of SIGPIPE."""
+
+_kept: list[KeyboardInterrupt] = []
+"""The interrupts, with their frames: what a compiler has half done may not be cleaned up."""
+
 
 @contextmanager
 def interruptible() -> Iterator[None]:
@@ -46,14 +53,6 @@ def interruptible() -> Iterator[None]:
     finally:
         for each, handler in handlers.items():
             signal.signal(each, handler)
-
-
-OK, FAILED, BAD_INPUT = 0, 1, 2
-NOBODY_READS = 141
-"""The status of shells: 128 and the number of SIGPIPE."""
-
-_kept: list[KeyboardInterrupt] = []
-"""The interrupts, with their frames: what a compiler has half done may not be cleaned up."""
 
 
 class ToolError(TriquadError):

@@ -18,6 +18,11 @@ from triquad_tools.plots.picture import draw_mesh
 from triquad_tools.recordings.publishing import publish_all, wait_until_settled
 from triquad_tools.simulation.lidar import SimulatedDrive, SimulatedScan
 
+MAP = "demo"
+_SEED = 0  # of the points that are asked
+_SETTLE_LIMIT_S = 70.0
+_QUERY_POINTS = 1_000
+
 
 @dataclass(frozen=True)
 class Intake:
@@ -94,13 +99,6 @@ def table_rows(results: DemoResults) -> list[Row]:
         note = f"90 % in {millimetres(fit.upper_m)}, of {fit.rays:,} rays that were never learnt"
         rows.insert(3, Row("error at held-out rays", millimetres(fit.median_m), note))
     return rows
-
-
-MAP = "demo"
-
-_SEED = 0  # of the points that are asked
-_SETTLE_LIMIT_S = 70.0
-_QUERY_POINTS = 1_000
 
 
 def demonstrate(client: Client, endpoint: str, drive: SimulatedDrive, out: Path) -> DemoResults:

@@ -27,6 +27,12 @@ _log = logging.getLogger("triquad_ros2")
 _MESH_DELIVERY = Delivery(depth=100)
 _GRID_DELIVERY = Delivery(latched=True, depth=1)  # as Nav2 expects of a map
 
+_SETTINGS = {
+    "mode": "client",
+    "connect/timeout_ms": 5000,  # a router that was started together with the bridge needs a moment
+    "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
+}
+
 
 class Bridge:
     """Takes part in ROS 2 for a map server, until it is closed; session and client stay open."""
@@ -71,13 +77,6 @@ class Bridge:
     def close(self) -> None:
         """Receive and publish no more."""
         self._parts.close()
-
-
-_SETTINGS = {
-    "mode": "client",
-    "connect/timeout_ms": 5000,  # a router that was started together with the bridge needs a moment
-    "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
-}
 
 
 def open_session(router: str | None, file: Path | None) -> zenoh.Session:

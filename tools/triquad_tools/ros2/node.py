@@ -22,6 +22,8 @@ from triquad_tools.ros2.topics import (
 
 NODE_NAME = "triquad"
 
+_log = logging.getLogger("triquad_ros2")
+
 
 class Node:
     """Announces what the bridge publishes and subscribes to, until it is closed."""
@@ -52,9 +54,6 @@ class Node:
 
     def _declare(self, token: str) -> None:
         self._tokens.append(self._session.liveliness().declare_token(token))
-
-
-_log = logging.getLogger("triquad_ros2")
 
 
 class TokenWatch:

@@ -22,6 +22,8 @@ from triquad_tools.sensors.ros.type_store import (
 TF_POSES = "tf"
 """Stands for transforms in place of a topic of poses."""
 
+MAX_GRID_CELLS = 250_000
+
 
 class Role(Enum):
     """The role of messages."""
@@ -138,9 +140,6 @@ class TopicChoice:
 def full_name(prefix: str, name: str) -> str:
     """Return a topic's name with a leading slash, behind ``prefix``."""
     return f"{prefix}/{name.strip('/')}"
-
-
-MAX_GRID_CELLS = 250_000
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,12 @@ ANY_HASH = "*"
 NO_HASH = "TypeHashNotSupported"
 """The text that ROS 2 Humble, which knows no hashes of types, writes in their place."""
 
+ATTACHMENT = struct.Struct("<qqB16s")
+"""The attachment: number, time, length of the identity, identity of the publisher."""
+
+_MAX_PUBLISHERS = 256
+_MAX_MISSED = 2**20  # a larger step is of a publisher that was started again, or of wrong bytes
+
 
 class End(Enum):
     """An end of a topic, as tokens call it."""
@@ -147,13 +153,6 @@ def _dds_type(type_name: str) -> str:
 def _ros_type(dds_type: str) -> str:
     package, kind, _, name = dds_type.split("::")
     return f"{package}/{kind}/{name.removesuffix('_')}"
-
-
-ATTACHMENT = struct.Struct("<qqB16s")
-"""The attachment: number, time, length of the identity, identity of the publisher."""
-
-_MAX_PUBLISHERS = 256
-_MAX_MISSED = 2**20  # a larger step is of a publisher that was started again, or of wrong bytes
 
 
 class SequenceGaps:

@@ -24,6 +24,10 @@ from triquad_tools.viewer.sources.map_source import MapSource
 from triquad_tools.viewer.time_panel import TimePanel
 from triquad_tools.viewer.trail_layer import TrailLayer
 
+DEFAULT_PORT = 8080
+_OF_ONE_WHO_LEFT = ("Queued a .* on a closed connection", "Attempted to remove an? already removed")
+"""Warnings of viser that come when a browser leaves while something is drawn or removed."""
+
 
 def open_page(client: viser.ClientHandle, shown: MapSource | History) -> ExitStack:
     """Build the page of one browser; return what ends it.
@@ -58,12 +62,6 @@ def _prepare(client: viser.ClientHandle) -> None:
     client.scene.configure_default_lights(cast_shadow=False)
     client.scene.configure_environment_map(None)
     client.scene.add_light_ambient("/ambient", intensity=2.0)  # no side of what is lit is black
-
-
-DEFAULT_PORT = 8080
-
-_OF_ONE_WHO_LEFT = ("Queued a .* on a closed connection", "Attempted to remove an? already removed")
-"""Warnings of viser that come when a browser leaves while something is drawn or removed."""
 
 
 class _OwnServer(viser.ViserServer):

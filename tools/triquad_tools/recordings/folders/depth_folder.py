@@ -20,6 +20,11 @@ from triquad_tools.sensors.sweep import PosedScan
 INTRINSICS_NAMES = ("camera_intrinsic.json", "intrinsic.json", "camera_primesense.json")
 """Names that Open3D and its data give them."""
 
+_LIST_NAME = "depth.txt"  # of TUM RGB-D
+_FOLDER_NAME = "depth"  # of Open3D
+_TUM_UNITS_PER_M, _OPEN3D_UNITS_PER_M = 5000.0, 1000.0
+_GREY_MODES = ("I;16", "I;16B", "I")  # 16 bits, as versions of Pillow name them
+
 
 class Camera(NamedTuple):
     """A camera, and the size of its images where that is known."""
@@ -95,12 +100,6 @@ def _read_camera(path: Path) -> Camera:
 
 def _size(shape: tuple[int, ...]) -> str:
     return f"{shape[1]} x {shape[0]}"
-
-
-_LIST_NAME = "depth.txt"  # of TUM RGB-D
-_FOLDER_NAME = "depth"  # of Open3D
-_TUM_UNITS_PER_M, _OPEN3D_UNITS_PER_M = 5000.0, 1000.0
-_GREY_MODES = ("I;16", "I;16B", "I")  # 16 bits, as versions of Pillow name them
 
 
 class _Images(NamedTuple):

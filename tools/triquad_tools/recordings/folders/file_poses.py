@@ -19,6 +19,16 @@ _WHY = {
     "pose_gap": "between poses that lie too far apart",
 }
 
+_NUMBERS = re.compile(r"(\d+)")
+_NS_OF_DIGITS = {10: 10**9, 13: 10**6, 16: 10**3, 19: 1}
+"""Whole numbers with as many digits are times since 1970, from 2001 to 2286, in a unit of
+nanoseconds: seconds, milliseconds, microseconds or nanoseconds."""
+
+_WHOLE = re.compile(r"(?:.*\D)?([1-9]\d+)")
+_DECIMAL = re.compile(r"(?:.*[^\d.])?(\d{1,10})\.(\d{1,9})")
+_PAIR = re.compile(r"(?:.*\D)?([1-9]\d{9})[_-](\d{1,9})")
+_PLACES = (3, 6, 9)  # decimal places of milliseconds, microseconds and nanoseconds
+
 
 class PlacedFiles(NamedTuple):
     """The files that can be mapped, in the order of their stamps."""
@@ -117,17 +127,6 @@ def _no_common_time(stamps_ns: Sequence[int], trajectory: Trajectory, folder: Pa
         f"{trajectory.path} goes from {start:.3f} to {end:.3f} s, with gaps of at most 2 s; write "
         "both with the times of one clock"
     )
-
-
-_NUMBERS = re.compile(r"(\d+)")
-_NS_OF_DIGITS = {10: 10**9, 13: 10**6, 16: 10**3, 19: 1}
-"""Whole numbers with as many digits are times since 1970, from 2001 to 2286, in a unit of
-nanoseconds: seconds, milliseconds, microseconds or nanoseconds."""
-
-_WHOLE = re.compile(r"(?:.*\D)?([1-9]\d+)")
-_DECIMAL = re.compile(r"(?:.*[^\d.])?(\d{1,10})\.(\d{1,9})")
-_PAIR = re.compile(r"(?:.*\D)?([1-9]\d{9})[_-](\d{1,9})")
-_PLACES = (3, 6, 9)  # decimal places of milliseconds, microseconds and nanoseconds
 
 
 def in_order(paths: Iterable[Path]) -> list[Path]:

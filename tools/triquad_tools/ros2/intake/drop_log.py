@@ -31,6 +31,10 @@ REMEDIES = {
     "not_sent": "is the map server up, and does the role of --config let it publish?",
 }
 
+AFTER_S = 10.0
+_MOST_LISTED = 20
+_USABLE = (POINT_CLOUD, IMAGE)
+
 
 class DropLog:
     """Counts by reason; the log has the first of each topic and reason, then one line a while."""
@@ -72,11 +76,6 @@ class DropLog:
                 return 0
             self._logged_s[kind] = now_s
             return self._since.pop(kind)
-
-
-AFTER_S = 10.0
-_MOST_LISTED = 20
-_USABLE = (POINT_CLOUD, IMAGE)
 
 
 class FirstScan:

@@ -19,6 +19,10 @@ _POSES_KEPT = 2000  # of each frame; 20 s at 100 Hz
 _MAX_FRAMES = 1000
 _MAX_NAME = 256
 
+_log = logging.getLogger("triquad_ros2")
+_CHOICE_S = 1.0
+"""The time after a sweep could first be placed in which a better map frame may appear."""
+
 
 class Motion:
     """Keeps the transforms that count, within limits: their names come from the network."""
@@ -68,12 +72,6 @@ class Motion:
             raise NoScanError("bad_transform", "its name is empty or too long")
         if len(self.frames) >= _MAX_FRAMES and not self.frames.knows(transform.child):
             raise NoScanError("bad_transform", f"more than {_MAX_FRAMES} frames")
-
-
-_log = logging.getLogger("triquad_ros2")
-
-_CHOICE_S = 1.0
-"""The time after a sweep could first be placed in which a better map frame may appear."""
 
 
 @dataclass(frozen=True)

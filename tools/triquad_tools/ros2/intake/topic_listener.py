@@ -25,6 +25,13 @@ from triquad_tools.ros2.topics import (
     rmw_topic_name,
 )
 
+_log = logging.getLogger("triquad_ros2")
+_MAX_FOUND = 1000  # topics that are remembered, whether they are wanted or not
+_ASK_S = 2.0
+_SUBSCRIPTION = Delivery(reliable=False)  # which suits every publisher
+# Static transforms are published once: who publishes them keeps them for those that come later.
+_HISTORY = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=100)
+
 
 @dataclass(frozen=True, eq=False)
 class Arrival:
@@ -95,15 +102,6 @@ class MessageQueue:
         with self._changed:
             self._closed = True
             self._changed.notify()
-
-
-_log = logging.getLogger("triquad_ros2")
-
-_MAX_FOUND = 1000  # topics that are remembered, whether they are wanted or not
-_ASK_S = 2.0
-_SUBSCRIPTION = Delivery(reliable=False)  # which suits every publisher
-# Static transforms are published once: who publishes them keeps them for those that come later.
-_HISTORY = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=100)
 
 
 @dataclass

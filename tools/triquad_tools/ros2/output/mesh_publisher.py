@@ -16,6 +16,8 @@ _NAMESPACE = "triquad"
 _COLOURS_REPEAT_M = 10.0
 _PHASES = np.array([0.0, 1 / 3, 2 / 3])  # of red, green and blue
 
+TileIndex = tuple[int, int, int]
+
 
 class Action(IntEnum):
     """The action of a marker."""
@@ -53,9 +55,6 @@ def height_colours(points: Doubles) -> Floats:
     colours = np.ones((len(points), 4), "<f4")
     colours[:, :3] = 0.55 + 0.4 * np.cos(2 * np.pi * turns)
     return colours
-
-
-TileIndex = tuple[int, int, int]
 
 
 @dataclass

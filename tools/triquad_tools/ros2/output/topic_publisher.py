@@ -25,6 +25,10 @@ from triquad_tools.ros2.topics import (
     type_hash,
 )
 
+_log = logging.getLogger("triquad_ros2")
+PERIOD_S = 0.5  # between two rounds
+_RETRY_S = 5.0  # after an error
+
 
 @dataclass(frozen=True)
 class _Key:
@@ -118,12 +122,6 @@ class TopicPublisher:
             )
             self._keys[key] = _Key(publisher, identity)
             return True
-
-
-_log = logging.getLogger("triquad_ros2")
-
-PERIOD_S = 0.5  # between two rounds
-_RETRY_S = 5.0  # after an error
 
 
 class MapThread:

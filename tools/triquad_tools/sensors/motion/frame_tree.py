@@ -16,6 +16,12 @@ MAX_GAP_S = 2.0
 _WIDTH = 7  # numbers of a pose
 _NEARLY_PARALLEL = 0.9995  # quaternions, of which spherical interpolation would divide by nearly 0
 
+STATIC = None
+"""The stamp of a transform that always holds."""
+
+ROOT_NAMES = ("map", "odom", "world")
+"""Frames that stand still, as usual in ROS (REP 105), in order of preference."""
+
 
 class Track:
     """The poses of a frame in its parent, in the order of their stamps.
@@ -107,13 +113,6 @@ def _slerp(first: Doubles, second: Doubles, share: Doubles) -> Doubles:
     between = of_first * first + of_second * second
     turned: Doubles = between / np.linalg.norm(between, axis=1, keepdims=True)
     return turned
-
-
-STATIC = None
-"""The stamp of a transform that always holds."""
-
-ROOT_NAMES = ("map", "odom", "world")
-"""Frames that stand still, as usual in ROS (REP 105), in order of preference."""
 
 
 @dataclass(frozen=True)

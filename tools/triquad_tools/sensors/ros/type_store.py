@@ -21,6 +21,8 @@ POSE = "geometry_msgs/msg/PoseStamped"
 MARKER = "visualization_msgs/msg/Marker"
 OCCUPANCY_GRID = "nav_msgs/msg/OccupancyGrid"
 
+_LITTLE_ENDIAN = b"\x00\x01\x00\x00"
+
 
 @cache
 def type_store() -> Typestore:
@@ -39,9 +41,6 @@ def decode_cdr(payload: bytes, type_name: str) -> Any:
     # Any error of the decoder: bytes of another type lead it anywhere.
     except (SerdeError, ValueError, IndexError, MemoryError, TypeError) as error:
         raise NoScanError("decode", f"no {type_name}: {error}") from error
-
-
-_LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 
 
 class CdrWriter:

@@ -32,6 +32,11 @@ _GROWN = 0.02  # share of the camera's distance; a smaller step is not worth a j
 _SAME = 1e-3
 _EYES = 64  # places where it was put last: what a browser reports is not as old as those before
 
+_PERIOD_S = 0.5
+_HEIGHT, _CONFIDENCE = "height", "confidence"
+_PIXELS = 4  # of a cell
+_ENOUGH = 200  # vertices of a tile, to know where it is
+
 
 class View(NamedTuple):
     """The camera's position and target: [3] metres, map frame."""
@@ -81,12 +86,6 @@ class OverviewCamera:
     def _moved(self, camera: viser.CameraHandle) -> None:
         away_m = np.linalg.norm(np.array(self._eyes) - camera.position, axis=1)
         self._taken |= bool(away_m.min() > _SAME * (1.0 + np.linalg.norm(camera.position)))
-
-
-_PERIOD_S = 0.5
-_HEIGHT, _CONFIDENCE = "height", "confidence"
-_PIXELS = 4  # of a cell
-_ENOUGH = 200  # vertices of a tile, to know where it is
 
 
 class _DrawnTile(NamedTuple):

@@ -22,6 +22,11 @@ _log = logging.getLogger(__name__)
 
 _LEAST_S = 0.05  # between one refresh and the next, however often it is woken
 
+_PERIOD_S = 0.5
+_LEAST_ASKED_S, _SHARE = 2.0, 0.1  # between the same questions; of the time that goes with them
+Wanted = TypeVar("Wanted", bound=Hashable)
+"""All that an answer depends on, but for the map."""
+
 
 class Layer(ABC):
     """Shows one thing of a map in scene and panel, until it is closed.
@@ -114,13 +119,6 @@ class Layer(ABC):
             failing = bool(problem)
             self._stopped.wait(_LEAST_S)
             self._woken.wait(self._period_s)
-
-
-_PERIOD_S = 0.5
-_LEAST_ASKED_S, _SHARE = 2.0, 0.1  # between the same questions; of the time that goes with them
-
-Wanted = TypeVar("Wanted", bound=Hashable)
-"""All that an answer depends on, but for the map."""
 
 
 @dataclass(frozen=True)

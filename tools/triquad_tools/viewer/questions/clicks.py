@@ -23,6 +23,20 @@ _POINT_REACH_M = 10.0  # how far around a point surfaces are searched for
 _BALL, _ARROW = 0.006, 0.08  # radius and length, as shares of the distance of the eye
 _COLOUR = "#c51b7d"  # no mesh has it
 
+_LEAST_REACH_M, _REACH_RADII = 1.0, 3.0  # how far around surfaces are searched for
+_LEAST_WIDTH = 0.004  # of what is drawn, as a share of the distance of the eye
+_FREE = "#0072b2"
+_LEGEND = lines_html(
+    (_FREE, "the robot passes"),
+    (UNKNOWN, "it is in unknown space, or was before"),
+    (BEHIND, "it touches a surface, or did before"),
+)
+_ASKS, _LAYS, _NOTHING = "asks the map", "adds to the path", "does nothing"
+_RAISED_M, _RADIUS_M = 0.5, 0.3
+_LEAST_LEG_M = 0.01  # a second click at the same place adds nothing
+_HINT = "Click at a surface."
+_SKY = "No surface there: sky, or nothing was seen in that direction."
+
 
 @dataclass(frozen=True)
 class Point:
@@ -75,16 +89,6 @@ class Point:
             )  # fmt: skip
             marks.append(arrow)
         return marks
-
-
-_LEAST_REACH_M, _REACH_RADII = 1.0, 3.0  # how far around surfaces are searched for
-_LEAST_WIDTH = 0.004  # of what is drawn, as a share of the distance of the eye
-_FREE = "#0072b2"
-_LEGEND = lines_html(
-    (_FREE, "the robot passes"),
-    (UNKNOWN, "it is in unknown space, or was before"),
-    (BEHIND, "it touches a surface, or did before"),
-)
 
 
 class Path:
@@ -147,13 +151,6 @@ class Path:
             pieces = np.stack([leg[:-1], leg[1:]], axis=1)
             marks.append(layer.lines(pieces, colour, max(2.0 * self._radius_m, least_m)))
         return marks
-
-
-_ASKS, _LAYS, _NOTHING = "asks the map", "adds to the path", "does nothing"
-_RAISED_M, _RADIUS_M = 0.5, 0.3
-_LEAST_LEG_M = 0.01  # a second click at the same place adds nothing
-_HINT = "Click at a surface."
-_SKY = "No surface there: sky, or nothing was seen in that direction."
 
 
 @dataclass(frozen=True)
