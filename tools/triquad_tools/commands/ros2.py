@@ -31,6 +31,7 @@ from triquad_tools.ros2.options import (
     BridgeOptions,
     SliceShape,
     TopicChoice,
+    full_name,
 )
 from triquad_tools.ros2.server_process import ServerProcess
 from triquad_tools.sensors.ros.header import frame_name
@@ -57,6 +58,10 @@ def _run(options: argparse.Namespace) -> int:
         with ExitStack() as stack:
             if options.serve is not None:
                 server = stack.enter_context(ServerProcess(options.serve, asked.topics))
+                options.map = options.map or server.map_name
+                if options.config is None:
+                    options.connect = options.connect or server.endpoint
+                    options.router = options.router or server.endpoint
             _bridge(options, asked, server)
     except KeyboardInterrupt:
         _log.info("stopped")
@@ -69,44 +74,38 @@ def _bridge(
     options: argparse.Namespace, asked: BridgeOptions, server: ServerProcess | None
 ) -> None:
     """Bridge until the server ends, or else for ever."""
-    with ExitStack() as stack:
-        client = _connected(options, server)
-        if client is None:
-            return
-        stack.enter_context(client)
-        router = options.router
-        if router is None and server is not None and options.config is None:
-            router = server.endpoint
-        session = stack.enter_context(closing(open_session(router, options.config)))
-        bridge = stack.enter_context(Bridge(session, client, asked))
-        stack.callback(_log_counts, bridge)
-        if server is None:
-            threading.Event().wait()
-        else:
-            server.wait()
+    client = _connected(options, server)
+    if client is None:
+        return
+    with (
+        client,
+        closing(open_session(options.router, options.config)) as session,
+        Bridge(session, client, asked) as bridge,
+    ):
+        try:
+            if server is None:
+                threading.Event().wait()
+            else:
+                server.wait()
+        finally:
+            dropped = ", ".join(f"{reason}: {n}" for reason, n in bridge.dropped.items())
+            _log.info("%d scans published, dropped: %s", bridge.published, dropped or "none")
 
 
 def _connected(options: argparse.Namespace, server: ServerProcess | None) -> Client | None:
-    """Return a client of the map server, once it serves; None where it ended before."""
-    if server is None:
-        return connect(options.connect, options.map or DEFAULT_MAP, config=options.config)
-    endpoint, tell_s = options.connect, time.monotonic() + _TELL_S
-    if endpoint is None and options.config is None:
-        endpoint = server.endpoint
-    while server.exit_code is None:
+    """Return a client of the map server, once it serves; None where one of ours ended before."""
+    tell_s = time.monotonic() + _TELL_S
+    while server is None or server.exit_code is None:
         try:
-            return connect(endpoint, options.map or server.map_name, config=options.config)
+            return connect(options.connect, options.map or DEFAULT_MAP, config=options.config)
         except (ConnectError, UnknownMapError) as error:
+            if server is None:
+                raise
             if time.monotonic() > tell_s:
                 tell_s = time.monotonic() + _TELL_S
                 _log.warning("waiting for the server: %s", error)
             server.wait(_RETRY_S)
     return None
-
-
-def _log_counts(bridge: Bridge) -> None:
-    dropped = ", ".join(f"{reason}: {n}" for reason, n in bridge.dropped.items())
-    _log.info("%d scans published, dropped: %s", bridge.published, dropped or "none")
 
 
 def bridge_options(options: argparse.Namespace) -> BridgeOptions:
@@ -121,12 +120,13 @@ def bridge_options(options: argparse.Namespace) -> BridgeOptions:
             f"a grid of {grid.side_m:g} m has {grid.cells} cells of {grid.cell_m:g} m along each "
             f"side: use at most {int(MAX_GRID_CELLS**0.5)}"
         )
-    topics = TopicChoice.named(
+    prefix = full_name("", options.namespace or "").rstrip("/")
+    topics = TopicChoice(
         options.domain,
-        options.namespace or "",
-        clouds=options.clouds,
-        depth=options.depth,
-        poses=options.poses,
+        prefix,
+        clouds=tuple(full_name(prefix, name) for name in options.clouds),
+        depth=tuple(full_name(prefix, name) for name in options.depth),
+        poses=None if options.poses.strip("/") == TF_POSES else full_name(prefix, options.poses),
     )
     others = {field.name for field in fields(BridgeOptions)} - {"topics", "grid"}
     return BridgeOptions(topics, grid, **{name: getattr(options, name) for name in others})

@@ -71,20 +71,6 @@ class TopicChoice:
     depth: tuple[str, ...] = ()
     poses: str | None = None  # None: from transforms
 
-    @classmethod
-    def named(
-        cls, domain: int, namespace: str, *, clouds: list[str], depth: list[str], poses: str
-    ) -> "TopicChoice":
-        """Return the choice of names below a namespace, all with or without leading slashes."""
-        prefix = full_name("", namespace).rstrip("/")
-        return cls(
-            domain,
-            prefix,
-            clouds=tuple(full_name(prefix, name) for name in clouds),
-            depth=tuple(full_name(prefix, name) for name in depth),
-            poses=None if poses.strip("/") == TF_POSES else full_name(prefix, poses),
-        )
-
     @property
     def takes_any_cloud(self) -> bool:
         """Whether all clouds are wanted: a depth camera publishes what it sees as clouds too."""
