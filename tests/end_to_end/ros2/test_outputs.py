@@ -22,7 +22,7 @@ from triquad_client import Client, MeshWatch, Status
 from triquad_server.settings import MeshSettings
 from triquad_tools.commands import ros2
 from triquad_tools.commands.ros2 import bridge_options
-from triquad_tools.ros2.bridge import Bridge
+from triquad_tools.ros2 import bridge
 from triquad_tools.ros2.intake.scan_publisher import Place
 from triquad_tools.ros2.output.mesh_publisher import MeshPublisher
 from triquad_tools.ros2.output.topic_publisher import PERIOD_S
@@ -238,7 +238,7 @@ def test_a_mesh_that_nobody_takes_does_not_hold_up_grids(server: str) -> None:
         # In the session of the bridge, so that what it puts waits for the subscriber.
         subscribed(session, "triquad/mesh", lambda _: taken.wait()),
         subscribed(session, "triquad/grid", grids.put),
-        Bridge(session, client, options),
+        bridge.bridging(session, client, options),
     ):
         try:
             assert grids.get(timeout=servers.WAIT_S)

@@ -24,7 +24,7 @@ from triquad_tools.console.arguments import (
 )
 from triquad_tools.console.command import FAILED, OK, ToolError, run
 from triquad_tools.console.lines import start_log
-from triquad_tools.ros2.bridge import Bridge, open_session
+from triquad_tools.ros2.bridge import bridging, open_session
 from triquad_tools.ros2.options import (
     MAX_GRID_CELLS,
     TF_POSES,
@@ -80,7 +80,7 @@ def _bridge(
     with (
         client,
         closing(open_session(options.router, options.config)) as session,
-        Bridge(session, client, asked) as bridge,
+        bridging(session, client, asked) as intake,
     ):
         try:
             if server is None:
@@ -88,8 +88,8 @@ def _bridge(
             else:
                 server.wait()
         finally:
-            dropped = ", ".join(f"{reason}: {n}" for reason, n in bridge.dropped.items())
-            _log.info("%d scans published, dropped: %s", bridge.published, dropped or "none")
+            dropped = ", ".join(f"{reason}: {n}" for reason, n in intake.dropped.items())
+            _log.info("%d scans published, dropped: %s", intake.published, dropped or "none")
 
 
 def _connected(options: argparse.Namespace, server: ServerProcess | None) -> Client | None:

@@ -2,7 +2,8 @@
 
 import json
 import logging
-from contextlib import ExitStack, closing
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -34,49 +35,29 @@ _SETTINGS = {
 }
 
 
-class Bridge:
-    """Takes part in ROS 2 for a map server, until it is closed; session and client stay open."""
+@contextmanager
+def bridging(session: zenoh.Session, client: Client, options: BridgeOptions) -> Iterator[Intake]:
+    """Take part in ROS 2 for a map server while the context is open, which counts what it takes in.
 
-    def __init__(self, session: zenoh.Session, client: Client, options: BridgeOptions) -> None:
-        """Start the bridge: ``session`` reaches the nodes of ROS, ``client`` the server."""
-        topics = options.topics
-        below = f" below {topics.prefix}" if topics.prefix else ""
-        _log.info("listening in domain %d%s", topics.domain, below)
-        with ExitStack() as parts:
-            node = parts.enter_context(closing(Node(session, topics.domain)))
-            intake = Intake(session, client, options, node)
-            self._intake = parts.enter_context(closing(intake))
-            topic = partial(TopicPublisher, session, node, domain=topics.domain)
-            markers = topic(Topic(topics.mesh, MARKER), delivery=_MESH_DELIVERY)
-            parts.enter_context(closing(markers))
-            slices = topic(Topic(topics.grid, OCCUPANCY_GRID), delivery=_GRID_DELIVERY)
-            parts.enter_context(closing(slices))
-            mesh = MeshPublisher(markers, client, options.mesh_level, options.mesh_bytes_per_s)
-            parts.enter_context(closing(mesh))
-            grid = GridPublisher(slices, client, options.grid)
-            for output in (mesh, grid):
-                parts.enter_context(closing(MapThread(output.publish, lambda: intake.place)))
-            self._parts = parts.pop_all()
-
-    def __enter__(self) -> "Bridge":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    @property
-    def published(self) -> int:
-        """The number of scans that were published to the server."""
-        return self._intake.scans.count
-
-    @property
-    def dropped(self) -> dict[str, int]:
-        """The messages of which no scan could be published, by reason."""
-        return self._intake.drops.counts()
-
-    def close(self) -> None:
-        """Receive and publish no more."""
-        self._parts.close()
+    ``session`` reaches the nodes of ROS, ``client`` the server.
+    """
+    topics = options.topics
+    below = f" below {topics.prefix}" if topics.prefix else ""
+    _log.info("listening in domain %d%s", topics.domain, below)
+    with ExitStack() as parts:
+        node = parts.enter_context(closing(Node(session, topics.domain)))
+        intake = parts.enter_context(closing(Intake(session, client, options, node)))
+        topic = partial(TopicPublisher, session, node, domain=topics.domain)
+        markers = topic(Topic(topics.mesh, MARKER), delivery=_MESH_DELIVERY)
+        parts.enter_context(closing(markers))
+        slices = topic(Topic(topics.grid, OCCUPANCY_GRID), delivery=_GRID_DELIVERY)
+        parts.enter_context(closing(slices))
+        mesh = MeshPublisher(markers, client, options.mesh_level, options.mesh_bytes_per_s)
+        parts.enter_context(closing(mesh))
+        grid = GridPublisher(slices, client, options.grid)
+        for output in (mesh, grid):
+            parts.enter_context(closing(MapThread(output.publish, lambda: intake.place)))
+        yield intake
 
 
 def open_session(router: str | None, file: Path | None) -> zenoh.Session:

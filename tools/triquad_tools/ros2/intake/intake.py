@@ -77,6 +77,16 @@ class Intake:
         self._thread.start()
 
     @property
+    def published(self) -> int:
+        """The number of scans that were published to the server."""
+        return self.scans.count
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """The messages of which no scan could be published, by reason."""
+        return self.drops.counts()
+
+    @property
     def place(self) -> Place | None:
         """The place of the newest scan; None before there is one, and no map frame is set."""
         return self.scans.newest or self._start
