@@ -56,36 +56,28 @@ class Node:
         self._tokens.append(self._session.liveliness().declare_token(token))
 
 
-class TokenWatch:
-    """Reports all others that have one end of a topic, existing ones first."""
+def watch_tokens(
+    session: zenoh.Session, domain: int, end: End, appeared: Callable[[Announcement], None]
+) -> list[Any]:
+    """Report all others that have one end of a topic, existing ones first.
 
-    def __init__(
-        self,
-        session: zenoh.Session,
-        domain: int,
-        end: End,
-        appeared: Callable[[Announcement], None],
-    ) -> None:
-        """``appeared`` is called from threads of the watch, and must not wait for long."""
-        self._appeared = appeared
-        self._own_chunk = f"/{session.zid()}/"
-        self._subscribers = [
-            session.liveliness().declare_subscriber(key, self._receive, history=True)
-            for key in (rmw_tokens(domain, end), bridge_tokens(end))
-        ]
+    ``appeared`` is called from threads of Zenoh, and must not wait for long. What is returned is to
+    be undeclared.
+    """
+    own_chunk = f"/{session.zid()}/"
 
-    def close(self) -> None:
-        """End the watch."""
-        for subscriber in self._subscribers:
-            subscriber.undeclare()
-
-    def _receive(self, sample: zenoh.Sample) -> None:
+    def receive(sample: zenoh.Sample) -> None:
         token = str(sample.key_expr)
-        if sample.kind != zenoh.SampleKind.PUT or self._own_chunk in token:
+        if sample.kind != zenoh.SampleKind.PUT or own_chunk in token:
             return
         announcement = read_token(token)
         try:
             if announcement is not None:
-                self._appeared(announcement)
+                appeared(announcement)
         except zenoh.ZError as error:  # names that cannot stand in a key
             _log.debug("%s cannot be used: %s", token, error)
+
+    return [
+        session.liveliness().declare_subscriber(key, receive, history=True)
+        for key in (rmw_tokens(domain, end), bridge_tokens(end))
+    ]

@@ -12,7 +12,7 @@ from typing import Any
 import zenoh
 import zenoh.ext
 
-from triquad_tools.ros2.node import Node, TokenWatch
+from triquad_tools.ros2.node import Node, watch_tokens
 from triquad_tools.ros2.options import Feed, Role, TopicChoice
 from triquad_tools.ros2.topics import (
     ANY_HASH,
@@ -120,7 +120,7 @@ class TopicListener:
         self._found: set[Announcement] = set()
         for feed in self.choice.feeds():
             self._open(feed)
-        self._watch = TokenWatch(self.session, self.choice.domain, End.PUBLISHER, self._find)
+        self._watches = watch_tokens(self.session, self.choice.domain, End.PUBLISHER, self._find)
 
     @property
     def found(self) -> list[Topic]:
@@ -130,7 +130,8 @@ class TopicListener:
 
     def close(self) -> None:
         """Forward nothing more."""
-        self._watch.close()
+        for watch in self._watches:
+            watch.undeclare()
         with self._lock:
             self._closed = True
         for subscriber in self._subscribers.values():

@@ -12,7 +12,7 @@ import zenoh
 from triquad_format.errors import TriquadError
 
 from triquad_tools.ros2.intake.scan_publisher import Place
-from triquad_tools.ros2.node import Node, TokenWatch
+from triquad_tools.ros2.node import Node, watch_tokens
 from triquad_tools.ros2.topics import (
     ATTACHMENT,
     NO_HASH,
@@ -62,11 +62,12 @@ class TopicPublisher:
         if self._open(bridge_key(self.topic.name), None):
             what = Announcement(End.PUBLISHER, self.topic, self._hash)
             self.node.announce_to_bridges(what, self.delivery)
-        self._watch = TokenWatch(self.session, self.domain, End.SUBSCRIPTION, self._appeared)
+        self._watches = watch_tokens(self.session, self.domain, End.SUBSCRIPTION, self._appeared)
 
     def close(self) -> None:
         """Publish no more."""
-        self._watch.close()
+        for watch in self._watches:
+            watch.undeclare()
         for key in self._keys.values():
             key.publisher.undeclare()
 
