@@ -107,7 +107,11 @@ def demonstrate(client: Client, endpoint: str, drive: SimulatedDrive, out: Path)
     Raises:
         ToolError, TriquadError, OSError: a step failed.
     """
-    scans = _simulated(drive)
+    scans: list[SimulatedScan] = []
+    with progress("simulating the drive", len(drive)) as report:
+        for scan in drive:
+            scans.append(scan)
+            report(len(scans), f"{len(scans)} of {len(drive)} scans")
     # Of surface along the drive, as a planner asks for.
     hits = np.concatenate([scan.true_hits for scan in scans])
     asked = np.random.default_rng(_SEED).choice(hits, _QUERY_POINTS)
@@ -128,15 +132,6 @@ def demonstrate(client: Client, endpoint: str, drive: SimulatedDrive, out: Path)
         parameters=status.parameters,
         faces=len(surface.faces),
     )
-
-
-def _simulated(drive: SimulatedDrive) -> list[SimulatedScan]:
-    scans: list[SimulatedScan] = []
-    with progress("simulating the drive", len(drive)) as report:
-        for scan in drive:
-            scans.append(scan)
-            report(len(scans), f"{len(scans)} of {len(drive)} scans")
-    return scans
 
 
 def _learnt(client: Client, scans: Sequence[SimulatedScan]) -> Intake:

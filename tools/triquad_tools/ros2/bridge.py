@@ -2,29 +2,33 @@
 
 import json
 import logging
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from functools import partial
 from pathlib import Path
 
 import zenoh
 from triquad_client import Client
+from triquad_format.errors import TriquadError
 from triquad_format.wire.codec import MAX_MESSAGE_BYTES
 from triquad_format.wire.endpoints import DEFAULT_ENDPOINT, full_endpoint
 from triquad_format.wire.zenoh_config import QUIET, fill, put
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.ros2.intake.intake import Intake
+from triquad_tools.ros2.intake.scan_publisher import Place
 from triquad_tools.ros2.node import Node
 from triquad_tools.ros2.options import BridgeOptions
 from triquad_tools.ros2.output.grid_publisher import GridPublisher
 from triquad_tools.ros2.output.mesh_publisher import MeshPublisher
-from triquad_tools.ros2.output.topic_publisher import MapThread, TopicPublisher
+from triquad_tools.ros2.output.topic_publisher import TopicPublisher
 from triquad_tools.ros2.topics import Delivery, Topic
 from triquad_tools.sensors.ros.type_store import MARKER, OCCUPANCY_GRID
 
 _log = logging.getLogger("triquad_ros2")
 
+_PERIOD_S, _RETRY_S = 0.5, 5.0  # between two rounds; after an error
 _MESH_DELIVERY = Delivery(depth=100)
 _GRID_DELIVERY = Delivery(latched=True, depth=1)  # as Nav2 expects of a map
 
@@ -56,8 +60,40 @@ def bridging(session: zenoh.Session, client: Client, options: BridgeOptions) -> 
         parts.enter_context(closing(mesh))
         grid = GridPublisher(slices, client, options.grid)
         for output in (mesh, grid):
-            parts.enter_context(closing(MapThread(output.publish, lambda: intake.place)))
+            parts.enter_context(_published(output.publish, intake))
         yield intake
+
+
+@contextmanager
+def _published(publish: Callable[[Place, float], None], intake: Intake) -> Iterator[None]:
+    """Publish an output again and again while the context is open; it holds up no other.
+
+    ``publish`` gets the place of the robot and how often it is called, and raises a TriquadError
+    where the map server does not answer.
+    """
+    stopping = threading.Event()
+
+    def run() -> None:
+        pause_s = _PERIOD_S
+        while not stopping.wait(pause_s):
+            place, pause_s = intake.place, _PERIOD_S
+            try:
+                if place is not None:
+                    publish(place, _PERIOD_S)
+            except TriquadError as error:
+                _log.warning("the map cannot be published now: %s", error)
+                pause_s = _RETRY_S
+            except Exception:
+                _log.exception("the map could not be published")
+                pause_s = _RETRY_S
+
+    thread = threading.Thread(target=run, name="ros2-map")
+    thread.start()
+    try:
+        yield
+    finally:
+        stopping.set()
+        thread.join()
 
 
 def open_session(router: str | None, file: Path | None) -> zenoh.Session:

@@ -29,7 +29,7 @@ class GridPublisher:
         self._shown: tuple[int, Sequence[float]] | None = None  # epoch and corner of the last slice
         self._due_s = 0.0  # monotonic
 
-    def publish(self, place: Place) -> None:
+    def publish(self, place: Place, _: float) -> None:
         """Publish a slice where the map or the place changed since the last."""
         followed, started_s = self._publisher.is_followed, time.monotonic()
         if self._publisher.has_newcomers() or not followed:

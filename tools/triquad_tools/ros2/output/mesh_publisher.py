@@ -8,7 +8,7 @@ from triquad_client import Client, MeshTile, MeshWatch
 from triquad_format.records.arrays import Doubles, Floats
 
 from triquad_tools.ros2.intake.scan_publisher import Place
-from triquad_tools.ros2.output.topic_publisher import PERIOD_S, TopicPublisher
+from triquad_tools.ros2.output.topic_publisher import TopicPublisher
 from triquad_tools.sensors.ros.type_store import CdrWriter
 
 _TRIANGLE_LIST = 11
@@ -72,9 +72,9 @@ class MeshPublisher:
         self._pending: dict[TileIndex, None] = {}  # whose markers are to be sent, in this order
         self._left_bytes = 0.0  # that may be sent; below 0 after a marker that was larger
 
-    def publish(self, place: Place) -> None:
-        """Send markers of what changed, as many as may be sent at a time."""
-        self._left_bytes = min(self._left_bytes, 0) + PERIOD_S * self.bytes_per_s
+    def publish(self, place: Place, period_s: float) -> None:
+        """Send markers of what changed, as many as may be sent in ``period_s``; return soon."""
+        self._left_bytes = min(self._left_bytes, 0) + period_s * self.bytes_per_s
         if not self.publisher.is_followed:
             self.close()
             return
