@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.recordings.trajectories import drive, matrices, write_log, write_tum
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.folders.file_poses import in_order, stamps_of_names
+from triquad_tools.recordings.folders.scan_folder import in_order, stamps_of_names
 from triquad_tools.recordings.folders.trajectory import read_trajectory
 from triquad_tools.sensors.sweep import NoTransformError
 

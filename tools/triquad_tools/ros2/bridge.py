@@ -16,8 +16,7 @@ from triquad_format.wire.endpoints import DEFAULT_ENDPOINT, full_endpoint
 from triquad_format.wire.zenoh_config import QUIET, fill, put
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.ros2.intake.intake import Intake
-from triquad_tools.ros2.intake.scan_publisher import Place
+from triquad_tools.ros2.intake.intake import Intake, Place
 from triquad_tools.ros2.node import Node
 from triquad_tools.ros2.options import BridgeOptions
 from triquad_tools.ros2.output.grid_publisher import GridPublisher

@@ -8,9 +8,14 @@ import numpy as np
 from triquad_format.records.arrays import Floats
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.folders.file_poses import in_order, place_files
 from triquad_tools.recordings.folders.point_file import POINT_SUFFIXES, check_points, read_points
-from triquad_tools.recordings.folders.scan_folder import PlacedFile, ScanFolder, check_all
+from triquad_tools.recordings.folders.scan_folder import (
+    PlacedFile,
+    ScanFolder,
+    check_all,
+    in_order,
+    place_files,
+)
 from triquad_tools.recordings.folders.trajectory import SENSOR, WORLD, Trajectory
 from triquad_tools.recordings.recording import ReadingOptions, Stream
 from triquad_tools.recordings.text_lines import parse_rigid, parse_stamps, read_lines
@@ -20,7 +25,6 @@ from triquad_tools.sensors.sweep import NoTransformError, PosedScan, Sweep, move
 
 _TRIED = 3  # clouds, to determine the frame of all
 _CLEARLY = 2.0  # times nearer to where the sensor was than to the origin, or the other way round
-
 
 _DEEPER = "velodyne_points/data"  # where KITTI's raw recordings have theirs
 

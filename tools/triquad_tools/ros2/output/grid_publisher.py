@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_client import Client, Grid, Status
 
-from triquad_tools.ros2.intake.scan_publisher import Place
+from triquad_tools.ros2.intake.intake import Place
 from triquad_tools.ros2.options import SliceShape
 from triquad_tools.ros2.output.topic_publisher import TopicPublisher
 from triquad_tools.sensors.ros.type_store import CdrWriter

@@ -7,7 +7,7 @@ import numpy as np
 from triquad_client import Client, MeshTile, MeshWatch
 from triquad_format.records.arrays import Doubles, Floats
 
-from triquad_tools.ros2.intake.scan_publisher import Place
+from triquad_tools.ros2.intake.intake import Place
 from triquad_tools.ros2.output.topic_publisher import TopicPublisher
 from triquad_tools.sensors.ros.type_store import CdrWriter
 

@@ -15,8 +15,7 @@ from triquad_format.wire.limits import MAX_DISTANCE_M
 from triquad_tools.plots.colours import BEHIND, UNKNOWN
 from triquad_tools.viewer.page.layer import Answer, Layer, Question
 from triquad_tools.viewer.page.legends import lines_html, table_html, text_html
-from triquad_tools.viewer.page.page import Page
-from triquad_tools.viewer.questions.picking import surface_along
+from triquad_tools.viewer.page.page import Page, surface_along
 
 _POINT_REACH_M = 10.0  # how far around a point surfaces are searched for
 
