@@ -19,8 +19,8 @@ from triquad_tools.console.lines import print_line, print_remark
 from triquad_tools.console.progress import progress
 from triquad_tools.mapping.mapping_run import MAP_NAME, MappingRun, mapping_key, read_unfinished
 from triquad_tools.mapping.output import SUFFIXES, check_target, write_output
-from triquad_tools.recordings.arguments import add_recording
 from triquad_tools.recordings.opening import Selection, open_selected
+from triquad_tools.recordings.recording import add_recording
 
 _COMMAND = "triquad-map"
 

@@ -12,13 +12,13 @@ from triquad_tools.console.command import FAILED, OK, run
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.progress import progress
 from triquad_tools.console.report import print_columns
-from triquad_tools.recordings.arguments import add_recording, options_of
 from triquad_tools.recordings.opening import Selection, length_s, open_recording, open_selected
 from triquad_tools.recordings.publishing import (
     FLUSH_TIMEOUT_S,
     keep_few_pending,
     wait_until_settled,
 )
+from triquad_tools.recordings.recording import add_recording, options_of
 
 _COMMAND = "triquad-replay"
 

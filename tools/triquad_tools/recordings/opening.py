@@ -10,13 +10,12 @@ import numpy as np
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.lines import print_remark
-from triquad_tools.recordings.arguments import options_of
 from triquad_tools.recordings.bag import find_bag
 from triquad_tools.recordings.cloud import points_in_range
 from triquad_tools.recordings.folders.cloud_folder import is_cloud_folder, read_cloud_folder
 from triquad_tools.recordings.folders.depth_folder import is_depth_folder, read_depth_folder
 from triquad_tools.recordings.folders.scan_folder import ScanFolder
-from triquad_tools.recordings.recording import ReadingOptions, ScanEntry
+from triquad_tools.recordings.recording import ReadingOptions, ScanEntry, options_of
 from triquad_tools.recordings.ros_recording import RosRecording
 from triquad_tools.sensors.sweep import PosedScan
 
@@ -25,7 +24,6 @@ Recording = RosRecording | ScanFolder
 
 _FLAGS = {"transforms": "--transform", "deskew": "--no-deskew"}
 """The flags whose names are not those of the choices that they set."""
-
 
 _OF_BAGS = {
     "topics", "poses", "map_frame", "body_frame", "transforms", "recorder_clock", "stride",

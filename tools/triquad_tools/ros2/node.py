@@ -15,14 +15,13 @@ from triquad_tools.ros2.topics import (
     bridge_token,
     bridge_tokens,
     read_token,
-    rmw_node_token,
     rmw_token,
     rmw_tokens,
 )
 
-NODE_NAME = "triquad"
-
 _log = logging.getLogger("triquad_ros2")
+
+NODE_NAME = "triquad"
 
 
 class Node:
@@ -34,7 +33,7 @@ class Node:
         self._session_id = str(session.zid())
         self._numbers = itertools.count()
         self._tokens: list[Any] = []
-        self._declare(rmw_node_token(domain, self._entity()))
+        self._declare(self._entity().rmw_prefix(domain, "NN"))
 
     def announce(self, what: Announcement, delivery: Delivery) -> None:
         """Announce it to nodes of rmw_zenoh."""

@@ -116,13 +116,11 @@ class Entity:
     number: int  # 0 is the node itself
 
     def rmw_prefix(self, domain: int, kind: str) -> str:
-        """Return the prefix of all its tokens; it has no enclave and no namespace."""
+        """Return the prefix of all its tokens; it has no enclave and no namespace.
+
+        The token of a node, of kind ``NN``, is the prefix alone.
+        """
         return f"@ros2_lv/{domain}/{self.session_id}/0/{self.number}/{kind}/%/%/{self.node}"
-
-
-def rmw_node_token(domain: int, entity: Entity) -> str:
-    """Return the token that says that there is a node."""
-    return entity.rmw_prefix(domain, "NN")
 
 
 def rmw_token(domain: int, entity: Entity, what: Announcement, delivery: Delivery) -> str:

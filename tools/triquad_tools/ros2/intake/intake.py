@@ -200,7 +200,7 @@ class Intake:
         if isinstance(placed.outcome, NoScanError):
             raise placed.outcome
         stamp_ns = placed.sweep.stamp_ns
-        self.scans.publish(placed.topic_name, placed.outcome, stamp_ns, placed.map_frame)
+        self.scans.publish(placed.topic_name, placed.outcome, stamp_ns, self._placement.map_frame)
 
     def _guard(self, topic_name: str, step: Callable[[], None]) -> None:
         """Do something with a message; no bytes may stop the intake."""

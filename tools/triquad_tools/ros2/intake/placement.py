@@ -12,6 +12,8 @@ from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES, STATIC, FrameTre
 from triquad_tools.sensors.motion.placing import place
 from triquad_tools.sensors.sweep import NoScanError, NoTransformError, PosedScan, Sweep
 
+_log = logging.getLogger("triquad_ros2")
+
 RESTART_NS = 10 * 10**9
 """Transforms that go back by more are of a simulation or a bag that was started again."""
 
@@ -19,7 +21,6 @@ _POSES_KEPT = 2000  # of each frame; 20 s at 100 Hz
 _MAX_FRAMES = 1000
 _MAX_NAME = 256
 
-_log = logging.getLogger("triquad_ros2")
 _CHOICE_S = 1.0
 """The time after a sweep could first be placed in which a better map frame may appear."""
 
@@ -81,7 +82,6 @@ class Placed:
     topic_name: str
     sweep: Sweep
     outcome: PosedScan | NoScanError
-    map_frame: str
 
 
 @dataclass
@@ -153,7 +153,7 @@ class Placement:
             outcome = error
         except Exception as error:  # whatever numbers came must not stop the others
             outcome = NoScanError("internal", repr(error))
-        return Placed(entry.topic_name, entry.sweep, outcome, self.map_frame)
+        return Placed(entry.topic_name, entry.sweep, outcome)
 
     def _scan(self, entry: _Waiting, now_s: float) -> PosedScan:
         frame = entry.sweep.frame

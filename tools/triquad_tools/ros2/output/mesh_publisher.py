@@ -1,6 +1,6 @@
 """The mesh as markers of ROS 2: a marker for each tile, and only tiles that changed."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
@@ -12,6 +12,7 @@ from triquad_tools.ros2.output.topic_publisher import TopicPublisher
 from triquad_tools.sensors.ros.type_store import CdrWriter
 
 _TRIANGLE_LIST = 11
+_NO_CORNERS = np.empty((0, 3))
 _NAMESPACE = "triquad"
 _COLOURS_REPEAT_M = 10.0
 _PHASES = np.array([0.0, 1 / 3, 2 / 3])  # of red, green and blue
@@ -27,26 +28,22 @@ class Action(IntEnum):
     DELETE_ALL = 3
 
 
-@dataclass(frozen=True)
-class Marker:
-    """Triangles that are shown, replaced and deleted together."""
+def marker_message(
+    frame: str, number: int, action: Action = Action.ADD, corners: Doubles = _NO_CORNERS
+) -> bytes:
+    """Return triangles that are shown, replaced and deleted together, CDR.
 
-    frame: str
-    number: int
-    action: Action = Action.ADD
-    corners: Doubles = field(default_factory=lambda: np.empty((0, 3)))  # [3 F, 3] map frame
-
-    def payload(self) -> bytes:
-        """Return the message, CDR."""
-        writer = CdrWriter().numbers("<u4", 0, 0).text(self.frame).text(_NAMESPACE)
-        writer.numbers("<i4", self.number, _TRIANGLE_LIST, self.action)
-        writer.numbers("<f8", 0, 0, 0, 0, 0, 0, 1, 1, 1, 1)  # pose and scale
-        writer.numbers("<f4", 1, 1, 1, 1).numbers("<u4", 0, 0).numbers("u1", False)
-        writer.sequence(self.corners.astype("<f8")).sequence(height_colours(self.corners))
-        nothing = np.empty(0, np.uint8)  # of texture, text and mesh file
-        writer.text("").numbers("<u4", 0, 0).text("").text("").sequence(nothing)
-        writer.sequence(nothing).text("").text("")
-        return writer.text("").sequence(nothing).numbers("u1", False).payload()
+    Their ``corners`` [3 F, 3] are metres, map frame.
+    """
+    writer = CdrWriter().numbers("<u4", 0, 0).text(frame).text(_NAMESPACE)
+    writer.numbers("<i4", number, _TRIANGLE_LIST, action)
+    writer.numbers("<f8", 0, 0, 0, 0, 0, 0, 1, 1, 1, 1)  # pose and scale
+    writer.numbers("<f4", 1, 1, 1, 1).numbers("<u4", 0, 0).numbers("u1", False)
+    writer.sequence(corners.astype("<f8")).sequence(height_colours(corners))
+    nothing = np.empty(0, np.uint8)  # of texture, text and mesh file
+    writer.text("").numbers("<u4", 0, 0).text("").text("").sequence(nothing)
+    writer.sequence(nothing).text("").text("")
+    return writer.text("").sequence(nothing).numbers("u1", False).payload()
 
 
 def height_colours(points: Doubles) -> Floats:
@@ -81,7 +78,7 @@ class MeshPublisher:
         if self._watch is None:
             self._watch = self.client.watch_mesh(level=self.level)
             # A bridge before this one may have left some.
-            self.publisher.put(Marker(place.map_frame, 0, Action.DELETE_ALL).payload())
+            self.publisher.put(marker_message(place.map_frame, 0, Action.DELETE_ALL))
         if self.publisher.has_newcomers():
             self._pending.update(dict.fromkeys(self._watch.tiles))
         while self._left_bytes > 0:
@@ -92,7 +89,7 @@ class MeshPublisher:
                 self._pending.update(dict.fromkeys((*update.removed, *update.changed)))
             index = next(iter(self._pending))
             del self._pending[index]
-            payload = self._marker(index, self._watch.tiles.get(index), place.map_frame).payload()
+            payload = self._marker(index, self._watch.tiles.get(index), place.map_frame)
             self.publisher.put(payload)
             self._left_bytes -= len(payload)
 
@@ -103,9 +100,9 @@ class MeshPublisher:
             self._watch = None
         self._pending.clear()
 
-    def _marker(self, index: TileIndex, tile: MeshTile | None, frame: str) -> Marker:
+    def _marker(self, index: TileIndex, tile: MeshTile | None, frame: str) -> bytes:
         number = self._numbers.setdefault(index, len(self._numbers) + 1)
         if tile is None:
-            return Marker(frame, number, Action.DELETE)
+            return marker_message(frame, number, Action.DELETE)
         vertices = tile.origin + tile.vertices.astype(np.float64)
-        return Marker(frame, number, corners=vertices[tile.faces.ravel()])
+        return marker_message(frame, number, corners=vertices[tile.faces.ravel()])
