@@ -1,4 +1,4 @@
-"""Types of command-line arguments; errors name the value and a remedy."""
+"""Types of command-line arguments, whose errors name the value and a remedy, and shared ones."""
 
 import argparse
 import math

@@ -1,4 +1,4 @@
-"""The end of every command: an exit status, and one line for what went wrong."""
+"""The end of every command: an exit status, and one line for what went wrong or interrupted it."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""Lines for people: the tools print everything through these functions."""
+"""Lines for people: the tools print and log everything through these functions."""
 
 import logging
 import sys

@@ -1,4 +1,4 @@
-"""The steps of the demonstration, each against a running server."""
+"""The steps of the demonstration against a running server, what they measure, and the promises."""
 
 import math
 import time

@@ -1,4 +1,4 @@
-"""Making a map of a recording, scan by scan."""
+"""Making a map of a recording, scan by scan, and going on with one that was interrupted."""
 
 import hashlib
 import os

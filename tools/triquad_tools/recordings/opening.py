@@ -1,4 +1,4 @@
-"""Finding out what kind of recording a path is."""
+"""Finding out what kind of recording a path is, and choosing the part that is to be mapped."""
 
 import argparse
 from collections import Counter

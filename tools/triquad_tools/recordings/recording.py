@@ -1,4 +1,4 @@
-"""What recordings tell of their content, whatever kind of file or folder holds them."""
+"""What a user may say of a recording, and what it tells, whatever kind of file or folder it is."""
 
 import argparse
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Recordings of ROS: clouds and depth images, placed by the poses that were recorded with them."""
+"""Recordings of ROS: clouds and depth images, placed by the recorded poses that place the most."""
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence

@@ -1,4 +1,4 @@
-"""The bridge between ROS 2 and a map server."""
+"""The bridge between ROS 2 and a map server, and the session that reaches the nodes of ROS."""
 
 import json
 import logging

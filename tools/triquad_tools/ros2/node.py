@@ -1,4 +1,4 @@
-"""The node as which the bridge shows in the graph of ROS: ``/triquad``."""
+"""The graph of ROS: the node as which the bridge shows, ``/triquad``, and the tokens of others."""
 
 import itertools
 import logging

@@ -1,4 +1,4 @@
-"""Options of the bridge."""
+"""Options of the bridge: which topics are received and as what, and what is published."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

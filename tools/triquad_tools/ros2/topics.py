@@ -1,7 +1,8 @@
 """Topics of ROS 2 in Zenoh: their keys, and the liveliness tokens of publishers and subscribers.
 
 There are two ways to write them: that of rmw_zenoh (its docs/design.md), and that of
-zenoh-bridge-ros2dds (its liveliness_mgt.rs).
+zenoh-bridge-ros2dds (its liveliness_mgt.rs). Messages of rmw_zenoh have attachments, whose numbers
+show how many never arrived.
 """
 
 import struct

@@ -1,4 +1,4 @@
-"""One sweep of a sensor, before and after its pose is known."""
+"""One sweep of a sensor, before and after its pose is known, and errors in such data."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""The web server that shows a map."""
+"""The web server that shows a map, and the page of each browser."""
 
 import io
 import socket

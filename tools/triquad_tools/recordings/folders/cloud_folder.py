@@ -149,6 +149,9 @@ def read_times(folder: Path, scans: int) -> list[int] | None:
 def of_lidar(folder: Path, files: Sequence[PlacedFile]) -> list[PlacedFile]:
     """Return files with the poses of the lidar, by the calibration of the folder, if it has one.
 
+    In ``calib.txt`` the line ``Tr:`` is ``camera_from_lidar``: the poses are then those of the
+    camera, as KITTI gives them.
+
     Raises:
         ToolError: the calibration is not a rigid motion.
     """

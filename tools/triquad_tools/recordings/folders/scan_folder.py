@@ -1,4 +1,4 @@
-"""Folders with a file for each scan, whatever the files hold."""
+"""Folders with a file for each scan, and the poses that belong to the files."""
 
 import re
 from collections import Counter

@@ -1,4 +1,4 @@
-"""Messages of which no scan could be published: all are counted, and some logged."""
+"""The log of what is received: messages of which no scan could be published, and the first scan."""
 
 import logging
 import threading

@@ -1,4 +1,4 @@
-"""Turning messages of ROS 2 into scans that are published once their poses are known."""
+"""Turning messages of ROS 2 into scans, which are published once their poses are known."""
 
 import logging
 import threading

@@ -1,4 +1,4 @@
-"""Pending sweeps, until it is known where they were taken."""
+"""The robot's known motion, and sweeps that wait until it tells where they were taken."""
 
 import logging
 from collections import deque

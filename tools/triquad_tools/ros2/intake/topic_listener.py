@@ -1,4 +1,4 @@
-"""Subscribing to topics: those that are known from the start, and those that are found."""
+"""Subscribing to topics, known or found, and the queue of messages for the thread that reads."""
 
 import logging
 import threading

@@ -1,4 +1,4 @@
-"""The tree of frames that robots report: how frames stand or move in each other."""
+"""The tree of frames that robots report: how frames stand or move in each other over time."""
 
 from array import array
 from bisect import bisect_left

@@ -1,4 +1,7 @@
-"""Decoding messages of ROS, whose types are known by their names alone."""
+"""Messages of ROS: decoded by the names of their types alone, and written as CDR from arrays.
+
+The library writes messages too, but from objects: large ones take seconds.
+"""
 
 from functools import cache
 from typing import Any

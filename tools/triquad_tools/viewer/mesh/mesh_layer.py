@@ -1,4 +1,4 @@
-"""The mesh in a scene: coarse everywhere, finer where the camera is near."""
+"""The mesh in a scene: finer where the camera is near, which shows all until a person moves it."""
 
 import math
 from collections import deque

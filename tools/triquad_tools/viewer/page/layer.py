@@ -1,4 +1,4 @@
-"""Parts of a page: controls, what they draw, and a thread that keeps it up to date."""
+"""Parts of a page, each with a thread that keeps it up to date, and questions to the map."""
 
 import logging
 import threading

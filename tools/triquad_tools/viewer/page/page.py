@@ -1,4 +1,4 @@
-"""A page: one scene and one panel in one browser, and where the scene has its zero."""
+"""A page: one scene and one panel in one browser, and what its camera sees."""
 
 import math
 import threading

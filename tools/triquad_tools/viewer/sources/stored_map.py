@@ -1,4 +1,4 @@
-"""The map of a file, shown without a server."""
+"""Map files, shown without a server: one, or the checkpoints of a store in the order of time."""
 
 import threading
 import time
