@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from triquad_client import Client, Mesh
+from triquad_client import Client
 from triquad_format.wire.messages import FieldFit
 
 from triquad_tools.console.amounts import millimetres
@@ -121,7 +121,12 @@ def demonstrate(client: Client, endpoint: str, drive: SimulatedDrive, out: Path)
     with progress("fetching the map and its mesh"):
         client.download_map(out / "map.triquad")
         surface = client.mesh(drive.scene.box)
-    _draw(surface, out)
+    with progress("drawing") as report:
+        for name in ("street.glb", "street.ply"):
+            report(0.0, name)
+            surface.save(out / name)
+        report(0.0, "street.png")
+        draw_mesh(f"map {MAP!r}, epoch {surface.epoch}", surface, out / "street.png")
     status = client.status()
     return DemoResults(
         drive.seed,
@@ -150,12 +155,3 @@ def _learnt(client: Client, scans: Sequence[SimulatedScan]) -> Intake:
         settled=status.settled,
         samples_trained=status.samples_trained,
     )
-
-
-def _draw(surface: Mesh, out: Path) -> None:
-    with progress("drawing") as report:
-        for name in ("street.glb", "street.ply"):
-            report(0.0, name)
-            surface.save(out / name)
-        report(0.0, "street.png")
-        draw_mesh(f"map {MAP!r}, epoch {surface.epoch}", surface, out / "street.png")

@@ -67,6 +67,7 @@ def read_unfinished(path: Path, key: str) -> UnfinishedMap:
     return UnfinishedMap(replace(record, name=MAP_NAME), int(scans_taken))
 
 
+@dataclass
 class MappingRun:
     """Integrates the scans of a recording and trains until nothing is left to learn.
 
@@ -74,15 +75,15 @@ class MappingRun:
     map has the key for a name, and the number of scans that are in it.
     """
 
-    def __init__(
-        self, mapper: Mapper, settings: Settings, unfinished: Path, key: str, scans_taken: int
-    ) -> None:
-        self._mapper = mapper
-        self._unfinished = unfinished
-        self._key = key
-        self._warnings = ScanWarnings(ScanQueue(1), settings)
+    mapper: Mapper
+    settings: Settings
+    unfinished: Path
+    key: str
+    scans_taken: int  # or refused
+
+    def __post_init__(self) -> None:
+        self._warnings = ScanWarnings(ScanQueue(1), self.settings)
         self._next_save_s = time.monotonic() + _SAVE_PERIOD_S
-        self.scans_taken = scans_taken  # or refused
         self.refusals: Counter[str] = Counter()
         self.last_refusal = ""
 
@@ -96,20 +97,20 @@ class MappingRun:
                 try:
                     stamp_s = entry.stamp_ns // 1_000_000_000
                     pose, source = scan.world_from_sensor, entry.source
-                    rays = self._mapper.ingest(scan.points, pose, stamp_s, source=source)
+                    rays = self.mapper.ingest(scan.points, pose, stamp_s, source=source)
                     self._warnings.add(source, len(scan.points), rays)
                     self._warnings.check()
                 except ScanRefusedError as error:
                     self.refusals[error.reason] += 1
                     self.last_refusal = f"scan {self.scans_taken}: {error}"
                 self.scans_taken += 1
-                self._mapper.train()
+                self.mapper.train()
                 report(self.scans_taken, f"{self.scans_taken} of {total} scans")
 
     def settle(self) -> None:
         """Save the map, train until nothing is left to learn, and save it again."""
         self._save()
-        mapper = self._mapper
+        mapper = self.mapper
         total = mapper.samples_left
         with progress("training", total) as report:
             while not mapper.settled:
@@ -126,10 +127,10 @@ class MappingRun:
     def _save(self) -> None:
         """Write the map; where it cannot be written, what was saved before is untouched."""
         started_s = time.monotonic()
-        record = self._mapper.changes_since(None).record
+        record = self.mapper.changes_since(None).record
         try:
-            write_map(replace(record, name=f"{self._key}.{self.scans_taken}"), self._unfinished)
+            write_map(replace(record, name=f"{self.key}.{self.scans_taken}"), self.unfinished)
         except OSError as error:
-            raise StoreError(f"{self._unfinished} cannot be written: {error}") from error
+            raise StoreError(f"{self.unfinished} cannot be written: {error}") from error
         ended_s = time.monotonic()
         self._next_save_s = ended_s + max(_SAVE_PERIOD_S, (ended_s - started_s) / _SAVE_SHARE)
