@@ -9,9 +9,14 @@ import numpy as np
 import pytest
 from support.files.changing_store import EMPTY, box_at, write_checkpoint
 from triquad_tools.console.command import ToolError
-from triquad_tools.viewer.sources.history import DamagedError, History, moment
 from triquad_tools.viewer.sources.map_source import COARSEST
-from triquad_tools.viewer.sources.stored_map import StoredMap, StoredTiles
+from triquad_tools.viewer.sources.stored_map import (
+    DamagedError,
+    History,
+    StoredMap,
+    StoredTiles,
+    moment,
+)
 
 ORIGIN = [[0.0, 0.0, 1.0]]
 

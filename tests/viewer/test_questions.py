@@ -10,7 +10,7 @@ from support.maps.exact_maps import SEEN_M, exact_map, flat
 from triquad_client import OfflineMap, Status
 from triquad_tools.viewer.page.page import Focus
 from triquad_tools.viewer.questions.cell_box import CellBox
-from triquad_tools.viewer.questions.path import Path
+from triquad_tools.viewer.questions.clicks import Path
 from triquad_tools.viewer.questions.slice import Slice
 from triquad_tools.viewer.questions.unknown_space import (
     ask_boundary,

@@ -10,7 +10,7 @@ from triquad_format.wire.messages import FieldFit
 from triquad_tools.commands import demo
 from triquad_tools.demo import steps
 from triquad_tools.demo.probe import ProbeReport
-from triquad_tools.demo.results import DemoResults, Intake, broken_promises, table_rows
+from triquad_tools.demo.steps import DemoResults, Intake, broken_promises, table_rows
 from triquad_tools.mapfiles.meshfile import read_mesh
 
 GOOD = DemoResults(

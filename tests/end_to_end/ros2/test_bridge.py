@@ -11,7 +11,7 @@ from support.ros.ros_messages import CLOUD
 from support.ros.ros_robot import T0, robot, shifted
 from triquad_client import Client, Status
 from triquad_server.settings import SourceSettings
-from triquad_tools.ros2.intake import first_scan
+from triquad_tools.ros2.intake import drop_log
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +115,7 @@ def test_clouds_that_are_no_scans_are_refused_with_the_reason(
 def test_only_chosen_topics_are_mapped_and_others_are_named(
     endpoint: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(first_scan, "AFTER_S", 1.0)
+    monkeypatch.setattr(drop_log, "AFTER_S", 1.0)
     caplog.set_level(logging.INFO)
     with robot(endpoint) as r2:
         r2.cloud(0.1, servers.sphere(), topic="/rear/points")  # so that it is found at once

@@ -12,8 +12,9 @@ from support.ros.ros_robot import Robot, shifted
 from triquad_client import Client, ServerStatus
 from triquad_tools.commands import ros2
 from triquad_tools.commands.ros2 import bridge_options
-from triquad_tools.ros2.bridge import Bridge
-from triquad_tools.ros2.session import open_session
+from triquad_tools.ros2 import bridge
+from triquad_tools.ros2.bridge import open_session
+from triquad_tools.ros2.intake.intake import Intake
 
 AT = (20.0, -3.0, 1.0)  # of the robot in the map
 MAST = shifted(z=0.5)  # of the lidar on the robot
@@ -25,7 +26,7 @@ class Bridged:
 
     endpoint: str  # where robots and clients connect to
     client: Client
-    bridge: Bridge
+    bridge: Intake
     before: ServerStatus  # of the server, when the bridge began
 
     @property
@@ -71,10 +72,10 @@ def bridging(endpoint: str, *arguments: object, router: str | None = None) -> It
         if client.status().scans_taken and file is None:
             client.reset()
         before = client.status()
-        with Bridge(session, client, bridge_options(parsed)) as bridge:
+        with bridge.bridging(session, client, bridge_options(parsed)) as intake:
             # Once this is answered, the router knows all subscriptions.
             list(session.liveliness().get("@ros2_lv/**", timeout=servers.WAIT_S))
-            yield Bridged(router or endpoint, client, bridge, before)
+            yield Bridged(router or endpoint, client, intake, before)
 
 
 def stand(robot: Robot, *seconds: float) -> None:

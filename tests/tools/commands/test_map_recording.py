@@ -167,11 +167,12 @@ def test_however_often_it_is_interrupted_no_scan_is_lost(
     assert_no_scan_is_lost(output, whole)
 
 
+@pytest.mark.parametrize("name", ["map.triquad.part", "map.triquad.part/mine.txt"])
 def test_what_somebody_else_put_beside_the_output_stays(
-    tmp_path: Path, recording: str, settings: str, capsys
+    tmp_path: Path, recording: str, settings: str, capsys, name: str
 ) -> None:
-    mine = tmp_path / "map.triquad.part" / "recording" / "mine.txt"
-    mine.parent.mkdir(parents=True)
+    mine = tmp_path / name
+    mine.parent.mkdir(exist_ok=True)
     mine.write_text("precious")
     assert main([recording, str(tmp_path / "map.triquad"), "--settings", settings]) == 2
     assert "holds something else; move it away" in capsys.readouterr().err

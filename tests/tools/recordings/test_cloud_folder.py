@@ -9,7 +9,7 @@ from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.folders import cloud_folder
 from triquad_tools.recordings.folders.cloud_folder import is_cloud_folder
 from triquad_tools.recordings.folders.scan_folder import ScanFolder
-from triquad_tools.recordings.options import ReadingOptions
+from triquad_tools.recordings.recording import ReadingOptions
 
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 100_000_000

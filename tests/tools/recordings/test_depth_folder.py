@@ -17,7 +17,7 @@ from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.folders import depth_folder
 from triquad_tools.recordings.folders.depth_folder import is_depth_folder
 from triquad_tools.recordings.folders.scan_folder import ScanFolder
-from triquad_tools.recordings.options import ReadingOptions
+from triquad_tools.recordings.recording import ReadingOptions
 
 START_NS = 1_305_031_102_160_407_000
 STEP_NS = 33_000_000

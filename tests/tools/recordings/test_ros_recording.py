@@ -9,9 +9,8 @@ import pytest
 from support.recordings.bags import KINDS, BagKind, Recorded, drive, messages_for, write_bag
 from support.ros.ros_messages import CAMERA_INFO, CLOUD, IMAGE, ODOMETRY, POSE, TF
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.arguments import transform
 from triquad_tools.recordings.opening import Recording, open_recording
-from triquad_tools.recordings.options import ReadingOptions
+from triquad_tools.recordings.recording import ReadingOptions, transform
 
 COUNT = 6
 STAMPS = [1_700_000_000 * 10**9 + i * 10**8 for i in range(COUNT)]

@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.recordings.trajectories import drive, matrices, write_log, write_tum
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.folders.file_names import in_order, stamps_of_names
+from triquad_tools.recordings.folders.scan_folder import in_order, stamps_of_names
 from triquad_tools.recordings.folders.trajectory import read_trajectory
-from triquad_tools.sensors.errors import NoTransformError
+from triquad_tools.sensors.sweep import NoTransformError
 
 START_NS = 1_700_000_000_000_000_000
 LINE = "1 0 0 0 0 0 0 1"

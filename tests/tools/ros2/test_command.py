@@ -14,7 +14,7 @@ def test_a_file_stands_for_arguments(tmp_path: Path) -> None:
     file.write_text("--clouds\n/a\n/b\n--map-frame=/odom\n--grid-height-m=-1.5\n--depth-stride=4\n")
     found = bridge_options(parser().parse_args([f"@{file}", "--depth-stride", "8"]))
     assert found.topics.clouds == ("/a", "/b")
-    assert (found.scans.map_frame, found.scans.depth_stride) == ("odom", 8)
+    assert (found.map_frame, found.depth_stride) == ("odom", 8)
     assert found.grid.height_m == -1.5
 
 

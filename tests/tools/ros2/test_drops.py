@@ -3,8 +3,8 @@
 import pytest
 import zenoh
 from triquad_tools.ros2.intake.drop_log import LOG_PERIOD_S, DropLog
-from triquad_tools.ros2.intake.message_queue import Arrival, MessageQueue, QueueLimits
-from triquad_tools.ros2.topic_choice import Role
+from triquad_tools.ros2.intake.topic_listener import Arrival, MessageQueue, QueueLimits
+from triquad_tools.ros2.options import Role
 
 
 def test_the_log_has_the_first_and_then_a_line_in_a_while(

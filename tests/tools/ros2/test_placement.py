@@ -1,8 +1,7 @@
 """Sweeps that wait for transforms take no memory without end."""
 
 import numpy as np
-from triquad_tools.ros2.intake.motion import Motion
-from triquad_tools.ros2.intake.placement import Placement
+from triquad_tools.ros2.intake.placement import Motion, Placement
 from triquad_tools.sensors.sweep import Sweep
 
 POINT_BYTES = 12

@@ -4,19 +4,19 @@ import numpy as np
 import pytest
 from support.ros.ros_messages import RosMessages
 from triquad_tools.commands.ros2 import bridge_options, parser
-from triquad_tools.ros2.attachment import ATTACHMENT, SequenceGaps
-from triquad_tools.ros2.output.markers import Action, Marker
-from triquad_tools.ros2.topic_choice import Role, TopicChoice
+from triquad_tools.ros2.options import Role, TopicChoice
+from triquad_tools.ros2.output.mesh_publisher import Action, marker_message
 from triquad_tools.ros2.topics import (
+    ATTACHMENT,
     Announcement,
     Delivery,
     End,
     Entity,
+    SequenceGaps,
     Topic,
     bridge_token,
     read_token,
     rmw_key,
-    rmw_node_token,
     rmw_token,
     rmw_topic_name,
     type_hash,
@@ -43,7 +43,7 @@ def test_keys_are_those_of_the_documents() -> None:
 
 def test_tokens_are_those_of_the_documents() -> None:
     listener = Entity("aac3178e146ba6f1fc6e6a4085e77f21", "listener", 0)
-    assert rmw_node_token(2, listener) == NODE
+    assert listener.rmw_prefix(2, "NN") == NODE
     what = Announcement(End.SUBSCRIPTION, CHATTER, HASH)
     entity = Entity(listener.session_id, listener.node, 10)
     assert rmw_token(2, entity, what, Delivery(depth=10)) == SUBSCRIPTION
@@ -103,7 +103,7 @@ def test_options_choose_topics_with_and_without_slashes() -> None:
 @pytest.mark.parametrize("triangles", [0, 1, 5])
 def test_markers_are_read_by_others_as_they_were_meant(frame: str, triangles: int) -> None:
     corners = np.random.default_rng(1).normal(size=(3 * triangles, 3))
-    payload = Marker(frame, 7, Action.ADD, corners).payload()
+    payload = marker_message(frame, 7, Action.ADD, corners)
     types = RosMessages().types
     marker = types.deserialize_cdr(payload, "visualization_msgs/msg/Marker")
     assert (marker.header.frame_id, marker.id, marker.action) == (frame, 7, 0)

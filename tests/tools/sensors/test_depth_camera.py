@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from support.ros.ros_messages import IMAGE, RosMessages
-from triquad_tools.sensors.errors import NoScanError
 from triquad_tools.sensors.ros.depth_camera import sweep_of_depth
 from triquad_tools.sensors.ros.type_store import decode_cdr
+from triquad_tools.sensors.sweep import NoScanError
 
 ROS = RosMessages()
 MATRIX = np.array([[500.0, 0, 3], [0, 400.0, 2], [0, 0, 1]])

@@ -6,11 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 from triquad_client.pose import Pose
-from triquad_tools.sensors.errors import NoTransformError
-from triquad_tools.sensors.motion.frame_tree import STATIC, FrameTree, Transform
+from triquad_tools.sensors.motion.frame_tree import STATIC, FrameTree, Track, Transform
 from triquad_tools.sensors.motion.placing import place
-from triquad_tools.sensors.motion.track import Track
-from triquad_tools.sensors.sweep import Sweep
+from triquad_tools.sensors.sweep import NoTransformError, Sweep
 
 SECOND = 10**9
 T0 = 1_700_000_000 * SECOND

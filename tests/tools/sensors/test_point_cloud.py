@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.ros.ros_messages import CLOUD, RosMessages
-from triquad_tools.sensors.errors import NoScanError
 from triquad_tools.sensors.ros.point_cloud import sweep_of_cloud
 from triquad_tools.sensors.ros.type_store import decode_cdr
+from triquad_tools.sensors.sweep import NoScanError
 
 ROS = RosMessages()
 STAMP_NS = 1_700_000_000_250_000_000

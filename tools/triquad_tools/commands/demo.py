@@ -11,13 +11,11 @@ from pathlib import Path
 
 from triquad_server import serve
 
-from triquad_tools.console.arguments import add_version, count, port, seed
+from triquad_tools.console.arguments import command_parser, count, port, seed
 from triquad_tools.console.command import FAILED, OK, ToolError, complain, run
-from triquad_tools.console.interrupts import sigterm_interrupts
 from triquad_tools.console.lines import print_line, print_remark
 from triquad_tools.console.report import json_text, print_rows
-from triquad_tools.demo.results import DemoResults, broken_promises, table_rows
-from triquad_tools.demo.steps import MAP, demonstrate
+from triquad_tools.demo.steps import MAP, DemoResults, broken_promises, demonstrate, table_rows
 from triquad_tools.simulation.street import street_drive
 from triquad_tools.viewer.sources.live_source import LiveSource
 from triquad_tools.viewer.viewer import DEFAULT_PORT, Viewer
@@ -28,13 +26,8 @@ _COMMAND = "triquad-demo"
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool: 0 all is as promised, 1 something is not or failed, 2 wrong usage."""
     work = partial(_demo, _parser().parse_args(argv))
-    with sigterm_interrupts():
-        return run(
-            _COMMAND,
-            work,
-            failures=(ToolError, OSError),
-            interrupted="interrupted; the server is stopped",
-        )
+    interrupted = "interrupted; the server is stopped"
+    return run(_COMMAND, work, failures=(ToolError, OSError), interrupted=interrupted)
 
 
 def _demo(options: argparse.Namespace) -> int:
@@ -80,8 +73,8 @@ def _beside_python(command: str) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=_COMMAND,
+    parser = command_parser(
+        _COMMAND,
         description="Map a simulated street with a real server, and ask it while it learns. Takes "
         "some minutes.",
         epilog="Exit status: 0 all is as promised, 1 something is not or failed, 2 wrong usage.",
@@ -93,5 +86,4 @@ def _parser() -> argparse.ArgumentParser:
     of_page = f"of that page ({DEFAULT_PORT})"
     add("--port", type=port, default=DEFAULT_PORT, metavar="N", help=of_page)
     add("--seed", type=seed, default=1, metavar="N", help="of the street (default: 1)")
-    add_version(parser)
     return parser

@@ -8,8 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 
-from triquad_tools.console.command import BAD_INPUT, complain
-from triquad_tools.console.interrupts import INTERRUPTED
+from triquad_tools.console.command import BAD_INPUT, INTERRUPTED, complain
 
 
 def _run(command: str, module: str, *, extra: str = "tools", needs: tuple[str, ...] = ()) -> int:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from triquad_format.records.arrays import Doubles
 
-from triquad_tools.console.arguments import add_version, not_negative, positive
+from triquad_tools.console.arguments import command_parser, not_negative, positive
 from triquad_tools.console.command import OK, ToolError, run
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.report import Row, centimetres, json_text, percent, print_rows
@@ -65,8 +65,8 @@ def _rows(scores: MeshScores) -> list[Row]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=_COMMAND,
+    parser = command_parser(
+        _COMMAND,
         description="Score a mesh against true surface points. docs/tools.md defines the figures.",
         epilog="Exit status: 0 done, 2 wrong usage or input.",
     )
@@ -79,5 +79,4 @@ def _parser() -> argparse.ArgumentParser:
     nearer = "leave out nearer points of a folder's scans (default: 0)"
     add("--range-min", type=not_negative, default=0.0, metavar="M", help=nearer)
     add("--json", action="store_true", help="print JSON")
-    add_version(parser)
     return parser

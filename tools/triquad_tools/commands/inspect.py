@@ -9,12 +9,11 @@ from triquad_format.errors import DamagedMapFileError
 from triquad_format.mapfile.metadata import utc_time
 from triquad_format.mapfile.reader import MapFile, read_map_file
 
-from triquad_tools.console.arguments import add_version, picture
+from triquad_tools.console.arguments import DEFAULT_MAP, add_config, command_parser, picture
 from triquad_tools.console.command import FAILED, OK, ToolError, complain, refuse, run
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.progress import progress
 from triquad_tools.console.report import json_text
-from triquad_tools.console.server_arguments import DEFAULT_MAP, add_config
 from triquad_tools.mapfiles.diff import compare, difference, print_diff
 from triquad_tools.mapfiles.object_changes import object_changes, print_objects
 from triquad_tools.mapfiles.source import SourceMap, is_endpoint, map_file
@@ -32,8 +31,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=_COMMAND,
+    parser = command_parser(
+        _COMMAND,
         description="Show what a map file holds, a folder's history, or how two maps differ. Map "
         "files are read in full and checked.",
         epilog="Exit status: 0 valid, also where maps differ; 1 damaged, or the server failed; "
@@ -57,7 +56,6 @@ def _parser() -> argparse.ArgumentParser:
     plot = "draw a picture of the map, or plans of the difference"
     add("--plot", type=picture, metavar="OUT.png", help=plot)
     add("--json", action="store_true", help="print JSON")
-    add_version(parser)
     return parser
 
 
@@ -82,9 +80,8 @@ def _check_usage(options: argparse.Namespace) -> None:
 
 def _inspect(options: argparse.Namespace) -> int:
     _check_usage(options)
-    if options.log:
-        return _log(options)
-    return _diff(options) if options.diff else _show(options)
+    work = _log if options.log else _diff if options.diff else _show
+    return work(options)
 
 
 def _show(options: argparse.Namespace) -> int:

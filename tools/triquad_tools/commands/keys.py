@@ -6,7 +6,7 @@ from datetime import datetime, timezone
 from functools import partial
 from pathlib import Path
 
-from triquad_tools.console.arguments import add_version, positive, whole
+from triquad_tools.console.arguments import command_parser, positive, whole
 from triquad_tools.console.command import OK, run
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.report import print_columns
@@ -85,8 +85,8 @@ def _day(expires: datetime) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="triquad-keys",
+    parser = command_parser(
+        "triquad-keys",
         description="Give roles to those who use a map server: a certificate authority in a "
         "folder, and a Zenoh configuration for the server, routers and each client, who may do "
         "what their roles say, and nothing else. docs/security.md tells more.",
@@ -121,7 +121,6 @@ def _parser() -> argparse.ArgumentParser:
     remove = command("remove", "take a role away", _remove)
     remove.add_argument("name", metavar="NAME", help="of a client")
     command("list", "tell who has which role, and until when", _list)
-    add_version(parser)
     return parser
 
 

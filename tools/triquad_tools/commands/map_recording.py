@@ -13,15 +13,14 @@ from triquad_server.process.threads import Teams
 from triquad_server.settings.loading import PRESETS, load_settings
 from triquad_server.warm_up import warm_up
 
-from triquad_tools.console.arguments import add_version
+from triquad_tools.console.arguments import command_parser
 from triquad_tools.console.command import OK, ToolError, run
 from triquad_tools.console.lines import print_line, print_remark
 from triquad_tools.console.progress import progress
-from triquad_tools.mapping.mapping_run import MappingRun
+from triquad_tools.mapping.mapping_run import MAP_NAME, MappingRun, mapping_key, read_unfinished
 from triquad_tools.mapping.output import SUFFIXES, check_target, write_output
-from triquad_tools.mapping.unfinished import UnfinishedMap, mapping_key
-from triquad_tools.recordings.arguments import add_recording
-from triquad_tools.recordings.selection import Selection, open_selected
+from triquad_tools.recordings.opening import Selection, open_selected
+from triquad_tools.recordings.recording import add_recording
 
 _COMMAND = "triquad-map"
 
@@ -39,17 +38,20 @@ def _map(options: argparse.Namespace) -> int:
     settings = load_settings(options.settings, options.set, preset=options.preset)
     check_device(options.device)
     selection = open_selected(options)
-    key = mapping_key(selection, settings)
-    with closing(UnfinishedMap(output, key)) as unfinished, closing(Teams()) as teams:
+    key, part = mapping_key(selection, settings), output.with_name(f"{output.name}.part")
+    unfinished = read_unfinished(part, key)
+    with closing(Teams()) as teams:
         # The first time all kernels are compiled, which takes half a minute or more.
         with progress("preparing") as report:
             warm_up(settings, options.device, teams, report=lambda stage: report(0.0, stage))
-        mapper = unfinished.resumed(settings, options.device, teams)
+        mapper = Mapper(MAP_NAME, settings, options.device, record=unfinished.record, teams=teams)
+        mapper.publish()
         taken = unfinished.scans_taken
+        del unfinished  # a map need not be in memory twice
         if taken:
-            print_line(f"going on after scan {taken}, from {unfinished.folder}")
-        mapping = MappingRun(mapper, unfinished, settings)
-        mapping.take(selection, taken)
+            print_line(f"going on after scan {taken}, from {part}")
+        mapping = MappingRun(mapper, settings, part, key, taken)
+        mapping.take(selection)
         _check_result(mapper, mapping, selection)
         mapping.settle()  # which saves the map, should the output not be written
         record = mapper.changes_since(None).record
@@ -59,10 +61,10 @@ def _map(options: argparse.Namespace) -> int:
             )
         except OSError as error:
             raise StoreError(
-                f"{output} cannot be written: {error}; the map is in {unfinished.folder}: the same "
+                f"{output} cannot be written: {error}; the map is in {part}: the same "
                 "command writes it once there is room"
             ) from error
-    unfinished.remove()
+    part.unlink()
     print_line(f"{output}: {written}")
     return OK
 
@@ -84,8 +86,8 @@ def _check_result(mapper: Mapper, mapping: MappingRun, selection: Selection) -> 
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=_COMMAND,
+    parser = command_parser(
+        _COMMAND,
         description="Make a map of a recording, without a server or a network.",
         epilog="Exit status: 0 done; 1 the map could not be written; 2 wrong usage, or input of "
         "which nothing can be used; 130 interrupted: the same command then goes on where it was.",
@@ -105,5 +107,4 @@ def _parser() -> argparse.ArgumentParser:
     add("--device", choices=DEVICES, default="cpu", help="what it trains on (default: cpu)")
     add("--training", action="store_true", help="keep what further training needs in the map file")
     add("--force", action="store_true", help="replace OUT where it exists")
-    add_version(parser)
     return parser

@@ -10,12 +10,13 @@ from triquad_format.errors import DamagedMapFileError
 from triquad_format.mapfile.checkpoint_folder import checkpoint_file, checkpoint_files, set_aside
 from triquad_format.mapfile.index import read_checkpoint
 from triquad_format.mapfile.parts.part import EVIDENCE, REGION, TRAINING, VERTICES
+from triquad_format.records.region import VertexTable
 from triquad_format.wire.limits import MAX_FILL_M
 
-from triquad_tools.console.arguments import add_version, within
+from triquad_tools.console.arguments import command_parser, within
 from triquad_tools.console.command import FAILED, OK, ToolError, refuse, run
-from triquad_tools.console.lines import print_line
-from triquad_tools.mapfiles.packing import pack_map
+from triquad_tools.console.lines import print_line, print_remark
+from triquad_tools.mapfiles.quantise import quantise
 from triquad_tools.mapfiles.recovered_map import Loss, RecoveredMap, recover
 from triquad_tools.mapfiles.source import (
     Box,
@@ -26,7 +27,7 @@ from triquad_tools.mapfiles.source import (
     is_endpoint,
     read_source,
 )
-from triquad_tools.mapping.output import MAP_SUFFIX, SUFFIXES, check_target, export
+from triquad_tools.mapping.output import MAP_SUFFIX, SUFFIXES, check_target, export, write_map_file
 
 _COMMAND = "triquad-pack"
 _DAMAGE = (DamagedMapFileError, NothingLeftError)
@@ -46,8 +47,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=_COMMAND,
+    parser = command_parser(
+        _COMMAND,
         description="Rewrite a map file: smaller, cropped, an earlier epoch of it, what is intact "
         "of it, in the newest version, or as a mesh or a picture.",
         epilog="Exit status: 0 done; 1 IN is damaged (with --recover: something of it is lost), or "
@@ -56,7 +57,6 @@ def _parser() -> argparse.ArgumentParser:
     _add_source(parser.add_argument)
     _add_content(parser.add_argument)
     _add_target(parser.add_argument)
-    add_version(parser)
     return parser
 
 
@@ -142,21 +142,37 @@ def _check_target(source: Path, target: Path, force: bool) -> None:
 def _pack_map(options: argparse.Namespace, path: Path) -> int:
     training = not options.no_training and options.max_error is None
     source, complete = _source(options, path, box=_box(options.crop), training=training)
-    written = pack_map(
-        source,
-        options.output,
-        max_error_m=options.max_error,
-        bytes_before=_bytes_of(path),
-    )
-    print_line(f"{options.output}: {written}")
+    told = ""
+    if options.max_error is not None:
+        source, told = _quantised(source, options.max_error)
+    size = write_map_file(source, options.output, feature_dtype=_dtype(source))
+    checkpoint = read_checkpoint(path)
+    before = path.stat().st_size + (checkpoint.manifest.stored_bytes if checkpoint else 0)
+    print_line(f"{options.output}: {size:,} bytes, {size / before:.0%} of {before:,}{told}")
     return OK if complete else FAILED
 
 
-def _bytes_of(path: Path) -> int:
-    """Return the bytes of a map file, or of a checkpoint with its parts."""
-    checkpoint = read_checkpoint(path)
-    parts = 0 if checkpoint is None else checkpoint.manifest.stored_bytes
-    return path.stat().st_size + parts
+def _quantised(source: SourceMap, max_error_m: float) -> tuple[SourceMap, str]:
+    """Return a map with features as integers, and lines that say how far distances moved."""
+    if any(table.scale is not None for table in _tables(source)):
+        print_remark(f"{_COMMAND}: features are integers already: both errors add up")
+    packed = quantise(source.record, max_error_m)
+    change = packed.change
+    most, largest = (f"{1e3 * one:.2f} mm" for one in (change.quantile_m, change.largest_m))
+    return SourceMap(packed.record, source.stamp_ns), (
+        f"\n  99 % of distances near surface moved by less than {most}, the most by {largest}\n"
+        "  without training state: it does not fit rounded features"
+    )
+
+
+def _dtype(source: SourceMap) -> str:
+    """Return what keeps all float features as they are."""
+    found = {table.features.dtype.str for table in _tables(source) if len(table.codes)}
+    return "<f4" if "<f4" in found else "<f2"
+
+
+def _tables(source: SourceMap) -> list[VertexTable]:
+    return [table for region in source.record.regions for table in region.tables]
 
 
 def _export(options: argparse.Namespace, path: Path) -> int:

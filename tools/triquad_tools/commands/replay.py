@@ -3,25 +3,22 @@
 import argparse
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 
 from triquad_client import Client, FlushReport, connect
 
-from triquad_tools.console.arguments import add_version, positive
+from triquad_tools.console.arguments import DEFAULT_MAP, add_server, command_parser, positive
 from triquad_tools.console.command import FAILED, OK, run
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.progress import progress
 from triquad_tools.console.report import print_columns
-from triquad_tools.console.server_arguments import DEFAULT_MAP, add_server
-from triquad_tools.recordings.arguments import add_recording, options_of
-from triquad_tools.recordings.opening import open_recording
+from triquad_tools.recordings.opening import Selection, length_s, open_recording, open_selected
 from triquad_tools.recordings.publishing import (
     FLUSH_TIMEOUT_S,
     keep_few_pending,
     wait_until_settled,
 )
-from triquad_tools.recordings.selection import Selection, length_s, open_selected
+from triquad_tools.recordings.recording import add_recording, options_of
 
 _COMMAND = "triquad-replay"
 
@@ -62,11 +59,14 @@ def _replay(options: argparse.Namespace) -> int:
     selection = open_selected(options)
     with connect(options.connect, options.map or DEFAULT_MAP, config=options.config) as client:
         before = client.status().scans_dropped
-        sent = _publish(client, selection, options.source, options.rate)
+        started_s = time.monotonic()
+        published = _publish(client, selection, options.source, options.rate)
         flush = client.flush(FLUSH_TIMEOUT_S)
+        seconds = time.monotonic() - started_s
         after = client.status().scans_dropped
         refusals = {reason: count - before.get(reason, 0) for reason, count in after.items()}
-        print_line(_summary(sent, flush, refusals))
+        told = _summary(published, len(selection) - published, flush, refusals)
+        print_line(f"{told}, {seconds:.1f} s, {published / max(seconds, 1e-9):.1f} scans/s")
         if flush.last_refusal:
             print_line(f"last refusal: {flush.last_refusal}")
         if options.settle:
@@ -76,25 +76,13 @@ def _replay(options: argparse.Namespace) -> int:
     return OK if flush.lost == flush.refused == 0 else FAILED
 
 
-@dataclass(frozen=True)
-class _Sent:
-    """What was sent, and how long it took, with the time until it was taken."""
-
-    published: int
-    skipped: int  # not sent: no point was left of them
-    started_s: float  # monotonic
-
-    @property
-    def pace(self) -> str:
-        """How long it has taken so far, and at which rate."""
-        seconds = time.monotonic() - self.started_s
-        return f"{seconds:.1f} s, {self.published / max(seconds, 1e-9):.1f} scans/s"
-
-
 def _publish(
     client: Client, selection: Selection, source: str | None, due_times: DueTimes | None
-) -> _Sent:
-    """Send all chosen scans, each when it is due; without times the server sets the pace."""
+) -> int:
+    """Send all chosen scans, each when it is due; without times the server sets the pace.
+
+    Return how many had points, and were sent.
+    """
     entries, total = selection.entries, len(selection)
     due_s = due_times([entry.stamp_ns for entry in entries]) if due_times else [0.0] * total
     started_s, published = time.monotonic(), 0
@@ -108,26 +96,26 @@ def _publish(
                 if due_times is None:
                     keep_few_pending(client, published)
             report(done, f"{done} of {total} scans")
-    return _Sent(published, total - published, started_s)
+    return published
 
 
-def _summary(sent: _Sent, flush: FlushReport, refusals: dict[str, int]) -> str:
+def _summary(published: int, skipped: int, flush: FlushReport, refusals: dict[str, int]) -> str:
     """Return what became of the scans; ``refusals`` are the server's counts by reason."""
     reasons = ", ".join(f"{reason}: {count}" for reason, count in refusals.items() if count > 0)
     parts = [
-        f"{sent.published} scans published",
+        f"{published} scans published",
         f"{flush.taken} taken",
         f"{flush.refused} refused" + (f" ({reasons})" if flush.refused and reasons else ""),
         f"{flush.lost} lost",
     ]
-    if sent.skipped:
-        parts.append(f"{sent.skipped} without points not sent")
-    return ", ".join([*parts, sent.pace])
+    if skipped:
+        parts.append(f"{skipped} without points not sent")
+    return ", ".join(parts)
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=_COMMAND,
+    parser = command_parser(
+        _COMMAND,
         description="Publish a recording to a map server. By default the server sets the pace, and "
         "no scan is lost.",
         epilog="Exit status: 0 all scans are in the map (--list: there are some to map), 1 some "
@@ -141,7 +129,6 @@ def _parser() -> argparse.ArgumentParser:
     rate = "scans a second, or 1x: as recorded, 2x: twice as fast; whatever the server takes"
     add("--rate", type=due_times, metavar="HZ|FACTORx", help=rate)
     add("--settle", action="store_true", help="wait until the server has learnt all of it")
-    add_version(parser)
     return parser
 
 

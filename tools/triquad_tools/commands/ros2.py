@@ -9,25 +9,31 @@ import threading
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
+from dataclasses import fields
 from functools import partial
 
 from triquad_client import Client, ConnectError, UnknownMapError, connect
 
-from triquad_tools.console.arguments import add_version, count, whole, within
+from triquad_tools.console.arguments import (
+    DEFAULT_MAP,
+    add_server,
+    command_parser,
+    count,
+    whole,
+    within,
+)
 from triquad_tools.console.command import FAILED, OK, ToolError, run
-from triquad_tools.console.interrupts import sigterm_interrupts
-from triquad_tools.console.log import start_log
-from triquad_tools.console.server_arguments import DEFAULT_MAP, add_server
-from triquad_tools.ros2.bridge import Bridge
+from triquad_tools.console.lines import start_log
+from triquad_tools.ros2.bridge import bridging, open_session
 from triquad_tools.ros2.options import (
     MAX_GRID_CELLS,
+    TF_POSES,
     BridgeOptions,
-    ScanOptions,
     SliceShape,
+    TopicChoice,
+    full_name,
 )
 from triquad_tools.ros2.server_process import ServerProcess
-from triquad_tools.ros2.session import open_session
-from triquad_tools.ros2.topic_choice import TF_POSES, TopicChoice
 from triquad_tools.sensors.ros.header import frame_name
 
 _COMMAND = "triquad-ros2"
@@ -49,9 +55,13 @@ def _run(options: argparse.Namespace) -> int:
     server: ServerProcess | None = None
     by_signal = FAILED
     try:
-        with sigterm_interrupts(), ExitStack() as stack:
+        with ExitStack() as stack:
             if options.serve is not None:
                 server = stack.enter_context(ServerProcess(options.serve, asked.topics))
+                options.map = options.map or server.map_name
+                if options.config is None:
+                    options.connect = options.connect or server.endpoint
+                    options.router = options.router or server.endpoint
             _bridge(options, asked, server)
     except KeyboardInterrupt:
         _log.info("stopped")
@@ -64,44 +74,38 @@ def _bridge(
     options: argparse.Namespace, asked: BridgeOptions, server: ServerProcess | None
 ) -> None:
     """Bridge until the server ends, or else for ever."""
-    with ExitStack() as stack:
-        client = _connected(options, server)
-        if client is None:
-            return
-        stack.enter_context(client)
-        router = options.router
-        if router is None and server is not None and options.config is None:
-            router = server.endpoint
-        session = stack.enter_context(closing(open_session(router, options.config)))
-        bridge = stack.enter_context(Bridge(session, client, asked))
-        stack.callback(_log_counts, bridge)
-        if server is None:
-            threading.Event().wait()
-        else:
-            server.wait()
+    client = _connected(options, server)
+    if client is None:
+        return
+    with (
+        client,
+        closing(open_session(options.router, options.config)) as session,
+        bridging(session, client, asked) as intake,
+    ):
+        try:
+            if server is None:
+                threading.Event().wait()
+            else:
+                server.wait()
+        finally:
+            dropped = ", ".join(f"{reason}: {n}" for reason, n in intake.dropped.items())
+            _log.info("%d scans published, dropped: %s", intake.published, dropped or "none")
 
 
 def _connected(options: argparse.Namespace, server: ServerProcess | None) -> Client | None:
-    """Return a client of the map server, once it serves; None where it ended before."""
-    if server is None:
-        return connect(options.connect, options.map or DEFAULT_MAP, config=options.config)
-    endpoint, tell_s = options.connect, time.monotonic() + _TELL_S
-    if endpoint is None and options.config is None:
-        endpoint = server.endpoint
-    while server.exit_code is None:
+    """Return a client of the map server, once it serves; None where one of ours ended before."""
+    tell_s = time.monotonic() + _TELL_S
+    while server is None or server.exit_code is None:
         try:
-            return connect(endpoint, options.map or server.map_name, config=options.config)
+            return connect(options.connect, options.map or DEFAULT_MAP, config=options.config)
         except (ConnectError, UnknownMapError) as error:
+            if server is None:
+                raise
             if time.monotonic() > tell_s:
                 tell_s = time.monotonic() + _TELL_S
                 _log.warning("waiting for the server: %s", error)
             server.wait(_RETRY_S)
     return None
-
-
-def _log_counts(bridge: Bridge) -> None:
-    dropped = ", ".join(f"{reason}: {n}" for reason, n in bridge.dropped.items())
-    _log.info("%d scans published, dropped: %s", bridge.published, dropped or "none")
 
 
 def bridge_options(options: argparse.Namespace) -> BridgeOptions:
@@ -116,38 +120,29 @@ def bridge_options(options: argparse.Namespace) -> BridgeOptions:
             f"a grid of {grid.side_m:g} m has {grid.cells} cells of {grid.cell_m:g} m along each "
             f"side: use at most {int(MAX_GRID_CELLS**0.5)}"
         )
-    return BridgeOptions(
-        TopicChoice.named(
-            options.domain,
-            options.namespace or "",
-            clouds=options.clouds,
-            depth=options.depth,
-            poses=options.poses,
-        ),
-        ScanOptions(
-            depth_stride=options.depth_stride,
-            body_frame=options.body_frame,
-            map_frame=options.map_frame,
-            by_arrival=options.clock == "arrival",
-            wait_s=options.wait_s,
-        ),
-        grid,
-        options.mesh_level,
-        options.mesh_bytes_per_s,
+    prefix = full_name("", options.namespace or "").rstrip("/")
+    topics = TopicChoice(
+        options.domain,
+        prefix,
+        clouds=tuple(full_name(prefix, name) for name in options.clouds),
+        depth=tuple(full_name(prefix, name) for name in options.depth),
+        poses=None if options.poses.strip("/") == TF_POSES else full_name(prefix, options.poses),
     )
+    others = {field.name for field in fields(BridgeOptions)} - {"topics", "grid"}
+    return BridgeOptions(topics, grid, **{name: getattr(options, name) for name in others})
 
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line; ``@FILE`` stands for what a file has, line by line."""
-    made = argparse.ArgumentParser(
-        prog=_COMMAND,
-        fromfile_prefix_chars="@",
+    made = command_parser(
+        _COMMAND,
         description="Map the clouds and depth images of a robot with ROS 2 (rmw_zenoh or "
         "zenoh-bridge-ros2dds), and publish the map's mesh and an occupancy grid to it: "
         "docs/guides/ros2.md. @FILE stands for the arguments in a file, one a line.",
         epilog="Exit status: 0 stopped by Ctrl-C or SIGTERM, 1 there is no such server, 2 wrong "
         "usage; with --serve, that of triquad-server where it is not 0.",
     )
+    made.fromfile_prefix_chars = "@"
     add = made.add_argument
     add(
         "--serve",
@@ -164,7 +159,6 @@ def parser() -> argparse.ArgumentParser:
     add_server(made)
     _add_topics(made.add_argument_group("what is taken in"))
     _add_outputs(made.add_argument_group("what is published, while somebody subscribes"))
-    add_version(made)
     return made
 
 

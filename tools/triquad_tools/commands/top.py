@@ -21,12 +21,16 @@ from triquad_format.mapfile.metadata import utc_time
 from triquad_format.printable import printable
 
 from triquad_tools.console.amounts import count, duration, milliseconds, rate, size, within
-from triquad_tools.console.arguments import add_version, positive
+from triquad_tools.console.arguments import (
+    DEFAULT_MAP,
+    add_server,
+    command_parser,
+    positive,
+    server_name,
+)
 from triquad_tools.console.command import FAILED, OK, complain, run
-from triquad_tools.console.interrupts import sigterm_interrupts
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.report import json_text
-from triquad_tools.console.server_arguments import DEFAULT_MAP, add_server, server_name
 
 _COMMAND = "triquad-top"
 _TIMEOUT_S = 5.0  # for connecting, and for each reply
@@ -88,7 +92,7 @@ def _top(options: argparse.Namespace) -> int:
     can_draw = sys.stdout.isatty() and os.environ.get("TERM") != "dumb"
     title = f"map {name} at {server}"
     reached = connect(options.connect, name, timeout_s=_TIMEOUT_S, config=options.config)
-    with sigterm_interrupts(), reached as client:
+    with reached as client:
         samples = _samples(client, options.interval)
         if options.once or not (options.json or can_draw):
             samples = itertools.islice(samples, 1, 2)
@@ -208,8 +212,8 @@ def _json_line(server: str, name: str, sample: Sample) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=_COMMAND,
+    parser = command_parser(
+        _COMMAND,
         description="Show how a map server is doing, as it goes, until Ctrl-C.",
         epilog="Exit status: 0 done, 1 there is no such server or it failed, 2 wrong usage, "
         "130 ended by Ctrl-C.",
@@ -219,5 +223,4 @@ def _parser() -> argparse.ArgumentParser:
     add("--interval", type=positive, default=1.0, metavar="S", help="seconds (default: 1)")
     add("--once", action="store_true", help="print one page as plain text, after one interval")
     add("--json", action="store_true", help="print an object of JSON a line, one each interval")
-    add_version(parser)
     return parser

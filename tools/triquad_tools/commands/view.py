@@ -9,15 +9,19 @@ from pathlib import Path
 
 import triquad_client
 
-from triquad_tools.console.arguments import add_version, port
+from triquad_tools.console.arguments import (
+    DEFAULT_MAP,
+    add_server,
+    command_parser,
+    port,
+    server_name,
+)
 from triquad_tools.console.command import OK, complain, refuse, run
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.progress import progress
-from triquad_tools.console.server_arguments import DEFAULT_MAP, add_server, server_name
-from triquad_tools.viewer.sources.history import History, moment
 from triquad_tools.viewer.sources.live_source import LiveSource
 from triquad_tools.viewer.sources.map_source import MapSource
-from triquad_tools.viewer.sources.stored_map import StoredMap
+from triquad_tools.viewer.sources.stored_map import History, StoredMap, moment
 from triquad_tools.viewer.viewer import DEFAULT_PORT, Viewer
 
 _COMMAND = "triquad-view"
@@ -29,7 +33,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _view(options: argparse.Namespace) -> int:
-    _check_usage(options)
+    server = options.connect or options.map or options.config
+    refuse(
+        {"--connect, --map and --config are for a server, not for a file": options.file and server}
+    )
     with (
         _shown(options) as shown,
         closing(
@@ -39,14 +46,6 @@ def _view(options: argparse.Namespace) -> int:
         print_line(f"open {viewer.url} in a browser; Ctrl-C ends it")
         threading.Event().wait()
     return OK
-
-
-def _check_usage(options: argparse.Namespace) -> None:
-    """Refuse what does not go together."""
-    server = options.connect or options.map or options.config
-    refuse(
-        {"--connect, --map and --config are for a server, not for a file": options.file and server}
-    )
 
 
 @contextmanager
@@ -81,8 +80,8 @@ def _name(shown: StoredMap) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=_COMMAND,
+    parser = command_parser(
+        _COMMAND,
         description="Show a map in the browser: of a server, as it grows, or of a file.",
     )
     add = parser.add_argument
@@ -104,5 +103,4 @@ def _parser() -> argparse.ArgumentParser:
         "for more (addresses and the machine's host name are)",
     )
     add("--port", type=port, default=DEFAULT_PORT, metavar="PORT", help=f"default: {DEFAULT_PORT}")
-    add_version(parser)
     return parser

@@ -1,4 +1,4 @@
-"""Types of command-line arguments; errors name the value and a remedy."""
+"""Types of command-line arguments, whose errors name the value and a remedy, and shared ones."""
 
 import argparse
 import math
@@ -6,12 +6,17 @@ from functools import partial
 from pathlib import Path
 
 import triquad_format
+from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
+
+DEFAULT_MAP = "default"
 
 
-def add_version(parser: argparse.ArgumentParser) -> None:
-    """Let a command print its version."""
+def command_parser(prog: str, description: str, epilog: str = "") -> argparse.ArgumentParser:
+    """Return the parser of a command, which can print its version."""
+    parser = argparse.ArgumentParser(prog, description=description, epilog=epilog)
     version = f"triquad {triquad_format.__version__}"
     parser.add_argument("--version", action="version", version=version)
+    return parser
 
 
 def positive(text: str) -> float:
@@ -65,3 +70,31 @@ seed = partial(whole, 0, None)
 
 port = partial(whole, 0, 65_535)
 """Returns a port to listen on; 0: any that is free."""
+
+
+def add_server(parser: argparse.ArgumentParser) -> None:
+    """Add the map and the server; a command that can do without one gets ``None`` for each."""
+    add = parser.add_argument
+    add(
+        "--connect",
+        "-e",
+        metavar="ENDPOINT",
+        help=f"of the server (default: that of --config, or {DEFAULT_ENDPOINT})",
+    )
+    add("--map", metavar="NAME", help=f"of the server's maps (default: {DEFAULT_MAP})")
+    add_config(parser)
+
+
+def add_config(parser: argparse.ArgumentParser) -> None:
+    """Add the option for the credentials of a server."""
+    parser.add_argument(
+        "--config",
+        type=Path,
+        metavar="FILE",
+        help="Zenoh configuration (JSON5) to connect with, such as one of triquad-keys",
+    )
+
+
+def server_name(options: argparse.Namespace) -> str:
+    """Return the server that the arguments name, for people."""
+    return str(options.connect or options.config or DEFAULT_ENDPOINT)

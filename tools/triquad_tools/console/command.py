@@ -1,13 +1,18 @@
-"""The end of every command: an exit status, and one line for what went wrong."""
+"""The end of every command: an exit status, and one line for what went wrong or interrupted it."""
 
 import os
+import signal
 import sys
-from collections.abc import Callable, Mapping
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 
 from triquad_format.errors import FormatError, NoCompiledCodeError, TriquadError
 
-from triquad_tools.console.interrupts import INTERRUPTED, interruptible
 from triquad_tools.console.lines import print_remark
+
+INTERRUPTED = 130
+"""The exit status of shells: 128 and the number of SIGINT."""
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
 NOBODY_READS = 141
@@ -15,6 +20,39 @@ NOBODY_READS = 141
 
 _kept: list[KeyboardInterrupt] = []
 """The interrupts, with their frames: what a compiler has half done may not be cleaned up."""
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Let Ctrl-C and SIGTERM raise ``KeyboardInterrupt``, and the second one end the process.
+
+    Imports, finalisers and callbacks of the compiler may swallow the first one, or fail for a
+    reason of their own: whatever fails after it was interrupted.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    pressed = threading.Event()
+
+    def interrupt(*_: object) -> None:
+        if pressed.is_set():
+            os._exit(INTERRUPTED)
+        pressed.set()
+        raise KeyboardInterrupt
+
+    handlers = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}
+    for each, handler in handlers.items():
+        if handler is not signal.SIG_IGN:  # as for what a shell runs in the background
+            signal.signal(each, interrupt)
+    try:
+        yield
+    except Exception as error:
+        if pressed.is_set():
+            raise KeyboardInterrupt from error
+        raise
+    finally:
+        for each, handler in handlers.items():
+            signal.signal(each, handler)
 
 
 class ToolError(TriquadError):

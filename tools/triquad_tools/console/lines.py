@@ -1,9 +1,10 @@
-"""Lines for people: the tools print everything through these functions."""
+"""Lines for people: the tools print and log everything through these functions."""
 
+import logging
 import sys
 from typing import TextIO
 
-from triquad_format.printable import printable_lines
+from triquad_format.printable import printable, printable_lines
 
 
 def print_line(text: str = "") -> None:
@@ -22,3 +23,19 @@ def _write(stream: TextIO, text: str) -> None:
     # Where the terminal does not know a letter, an escape is better than no line.
     stream.write(line.encode(encoding, "backslashreplace").decode(encoding))
     stream.flush()
+
+
+def start_log(name: str) -> None:
+    """Log messages, each line with the ``name`` of the part that logs it."""
+    handler = logging.StreamHandler()
+    handler.setFormatter(_Lines(f"%(asctime)s %(levelname)s {name}: %(message)s"))
+    logging.basicConfig(level=logging.INFO, handlers=[handler])
+
+
+class _Lines(logging.Formatter):
+    """Lines in which names from the network cannot look like other lines."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802
+        """Return the line of a message."""
+        record.message = printable(record.message)
+        return super().formatMessage(record)

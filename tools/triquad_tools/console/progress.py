@@ -3,8 +3,11 @@
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import Progress, TextColumn
 from triquad_format.printable import printable
 
 from triquad_tools.console.lines import print_remark
@@ -12,56 +15,41 @@ from triquad_tools.console.lines import print_remark
 Report = Callable[[float, str], None]
 """Takes how much is done, in the units of the total, and a remark."""
 
-
 _LINE_PERIOD_S = 10.0
 
 
-def progress(title: str, total: float | None = None) -> AbstractContextManager[Report]:
+@contextmanager
+def progress(title: str, total: float | None = None) -> Iterator[Report]:
     """Show the progress of a step on standard error, and how long it will take.
 
     Without a total it shows that it goes on.
     """
-    show = _bar if sys.stderr.isatty() else _lines
-    return show(title, total)
-
-
-@contextmanager
-def _bar(title: str, total: float | None) -> Iterator[Report]:
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.progress import Progress, TextColumn
-
+    in_lines, started_s = not sys.stderr.isatty(), time.monotonic()
     columns = *Progress.get_default_columns(), TextColumn("{task.fields[note]}", markup=False)
-    with Progress(*columns, console=Console(stderr=True)) as bars:
-        task = bars.add_task(escape(printable(title)), total=total, note="")
+    bars = Progress(*columns, console=Console(stderr=True), disable=in_lines)
+    bars.add_task(escape(printable(title)), total=total, note="")
+    (task,) = bars.tasks
+    due_s = started_s + _LINE_PERIOD_S
+    if in_lines:
+        print_remark(f"{title} ...")
 
-        def report(done: float, note: str) -> None:
-            bars.update(task, completed=done, note=printable(note))
-
-        yield report
-        if total is None:
-            bars.update(task, total=1.0, completed=1.0)
-
-
-@contextmanager
-def _lines(title: str, total: float | None) -> Iterator[Report]:
-    started = time.monotonic()
-    next_line = started + _LINE_PERIOD_S
-    latest = ""
-    first: tuple[float, float] | None = None  # when it was first reported, and how much was done
-    print_remark(f"{title} ...")
+    def state() -> str:
+        share = "" if total is None else f"{task.percentage:.0f}% "
+        return f"{share}{task.fields['note']}".strip()
 
     def report(done: float, note: str) -> None:
-        nonlocal next_line, latest, first
-        first = first or (time.monotonic(), done)
-        share = "" if total is None else f"{min(done / max(total, 1e-9), 1.0):.0%} "
-        latest = f"{share}{note}".strip()
-        if time.monotonic() >= next_line:
-            next_line = time.monotonic() + _LINE_PERIOD_S
-            since_s, since = time.monotonic() - first[0], done - first[1]
-            left = f", {(total - done) * since_s / since:.0f} s left" if total and since > 0 else ""
-            print_remark(f"  {title}: {latest}{left}")
+        nonlocal due_s
+        bars.update(task.id, completed=done, note=printable(note))
+        if in_lines and time.monotonic() >= due_s:
+            due_s = time.monotonic() + _LINE_PERIOD_S
+            left_s = task.time_remaining
+            left = "" if left_s is None else f", {left_s:.0f} s left"
+            print_remark(f"  {title}: {state()}{left}")
 
-    yield report
-    end = f"  {title}: done in {time.monotonic() - started:.1f} s"
-    print_remark(f"{end}, {latest}" if latest else end)
+    with bars:
+        yield report
+        if total is None:
+            bars.update(task.id, total=1.0, completed=1.0)
+    if in_lines:
+        end = f"  {title}: done in {time.monotonic() - started_s:.1f} s"
+        print_remark(", ".join(filter(None, (end, state()))))

@@ -7,13 +7,16 @@
     authority/                   the authority's own: a program that can read it can take any role
 
 Files and folders can be read by their owner alone, and each is written as a whole or not at all.
+Configurations deny what no rule allows: servers and routers what clients may not do, and clients
+what comes from anyone but the server or a router.
 """
 
+import base64
 import json
 import os
 import re
 import secrets
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -21,9 +24,9 @@ from typing import Any
 
 from triquad_format.mapfile.files import replacing
 from triquad_format.wire.access_control import access_control
+from triquad_format.wire.endpoints import DEFAULT_PORT
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.credentials import configurations
 from triquad_tools.credentials.certificates import LOCAL_HOSTS, Authority, Certificate
 from triquad_tools.credentials.roles import (
     ROUTER,
@@ -36,6 +39,11 @@ from triquad_tools.credentials.roles import (
 
 LISTENING = (SERVER, ROUTER)
 """The roles that listen; each has a file of its own, whose name no client can have."""
+
+_WARNING = """\
+// Written by triquad-keys, which writes it again with each change: what is changed here is lost.
+// It holds a private key: a program that can read it can do what {title} may do.
+"""
 
 _HOST = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9.-]*[A-Za-z0-9])?|[0-9A-Fa-f:]*:[0-9A-Fa-f:.]*")
 _NAME_LENGTH = 48  # with role and issue it has to fit into the 64 characters of a common name
@@ -169,7 +177,7 @@ class KeyFolder:
         own, authority = self.authority.client(holder.common_name, days), self.authority.own
         file, title = self._file(holder.name), f"{holder.role.value} {holder.name}"
         access, hosts = access_control(client_grants()), self.hosts or LOCAL_HOSTS[:1]
-        _write(file, configurations.connecting(title, own, authority, access, hosts))
+        _write(file, _connecting(title, own, authority, access, hosts))
         self.entries[holder.name] = Entry(holder, own.expires)
         self._write_access()
         return file
@@ -186,7 +194,7 @@ class KeyFolder:
         access = access_control(server_grants(tuple(one.holder for one in entries)))
         for name in LISTENING:
             own, authority = self.certificate(name), self.authority.own
-            text = configurations.listening(f"the {name}", own, authority, access)
+            text = _listening(f"the {name}", own, authority, access)
             _write(self._file(name), text)
 
     @property
@@ -211,3 +219,52 @@ def _write(path: Path, data: bytes) -> None:
     with replacing(path) as stream:
         os.fchmod(stream.fileno(), 0o600)  # before there is anything to read in it
         stream.write(data)
+
+
+def _listening(title: str, own: Certificate, authority: Certificate, access: object) -> bytes:
+    """Return the file of a server or router, with its section ``access_control``."""
+    listen = {"endpoints": [_endpoint("0.0.0.0")], "exit_on_failure": True}
+    tls = _tls(own, authority, "listen", "connect")
+    return _text(title, tls, access, {"mode": "router", "listen": listen})
+
+
+def _connecting(
+    title: str, own: Certificate, authority: Certificate, access: object, hosts: Sequence[str]
+) -> bytes:
+    """Return the file of a client, which finds the server at one of ``hosts``."""
+    once = {"timeout_ms": 0, "exit_on_failure": True}  # one attempt at each
+    connect = {"endpoints": [_endpoint(host) for host in hosts], **once}
+    # ROS 2 keeps the last messages of some topics, which needs their times.
+    values = {"mode": "client", "connect": connect, "timestamping": {"enabled": True}}
+    return _text(title, _tls(own, authority, "connect"), access, values)
+
+
+def _text(title: str, tls: object, access: object, values: Mapping[str, object]) -> bytes:
+    """Return a file that neither looks for others nor shares memory, as zenoh_config.QUIET."""
+    off = {"enabled": False}
+    transport = {"shared_memory": off, "link": {"protocols": ["tls"], "tls": tls}}
+    scouting = {"multicast": off, "gossip": off}
+    whole = {**values, "scouting": scouting, "transport": transport, "access_control": access}
+    return (_WARNING.format(title=title) + json.dumps(whole, indent=2) + "\n").encode()
+
+
+def _tls(own: Certificate, authority: Certificate, *sides: str) -> dict[str, object]:
+    """Have both ends of a link show their certificates, and end it when one expires."""
+    section: dict[str, object] = {
+        "root_ca_certificate_base64": _base64(authority.pem),
+        "enable_mtls": True,
+        "verify_name_on_connect": True,
+        "close_link_on_expiration": True,
+    }
+    for side in sides:
+        section[f"{side}_certificate_base64"] = _base64(own.pem)
+        section[f"{side}_private_key_base64"] = _base64(own.key_pem)
+    return section
+
+
+def _endpoint(host: str) -> str:
+    return f"tls/[{host}]:{DEFAULT_PORT}" if ":" in host else f"tls/{host}:{DEFAULT_PORT}"
+
+
+def _base64(data: bytes) -> str:
+    return base64.b64encode(data).decode("ascii")

@@ -84,20 +84,11 @@ def _samples(mesh: Mesh, reference: Doubles, settings: ScoreSettings) -> Doubles
     if count == 0:
         return np.empty((0, 3))
     samples = trimesh.sample.sample_surface(surface, count, seed=settings.seed)[0]
-    low, high = np.array(_scored_box(reference, settings))
-    inside = ((samples >= low) & (samples <= high)).all(axis=1)
-    return thin(samples[inside], settings.voxel_m)
-
-
-def _scored_box(reference: Doubles, settings: ScoreSettings) -> tuple[list[float], list[float]]:
-    """Return the lower and upper corner of the truth's box, in which a mesh is scored, metres.
-
-    It is grown by the accuracy's cut: a level road is the very bottom of its box, and samples just
-    below it are errors to be counted.
-    """
+    # Below a level road, which is the very bottom of its box, samples are errors to be counted.
     margin_m = settings.accuracy_cut_m
     low, high = reference.min(axis=0) - margin_m, reference.max(axis=0) + margin_m
-    return low.tolist(), high.tolist()
+    inside = ((samples >= low) & (samples <= high)).all(axis=1)
+    return thin(samples[inside], settings.voxel_m)
 
 
 def _nearest(points: Doubles, places: Doubles, limit_m: float) -> Doubles:

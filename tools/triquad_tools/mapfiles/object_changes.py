@@ -82,13 +82,12 @@ def _clusters(sighting: Sighting, status: Status) -> tuple[Cluster, ...]:
     points = sighting.having(status)
     voxels = np.floor(points / sighting.leaf_m).astype(np.int64)
     members = (points[rows] for _, rows in rows_by_cell(clusters(voxels)[:, None]))
-    found = [_cluster(points) for points in members if len(points) >= LEAST_POINTS]
+    found = []
+    for some in members:
+        low, high = (tuple(end.round(3).tolist()) for end in (some.min(axis=0), some.max(axis=0)))
+        if len(some) >= LEAST_POINTS:
+            found.append(Cluster(low, high, len(some)))
     return tuple(sorted(found, key=lambda cluster: -cluster.points))
-
-
-def _cluster(points: Doubles) -> Cluster:
-    low, high = (tuple(end.round(3).tolist()) for end in (points.min(axis=0), points.max(axis=0)))
-    return Cluster(low, high, len(points))
 
 
 def _metres(place: Doubles) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ searched for by evaluating the map.
 import dataclasses
 import math
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 
@@ -110,11 +111,8 @@ def probes(record: MapRecord, seed: int) -> Doubles:
 
 
 def _distances(record: MapRecord, points: Doubles) -> Floats:
-    view = open_view(record)
-    try:
+    with closing(open_view(record)) as view:
         return view.query(points).sdf
-    finally:
-        view.close()
 
 
 def _with_tables(record: MapRecord, change: Callable[[VertexTable], VertexTable]) -> MapRecord:

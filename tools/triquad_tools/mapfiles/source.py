@@ -106,11 +106,15 @@ def read_source(path: Path, box: Box | None, training: bool) -> SourceMap:
         FormatError: the box is empty, or the file cannot be read.
         OSError: it cannot be read.
     """
-    source = None if box is None else _box(path, box, training)
-    if source is None:
-        file = read_map_file(path)
-        source = SourceMap(file.record, file.manifest.stamp_ns or None)
-    return cropped(source, box, training)
+    if box is not None:
+        with StoredMap.open(path) as stored:
+            manifest = stored.manifest
+            topics = {entry.key.topic for entry in manifest.entries}
+            if not (training and topics & set(TRAINING_TOPICS)):
+                part = SourceMap(stored.box(box[0], box[1]), manifest.stamp_ns or None)
+                return cropped(part, box, training)
+    file = read_map_file(path)
+    return cropped(SourceMap(file.record, file.manifest.stamp_ns or None), box, training)
 
 
 def cropped(source: SourceMap, box: Box | None, training: bool) -> SourceMap:
@@ -121,15 +125,6 @@ def cropped(source: SourceMap, box: Box | None, training: bool) -> SourceMap:
         if not record.regions or (source.record.has_evidence and not record.has_evidence):
             raise NothingLeftError("nothing of the map lies in the box of --crop")
     return SourceMap(record if training else without_training(record), source.stamp_ns)
-
-
-def _box(path: Path, box: Box, training: bool) -> SourceMap | None:
-    """Return what answers in a box; ``None`` if the whole file has to be read."""
-    with StoredMap.open(path) as stored:
-        topics = {entry.key.topic for entry in stored.manifest.entries}
-        if training and topics & set(TRAINING_TOPICS):
-            return None
-        return SourceMap(stored.box(box[0], box[1]), stored.manifest.stamp_ns or None)
 
 
 def checkpoint_at(folder: Path, when: str) -> CheckpointFile:

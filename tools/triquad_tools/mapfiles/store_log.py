@@ -13,7 +13,7 @@ from triquad_format.mapfile.checkpoint_folder import (
     set_aside,
 )
 from triquad_format.mapfile.files import FileBytes, named
-from triquad_format.mapfile.index import CheckpointIndex, MapIndex, open_index
+from triquad_format.mapfile.index import CheckpointIndex, open_index
 from triquad_format.mapfile.metadata import utc_time
 
 from triquad_tools.console.lines import print_line
@@ -94,15 +94,12 @@ def print_log(log: StoreLog) -> None:
 def _logged(file: CheckpointFile) -> LoggedCheckpoint:
     try:
         with closing(FileBytes(file.path)) as source, named(str(file.path)):
-            return _opened(file, open_index(source))
+            index = open_index(source)
+            in_store = index if isinstance(index, CheckpointIndex) else None
+            missing = len(in_store.missing()) if in_store else 0
     except (FormatError, OSError) as error:
         return LoggedCheckpoint(file.path.name, file.epoch, problem=str(error))
-
-
-def _opened(file: CheckpointFile, index: MapIndex | CheckpointIndex) -> LoggedCheckpoint:
     manifest = index.manifest
-    in_store = index if isinstance(index, CheckpointIndex) else None
-    missing = len(in_store.missing()) if in_store else 0
     return LoggedCheckpoint(
         file.path.name,
         file.epoch,

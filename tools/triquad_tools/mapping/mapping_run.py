@@ -1,61 +1,116 @@
-"""Making a map of a recording, scan by scan."""
+"""Making a map of a recording, scan by scan, and going on with one that was interrupted."""
 
+import hashlib
+import os
 import time
 from collections import Counter
+from dataclasses import dataclass, replace
+from pathlib import Path
 
-from triquad_server.errors import ScanRefusedError
+from triquad_format.errors import FormatError
+from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.writer import write_map
+from triquad_format.records.region import MapRecord
+from triquad_server.errors import ScanRefusedError, StoreError
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
 
+from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
-from triquad_tools.mapping.unfinished import UnfinishedMap
-from triquad_tools.recordings.selection import Selection
+from triquad_tools.recordings.opening import Selection
 
-_SAVE_PERIOD_S = 60.0
+MAP_NAME = "recording"
+_SAVE_PERIOD_S, _SAVE_SHARE = 60.0, 0.05  # at least, and of the time: a large map takes seconds
+_SECTIONS = {"field", "scan", "change", "training", "sources"}  # that a map depends on
+_KEY_DIGITS = 40  # the name of a map has 64 characters at most, and the number of scans follows
 
 
+def mapping_key(selection: Selection, settings: Settings) -> str:
+    """Return a key that identifies the scans, poses and settings; it can be the name of a map."""
+    digest = hashlib.sha256(settings.model_dump_json(include=_SECTIONS).encode())
+    digest.update(selection.way.encode())
+    for entry in selection.entries:
+        digest.update(f"{entry.stamp_ns} {entry.source}\n".encode())
+    return digest.hexdigest()[:_KEY_DIGITS]
+
+
+@dataclass(frozen=True)
+class UnfinishedMap:
+    """What an earlier run has saved."""
+
+    record: MapRecord | None = None
+    scans_taken: int = 0  # or refused: those that need not be taken again
+
+
+def read_unfinished(path: Path, key: str) -> UnfinishedMap:
+    """Return what an interrupted run left in a file; nothing where there is none.
+
+    Raises:
+        ToolError: it is of another recording or other settings, or is not ours.
+    """
+    if not os.path.lexists(path):
+        return UnfinishedMap()
+    try:
+        record = read_map(path)
+    except (FormatError, OSError) as error:
+        raise ToolError(
+            f"{path} holds something else; move it away, or give OUT another name ({error})"
+        ) from error
+    own_key, _, scans_taken = record.name.partition(".")
+    if own_key != key or not scans_taken.isdecimal():
+        raise ToolError(
+            f"{path} holds an unfinished map of another recording, or with other flags or "
+            "settings: give the same to go on with it, or delete it to begin again"
+        )
+    return UnfinishedMap(replace(record, name=MAP_NAME), int(scans_taken))
+
+
+@dataclass
 class MappingRun:
     """Integrates the scans of a recording and trains until nothing is left to learn.
 
-    What is done is saved each minute, from where an interrupted map goes on.
+    What is done is saved each minute, from where an interrupted map goes on: in a map file whose
+    map has the key for a name, and the number of scans that are in it.
     """
 
-    def __init__(self, mapper: Mapper, unfinished: UnfinishedMap, settings: Settings) -> None:
-        self._mapper = mapper
-        self._unfinished = unfinished
-        self._warnings = ScanWarnings(ScanQueue(1), settings)
-        self._next_save = time.monotonic() + _SAVE_PERIOD_S
-        self.scans_taken = 0  # or refused: those that need not be taken again
+    mapper: Mapper
+    settings: Settings
+    unfinished: Path
+    key: str
+    scans_taken: int  # or refused
+
+    def __post_init__(self) -> None:
+        self._warnings = ScanWarnings(ScanQueue(1), self.settings)
+        self._next_save_s = time.monotonic() + _SAVE_PERIOD_S
         self.refusals: Counter[str] = Counter()
         self.last_refusal = ""
 
-    def take(self, selection: Selection, start: int) -> None:
-        """Integrate the scans from number ``start`` on, and train between them."""
-        self.scans_taken = start
+    def take(self, selection: Selection) -> None:
+        """Integrate the scans that are left, and train between them."""
         total, entries = len(selection), selection.entries
         with progress("mapping", total) as report:
-            for scan in selection.scans(start):
+            for scan in selection.scans(self.scans_taken):
                 self._save_now_and_then()
                 entry = entries[self.scans_taken]
                 try:
                     stamp_s = entry.stamp_ns // 1_000_000_000
                     pose, source = scan.world_from_sensor, entry.source
-                    rays = self._mapper.ingest(scan.points, pose, stamp_s, source=source)
+                    rays = self.mapper.ingest(scan.points, pose, stamp_s, source=source)
                     self._warnings.add(source, len(scan.points), rays)
                     self._warnings.check()
                 except ScanRefusedError as error:
                     self.refusals[error.reason] += 1
                     self.last_refusal = f"scan {self.scans_taken}: {error}"
                 self.scans_taken += 1
-                self._mapper.train()
+                self.mapper.train()
                 report(self.scans_taken, f"{self.scans_taken} of {total} scans")
 
     def settle(self) -> None:
         """Save the map, train until nothing is left to learn, and save it again."""
         self._save()
-        mapper = self._mapper
+        mapper = self.mapper
         total = mapper.samples_left
         with progress("training", total) as report:
             while not mapper.settled:
@@ -66,9 +121,16 @@ class MappingRun:
         self._save()
 
     def _save_now_and_then(self) -> None:
-        if time.monotonic() >= self._next_save:
+        if time.monotonic() >= self._next_save_s:
             self._save()
 
     def _save(self) -> None:
-        self._unfinished.save(self._mapper, self.scans_taken)
-        self._next_save = time.monotonic() + _SAVE_PERIOD_S
+        """Write the map; where it cannot be written, what was saved before is untouched."""
+        started_s = time.monotonic()
+        record = self.mapper.changes_since(None).record
+        try:
+            write_map(replace(record, name=f"{self.key}.{self.scans_taken}"), self.unfinished)
+        except OSError as error:
+            raise StoreError(f"{self.unfinished} cannot be written: {error}") from error
+        ended_s = time.monotonic()
+        self._next_save_s = ended_s + max(_SAVE_PERIOD_S, (ended_s - started_s) / _SAVE_SHARE)

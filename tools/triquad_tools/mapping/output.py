@@ -11,6 +11,7 @@ from triquad_format.mapfile.writer import write_map
 from triquad_format.records.region import MapRecord
 
 from triquad_tools.console.command import ToolError
+from triquad_tools.console.lines import print_remark
 from triquad_tools.console.progress import progress
 from triquad_tools.mapfiles.crop import without_training
 from triquad_tools.mapfiles.meshfile import MESH_SUFFIXES
@@ -44,13 +45,36 @@ def write_output(record: MapRecord, path: Path, *, cell_m: float, training: bool
     Raises:
         OSError: it cannot be written.
     """
+    source = SourceMap(record if training else without_training(record), time.time_ns())
     if path.suffix != MAP_SUFFIX:
-        return export(SourceMap(record, time.time_ns()), path, cell_m=cell_m)
-    from triquad_map.preview import previews_of  # which triquad-pack can do without
+        return export(source, path, cell_m=cell_m)
+    size = write_map_file(source, path)
+    return f"{size:,} bytes, {len(record.regions)} regions, epoch {record.epoch}"
 
-    kept = record if training else without_training(record)
-    info = write_map(kept, path, stamp_ns=time.time_ns(), previews=previews_of(kept))
-    return f"{info.bytes:,} bytes, {len(record.regions)} regions, epoch {record.epoch}"
+
+def write_map_file(source: SourceMap, path: Path, *, feature_dtype: str = "<f2") -> int:
+    """Write a map file with a preview for MCAP viewers; return its size in bytes.
+
+    It has none, and that is told, if the libraries for it are not installed.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    record, stamp_ns, previews = source.record, source.stamp_ns, None
+    try:
+        from triquad_map.preview import previews_of
+
+        previews = previews_of(record, stamp_ns=stamp_ns)
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.startswith("triquad"):
+            raise
+        print_remark(
+            f"without a preview for MCAP viewers, as {error.name} is missing: "
+            "install triquad[preview]"
+        )
+    return write_map(
+        record, path, feature_dtype=feature_dtype, stamp_ns=stamp_ns, previews=previews
+    ).bytes
 
 
 def export(

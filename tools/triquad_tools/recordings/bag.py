@@ -1,10 +1,9 @@
 """Bags of ROS 1 and ROS 2 and MCAP files, message by message."""
 
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
@@ -16,84 +15,68 @@ _REPAIR = {".bag": "rosbag reindex", ".mcap": "mcap recover", ".db3": "ros2 bag 
 """What saves a damaged file, by the suffixes that bags have."""
 
 
-class Message(NamedTuple):
+@dataclass(frozen=True)
+class Message:
     """A message as it was recorded."""
 
-    connection: Connection
+    topic: str
+    kind: str
     recorded_ns: int  # nanoseconds since 1970, by the recorder's clock
     payload: bytes
-
-
-@dataclass(frozen=True)
-class OpenBag:
-    """A bag that can be read."""
-
-    bag: "Bag"
     reader: AnyReader
 
-    @property
-    def connections(self) -> list[Connection]:
-        """The recorded connections: several may be of one topic."""
-        return self.reader.connections
-
-    def messages(self, connections: Collection[Connection]) -> Iterator[Message]:
-        """Yield the messages of some connections in the order in which they were recorded.
-
-        Raises:
-            ToolError: the bag is damaged.
-        """
-        if not connections:
-            return
-        messages = self.reader.messages(connections)
-        while True:
-            try:
-                message = next(messages, None)
-            except Exception as error:  # a damaged file leads the readers anywhere
-                raise self.bag.damaged(error) from error
-            if message is None:
-                return
-            yield Message(*message)
-
-    def decode(self, message: Message) -> Any:
+    def decoded(self) -> Any:
         """Return the message as an object with the fields that its type has.
 
         Raises:
             ToolError: its bytes are no such message.
         """
-        kind, topic = message.connection.msgtype, message.connection.topic
         try:
-            return self.reader.deserialize(message.payload, kind)
-        except Exception as error:  # as above
-            text = f"{self.bag.path}: a message on {topic} is no {kind}: {error}"
+            return self.reader.deserialize(self.payload, self.kind)
+        except Exception as error:  # damaged bytes lead the decoders anywhere
+            text = f"{self.reader.paths[0]}: a message on {self.topic} is no {self.kind}: {error}"
             raise ToolError(text) from error
 
 
 @dataclass(frozen=True)
 class Bag:
-    """The path of a bag, which may be cut into several files."""
+    """A bag, which may be cut into several files.
+
+    What reads it raises a ToolError where it cannot be read, or is not whole.
+    """
 
     path: Path
     files: tuple[Path, ...]
 
-    @contextmanager
-    def open(self) -> Iterator[OpenBag]:
-        """Yield the bag, open for reading.
+    def connections(self) -> list[Connection]:
+        """Return the recorded connections: several may be of one topic."""
+        try:
+            with self._reader() as reader:
+                return list(reader.connections)
+        except Exception as error:  # a damaged file leads the readers anywhere
+            raise self._damaged(error) from error
 
-        Raises:
-            ToolError: it cannot be read, or is not whole.
+    def messages(self, *wanted: Callable[[Connection], bool]) -> Iterator[Message]:
+        """Yield the messages of the connections that are wanted first, then of others, and so on.
+
+        Each time they come in the order in which they were recorded.
         """
         try:
-            reader = AnyReader(self.files, default_typestore=get_typestore(Stores.LATEST))
-            reader.open()
-        except Exception as error:  # a damaged file leads the readers anywhere
-            raise self.damaged(error) from error
-        try:
-            yield OpenBag(self, reader)
-        finally:
-            reader.close()
+            with self._reader() as reader:
+                for is_wanted in wanted:
+                    connections = [each for each in reader.connections if is_wanted(each)]
+                    # Of no connections the reader would yield the messages of all.
+                    for each, recorded_ns, payload in (
+                        reader.messages(connections) if connections else ()
+                    ):
+                        yield Message(each.topic, each.msgtype, recorded_ns, payload, reader)
+        except Exception as error:  # as above
+            raise self._damaged(error) from error
 
-    def damaged(self, error: Exception) -> ToolError:
-        """Return the error for a bag that cannot be read."""
+    def _reader(self) -> AnyReader:
+        return AnyReader(self.files, default_typestore=get_typestore(Stores.LATEST))
+
+    def _damaged(self, error: Exception) -> ToolError:
         files = _bag_files(self.path) if self.path.is_dir() else self.files
         repairs = sorted({_REPAIR[file.suffix] for file in files})
         words = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

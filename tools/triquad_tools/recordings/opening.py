@@ -1,16 +1,23 @@
-"""Finding out what kind of recording a path is."""
+"""Finding out what kind of recording a path is, and choosing the part that is to be mapped."""
 
-from collections.abc import Callable
+import argparse
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from triquad_tools.console.command import ToolError
+from triquad_tools.console.lines import print_remark
 from triquad_tools.recordings.bag import find_bag
+from triquad_tools.recordings.cloud import points_in_range
 from triquad_tools.recordings.folders.cloud_folder import is_cloud_folder, read_cloud_folder
 from triquad_tools.recordings.folders.depth_folder import is_depth_folder, read_depth_folder
 from triquad_tools.recordings.folders.scan_folder import ScanFolder
-from triquad_tools.recordings.options import ReadingOptions
+from triquad_tools.recordings.recording import ReadingOptions, ScanEntry, options_of
 from triquad_tools.recordings.ros_recording import RosRecording
+from triquad_tools.sensors.sweep import PosedScan
 
 Recording = RosRecording | ScanFolder
 """A recording that was checked as a whole, so that its errors are known."""
@@ -18,46 +25,12 @@ Recording = RosRecording | ScanFolder
 _FLAGS = {"transforms": "--transform", "deskew": "--no-deskew"}
 """The flags whose names are not those of the choices that they set."""
 
-
-@dataclass(frozen=True)
-class _Reader:
-    """The reader of one kind of recording."""
-
-    kind: str  # in words, for messages
-    options: frozenset[str]  # the choices that mean something for this kind
-    is_of_kind: Callable[[Path], bool]  # whether a path that exists holds such a recording
-    read: Callable[[Path, ReadingOptions], Recording]
-
-
-def _read_bag(path: Path, options: ReadingOptions) -> Recording:
-    bag = find_bag(path)
-    assert bag is not None  # or another reader would have been chosen
-    return RosRecording(bag, options)
-
-
-_READERS = (
-    _Reader(
-        "a bag",
-        frozenset(
-            {"topics", "poses", "map_frame", "body_frame", "transforms", "recorder_clock", "stride"}
-        ),
-        lambda path: find_bag(path) is not None,
-        _read_bag,
-    ),
-    _Reader(
-        "a folder of depth images",
-        frozenset({"trajectory", "intrinsics", "units_per_metre", "stride"}),
-        is_depth_folder,
-        read_depth_folder,
-    ),
-    _Reader(
-        "a folder of clouds",
-        frozenset({"trajectory", "points_in", "deskew"}),
-        is_cloud_folder,
-        read_cloud_folder,
-    ),
-)
-"""All readers; the first whose kind a path is reads it."""
+_OF_BAGS = {
+    "topics", "poses", "map_frame", "body_frame", "transforms", "recorder_clock", "stride",
+}  # fmt: skip
+_OF_DEPTH = {"trajectory", "intrinsics", "units_per_metre", "stride"}
+_OF_CLOUDS = {"trajectory", "points_in", "deskew"}
+"""The choices that mean something for each kind of recording."""
 
 
 def open_recording(path: Path, options: ReadingOptions) -> Recording:
@@ -68,21 +41,94 @@ def open_recording(path: Path, options: ReadingOptions) -> Recording:
     """
     if not path.exists():
         raise ToolError(f"{path}: no such file or folder")
-    for reader in _READERS:
-        if reader.is_of_kind(path):
-            _refuse_others(path, reader, options)
-            return reader.read(path, options)
+    bag = find_bag(path)
+    if bag is not None:
+        _refuse_others(f"{path} is a bag", _OF_BAGS, options)
+        return RosRecording(bag, options)
+    if is_depth_folder(path):
+        _refuse_others(f"{path} is a folder of depth images", _OF_DEPTH, options)
+        return read_depth_folder(path, options)
+    if is_cloud_folder(path):
+        _refuse_others(f"{path} is a folder of clouds", _OF_CLOUDS, options)
+        return read_cloud_folder(path, options)
     raise ToolError(
         f"{path}: no recording that is understood: give a bag of ROS, an MCAP file, or a folder as "
         "docs/tools.md describes them"
     )
 
 
-def _refuse_others(path: Path, reader: _Reader, options: ReadingOptions) -> None:
+def _refuse_others(what: str, meaningful: set[str], options: ReadingOptions) -> None:
     """Refuse choices that are not for the kind of recording that was found."""
     for name in options.given:
-        if name not in reader.options:
+        if name not in meaningful:
             flag = _FLAGS.get(name, f"--{name.replace('_', '-')}")
-            raise ToolError(
-                f"{path} is {reader.kind}, for which {flag} means nothing: leave it out"
-            )
+            raise ToolError(f"{what}, for which {flag} means nothing: leave it out")
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Some scans of a recording, without points that are too near."""
+
+    recording: Recording
+    indices: Sequence[int]
+    range_min_m: float
+    way: str  # in which it is read: another one may give other scans
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    @property
+    def entries(self) -> list[ScanEntry]:
+        """The time and sensor of each scan."""
+        entries = self.recording.entries
+        return [entries[index] for index in self.indices]
+
+    def scans(self, start: int = 0) -> Iterator[PosedScan]:
+        """Yield the scans from number ``start`` on, one after the other."""
+        for scan in self.recording.read(self.indices[start:]):
+            points = points_in_range(np.asarray(scan.points, np.float32), self.range_min_m)
+            yield PosedScan(points, scan.world_from_sensor)
+
+
+def open_selected(options: argparse.Namespace) -> Selection:
+    """Return the recording of the arguments and the scans they choose; its remarks are printed.
+
+    Raises:
+        ToolError: it cannot be read, or no scan is left to map.
+    """
+    reading = options_of(options)
+    recording = open_recording(options.recording, reading)
+    for remark in recording.remarks:
+        print_remark(f"{options.recording}: {remark}")
+    entries = recording.entries
+    if not entries:
+        raise ToolError(f"{options.recording}: nothing of it can be mapped")
+    indices = _chosen(entries, options)
+    if not indices:
+        raise ToolError(
+            f"{options.recording}: no scan is left of {len(entries)} in {length_s(entries):.1f} s: "
+            "see --start, --end and --every"
+        )
+    way = repr((options.recording.resolve(), reading, options.range_min))
+    return Selection(recording, indices, options.range_min, way)
+
+
+def length_s(entries: Sequence[ScanEntry]) -> float:
+    """Return the seconds between the first and the last of some scans."""
+    stamps = [entry.stamp_ns for entry in entries]
+    return (max(stamps) - min(stamps)) / 1e9
+
+
+def _chosen(entries: Sequence[ScanEntry], options: argparse.Namespace) -> list[int]:
+    """Return the numbers of scans within the times, every Nth of each sensor."""
+    first_ns = min(entry.stamp_ns for entry in entries)
+    end_s = float("inf") if options.end is None else options.end
+    before: Counter[str] = Counter()  # scans of each sensor
+    chosen: list[int] = []
+    for index, entry in enumerate(entries):
+        nth = before[entry.source] % options.every == 0
+        before[entry.source] += 1
+        timely = options.start <= (entry.stamp_ns - first_ns) / 1e9 <= end_s
+        if nth and timely:
+            chosen.append(index)
+    return chosen

@@ -1,9 +1,22 @@
-"""What recordings tell of their content, whatever kind of file or folder holds them."""
+"""What a user may say of a recording, and what it tells, whatever kind of file or folder it is."""
 
-from dataclasses import dataclass
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Literal
+
+from triquad_client.depth_image import Intrinsics
+from triquad_client.pose import Pose
+
+from triquad_tools.console.arguments import count, not_negative, positive
+from triquad_tools.sensors.motion.frame_tree import STATIC, Transform
+from triquad_tools.sensors.ros.header import frame_name
 
 DEFAULT_SOURCE = "default"
 """The source of recordings that name no sensor: the client's default, too."""
+
+_Add = Callable[..., argparse.Action]
 
 
 @dataclass(frozen=True)
@@ -23,3 +36,115 @@ class Stream:
     count: int
     use: str  # in plain words: what is made of it, or why nothing
     frame: str = ""  # of the sensor, or parent and child of poses
+
+
+@dataclass(frozen=True)
+class ReadingOptions:
+    """The choices for reading a recording; those for another kind of recording stay unset."""
+
+    topics: tuple[str, ...] = ()  # of clouds or depth images
+    poses: str | None = None  # topic of odometry or poses, or "tf"
+    map_frame: str | None = None
+    body_frame: str | None = None  # whose poses those of the topic are
+    transforms: tuple[Transform, ...] = ()  # that the recording lacks
+    recorder_clock: bool = False  # stamps are when a message was recorded
+    trajectory: Path | None = None  # the file of poses; else that with a usual name
+    points_in: Literal["sensor", "world"] | None = None  # frame of clouds; else sensor, and checked
+    deskew: bool = True  # take the sensor's motion out of clouds whose points have times
+    intrinsics: Intrinsics | None = None  # of depth images; else those of a file in the folder
+    units_per_metre: float | None = None  # of a pixel; else 5000 for TUM RGB-D, 1000 for others
+    stride: int = 1  # take every N-th row and column of depth images
+
+    @property
+    def given(self) -> list[str]:
+        """The names of the choices that differ from the defaults."""
+        return [field.name for field in fields(self) if getattr(self, field.name) != field.default]
+
+
+def add_recording(parser: argparse.ArgumentParser) -> None:
+    """Let a command take a recording, and choose from it."""
+    parser.add_argument(
+        "recording",
+        type=Path,
+        metavar="RECORDING",
+        help="a bag of ROS 1 or ROS 2, an MCAP file, or a folder of scans (docs/tools.md)",
+    )
+    _add_choice(parser.add_argument_group("which scans").add_argument)
+    _add_ros(parser.add_argument_group("bags and MCAP files").add_argument)
+    _add_folder(parser.add_argument_group("folders of clouds or depth images").add_argument)
+
+
+def options_of(options: argparse.Namespace) -> ReadingOptions:
+    """Return how the arguments want a recording to be read."""
+    values = {field.name: getattr(options, field.name) for field in fields(ReadingOptions)}
+    for name in ("topics", "transforms"):
+        values[name] = tuple(values[name])
+    return ReadingOptions(**values)
+
+
+def _add_choice(add: _Add) -> None:
+    add("--start", type=not_negative, default=0.0, metavar="S", help="seconds after the first scan")
+    add("--end", type=positive, metavar="S", help="seconds after the first scan")
+    add("--every", type=count, default=1, metavar="N", help="take every Nth scan of each sensor")
+    nearer = "leave out nearer points: the vehicle's own body (default: 0)"
+    add("--range-min", type=not_negative, default=0.0, metavar="M", help=nearer)
+
+
+def _add_ros(add: _Add) -> None:
+    topics = "of clouds or depth images (default: all clouds, or else all depth images)"
+    add("--topics", nargs="+", default=[], metavar="TOPIC", help=topics)
+    poses = "of odometry or poses, or 'tf' for transforms (default: what places the most scans)"
+    add("--poses", metavar="TOPIC", help=poses)
+    to_map_in = "to map in (default: map, odom, world or the root)"
+    add("--map-frame", type=frame_name, metavar="FRAME", help=to_map_in)
+    add("--body-frame", type=frame_name, metavar="FRAME", help="whose poses those of --poses are")
+    add(
+        "--transform",
+        dest="transforms",
+        type=transform,
+        action="append",
+        default=[],
+        metavar="'PARENT CHILD X Y Z QX QY QZ QW'",
+        help="that the recording lacks, metres and a quaternion, repeatable",
+    )
+    clock = "go by when messages were recorded, where their stamps are of different clocks"
+    add("--recorder-clock", action="store_true", help=clock)
+
+
+def _add_folder(add: _Add) -> None:
+    add("--trajectory", type=Path, metavar="FILE", help="of poses (default: one with a usual name)")
+    frame = "frame of the points of clouds (default: sensor, and checked)"
+    add("--points-in", choices=("sensor", "world"), help=frame)
+    skewed = "clouds are free of motion, though they have times"
+    add("--no-deskew", dest="deskew", action="store_false", help=skewed)
+    camera = "of the depth camera, pixels (default: of a file in the folder)"
+    add("--intrinsics", type=_intrinsics, metavar="FX,FY,CX,CY", help=camera)
+    units = "of pixels of depth (default: 5000 for TUM RGB-D, 1000 for others)"
+    add("--units-per-metre", type=positive, metavar="N", help=units)
+    stride = "take every Nth row and column of depth images"
+    add("--stride", type=count, default=1, metavar="N", help=stride)
+
+
+def transform(text: str) -> Transform:
+    """Return a transform such as ``base_link lidar 0 0 1.5 0 0 0 1``: position and quaternion."""
+    try:
+        parent, child, *numbers = text.split()
+        x, y, z, *quaternion = map(float, numbers)
+        pose = Pose((x, y, z), quaternion)
+        pose.matrix()
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}: use 'PARENT CHILD X Y Z QX QY QZ QW', such as "
+            f"'base_link lidar 0 0 1.5 0 0 0 1' ({error})"
+        ) from error
+    return Transform(frame_name(parent), frame_name(child), STATIC, pose)
+
+
+def _intrinsics(text: str) -> Intrinsics:
+    try:
+        fx, fy, cx, cy = map(float, text.split(","))
+        return Intrinsics(fx, fy, cx, cy)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}: use FX,FY,CX,CY in pixels, such as 525,525,319.5,239.5 ({error})"
+        ) from error

@@ -2,24 +2,24 @@
 
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
-from itertools import chain
 from typing import Any
 
+from rosbags.interfaces import Connection
 from triquad_format.errors import InvalidInputError
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
 from triquad_tools.recordings.bag import Bag, Message
-from triquad_tools.sensors.errors import NoScanError
-from triquad_tools.sensors.motion.frame_tree import STATIC, FrameTree, Transform
-from triquad_tools.sensors.motion.track import Track
+from triquad_tools.sensors.motion.frame_tree import STATIC, FrameTree, Track, Transform
 from triquad_tools.sensors.ros import type_store
 from triquad_tools.sensors.ros.depth_camera import is_depth
 from triquad_tools.sensors.ros.message_reader import MessageReader
+from triquad_tools.sensors.sweep import NoScanError
 
-_SCANS = (type_store.POINT_CLOUD, type_store.IMAGE)
 _TRANSFORMS = (type_store.TF, type_store.TF_OF_ROS_1)
 _POSES = (type_store.ODOMETRY, type_store.POSE)
+_SCANS = (type_store.POINT_CLOUD, type_store.IMAGE)
+_USED = (type_store.CAMERA_INFO, *_TRANSFORMS, *_POSES, *_SCANS)
 
 
 @dataclass(frozen=True)
@@ -67,30 +67,28 @@ class RosContent:
         self._colours: set[str] = set()  # topics of images that hold no depth
         self._numbers: Counter[str] = Counter()
         self._reader = reader
-        with bag.open() as opened:
-            for connection in opened.connections:
-                self.kinds[connection.topic] = connection.msgtype
-                self.counts[connection.topic] += connection.msgcount
-            # Cameras first: an image may come before what is known of its camera.
-            cameras = [c for c in opened.connections if c.msgtype == type_store.CAMERA_INFO]
-            others = [
-                c for c in opened.connections if c.msgtype in (*_SCANS, *_TRANSFORMS, *_POSES)
-            ]
-            total = sum(connection.msgcount for connection in (*cameras, *others))
-            messages = chain(opened.messages(cameras), opened.messages(others))
-            done = 0
-            with progress("looking through the recording", total) as report:
-                for done, message in enumerate(messages, start=1):
-                    if message.connection.topic not in self._colours:
-                        self._take(message, opened.decode(message))
-                    report(done, f"{done} of {total} messages")
-            self.missing = total - done
+        total = 0
+        for connection in bag.connections():
+            self.kinds[connection.topic] = connection.msgtype
+            self.counts[connection.topic] += connection.msgcount
+            total += connection.msgcount if connection.msgtype in _USED else 0
+        # Cameras first: an image may come before what is known of its camera.
+        messages = bag.messages(
+            _is_camera, lambda one: one.msgtype in _USED and not _is_camera(one)
+        )
+        done = 0
+        with progress("looking through the recording", total) as report:
+            for done, message in enumerate(messages, start=1):
+                if message.topic not in self._colours:
+                    self._take(message, message.decoded())
+                report(done, f"{done} of {total} messages")
+        self.missing = total - done
 
     def _take(self, message: Message, decoded: Any) -> None:
-        topic, kind = message.connection.topic, message.connection.msgtype
+        topic, kind = message.topic, message.kind
         try:
             if kind == type_store.CAMERA_INFO:
-                self._reader.remember_camera(topic, decoded)
+                self._reader.cameras[topic] = decoded
             elif kind in (*_TRANSFORMS, *_POSES):
                 static, came_ns = topic.endswith("tf_static"), message.recorded_ns
                 for each in self._reader.transforms(kind, decoded, came_ns, static=static):
@@ -103,12 +101,11 @@ class RosContent:
             raise ToolError(f"{topic}: messages are not as {kind} is defined: {error}") from error
 
     def _add_cloud(self, message: Message, decoded: Any) -> None:
-        topic = message.connection.topic
+        topic = message.topic
         number = self._numbers[topic]
         self._numbers[topic] += 1
         try:
-            kind, came_ns = message.connection.msgtype, message.recorded_ns
-            sweep = self._reader.sweep(topic, kind, decoded, came_ns)
+            sweep = self._reader.sweep(topic, message.kind, decoded, message.recorded_ns)
         except NoScanError as error:
             self.clouds.append(SeenCloud(topic, number, problem=error))
             return
@@ -129,3 +126,7 @@ class RosContent:
         known.parent, known.child = transform.parent, transform.child
         assert transform.stamp_ns is not STATIC
         known.track.add(transform.stamp_ns, position, quaternion)
+
+
+def _is_camera(connection: Connection) -> bool:
+    return connection.msgtype == type_store.CAMERA_INFO

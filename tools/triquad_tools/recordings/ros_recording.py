@@ -1,22 +1,24 @@
-"""Recordings of ROS: clouds and depth images, placed by the poses that were recorded with them."""
+"""Recordings of ROS: clouds and depth images, placed by the recorded poses that place the most."""
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
-from typing import Any
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.bag import Bag, Message
-from triquad_tools.recordings.options import ReadingOptions
-from triquad_tools.recordings.pose_source import TF, PoseSource, choose_poses
-from triquad_tools.recordings.recording import ScanEntry, Stream
+from triquad_tools.recordings.recording import ReadingOptions, ScanEntry, Stream
 from triquad_tools.recordings.ros_content import RosContent, SeenCloud
-from triquad_tools.sensors.errors import NoScanError
-from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES
+from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES, FrameTree
 from triquad_tools.sensors.motion.placing import place
 from triquad_tools.sensors.ros import type_store
 from triquad_tools.sensors.ros.header import source_of_topic
 from triquad_tools.sensors.ros.message_reader import MessageReader
-from triquad_tools.sensors.sweep import PosedScan
+from triquad_tools.sensors.sweep import NoScanError, NoTransformError, PosedScan
+
+TF = "tf"
+"""Stands for all transforms, whatever their topics."""
 
 _CLOCKS = (
     "no cloud's stamp lies within the times of the poses: where they are of another clock, "
@@ -42,6 +44,79 @@ _NO_POSES = (
 _OF_TIME = ("pose_early", "pose_late")
 
 
+@dataclass(frozen=True)
+class PoseSource:
+    """Poses that may be used, and the frame to map in."""
+
+    name: str  # a topic, or TF
+    frames: FrameTree
+    target: str
+    body: str  # the frame whose poses they are, or one that hangs on it
+    assumed: bool = False  # nothing says that they are its poses
+
+    def find(self, cloud: SeenCloud) -> NoTransformError | None:
+        """Return why the pose of a cloud is not known; None if it is."""
+        times = np.array([cloud.first_ns, cloud.last_ns], np.int64)
+        try:
+            self.frames.poses(self.target, cloud.frame, times)
+        except NoTransformError as error:
+            return error
+        return None
+
+
+def choose_poses(
+    content: RosContent, clouds: Sequence[SeenCloud], options: ReadingOptions
+) -> PoseSource | None:
+    """Return the source that places the most clouds; None if there is no pose at all.
+
+    Raises:
+        ToolError: the source that was asked for does not exist.
+    """
+    for transform in options.transforms:
+        content.frames.add(transform)
+    frame = clouds[0].frame
+    names = [TF, *content.poses]
+    if options.poses is not None:
+        if options.poses not in names:
+            raise ToolError(
+                f"--poses {options.poses}: there are no such poses, only {', '.join(names)}"
+            )
+        names = [options.poses]
+    sources = [
+        _of_tf(content.frames, frame, options)
+        if name == TF
+        else _of_topic(content, name, frame, options)
+        for name in names
+    ]
+    # Transforms that always hold are no poses.
+    moving = [source for source in sources if source.frames.moves(source.target, source.body)]
+
+    def merit(source: PoseSource) -> tuple[int, bool]:
+        placed = sum(source.find(cloud) is None for cloud in clouds)
+        return placed, source.target in ROOT_NAMES
+
+    return max(moving, key=merit, default=None)
+
+
+def _of_tf(frames: FrameTree, frame: str, options: ReadingOptions) -> PoseSource:
+    """Return all transforms. If they do not reach the sensor, finding a cloud says so."""
+    body = frame
+    if not frames.moves(frames.root(frame), frame):
+        body = next(iter(frames.moving), frame)
+    return PoseSource(TF, frames, options.map_frame or frames.fixed_frame(body), body)
+
+
+def _of_topic(content: RosContent, topic: str, frame: str, options: ReadingOptions) -> PoseSource:
+    """Return the poses of a topic, in the tree of all transforms but those that say the same."""
+    poses = content.poses[topic]
+    # Where a topic does not name the body, it is what the sensor is fixed to.
+    body = options.body_frame or poses.child or content.frames.root(frame)
+    frames = content.frames.with_track(poses.parent, body, poses.track)
+    target = options.map_frame or frames.fixed_frame(body)
+    assumed = not (options.body_frame or poses.child)
+    return PoseSource(topic, frames, target, body, assumed=assumed)
+
+
 class RosRecording:
     """A bag or an MCAP file with clouds or depth images, and poses."""
 
@@ -58,7 +133,6 @@ class RosRecording:
         self._poses: PoseSource | None = None
         self._placed: list[SeenCloud] = []
         self._left_out: dict[tuple[str, str], list[SeenCloud]] = defaultdict(list)
-        self._reasons: dict[tuple[str, str], str] = {}  # the first, by topic and its short key
         self._place_clouds(options)
 
     @property
@@ -95,29 +169,26 @@ class RosRecording:
         wanted = {(self._placed[i].topic, self._placed[i].number) for i in indices}
         topics = {topic for topic, _ in wanted}
         numbers: Counter[str] = Counter()
-        with self._bag.open() as opened:
-            connections = [c for c in opened.connections if c.topic in topics]
-            for message in opened.messages(connections):
-                topic = message.connection.topic
-                key = topic, numbers[topic]
-                numbers[topic] += 1
-                if key in wanted:
-                    wanted.discard(key)
-                    yield self._read(message, opened.decode(message))
+        for message in self._bag.messages(lambda connection: connection.topic in topics):
+            key = message.topic, numbers[message.topic]
+            numbers[message.topic] += 1
+            if key in wanted:
+                wanted.discard(key)
+                yield self._read(message)
         if wanted:
             raise ToolError(
                 f"{self._bag.path}: {len(wanted)} scans are no longer there; has it changed since "
                 "it was looked through?"
             )
 
-    def _read(self, message: Message, decoded: Any) -> PosedScan:
+    def _read(self, message: Message) -> PosedScan:
         assert self._poses is not None
-        topic, kind = message.connection.topic, message.connection.msgtype
+        decoded, came_ns = message.decoded(), message.recorded_ns
         try:
-            sweep = self._reader.sweep(topic, kind, decoded, message.recorded_ns)
+            sweep = self._reader.sweep(message.topic, message.kind, decoded, came_ns)
             return place(sweep, self._poses.frames, self._poses.target)
         except NoScanError as error:
-            raise ToolError(f"{self._bag.path}: a message on {topic}: {error}") from error
+            raise ToolError(f"{self._bag.path}: a message on {message.topic}: {error}") from error
 
     def _place_clouds(self, options: ReadingOptions) -> None:
         """Choose the poses, and find out which clouds they place."""
@@ -132,8 +203,8 @@ class RosRecording:
                 newest_ns[cloud.topic] = cloud.stamp_ns
                 self._placed.append(cloud)
             else:
-                self._left_out[cloud.topic, problem.reason].append(cloud)
-                self._reasons.setdefault((cloud.topic, problem.reason), str(problem))
+                left_out = replace(cloud, problem=problem)
+                self._left_out[cloud.topic, problem.reason].append(left_out)
 
     def _problem(self, cloud: SeenCloud, newest_ns: dict[str, int]) -> NoScanError | None:
         if cloud.problem is not None:
@@ -147,8 +218,7 @@ class RosRecording:
     def _left_out_line(self, topic: str, reason: str) -> str:
         clouds = self._left_out[topic, reason]
         of_topic = sum(cloud.topic == topic for cloud in self._content.clouds)
-        why = self._reasons[topic, reason]
-        line = f"{topic}: {len(clouds)} of {of_topic} are left out: {why}"
+        line = f"{topic}: {len(clouds)} of {of_topic} are left out: {clouds[0].problem}"
         if reason == "no_transform":
             return f"{line}; {_NO_TRANSFORM.format(frame=clouds[0].frame)}"
         if reason in _OF_TIME and not any(placed.topic == topic for placed in self._placed):

@@ -41,35 +41,38 @@ def parse_numbers(place: str, words: Sequence[str]) -> list[float]:
     Raises:
         ToolError: a word is none.
     """
-    return [_parse_number(place, word) for word in words]
+    numbers = []
+    for word in words:
+        try:
+            numbers.append(float(word))
+        except ValueError:
+            raise ToolError(f"{place}: {word!r} is not a number") from None
+        if not math.isfinite(numbers[-1]):
+            raise ToolError(f"{place}: {word!r} is not finite")
+    return numbers
 
 
-def _parse_number(place: str, word: str) -> float:
-    try:
-        number = float(word)
-    except ValueError:
-        raise ToolError(f"{place}: {word!r} is not a number") from None
-    if not math.isfinite(number):
-        raise ToolError(f"{place}: {word!r} is not finite")
-    return number
-
-
-def parse_stamp(place: str, word: str, earliest_ns: int) -> int:
-    """Convert decimal seconds to nanoseconds: a float of seconds since 1970 is off by 100 ns.
+def parse_stamps(lines: Sequence[Line]) -> list[int]:
+    """Return the times with which lines begin, nanoseconds: as floats they would be off by 100 ns.
 
     Raises:
-        ToolError: the word is no number of seconds, or before ``earliest_ns``, the time of the
-            line above.
+        ToolError: a line begins with no number of seconds, or with one before that of the line
+            above.
     """
-    try:
-        stamp_ns = int(Decimal(word) * 10**9)
-    except (ArithmeticError, ValueError):  # those of decimal numbers among them
-        raise ToolError(f"{place}: {word!r} is not a number of seconds") from None
-    if not 0 <= stamp_ns < 2**63:
-        raise ToolError(f"{place}: {word} s is out of range: times are seconds, from 0 on")
-    if stamp_ns < earliest_ns:
-        raise ToolError(f"{place}: {word} s is before the line above: sort the lines by time")
-    return stamp_ns
+    stamps = [0]
+    for line in lines:
+        word = line.words[0]
+        try:
+            stamps.append(int(Decimal(word) * 10**9))
+        except (ArithmeticError, ValueError):  # those of decimal numbers among them
+            raise ToolError(f"{line.place}: {word!r} is not a number of seconds") from None
+        if not 0 <= stamps[-1] < 2**63:
+            raise ToolError(f"{line.place}: {word} s is out of range: times are seconds, from 0 on")
+        if stamps[-1] < stamps[-2]:
+            raise ToolError(
+                f"{line.place}: {word} s is before the line above: sort the lines by time"
+            )
+    return stamps[1:]
 
 
 def parse_rigid(place: str, words: Sequence[str]) -> Doubles:

@@ -1,6 +1,8 @@
-"""The node as which the bridge shows in the graph of ROS: ``/triquad``."""
+"""The graph of ROS: the node as which the bridge shows, ``/triquad``, and the tokens of others."""
 
 import itertools
+import logging
+from collections.abc import Callable
 from typing import Any
 
 import zenoh
@@ -8,11 +10,16 @@ import zenoh
 from triquad_tools.ros2.topics import (
     Announcement,
     Delivery,
+    End,
     Entity,
     bridge_token,
-    rmw_node_token,
+    bridge_tokens,
+    read_token,
     rmw_token,
+    rmw_tokens,
 )
+
+_log = logging.getLogger("triquad_ros2")
 
 NODE_NAME = "triquad"
 
@@ -26,7 +33,7 @@ class Node:
         self._session_id = str(session.zid())
         self._numbers = itertools.count()
         self._tokens: list[Any] = []
-        self._declare(rmw_node_token(domain, self._entity()))
+        self._declare(self._entity().rmw_prefix(domain, "NN"))
 
     def announce(self, what: Announcement, delivery: Delivery) -> None:
         """Announce it to nodes of rmw_zenoh."""
@@ -46,3 +53,30 @@ class Node:
 
     def _declare(self, token: str) -> None:
         self._tokens.append(self._session.liveliness().declare_token(token))
+
+
+def watch_tokens(
+    session: zenoh.Session, domain: int, end: End, appeared: Callable[[Announcement], None]
+) -> list[Any]:
+    """Report all others that have one end of a topic, existing ones first.
+
+    ``appeared`` is called from threads of Zenoh, and must not wait for long. What is returned is to
+    be undeclared.
+    """
+    own_chunk = f"/{session.zid()}/"
+
+    def receive(sample: zenoh.Sample) -> None:
+        token = str(sample.key_expr)
+        if sample.kind != zenoh.SampleKind.PUT or own_chunk in token:
+            return
+        announcement = read_token(token)
+        try:
+            if announcement is not None:
+                appeared(announcement)
+        except zenoh.ZError as error:  # names that cannot stand in a key
+            _log.debug("%s cannot be used: %s", token, error)
+
+    return [
+        session.liveliness().declare_subscriber(key, receive, history=True)
+        for key in (rmw_tokens(domain, end), bridge_tokens(end))
+    ]

@@ -1,34 +1,140 @@
-"""Options of the bridge."""
+"""Options of the bridge: which topics are received and as what, and what is published."""
 
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 from triquad_client import Bounds
 from triquad_format.records.arrays import Doubles
 
-from triquad_tools.ros2.topic_choice import TopicChoice
+from triquad_tools.ros2.topics import Topic, bridge_key, rmw_key
+from triquad_tools.sensors.ros.depth_camera import camera_topic
+from triquad_tools.sensors.ros.type_store import (
+    CAMERA_INFO,
+    IMAGE,
+    ODOMETRY,
+    POINT_CLOUD,
+    POSE,
+    TF,
+)
+
+TF_POSES = "tf"
+"""Stands for transforms in place of a topic of poses."""
 
 MAX_GRID_CELLS = 250_000
 
 
-@dataclass(frozen=True)
-class ScanOptions:
-    """Options for turning messages into scans."""
+class Role(Enum):
+    """The role of messages."""
 
-    depth_stride: int = 2  # every how many rows and columns of a depth image one is taken
-    body_frame: str = "base_link"  # whose pose a topic of PoseStamped gives
-    map_frame: str = ""  # "": map, odom or world, the first that the transforms have
-    by_arrival: bool = False  # stamps are when messages arrived, not those of their headers
-    wait_s: float = 2.0  # for how long a scan waits for its transforms
+    CLOUD = "cloud"
+    DEPTH = "depth image"
+    CAMERA_INFO = "camera info"
+    TF = "transforms"
+    TF_STATIC = "static transforms"
+    POSE = "pose"
+
+    @property
+    def brings_scans(self) -> bool:
+        """Whether a scan is made of each message; others say something about scans."""
+        return self in (Role.CLOUD, Role.DEPTH)
+
+
+TYPES: dict[Role, tuple[str, ...]] = {
+    Role.CLOUD: (POINT_CLOUD,),
+    Role.DEPTH: (IMAGE,),
+    Role.CAMERA_INFO: (CAMERA_INFO,),
+    Role.TF: (TF,),
+    Role.TF_STATIC: (TF,),
+    Role.POSE: (ODOMETRY, POSE),
+}
+"""The types that messages may have."""
+
+
+@dataclass(frozen=True)
+class Feed:
+    """A key expression and what comes on it."""
+
+    role: Role
+    key: str
+    topic_name: str | None  # None: each key of rmw_zenoh names its own
+
+
+@dataclass(frozen=True)
+class TopicChoice:
+    """The topics that are wanted, by their full names."""
+
+    domain: int = 0
+    prefix: str = ""  # of all names: "", or with a leading slash
+    clouds: tuple[str, ...] = ()  # (): all that there are, or none where there are depth images
+    depth: tuple[str, ...] = ()
+    poses: str | None = None  # None: from transforms
+
+    @property
+    def takes_any_cloud(self) -> bool:
+        """Whether all clouds are wanted: a depth camera publishes what it sees as clouds too."""
+        return not self.clouds and not self.depth
+
+    @property
+    def mesh(self) -> str:
+        """The topic on which the mesh is published."""
+        return full_name(self.prefix, "triquad/mesh")
+
+    @property
+    def grid(self) -> str:
+        """The topic on which the occupancy grid is published."""
+        return full_name(self.prefix, "triquad/grid")
+
+    def feeds(self) -> Iterator[Feed]:
+        """Return what to subscribe to from the start.
+
+        Where clouds are not chosen, those of zenoh-bridge-ros2dds are found by their tokens, since
+        their keys do not give types.
+        """
+        for role, names in self._names().items():
+            for name in names:
+                for type_name in TYPES[role]:
+                    yield Feed(role, rmw_key(self.domain, Topic(name, type_name)), name)
+                yield Feed(role, bridge_key(name), name)
+        if self.takes_any_cloud:
+            anywhere = Topic(f"{self.prefix}/**", POINT_CLOUD)
+            yield Feed(Role.CLOUD, rmw_key(self.domain, anywhere), None)
+
+    def wants(self, topic: Topic) -> Role | None:
+        """Return the role of a topic that was found."""
+        for role, names in self._names().items():
+            if topic.name in names and topic.type_name in TYPES[role]:
+                return role
+        is_cloud = topic.type_name == POINT_CLOUD and topic.name.startswith(f"{self.prefix}/")
+        return Role.CLOUD if is_cloud and self.takes_any_cloud else None
+
+    def _names(self) -> dict[Role, tuple[str, ...]]:
+        """Return the topics whose names are known."""
+        infos = tuple(camera_topic(name) for name in self.depth)
+        names = {
+            Role.CLOUD: self.clouds,
+            Role.DEPTH: self.depth,
+            Role.CAMERA_INFO: tuple(dict.fromkeys(infos)),
+            Role.TF_STATIC: (f"{self.prefix}/tf_static",),
+        }
+        if self.poses is None:
+            return {**names, Role.TF: (f"{self.prefix}/tf",)}
+        return {**names, Role.POSE: (self.poses,)}
+
+
+def full_name(prefix: str, name: str) -> str:
+    """Return a topic's name with a leading slash, behind ``prefix``."""
+    return f"{prefix}/{name.strip('/')}"
 
 
 @dataclass(frozen=True)
 class SliceShape:
     """The slice of the map that is published as an occupancy grid."""
 
-    height_m: float = 0.5  # in the map frame
-    side_m: float = 40.0
-    cell_m: float = 0.1
+    height_m: float  # in the map frame
+    side_m: float
+    cell_m: float
 
     @property
     def cells(self) -> int:
@@ -46,8 +152,12 @@ class SliceShape:
 class BridgeOptions:
     """All options of the bridge."""
 
-    topics: TopicChoice = field(default_factory=TopicChoice)
-    scans: ScanOptions = field(default_factory=ScanOptions)
-    grid: SliceShape = field(default_factory=SliceShape)
-    mesh_level: int = 1  # of detail: cells are twice as large at each
-    mesh_bytes_per_s: int = 5_000_000  # of markers, at most
+    topics: TopicChoice
+    grid: SliceShape
+    depth_stride: int  # every how many rows and columns of a depth image one is taken
+    body_frame: str  # whose pose a topic of PoseStamped gives
+    map_frame: str  # "": map, odom or world, the first that the transforms have
+    clock: str  # stamps are when messages arrived ("arrival"), or those of their "header"
+    wait_s: float  # for how long a scan waits for its transforms
+    mesh_level: int  # of detail: cells are twice as large at each
+    mesh_bytes_per_s: int  # of markers, at most

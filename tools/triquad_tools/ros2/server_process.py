@@ -17,14 +17,13 @@ from triquad_format.wire.access_control import (
     take_part_in_ros2,
     without_credentials,
 )
-from triquad_format.wire.endpoints import DEFAULT_ENDPOINT, Locator, full_endpoint
+from triquad_format.wire.endpoints import DEFAULT_ENDPOINT, full_endpoint
 
-from triquad_tools.console.server_arguments import DEFAULT_MAP
-from triquad_tools.ros2.topic_choice import TopicChoice
+from triquad_tools.console.arguments import DEFAULT_MAP
+from triquad_tools.ros2.options import TopicChoice
 from triquad_tools.ros2.topics import bridge_key
 
 _PR_SET_PDEATHSIG = 1  # of prctl(2)
-_ANYWHERE = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]", "": "127.0.0.1"}
 
 
 class ServerProcess:
@@ -38,9 +37,8 @@ class ServerProcess:
         """
         given = _parsed(arguments)
         self.map_name: str = given.map
-        self.endpoint = _reached(
-            full_endpoint(given.listen[0] if given.listen else DEFAULT_ENDPOINT)
-        )
+        # Where it listens on 0.0.0.0, connecting to that reaches it on this machine.
+        self.endpoint = full_endpoint(given.listen[0] if given.listen else DEFAULT_ENDPOINT)
         self._folder = TemporaryDirectory(prefix="triquad-ros2-")
         command = [sys.executable, "-m", "triquad_server.cli", *arguments]
         if given.config is None:
@@ -84,12 +82,6 @@ def _parsed(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("-l", "--listen", action="append")
     parser.add_argument("-c", "--config")
     return parser.parse_known_args(arguments)[0]
-
-
-def _reached(endpoint: str) -> str:
-    """Return where a program of this machine reaches what listens at an endpoint."""
-    protocol, host, port = Locator.of(endpoint)
-    return f"{protocol}/{_ANYWHERE[host]}:{port}" if host in _ANYWHERE and port else endpoint
 
 
 def _network(map_name: str, topics: TopicChoice) -> str:

@@ -1,9 +1,11 @@
 """Topics of ROS 2 in Zenoh: their keys, and the liveliness tokens of publishers and subscribers.
 
 There are two ways to write them: that of rmw_zenoh (its docs/design.md), and that of
-zenoh-bridge-ros2dds (its liveliness_mgt.rs).
+zenoh-bridge-ros2dds (its liveliness_mgt.rs). Messages of rmw_zenoh have attachments, whose numbers
+show how many never arrived.
 """
 
+import struct
 from dataclasses import dataclass
 from enum import Enum
 
@@ -12,6 +14,12 @@ from triquad_tools.sensors.ros.type_store import type_store
 ANY_HASH = "*"
 NO_HASH = "TypeHashNotSupported"
 """The text that ROS 2 Humble, which knows no hashes of types, writes in their place."""
+
+ATTACHMENT = struct.Struct("<qqB16s")
+"""The attachment: number, time, length of the identity, identity of the publisher."""
+
+_MAX_PUBLISHERS = 256
+_MAX_MISSED = 2**20  # a larger step is of a publisher that was started again, or of wrong bytes
 
 
 class End(Enum):
@@ -99,16 +107,6 @@ class Delivery:
     latched: bool = False  # later subscribers get the last ones too: TRANSIENT_LOCAL
     depth: int = 10
 
-    @property
-    def of_rmw(self) -> str:
-        """Return the text of rmw_zenoh, which leaves out its defaults."""
-        return f"{'' if self.reliable else 2}:{1 if self.latched else ''}:,{self.depth}:,:,:,,"
-
-    def of_bridge(self, type_hash: str) -> str:
-        """Return the text of a bridge, with the user data that DDS nodes expect since Iron."""
-        kinds = f":{int(self.reliable)}:{int(self.latched)}:0,{self.depth}"
-        return f"{kinds}:typehash={type_hash};"
-
 
 @dataclass(frozen=True)
 class Entity:
@@ -119,28 +117,30 @@ class Entity:
     number: int  # 0 is the node itself
 
     def rmw_prefix(self, domain: int, kind: str) -> str:
-        """Return the prefix of all its tokens; it has no enclave and no namespace."""
+        """Return the prefix of all its tokens; it has no enclave and no namespace.
+
+        The token of a node, of kind ``NN``, is the prefix alone.
+        """
         return f"@ros2_lv/{domain}/{self.session_id}/0/{self.number}/{kind}/%/%/{self.node}"
-
-
-def rmw_node_token(domain: int, entity: Entity) -> str:
-    """Return the token that says that there is a node."""
-    return entity.rmw_prefix(domain, "NN")
 
 
 def rmw_token(domain: int, entity: Entity, what: Announcement, delivery: Delivery) -> str:
     """Return the token that says to nodes of rmw_zenoh what :func:`read_token` reads."""
     name = what.topic.name.replace("/", "%")
     type_key = f"{_dds_type(what.topic.type_name)}/{what.type_hash}"
+    # Defaults are left out.
+    kinds = f"{'' if delivery.reliable else 2}:{1 if delivery.latched else ''}"
     prefix = entity.rmw_prefix(domain, what.end.value)
-    return f"{prefix}/{name}/{type_key}/{delivery.of_rmw}"
+    return f"{prefix}/{name}/{type_key}/{kinds}:,{delivery.depth}:,:,:,,"
 
 
 def bridge_token(session_id: str, what: Announcement, delivery: Delivery) -> str:
     """Return the token that says to bridges what :func:`read_token` reads."""
     key = bridge_key(what.topic.name).replace("/", "§")
     type_key = what.topic.type_name.replace("/", "§")
-    qos = delivery.of_bridge(what.type_hash)
+    kinds = f":{int(delivery.reliable)}:{int(delivery.latched)}:0,{delivery.depth}"
+    # DDS nodes since Iron expect the hash.
+    qos = f"{kinds}:typehash={what.type_hash};"
     return f"@/{session_id}/@ros2_lv/{what.end.value}/{key}/{type_key}/{qos}"
 
 
@@ -152,3 +152,27 @@ def _dds_type(type_name: str) -> str:
 def _ros_type(dds_type: str) -> str:
     package, kind, _, name = dds_type.split("::")
     return f"{package}/{kind}/{name.removesuffix('_')}"
+
+
+class SequenceGaps:
+    """The last number of each publisher."""
+
+    def __init__(self) -> None:
+        self._last: dict[bytes, int] = {}
+
+    def missed(self, attachment: bytes) -> int:
+        """Return how many messages of its publisher are missing before one with this attachment.
+
+        An attachment in another form, as by old releases, is ignored, and so is a
+        number below 0 or one that is too far ahead.
+        """
+        if len(attachment) != ATTACHMENT.size:
+            return 0
+        number: int
+        number, _, _, publisher = ATTACHMENT.unpack(attachment)
+        if len(self._last) > _MAX_PUBLISHERS:
+            self._last.clear()
+        last = self._last.get(publisher, number - 1)
+        self._last[publisher] = number
+        missed = number - last - 1
+        return missed if 0 <= missed <= _MAX_MISSED and last >= 0 else 0

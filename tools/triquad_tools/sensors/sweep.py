@@ -1,9 +1,10 @@
-"""One sweep of a sensor, before and after its pose is known."""
+"""One sweep of a sensor, before and after its pose is known, and errors in such data."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.errors import TriquadError
 from triquad_format.records.arrays import Doubles
 
 
@@ -41,3 +42,19 @@ def moved(points: NDArray[np.floating], pose: NDArray[np.floating]) -> Doubles:
     """Move points [N, 3] by a pose [4, 4], in double precision: they may be far from the origin."""
     result: Doubles = points.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
     return result
+
+
+class NoScanError(TriquadError):
+    """No scan can be made of a sensor's data; ``reason`` is the short key to count it under."""
+
+    def __init__(self, reason: str, text: str) -> None:
+        super().__init__(text)
+        self.reason = reason
+
+
+class NoTransformError(NoScanError):
+    """The pose of a sensor is not known; ``late`` if transforms that still come may give it."""
+
+    def __init__(self, reason: str, text: str, *, late: bool = False) -> None:
+        super().__init__(reason, text)
+        self.late = late

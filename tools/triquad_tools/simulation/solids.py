@@ -17,6 +17,8 @@ _KIND, X, Y, Z, _COS, _SIN, _A, _B, _C, _D, BOUND = range(_COLUMNS)
 
 HALF_SPACE, BOX, CYLINDER, GABLE = range(4)
 
+Distance = tuple[float, float, float, float]  # and its gradient
+
 
 @dataclass(frozen=True)
 class Solid:
@@ -73,9 +75,6 @@ def gable(centre: Vector, half: Vector, eave: float, yaw: float = 0.0) -> Solid:
 def solid_table(solids: tuple[Solid, ...]) -> Doubles:
     """Return the table ``[S, 11]`` of solids that the kernels read."""
     return np.array([solid.row for solid in solids], np.float64).reshape(-1, _COLUMNS)
-
-
-Distance = tuple[float, float, float, float]  # and its gradient
 
 
 @inner_kernel()

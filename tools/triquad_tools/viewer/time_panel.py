@@ -3,11 +3,10 @@
 from triquad_format.mapfile.checkpoint_folder import CheckpointFile
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.viewer.page.layer import Layer
+from triquad_tools.viewer.page.layer import Layer, newest_epoch
 from triquad_tools.viewer.page.legends import problem_html, text_html
 from triquad_tools.viewer.page.page import Page
-from triquad_tools.viewer.questions.question import newest_epoch
-from triquad_tools.viewer.sources.history import History, moment
+from triquad_tools.viewer.sources.stored_map import History, moment
 
 _PERIOD_S = 1.0
 _PREVIOUS, _NEXT = "◀ Previous", "Next ▶"

@@ -1,24 +1,67 @@
-"""The web server that shows a map."""
+"""The web server that shows a map, and the page of each browser."""
 
 import io
 import socket
 import threading
 import warnings
 from collections.abc import Sequence
-from contextlib import redirect_stdout
+from contextlib import ExitStack, redirect_stdout
 
 import viser
+from triquad_format.errors import TriquadError
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.viewer.allowed_origins import serving_only
-from triquad_tools.viewer.browser_session import BrowserSession
-from triquad_tools.viewer.sources.history import History
+from triquad_tools.viewer.mesh.mesh_layer import MeshLayer
+from triquad_tools.viewer.page.legends import text_html
+from triquad_tools.viewer.page.page import Page
+from triquad_tools.viewer.questions.clicks import Clicks
+from triquad_tools.viewer.questions.slice import SliceQuestion
+from triquad_tools.viewer.questions.unknown_space import UnknownSpace
+from triquad_tools.viewer.sources.live_source import LiveSource
 from triquad_tools.viewer.sources.map_source import MapSource
+from triquad_tools.viewer.sources.stored_map import History
+from triquad_tools.viewer.time_panel import TimePanel
+from triquad_tools.viewer.trail_layer import TrailLayer
 
 DEFAULT_PORT = 8080
-
 _OF_ONE_WHO_LEFT = ("Queued a .* on a closed connection", "Attempted to remove an? already removed")
 """Warnings of viser that come when a browser leaves while something is drawn or removed."""
+
+
+def open_page(client: viser.ClientHandle, shown: MapSource | History) -> ExitStack:
+    """Build the page of one browser; return what ends it.
+
+    Of a history, each browser chooses its own moment.
+    """
+    _prepare(client)
+    title, page, parts = client.gui.add_html(""), Page(client), ExitStack()
+    try:
+        page.source = source = shown.newest() if isinstance(shown, History) else shown
+        title.content = text_html(source.title)
+        if isinstance(shown, History):
+            parts.callback(TimePanel(page, shown).close)
+        for part in (MeshLayer, SliceQuestion, UnknownSpace, Clicks):
+            parts.callback(part(page).close)
+        if isinstance(source, LiveSource):
+            parts.callback(TrailLayer(page, source.client).close)
+    except TriquadError as error:
+        page.failed("page", str(error))
+    except Exception:
+        parts.close()
+        raise
+    return parts
+
+
+def _prepare(client: viser.ClientHandle) -> None:
+    """Make a page plain: the map alone, z upwards."""
+    client.gui.configure_theme(show_logo=False, show_share_button=False)
+    client.gui.main_panel.dock_right()
+    client.gui.set_panel_label("triquad")
+    client.scene.set_up_direction("+z")
+    client.scene.configure_default_lights(cast_shadow=False)
+    client.scene.configure_environment_map(None)
+    client.scene.add_light_ambient("/ambient", intensity=2.0)  # no side of what is lit is black
 
 
 class _OwnServer(viser.ViserServer):
@@ -50,7 +93,7 @@ class Viewer:
         """
         _check_address(host)
         self._shown = shown
-        self._sessions: dict[int, BrowserSession] = {}
+        self._sessions: dict[int, ExitStack] = {}  # what ends the page of a browser
         self._closed = False
         self._changing = threading.Lock()
         self._opened = threading.Event()
@@ -84,7 +127,7 @@ class Viewer:
             self._server.stop()
 
     def _enter(self, client: viser.ClientHandle) -> None:
-        session = BrowserSession(client, self._shown)
+        session = open_page(client, self._shown)
         with self._changing:
             # A browser may leave meanwhile: callbacks run at the same time, in any order.
             left = self._closed or client.client_id not in self._server.get_clients()

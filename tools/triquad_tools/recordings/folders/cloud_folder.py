@@ -8,22 +8,23 @@ import numpy as np
 from triquad_format.records.arrays import Floats
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.folders.file_names import in_order
-from triquad_tools.recordings.folders.file_poses import place_files
-from triquad_tools.recordings.folders.kitti import of_lidar, read_times
 from triquad_tools.recordings.folders.point_file import POINT_SUFFIXES, check_points, read_points
-from triquad_tools.recordings.folders.scan_folder import PlacedFile, ScanFolder, check_all
+from triquad_tools.recordings.folders.scan_folder import (
+    PlacedFile,
+    ScanFolder,
+    check_all,
+    in_order,
+    place_files,
+)
 from triquad_tools.recordings.folders.trajectory import SENSOR, WORLD, Trajectory
-from triquad_tools.recordings.options import ReadingOptions
-from triquad_tools.recordings.recording import Stream
-from triquad_tools.sensors.errors import NoTransformError
+from triquad_tools.recordings.recording import ReadingOptions, Stream
+from triquad_tools.recordings.text_lines import parse_rigid, parse_stamps, read_lines
 from triquad_tools.sensors.motion.placing import place
 from triquad_tools.sensors.point_times import offsets_s
-from triquad_tools.sensors.sweep import PosedScan, Sweep, moved
+from triquad_tools.sensors.sweep import NoTransformError, PosedScan, Sweep, moved
 
 _TRIED = 3  # clouds, to determine the frame of all
 _CLEARLY = 2.0  # times nearer to where the sensor was than to the origin, or the other way round
-
 
 _DEEPER = "velodyne_points/data"  # where KITTI's raw recordings have theirs
 
@@ -128,3 +129,42 @@ def _lies_around_its_place(file: PlacedFile) -> bool:
     from_origin = np.median(np.linalg.norm(points, axis=1))
     from_place = np.median(np.linalg.norm(points - file.world_from_sensor[:3, 3], axis=1))
     return bool(from_place * _CLEARLY < from_origin)
+
+
+def read_times(folder: Path, scans: int) -> list[int] | None:
+    """Return the nanoseconds at which the scans of a folder were taken; None where it has no times.
+
+    Raises:
+        ToolError: a time is not a number, times run backwards, or there are not as many as scans.
+    """
+    path = folder / "times.txt"
+    if not path.is_file():
+        return None
+    stamps = parse_stamps(read_lines(path))
+    if len(stamps) != scans:
+        raise ToolError(f"{path}: {len(stamps)} times for {scans} scans")
+    return stamps
+
+
+def of_lidar(folder: Path, files: Sequence[PlacedFile]) -> list[PlacedFile]:
+    """Return files with the poses of the lidar, by the calibration of the folder, if it has one.
+
+    In ``calib.txt`` the line ``Tr:`` is ``camera_from_lidar``: the poses are then those of the
+    camera, as KITTI gives them.
+
+    Raises:
+        ToolError: the calibration is not a rigid motion.
+    """
+    path = folder / "calib.txt"
+    if not path.is_file():
+        return list(files)
+    for line in read_lines(path):
+        name, _, numbers = line.text.partition(":")
+        if name.strip() == "Tr":
+            camera_from_lidar = parse_rigid(line.place, numbers.split())
+            turned = np.linalg.inv(camera_from_lidar)
+            return [
+                file._replace(world_from_sensor=turned @ file.world_from_sensor @ camera_from_lidar)
+                for file in files
+            ]
+    raise ToolError(f"{path}: has no line 'Tr:'")

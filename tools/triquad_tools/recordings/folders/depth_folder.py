@@ -1,27 +1,110 @@
 """Folders of depth images with a trajectory of the camera: those of TUM RGB-D, and of Open3D."""
 
+import json
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_client.depth_image import depth_points
+from triquad_client.depth_image import Intrinsics, depth_points
+from triquad_client.errors import NO_NUMBER, InvalidScanError
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.folders.camera import Camera, check_fits, choose_camera
-from triquad_tools.recordings.folders.file_names import in_order
-from triquad_tools.recordings.folders.file_poses import place_files
-from triquad_tools.recordings.folders.scan_folder import PlacedFile, ScanFolder, check_all
-from triquad_tools.recordings.options import ReadingOptions
-from triquad_tools.recordings.recording import Stream
-from triquad_tools.recordings.text_lines import parse_stamp, read_lines
+from triquad_tools.recordings.folders.scan_folder import (
+    PlacedFile,
+    ScanFolder,
+    check_all,
+    in_order,
+    place_files,
+)
+from triquad_tools.recordings.recording import ReadingOptions, Stream
+from triquad_tools.recordings.text_lines import parse_stamps, read_lines
 from triquad_tools.sensors.sweep import PosedScan
+
+INTRINSICS_NAMES = ("camera_intrinsic.json", "intrinsic.json", "camera_primesense.json")
+"""Names that Open3D and its data give them."""
 
 _LIST_NAME = "depth.txt"  # of TUM RGB-D
 _FOLDER_NAME = "depth"  # of Open3D
 _TUM_UNITS_PER_M, _OPEN3D_UNITS_PER_M = 5000.0, 1000.0
 _GREY_MODES = ("I;16", "I;16B", "I")  # 16 bits, as versions of Pillow name them
+
+
+class Camera(NamedTuple):
+    """A camera, and the size of its images where that is known."""
+
+    intrinsics: Intrinsics
+    shape: tuple[int, ...] | None  # rows and columns
+    origin: str  # where this is said, for messages
+
+
+_TUM = Camera(Intrinsics(525.0, 525.0, 319.5, 239.5), (480, 640), "the documentation of TUM RGB-D")
+"""The intrinsics of all three cameras, whose depth was registered by OpenNI:
+https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats"""
+
+
+def choose_camera(folder: Path, given: Intrinsics | None) -> Camera:
+    """Return the camera that was given, that a folder has in a file, or that its name implies.
+
+    Raises:
+        ToolError: it is not known, or the file is not understood.
+    """
+    if given is not None:
+        return Camera(given, None, "--intrinsics")
+    for name in INTRINSICS_NAMES:
+        if (folder / name).is_file():
+            return _read_camera(folder / name)
+    if "freiburg" in folder.resolve().name:
+        return _TUM
+    raise ToolError(
+        f"{folder}: the camera is not known: put {INTRINSICS_NAMES[0]} of Open3D there, or give "
+        "--intrinsics FX,FY,CX,CY in pixels"
+    )
+
+
+def check_fits(camera: Camera, shape: tuple[int, ...], path: Path) -> None:
+    """Check that an image of these rows and columns fits a camera.
+
+    Raises:
+        ToolError: it has another size, or the centre of the camera lies outside of it.
+    """
+    if camera.shape is not None and camera.shape != shape:
+        raise ToolError(
+            f"{path}: has {_size(shape)} pixels, and the camera of {camera.origin} "
+            f"{_size(camera.shape)}: give the intrinsics for these images, with --intrinsics "
+            "FX,FY,CX,CY"
+        )
+    centre, (rows, columns) = camera.intrinsics, shape
+    if not (0 < centre.cx < columns and 0 < centre.cy < rows):
+        raise ToolError(
+            f"{path}: has {_size(shape)} pixels, and the centre of the camera of {camera.origin} "
+            f"lies outside, at {centre.cx:g}, {centre.cy:g}: give the intrinsics for these images"
+        )
+
+
+def _read_camera(path: Path) -> Camera:
+    """Return the camera of a file as Open3D writes it.
+
+    JSON with ``width``, ``height`` and ``intrinsic_matrix``, nine numbers, column by column.
+    """
+    try:
+        said = json.loads(path.read_text())
+        columns = [said["intrinsic_matrix"][start : start + 3] for start in (0, 3, 6)]
+        matrix = [list(row) for row in zip(*columns, strict=True)]
+        shape = int(said["height"]), int(said["width"])
+        return Camera(Intrinsics.from_matrix(matrix), shape, path.name)
+    except InvalidScanError as error:
+        raise ToolError(f"{path}: {error}; numbers stand column by column") from error
+    except (*NO_NUMBER, KeyError) as error:
+        raise ToolError(
+            f"{path}: has no width, height and intrinsic_matrix of nine numbers, as Open3D writes "
+            f"them: {error}"
+        ) from error
+
+
+def _size(shape: tuple[int, ...]) -> str:
+    return f"{shape[1]} x {shape[0]}"
 
 
 class _Images(NamedTuple):
@@ -44,7 +127,7 @@ def read_depth_folder(folder: Path, options: ReadingOptions) -> ScanFolder:
         ToolError: there is no trajectory, no common time or no intrinsics, an image is missing,
             damaged or no depth image, or does not fit to the camera.
     """
-    images = _listed(folder) if (folder / _LIST_NAME).is_file() else _found(folder)
+    images = _images(folder)
     camera = choose_camera(folder, options.intrinsics)
     placed = place_files(folder, options.trajectory, images.paths, images.stamps_ns)
     for path, pixels in zip(images.paths, check_all(images.paths, read_depth), strict=True):
@@ -93,23 +176,21 @@ def _read_scan(camera: Camera, units: float, stride: int, file: PlacedFile) -> P
     return PosedScan(points, file.world_from_sensor)
 
 
-def _listed(folder: Path) -> _Images:
-    """Return the images that TUM lists: a line for each, its time and its path."""
+def _images(folder: Path) -> _Images:
+    """Return the images that TUM lists with their times, or that lie where Open3D has them."""
+    if not (folder / _LIST_NAME).is_file():
+        found = in_order((folder / _FOLDER_NAME).glob("*.png"))
+        return _Images(found, None, _OPEN3D_UNITS_PER_M)
     paths: list[Path] = []
-    stamps: list[int] = []
-    for place, text in read_lines(folder / _LIST_NAME):
-        stamp, *name = text.split(maxsplit=1)
+    lines = read_lines(folder / _LIST_NAME)
+    stamps = parse_stamps(lines)
+    for place, text in lines:
+        _, *name = text.split(maxsplit=1)
         if not name:
             raise ToolError(f"{place}: {text!r} where a line is the time of an image and its path")
-        stamps.append(parse_stamp(place, stamp, stamps[-1] if stamps else 0))
         paths.append(folder / name[0])
         if not paths[-1].is_file():
             raise ToolError(f"{place}: {paths[-1]}: no such file")
     if not paths:
         raise ToolError(f"{folder / _LIST_NAME}: lists no images")
     return _Images(paths, stamps, _TUM_UNITS_PER_M)
-
-
-def _found(folder: Path) -> _Images:
-    """Return the images as Open3D has them: all that lie in a folder."""
-    return _Images(in_order((folder / _FOLDER_NAME).glob("*.png")), None, _OPEN3D_UNITS_PER_M)

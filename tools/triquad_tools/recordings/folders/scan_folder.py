@@ -1,17 +1,37 @@
-"""Folders with a file for each scan, whatever the files hold."""
+"""Folders with a file for each scan, and the poses that belong to the files."""
 
-from collections.abc import Callable, Iterator, Sequence
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 from triquad_format.records.arrays import Doubles
 
+from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
+from triquad_tools.recordings.folders.trajectory import Trajectory, read_trajectory
 from triquad_tools.recordings.recording import DEFAULT_SOURCE, ScanEntry, Stream
-from triquad_tools.sensors.sweep import PosedScan
+from triquad_tools.sensors.sweep import NoTransformError, PosedScan
 
 _Read = TypeVar("_Read")
+
+TRAJECTORY_NAMES = ("trajectory.txt", "trajectory.log", "poses.txt", "groundtruth.txt", "*.tum")
+_WHY = {
+    "pose_early": "before the first pose",
+    "pose_late": "after the last pose",
+    "pose_gap": "between poses that lie too far apart",
+}
+_NUMBERS = re.compile(r"(\d+)")
+_NS_OF_DIGITS = {10: 10**9, 13: 10**6, 16: 10**3, 19: 1}
+"""Whole numbers with as many digits are times since 1970, from 2001 to 2286, in a unit of
+nanoseconds: seconds, milliseconds, microseconds or nanoseconds."""
+
+_WHOLE = re.compile(r"(?:.*\D)?([1-9]\d+)")
+_DECIMAL = re.compile(r"(?:.*[^\d.])?(\d{1,10})\.(\d{1,9})")
+_PAIR = re.compile(r"(?:.*\D)?([1-9]\d{9})[_-](\d{1,9})")
+_PLACES = (3, 6, 9)  # decimal places of milliseconds, microseconds and nanoseconds
 
 
 class PlacedFile(NamedTuple):
@@ -57,3 +77,145 @@ def check_all(paths: Sequence[Path], read: Callable[[Path], _Read]) -> Iterator[
         for number, path in enumerate(paths, start=1):
             yield read(path)
             report(number, f"{number} of {len(paths)} files")
+
+
+class PlacedFiles(NamedTuple):
+    """The files that can be mapped, in the order of their stamps."""
+
+    files: list[PlacedFile]
+    trajectory: Trajectory  # from which their poses are
+    remarks: list[str]  # on those that cannot, and on what else was not used
+
+
+def place_files(
+    folder: Path,
+    given: Path | None,
+    paths: Sequence[Path],
+    stamps_ns: Sequence[int] | None = None,
+) -> PlacedFiles:
+    """Give the files of a folder their poses: by their times, or else one to one in order.
+
+    Args:
+        folder: holds the trajectory, unless that is given.
+        given: the file of the trajectory.
+        paths: the files, one at least, in order.
+        stamps_ns: when each was taken; ``None``: as their names say, if they do.
+
+    Raises:
+        ToolError: there is no trajectory, or neither way is possible.
+    """
+    path, remarks = _choose(folder, given)
+    trajectory = read_trajectory(path)
+    stamps = stamps_of_names(paths) if stamps_ns is None else stamps_ns
+    timed = stamps is not None and trajectory.frames is not None
+    if stamps is not None and timed:
+        placed = _by_time(paths, stamps, trajectory, remarks)
+        if placed.files:
+            return placed
+    if len(paths) == len(trajectory.poses):
+        when = trajectory.stamps_ns.tolist()
+        if stamps is not None and not timed:
+            when = list(stamps)
+        poses = zip(paths, when, trajectory.poses, strict=True)
+        if timed:
+            remarks.append(
+                f"the times of the files, such as {paths[0].name}, are of another clock than those "
+                f"of {path.name}: files and poses, of which there are as many, go in order"
+            )
+        return PlacedFiles([PlacedFile(*each) for each in poses], trajectory, remarks)
+    if stamps is not None and timed:
+        raise _no_common_time(stamps, trajectory, paths[0].parent)
+    what = "the trajectory has no times" if stamps is not None else "their names hold no times"
+    raise ToolError(
+        f"{paths[0].parent}: {len(paths)} files such as {paths[0].name}, and "
+        f"{len(trajectory.poses)} poses in {path}, and {what}: give every file one pose, or times "
+        "to both"
+    )
+
+
+def _choose(folder: Path, given: Path | None) -> tuple[Path, list[str]]:
+    """Return the file of the trajectory, and a remark where there are several."""
+    if given is not None:
+        if not given.is_file():
+            raise ToolError(f"{given}: no such file")
+        return given, []
+    found = [path for name in TRAJECTORY_NAMES for path in sorted(folder.glob(name))]
+    if not found:
+        raise ToolError(
+            f"{folder}: holds no trajectory, {', '.join(TRAJECTORY_NAMES)}: put one there, or name "
+            "it with --trajectory"
+        )
+    others = ", ".join(path.name for path in found[1:])
+    remark = f"poses are those of {found[0].name}, not of {others}: --trajectory FILE chooses"
+    return found[0], [remark] if others else []
+
+
+def _by_time(
+    paths: Sequence[Path], stamps_ns: Sequence[int], trajectory: Trajectory, remarks: list[str]
+) -> PlacedFiles:
+    placed: list[PlacedFile] = []
+    left_out: Counter[str] = Counter()
+    for stamp, path in sorted(zip(stamps_ns, paths, strict=True)):
+        try:
+            placed.append(PlacedFile(path, stamp, trajectory.pose_at(stamp)))
+        except NoTransformError as error:
+            left_out[error.reason] += 1
+    told = [
+        f"{count} of {len(paths)} files are left out: they were taken {_WHY[reason]} of "
+        f"{trajectory.path.name}"
+        for reason, count in left_out.items()
+    ]
+    return PlacedFiles(placed, trajectory, [*remarks, *told])
+
+
+def _no_common_time(stamps_ns: Sequence[int], trajectory: Trajectory, folder: Path) -> ToolError:
+    first, last = (stamp / 1e9 for stamp in (min(stamps_ns), max(stamps_ns)))
+    start, end = (stamp / 1e9 for stamp in trajectory.stamps_ns[[0, -1]].tolist())
+    return ToolError(
+        f"{folder}: no file has a pose: they were taken from {first:.3f} to {last:.3f} s, and "
+        f"{trajectory.path} goes from {start:.3f} to {end:.3f} s, with gaps of at most 2 s; write "
+        "both with the times of one clock"
+    )
+
+
+def in_order(paths: Iterable[Path]) -> list[Path]:
+    """Return paths in the order of the numbers in their names: 2 before 10, padded or not.
+
+    Hidden files are left out: macOS adds one to each that it copies.
+    """
+
+    def key(path: Path) -> list[tuple[int, str]]:
+        parts = _NUMBERS.split(path.name)
+        return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
+
+    return sorted((path for path in paths if not path.name.startswith(".")), key=key)
+
+
+def stamps_of_names(paths: Sequence[Path]) -> list[int] | None:
+    """Return nanoseconds that the names of all files say; None where any of them says none.
+
+    A time is the last number of a name: ``1700000000.25``, ``1700000000250000000`` or
+    ``1700000000_250000000``, seconds and a fraction of them in whole units. Small whole numbers
+    are counts, not times, and so are those that begin with 0.
+    """
+    pairs = [_PAIR.fullmatch(path.stem) for path in paths]
+    longest = max((len(pair[2]) for pair in pairs if pair), default=0)
+    unit_ns = next(10 ** (9 - places) for places in _PLACES if places >= longest)
+    stamps: list[int] = []
+    for path, pair in zip(paths, pairs, strict=True):
+        stamp = (
+            _stamp_of(path.stem) if pair is None else int(pair[1]) * 10**9 + int(pair[2]) * unit_ns
+        )
+        if stamp is None:
+            return None
+        stamps.append(stamp)
+    return stamps
+
+
+def _stamp_of(stem: str) -> int | None:
+    decimal = _DECIMAL.fullmatch(stem)
+    if decimal is not None:
+        return int(decimal[1]) * 10**9 + int(decimal[2].ljust(9, "0"))
+    whole = _WHOLE.fullmatch(stem)
+    unit_ns = None if whole is None else _NS_OF_DIGITS.get(len(whole[1]))
+    return None if whole is None or unit_ns is None else int(whole[1]) * unit_ns

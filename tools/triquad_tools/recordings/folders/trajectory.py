@@ -19,11 +19,11 @@ from triquad_tools.recordings.text_lines import (
     Line,
     parse_numbers,
     parse_rigid,
-    parse_stamp,
+    parse_stamps,
     read_lines,
 )
-from triquad_tools.sensors.errors import NoTransformError
 from triquad_tools.sensors.motion.frame_tree import FrameTree, Transform
+from triquad_tools.sensors.sweep import NoTransformError
 
 DEFAULT_PERIOD_NS = 100_000_000
 """The time between scans of a recording without times."""
@@ -86,15 +86,12 @@ def read_trajectory(path: Path) -> Trajectory:
 
 
 def _read_tum(path: Path, lines: Sequence[Line]) -> Trajectory:
-    frames = FrameTree()
-    stamps: list[int] = []
+    frames, stamps = FrameTree(), parse_stamps(lines)
     poses: list[Doubles] = []
-    for line in lines:
-        words = line.words
-        if len(words) != 8:
-            raise ToolError(f"{line.place}: {len(words)} numbers where a pose has 8")
-        stamps.append(parse_stamp(line.place, words[0], stamps[-1] if stamps else 0))
-        numbers = parse_numbers(line.place, words[1:])
+    for line, stamp_ns in zip(lines, stamps, strict=True):
+        if len(line.words) != 8:
+            raise ToolError(f"{line.place}: {len(line.words)} numbers where a pose has 8")
+        numbers = parse_numbers(line.place, line.words[1:])
         pose = Pose(numbers[:3], numbers[3:])
         try:
             poses.append(pose.matrix())
@@ -102,7 +99,7 @@ def _read_tum(path: Path, lines: Sequence[Line]) -> Trajectory:
             raise ToolError(
                 f"{line.place}: {error}; a line is t x y z qx qy qz qw, w last"
             ) from error
-        frames.add(Transform(WORLD, SENSOR, stamps[-1], pose))
+        frames.add(Transform(WORLD, SENSOR, stamp_ns, pose))
     return Trajectory(path, "TUM trajectory", np.array(poses), np.array(stamps), frames)
 
 

@@ -1,10 +1,11 @@
-"""Turning messages of ROS 2 into scans that are published once their poses are known."""
+"""Turning messages of ROS 2 into scans, which are published once their poses are known."""
 
 import logging
 import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -12,24 +13,31 @@ import numpy as np
 import zenoh
 from triquad_client import Client, InvalidScanError
 from triquad_format.errors import TriquadError
+from triquad_format.records.arrays import Doubles
 
-from triquad_tools.ros2.attachment import SequenceGaps
-from triquad_tools.ros2.intake.drop_log import DropLog
-from triquad_tools.ros2.intake.first_scan import FirstScan
-from triquad_tools.ros2.intake.message_queue import Arrival, MessageQueue, QueueLimits
-from triquad_tools.ros2.intake.motion import Motion
-from triquad_tools.ros2.intake.placement import Placed, Placement
-from triquad_tools.ros2.intake.scan_publisher import Place, ScanPublisher
-from triquad_tools.ros2.intake.topic_listener import TopicListener
+from triquad_tools.ros2.intake.drop_log import DropLog, FirstScan
+from triquad_tools.ros2.intake.placement import Motion, Placed, Placement
+from triquad_tools.ros2.intake.topic_listener import (
+    Arrival,
+    MessageQueue,
+    QueueLimits,
+    TopicListener,
+)
 from triquad_tools.ros2.node import Node
-from triquad_tools.ros2.options import BridgeOptions
-from triquad_tools.ros2.topic_choice import TYPES, Role
-from triquad_tools.sensors.errors import NoScanError
+from triquad_tools.ros2.options import TYPES, BridgeOptions, Role
+from triquad_tools.ros2.topics import SequenceGaps
+from triquad_tools.sensors.ros.header import source_of_topic
 from triquad_tools.sensors.ros.message_reader import MessageReader
 from triquad_tools.sensors.ros.type_store import decode_cdr
-from triquad_tools.sensors.sweep import Sweep
+from triquad_tools.sensors.sweep import NoScanError, PosedScan, Sweep
 
 _log = logging.getLogger("triquad_ros2")
+
+MAX_TOPICS = 64
+"""Topics of which scans are made at most."""
+
+RESTART_NS = 10**9
+"""Stamps that go back by more start again; a wrong one silences no sensor for longer."""
 
 MAX_POINTS = 2_500_000
 """Points of a scan at most: a message of 30 MB, which servers receive with default settings."""
@@ -42,6 +50,71 @@ _WAITING_BYTES = 512_000_000  # of sweeps that wait for their transforms
 _TICK_S = 0.2
 
 
+@dataclass(frozen=True)
+class Place:
+    """The position of the robot."""
+
+    map_frame: str
+    position_m: Doubles  # [3] map frame
+    stamp_ns: int
+
+
+@dataclass
+class _Source:
+    """A topic of which scans are made."""
+
+    name: str
+    read_ns: int  # newest stamp of a sweep that was read, since time went back
+    sent_ns: int = 0  # and of one that was published: sweeps wait in between
+
+
+class ScanPublisher:
+    """Publishes scans to the map server, those of a topic in the order of their stamps."""
+
+    def __init__(self, client: Client) -> None:
+        self.newest: Place | None = None  # where the newest scan was taken
+        self.count = 0  # scans that were published
+        self._client = client
+        self._sources: dict[str, _Source] = {}
+
+    def time_went_back(self, topic_name: str, stamp_ns: int) -> bool:
+        """Return whether a topic was started again, given the stamp of a sweep that is read.
+
+        Raises:
+            NoScanError: it is a little before the one before, or of too many topics.
+        """
+        source = self._sources.get(topic_name)
+        if source is None:
+            if len(self._sources) >= MAX_TOPICS:
+                others = f"there are {len(self._sources)} others already: choose some with --clouds"
+                raise NoScanError("too_many_topics", others)
+            source = self._sources[topic_name] = _Source(source_of_topic(topic_name), stamp_ns)
+        back_ns, source.read_ns = source.read_ns - stamp_ns, max(source.read_ns, stamp_ns)
+        if 0 < back_ns <= RESTART_NS:
+            raise NoScanError("time_backwards", f"{back_ns / 1e9:.3g} s before the scan before")
+        source.read_ns = stamp_ns
+        return back_ns > 0
+
+    def publish(self, topic_name: str, scan: PosedScan, stamp_ns: int, map_frame: str) -> None:
+        """Publish a scan.
+
+        Raises:
+            NoScanError: it is empty.
+            TriquadError: it could not be sent.
+        """
+        if len(scan.points) == 0:
+            raise NoScanError("empty", "no point of it is finite")
+        source = self._sources[topic_name]
+        if stamp_ns < source.sent_ns:
+            self._client.restart_source(source.name)
+        source.sent_ns = stamp_ns
+        self._client.publish_scan(
+            scan.points, scan.world_from_sensor, stamp_ns / 1e9, source=source.name
+        )
+        self.count += 1
+        self.newest = Place(map_frame, scan.world_from_sensor[:3, 3], stamp_ns)
+
+
 class Intake:
     """Receives what a robot publishes, on a thread of its own."""
 
@@ -49,21 +122,25 @@ class Intake:
         self, session: zenoh.Session, client: Client, options: BridgeOptions, node: Node
     ) -> None:
         """Begin to receive messages."""
-        frame = options.scans.map_frame
+        frame = options.map_frame
         self._start = Place(frame, np.zeros(3), stamp_ns=0) if frame else None
         self.drops = DropLog()
         self.scans = ScanPublisher(client)
         self._motion = Motion(from_topic=options.topics.poses is not None)
         self._reader = MessageReader(
-            stride=options.scans.depth_stride,
-            body_frame=options.scans.body_frame,
-            by_arrival=options.scans.by_arrival,
+            stride=options.depth_stride,
+            body_frame=options.body_frame,
+            by_arrival=options.clock == "arrival",
             max_points=MAX_POINTS,
         )
         self._placement = Placement(
-            self._motion, map_frame=frame, max_bytes=_WAITING_BYTES, timeout_s=options.scans.wait_s
+            self._motion, map_frame=frame, max_bytes=_WAITING_BYTES, timeout_s=options.wait_s
         )
-        self._queue = MessageQueue(_SCANS_UNREAD, _OTHERS_UNREAD, self._pushed_out)
+        self._queue = MessageQueue(
+            _SCANS_UNREAD,
+            _OTHERS_UNREAD,
+            lambda gone: self.drops.add(gone.topic_name, "pushed_out", "too many messages wait"),
+        )
         self._gaps = SequenceGaps()
         self._gaps_lock = threading.Lock()
         self._first_scan = FirstScan(options.topics, time.monotonic())
@@ -71,6 +148,16 @@ class Intake:
         self._listener = TopicListener(session, options.topics, node, self._receive)
         self._thread = threading.Thread(target=self._run, name="ros2-intake")
         self._thread.start()
+
+    @property
+    def published(self) -> int:
+        """The number of scans that were published to the server."""
+        return self.scans.count
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """The messages of which no scan could be published, by reason."""
+        return self.drops.counts()
 
     @property
     def place(self) -> Place | None:
@@ -100,9 +187,6 @@ class Intake:
         else:
             self._queue.put(arrival)
 
-    def _pushed_out(self, arrival: Arrival) -> None:
-        self.drops.add(arrival.topic_name, "pushed_out", "too many messages wait")
-
     def _run(self) -> None:
         while not self._stopping.is_set():
             arrival = self._queue.take(_TICK_S)
@@ -116,7 +200,7 @@ class Intake:
         if isinstance(placed.outcome, NoScanError):
             raise placed.outcome
         stamp_ns = placed.sweep.stamp_ns
-        self.scans.publish(placed.topic_name, placed.outcome, stamp_ns, placed.map_frame)
+        self.scans.publish(placed.topic_name, placed.outcome, stamp_ns, self._placement.map_frame)
 
     def _guard(self, topic_name: str, step: Callable[[], None]) -> None:
         """Do something with a message; no bytes may stop the intake."""
@@ -138,7 +222,7 @@ class Intake:
             self._first_scan.came(topic_name)
         kind, message = _decoded(arrival)
         if role is Role.CAMERA_INFO:
-            self._reader.remember_camera(topic_name, message)
+            self._reader.cameras[topic_name] = message
         elif role.brings_scans:
             self._place(topic_name, self._reader.sweep(topic_name, kind, message, came_ns))
         else:

@@ -1,4 +1,4 @@
-"""Pending sweeps, until it is known where they were taken."""
+"""The robot's known motion, and sweeps that wait until it tells where they were taken."""
 
 import logging
 from collections import deque
@@ -6,17 +6,73 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from triquad_client.errors import InvalidScanError
 
-from triquad_tools.ros2.intake.motion import Motion
-from triquad_tools.sensors.errors import NoScanError, NoTransformError
-from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES
+from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES, STATIC, FrameTree, Transform
 from triquad_tools.sensors.motion.placing import place
-from triquad_tools.sensors.sweep import PosedScan, Sweep
+from triquad_tools.sensors.sweep import NoScanError, NoTransformError, PosedScan, Sweep
 
 _log = logging.getLogger("triquad_ros2")
 
+RESTART_NS = 10 * 10**9
+"""Transforms that go back by more are of a simulation or a bag that was started again."""
+
+_POSES_KEPT = 2000  # of each frame; 20 s at 100 Hz
+_MAX_FRAMES = 1000
+_MAX_NAME = 256
+
 _CHOICE_S = 1.0
 """The time after a sweep could first be placed in which a better map frame may appear."""
+
+
+class Motion:
+    """Keeps the transforms that count, within limits: their names come from the network."""
+
+    def __init__(self, *, from_topic: bool) -> None:
+        """With ``from_topic``, only a topic of poses gives the motion of the robot's body."""
+        self.frames = FrameTree(_POSES_KEPT)
+        self.body_parent: str | None = None  # in which frame that topic has the body
+        self._from_topic = from_topic
+        self._body: str | None = None
+
+    def add(self, transforms: list[Transform], *, is_body: bool) -> None:
+        """Add transforms, or the pose of the body.
+
+        Raises:
+            NoScanError: one of them is of no use; the others were added.
+        """
+        if is_body:
+            self._body, self.body_parent = transforms[0].child, transforms[0].parent
+        refusal = None
+        for transform in transforms:
+            if self._from_topic and not is_body and transform.child == self._body:
+                continue
+            try:
+                self._check(transform)
+                if transform.stamp_ns is not STATIC:
+                    self._forget_after(transform.child, transform.stamp_ns)
+                self.frames.add(transform)
+            except (InvalidScanError, NoScanError) as error:
+                refusal = NoScanError("bad_transform", f"{transform.child[:_MAX_NAME]}: {error}")
+        if refusal is not None:
+            raise refusal
+
+    def forget_after(self, stamp_ns: int) -> None:
+        """Remove poses from before time went back to a stamp."""
+        for child in self.frames.moving:
+            self._forget_after(child, stamp_ns)
+
+    def _forget_after(self, child: str, stamp_ns: int) -> None:
+        """Remove the poses of a frame whose time goes back to a stamp."""
+        newest_ns = self.frames.newest_ns(child)
+        if newest_ns is not None and newest_ns > stamp_ns + RESTART_NS:
+            self.frames.forget(child)
+
+    def _check(self, transform: Transform) -> None:
+        if max(len(transform.parent), len(transform.child)) > _MAX_NAME or not transform.child:
+            raise NoScanError("bad_transform", "its name is empty or too long")
+        if len(self.frames) >= _MAX_FRAMES and not self.frames.knows(transform.child):
+            raise NoScanError("bad_transform", f"more than {_MAX_FRAMES} frames")
 
 
 @dataclass(frozen=True)
@@ -26,7 +82,6 @@ class Placed:
     topic_name: str
     sweep: Sweep
     outcome: PosedScan | NoScanError
-    map_frame: str
 
 
 @dataclass
@@ -38,26 +93,23 @@ class _Waiting:
     is_over: bool = False  # time went back before its stamp, so its transforms come no more
 
 
+@dataclass
 class Placement:
     """Places sweeps in the map frame, those of each topic in the order in which they came."""
 
-    def __init__(self, motion: Motion, *, map_frame: str, max_bytes: int, timeout_s: float) -> None:
-        """``motion`` is extended by others meanwhile, on the same thread.
+    motion: Motion  # which others extend meanwhile, on the same thread
+    map_frame: str  # without one it is chosen, once, as the transforms come
+    max_bytes: int  # of all sweeps that wait
+    timeout_s: float  # for how long each waits
 
-        Without a ``map_frame`` it is chosen, once, as the transforms come. Sweeps wait for
-        ``timeout_s`` each, and no more than ``max_bytes`` together.
-        """
-        self.map_frame = map_frame
-        self._motion = motion
-        self._max_bytes = max_bytes
-        self._timeout_s = timeout_s
+    def __post_init__(self) -> None:
         self._waiting: dict[str, deque[_Waiting]] = {}
-        self._warned = bool(map_frame)  # that there is a better frame; not where it was chosen
+        self._warned = bool(self.map_frame)  # that there is a better frame; not where it was chosen
         self._choose_s: float | None = None  # when the map frame is chosen at the latest
 
     def add(self, topic_name: str, sweep: Sweep, now_s: float) -> None:
         """Have a sweep placed; if too many are pending, the oldest are dropped."""
-        entry = _Waiting(topic_name, sweep, sweep.span_ns, now_s + self._timeout_s)
+        entry = _Waiting(topic_name, sweep, sweep.span_ns, now_s + self.timeout_s)
         self._waiting.setdefault(topic_name, deque()).append(entry)
         self._keep_within_limit(now_s)
 
@@ -78,7 +130,7 @@ class Placement:
     def _keep_within_limit(self, now_s: float) -> None:
         """Give up the oldest sweeps where all together are too large."""
         entries = [entry for entries in self._waiting.values() for entry in entries]
-        excess = sum(entry.sweep.memory_bytes for entry in entries) - self._max_bytes
+        excess = sum(entry.sweep.memory_bytes for entry in entries) - self.max_bytes
         for entry in sorted(entries, key=lambda entry: entry.give_up_s):
             if excess <= 0:
                 return
@@ -101,7 +153,7 @@ class Placement:
             outcome = error
         except Exception as error:  # whatever numbers came must not stop the others
             outcome = NoScanError("internal", repr(error))
-        return Placed(entry.topic_name, entry.sweep, outcome, self.map_frame)
+        return Placed(entry.topic_name, entry.sweep, outcome)
 
     def _scan(self, entry: _Waiting, now_s: float) -> PosedScan:
         frame = entry.sweep.frame
@@ -113,7 +165,7 @@ class Placement:
                 "choose the topic of the sensor itself with --clouds",
             )
         # Asked first, since it is quick, and most that wait will wait on.
-        frames = self._motion.frames
+        frames = self.motion.frames
         frames.poses(target, frame, np.array(entry.needs_ns, np.int64))
         scan = place(entry.sweep, frames, target)
         if not self.map_frame:
@@ -124,7 +176,7 @@ class Placement:
 
     def _warn_of_better_frame(self) -> None:
         """Warn, once, if a better frame to map in appeared too late."""
-        better = self._motion.frames.fixed_frame(self.map_frame)
+        better = self.motion.frames.fixed_frame(self.map_frame)
         if better != self.map_frame and not self._warned:
             self._warned = True
             _log.warning(
@@ -137,9 +189,9 @@ class Placement:
 
     def _best_frame(self, frame: str, now_s: float) -> str:
         """Return the frame to map in, as far as is known by now."""
-        if self._motion.body_parent is not None:
-            return self._motion.body_parent
-        found = self._motion.frames.fixed_frame(frame)
+        if self.motion.body_parent is not None:
+            return self.motion.body_parent
+        found = self.motion.frames.fixed_frame(frame)
         if found not in ROOT_NAMES:
             above = "no transform names it" if found == frame else f"it is in {found!r}"
             raise NoTransformError(
@@ -148,7 +200,7 @@ class Placement:
                 late=True,
             )
         if self._choose_s is None:
-            self._choose_s = now_s + min(_CHOICE_S, self._timeout_s / 2)
+            self._choose_s = now_s + min(_CHOICE_S, self.timeout_s / 2)
         if found != ROOT_NAMES[0] and now_s < self._choose_s:
             raise NoTransformError("no_transform", f"no frame above {found!r} yet", late=True)
         return found

@@ -1,19 +1,19 @@
-"""Subscribing to topics: those that are known from the start, and those that are found."""
+"""Subscribing to topics, known or found, and the queue of messages for the thread that reads."""
 
 import logging
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import zenoh
 import zenoh.ext
 
-from triquad_tools.ros2.intake.message_queue import Arrival
-from triquad_tools.ros2.node import Node
-from triquad_tools.ros2.token_watch import TokenWatch
-from triquad_tools.ros2.topic_choice import Feed, Role, TopicChoice
+from triquad_tools.ros2.node import Node, watch_tokens
+from triquad_tools.ros2.options import Feed, Role, TopicChoice
 from triquad_tools.ros2.topics import (
     ANY_HASH,
     Announcement,
@@ -26,7 +26,6 @@ from triquad_tools.ros2.topics import (
 )
 
 _log = logging.getLogger("triquad_ros2")
-
 _MAX_FOUND = 1000  # topics that are remembered, whether they are wanted or not
 _ASK_S = 2.0
 _SUBSCRIPTION = Delivery(reliable=False)  # which suits every publisher
@@ -34,28 +33,94 @@ _SUBSCRIPTION = Delivery(reliable=False)  # which suits every publisher
 _HISTORY = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=100)
 
 
+@dataclass(frozen=True, eq=False)
+class Arrival:
+    """A message as it arrived."""
+
+    role: Role
+    topic_name: str
+    payload: zenoh.ZBytes
+    arrived_ns: int  # nanoseconds since 1970, by this machine's clock
+    attachment: bytes = b""
+
+    @property
+    def nbytes(self) -> int:
+        """About the memory that it takes."""
+        return len(self.payload) + 1000
+
+
+@dataclass(frozen=True)
+class QueueLimits:
+    """The most that may wait."""
+
+    messages: int
+    nbytes: int
+
+
+class MessageQueue:
+    """Scans, and other messages, which go first: transforms must not wait behind large clouds."""
+
+    def __init__(
+        self, scans: QueueLimits, others: QueueLimits, dropped: Callable[[Arrival], None]
+    ) -> None:
+        """``dropped`` is called with each message that nobody will read."""
+        self._limits = {True: scans, False: others}  # by whether they bring scans
+        self._waiting: dict[bool, deque[Arrival]] = {True: deque(), False: deque()}
+        self._bytes = {True: 0, False: 0}  # of these
+        self._dropped = dropped
+        self._changed = threading.Condition()
+        self._closed = False
+
+    def put(self, arrival: Arrival) -> None:
+        """Add a message; where they are too many, the oldest go. Never waits."""
+        is_scan = arrival.role.brings_scans
+        line, limits = self._waiting[is_scan], self._limits[is_scan]
+        gone = []
+        with self._changed:
+            line.append(arrival)
+            self._bytes[is_scan] += arrival.nbytes
+            while len(line) > limits.messages or self._bytes[is_scan] > limits.nbytes:
+                gone.append(self._oldest(is_scan))
+            self._changed.notify()
+        for each in gone:
+            self._dropped(each)
+
+    def take(self, timeout_s: float) -> Arrival | None:
+        """Return the message to read next; None if none comes in time, or the queue is closed."""
+        with self._changed:
+            others, scans = self._waiting[False], self._waiting[True]
+            self._changed.wait_for(lambda: self._closed or others or scans, timeout_s)
+            return None if self._closed or not (others or scans) else self._oldest(not others)
+
+    def _oldest(self, is_scan: bool) -> Arrival:
+        arrival = self._waiting[is_scan].popleft()
+        self._bytes[is_scan] -= arrival.nbytes
+        return arrival
+
+    def close(self) -> None:
+        """Give out no more messages."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+
+
+@dataclass
 class TopicListener:
     """Forwards what arrives on all wanted topics."""
 
-    def __init__(
-        self,
-        session: zenoh.Session,
-        choice: TopicChoice,
-        node: Node,
-        arrived: Callable[[Arrival], None],
-    ) -> None:
-        """``arrived`` is called with each message, from several threads, and must not wait."""
-        self._session = session
-        self._choice = choice
-        self._node = node
-        self._arrived = arrived
+    session: zenoh.Session
+    choice: TopicChoice
+    node: Node
+    arrived: Callable[[Arrival], None]  # called from several threads, and must not wait
+
+    def __post_init__(self) -> None:
         self._lock = threading.Lock()
         self._closed = False
         self._subscribers: dict[str, Any] = {}  # by key
         self._found: set[Announcement] = set()
-        for feed in choice.feeds():
+        for feed in self.choice.feeds():
             self._open(feed)
-        self._watch = TokenWatch(session, choice.domain, End.PUBLISHER, self._find)
+        self._watches = watch_tokens(self.session, self.choice.domain, End.PUBLISHER, self._find)
 
     @property
     def found(self) -> list[Topic]:
@@ -65,7 +130,8 @@ class TopicListener:
 
     def close(self) -> None:
         """Forward nothing more."""
-        self._watch.close()
+        for watch in self._watches:
+            watch.undeclare()
         with self._lock:
             self._closed = True
         for subscriber in self._subscribers.values():
@@ -79,21 +145,21 @@ class TopicListener:
             receive = partial(self._receive, feed)
             self._subscribers[feed.key] = (
                 zenoh.ext.declare_advanced_subscriber(
-                    self._session, feed.key, receive, history=_HISTORY
+                    self.session, feed.key, receive, history=_HISTORY
                 )
                 if feed.role is Role.TF_STATIC
-                else self._session.declare_subscriber(feed.key, receive)
+                else self.session.declare_subscriber(feed.key, receive)
             )
 
     def _receive(self, feed: Feed, sample: zenoh.Sample) -> None:
         name = feed.topic_name or rmw_topic_name(str(sample.key_expr))
         attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
-        self._arrived(Arrival(feed.role, name, sample.payload, time.time_ns(), attachment))
+        self.arrived(Arrival(feed.role, name, sample.payload, time.time_ns(), attachment))
 
     def _find(self, announcement: Announcement) -> None:
         """Handle a topic that is published."""
         topic = announcement.topic
-        role = self._choice.wants(topic)
+        role = self.choice.wants(topic)
         if role is Role.TF_STATIC and announcement.type_hash == ANY_HASH:
             self._ask_old_bridges(topic.name)
         with self._lock:
@@ -108,12 +174,12 @@ class TopicListener:
         else:
             # Drivers that publish only while there is a subscriber learn it from this.
             what = Announcement(End.SUBSCRIPTION, topic, announcement.type_hash)
-            self._node.announce(what, _SUBSCRIPTION)
+            self.node.announce(what, _SUBSCRIPTION)
 
     def _ask_old_bridges(self, topic_name: str) -> None:
         """Fetch what bridges up to 1.5 published before anybody subscribed."""
         feed = Feed(Role.TF_STATIC, old_bridge_cache(topic_name), topic_name)
-        replies = self._session.get(
+        replies = self.session.get(
             feed.key,
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_client import Client, Grid, Status
 
-from triquad_tools.ros2.intake.scan_publisher import Place
+from triquad_tools.ros2.intake.intake import Place
 from triquad_tools.ros2.options import SliceShape
 from triquad_tools.ros2.output.topic_publisher import TopicPublisher
-from triquad_tools.sensors.ros.cdr import CdrWriter
+from triquad_tools.sensors.ros.type_store import CdrWriter
 
 _PERIOD_S = 1.0  # between two slices
 _MAX_SHARE = 4  # the server works on slices for at most one part in four of the time
@@ -29,7 +29,7 @@ class GridPublisher:
         self._shown: tuple[int, Sequence[float]] | None = None  # epoch and corner of the last slice
         self._due_s = 0.0  # monotonic
 
-    def publish(self, place: Place) -> None:
+    def publish(self, place: Place, _: float) -> None:
         """Publish a slice where the map or the place changed since the last."""
         followed, started_s = self._publisher.is_followed, time.monotonic()
         if self._publisher.has_newcomers() or not followed:

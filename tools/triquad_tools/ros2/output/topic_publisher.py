@@ -8,10 +8,9 @@ from dataclasses import dataclass
 
 import zenoh
 
-from triquad_tools.ros2.attachment import ATTACHMENT
-from triquad_tools.ros2.node import Node
-from triquad_tools.ros2.token_watch import TokenWatch
+from triquad_tools.ros2.node import Node, watch_tokens
 from triquad_tools.ros2.topics import (
+    ATTACHMENT,
     NO_HASH,
     Announcement,
     Delivery,
@@ -35,34 +34,32 @@ class _Key:
         return bool(self.publisher.matching_status.matching)  # type: ignore[attr-defined]
 
 
+@dataclass
 class TopicPublisher:
     """Publishes to all subscribers; notices new ones by their tokens: they lack what was sent."""
 
-    def __init__(
-        self,
-        session: zenoh.Session,
-        node: Node,
-        topic: Topic,
-        domain: int,
-        delivery: Delivery,
-    ) -> None:
-        self._session = session
-        self._node = node
-        self._topic = topic
-        self._domain = domain
-        self._delivery = delivery
-        self._hash = type_hash(topic.type_name)
+    session: zenoh.Session
+    node: Node
+    topic: Topic
+    domain: int
+    delivery: Delivery
+
+    def __post_init__(self) -> None:
+        self._hash = type_hash(self.topic.type_name)
         self._lock = threading.Lock()
         self._numbers = itertools.count(1)
         self._keys: dict[str, _Key] = {}
         self._came = threading.Event()  # a subscriber did
         self._open_rmw(self._hash)
-        self._open_bridge()
-        self._watch = TokenWatch(session, domain, End.SUBSCRIPTION, self._appeared)
+        if self._open(bridge_key(self.topic.name), None):
+            what = Announcement(End.PUBLISHER, self.topic, self._hash)
+            self.node.announce_to_bridges(what, self.delivery)
+        self._watches = watch_tokens(self.session, self.domain, End.SUBSCRIPTION, self._appeared)
 
     def close(self) -> None:
         """Publish no more."""
-        self._watch.close()
+        for watch in self._watches:
+            watch.undeclare()
         for key in self._keys.values():
             key.publisher.undeclare()
 
@@ -92,22 +89,17 @@ class TopicPublisher:
 
     def _appeared(self, who: Announcement) -> None:
         """Handle a new subscriber of any topic."""
-        if who.topic != self._topic:
+        if who.topic != self.topic:
             return
         if who.type_hash == NO_HASH:
             self._open_rmw(NO_HASH)
         self._came.set()
 
     def _open_rmw(self, type_hash: str) -> None:
-        key = rmw_key(self._domain, self._topic, type_hash)
+        key = rmw_key(self.domain, self.topic, type_hash)
         if self._open(key, hashlib.blake2b(key.encode(), digest_size=16).digest()):
-            what = Announcement(End.PUBLISHER, self._topic, type_hash)
-            self._node.announce(what, self._delivery)
-
-    def _open_bridge(self) -> None:
-        if self._open(bridge_key(self._topic.name), None):
-            what = Announcement(End.PUBLISHER, self._topic, self._hash)
-            self._node.announce_to_bridges(what, self._delivery)
+            what = Announcement(End.PUBLISHER, self.topic, type_hash)
+            self.node.announce(what, self.delivery)
 
     def _open(self, key: str, identity: bytes | None) -> bool:
         """Publish under a key from now on; return False if that is done already."""
@@ -116,7 +108,7 @@ class TopicPublisher:
                 return False
             # Large messages that may be dropped are lost without need. Last of all, since a
             # publisher that waits for a slow subscriber delays others of its priority.
-            publisher = self._session.declare_publisher(
+            publisher = self.session.declare_publisher(
                 key,
                 congestion_control=zenoh.CongestionControl.BLOCK,
                 priority=zenoh.Priority.BACKGROUND,

@@ -7,9 +7,8 @@ from numpy.typing import NDArray
 from triquad_client.depth_image import Intrinsics, depth_points
 from triquad_client.errors import InvalidScanError
 
-from triquad_tools.sensors.errors import NoScanError
 from triquad_tools.sensors.ros.header import frame_name, stamp_ns
-from triquad_tools.sensors.sweep import Sweep
+from triquad_tools.sensors.sweep import NoScanError, Sweep
 
 _ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 

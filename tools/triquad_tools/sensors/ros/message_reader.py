@@ -1,46 +1,28 @@
 """Messages of ROS, recorded or as they arrive, turned into sweeps and transforms."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
-from triquad_tools.sensors.errors import NoScanError
+from triquad_client.pose import Pose
+
 from triquad_tools.sensors.motion.frame_tree import STATIC, Transform
 from triquad_tools.sensors.ros.depth_camera import camera_topic, sweep_of_depth
+from triquad_tools.sensors.ros.header import frame_name, stamp_ns
 from triquad_tools.sensors.ros.point_cloud import sweep_of_cloud
-from triquad_tools.sensors.ros.transforms import transforms_of
-from triquad_tools.sensors.ros.type_store import POINT_CLOUD
-from triquad_tools.sensors.sweep import Sweep
+from triquad_tools.sensors.ros.type_store import ODOMETRY, POINT_CLOUD, POSE
+from triquad_tools.sensors.sweep import NoScanError, Sweep
 
 
+@dataclass(frozen=True)
 class MessageReader:
     """Reads decoded messages; remembers the cameras, which depth images need."""
 
-    def __init__(
-        self,
-        *,
-        stride: int = 1,
-        body_frame: str = "",
-        by_arrival: bool = False,
-        max_points: float = math.inf,
-    ) -> None:
-        """Set how messages are read.
-
-        Args:
-            stride: every how many rows and columns of a depth image one is taken.
-            body_frame: whose poses are those that do not say whose they are.
-            by_arrival: stamps are when messages came, not those of their headers.
-            max_points: of a scan; what has more is refused.
-        """
-        self._stride = stride
-        self._body_frame = body_frame
-        self._by_arrival = by_arrival
-        self._max_points = max_points
-        self._cameras: dict[str, Any] = {}  # CameraInfo by its topic
-
-    def remember_camera(self, topic: str, info: Any) -> None:
-        """Remember the ``CameraInfo`` of a topic."""
-        self._cameras[topic] = info
+    stride: int = 1  # every how many rows and columns of a depth image one is taken
+    body_frame: str = ""  # whose poses are those that do not say whose they are
+    by_arrival: bool = False  # stamps are when messages came, not those of their headers
+    max_points: float = math.inf  # of a scan; what has more is refused
+    cameras: dict[str, Any] = field(default_factory=dict)  # CameraInfo by its topic
 
     def sweep(self, topic: str, kind: str, message: Any, came_ns: int) -> Sweep:
         """Return the sweep of a cloud or a depth image.
@@ -52,34 +34,63 @@ class MessageReader:
             self._check_count(message.width * message.height)
             sweep = sweep_of_cloud(message)
         else:
-            stride = self._stride
+            stride = self.stride
             self._check_count(-(-message.width // stride) * -(-message.height // stride))
             sweep = sweep_of_depth(message, self._camera(camera_topic(topic)), stride)
-        return replace(sweep, stamp_ns=came_ns) if self._by_arrival else sweep
+        return replace(sweep, stamp_ns=came_ns) if self.by_arrival else sweep
 
     def transforms(
         self, kind: str, message: Any, came_ns: int, *, static: bool = False
     ) -> list[Transform]:
         """Return the transforms of a message of transforms, ``static`` or not, or of a pose."""
-        found = transforms_of(kind, message, self._body_frame)
+        found = transforms_of(kind, message, self.body_frame)
         if static:
             return [replace(each, stamp_ns=STATIC) for each in found]
-        return [replace(each, stamp_ns=came_ns) for each in found] if self._by_arrival else found
+        return [replace(each, stamp_ns=came_ns) for each in found] if self.by_arrival else found
 
     def _camera(self, topic: str) -> Any:
-        if topic not in self._cameras:
-            there = ", ".join(sorted(self._cameras)) or "none"
+        if topic not in self.cameras:
+            there = ", ".join(sorted(self.cameras)) or "none"
             raise NoScanError(
                 "no_camera_info",
                 f"nothing is known of the camera of {topic} (of that kind there is {there}): it "
                 "has to be published and recorded",
             )
-        return self._cameras[topic]
+        return self.cameras[topic]
 
     def _check_count(self, points: int) -> None:
-        if points > self._max_points:
+        if points > self.max_points:
             raise NoScanError(
                 "too_many_points",
-                f"{points} points exceed {self._max_points}: publish smaller clouds, or, of depth "
+                f"{points} points exceed {self.max_points}: publish smaller clouds, or, of depth "
                 "images, raise --depth-stride",
             )
+
+
+def transforms_of(kind: str, message: Any, body_frame: str) -> list[Transform]:
+    """Return the transforms of a message of a kind, at the times of its headers.
+
+    ``body_frame`` is whose pose it is where it does not say so, as a ``PoseStamped``.
+    """
+    if kind == POSE:
+        where = message.pose
+        return [_transform(message.header, body_frame, where.position, where.orientation)]
+    if kind == ODOMETRY:
+        where, child = message.pose.pose, message.child_frame_id or body_frame
+        return [_transform(message.header, child, where.position, where.orientation)]
+    return [
+        _transform(
+            each.header, each.child_frame_id, each.transform.translation, each.transform.rotation
+        )
+        for each in message.transforms
+    ]
+
+
+def _transform(header: Any, child: str, position: Any, rotation: Any) -> Transform:
+    quaternion = rotation.x, rotation.y, rotation.z, rotation.w
+    return Transform(
+        parent=frame_name(header.frame_id),
+        child=frame_name(child),
+        stamp_ns=stamp_ns(header),
+        pose=Pose((position.x, position.y, position.z), quaternion),
+    )

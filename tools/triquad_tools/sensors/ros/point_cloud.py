@@ -6,10 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Floats
 
-from triquad_tools.sensors.errors import NoScanError
 from triquad_tools.sensors.point_times import TIME_FIELDS, offsets_s
 from triquad_tools.sensors.ros.header import frame_name, stamp_ns
-from triquad_tools.sensors.sweep import Sweep
+from triquad_tools.sensors.sweep import NoScanError, Sweep
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """The types of the message's constants INT8 to FLOAT64."""
@@ -25,19 +24,14 @@ def sweep_of_cloud(message: Any) -> Sweep:
     _check_layout(message)
     points = _points(message, fields)
     stamp = stamp_ns(message.header)
-    times = _times(message, fields)
+    name = next((name for name in TIME_FIELDS if name in fields), None)
+    times = None if name is None else _column(message, fields[name]).reshape(-1)
     if not np.isfinite(points).all():
         finite = np.isfinite(points).all(axis=1)
         points = points[finite]
         times = None if times is None else times[finite]
     offsets = None if times is None else offsets_s(times, stamp)
     return Sweep(points, frame_name(message.header.frame_id), stamp, offsets)
-
-
-def _times(message: Any, fields: dict[str, Any]) -> NDArray[Any] | None:
-    """Return the time of each point [N] as the driver wrote it, if it did."""
-    name = next((name for name in TIME_FIELDS if name in fields), None)
-    return None if name is None else _column(message, fields[name]).reshape(-1)
 
 
 def _points(message: Any, fields: dict[str, Any]) -> Floats:

@@ -1,13 +1,18 @@
-"""Decoding messages of ROS, whose types are known by their names alone."""
+"""Messages of ROS: decoded by the names of their types alone, and written as CDR from arrays.
+
+The library writes messages too, but from objects: large ones take seconds.
+"""
 
 from functools import cache
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
-from triquad_tools.sensors.errors import NoScanError
+from triquad_tools.sensors.sweep import NoScanError
 
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 IMAGE = "sensor_msgs/msg/Image"
@@ -18,6 +23,8 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 POSE = "geometry_msgs/msg/PoseStamped"
 MARKER = "visualization_msgs/msg/Marker"
 OCCUPANCY_GRID = "nav_msgs/msg/OccupancyGrid"
+
+_LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 
 
 @cache
@@ -37,3 +44,35 @@ def decode_cdr(payload: bytes, type_name: str) -> Any:
     # Any error of the decoder: bytes of another type lead it anywhere.
     except (SerdeError, ValueError, IndexError, MemoryError, TypeError) as error:
         raise NoScanError("decode", f"no {type_name}: {error}") from error
+
+
+class CdrWriter:
+    """Fields in the order of the message's definition (OMG formal/02-06-51, chapter 15)."""
+
+    def __init__(self) -> None:
+        self._data = bytearray()
+
+    def numbers(self, dtype: str, *values: float) -> "CdrWriter":
+        """Write numbers of one type, such as ``<f8``."""
+        return self._array(np.array(values, dtype))
+
+    def text(self, value: str) -> "CdrWriter":
+        """Write a string."""
+        data = value.encode() + b"\x00"
+        self.numbers("<u4", len(data))
+        self._data += data
+        return self
+
+    def sequence(self, values: NDArray[np.generic]) -> "CdrWriter":
+        """Write elements [N, ...] of one or more numbers each."""
+        self.numbers("<u4", len(values))
+        return self._array(values) if len(values) else self
+
+    def payload(self) -> bytes:
+        """Return the bytes of the message."""
+        return _LITTLE_ENDIAN + bytes(self._data)
+
+    def _array(self, values: NDArray[np.generic]) -> "CdrWriter":
+        self._data += bytes(-len(self._data) % values.itemsize)
+        self._data += values.tobytes()
+        return self

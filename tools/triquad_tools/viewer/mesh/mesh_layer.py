@@ -1,5 +1,7 @@
-"""The mesh in a scene: coarse everywhere, finer where the camera is near."""
+"""The mesh in a scene: finer where the camera is near, which shows all until a person moves it."""
 
+import math
+from collections import deque
 from collections.abc import Hashable, Iterable, Mapping
 from typing import NamedTuple
 
@@ -9,7 +11,7 @@ from triquad_client.mesh.followed_mesh import MeshTile
 from triquad_client.mesh.mesh_files import GlbMesh, glb_bytes
 from triquad_format.records.arrays import Doubles
 
-from triquad_tools.viewer.mesh.overview_camera import OverviewCamera
+from triquad_tools.plots.mesh_view import view_axes
 from triquad_tools.viewer.mesh.tile_colours import (
     TileColours,
     confidence_colours,
@@ -20,10 +22,70 @@ from triquad_tools.viewer.mesh.tiles_in_view import TileName, TilesInView
 from triquad_tools.viewer.page.layer import Layer
 from triquad_tools.viewer.page.page import Page
 
+_NEAR_M, _FAR_M = 0.1, 20_000.0
+_VIEW_RAD = math.radians(50.0)
+_TOWARDS_EYE = np.array([-0.45, -0.65, 0.62])
+_FRAMED = (1.0, 99.0)  # percentiles: what lies far away from all else does not make it small
+_MARGIN = 1.05
+_LEAST_ASPECT = 0.1
+_GROWN = 0.02  # share of the camera's distance; a smaller step is not worth a jump
+_SAME = 1e-3
+_EYES = 64  # places where it was put last: what a browser reports is not as old as those before
+
 _PERIOD_S = 0.5
 _HEIGHT, _CONFIDENCE = "height", "confidence"
 _PIXELS = 4  # of a cell
 _ENOUGH = 200  # vertices of a tile, to know where it is
+
+
+class View(NamedTuple):
+    """The camera's position and target: [3] metres, map frame."""
+
+    eye: Doubles
+    target: Doubles
+
+
+def view_of(points: Doubles, aspect: float) -> View:
+    """Return an oblique view from above of nearly all ``points`` [N, 3], at least one."""
+    axes = view_axes(-_TOWARDS_EYE)
+    seen = points @ axes.T
+    middle = 0.5 * np.percentile(seen, _FRAMED, axis=0).sum(axis=0)
+    right, down, ahead = (seen - middle).T
+    tangent = math.tan(0.5 * _VIEW_RAD)
+    needed = np.maximum(np.abs(right) / aspect, np.abs(down)) / tangent - ahead
+    distance_m = _MARGIN * max(float(np.percentile(needed, _FRAMED[1])), _NEAR_M)
+    return View((middle - [0.0, 0.0, distance_m]) @ axes, middle @ axes)
+
+
+class OverviewCamera:
+    """Moves the camera of a scene back as the map grows."""
+
+    def __init__(self, page: Page) -> None:
+        self._page = page
+        self._taken = False
+        camera = page.client.camera
+        camera.fov, camera.near, camera.far = _VIEW_RAD, _NEAR_M, _FAR_M
+        # The browser reports each place late: only one where it never was put is a person's.
+        self._eyes = deque([np.array(camera.position)], _EYES)  # [3] in the scene
+        camera.on_update(self._moved)
+
+    def follow(self, points: Doubles) -> None:
+        """Show all of ``points`` [N, 3], metres, map frame, unless a person moved the camera."""
+        if self._taken or not len(points):
+            return
+        camera = self._page.client.camera
+        view = view_of(points, max(camera.aspect, _LEAST_ASPECT))
+        eye, target = self._page.in_scene(view.eye), self._page.in_scene(view.target)
+        away_m = float(np.linalg.norm(eye - target))
+        if float(np.linalg.norm(eye - self._eyes[-1])) > _GROWN * away_m:
+            self._eyes.append(np.asarray(eye, np.float64))
+            with self._page.client.atomic():
+                camera.position = eye
+                camera.look_at = target
+
+    def _moved(self, camera: viser.CameraHandle) -> None:
+        away_m = np.linalg.norm(np.array(self._eyes) - camera.position, axis=1)
+        self._taken |= bool(away_m.min() > _SAME * (1.0 + np.linalg.norm(camera.position)))
 
 
 class _DrawnTile(NamedTuple):
@@ -82,7 +144,12 @@ class MeshLayer(Layer):
         if self.page.source.grows or not self._framed:
             self._camera.follow(points)
             self._framed = self._tiles.loaded
-        colours = self._colours(points)
+        by_confidence = self._by.value == _CONFIDENCE
+        colours = (
+            confidence_colours(self.page.source.queries)
+            if by_confidence
+            else height_colours(points[:, 2])
+        )
         self.tell(colours.scale.html)
         for name, tile in wanted.items():
             appearance = (colours.scale.label, colours.scale.low, colours.scale.high, tile.version)
@@ -92,12 +159,6 @@ class MeshLayer(Layer):
                 self._replaced += [drawn.handle] if drawn else []
         for name in self._shown.keys() - wanted.keys():
             self._replaced.append(self._shown.pop(name).handle)
-
-    def _colours(self, points: Doubles) -> TileColours:
-        """Return the chosen colours, for a mesh with some ``points`` [N, 3]."""
-        if self._by.value == _CONFIDENCE:
-            return confidence_colours(self.page.source.queries)
-        return height_colours(points[:, 2])
 
     def _add(self, tile: MeshTile, colours: TileColours) -> viser.GlbHandle:
         mesh = GlbMesh("tile", tile.vertices, tile.faces, lit_colours(colours, tile))

@@ -2,22 +2,154 @@
 
 from collections import deque
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import viser
+from matplotlib.colors import to_rgb
+from triquad_client import Distances, Polyline, Status
+from triquad_client.calls.queries import MapQueries
+from triquad_format.records.arrays import Doubles
+from triquad_format.wire.limits import MAX_DISTANCE_M
 
-from triquad_tools.viewer.page.legends import text_html
-from triquad_tools.viewer.page.page import Page
-from triquad_tools.viewer.questions.path import Path
-from triquad_tools.viewer.questions.picking import surface_along
-from triquad_tools.viewer.questions.point import MAX_DISTANCE_M, Point
-from triquad_tools.viewer.questions.question import Answer, Question
+from triquad_tools.plots.colours import BEHIND, UNKNOWN
+from triquad_tools.viewer.page.layer import Answer, Layer, Question
+from triquad_tools.viewer.page.legends import lines_html, table_html, text_html
+from triquad_tools.viewer.page.page import Page, surface_along
 
+_POINT_REACH_M = 10.0  # how far around a point surfaces are searched for
+
+_BALL, _ARROW = 0.006, 0.08  # radius and length, as shares of the distance of the eye
+_COLOUR = "#c51b7d"  # no mesh has it
+
+_LEAST_REACH_M, _REACH_RADII = 1.0, 3.0  # how far around surfaces are searched for
+_LEAST_WIDTH = 0.004  # of what is drawn, as a share of the distance of the eye
+_FREE = "#0072b2"
+_LEGEND = lines_html(
+    (_FREE, "the robot passes"),
+    (UNKNOWN, "it is in unknown space, or was before"),
+    (BEHIND, "it touches a surface, or did before"),
+)
 _ASKS, _LAYS, _NOTHING = "asks the map", "adds to the path", "does nothing"
 _RAISED_M, _RADIUS_M = 0.5, 0.3
 _LEAST_LEG_M = 0.01  # a second click at the same place adds nothing
 _HINT = "Click at a surface."
 _SKY = "No surface there: sky, or nothing was seen in that direction."
+
+
+@dataclass(frozen=True)
+class Point:
+    """A point above a surface."""
+
+    surface: tuple[float, ...]  # [3] metres, map frame
+    raised_m: float
+
+    @property
+    def place(self) -> Doubles:
+        """The point [3] itself."""
+        return np.array(self.surface) + [0.0, 0.0, self.raised_m]
+
+    def html(self, answer: Distances) -> str:
+        """Return what the map answers about it."""
+        x, y, z = self.place
+        status, distance_m = Status(int(answer.status[0])), float(answer.distance_m[0])
+        distance, gradient = f"no surface within {_POINT_REACH_M:g} m", "none"
+        if answer.found[0]:
+            distance = f"{distance_m:.3f} m" + (", behind a surface" if distance_m < 0 else "")
+            gradient = ", ".join(f"{part:.2f}" for part in answer.gradient[0])
+        unseen = ": not seen, so the distance is to what was" if status is Status.UNKNOWN else ""
+        rows = [
+            ("position", f"{x:.3f}, {y:.3f}, {z:.3f} m"),
+            ("raised by", f"{self.raised_m:.2f} m"),
+            ("distance", distance),
+            ("gradient", gradient),
+            ("status", f"{status.name}{unseen}"),
+            ("confidence", f"{float(answer.confidence[0]):.2f}"),
+            ("epoch", f"{answer.epoch}"),
+        ]
+        return table_html(rows)
+
+    def marks(self, layer: Layer, answer: Distances) -> list[viser.SceneNodeHandle]:
+        """Draw a ball, a stem up from the surface, and the gradient as an arrow."""
+        page, place = layer.page, self.place
+        eye_m = float(np.linalg.norm(place - page.eye))
+        light, at, radius_m = to_rgb(_COLOUR), page.in_scene(place), _BALL * eye_m
+        stem, thick_m = np.array([[self.surface, place]]), 0.4 * radius_m
+        marks: list[viser.SceneNodeHandle] = [
+            page.scene.add_icosphere(layer.node("ball"), radius_m, light, position=at),
+            layer.lines(stem, _COLOUR, thick_m),
+        ]
+        if answer.found[0]:
+            length_m = _ARROW * eye_m
+            ends = page.in_scene(np.array([[place, place + length_m * answer.gradient[0]]]))
+            arrow = page.scene.add_arrows(
+                layer.node("gradient"), ends, np.array(light), shaft_radius=thick_m,
+                head_radius=radius_m, head_length=0.3 * length_m,
+            )  # fmt: skip
+            marks.append(arrow)
+        return marks
+
+
+class Path:
+    """A ball that moves from point to point, and what the map answers about it."""
+
+    def __init__(self, queries: MapQueries, points: Doubles, radius_m: float) -> None:
+        """Ask about points [N, 3], at least two, metres, map frame.
+
+        Raises:
+            TriquadError: the map does not answer, or not about so long a path.
+        """
+        self._points = points
+        self._radius_m = radius_m
+        self._reach_m = min(max(_LEAST_REACH_M, _REACH_RADII * radius_m), MAX_DISTANCE_M)
+        self.answer: Polyline = queries.query_polyline(points, radius_m, self._reach_m)
+
+    def html(self) -> str:
+        """Return the answer."""
+        answer = self.answer
+        rows = [("path", f"{len(self._points)} points, {answer.length_m:.2f} m")]
+        if answer.blocked:
+            rows.append(("blocked", f"⚠ at {answer.contact_m:.2f} m"))
+        if answer.meets_unknown:
+            rows.append(("unknown", f"⚠ from {answer.unknown_contact_m:.2f} m"))
+        if answer.free():
+            rows.append(("free", f"all along, with radius {self._radius_m:g} m"))
+        least = f"{answer.clearance_m:.2f} m, at {answer.clearance_at_m:.2f} m"
+        if answer.clearance_m >= self._reach_m:
+            least = f"{self._reach_m:g} m or more"
+        return _LEGEND + table_html([*rows, ("least clearance", least)])
+
+    def legs(self) -> list[tuple[str, Doubles]]:
+        """Return its stretches, each with a colour and the points [N, 3] along it."""
+        answer, places = self.answer, self._points
+        steps_m = np.linalg.norm(np.diff(places, axis=0), axis=1)
+        ends_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+        contact_m = min(answer.contact_m if answer.blocked else np.inf, ends_m[-1])
+        unknown_m = min(answer.unknown_contact_m if answer.meets_unknown else np.inf, contact_m)
+        cuts_m = [0.0, unknown_m, contact_m, ends_m[-1]]
+        legs = []
+        for colour, (start_m, end_m) in zip(
+            (_FREE, UNKNOWN, BEHIND), pairwise(cuts_m), strict=True
+        ):
+            if end_m > start_m:
+                inner_m = ends_m[(ends_m > start_m) & (ends_m < end_m)]
+                along_m = np.concatenate([[start_m], inner_m, [end_m]])
+                leg = np.stack([np.interp(along_m, ends_m, axis) for axis in places.T], axis=1)
+                legs.append((colour, leg))
+        return legs
+
+    def marks(self, layer: Layer) -> list[viser.SceneNodeHandle]:
+        """Draw the numbers of its points, and the stretches as wide as the robot."""
+        page = layer.page
+        marks: list[viser.SceneNodeHandle] = [
+            page.scene.add_label(layer.node("number"), f"{number}", position=page.in_scene(point))
+            for number, point in enumerate(self._points, start=1)
+        ]
+        for colour, leg in self.legs():
+            least_m = _LEAST_WIDTH * float(np.linalg.norm(leg[-1] - page.eye))
+            pieces = np.stack([leg[:-1], leg[1:]], axis=1)
+            marks.append(layer.lines(pieces, colour, max(2.0 * self._radius_m, least_m)))
+        return marks
 
 
 @dataclass(frozen=True)
@@ -70,7 +202,7 @@ class Clicks(Question[Clicked]):
         """Ask at the newest point, and about the path if there are several."""
         queries, point = self.page.source.queries, wanted.points[-1]
         told = text_html(_SKY) if wanted.sky else ""
-        found = queries.query_distance(point.place[None], MAX_DISTANCE_M)
+        found = queries.query_distance(point.place[None], _POINT_REACH_M)
         if len(wanted.points) == 1:
             html, marks = told + point.html(found), point.marks(self, found)
             return Answer(html, found.epoch, marks)

@@ -13,11 +13,10 @@ from triquad_format.records.status import Status
 from viser.transforms import SO3
 
 from triquad_tools.plots.colours import BEHIND, DISTANCES, UNKNOWN
+from triquad_tools.viewer.page.layer import Answer, Question
 from triquad_tools.viewer.page.legends import ColourScale, lines_html, text_html
-from triquad_tools.viewer.page.page import Focus, Page
+from triquad_tools.viewer.page.page import Focus, Page, ground_in_view
 from triquad_tools.viewer.questions.cell_box import CellBox
-from triquad_tools.viewer.questions.picking import ground_in_view
-from triquad_tools.viewer.questions.question import Answer, Question
 
 _HEIGHT_AXIS = 2
 _AXES = {"level, at some z": _HEIGHT_AXIS, "upright, at some x": 0, "upright, at some y": 1}

@@ -6,10 +6,10 @@ from triquad_client.calls.queries import MapQueries
 from triquad_format.records.arrays import Bytes, Floats, Ints
 from triquad_format.records.status import Status
 
+from triquad_tools.viewer.page.layer import Answer, Question
 from triquad_tools.viewer.page.legends import lines_html, text_html
 from triquad_tools.viewer.page.page import Page
 from triquad_tools.viewer.questions.cell_box import CellBox
-from triquad_tools.viewer.questions.question import Answer, Question
 
 _COUNTS = (64, 64, 24)  # cells: they bound how much is asked
 _MOST_CELL_M = 0.75

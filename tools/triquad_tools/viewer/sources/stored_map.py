@@ -1,8 +1,11 @@
-"""The map of a file, shown without a server."""
+"""Map files, shown without a server: one, or the checkpoints of a store in the order of time."""
 
+import threading
 import time
-from collections.abc import Mapping
-from functools import lru_cache
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +13,23 @@ from triquad_client import open_map
 from triquad_client.checks import Bounds
 from triquad_client.mesh.followed_mesh import MeshTile, TileIndex
 from triquad_client.offline.map_mesh import TILE_CELLS
+from triquad_format.errors import FormatError
+from triquad_format.mapfile.checkpoint_folder import (
+    CheckpointFile,
+    checkpoint_files,
+    map_folder,
+)
+from triquad_format.mapfile.metadata import utc_time
+from triquad_format.mapfile.reader import open_manifest
 
+from triquad_tools.console.command import ToolError
 from triquad_tools.viewer.sources.map_source import COARSEST, TileFollower, TileSizes
 
 _CELL_LEAVES = 0.5  # of a cell of level 0, as in a server's mesh
 _MAX_TILES = 500  # that are kept of an open map: some 50 to 200 MB
 _WAIT_S = 0.1  # how long one refresh makes tiles
+
+_MAX_OPEN = 4  # maps that stay in memory beyond those that pages show
 
 
 class StoredMap:
@@ -47,7 +61,12 @@ class StoredMap:
         self, level: int, bounds: Bounds | None = None, before: TileFollower | None = None
     ) -> "StoredTiles":
         """Make the mesh tiles of a level that meet ``bounds``."""
-        return StoredTiles(self, level, bounds, {} if before is None else before.tiles)
+        known, wanted = {} if before is None else before.tiles, self.indices(level, bounds)
+        return StoredTiles(
+            partial(self.tile, level),
+            waiting=[index for index in wanted if index not in known],
+            tiles={index: known[index] for index in wanted if index in known},
+        )
 
     def indices(self, level: int, bounds: Bounds | None) -> list[TileIndex]:
         """Return the tiles that meet a box and may have faces."""
@@ -68,35 +87,98 @@ class StoredMap:
         )
 
 
+@dataclass
 class StoredTiles:
     """Mesh tiles of a map file within a box, which are made bit by bit."""
 
-    def __init__(
-        self,
-        stored: StoredMap,
-        level: int,
-        bounds: Bounds | None,
-        known: Mapping[TileIndex, MeshTile],
-    ) -> None:
-        self._stored = stored
-        self._level = level
-        wanted = stored.indices(level, bounds)
-        self._waiting = [index for index in wanted if index not in known]  # the next one last
-        self.tiles = {index: known[index] for index in wanted if index in known}
-        """The tiles with faces that are made, by their indices."""
+    make: Callable[[TileIndex], MeshTile]
+    waiting: list[TileIndex]  # to be made, the next one last
+    tiles: dict[TileIndex, MeshTile]  # with faces, that are made
 
     @property
     def complete(self) -> bool:
         """Whether all tiles are made."""
-        return not self._waiting
+        return not self.waiting
 
     def next(self, timeout_s: float) -> None:
         """Make tiles for as long, and no less than a tenth of a second."""
         ends_s = time.monotonic() + max(timeout_s, _WAIT_S)
-        while self._waiting and time.monotonic() < ends_s:
-            tile = self._stored.tile(self._level, self._waiting.pop())
+        while self.waiting and time.monotonic() < ends_s:
+            tile = self.make(self.waiting.pop())
             if len(tile.faces):
                 self.tiles[tile.index] = tile
 
     def close(self) -> None:
         """Do nothing: there is nothing to release."""
+
+
+class DamagedError(ToolError):
+    """A checkpoint that cannot be shown."""
+
+
+class History:
+    """The checkpoints of one map in a store, to which a server may add; for several threads."""
+
+    def __init__(self, store: Path) -> None:
+        """Find the folder.
+
+        Raises:
+            MapFileError: there are no checkpoints, or those of several maps.
+            OSError: the folder cannot be read.
+        """
+        self.folder = map_folder(store)
+        self._damaged: dict[CheckpointFile, str] = {}  # as far as is known, and why
+        self._opening = threading.Lock()  # one at a time: it takes all cores
+        self._open = lru_cache(_MAX_OPEN)(lambda path: StoredMap(path, str(self.folder)))
+
+    def files(self) -> list[CheckpointFile]:
+        """Return the checkpoints that can be shown as far as is known, the oldest first.
+
+        Raises:
+            ToolError: the folder cannot be read.
+        """
+        try:
+            found = checkpoint_files(self.folder)
+        except OSError as error:
+            raise ToolError(f"{self.folder} cannot be read: {error.strerror}") from error
+        return [file for file in reversed(found) if file not in self._damaged]
+
+    def damaged(self) -> list[str]:
+        """Return the errors of those that cannot be shown and are still there."""
+        return [why for file, why in sorted(self._damaged.items()) if file.path.exists()]
+
+    def opened(self, file: CheckpointFile) -> StoredMap:
+        """Return the map as it was.
+
+        Raises:
+            DamagedError: it cannot be shown; it is among the files no longer.
+        """
+        try:
+            with self._opening:
+                return self._open(file.path)
+        except (FormatError, OSError) as error:
+            self._damaged[file] = f"{file.path.name} is left out: {error}"
+            raise DamagedError(self._damaged[file]) from error
+
+    def newest(self) -> StoredMap:
+        """Return the map as it was at the newest moment that can be shown.
+
+        Raises:
+            ToolError: there is none.
+        """
+        while files := self.files():
+            with suppress(DamagedError):
+                return self.opened(files[-1])
+        raise ToolError(
+            f"{self.folder}: no checkpoint can be shown; triquad-pack --recover saves what is "
+            "intact"
+        )
+
+
+@lru_cache
+def moment(file: CheckpointFile) -> str:
+    """Return the epoch of a checkpoint, and its time, UTC as in RFC 3339, if the file says it."""
+    with suppress(FormatError, OSError):
+        if stamp_ns := open_manifest(file).stamp_ns:
+            return f"epoch {file.epoch}, {utc_time(stamp_ns)}"
+    return f"epoch {file.epoch}"
