@@ -61,7 +61,7 @@ def _one_turn(options: argparse.Namespace) -> int:
     faulthandler.dump_traceback_later(0.9 * 60 * options.minutes + 60)
     turn = Turn(options.seed, folder, options.most or part.per_turn, seconds=60.0 * options.minutes)
     seconds = _run(part, turn)
-    result = TurnResult(turn.seed, turn.counts, turn.most_seen, turn.broken, seconds)
+    result = TurnResult(turn.seed, dict(turn.counts), turn.most_seen, turn.broken, seconds)
     result.write(folder.with_name(f"{folder.name}.json"))
     print(result)
     faulthandler.cancel_dump_traceback_later()

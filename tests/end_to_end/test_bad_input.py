@@ -11,6 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support import servers
 from support.operations import OPERATIONS
+from support.requests import tile_changes
 from triquad_format.wire import codec, keys
 from triquad_format.wire.mesh_messages import MeshRequest, TileListRequest
 from triquad_format.wire.messages import ResetRequest, SdfRequest, StatusRequest
@@ -192,6 +193,9 @@ def test_random_scans_are_dropped_or_taken_but_never_do_harm(peer, client):
         (keys.MESH, MeshRequest(tiles(0), 0, level=3), "bad_request"),
         (keys.MESH, MeshRequest(tiles(), 0), "bad_request"),
         (keys.MESH, MeshRequest(tiles(*range(65)), 0), "bad_request"),
+        (keys.MESH, MeshRequest(tiles(0), 0, fill_m=1.0), "bad_request"),
+        (keys.TILE_CHANGES, tile_changes(minimum=np.full(3, np.nan)), "bad_request"),
+        (keys.TILE_CHANGES, tile_changes(level=7), "bad_request"),
         (keys.TILE_LIST, TileListRequest(ORIGIN + 1, ORIGIN, 0), "bad_request"),
         (keys.TILE_LIST, TileListRequest(ORIGIN * np.nan, ORIGIN, 0), "bad_request"),
         (keys.RESET, ResetRequest(ORIGIN, ORIGIN * np.nan), "bad_request"),

@@ -95,16 +95,6 @@ def test_memory_and_time_are_told_by_part(client):
     assert metrics.problem is None
 
 
-def test_how_well_it_was_learnt_is_told(client):
-    servers.learn(client, 4)
-    client.settle(servers.WAIT_S)
-    fit = client.status().fit
-    assert fit.rays > 50
-    assert fit.median_m <= fit.upper_m < 0.1
-    assert len(fit.worst) == len(fit.worst_median_m) <= 5
-    assert (np.diff(fit.worst_median_m) <= 0).all()
-
-
 def test_connected_clients_are_listed(client, endpoint):
     before = client.metrics().sessions
     with triquad_client.connect(endpoint) as other:
