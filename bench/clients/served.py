@@ -16,7 +16,7 @@ from triquad_tools.console.progress import progress
 from triquad_tools.demo.probe import Probe, ProbeReport
 from triquad_tools.sensors.sweep import PosedScan
 
-from bench.clients.server_process import ServerProcess
+from bench.clients.server_process import server_process
 from bench.figures import Figure
 from bench.street_scores import DrivenStreet
 
@@ -67,7 +67,7 @@ def served(record: MapRecord | None = None, arguments: Sequence[str] = ()) -> It
             store.mkdir(parents=True)
             write_map(record, store / f"epoch-{record.epoch:09d}.triquad")
         with (
-            ServerProcess(folder, MAP, arguments) as server,
+            server_process(["--map", MAP, "--store", folder / "store", *arguments]) as server,
             connect(server.endpoint, MAP, timeout_s=_TIMEOUT_S) as client,
         ):
             yield Served(folder, server.endpoint, client)

@@ -137,16 +137,6 @@ def test_a_source_whose_name_cannot_stand_in_a_key_is_refused(peer, client):
     assert name not in status.scans_lost
 
 
-def test_repeated_and_overtaken_scans_are_counted(peer, client):
-    for sequence in (0, 2, 2, 1):
-        peer.put("lidar", codec.encode(servers.scan(sequence)))
-    reply = peer.flush(servers.scan(2))
-    assert (reply.taken, reply.lost) == (2, 1)
-    status = client.status()
-    assert status.scans_dropped == {"sequence_backwards": 2}
-    assert status.scans_lost == {"lidar": 1}
-
-
 def test_random_scans_are_dropped_or_taken_but_never_do_harm(peer, client):
     rng = np.random.default_rng(3)
     for _ in range(30):

@@ -5,7 +5,6 @@ import pytest
 import triquad_client
 from support import servers
 from triquad_client import RefusedError, ServerMetrics
-from triquad_server.settings import ServiceSettings
 
 PARTS = {
     "field",
@@ -100,19 +99,6 @@ def test_connected_clients_are_listed(client, endpoint):
     with triquad_client.connect(endpoint) as other:
         assert len(other.metrics().sessions) == len(before) + 1
         assert set(other.metrics().sessions.values()) == {"client"}
-
-
-def test_epochs_that_were_asked_for_by_number_are_pinned(client):
-    servers.learn(client)
-    pinned = client.pinned()
-    for _ in range(6):
-        pinned.query_sdf([[0, 0, 0]])
-        servers.learn(client, 1)
-    metrics = client.metrics()
-    assert metrics.epochs_pinned >= 1
-    assert metrics.epochs_kept > ServiceSettings().epochs_kept
-    assert metrics.epoch == client.status().epoch
-    assert metrics.epoch_age_s >= 0
 
 
 def test_checkpoints_are_counted_and_timed(tmp_path):

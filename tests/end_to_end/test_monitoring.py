@@ -21,7 +21,6 @@ import triquad_client
 import triquad_server
 from prometheus_client.parser import text_string_to_metric_families
 from support import servers
-from support.servers import free_port
 from triquad_client import RefusedError
 from triquad_format.mapfile.checkpoint_folder import checkpoint_files
 from triquad_format.mapfile.reader import read_map
@@ -29,6 +28,8 @@ from triquad_format.printable import printable
 from triquad_server.errors import ListenError
 from triquad_server.monitoring.prometheus import FAMILIES
 from triquad_server.settings import MetricsSettings
+
+from bench.clients.server_process import free_port
 
 PAGE = (Path(__file__).parents[2] / "docs" / "metrics.md").read_text(encoding="utf-8")
 

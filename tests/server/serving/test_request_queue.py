@@ -63,15 +63,6 @@ def test_a_session_has_half_of_the_workers_and_the_next_begins_at_once(workers, 
     assert (100 in work.numbers) == (workers > 1)
 
 
-def test_sessions_take_turns():
-    work = Work(workers=1)
-    work.put(A, 0, 1, 2)
-    work.put(B, 10, 11)
-    for number in (0, 1, 10, 2, 11):
-        assert work.numbers[-1] == number
-        work.finish(number)
-
-
 def test_all_clients_without_a_link_of_their_own_share_a_turn_and_take_turns_in_it():
     work = Work(workers=2)
     work.put("", 0, 1, 2, name="greedy")
