@@ -7,13 +7,7 @@ from triquad_format.records.status import Status
 from triquad_tools.simulation.scene import Scene
 from triquad_tools.simulation.street import street_drive
 
-from bench.street_scores import (
-    HOUSE_MARGIN_M,
-    NEAR_M,
-    StreetProbes,
-    score_street,
-    street_probes,
-)
+from bench.street_scores import HOUSE_MARGIN_M, NEAR_M, StreetProbes, score_street, street_probes
 
 DRIVE = street_drive(3, 2)
 

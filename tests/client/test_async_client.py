@@ -14,15 +14,9 @@ import zenoh
 from support import servers
 from support.event_loop import connected
 from support.server_records import STATUS
-from triquad_client import (
-    AsyncClient,
-    ClosedError,
-)
+from triquad_client import AsyncClient, ClosedError
 from triquad_format.wire import codec, keys
-from triquad_format.wire.messages import (
-    MapInfo,
-    SdfReply,
-)
+from triquad_format.wire.messages import MapInfo, SdfReply
 from triquad_map.stored_map import StoredMap
 
 POSE = np.eye(4)

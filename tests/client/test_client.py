@@ -22,12 +22,7 @@ from triquad_client import (
     UnknownMapError,
 )
 from triquad_format.wire import codec, keys
-from triquad_format.wire.messages import (
-    ErrorReply,
-    FlushReply,
-    SdfReply,
-    SdfRequest,
-)
+from triquad_format.wire.messages import ErrorReply, FlushReply, SdfReply, SdfRequest
 
 POSE = np.eye(4)
 CLOUD = np.ones((10, 3), np.float32)

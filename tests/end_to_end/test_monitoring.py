@@ -11,7 +11,6 @@ import subprocess
 import sys
 import urllib.error
 import urllib.request
-from collections.abc import Callable
 from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -159,7 +158,7 @@ def test_connections_that_stall_or_trickle_take_some_threads_for_some_seconds(po
         trickling = opened
         while trickling:  # a byte each tenth of a second or so: never silent for long
             trickling = [connection for connection in trickling if stays_open(connection)]
-    until(lambda: is_healthy(port))
+    assert any(is_healthy(port) for _ in range(1000))
 
 
 def stays_open(connection: socket.socket) -> bool:
@@ -178,11 +177,6 @@ def is_healthy(port: int) -> bool:
         return get(port, "/healthz").code == 200
     except OSError:
         return False
-
-
-def until(is_so: Callable[[], bool]) -> None:
-    """Ask until something is so, which takes a moment."""
-    assert any(is_so() for _ in range(1000))
 
 
 @contextmanager

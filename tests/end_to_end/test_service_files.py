@@ -7,15 +7,8 @@ from support import servers
 from triquad_client import RefusedError
 from triquad_format.mapfile.reader import read_map
 from triquad_format.wire import codec, keys
-from triquad_format.wire.messages import (
-    MapChunk,
-    MapChunkRequest,
-    ResetRequest,
-)
+from triquad_format.wire.messages import MapChunk, MapChunkRequest, ResetRequest
 from triquad_server.store.store import Store
-
-POSE = np.eye(4)
-PROBES = np.concatenate([servers.sphere(50, radius) for radius in (2.0, 3.9, 4.0, 4.1)])
 
 
 def assert_same_map(before, after):

@@ -20,13 +20,7 @@ from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
 from support.files.file_damage import chunks, flipped, zeroed
-from support.files.mapfile_edit import (
-    file_bytes,
-    read_bytes,
-    rewritten,
-    stored,
-    stored_record,
-)
+from support.files.mapfile_edit import file_bytes, read_bytes, rewritten, stored, stored_record
 from support.maps.map_records import assert_same, random_record
 from triquad_format.errors import (
     DamagedMapFileError,

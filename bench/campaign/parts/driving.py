@@ -6,11 +6,7 @@ from support import servers
 from triquad_tools.simulation.lidar import Lidar, SimulatedScan, drive
 from triquad_tools.simulation.street import street
 
-from bench.campaign.server_under_test import (
-    expect,
-    expect_honest_service,
-    server_under_test,
-)
+from bench.campaign.server_under_test import expect, expect_honest_service, server_under_test
 from bench.campaign.turn import Turn
 
 _SCANS_PER_S = 10

@@ -13,11 +13,7 @@ import zenoh
 from support import servers
 from support.event_loop import connected
 from support.watched_ball import SETTINGS, digests, half, learn
-from triquad_client import (
-    AsyncClient,
-    ClosedError,
-    KnownTiles,
-)
+from triquad_client import AsyncClient, ClosedError, KnownTiles
 from triquad_format.wire import codec, keys
 from triquad_format.wire.mesh_messages import TileChanges
 

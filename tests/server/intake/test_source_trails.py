@@ -5,11 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from triquad_format.wire.messages import Scan
 from triquad_server.intake.rays import ScanRays
-from triquad_server.intake.source_trails import (
-    MAX_POSITIONS,
-    MAX_SOURCES,
-    SourceTrails,
-)
+from triquad_server.intake.source_trails import MAX_POSITIONS, MAX_SOURCES, SourceTrails
 
 LEAF_M = 0.2
 

@@ -5,14 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.maps.small_world import (
-    damage,
-    settings,
-    settle,
-    settled,
-    surface_error,
-    world,
-)
+from support.maps.small_world import damage, settings, settle, settled, surface_error, world
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.map_progress import MapProgress

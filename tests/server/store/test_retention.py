@@ -4,14 +4,7 @@ import dataclasses
 import os
 from contextlib import closing
 
-from support.files.growing_store import (
-    ROW,
-    changes,
-    drive,
-    grown,
-    parts_of,
-    paths,
-)
+from support.files.growing_store import ROW, changes, drive, grown, parts_of, paths
 from support.maps.map_records import assert_same
 from triquad_format.mapfile.checkpoint import read_checkpoint, write_checkpoint
 from triquad_format.mapfile.part_files import PartFiles
