@@ -79,16 +79,20 @@ def server_process(
     endpoint: str | None = None,
     ready: bool = True,
     environment: Mapping[str, str] | None = None,
+    program: Sequence[str] = ("-m", "triquad_server.cli"),
+    **pipes: int,
 ) -> Iterator[ServerProcess]:
     """Yield a server once it is ``ready``; it is killed at the end if it still runs.
 
-    ``environment`` has variables in addition to those of this process.
+    ``environment`` has variables in addition to those of this process; another ``program`` of
+    Python is one that serves, too. ``pipes`` are those to its standard input and output.
     """
     endpoint = endpoint or free_endpoint()
-    command = [sys.executable, "-m", "triquad_server.cli", "--listen", endpoint]
+    command = [sys.executable, *program, "--listen", endpoint]
     command += map(str, arguments)
     variables = {**os.environ, **(environment or {})}
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=variables) as process:
+    pipes["stderr"] = subprocess.PIPE
+    with subprocess.Popen(command, text=True, env=variables, **pipes) as process:
         server = ServerProcess(process, endpoint)
         try:
             if ready:
