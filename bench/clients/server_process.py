@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 _WAIT_S = 300.0  # kernels are compiled on the first start
 
@@ -80,7 +81,7 @@ def server_process(
     ready: bool = True,
     environment: Mapping[str, str] | None = None,
     program: Sequence[str] = ("-m", "triquad_server.cli"),
-    **pipes: int,
+    **pipes: Any,
 ) -> Iterator[ServerProcess]:
     """Yield a server once it is ``ready``; it is killed at the end if it still runs.
 

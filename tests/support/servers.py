@@ -56,6 +56,16 @@ def learn(client: triquad_client.Client, scans: int = 2) -> triquad_client.Flush
     return client.flush(WAIT_S)
 
 
+def until(
+    is_so: Callable[[], bool], told: Callable[[], object] = str, within_s: float = WAIT_S
+) -> None:
+    """Return once something is so; what is ``told`` of it where that takes too long."""
+    ends_s = time.monotonic() + within_s
+    while not is_so():
+        assert time.monotonic() < ends_s, told()
+        time.sleep(0.01)
+
+
 @cache
 def compiled() -> None:
     """Have all kernels compiled: at the first start that takes longer than a request may."""
