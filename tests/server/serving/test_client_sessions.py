@@ -1,9 +1,10 @@
 """A request is of a linked session where its name says so, and of one of all others where not."""
 
+import time
 from contextlib import closing
 
 import zenoh
-from support.servers import free_endpoint, raw_session, until
+from support.servers import WAIT_S, free_endpoint, raw_session
 from triquad_format.wire import codec
 from triquad_format.wire.messages import RequestOrigin
 from triquad_server.serving.client_sessions import ClientSessions
@@ -32,7 +33,10 @@ def test_who_is_linked_has_turns_of_its_own_until_it_leaves():
             assert group(sessions, "invented") == ""
             owner = sessions.source(Query(name), longest_s=60.0).owner
             assert not sessions.have_left(owner)
-        until(lambda: sessions.have_left(owner))
+        until_s = time.monotonic() + WAIT_S
+        while not sessions.have_left(owner):
+            assert time.monotonic() < until_s, "its link is not known to be gone"
+            time.sleep(0.01)
         assert group(sessions, name) == ""
 
 
