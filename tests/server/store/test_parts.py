@@ -8,7 +8,16 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from support.files.growing_store import ROW, changes, drive, grown, part_of, parts_of, paths, rot
+from support.files.growing_store import (
+    ROW,
+    changes,
+    drive,
+    grown,
+    part_of,
+    parts_of,
+    paths,
+    rot,
+)
 from support.maps.map_records import assert_same
 from triquad_format.errors import DamagedMapFileError, MapFileError
 from triquad_format.mapfile.part_files import PartFiles
