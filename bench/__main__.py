@@ -11,14 +11,28 @@ from collections.abc import Callable, Sequence
 from functools import cache, partial
 from pathlib import Path
 
+from triquad_server.settings import Settings
+from triquad_server.warm_up import warm_up
 from triquad_tools.console.arguments import seed
 from triquad_tools.console.command import ToolError, run
 from triquad_tools.console.progress import progress
 from triquad_tools.console.report import Row, print_rows
 
 from bench.figures import Figure
+from bench.parts.answers import measure_planners
+from bench.parts.belief import measure_belief
+from bench.parts.core import measure_core
+from bench.parts.file import measure_file
+from bench.parts.neighbours import measure_neighbours
+from bench.parts.parked import measure_parked
+from bench.parts.presets import measure_presets
+from bench.parts.revisited import measure_revisited
+from bench.parts.server import measure_server
+from bench.parts.start import measure_start
+from bench.parts.store import measure_store
 from bench.results import RESULTS, Result, machine, write_page
-from bench.street import BenchStreet, bench_street
+from bench.street import bench_street
+from bench.street_scores import DrivenStreet
 
 _Measure = Callable[[argparse.Namespace], list[Figure]]
 
@@ -46,69 +60,13 @@ def _bench(options: argparse.Namespace) -> int:
 
 def _compile(device: str) -> None:
     """Compile all kernels, so that no part but "start" meets a first start."""
-    from triquad_server.settings import Settings  # slow to import
-    from triquad_server.warm_up import warm_up
-
     with progress("compiling") as report:
         warm_up(Settings(), device, report=lambda stage: report(0.0, stage))
 
 
 @cache
-def _street(number: int) -> BenchStreet:
+def _street(number: int) -> DrivenStreet:
     return bench_street(number)
-
-
-def _core(options: argparse.Namespace) -> list[Figure]:
-    from bench.parts.core import measure_core
-
-    return measure_core(_street(options.seed), options.device)
-
-
-def _server(options: argparse.Namespace) -> list[Figure]:
-    from bench.parts.neighbours import measure_neighbours
-    from bench.parts.server import measure_server
-
-    return measure_server(_street(options.seed)) + measure_neighbours(_street(options.seed))
-
-
-def _answers(options: argparse.Namespace) -> list[Figure]:
-    from bench.parts.answers import measure_planners
-
-    return measure_planners(_street(options.seed))
-
-
-def _file(options: argparse.Namespace) -> list[Figure]:
-    from bench.parts.file import measure_file
-    from bench.parts.offline import measure_offline
-    from bench.parts.store import measure_store
-
-    made = _street(options.seed)
-    return measure_file(made) + measure_offline(made) + measure_store(made)
-
-
-def _moving(options: argparse.Namespace) -> list[Figure]:
-    from bench.parts.belief import measure_belief
-    from bench.parts.parked import measure_parked
-    from bench.parts.revisited import measure_revisited
-
-    return [
-        *measure_revisited(options.recorded),
-        *measure_belief(held=False),
-        *measure_belief(held=True),
-        *measure_parked(options.seed),
-    ]
-
-
-def _presets(options: argparse.Namespace) -> list[Figure]:
-    from bench.parts.presets import measure_presets
-
-    return measure_presets(options.seed)
-
-
-def _start(options: argparse.Namespace) -> list[Figure]:  # noqa: ARG001
-    from bench.parts.start import measure_start
-
-    return measure_start()
 
 
 def _viewer(options: argparse.Namespace) -> list[Figure]:
@@ -118,13 +76,24 @@ def _viewer(options: argparse.Namespace) -> list[Figure]:
 
 
 PARTS: dict[str, _Measure] = {
-    "core": _core,
-    "server": _server,
-    "answers": _answers,
-    "file": _file,
-    "moving": _moving,
-    "presets": _presets,
-    "start": _start,
+    "core": lambda options: measure_core(_street(options.seed), options.device),
+    "server": lambda options: [
+        *measure_server(_street(options.seed)),
+        *measure_neighbours(_street(options.seed)),
+    ],
+    "answers": lambda options: measure_planners(_street(options.seed)),
+    "file": lambda options: [
+        *measure_file(_street(options.seed)),
+        *measure_store(_street(options.seed)),
+    ],
+    "moving": lambda options: [
+        *measure_revisited(options.recorded),
+        *measure_belief(held=False),
+        *measure_belief(held=True),
+        *measure_parked(options.seed),
+    ],
+    "presets": lambda options: measure_presets(options.seed),
+    "start": lambda _: measure_start(),
     "viewer": _viewer,
 }
 

@@ -1,11 +1,9 @@
-"""Voxels in which rays ended, and how many of them a map takes to be surface."""
+"""Voxels in which rays ended."""
 
 from dataclasses import dataclass, field
 
 import numpy as np
 from triquad_format.records.arrays import Doubles, Longs
-from triquad_format.records.status import Status
-from triquad_map.view import MapView
 from triquad_server.intake.rays import usable_rays
 from triquad_server.settings import Settings
 from triquad_tools.sensors.sweep import PosedScan, moved
@@ -53,8 +51,3 @@ def voxel_centres(keys: Longs, voxel_m: float) -> Doubles:
     """Return the centres [N, 3] of the voxels of keys [N]."""
     cells = np.stack([keys // _KEY_SIDE**2, keys // _KEY_SIDE % _KEY_SIDE, keys % _KEY_SIDE], 1)
     return np.asarray((cells - _KEY_SIDE // 2 + 0.5) * voxel_m)
-
-
-def surface_share(view: MapView, centres: Doubles) -> float:
-    """Return the share of voxels with ``centres`` [N, 3] that a map takes to be surface."""
-    return float((view.status(centres, reach_m=0.0) == Status.SURFACE).mean())

@@ -5,8 +5,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-_FIRST_SCANS = 20
-
 
 @dataclass(frozen=True)
 class Figure:
@@ -48,11 +46,6 @@ def seconds(work: Callable[[], object]) -> float:
     started = time.perf_counter()
     work()
     return time.perf_counter() - started
-
-
-def typical(scans_s: list[float]) -> float:
-    """Return the typical seconds of a scan after the first, which meet only new surface."""
-    return statistics.median(scans_s[_FIRST_SCANS:])
 
 
 @dataclass(frozen=True)

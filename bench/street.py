@@ -1,28 +1,16 @@
 """The drive along which most parts are measured."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import partial
 
-from triquad_client import Mesh
-from triquad_format.records.arrays import Doubles
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
 from triquad_tools.console.progress import progress
-from triquad_tools.evaluation.metrics import MeshScores, ScoreSettings, score_mesh
 from triquad_tools.sensors.sweep import PosedScan
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.street import street
 
-from bench.figures import seconds
-from bench.street_scores import (
-    STREET_VOXEL_M,
-    DrivenStreet,
-    StreetProbes,
-    driven_street,
-    score_street,
-)
+from bench.street_scores import DrivenStreet, StreetProbes, driven_street, score_street
 
 SCANS = 100
 LENGTH_M = 110.0  # so that the map has some 2 million parameters
@@ -31,28 +19,11 @@ _STEPS = 14  # of training between two scans that a map streams in
 _PUBLISHED = 5  # one such scan in N
 
 
-@dataclass(frozen=True)
-class BenchStreet(DrivenStreet):
-    """A drive of 10 s, and the truth about it."""
-
-    visible: Doubles  # [M, 3] exact surface points that the lidar hit
-    samples_max: int = ScoreSettings.samples_max  # of a mesh, to score it
-
-    def mesh_scores(self, mesh: Mesh) -> MeshScores:
-        """Return scores of a mesh within the scene's bounds."""
-        settings = ScoreSettings(samples_max=self.samples_max)
-        return score_mesh(mesh, self.visible, settings, self.drive.scene.sdf)
-
-
-def bench_street(seed: int) -> BenchStreet:
+def bench_street(seed: int) -> DrivenStreet:
     """Return 100 scans along the exact street ``seed``."""
     scene = street(seed, LENGTH_M)
     poses = drive(scene, SCANS, LENGTH_M / SCANS)
-    driven = driven_street(SimulatedDrive(scene, Lidar(columns=_COLUMNS), poses, seed=seed))
-    visible = driven.drive.true_hits(STREET_VOXEL_M)
-    low, high = scene.bounds  # to which meshes are cut
-    visible = visible[((visible >= low) & (visible <= high)).all(axis=1)]
-    return BenchStreet(driven.drive, driven.scans, driven.probes, visible=visible)
+    return driven_street(SimulatedDrive(scene, Lidar(columns=_COLUMNS), poses, seed=seed))
 
 
 def settled_mapper(
@@ -85,15 +56,14 @@ class StreamedMap:
     """A map that trains and publishes between scans, as a server's does."""
 
     def __init__(self, settings: Settings) -> None:
-        self.settings = settings
         self.mapper = Mapper("bench", settings, "cpu")
-        self.ingest_s: list[float] = []  # of each scan
+        self._scans = 0
 
     def take_in(self, scan: PosedScan) -> None:
         """Integrate a scan, and train."""
-        ingest = partial(self.mapper.ingest, scan.points, scan.world_from_sensor)
-        self.ingest_s.append(seconds(ingest))
+        self.mapper.ingest(scan.points, scan.world_from_sensor)
         for _ in range(_STEPS):
             self.mapper.train()
-        if len(self.ingest_s) % _PUBLISHED == 0:
+        self._scans += 1
+        if self._scans % _PUBLISHED == 0:
             self.mapper.publish()

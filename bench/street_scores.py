@@ -11,21 +11,20 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_client import SdfResult
+from triquad_client import Mesh, SdfResult
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.status import Status
 from triquad_map.view import FieldAnswer
 from triquad_tools.console.progress import progress
-from triquad_tools.evaluation.metrics import mean_or_nan
+from triquad_tools.evaluation.metrics import MeshScores, ScoreSettings, mean_or_nan, score_mesh
+from triquad_tools.recordings.cloud import merged
 from triquad_tools.simulation.lidar import SimulatedDrive, SimulatedScan
 from triquad_tools.simulation.scene import Scene
 
-STREET_VOXEL_M = 0.05
-"""The spacing of the points of a street that completion asks for."""
-
 NEAR_M = 0.1  # distances are scored up to this far from the surface
 HOUSE_MARGIN_M = 0.5  # deeper than this in a house nothing can be seen
-PROBE_SPACING_M = 0.1  # between surface points at which distances are scored
+_PROBE_SPACING_M = 0.1  # between surface points at which distances are scored
+_VOXEL_M = 0.05  # between the points of a street that completion asks for
 _HOUSE_PROBES = 20_000
 _SEED = 0  # of the points at which a driven street is asked
 _HOUSE_REACH_M = 20.0  # houses are probed up to this far from where the sensor was
@@ -47,11 +46,16 @@ class StreetProbes:
 
 @dataclass(frozen=True)
 class DrivenStreet:
-    """A simulated drive, its scans and where its map will be asked."""
+    """A simulated drive, its scans, and the truth about what they show."""
 
     drive: SimulatedDrive
     scans: list[SimulatedScan]
     probes: StreetProbes
+    visible: Doubles  # [M, 3] exact surface points that the lidar hit within the scene's bounds
+
+    def mesh_scores(self, mesh: Mesh) -> MeshScores:
+        """Return scores of a mesh within the scene's bounds."""
+        return score_mesh(mesh, self.visible, ScoreSettings(), self.drive.scene.sdf)
 
 
 @dataclass(frozen=True)
@@ -59,18 +63,13 @@ class StreetScores:
     """The agreement of a map with an exact street; NaN where there was nothing to score."""
 
     sdf_error_m: float  # mean absolute error near the surface
-    sdf_error_median_m: float
-    sdf_error_p95_m: float
     gradient_angle_deg: float  # median angle to the exact gradient
-    near_surface_ratio: float  # share of the near points with status SURFACE
-    near_points: int
     houses_unknown_ratio: float  # share of the points in houses with status UNKNOWN
-    house_points: int
 
 
 def street_probes(drive: SimulatedDrive, rng: np.random.Generator) -> StreetProbes:
     """Return points at which a map of ``drive`` is scored."""
-    hits = drive.true_hits(PROBE_SPACING_M)
+    hits = drive.true_hits(_PROBE_SPACING_M)
     normals = drive.scene.gradient(hits)
     near = hits + rng.uniform(-NEAR_M, NEAR_M, (len(hits), 1)) * normals
     near = near[drive.scene.is_exact(near)]
@@ -89,7 +88,11 @@ def driven_street(drive: SimulatedDrive) -> DrivenStreet:
         for scan in drive:
             scans.append(scan)
             report(len(scans), f"{len(scans)} of {len(drive)} scans")
-    return DrivenStreet(drive, scans, street_probes(drive, np.random.default_rng(_SEED)))
+    visible = merged((scan.true_hits for scan in scans), _VOXEL_M)
+    low, high = drive.scene.bounds  # to which meshes are cut
+    visible = visible[((visible >= low) & (visible <= high)).all(axis=1)]
+    probes = street_probes(drive, np.random.default_rng(_SEED))
+    return DrivenStreet(drive, scans, probes, visible)
 
 
 def score_street(query: MapQuery, probes: StreetProbes) -> StreetScores:
@@ -100,13 +103,8 @@ def score_street(query: MapQuery, probes: StreetProbes) -> StreetScores:
     houses = query(probes.in_houses)
     return StreetScores(
         sdf_error_m=mean_or_nan(errors),
-        sdf_error_median_m=_quantile(errors, 0.5),
-        sdf_error_p95_m=_quantile(errors, 0.95),
         gradient_angle_deg=_median_angle_deg(answer.gradient[known], probes.exact_gradient[known]),
-        near_surface_ratio=mean_or_nan(answer.status == Status.SURFACE),
-        near_points=len(probes.near),
         houses_unknown_ratio=mean_or_nan(houses.status == Status.UNKNOWN),
-        house_points=len(probes.in_houses),
     )
 
 
@@ -124,8 +122,4 @@ def _median_angle_deg(one: NDArray[np.floating], other: NDArray[np.floating]) ->
     lengths = np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
     cosines = np.einsum("ni,ni->n", one, other) / np.maximum(lengths, 1e-12)
     angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
-    return _quantile(angles, 0.5)
-
-
-def _quantile(values: NDArray[np.floating], level: float) -> float:
-    return float(np.quantile(values, level)) if len(values) else float("nan")
+    return float(np.median(angles)) if len(angles) else float("nan")

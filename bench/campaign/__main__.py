@@ -7,7 +7,6 @@
 
 import argparse
 import faulthandler
-import json
 import shutil
 import sys
 import time
@@ -17,6 +16,7 @@ from pathlib import Path
 
 from bench.campaign.all_parts import BY_NAME, PARTS
 from bench.campaign.campaign import Campaign
+from bench.campaign.record import TurnResult
 from bench.campaign.turn import BrokenError, Part, Turn
 
 _TRACEBACK = 2000  # characters of it that are kept
@@ -30,8 +30,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     if options.seed is not None:
         return _one_turn(options)
     parts = [BY_NAME[name] for name in options.part] or PARTS
-    if options.afresh:
-        shutil.rmtree(options.out, ignore_errors=True)
     campaign = Campaign(options.out, parts)
     try:
         campaign.run(60.0 * options.minutes, options.lanes)
@@ -50,14 +48,12 @@ def _parser() -> argparse.ArgumentParser:
     add("--minutes", type=float, default=5.0, help="how long (default: 5)")
     add("--lanes", type=int, default=2, help="turns at a time (default: 2)")
     add("--out", type=Path, default=Path("campaign-out"), help="default: campaign-out")
-    add("--afresh", action="store_true", help="forget what is in --out, and begin again")
     add("--most", type=int, help="of --seed: things to do, at most")
-    add("--result", type=Path, help=argparse.SUPPRESS)
     return parser
 
 
 def _one_turn(options: argparse.Namespace) -> int:
-    """Run a turn in this process, and report what it did."""
+    """Run a turn in this process, and write what it did to the campaign's folder."""
     part = BY_NAME[options.part[0]]
     folder = options.out / f"{part.name}-{options.seed}"
     shutil.rmtree(folder, ignore_errors=True)
@@ -65,16 +61,9 @@ def _one_turn(options: argparse.Namespace) -> int:
     faulthandler.dump_traceback_later(0.9 * 60 * options.minutes + 60)
     turn = Turn(options.seed, folder, options.most or part.per_turn, seconds=60.0 * options.minutes)
     seconds = _run(part, turn)
-    told = {
-        "counts": turn.counts,
-        "most_seen": turn.most_seen,
-        "broken": turn.broken,
-        "seconds": seconds,
-    }
-    if options.result:
-        options.result.write_text(json.dumps(told))
-    else:
-        print(json.dumps(told, indent=2))
+    result = TurnResult(turn.seed, dict(turn.counts), turn.most_seen, turn.broken, seconds)
+    result.write(folder.with_name(f"{folder.name}.json"))
+    print(result)
     faulthandler.cancel_dump_traceback_later()
     return 1 if turn.broken else 0
 

@@ -3,6 +3,7 @@
 import copy
 import math
 import random
+from collections.abc import Iterator
 from typing import Any
 
 import msgpack
@@ -109,14 +110,13 @@ class MutatedMessages:
         how = self._chance.random()
         if how < 0.2:
             return self._other_bytes(payload)
-        if how < 0.6:
-            body = msgpack.unpackb(payload)
-            for _ in range(self._chance.choice((1, 1, 2, 4))):
-                self._change_within(body)
-            return bytes(msgpack.packb(body))
         if how < 0.9:
             body = msgpack.unpackb(payload)
-            self._nudge(body)
+            if how < 0.6:
+                for _ in range(self._chance.choice((1, 1, 2, 4))):
+                    self._replace(*self._chance.choice([*_values(body)]))
+            else:
+                self._nudge(body)
             return bytes(msgpack.packb(body))
         return payload
 
@@ -134,22 +134,6 @@ class MutatedMessages:
             changed[chance.randrange(len(changed))] ^= 1 << chance.randrange(8)
         return bytes(changed)
 
-    def _change_within(self, body: Any) -> None:
-        """Replace something of a message at a random depth."""
-        if not body:
-            return
-        chance = self._chance
-        key = chance.choice(list(body)) if isinstance(body, dict) else chance.randrange(len(body))
-        value = body[key]
-        if isinstance(value, (dict, list)) and chance.random() < 0.8:
-            self._change_within(value)
-        elif isinstance(value, bytes) and value and chance.random() < 0.9:
-            body[key] = self._other_numbers(value)
-        elif isinstance(body, dict) and chance.random() < 0.1:
-            del body[key]
-        else:
-            body[key] = copy.deepcopy(chance.choice(_VALUES))
-
     def _nudge(self, body: dict[str, Any]) -> None:
         """Change the numbers and flags of a message a little: most mutants are still answered."""
         for key, value in body.items():
@@ -163,9 +147,18 @@ class MutatedMessages:
                 body[key] = value * self._chance.uniform(0.1, 3.0)
             elif isinstance(value, dict) and value.get("dtype") in ("<f4", "<f8"):
                 numbers = np.frombuffer(value["data"], value["dtype"])
-                body[key] = value | {
-                    "data": (numbers * numbers.dtype.type(self._chance.uniform(-2, 2))).tobytes()
-                }
+                times = numbers.dtype.type(self._chance.uniform(-2, 2))
+                body[key] = value | {"data": (numbers * times).tobytes()}
+
+    def _replace(self, within: Any, key: Any) -> None:
+        """Change a value to anything, or leave it out."""
+        value, chance = within[key], self._chance
+        if isinstance(value, bytes) and value and chance.random() < 0.9:
+            within[key] = self._other_numbers(value)
+        elif isinstance(within, dict) and chance.random() < 0.1:
+            del within[key]
+        else:
+            within[key] = copy.deepcopy(chance.choice(_VALUES))
 
     def _other_numbers(self, data: bytes) -> bytes:
         """Return an array in which some of the numbers are changed."""
@@ -178,3 +171,11 @@ class MutatedMessages:
         else:
             numbers[places] = self._chance.choice(odd)
         return numbers.tobytes()
+
+
+def _values(body: Any) -> Iterator[tuple[Any, Any]]:
+    """Find what can be changed of a message: the container and the key of each value in it."""
+    for key, value in [*body.items()] if isinstance(body, dict) else [*enumerate(body)]:
+        yield body, key
+        if isinstance(value, (dict, list)):
+            yield from _values(value)

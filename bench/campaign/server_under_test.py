@@ -1,6 +1,5 @@
 """A server process under test, and what an honest client may expect of it whatever happens."""
 
-import os
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -10,10 +9,11 @@ import numpy as np
 import triquad_client
 from support import servers
 from triquad_client import Status
+from triquad_format.mapfile.reader import read_map
 
 from bench.campaign.turn import BrokenError, Turn
 
-MAX_GROWTH_BYTES = 200 * 2**20
+_MAX_GROWTH_BYTES = 200 * 2**20
 WITHIN_S = 30.0  # an honest request is answered, also where much else goes on
 _SETTINGS = servers.SMALL_TOML + "max_regions = 40\n[store]\nkeep = 4\n"
 _INTERNAL = ("Traceback", "internal error")
@@ -53,6 +53,15 @@ def expect(kept: bool, promise: str) -> None:
         raise BrokenError(promise)
 
 
+@contextmanager
+def learnt_server(turn: Turn) -> Iterator[servers.ServerProcess]:
+    """Yield a server that has learnt a sphere about the origin; it is stopped at the end."""
+    with server_under_test(turn) as server:
+        with triquad_client.connect(server.endpoint) as client:
+            servers.learn(client)
+        yield server
+
+
 def sphere_at(x_m: float, points: int = 500) -> tuple[np.ndarray, np.ndarray]:
     """Return points of a scan in the sensor frame, and its pose on the x axis."""
     pose = np.eye(4)
@@ -84,13 +93,19 @@ def expect_honest_service(endpoint: str, x_m: float = 0.0) -> None:
     expect(time.monotonic() - started < WITHIN_S, "an honest client waited too long")
 
 
-def resident_bytes(pid: int) -> int:
-    """Return the memory that a process has of its own in RAM."""
-    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGESIZE")
+def expect_steady_memory(turn: Turn, before: int, after: int) -> None:
+    """Expect a server to take hardly more bytes than before."""
+    turn.measured("growth MB", (after - before) / 2**20)
+    expect(after - before < _MAX_GROWTH_BYTES, f"memory grew from {before} to {after} bytes")
 
 
-def virtual_bytes(pid: int) -> int:
-    """Return the address space that a process takes."""
-    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[0])
-    return pages * os.sysconf("SC_PAGESIZE")
+def expect_whole(kept: triquad_client.CheckpointInfo) -> None:
+    """Expect a checkpoint to be what was acknowledged."""
+    expect(Path(kept.path).exists(), f"{kept.path} was acknowledged and is gone")
+    expect(read_map(kept.path).epoch == kept.epoch, f"{kept.path} is another")
+
+
+def expect_none_damaged(turn: Turn) -> None:
+    """Expect that no server of the turn took a checkpoint for damaged."""
+    aside = [path.name for path in (turn.folder / "store").rglob("*.damaged")]
+    expect(not aside, f"checkpoints were taken for damaged: {aside}")

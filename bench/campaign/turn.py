@@ -53,9 +53,8 @@ class Part:
 
     name: str
     unit: str  # of what it counts
+    run: Callable[[Turn], None]
     goal: int  # how many in a whole campaign
     per_turn: int
-    run: Callable[[Turn], None]
-    promise: str  # what has to be true all the while
     missing: Callable[[], str | None] = lambda: None
     """The reason why the part cannot run on this machine, if it cannot."""

@@ -79,25 +79,17 @@ def be_greedy(session: zenoh.Session, map_name: str) -> None:
 
 
 def leave_unread(session: zenoh.Session, map_name: str) -> None:
-    """Ask for much; the parent freezes this process before the replies come."""
-    request = codec.encode(_distances())
-    asked = [_ask(session, map_name, keys.DISTANCE, request) for _ in range(_UNREAD)]
-    _say_begun()
-    time.sleep(_TIMEOUT_S)
-    del asked
+    """Ask for many distances; the parent freezes this process before the replies come."""
+    _ask_and_sleep(session, map_name, keys.DISTANCE, codec.encode(_distances()))
 
 
 def leave_segments(session: zenoh.Session, map_name: str) -> None:
-    """Ask for long segments, 64 times; then sleep until the parent ends this process."""
+    """Ask for long segments; then sleep until the parent ends this process."""
     rng = np.random.default_rng(0)
     starts = rng.uniform((-8, -8, -1), (8, 8, 2), (800, 3)).astype(np.float32)
     ends = starts + rng.normal(0, 3, starts.shape).astype(np.float32)
     request = SegmentsRequest(np.zeros(3), starts, ends, 0.3, 5.0, 0)
-    payload = codec.encode(request)
-    asked = [_ask(session, map_name, keys.SEGMENTS, payload) for _ in range(_UNREAD)]
-    _say_begun()
-    time.sleep(_TIMEOUT_S)
-    del asked
+    _ask_and_sleep(session, map_name, keys.SEGMENTS, codec.encode(request))
 
 
 def flood(session: zenoh.Session, map_name: str) -> None:
@@ -128,6 +120,13 @@ KINDS = {
 def _distances() -> DistanceRequest:
     points = np.random.default_rng(0).uniform((-30, -8, -1), (30, 8, 4), (MAX_SEARCHES, 3))
     return DistanceRequest(np.zeros(3), points.astype(np.float32), 5.0, False, True, 0)
+
+
+def _ask_and_sleep(session: zenoh.Session, map_name: str, operation: str, payload: bytes) -> None:
+    asked = [_ask(session, map_name, operation, payload) for _ in range(_UNREAD)]
+    _say_begun()
+    time.sleep(_TIMEOUT_S)
+    del asked
 
 
 def _ask(

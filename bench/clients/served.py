@@ -16,9 +16,9 @@ from triquad_tools.console.progress import progress
 from triquad_tools.demo.probe import Probe, ProbeReport
 from triquad_tools.sensors.sweep import PosedScan
 
-from bench.clients.server_process import ServerProcess
+from bench.clients.server_process import server_process
 from bench.figures import Figure
-from bench.street import BenchStreet
+from bench.street_scores import DrivenStreet
 
 MAP = "bench"
 
@@ -49,7 +49,7 @@ def around(place: Doubles, count: int, rng: np.random.Generator) -> Doubles:
     return place + rng.uniform((-8, -8, -1.5), (8, 8, 2.0), (count, 3))
 
 
-def near_surface(made: BenchStreet) -> Doubles:
+def near_surface(made: DrivenStreet) -> Doubles:
     """Return 1,000 points [N, 3] near the street's surface."""
     return np.random.default_rng(0).permutation(made.probes.near)[:_ASKED]
 
@@ -67,7 +67,7 @@ def served(record: MapRecord | None = None, arguments: Sequence[str] = ()) -> It
             store.mkdir(parents=True)
             write_map(record, store / f"epoch-{record.epoch:09d}.triquad")
         with (
-            ServerProcess(folder, MAP, arguments) as server,
+            server_process(["--map", MAP, "--store", folder / "store", *arguments]) as server,
             connect(server.endpoint, MAP, timeout_s=_TIMEOUT_S) as client,
         ):
             yield Served(folder, server.endpoint, client)
@@ -91,7 +91,7 @@ def stream(
 
 
 def stream_beside_planner(
-    server: Served, made: BenchStreet, published: Callable[[int], None] = lambda _: None
+    server: Served, made: DrivenStreet, published: Callable[[int], None] = lambda _: None
 ) -> ProbeReport:
     """Stream the street while a planner asks for 1,000 gradients, and report what it met."""
     with server.planner(near_surface(made), "gradient") as probe:

@@ -1,20 +1,14 @@
-"""Planners: one, sixteen at once while a lidar streams, and a frozen one."""
+"""Planners: one, and sixteen at once while a lidar streams."""
 
-import signal
 import statistics
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack
 from functools import partial
 
 import numpy as np
-import zenoh
 from triquad_format.mapfile.reader import read_map
 from triquad_format.records.arrays import Doubles
-from triquad_format.wire import keys
-from triquad_format.wire.zenoh_config import QUIET, put
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.view import MapView
 from triquad_server.mapping.mapper import Mapper
@@ -26,9 +20,7 @@ from bench.clients.served import MAP, Served, around, latency_figures, served, s
 from bench.figures import Figure, seconds
 from bench.parts.ground import ground_latency, ground_points, measure_ground
 from bench.parts.truths import REACH_M, measure_answers
-from bench.street import BenchStreet
-
-Points = Doubles
+from bench.street_scores import DrivenStreet
 
 _ASKED = 1_000
 _ASKED_AT_ONCE = 100_000
@@ -36,23 +28,14 @@ _ROUNDS = 5
 _CLIENTS = 16
 _SETTLE_LIMIT_S = 600.0
 _WARM_S = 3.0  # until sixteen processes have started
-_FREEZE_AFTER_S = 0.5
-_FROZEN = """
-import sys, triquad_client
-with triquad_client.connect(sys.argv[1], sys.argv[2], timeout_s=60.0) as client:
-    print("asking", flush=True)
-    while True:
-        client.mesh()
-"""
 
 
-def measure_planners(made: BenchStreet) -> list[Figure]:
+def measure_planners(made: DrivenStreet) -> list[Figure]:
     """Return figures of answers, and of how soon they come."""
     with served() as server:
         points = _planner_points(made, _ASKED)
         figures = _one(server, made, points[0])
         figures += _sixteen(server, made, points)
-        figures += _beside_frozen(server, points[0])
         wait_until_settled(server.client, _SETTLE_LIMIT_S)
         figures += ground_latency(server, ground_points(made))
         server.client.download_map(server.folder / "map.triquad")
@@ -62,11 +45,11 @@ def measure_planners(made: BenchStreet) -> list[Figure]:
     return measure_answers(made, record, view) + measure_ground(made, view) + figures
 
 
-def _in_process(made: BenchStreet, view: MapView) -> list[Figure]:
+def _in_process(made: DrivenStreet, view: MapView) -> list[Figure]:
     """Return how soon distances are known, without a network and while nothing else is done."""
     options = DistanceOptions(REACH_M)
 
-    def typical_s(asked: Sequence[Points]) -> float:
+    def typical_s(asked: Sequence[Doubles]) -> float:
         distances(view, asked[0], options)
         times = [seconds(partial(distances, view, each, options)) for each in asked]
         return statistics.median(times)
@@ -83,14 +66,14 @@ def _in_process(made: BenchStreet, view: MapView) -> list[Figure]:
     ]  # fmt: skip
 
 
-def _planner_points(made: BenchStreet, count: int) -> list[Points]:
+def _planner_points(made: DrivenStreet, count: int) -> list[Doubles]:
     """Return what each planner asks: ``count`` points around one place of the drive."""
     rng = np.random.default_rng(0)
     poses = made.drive.poses[np.arange(_CLIENTS) * len(made.drive.poses) // _CLIENTS]
     return [around(pose[:3, 3], count, rng) for pose in poses]
 
 
-def _trained_per_s(server: Served, made: BenchStreet, title: str) -> float:
+def _trained_per_s(server: Served, made: DrivenStreet, title: str) -> float:
     """Stream all scans; return how many samples were trained each second meanwhile."""
     before = server.client.status().samples_trained
     started = time.monotonic()
@@ -99,7 +82,7 @@ def _trained_per_s(server: Served, made: BenchStreet, title: str) -> float:
     return trained / (time.monotonic() - started)
 
 
-def _one(server: Served, made: BenchStreet, points: Points) -> list[Figure]:
+def _one(server: Served, made: DrivenStreet, points: Doubles) -> list[Figure]:
     stream(server.client, made.scans, "streaming alone at first")
     with server.planner(points, "distance") as probe:
         time.sleep(_WARM_S)
@@ -109,7 +92,7 @@ def _one(server: Served, made: BenchStreet, points: Points) -> list[Figure]:
     return latency_figures(name, met, median_ms=4, tail_ms=12)
 
 
-def _sixteen(server: Served, made: BenchStreet, points: Sequence[Points]) -> list[Figure]:
+def _sixteen(server: Served, made: DrivenStreet, points: Sequence[Doubles]) -> list[Figure]:
     alone = _trained_per_s(server, made, "streaming alone")
     figures = [Figure("samples trained while streaming alone", alone / 1e6, "M/s")]
     for question in ("gradient", "distance"):
@@ -138,54 +121,3 @@ def _met_together(name: str, met: Sequence[ProbeReport]) -> list[Figure]:
         Figure(f"{name}: 99 % of the worst client",
                max(report.latency_p99_ms for report in met), "ms", at_most=50),
     ]  # fmt: skip
-
-
-def _beside_frozen(server: Served, points: Points) -> list[Figure]:
-    """Return figures of other clients while one freezes in the middle of a mesh."""
-    wait_until_settled(server.client, _SETTLE_LIMIT_S)
-
-    def ask() -> tuple[ProbeReport, int]:
-        with server.planner(points, "distance") as probe, _samples(server.endpoint) as count:
-            time.sleep(15.0)
-            return probe.finish(), count()
-
-    with _mesh_reader(server.endpoint) as reader:
-        beside, samples = ask()
-        reader.send_signal(signal.SIGSTOP)
-        frozen, frozen_samples = ask()
-    ratio = frozen.latency_p99_ms / beside.latency_p99_ms
-    return [
-        Figure("beside a client that fetches meshes, 99 %", beside.latency_p99_ms, "ms"),
-        Figure("beside one frozen in the middle of a mesh, 99 %", frozen.latency_p99_ms, "ms"),
-        Figure("the same, times", ratio, "", at_most=1.5),
-        Figure("the same, errors", frozen.errors, "", at_most=0),
-        Figure("status samples lost meanwhile", max(0, samples - frozen_samples - 1), "",
-               at_most=0),
-    ]  # fmt: skip
-
-
-@contextmanager
-def _mesh_reader(endpoint: str) -> Iterator["subprocess.Popen[str]"]:
-    """Yield a process that fetches meshes all the time."""
-    command = [sys.executable, "-c", _FROZEN, endpoint, MAP]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout is not None
-            process.stdout.readline()
-            time.sleep(_FREEZE_AFTER_S)
-            yield process
-        finally:
-            process.kill()
-
-
-@contextmanager
-def _samples(endpoint: str) -> Iterator[Callable[[], int]]:
-    """Yield a counter of the status samples that arrive."""
-    config = zenoh.Config()
-    put(config, {**QUIET, "mode": "client", "connect/endpoints": [endpoint]})
-    received: list[zenoh.Sample] = []
-    with zenoh.open(config) as session:
-        callback = zenoh.handlers.Callback(received.append, indirect=False)
-        subscriber = session.declare_subscriber(keys.status_key(MAP), callback)
-        yield lambda: len(received)
-        subscriber.undeclare()

@@ -6,6 +6,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import BinaryIO
 
 from triquad_client import OfflineMap
 from triquad_format.mapfile.reader import read_map
@@ -16,13 +17,13 @@ from triquad_server.epochs.epoch import Epoch
 from triquad_tools.mapfiles.quantise import field_change, quantise
 
 from bench.figures import Figure, seconds
-from bench.street import BenchStreet, settled_mapper
+from bench.parts.offline import measure_offline
+from bench.street import settled_mapper
+from bench.street_scores import DrivenStreet
 
 _LARGE_BYTES = 100_000_000
 _INTEGER_ERROR_M = 0.0015  # gives most features one byte
 _SEED = 2  # of the points at which the file is compared with the live map
-_OFFLINE_SEED = 4
-_ROUNDS = 7
 
 _OPEN = """
 import sys, time
@@ -34,22 +35,23 @@ print(time.perf_counter() - started)
 """
 
 
-def measure_file(made: BenchStreet) -> list[Figure]:
+def measure_file(made: DrivenStreet) -> list[Figure]:
     """Return figures of the street's map as a file."""
     epoch = settled_mapper("the street", made.scans).publish()
     record = epoch.record()
     with tempfile.TemporaryDirectory(prefix="triquad-bench-") as name:
         folder = Path(name)
         figures = _sizes(epoch, record, made, folder=folder)
-        return figures + _opening(record, folder)
+        figures += _opening(record, folder)
+        return figures + measure_offline(made, epoch, folder / "fp16.triquad")
 
 
-def _sizes(epoch: Epoch, record: MapRecord, made: BenchStreet, folder: Path) -> list[Figure]:
-    plain = _written(epoch, record, folder / "fp16.triquad")
+def _sizes(epoch: Epoch, record: MapRecord, made: DrivenStreet, folder: Path) -> list[Figure]:
+    plain = written(epoch, record, folder / "fp16.triquad")
     stored = read_map(folder / "fp16.triquad")
     eighth, tight = quantise(stored, _INTEGER_ERROR_M), quantise(stored, 0.002)
-    small = _written(epoch, eighth.record, folder / "int8.triquad")
-    least = _written(epoch, tight.record, folder / "2mm.triquad")
+    small = written(epoch, eighth.record, folder / "int8.triquad")
+    least = written(epoch, tight.record, folder / "2mm.triquad")
     live = field_change(record, stored, _SEED)
     count = epoch.parameters
     scores = [_f_score(one, made) for one in (stored, tight.record)]
@@ -70,12 +72,12 @@ def _sizes(epoch: Epoch, record: MapRecord, made: BenchStreet, folder: Path) -> 
     ]
 
 
-def _written(epoch: Epoch, record: MapRecord, path: Path) -> MapFileInfo:
+def written(epoch: Epoch, record: MapRecord, path: Path | BinaryIO) -> MapFileInfo:
     """Write a map as a server does, with its previews."""
     return write_map(record, path, previews=previews_of(record, epoch))
 
 
-def _f_score(record: MapRecord, made: BenchStreet) -> float:
+def _f_score(record: MapRecord, made: DrivenStreet) -> float:
     with OfflineMap(record) as opened:
         return 100 * made.mesh_scores(opened.mesh(made.drive.scene.box)).f_score
 

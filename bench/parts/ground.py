@@ -11,7 +11,7 @@ from triquad_tools.simulation.scene import Scene
 
 from bench.clients.served import Served, latency_figures
 from bench.figures import Figure, seconds
-from bench.street import BenchStreet
+from bench.street_scores import DrivenStreet
 
 MAX_DROP_M = 2.0
 _PLACES = 20_000
@@ -24,7 +24,7 @@ _CLEAR_M = 0.2
 _STEPS = 200
 
 
-def measure_ground(made: BenchStreet, view: MapView) -> list[Figure]:
+def measure_ground(made: DrivenStreet, view: MapView) -> list[Figure]:
     """Return figures of a map of the street, asked in this process."""
     points = ground_points(made)
     truth_m = _true_heights(made.drive.scene, points)
@@ -55,7 +55,7 @@ def ground_latency(server: Served, points: Doubles) -> list[Figure]:
         return latency_figures(f"ground below {_ASKED} points, through the network", probe.finish())
 
 
-def ground_points(made: BenchStreet) -> Doubles:
+def ground_points(made: DrivenStreet) -> Doubles:
     """Return places [N, 3] in free space over walkable ground, next to the sensor's way."""
     rng = np.random.default_rng(0)
     way = made.drive.poses[rng.integers(len(made.drive.poses), size=_PLACES), :3, 3]

@@ -8,9 +8,9 @@ from triquad_format.records.arrays import Doubles
 from triquad_tools.demo.probe import ProbeReport
 
 from bench.clients.noisy_neighbours import frozen_neighbours, neighbour
-from bench.clients.served import MAP, Served, around, served, stream
+from bench.clients.served import MAP, Served, around, latency_figures, served, stream
 from bench.figures import Figure
-from bench.street import BenchStreet
+from bench.street_scores import DrivenStreet
 
 _ASKED = 1_000
 _WARM_SCANS = 20
@@ -19,7 +19,7 @@ _LOST_SHARE = 0.01
 _SETTLE_S = 600.0
 
 
-def measure_neighbours(made: BenchStreet) -> list[Figure]:
+def measure_neighbours(made: DrivenStreet) -> list[Figure]:
     """Return figures of a planner at 20 Hz and a lidar at 10 Hz, alone and with neighbours."""
     place = made.drive.poses[len(made.drive.poses) // 2][:3, 3]
     points = around(place, _ASKED, np.random.default_rng(0))
@@ -31,7 +31,7 @@ def measure_neighbours(made: BenchStreet) -> list[Figure]:
 
 
 def _measure(
-    server: Served, made: BenchStreet, points: Doubles, kinds: Sequence[str]
+    server: Served, made: DrivenStreet, points: Doubles, kinds: Sequence[str]
 ) -> tuple[ProbeReport, int, int]:
     """Return a planner's figures while a lidar streams, the scans, and how many were lost."""
     with ExitStack() as stack:
@@ -50,10 +50,9 @@ def _measure(
 
 def _figures(name: str, measured: tuple[ProbeReport, int, int]) -> list[Figure]:
     met, scans, lost = measured
+    figures = latency_figures(f"planner {name}", met, tail_ms=_TAIL_MS)
+    lost_at_most = _LOST_SHARE * scans
     return [
-        Figure(f"planner {name}, median", met.latency_p50_ms, "ms"),
-        Figure(f"planner {name}, 99 %", met.latency_p99_ms, "ms", at_most=_TAIL_MS),
-        Figure(f"planner {name}, longest of {met.queries}", met.latency_max_ms, "ms"),
-        Figure(f"planner {name}, errors", met.errors, "", at_most=0),
-        Figure(f"lidar {name}, lost of {scans} scans", lost, "", at_most=_LOST_SHARE * scans),
+        *figures,
+        Figure(f"lidar {name}, lost of {scans} scans", lost, "", at_most=lost_at_most),
     ]

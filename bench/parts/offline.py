@@ -1,37 +1,32 @@
 """Maps opened offline: how true and fast their answers are compared to the server's epoch."""
 
-import tempfile
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 from triquad_client import OfflineMap, open_map
-from triquad_format.mapfile.writer import write_map
 from triquad_format.records.arrays import Doubles
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_server.epochs.epoch import Epoch
 
 from bench.figures import Figure, compare, seconds
 from bench.parts.core import seen_points
-from bench.street import BenchStreet, settled_mapper
+from bench.street_scores import DrivenStreet
 
-_OFFLINE_SEED = 4  # of the points at which both are asked
+_SEED = 4  # of the points at which both are asked
 _ROUNDS = 7
+_MANY, _FEW = 100_000, 1_000
 
 
-def measure_offline(made: BenchStreet) -> list[Figure]:
-    """Return figures of the street's map, opened offline, against the settled server's epoch."""
-    epoch = settled_mapper("the street", made.scans).publish()
-    points = seen_points(epoch, made, np.random.default_rng(_OFFLINE_SEED))
-    with tempfile.TemporaryDirectory(prefix="triquad-bench-") as name:
-        path = Path(name) / "street.triquad"
-        write_map(epoch.record(), path)
-        open_map(path).query_distance(points[:10])  # compiled code is loaded
-        opening_s = seconds(lambda: open_map(path))
-        with open_map(path) as offline:
-            first_s = seconds(lambda: offline.query_distance(points[:1]))
-            figures = _differences(offline, epoch, points) + _ratios(offline, epoch, points)
+def measure_offline(made: DrivenStreet, epoch: Epoch, path: Path) -> list[Figure]:
+    """Return figures of the street's map in a file, against the epoch that it was written of."""
+    points = seen_points(epoch, made, np.random.default_rng(_SEED))
+    open_map(path).query_distance(points[:10])  # compiled code is loaded
+    opening_s = seconds(lambda: open_map(path))
+    with open_map(path) as offline:
+        first_s = seconds(lambda: offline.query_distance(points[:1]))
+        figures = _differences(offline, epoch, points)
+        figures += _ratios(offline, epoch, points[:_FEW], repeats=20)
+        figures += _ratios(offline, epoch, points[:_MANY], repeats=2)
     return [
         *figures,
         Figure("open the file of the street", opening_s, "s", at_most=2),
@@ -53,21 +48,16 @@ def _differences(offline: OfflineMap, epoch: Epoch, points: Doubles) -> list[Fig
     ]
 
 
-def _ratios(offline: OfflineMap, epoch: Epoch, points: Doubles) -> list[Figure]:
+def _ratios(offline: OfflineMap, epoch: Epoch, points: Doubles, repeats: int) -> list[Figure]:
     """Return how many times as long as the server's epoch the file takes."""
-    figures = []
-    for count in (1_000, 100_000):
-        some = points[:count]
-        repeats = 20 if count < 10_000 else 2
-        ways: dict[str, tuple[Callable[[], object], Callable[[], object]]] = {
-            "SDF": (partial(offline.query_sdf, some), partial(epoch.query, some)),
-            "distances": (
-                partial(offline.query_distance, some),
-                partial(distances, epoch, some, DistanceOptions()),
-            ),
-        }
-        for name, (here, there) in ways.items():
-            taken = 1 / compare(here, there, _ROUNDS, repeats=repeats).ratio
-            label = f"{count:,} {name}, times the server's epoch"
-            figures.append(Figure(label, taken, "", at_most=1.2))
-    return figures
+    sdf = compare(lambda: offline.query_sdf(points), lambda: epoch.query(points), _ROUNDS, repeats)
+    distance = compare(
+        lambda: offline.query_distance(points),
+        lambda: distances(epoch, points, DistanceOptions()),
+        _ROUNDS,
+        repeats,
+    )
+    return [
+        Figure(f"{len(points):,} {name}, times the server's epoch", 1 / one.ratio, "", at_most=1.2)
+        for name, one in (("SDF", sdf), ("distances", distance))
+    ]

@@ -9,7 +9,7 @@ import numpy as np
 from triquad_client import Mesh
 from triquad_format.records.arrays import Doubles
 from triquad_tools.console.progress import progress
-from triquad_tools.evaluation.metrics import MeshScores, ScoreSettings, score_mesh
+from triquad_tools.evaluation.metrics import ScoreSettings, score_mesh
 from triquad_tools.recordings.cloud import merged
 from triquad_tools.recordings.publishing import FLUSH_TIMEOUT_S, wait_until_settled
 from triquad_tools.sensors.sweep import PosedScan
@@ -23,8 +23,8 @@ from bench.scenes.tabletop import tabletop_by_camera
 
 _SETTLE_LIMIT_S = 300.0
 _SCANS = 200
-_STREET_SCANS, _STREET_M = 100, 110.0
-_LONG_SCANS, _LONG_M = 150, 300.0
+_STREET = (100, 110.0)  # scans, metres
+_LONG_STREET = (150, 300.0)  # at 72 km/h
 
 
 @dataclass(frozen=True)
@@ -38,30 +38,23 @@ class Place:
     voxel_m: float  # between the points of the truth and of the mesh that are compared
 
 
-def _street_by(lidar: Lidar, seed: int) -> SimulatedDrive:
-    scene = street(seed, _STREET_M)
-    return SimulatedDrive(
-        scene, lidar, drive(scene, _STREET_SCANS, _STREET_M / _STREET_SCANS), seed
-    )
+def _street_by(lidar: Lidar, scans: int, length_m: float, seed: int) -> SimulatedDrive:
+    scene = street(seed, length_m)
+    return SimulatedDrive(scene, lidar, drive(scene, scans, length_m / scans), seed)
 
 
-def _long_street(seed: int) -> SimulatedDrive:
-    """Return a lidar of 128 beams with a range of 120 m, at 72 km/h."""
-    lidar = Lidar(beams=128, columns=1024, range_max_m=120.0, noise_m=0.02)
-    scene = street(seed, _LONG_M)
-    return SimulatedDrive(scene, lidar, drive(scene, _LONG_SCANS, _LONG_M / _LONG_SCANS), seed)
-
-
+_FAR = Lidar(beams=128, columns=1024, range_max_m=120.0, noise_m=0.02)
 _SIXTEEN = Lidar(beams=16, columns=1800, elevation_min_deg=-15.0, elevation_max_deg=15.0)
+_ALL_BEAMS = partial(_street_by, Lidar(columns=1024), *_STREET)
+_FEW_BEAMS = partial(_street_by, _SIXTEEN, *_STREET)
+_FAR_BEAMS = partial(_street_by, _FAR, *_LONG_STREET)
 _FINE = {0.02: 90.0, 0.05: 99.0}
 
 PLACES = (
     Place("room, depth camera", "indoor", partial(room_by_camera, scans=_SCANS), _FINE, 0.01),
     Place("room, 64 beams", "indoor", partial(room_by_lidar, scans=_SCANS), _FINE, 0.01),
-    Place(
-        "street, 64 beams", "street", partial(_street_by, Lidar(columns=1024)), {0.1: 98.0}, 0.05
-    ),
-    Place("street, 16 beams", "street", partial(_street_by, _SIXTEEN), {0.1: 98.0}, 0.05),
+    Place("street, 64 beams", "street", _ALL_BEAMS, {0.1: 98.0}, 0.05),
+    Place("street, 16 beams", "street", _FEW_BEAMS, {0.1: 98.0}, 0.05),
     Place(
         "tabletop, depth camera",
         "tabletop",
@@ -69,7 +62,7 @@ PLACES = (
         {0.005: None, 0.01: 98.0, 0.02: None},
         0.0025,
     ),
-    Place("long street, 128 beams", "long-range", _long_street, {0.1: None, 0.2: 99.0}, 0.05),
+    Place("long street, 128 beams", "long-range", _FAR_BEAMS, {0.1: None, 0.2: 99.0}, 0.05),
 )
 
 
@@ -129,7 +122,8 @@ def _place_figures(place: Place, seed: int) -> list[Figure]:
 def _f_figures(place: Place, driven: _Driven, mesh: Mesh) -> list[Figure]:
     figures = []
     for within_m, wanted in place.f_scores.items():
-        scores = _scores(place, driven, mesh, within_m)
+        settings = ScoreSettings(threshold_m=within_m, voxel_m=place.voxel_m)
+        scores = score_mesh(mesh, driven.visible, settings, driven.drive.scene.sdf)
         name = f"F-score at {100 * within_m:g} cm"
         figures.append(Figure(name, 100 * scores.f_score, "%", at_least=wanted))
     return [
@@ -137,8 +131,3 @@ def _f_figures(place: Place, driven: _Driven, mesh: Mesh) -> list[Figure]:
         Figure("accuracy, mean", 100 * scores.accuracy_m, "cm"),
         Figure("samples beyond 20 cm", 100 * scores.outlier_ratio, "%"),
     ]
-
-
-def _scores(place: Place, driven: _Driven, mesh: Mesh, within_m: float) -> MeshScores:
-    settings = ScoreSettings(threshold_m=within_m, voxel_m=place.voxel_m)
-    return score_mesh(mesh, driven.visible, settings, driven.drive.scene.sdf)

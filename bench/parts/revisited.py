@@ -9,23 +9,49 @@ from pathlib import Path
 
 import numpy as np
 from triquad_format.records.arrays import Doubles
+from triquad_format.records.status import Status
+from triquad_map.view import MapView
 from triquad_server.intake.rays import usable_rays
 from triquad_server.settings import Settings
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.lines import print_remark
 from triquad_tools.console.progress import progress
+from triquad_tools.recordings.cloud import points_in_range
+from triquad_tools.recordings.folders.cloud_folder import read_cloud_folder
+from triquad_tools.sensors.sweep import PosedScan
 
-from bench.ended_voxels import (
-    EndedVoxels,
-    end_keys,
-    surface_share,
-    voxel_centres,
-)
+from bench.ended_voxels import EndedVoxels, end_keys, voxel_centres
 from bench.figures import Figure
-from bench.recorded import RecordedScans, recorded_scans
-from bench.street import StreamedMap
+from bench.street import StreamedMap, learn_all
 
 _ROUNDS = 2
+_SKIP_EVERY = 7
+_RANGE_MIN_M = 2.0  # nearer is the vehicle's own body
+
+
+@dataclass(frozen=True)
+class RecordedScans:
+    """Scans of a recorded drive: those to map, and those to withhold."""
+
+    mapped: tuple[PosedScan, ...]
+    withheld: tuple[PosedScan, ...]
+
+
+def recorded_scans(path: Path, scans: int | None = None) -> RecordedScans:
+    """Return the scans of a folder (the first ``scans`` of them), every 7th apart.
+
+    Raises:
+        ToolError: the folder cannot be read.
+    """
+    folder = read_cloud_folder(path)
+    mapped: list[PosedScan] = []
+    withheld: list[PosedScan] = []
+    indices = range(len(folder))[:scans]
+    for index, whole in zip(indices, folder.read(indices), strict=True):
+        near = points_in_range(whole.points, _RANGE_MIN_M)
+        scan = PosedScan(near, whole.world_from_sensor)
+        (withheld if index % _SKIP_EVERY == _SKIP_EVERY - 1 else mapped).append(scan)
+    return RecordedScans(tuple(mapped), tuple(withheld))
 
 
 @dataclass(frozen=True)
@@ -72,12 +98,11 @@ def revisit(scans: RecordedScans, settings: Settings, name: str) -> Revisited:
                 ended.add(end_keys(scan, settings))
             streamed.take_in(scan)
             report(number, f"scan {number}")
-        while not streamed.mapper.settled:
-            streamed.mapper.train()
+        learn_all(streamed.mapper)
         report(len(rounds) + 1, "settled")
     epoch = streamed.mapper.publish()
     kept, kept_of_several = (
-        surface_share(epoch, voxel_centres(ended.keys(seen_by), epoch.voxel_m))
+        _surface_share(epoch, voxel_centres(ended.keys(seen_by), epoch.voxel_m))
         for seen_by in (1, 2)
     )
     off_m = np.abs(epoch.query(_unseen_points(scans, settings)).sdf)
@@ -88,3 +113,8 @@ def _unseen_points(scans: RecordedScans, settings: Settings) -> Doubles:
     """Return the points [N, 3] of withheld scans that a map would use, map frame."""
     rays = (usable_rays(s.points, s.world_from_sensor, settings.scan) for s in scans.withheld)
     return np.concatenate([of_scan.ends for of_scan in rays])
+
+
+def _surface_share(view: MapView, centres: Doubles) -> float:
+    """Return the share of voxels with ``centres`` [N, 3] that a map takes to be surface."""
+    return float((view.status(centres, reach_m=0.0) == Status.SURFACE).mean())

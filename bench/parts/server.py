@@ -3,7 +3,6 @@
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,22 +21,19 @@ from bench.clients.served import (
 )
 from bench.figures import Figure, seconds
 from bench.parts.core import seen_points
-from bench.street import BenchStreet
-from bench.street_scores import score_street
+from bench.street_scores import DrivenStreet, score_street
 
 _SOON_S = 2.0  # after the last scan
 _SETTLE_LIMIT_S = 300.0
 _REST_S = 12.0  # in which a server frees what it does not need
 _RESTED = 11  # seconds after that in which its memory is measured
-_MESH_SAMPLES = 6_000_000
 _REPEATS = 15
 _ASKED = 1_000
 _QUESTIONS, _FIRST = 320, 20  # the first are not counted
 
 
-def measure_server(made: BenchStreet) -> list[Figure]:
+def measure_server(made: DrivenStreet) -> list[Figure]:
     """Return figures of a whole server: what a robot would meet."""
-    made = replace(made, samples_max=_MESH_SAMPLES)
     with served() as server:
         client = server.client
         met = stream_beside_planner(server, made)
@@ -71,7 +67,7 @@ def _resident_at_rest_mb(client: Client) -> float:
     return statistics.median(samples)
 
 
-def _early(client: Client, made: BenchStreet) -> list[Figure]:
+def _early(client: Client, made: DrivenStreet) -> list[Figure]:
     """Return figures of the map soon after the last scan, all from the epoch of that moment."""
     trained = client.status().samples_trained / 1e6
     mesh = client.mesh(made.drive.scene.box)
@@ -85,7 +81,7 @@ def _early(client: Client, made: BenchStreet) -> list[Figure]:
     ]
 
 
-def _idle(client: Client, made: BenchStreet) -> list[Figure]:
+def _idle(client: Client, made: DrivenStreet) -> list[Figure]:
     """Return how soon an idle server answers one question after the other."""
     place = made.drive.poses[len(made.drive.poses) // 2][:3, 3]
     points, near = around(place, _ASKED, np.random.default_rng(0)), near_surface(made)
@@ -104,7 +100,7 @@ def _idle(client: Client, made: BenchStreet) -> list[Figure]:
     ]  # fmt: skip
 
 
-def _converged(client: Client, made: BenchStreet) -> list[Figure]:
+def _converged(client: Client, made: DrivenStreet) -> list[Figure]:
     street = score_street(client.query_sdf, made.probes)
     started = time.perf_counter()
     mesh = client.mesh(made.drive.scene.box)
@@ -127,7 +123,7 @@ def _converged(client: Client, made: BenchStreet) -> list[Figure]:
     ]
 
 
-def _network(client: Client, made: BenchStreet, folder: Path) -> list[Figure]:
+def _network(client: Client, made: DrivenStreet, folder: Path) -> list[Figure]:
     """Compare queries of 100,000 points through the network with the same map in this process."""
     client.download_map(folder / "map.triquad")
     epoch = Mapper("bench", Settings(), "cpu", record=read_map(folder / "map.triquad")).publish()

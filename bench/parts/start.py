@@ -1,6 +1,5 @@
 """A server's start: with nothing compiled, and later."""
 
-import os
 import statistics
 import tempfile
 import time
@@ -11,7 +10,7 @@ from triquad_client import connect
 from triquad_format.records.arrays import Floats
 
 from bench.clients.served import MAP
-from bench.clients.server_process import ServerProcess
+from bench.clients.server_process import server_process
 from bench.figures import Figure
 
 _STARTS = 5
@@ -38,12 +37,11 @@ class _Start:
 
     def __init__(self, folder: Path) -> None:
         """Start a server whose compiled code is kept in a folder."""
-        variables = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "kernels")}
+        compiled = {"NUMBA_CACHE_DIR": str(folder / "kernels")}
         started = time.monotonic()
-        with tempfile.TemporaryDirectory(dir=folder) as name:
-            server = ServerProcess(Path(name), MAP, ["--device", "cpu"], variables=variables)
+        with server_process(["--map", MAP, "--device", "cpu"], environment=compiled) as server:
             self.ready_s = time.monotonic() - started
-            with server, connect(server.endpoint, MAP, timeout_s=_TIMEOUT_S) as client:
+            with connect(server.endpoint, MAP, timeout_s=_TIMEOUT_S) as client:
                 client.publish_scan(_sphere(), np.eye(4))
                 client.flush(_TIMEOUT_S)
                 self.mapping_s = time.monotonic() - started

@@ -16,7 +16,7 @@ from triquad_server.store.store import Store
 
 from bench.clients.served import MAP, served, stream_beside_planner
 from bench.figures import Figure
-from bench.street import BenchStreet
+from bench.street_scores import DrivenStreet
 
 _REGIONS = 16
 _SCANS = 40  # that made the map
@@ -25,13 +25,13 @@ _CHECKPOINTS = 6
 _EVERY_SCANS = 15
 
 
-def measure_store(made: BenchStreet) -> list[Figure]:
+def measure_store(made: DrivenStreet) -> list[Figure]:
     """Return figures of checkpoints."""
     record = _row(made)
     return _costs(record, made) + _latencies(record, made)
 
 
-def _row(made: BenchStreet) -> MapRecord:
+def _row(made: DrivenStreet) -> MapRecord:
     """Return a street's region, settled, 16 times in a row."""
     settings = Settings()
     mapper = Mapper(MAP, settings, "cpu")
@@ -52,7 +52,7 @@ def _row(made: BenchStreet) -> MapRecord:
     )
 
 
-def _costs(record: MapRecord, made: BenchStreet) -> list[Figure]:
+def _costs(record: MapRecord, made: DrivenStreet) -> list[Figure]:
     """Return bytes and time of a first checkpoint, and of those after driving in one region."""
     mapper = Mapper(MAP, Settings(), "cpu", record=record)
     with (
@@ -99,7 +99,7 @@ def _stored_bytes(folder: Path) -> int:
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
-def _latencies(record: MapRecord, made: BenchStreet) -> list[Figure]:
+def _latencies(record: MapRecord, made: DrivenStreet) -> list[Figure]:
     """Return latencies while the robot drives on in one region, without and with checkpoints."""
     with served(record) as server, ThreadPoolExecutor(1) as beside:
 

@@ -4,7 +4,6 @@ An episode begins with scans amid things that move, and goes on with scans of th
 them. Those to tune on and those that are only scored differ in place, sensor, drive and things.
 """
 
-import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
@@ -12,7 +11,7 @@ import numpy as np
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_tools.simulation.lidar import SimulatedDrive, SimulatedScan
 from triquad_tools.simulation.scene import Scene
-from triquad_tools.simulation.solids import Solid
+from triquad_tools.simulation.solids import Solid, box, cylinder
 
 PERIOD_S = 0.1  # from scan to scan
 _ON_SURFACE_M = 1e-6
@@ -100,7 +99,15 @@ def straight_lane(x: tuple[float, float], y: float, z: float) -> Doubles:
     return np.stack([starts, starts + (1.0, 0.0, 0.0)], axis=1)
 
 
-def turning(angle: float) -> Doubles:
-    """Return a rotation [3, 3] about the vertical."""
-    cos, sin = math.cos(angle), math.sin(angle)
-    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+def thin_things(x: float, y: float, length_m: float = 12.0) -> list[Solid]:
+    """Return posts of 2 cm, two wires of 4 cm and a fence of bars of 16 mm.
+
+    They stand along x for ``length_m`` from ``x`` on, within 1.2 m of ``y``, metres.
+    """
+    solids = [cylinder((x + i, y, 0.5), 0.01, 0.7) for i in np.arange(0.0, length_m, 2.0)]
+    middle = x + 0.5 * length_m
+    solids.append(box((middle, y - 0.6, 1.4), (0.5 * length_m, 0.02, 0.02), 0.0, 0.02))
+    solids.append(box((middle, y + 0.6, 2.6), (0.5 * length_m, 0.02, 0.02), 0.0, 0.02))
+    bars = np.arange(0.0, length_m, 0.12)
+    solids += [cylinder((x + i, y + 1.2, 0.5), 0.008, 0.6) for i in bars]
+    return solids

@@ -4,7 +4,7 @@ Another seed is not another scene: places, speeds, sensors and drives of the two
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from triquad_format.records.arrays import Doubles
@@ -13,9 +13,8 @@ from triquad_tools.simulation.scene import Scene
 from triquad_tools.simulation.solids import Solid, box, cylinder, half_space
 from triquad_tools.simulation.street import ROAD_HALF_WIDTH_M, street
 
-from bench.scenes.episodes import Episode, Things, straight_lane
+from bench.scenes.episodes import Episode, Things, straight_lane, thin_things
 from bench.scenes.room import room_by_lidar
-from bench.scenes.thin_things import thin_things
 
 _BUSY_SCANS = 60
 _ROBOT_Z_M = 0.6
@@ -131,28 +130,15 @@ class NonRepeating:
         around = rng.uniform(0, 2 * math.pi, self.rays)
         across = np.sin(angle)
         rays = np.stack([np.cos(angle), across * np.cos(around), across * np.sin(around)], axis=1)
-        made = Lidar(beams=1, columns=1, noise_m=self.noise_m)
-        return _cast(made, rays, scene, world_from_sensor, rng)
+        lidar = _LidarOfRays(noise_m=self.noise_m, directions=rays)
+        return lidar.scan(scene, world_from_sensor, rng)
 
 
-def _cast(
-    lidar: Lidar,
-    rays: Doubles,
-    scene: Scene,
-    world_from_sensor: Doubles,
-    rng: np.random.Generator,
-) -> SimulatedScan:
-    rotation, origin = world_from_sensor[:3, :3], world_from_sensor[:3, 3]
-    world = rays @ rotation.T
-    ranges = scene.cast(origin, world, lidar.range_max_m)
-    seen = np.isfinite(ranges) & (ranges >= lidar.range_min_m)
-    measured = ranges[seen] + rng.normal(0.0, lidar.noise_m, int(seen.sum()))
-    return SimulatedScan(
-        points=(measured[:, None] * rays[seen]).astype(np.float32),
-        true_hits=origin + ranges[seen][:, None] * world[seen],
-        world_from_sensor=world_from_sensor,
-        no_return=rays[np.isinf(ranges)].astype(np.float32),
-    )
+@dataclass(frozen=True)
+class _LidarOfRays(Lidar):
+    """A lidar whose rays leave in given directions."""
+
+    directions: Doubles = field(kw_only=True)  # [N, 3] unit vectors, sensor frame
 
 
 def _crossing(scans: int) -> Episode:

@@ -14,7 +14,10 @@ from functools import partial
 from unittest.mock import patch
 
 import numpy as np
-from triquad_client import OfflineMap
+from triquad_client import Mesh, OfflineMap
+from triquad_client.offline.map_mesh import MapTiles, map_lattice
+from triquad_format.records.arrays import Doubles
+from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.training.focus import Focus
 from triquad_server.mapping.training.slopes import Slopes
@@ -131,18 +134,31 @@ class _Learner:
         settings = ScoreSettings(
             threshold_m=self._place.within_m, voxel_m=self._place.voxel_m, samples_max=_SCORED
         )
-        with OfflineMap(self.mapper.publish().record()) as opened:
-            scores = score_mesh(opened.mesh(), self._visible, settings, self._drive.scene.sdf)
-        self.figures += [
-            Figure(f"{name}: samples", samples / 1e6, "M"),
-            Figure(f"{name}: F-score", 100 * scores.f_score, "%"),
-            Figure(f"{name}: accuracy", 100 * scores.accuracy_m, "cm"),
-        ]
+        epoch = self.mapper.publish()
+        with OfflineMap(epoch.record()) as opened:
+            ends = opened.surface_voxels()
+            meshes = {"served": _served(epoch, ends), "in a file": opened.mesh()}
+        self.figures.append(Figure(f"{name}: samples", samples / 1e6, "M"))
+        for where, mesh in meshes.items():
+            scores = score_mesh(mesh, self._visible, settings, self._drive.scene.sdf)
+            self.figures += [
+                Figure(f"{name}, {where}: F-score", 100 * scores.f_score, "%"),
+                Figure(f"{name}, {where}: accuracy", 100 * scores.accuracy_m, "cm"),
+            ]
+
+
+def _served(epoch: Epoch, ends: Doubles) -> Mesh:
+    """Return the mesh of an epoch as a server gives it; rays ended in voxels around ``ends``."""
+    half_m = epoch.voxel_m / 2
+    everywhere = (np.full(3, -np.inf), np.full(3, np.inf))
+    lattice = map_lattice(half_m, half_m, whole=True)
+    return MapTiles(epoch, ends, lattice, everywhere, 0.0).joined(None)
 
 
 def measure_learning(place: Place) -> list[Figure]:
     """Return figures of a place: by samples, settled, after a rest, and seen again in part."""
     learner = _Learner(place)
+    learner.score("0 M")
     for samples in _SAMPLES:
         learner.learn(samples)
         learner.score(f"{samples / 1e6:g} M")

@@ -1,7 +1,7 @@
 """``python -m bench.studies.tradeoffs OUT.png``: how good a map is for its time, bytes and scans.
 
 The map is of one drive along an exact street; every mesh is scored against all lidar hits
-of the whole drive. On street 1 it is drawn with VDBFusion 0.1.6, measured on the same scans.
+of the whole drive. It is drawn with VDBFusion 0.1.6, measured on the same scans.
 """
 
 import argparse
@@ -19,17 +19,17 @@ from matplotlib.figure import Figure as Sheet
 from matplotlib.ticker import NullFormatter, ScalarFormatter
 from triquad_client import OfflineMap
 from triquad_format.mapfile.reader import read_map
-from triquad_format.mapfile.writer import write_map
 from triquad_format.records.region import MapRecord
-from triquad_map.preview import previews_of
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
-from triquad_tools.console.arguments import picture, seed
+from triquad_tools.console.arguments import picture
 from triquad_tools.console.progress import progress
 from triquad_tools.mapfiles.quantise import quantise
 
-from bench.street import BenchStreet, bench_street, settled_mapper
+from bench.parts.file import written
+from bench.street import bench_street, settled_mapper
+from bench.street_scores import DrivenStreet
 
 _TRAINED_S = (1.0, 2.0, 4.0, 8.0, 16.0, math.inf)  # of all cores; until settled, at last
 _ERRORS_M = (0.001, 0.002, 0.005, 0.01, 0.02)  # of triquad-pack --max-error
@@ -48,8 +48,8 @@ class Scored:
     accuracy_cm: float  # mean error of the mesh where it is below 20 cm
 
 
-_NEIGHBOUR_STREET = 1
-NEIGHBOUR = (
+_STREET = 1
+_NEIGHBOUR = (
     Scored(TIME, 3.6, f_score=98.56, accuracy_cm=0.72),
     Scored(BYTES, 32.25, f_score=98.56, accuracy_cm=0.72),
     Scored(SPACING, 1, f_score=98.56, accuracy_cm=0.72),
@@ -57,10 +57,10 @@ NEIGHBOUR = (
     Scored(SPACING, 5, f_score=92.59, accuracy_cm=0.89),
     Scored(SPACING, 10, f_score=80.32, accuracy_cm=0.98),
 )
-"""VDBFusion 0.1.6, voxels of 10 cm, on the scans of street 1; its meshes scored as all others."""
+"""VDBFusion 0.1.6, voxels of 10 cm, on the scans of the street; its meshes scored as all others."""
 
 
-def measure_tradeoffs(made: BenchStreet) -> list[Scored]:
+def measure_tradeoffs(made: DrivenStreet) -> list[Scored]:
     """Return scores along three curves."""
     scores, settled = _by_time(made)
     scores += _by_bytes(settled, made)
@@ -73,17 +73,18 @@ def measure_tradeoffs(made: BenchStreet) -> list[Scored]:
     return scores
 
 
-def draw(scores: Sequence[Scored], path: Path, *, title: str, neighbour: bool) -> None:
+def draw(scores: Sequence[Scored], path: Path) -> None:
     """Save a picture of the three curves, F-score above and accuracy below."""
     sheet = Sheet(figsize=(13.2, 7.4), layout="constrained")
-    sheet.suptitle(title)
+    sheet.suptitle(f"triquad on simulated street {_STREET}: 110 m, 100 scans, noise of 1 cm")
+    maps = {
+        "triquad": (scores, "o-", "#0072b2"),
+        "VDBFusion, voxels of 10 cm": (_NEIGHBOUR, "s--", "#d55e00"),
+    }
     panels = sheet.subplots(2, 3)
     for column, curve in zip(panels.T, (TIME, BYTES, SPACING), strict=True):
         for panel, measure in zip(column, ("f_score", "accuracy_cm"), strict=True):
-            drawn = {"triquad": (scores, "o-", "#0072b2")}
-            if neighbour:
-                drawn["VDBFusion, voxels of 10 cm"] = (NEIGHBOUR, "s--", "#d55e00")
-            for label, (of, style, colour) in drawn.items():
+            for label, (of, style, colour) in maps.items():
                 points = [(one.cost, getattr(one, measure)) for one in of if one.curve == curve]
                 panel.plot(*zip(*points, strict=True), style, color=colour, label=label)
             panel.set_xscale("log")
@@ -96,7 +97,7 @@ def draw(scores: Sequence[Scored], path: Path, *, title: str, neighbour: bool) -
     sheet.savefig(path, dpi=110)
 
 
-def _by_time(made: BenchStreet) -> tuple[list[Scored], Epoch]:
+def _by_time(made: DrivenStreet) -> tuple[list[Scored], Epoch]:
     """Return scores after some seconds of integrating scans and training, of all cores together.
 
     The epoch is that of the settled map, of all scans.
@@ -123,28 +124,23 @@ def _by_time(made: BenchStreet) -> tuple[list[Scored], Epoch]:
     return scores, epoch
 
 
-def _by_bytes(epoch: Epoch, made: BenchStreet) -> list[Scored]:
+def _by_bytes(epoch: Epoch, made: DrivenStreet) -> list[Scored]:
     """Return scores of a map's file, as it is and packed within errors."""
     with tempfile.NamedTemporaryFile() as plain:
-        size = _written(epoch.record(), epoch, cast(BinaryIO, plain))
+        size = written(epoch, epoch.record(), cast(BinaryIO, plain)).bytes
         plain.flush()
         stored = read_map(plain.name)
     scores = [_score(stored, made, curve=BYTES, cost=size / 1e6)]
     with progress("packing", len(_ERRORS_M)) as report:
         for number, error_m in enumerate(_ERRORS_M):
             packed = quantise(stored, error_m).record
-            size = _written(packed, epoch, io.BytesIO())
+            size = written(epoch, packed, io.BytesIO()).bytes
             scores.append(_score(packed, made, curve=BYTES, cost=size / 1e6))
             report(number + 1, f"within {1e3 * error_m:g} mm")
     return scores
 
 
-def _written(record: MapRecord, epoch: Epoch, file: BinaryIO) -> int:
-    """Write a map as a server does, with its previews; return its size in bytes."""
-    return write_map(record, file, previews=previews_of(record, epoch)).bytes
-
-
-def _score(record: MapRecord, made: BenchStreet, *, curve: str, cost: float) -> Scored:
+def _score(record: MapRecord, made: DrivenStreet, *, curve: str, cost: float) -> Scored:
     with OfflineMap(record) as opened:
         scores = made.mesh_scores(opened.mesh(made.drive.scene.box))
     return Scored(curve, cost, 100 * scores.f_score, 100 * scores.accuracy_m)
@@ -154,12 +150,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Measure a street, and draw it."""
     parser = argparse.ArgumentParser(prog="tradeoffs", description=__doc__)
     parser.add_argument("picture", type=picture, metavar="OUT.png")
-    parser.add_argument("--seed", type=seed, default=1, help="of the street (default: 1)")
     options = parser.parse_args(argv)
-    scores = measure_tradeoffs(bench_street(options.seed))
-    neighbour = options.seed == _NEIGHBOUR_STREET
-    title = f"triquad on simulated street {options.seed}: 110 m, 100 scans, noise of 1 cm"
-    draw(scores, options.picture, title=title, neighbour=neighbour)
+    draw(measure_tradeoffs(bench_street(_STREET)), options.picture)
     return 0
 
 

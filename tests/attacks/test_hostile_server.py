@@ -9,13 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import triquad_client
-from support.attackers.hostile_server import (
-    Body,
-    HostileServer,
-    hostile_server,
-    packed,
-    told,
-)
+from support.attackers.hostile_server import Body, HostileServer, hostile_server, packed, told
 from support.attackers.lies import LIES, QUESTIONS, TILE, Ask, Lie, out_of_bounds
 from triquad_client import Client
 from triquad_client.errors import BadReplyError, DownloadError

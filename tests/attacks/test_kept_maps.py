@@ -2,7 +2,6 @@
 
 import errno
 import os
-import resource
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -33,11 +32,6 @@ def served(folder: Path, *more: str) -> Iterator[tuple[servers.ServerProcess, Cl
         triquad_client.connect(server.endpoint) as client,
     ):
         yield server, client
-
-
-def stop(server: servers.ServerProcess) -> None:
-    server.process.terminate()
-    assert server.wait() == 0, server.log
 
 
 def counts(client: Client) -> tuple[int, int]:
@@ -85,23 +79,6 @@ def test_the_map_of_before_outlives_resets_and_checkpoints_without_end(
         assert "was taken back to epoch" in server.log
         assert client.status().epoch >= learnt_since
         assert np.array_equal(client.query_sdf(PROBES).status, before.status)
-
-
-def test_a_reset_is_refused_where_the_map_cannot_be_kept(tmp_path: Path) -> None:
-    with served(tmp_path) as (server, client):
-        servers.learn(client)
-        _, hard = resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE)
-        resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE, (1000, hard))
-        with pytest.raises(RefusedError, match="nothing was reset.*File too large"):
-            client.reset()
-        assert client.status().regions == 1
-        resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE, (hard, hard))
-        kept = client.reset().kept_epoch
-        assert client.status().regions == 0
-        stop(server)
-    (folder,) = (tmp_path / "store").iterdir()
-    (file,) = (file for file in checkpoint_files(folder) if file.epoch == kept)
-    assert len(read_map(file.path).regions) == 1
 
 
 def test_nothing_is_reset_where_the_map_cannot_be_kept_and_mapping_goes_on_while_it_is(

@@ -6,8 +6,7 @@ from support.maps.episodes import box_on_a_street
 from support.recordings.kitti_folder import write_folder
 from triquad_server.settings import ChangeSettings, Settings
 
-from bench.parts.revisited import Revisited, revisit
-from bench.recorded import RecordedScans, recorded_scans
+from bench.parts.revisited import RecordedScans, Revisited, recorded_scans, revisit
 
 BUSY, SCANS = 4, 14  # things move in the first
 

@@ -6,7 +6,6 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,16 +14,9 @@ import zenoh
 from support import servers
 from support.event_loop import connected
 from support.server_records import STATUS
-from triquad_client import (
-    AsyncClient,
-    ClosedError,
-)
+from triquad_client import AsyncClient, ClosedError
 from triquad_format.wire import codec, keys
-from triquad_format.wire.messages import (
-    MapInfo,
-    Scan,
-    SdfReply,
-)
+from triquad_format.wire.messages import MapInfo, SdfReply
 from triquad_map.stored_map import StoredMap
 
 POSE = np.eye(4)
@@ -181,54 +173,6 @@ def test_what_is_under_way_when_the_client_is_closed_says_so(tmp_path: Path) -> 
         connected(endpoint, use)
         held.drop()
         held_files.drop()
-
-
-def test_a_cancelled_scan_that_the_network_holds_up_is_not_waited_for(tmp_path: Path) -> None:
-    """It is sent all the same, in its place."""
-    patient = tmp_path / "patient.json5"  # or the link would be given up after 5 s
-    block = f"{{ wait_before_close: {int(2e6 * servers.WAIT_S)} }}"
-    queue = f"{{ queue: {{ congestion_control: {{ block: {block} }} }} }}"
-    patient.write_text(f"{{ transport: {{ link: {{ tx: {queue} }} }} }}")
-    endpoint, cloud = servers.free_endpoint(), servers.sphere(100_000)
-
-    async def use(subscriber: "zenoh.Subscriber[Any]") -> None:
-        async with triquad_client.connect_async(endpoint, config=patient) as client:
-            sent, held_up = 0, None
-            while held_up is None:
-                sending = asyncio.ensure_future(client.publish_scan(cloud, POSE))
-                _, waiting = await asyncio.wait({sending}, timeout=0.5)
-                held_up = sending if waiting else None
-                sent += 1
-            held_up.cancel()
-            await asyncio.wait({held_up}, timeout=servers.WAIT_S)
-            assert held_up.cancelled()
-            last = asyncio.ensure_future(client.publish_scan(cloud, POSE))
-            samples = [await asyncio.to_thread(subscriber.recv) for _ in range(sent + 1)]
-            await last
-            scans = [codec.decode(Scan, sample.payload.to_bytes()) for sample in samples]
-            assert [scan.sequence for scan in scans] == list(range(sent + 1))
-
-    with servers.raw_session("router", listen=endpoint) as router:
-        token = router.liveliness().declare_token(keys.alive_key(servers.MAP, "x"))
-        # Its queue is full soon, and nobody reads it at first.
-        key = keys.scan_key(servers.MAP, "default")
-        subscriber = router.declare_subscriber(key, zenoh.handlers.FifoChannel(1))
-        asyncio.run(use(subscriber))
-        token.undeclare()
-
-
-def test_a_lack_of_threads_is_called_so_and_does_no_harm(endpoint: str) -> None:
-    async def use(client: AsyncClient) -> None:
-        before = threading.stack_size(2**46)  # more than there is: no thread can be started
-        try:
-            for _ in range(40):  # more than may go on at once
-                with pytest.raises(RuntimeError, match="can't start new thread"):
-                    await client.status()
-        finally:
-            threading.stack_size(before)
-        assert (await client.status()).map_name == servers.MAP
-
-    connected(endpoint, use)
 
 
 def test_a_connection_that_is_cancelled_while_it_opens_is_closed() -> None:

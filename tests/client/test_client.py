@@ -1,8 +1,6 @@
 """The client where things go wrong."""
 
 import socket
-import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,12 +20,7 @@ from triquad_client import (
     UnknownMapError,
 )
 from triquad_format.wire import codec, keys
-from triquad_format.wire.messages import (
-    ErrorReply,
-    FlushReply,
-    SdfReply,
-    SdfRequest,
-)
+from triquad_format.wire.messages import ErrorReply, FlushReply, SdfReply, SdfRequest
 
 POSE = np.eye(4)
 CLOUD = np.ones((10, 3), np.float32)
@@ -85,22 +78,14 @@ def test_two_maps_on_one_network_do_not_disturb_each_other() -> None:
         servers.running_service(map_name="cellar", connect=(ground,)),
         triquad_client.connect(ground, "ground") as upstairs,
     ):
-        wait_for_maps(upstairs, ["cellar", "ground"])
+        # Two routers exchange what they know some time after they are up.
+        servers.until(lambda: upstairs.maps() == ["cellar", "ground"], upstairs.maps)
         with triquad_client.connect(ground, "cellar") as downstairs:
             downstairs.publish_scan(servers.sphere(), POSE)
             assert downstairs.flush(servers.WAIT_S).taken == 1
             assert downstairs.status().scans_taken == 1
         assert upstairs.status().scans_taken == 0
         assert upstairs.status().regions == 0
-
-
-def wait_for_maps(client: triquad_client.Client, names: list[str]) -> None:
-    """Two routers exchange what they know some time after they are up."""
-    pause = threading.Event()
-    deadline = time.monotonic() + servers.WAIT_S
-    while (found := client.maps()) != names:
-        assert time.monotonic() < deadline, f"found {found}, not {names}"
-        pause.wait(0.05)
 
 
 def test_a_closed_client_says_so(endpoint: str) -> None:

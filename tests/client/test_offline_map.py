@@ -10,13 +10,7 @@ import pytest
 from support import servers
 from support.files.checkpoint_folder import map_at, write_checkpoints
 from support.maps.exact_maps import exact_map, flat
-from triquad_client import (
-    Client,
-    ClosedError,
-    OfflineMap,
-    RefusedError,
-    open_map,
-)
+from triquad_client import Client, ClosedError, OfflineMap, RefusedError, open_map
 from triquad_client.calls.queries import MapQueries
 from triquad_format.errors import DamagedMapFileError, MapFileError
 from triquad_format.mapfile.writer import write_map

@@ -11,6 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support import servers
 from support.operations import OPERATIONS
+from support.requests import tile_changes
 from triquad_format.wire import codec, keys
 from triquad_format.wire.mesh_messages import MeshRequest, TileListRequest
 from triquad_format.wire.messages import ResetRequest, SdfRequest, StatusRequest
@@ -136,16 +137,6 @@ def test_a_source_whose_name_cannot_stand_in_a_key_is_refused(peer, client):
     assert name not in status.scans_lost
 
 
-def test_repeated_and_overtaken_scans_are_counted(peer, client):
-    for sequence in (0, 2, 2, 1):
-        peer.put("lidar", codec.encode(servers.scan(sequence)))
-    reply = peer.flush(servers.scan(2))
-    assert (reply.taken, reply.lost) == (2, 1)
-    status = client.status()
-    assert status.scans_dropped == {"sequence_backwards": 2}
-    assert status.scans_lost == {"lidar": 1}
-
-
 def test_random_scans_are_dropped_or_taken_but_never_do_harm(peer, client):
     rng = np.random.default_rng(3)
     for _ in range(30):
@@ -192,6 +183,9 @@ def test_random_scans_are_dropped_or_taken_but_never_do_harm(peer, client):
         (keys.MESH, MeshRequest(tiles(0), 0, level=3), "bad_request"),
         (keys.MESH, MeshRequest(tiles(), 0), "bad_request"),
         (keys.MESH, MeshRequest(tiles(*range(65)), 0), "bad_request"),
+        (keys.MESH, MeshRequest(tiles(0), 0, fill_m=1.0), "bad_request"),
+        (keys.TILE_CHANGES, tile_changes(minimum=np.full(3, np.nan)), "bad_request"),
+        (keys.TILE_CHANGES, tile_changes(level=7), "bad_request"),
         (keys.TILE_LIST, TileListRequest(ORIGIN + 1, ORIGIN, 0), "bad_request"),
         (keys.TILE_LIST, TileListRequest(ORIGIN * np.nan, ORIGIN, 0), "bad_request"),
         (keys.RESET, ResetRequest(ORIGIN, ORIGIN * np.nan), "bad_request"),

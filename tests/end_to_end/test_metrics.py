@@ -5,7 +5,6 @@ import pytest
 import triquad_client
 from support import servers
 from triquad_client import RefusedError, ServerMetrics
-from triquad_server.settings import ServiceSettings
 
 
 def figures(client: triquad_client.Client, done) -> ServerMetrics:
@@ -70,34 +69,11 @@ def test_memory_and_time_are_told_by_part(client):
     assert metrics.problem is None
 
 
-def test_how_well_it_was_learnt_is_told(client):
-    servers.learn(client, 4)
-    client.settle(servers.WAIT_S)
-    fit = client.status().fit
-    assert fit.rays > 50
-    assert fit.median_m <= fit.upper_m < 0.1
-    assert len(fit.worst) == len(fit.worst_median_m) <= 5
-    assert (np.diff(fit.worst_median_m) <= 0).all()
-
-
 def test_connected_clients_are_listed(client, endpoint):
     before = client.metrics().sessions
     with triquad_client.connect(endpoint) as other:
         assert len(other.metrics().sessions) == len(before) + 1
         assert set(other.metrics().sessions.values()) == {"client"}
-
-
-def test_epochs_that_were_asked_for_by_number_are_pinned(client):
-    servers.learn(client)
-    pinned = client.pinned()
-    for _ in range(6):
-        pinned.query_sdf([[0, 0, 0]])
-        servers.learn(client, 1)
-    metrics = client.metrics()
-    assert metrics.epochs_pinned >= 1
-    assert metrics.epochs_kept > ServiceSettings().epochs_kept
-    assert metrics.epoch == client.status().epoch
-    assert metrics.epoch_age_s >= 0
 
 
 def test_checkpoints_are_counted_and_timed(tmp_path):

@@ -11,7 +11,6 @@ import subprocess
 import sys
 import urllib.error
 import urllib.request
-from collections.abc import Callable
 from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -21,7 +20,6 @@ import triquad_client
 import triquad_server
 from prometheus_client.parser import text_string_to_metric_families
 from support import servers
-from support.servers import free_port
 from triquad_client import RefusedError
 from triquad_format.mapfile.checkpoint_folder import checkpoint_files
 from triquad_format.mapfile.reader import read_map
@@ -29,6 +27,8 @@ from triquad_format.printable import printable
 from triquad_server.errors import ListenError
 from triquad_server.monitoring.prometheus import FAMILIES
 from triquad_server.settings import MetricsSettings
+
+from bench.clients.server_process import free_port
 
 PAGE = (Path(__file__).parents[2] / "docs" / "metrics.md").read_text(encoding="utf-8")
 
@@ -157,7 +157,7 @@ def test_connections_that_stall_or_trickle_take_some_threads_for_some_seconds(po
         trickling = opened
         while trickling:  # a byte each tenth of a second or so: never silent for long
             trickling = [connection for connection in trickling if stays_open(connection)]
-    until(lambda: is_healthy(port))
+    assert any(is_healthy(port) for _ in range(1000))
 
 
 def stays_open(connection: socket.socket) -> bool:
@@ -176,11 +176,6 @@ def is_healthy(port: int) -> bool:
         return get(port, "/healthz").code == 200
     except OSError:
         return False
-
-
-def until(is_so: Callable[[], bool]) -> None:
-    """Ask until something is so, which takes a moment."""
-    assert any(is_so() for _ in range(1000))
 
 
 @contextmanager

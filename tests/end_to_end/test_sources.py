@@ -6,13 +6,7 @@ import numpy as np
 import pytest
 import triquad_client
 from support import servers
-from triquad_client import (
-    Client,
-    FlushReport,
-    InvalidInputError,
-    NoReplyError,
-    SourceReport,
-)
+from triquad_client import Client, FlushReport, InvalidInputError, NoReplyError, SourceReport
 from triquad_format.records.arrays import Doubles
 from triquad_format.wire import keys
 from triquad_format.wire.source_messages import SourcesRequest

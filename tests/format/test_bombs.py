@@ -20,19 +20,10 @@ from support.files.mapfile_edit import (
     stored_record,
 )
 from support.maps.map_records import random_record, with_rays, with_support
-from triquad_format.errors import (
-    DamagedMapFileError,
-    MapFileError,
-    UnsupportedMapFileError,
-)
+from triquad_format.errors import DamagedMapFileError, MapFileError, UnsupportedMapFileError
 from triquad_format.mapfile.container import chunk_messages
 from triquad_format.mapfile.manifest import Manifest
-from triquad_format.mapfile.parts.part import (
-    EVIDENCE,
-    RAYS,
-    VERTICES,
-    PartKey,
-)
+from triquad_format.mapfile.parts.part import EVIDENCE, RAYS, VERTICES, PartKey
 from triquad_format.records.region import MapRecord
 
 RECORD = with_rays(with_support(random_record(12)))

@@ -8,33 +8,22 @@ may take longer than 5 s; otherwise they are always the same. Linux only: memory
 
 import io
 import os
-import resource
 import subprocess
 import sys
-import tracemalloc
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from pathlib import Path
 
-import numpy as np
 import pytest
 from fuzz.mutants import DAMAGE, FORGERY, Mutation, cut, flip_bits
-from fuzz.valid_maps import READERS, Reader, Results, ValidMap, valid_maps
+from fuzz.reading import in_its_place, read_in_every_way
+from fuzz.valid_maps import ValidMap, valid_maps
 from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
 from support.files.file_damage import chunks, flipped, zeroed
-from support.files.mapfile_edit import (
-    file_bytes,
-    read_bytes,
-    rewritten,
-    stored,
-    stored_record,
-)
+from support.files.mapfile_edit import file_bytes, read_bytes, rewritten, stored, stored_record
 from support.maps.map_records import assert_same, random_record
 from triquad_format.errors import (
     DamagedMapFileError,
-    FormatError,
     MapFileError,
     TooLargeMapFileError,
     UnsupportedMapFileError,
@@ -44,14 +33,9 @@ from triquad_format.mapfile.parts.pack import pack_part, pack_record
 from triquad_format.mapfile.parts.part import PartKey
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_parts
-from triquad_format.records.record_check import check_record
-from triquad_format.records.region import MapRecord
-from triquad_tools.mapfiles.recovered_map import recover
 
 CAMPAIGN = os.environ.get("TRIQUAD_FUZZ")
 COUNT = int(CAMPAIGN or 20)
-LIMIT_BYTES = 64 * 2**20
-"""Memory that a reader may take beside the size of the file."""
 
 mutants = settings(
     max_examples=COUNT,
@@ -98,65 +82,8 @@ def check_mutant(
             ]
         )
     )
-    mutant = mutation(data.draw, valid.files[name])
-    (valid.path.parent / name).write_bytes(mutant)
-    try:
-        for read, wanted in zip(READERS, valid.results, strict=True):
-            with little_memory(len(mutant)), np.errstate(all="ignore"):
-                have = outcome(read, valid.path)
-            if isinstance(have, FormatError):
-                check_error(have)
-            elif not is_same(have, wanted):
-                assert forged, f"{read}: it is read as another map"
-                check_results(have)
-        with little_memory(len(mutant)), suppress(FormatError):
-            check_record(recover(valid.path).record)
-    finally:
-        (valid.path.parent / name).write_bytes(valid.files[name])
-
-
-def outcome(read: Reader, path: Path) -> Results | FormatError:
-    try:
-        return read(path)
-    except FormatError as error:
-        return error
-
-
-def check_error(error: FormatError) -> None:
-    event(type(error).__name__)
-    assert not isinstance(error.__cause__, MemoryError), "it takes too much memory"
-    assert str(error).strip(), f"{type(error).__name__} without a text"
-
-
-def is_same(results: Results, wanted: Results) -> bool:
-    try:
-        assert_same(results, wanted)
-    except AssertionError:
-        return False
-    return True
-
-
-def check_results(results: Results) -> None:
-    event("another valid map")
-    for record in results:
-        if isinstance(record, MapRecord):
-            check_record(record)
-
-
-@contextmanager
-def little_memory(file_bytes: int) -> Iterator[None]:
-    """Limit the address space, so that no allocation passes unseen, and measure Python's."""
-    limit = LIMIT_BYTES + file_bytes
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
-    before = resource.getrlimit(resource.RLIMIT_AS)
-    tracemalloc.start()
-    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + limit, before[1]))
-    try:
-        yield
-        assert tracemalloc.get_traced_memory()[1] <= limit, "it takes too much memory"
-    finally:
-        resource.setrlimit(resource.RLIMIT_AS, before)
-        tracemalloc.stop()
+    with in_its_place(valid, name, mutation(data.draw, valid.files[name])):
+        event(read_in_every_way(valid, forged=forged))
 
 
 RECORD = random_record(6, indices=((0, 0, 0), (1, 0, 0)))

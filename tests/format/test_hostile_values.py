@@ -22,11 +22,7 @@ from support.files.mapfile_edit import (
     stored,
 )
 from support.maps.map_records import random_record, with_integers, with_rays, with_support
-from triquad_format.errors import (
-    DamagedMapFileError,
-    FormatError,
-    MapFileError,
-)
+from triquad_format.errors import DamagedMapFileError, FormatError, MapFileError
 from triquad_format.mapfile.manifest import Manifest
 from triquad_format.mapfile.parts.part import (
     EVIDENCE,

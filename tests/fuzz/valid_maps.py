@@ -7,12 +7,7 @@ from pathlib import Path
 
 from support.files import golden
 from support.files.checkpoint_folder import write_record
-from support.maps.map_records import (
-    random_record,
-    with_integers,
-    with_rays,
-    with_support,
-)
+from support.maps.map_records import random_record, with_integers, with_rays, with_support
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.field_settings import FieldSettings

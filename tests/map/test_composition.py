@@ -123,27 +123,6 @@ def test_confidence_fades_with_the_age_since_anything_was_seen_anywhere() -> Non
     np.testing.assert_allclose(aged.confidence[same], fresh.confidence[same] / 2, rtol=1e-5)
 
 
-def test_the_field_has_no_step_across_two_regions() -> None:
-    record = random_record(7, indices=TWO)
-    s = record.settings
-    x = np.linspace(-2, s.region_pitch_m + 2, 20_001)
-    points = np.column_stack([x, np.full_like(x, 0.3), np.full_like(x, -0.4)])
-    whole, *alone = (
-        RecordedView(dataclasses.replace(record, regions=regions)).query(points).sdf
-        for regions in (record.regions, record.regions[:1], record.regions[1:])
-    )
-    steps = np.abs(np.diff(whole))
-    assert steps.max() < 20 * np.median(steps) + 1e-3
-    for one, is_only in zip(
-        alone,
-        (x < s.region_pitch_m - s.region_side_m / 2, x > s.region_side_m / 2),
-        strict=True,
-    ):
-        np.testing.assert_array_equal(whole[is_only], one[is_only])
-    middle = np.argmin(np.abs(x - s.region_pitch_m / 2))
-    assert whole[middle] == pytest.approx((alone[0][middle] + alone[1][middle]) / 2, abs=2e-3)
-
-
 def test_gradients_are_told_on_request_and_leave_the_values_alone() -> None:
     record = random_record(6, indices=TWO)
     points = across_the_border(record, 100, 1.5 * record.settings.region_side_m)

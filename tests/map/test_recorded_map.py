@@ -112,24 +112,6 @@ def test_of_more_surfels_than_count_in_the_direction_the_nearest_is_found():
     assert (np.linalg.norm(fast.means - middle, axis=1) < 25.5).all()
 
 
-def test_what_is_found_for_a_point_hangs_on_no_other_point():
-    rng = np.random.default_rng(9)
-    live = LiveEvidence(64)
-    live.mark_surface(rng.uniform(0, 64, (3000, 3)) * (1, 1, 0.1))
-    evidence = live.freeze()
-    places = surfel_places(evidence.cells, evidence.surface)
-    surfels = random_surfels(rng, len(places.voxels()))
-    tree = surfel_tree(places.shape, places.voxels(), surfels)
-    points = rng.uniform(-10, 74, (300, 3))
-    together = no_surfels(np.full(300, 50.0))
-    find_nearest(points, tree, together)
-    for order in (rng.permutation(300), *np.arange(300)[:, None]):
-        found = no_surfels(np.full(len(order), 50.0))
-        find_nearest(points[order], tree, found)
-        for mine, wanted in zip(found, together, strict=True):
-            np.testing.assert_array_equal(mine, wanted[order])
-
-
 def random_surfels(rng, count):
     normals = rng.normal(size=(count, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)

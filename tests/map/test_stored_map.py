@@ -84,15 +84,6 @@ def test_a_deleted_file_answers_on(tmp_path):
         StoredMap.open(path)
 
 
-def test_a_replaced_file_answers_as_before(tmp_path):
-    record = random_record(46)
-    path = tmp_path / "map.triquad"
-    write_map(record, path)
-    with StoredMap.open(path) as map_file:
-        write_map(random_record(47), path)
-        assert_same(map_file.record(), record)
-
-
 def test_a_file_cut_meanwhile_is_named(tmp_path):
     record = random_record(46, indices=((0, 0, 0), (3, 0, 0)))
     path = tmp_path / "map.triquad"

@@ -1,12 +1,10 @@
 """Work that is shared among threads is all done, once, whatever happens."""
 
-import os
-import sys
 import threading
 
 import numpy as np
 import pytest
-from triquad_map.compiled.team import THREADS, Team, lower_priority
+from triquad_map.compiled.team import THREADS, Team
 
 
 @pytest.fixture
@@ -96,26 +94,3 @@ def test_the_caller_waits_for_no_thread_that_has_other_work(team):
     for other in others:
         other.join()
     assert done.all()
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="priorities of single threads are Linux's")
-def test_threads_have_the_priority_of_a_caller_who_starts_them_at_the_same():
-    lowered = Team("lowered", 3)
-    met = threading.Barrier(THREADS)
-    niceness = []
-
-    def work(_):
-        met.wait()  # so that each part has a thread of its own
-        niceness.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
-
-    def call():
-        lower_priority(3)
-        lowered.each(work)
-
-    caller = threading.Thread(target=call)
-    caller.start()
-    caller.join()
-    lowered.close()
-    lowest = 19
-    expected = min(lowest, os.getpriority(os.PRIO_PROCESS, os.getpid()) + 3)
-    assert niceness == [expected] * THREADS

@@ -1,6 +1,5 @@
 """Whether mapping goes on, as a supervisor is told."""
 
-import queue
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
@@ -9,14 +8,14 @@ from typing import cast
 
 import zenoh
 from support import servers
-from support.maps.small_world import settings, world
+from support.maps.small_world import settings
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.mapping.thread_time import ThreadTime
-from triquad_server.process.stop import Stop, Stops
+from triquad_server.process.stop import Stop
 from triquad_server.server_status import ENDLESS_S, STUCK_S, Health
 from triquad_server.serving.operations import Operations
 from triquad_server.settings import ServiceSettings, Settings
@@ -116,22 +115,3 @@ def test_a_thread_that_comes_to_no_end_is_a_problem_until_it_does() -> None:
         caller.join()
         thread.call(lambda mapper: mapper.settled)
         assert health.problem() is None
-
-
-class FailingMapper(Mapper):
-    """Its training meets an internal error."""
-
-    def train(self) -> None:
-        raise RuntimeError("training failed")
-
-
-def test_mapping_that_was_stopped_by_an_error_is_a_problem() -> None:
-    mapper = FailingMapper("test", settings(samples_per_ray=1000.0), "cpu")
-    scan = world(1).scans[0]
-    mapper.ingest(scan.points, scan.world_from_sensor)
-    stops: Stops = queue.SimpleQueue()
-    with running(mapper, Clock(), stops.put) as (thread, health):
-        assert stops.get(timeout=servers.WAIT_S) is Stop.INTERNAL_ERROR
-    problem = health.mapping_problem()
-    assert problem is not None
-    assert "internal error" in problem

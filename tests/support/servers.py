@@ -1,16 +1,10 @@
 """Real servers and raw Zenoh sessions for the tests, on free ports of the loopback."""
 
-import os
-import queue
-import resource
-import socket
-import subprocess
-import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -32,6 +26,9 @@ from triquad_server.store.restore import ValidCheckpoint
 from triquad_server.store.store import Store
 from triquad_server.warm_up import warm_up
 
+from bench.clients.server_process import ServerProcess, free_endpoint
+from bench.clients.server_process import server_process as process_of
+
 MAP = "default"
 WAIT_S = 120.0  # for what takes milliseconds unless something is broken
 SMALL = Settings(
@@ -42,18 +39,6 @@ SMALL_TOML = (
     "[field]\ndepth = 7\n[training]\nbatch = 2048\nsamples_per_ray = 10.0\npool_bytes = 480000\n"
 )
 RADIUS_M = 4.0
-
-
-def free_port() -> int:
-    """A port of the loopback that nothing uses."""
-    with closing(socket.socket()) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
-
-
-def free_endpoint() -> str:
-    return f"tcp/127.0.0.1:{free_port()}"
 
 
 def sphere(count: int = 4000, radius_m: float = RADIUS_M) -> NDArray[np.float32]:
@@ -68,6 +53,16 @@ def learn(client: triquad_client.Client, scans: int = 2) -> triquad_client.Flush
     for _ in range(scans):
         client.publish_scan(sphere(), np.eye(4))
     return client.flush(WAIT_S)
+
+
+def until(
+    is_so: Callable[[], bool], told: Callable[[], object] = str, within_s: float = WAIT_S
+) -> None:
+    """Return once something is so; what is ``told`` of it where that takes too long."""
+    ends_s = time.monotonic() + within_s
+    while not is_so():
+        assert time.monotonic() < ends_s, told()
+        time.sleep(0.01)
 
 
 @cache
@@ -214,73 +209,15 @@ def scan(sequence: int = 0, **changes: object) -> Scan:
     return replace(good, **changes)  # type: ignore[arg-type]
 
 
-@dataclass
-class ServerProcess:
-    """A ``triquad-server`` process whose log is read as it comes."""
-
-    process: subprocess.Popen[str]
-    endpoint: str
-    lines: list[str] = field(default_factory=list)
-    _news: "queue.SimpleQueue[str | None]" = field(default_factory=queue.SimpleQueue)
-
-    def __post_init__(self) -> None:
-        self._reader = threading.Thread(target=self._read)
-        self._reader.start()
-
-    @property
-    def log(self) -> str:
-        return "".join(self.lines)
-
-    @property
-    def resident_bytes(self) -> int:
-        pages = Path(f"/proc/{self.process.pid}/statm").read_text().split()[1]
-        return int(pages) * resource.getpagesize()
-
-    def wait_for(self, text: str) -> None:
-        """Return once a line holds ``text``."""
-        while (line := self._news.get(timeout=WAIT_S)) is not None:
-            if text in line:
-                return
-        raise AssertionError(f"the server ended without {text!r}:\n{self.log}")
-
-    def wait(self) -> int:
-        """The exit code, once it ends."""
-        code = self.process.wait(WAIT_S)
-        self._reader.join()
-        return code
-
-    def _read(self) -> None:
-        assert self.process.stderr is not None
-        for line in self.process.stderr:
-            self.lines.append(line)
-            self._news.put(line)
-        self._news.put(None)
-
-
 @contextmanager
 def server_process(
-    arguments: Sequence[str | Path] = (),
-    endpoint: str | None = None,
-    ready: bool = True,
-    environment: Mapping[str, str] | None = None,
+    arguments: Sequence[str | Path] = (), *more: Any, **options: Any
 ) -> Iterator[ServerProcess]:
-    """A server process; killed at the end if it still runs.
+    """A server process that trains on the CPU; with options as those of :mod:`bench`.
 
-    ``environment`` has variables beside those of this process; without any all is compiled before.
+    Without an environment of its own all is compiled before.
     """
-    if environment is None:
+    if options.get("environment") is None:
         compiled()
-    endpoint = endpoint or free_endpoint()
-    command = [sys.executable, "-m", "triquad_server.cli", "--listen", endpoint]
-    command += ["--device", "cpu", *map(str, arguments)]
-    variables = {**os.environ, **(environment or {})}
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=variables) as process:
-        server = ServerProcess(process, endpoint)
-        try:
-            if ready:
-                server.wait_for("ready: ")
-            yield server
-        finally:
-            if process.poll() is None:
-                process.kill()
-            server.wait()
+    with process_of(["--device", "cpu", *arguments], *more, **options) as server:
+        yield server

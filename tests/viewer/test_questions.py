@@ -12,10 +12,7 @@ from triquad_tools.viewer.page.page import Focus
 from triquad_tools.viewer.questions.cell_box import CellBox
 from triquad_tools.viewer.questions.clicks import Path
 from triquad_tools.viewer.questions.slice import Slice
-from triquad_tools.viewer.questions.unknown_space import (
-    ask_boundary,
-    border_faces,
-)
+from triquad_tools.viewer.questions.unknown_space import ask_boundary, border_faces
 
 GROUND_M = 0.1  # in the middle of a voxel
 FOCUS = Focus(np.array([0.3, -0.4, 1.2]), 16.0)

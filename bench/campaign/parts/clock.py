@@ -4,9 +4,14 @@ from pathlib import Path
 
 import triquad_client
 from support import servers
-from triquad_format.mapfile.reader import read_map
 
-from bench.campaign.server_under_test import expect, expect_known, server_under_test, sphere_at
+from bench.campaign.server_under_test import (
+    expect,
+    expect_known,
+    expect_whole,
+    server_under_test,
+    sphere_at,
+)
 from bench.campaign.turn import Turn
 
 _LIBRARIES = "/usr/lib/*/faketime/libfaketimeMT.so.1"
@@ -45,7 +50,7 @@ def run(turn: Turn) -> None:
             expect(report.lost == report.refused == 0, f"scans were not taken: {report}")
             expect_known(client, 0.0)
             kept = client.checkpoint()
-            expect(read_map(kept.path).epoch == kept.epoch, f"{kept.path} is another")
+            expect_whole(kept)
             status = client.status()
             expect(0 <= status.uptime_s < 3_600, f"an uptime of {status.uptime_s} s")
             turn.did("forwards" if jump_s > 0 else "backwards")

@@ -11,9 +11,8 @@ from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import Scan
 
 from bench.campaign.server_under_test import (
-    MAX_GROWTH_BYTES,
-    expect,
     expect_honest_service,
+    expect_steady_memory,
     server_under_test,
 )
 from bench.campaign.turn import Turn
@@ -35,9 +34,7 @@ def run(turn: Turn) -> None:
             _round(turn, server.endpoint, turn.random.choices(sorted(KINDS), k=count))
             expect_honest_service(server.endpoint, _HONEST_AT_M)
             turn.did("seconds", _ROUND_S)
-            growth = _beside_the_map(server.endpoint) - before
-            turn.measured("growth MB", growth / 2**20)
-            expect(growth < MAX_GROWTH_BYTES, f"memory grew by {growth} bytes")
+            expect_steady_memory(turn, before, _beside_the_map(server.endpoint))
 
 
 def _use_honestly(endpoint: str) -> None:

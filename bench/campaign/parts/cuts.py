@@ -12,13 +12,12 @@ from triquad_client import TriquadError
 
 from bench.campaign.cutting_proxy import CuttingProxy
 from bench.campaign.server_under_test import (
-    MAX_GROWTH_BYTES,
     WITHIN_S,
     expect,
     expect_honest_service,
     expect_known,
-    resident_bytes,
-    server_under_test,
+    expect_steady_memory,
+    learnt_server,
     sphere_at,
 )
 from bench.campaign.turn import BrokenError, Turn
@@ -29,15 +28,11 @@ _PLACES = 4
 
 def run(turn: Turn) -> None:
     """Cut connections under load; after each cut clients are served again."""
-    with server_under_test(turn) as server, closing(CuttingProxy(server.endpoint)) as proxy:
-        with triquad_client.connect(server.endpoint) as client:
-            servers.learn(client)
-        before = resident_bytes(server.process.pid)
+    with learnt_server(turn) as server, closing(CuttingProxy(server.endpoint)) as proxy:
+        before = server.resident_bytes
         while not turn.over:
             _cut_amid_load(turn, proxy)
-        growth = resident_bytes(server.process.pid) - before
-        turn.measured("growth MB", growth / 2**20)
-        expect(growth < MAX_GROWTH_BYTES, f"memory grew by {growth} bytes")
+        expect_steady_memory(turn, before, server.resident_bytes)
         expect_honest_service(server.endpoint)
 
 

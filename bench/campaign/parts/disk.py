@@ -3,16 +3,15 @@
 import resource
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import triquad_client
 from support import servers
 from triquad_client import RefusedError
-from triquad_format.mapfile.reader import read_map
 
 from bench.campaign.server_under_test import (
     expect,
     expect_honest_service,
+    expect_whole,
     server_under_test,
     sphere_at,
 )
@@ -53,8 +52,7 @@ def _fill(
         # Mapping goes on.
         client.publish_scan(*sphere_at(0.0))
         client.flush(servers.WAIT_S)
-    expect(Path(kept.path).exists(), f"{kept.path} was acknowledged and is gone")
-    expect(read_map(kept.path).epoch == kept.epoch, f"{kept.path} is another")
+    expect_whole(kept)
     return _learn_and_keep(client, turn.random.randrange(_PLACES))
 
 
@@ -62,7 +60,7 @@ def _learn_and_keep(client: triquad_client.Client, place: int) -> triquad_client
     client.publish_scan(*sphere_at(place * _SPACING_M))
     client.flush(servers.WAIT_S)
     kept = client.checkpoint()
-    expect(read_map(kept.path).epoch == kept.epoch, f"{kept.path} is another")
+    expect_whole(kept)
     return kept
 
 

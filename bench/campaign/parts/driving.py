@@ -6,12 +6,7 @@ from support import servers
 from triquad_tools.simulation.lidar import Lidar, SimulatedScan, drive
 from triquad_tools.simulation.street import street
 
-from bench.campaign.server_under_test import (
-    expect,
-    expect_honest_service,
-    resident_bytes,
-    server_under_test,
-)
+from bench.campaign.server_under_test import expect, expect_honest_service, server_under_test
 from bench.campaign.turn import Turn
 
 _SCANS_PER_S = 10
@@ -37,7 +32,7 @@ def run(turn: Turn) -> None:
                 )
             report = client.flush(servers.WAIT_S, pending=_PENDING)
             turn.did("seconds")
-            taken.append(resident_bytes(server.process.pid))
+            taken.append(server.resident_bytes)
         report = client.flush(servers.WAIT_S)
         expect(report.lost == report.refused == 0, f"scans are missing: {report}")
         warm = taken[int(_WARM_SHARE * len(taken)) :]

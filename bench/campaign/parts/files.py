@@ -5,32 +5,22 @@ import io
 import itertools
 import multiprocessing
 import os
-import resource
 import signal
-from collections.abc import Iterator
 from multiprocessing.connection import Connection
 from pathlib import Path
 
-import numpy as np
 from fuzz.mutants import DAMAGE, FORGERY, Mutation, cut, flip_bits
-from fuzz.valid_maps import READERS, ValidMap, valid_maps
+from fuzz.reading import REFUSED, in_its_place, read_in_every_way
+from fuzz.valid_maps import ValidMap, valid_maps
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
-from support.maps.map_records import assert_same
-from triquad_format.errors import FormatError
-from triquad_format.records.record_check import check_record
-from triquad_format.records.region import MapRecord
 from triquad_tools.commands import inspect
-from triquad_tools.mapfiles.recovered_map import recover
 
 from bench.campaign.turn import Turn
 
 _START_S = 120.0
 """Time for a child to import all that reads files, and to make valid ones."""
 _HANG_S = 20.0
-_LIMIT_BYTES = 64 * 2**20
-"""Memory that a reader may take in addition to the size of the file."""
-
 _MUTATIONS = (*DAMAGE, *FORGERY)
 _READ, _ENDED = "read", "ended"
 _CHUNK = 50  # mutants between two checks of the time
@@ -115,54 +105,16 @@ def _outcome(maps: list[ValidMap], data: st.DataObject) -> tuple[str, str]:
     in_store = not name.endswith(".triquad")
     mutation: Mutation = data.draw(st.sampled_from((flip_bits, cut) if in_store else _MUTATIONS))
     mutant = mutation(data.draw, valid.files[name])
-    forged = mutation in FORGERY
-    file = valid.path.parent / name
-    file.write_bytes(mutant)
     try:
-        with _little_memory(len(mutant)), np.errstate(all="ignore"):
-            what = _read_all(valid, forged=forged)
+        with in_its_place(valid, name, mutant):
+            what = read_in_every_way(valid, forged=mutation in FORGERY)
+            _inspect(valid.path, readable=what != REFUSED)
     except Exception as error:
-        kept = valid.path.parent.parent / f"broken-{file.name}-{abs(hash(mutant)):x}"
+        kept = valid.path.parent.parent / f"broken-{Path(name).name}-{abs(hash(mutant)):x}"
         kept.write_bytes(mutant)
         how = f"{valid}, {mutation.__name__}: {type(error).__name__}: {error}"
         return "broken", f"{how:.900}; the file is {kept.name}"
-    finally:
-        file.write_bytes(valid.files[name])
     return what, ""
-
-
-def _read_all(valid: ValidMap, *, forged: bool) -> str:
-    """Read a mutant in every way; return the sum of the results.
-
-    Raises:
-        AssertionError: it passed for what it is not, or took too much memory.
-        Exception: whatever a reader lets out and should not.
-    """
-    outcomes = set()
-    for read, wanted in zip(READERS, valid.results, strict=True):
-        try:
-            have = read(valid.path)
-        except FormatError as error:
-            _check_error(error)
-            outcomes.add("refused")
-            continue
-        if _is_same(have, wanted):
-            outcomes.add("as it was")
-        else:
-            assert forged, f"{read.__name__}: it is read as another map"
-            for record in have:
-                if isinstance(record, MapRecord):
-                    check_record(record)
-            outcomes.add("another valid map")
-    with contextlib.suppress(FormatError):
-        check_record(recover(valid.path).record)
-    _inspect(valid.path, readable="refused" not in outcomes)
-    return "refused" if "refused" in outcomes else min(outcomes)
-
-
-def _check_error(error: FormatError) -> None:
-    assert not isinstance(error.__cause__, MemoryError), "it takes too much memory"
-    assert str(error).strip(), "an error without a text"
 
 
 def _inspect(path: Path, *, readable: bool) -> None:
@@ -171,24 +123,3 @@ def _inspect(path: Path, *, readable: bool) -> None:
         status = inspect.main([str(path)])
     assert status in (0, 1, 2), f"triquad-inspect ended with {status}"
     assert status == 0 or not readable, f"triquad-inspect refuses it: {printed.getvalue()}"
-
-
-def _is_same(results: tuple[object, ...], wanted: tuple[object, ...]) -> bool:
-    try:
-        assert_same(results, wanted)
-    except AssertionError:
-        return False
-    return True
-
-
-@contextlib.contextmanager
-def _little_memory(file_bytes: int) -> Iterator[None]:
-    """Limit the address space of this process, which must be a child's."""
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
-    limit = pages * resource.getpagesize() + _LIMIT_BYTES + file_bytes
-    before = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (limit, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_AS, before)

@@ -8,7 +8,13 @@ from dataclasses import dataclass, field
 import triquad_client
 from triquad_client import TriquadError
 
-from bench.campaign.server_under_test import expect, expect_known, server_under_test, sphere_at
+from bench.campaign.server_under_test import (
+    expect,
+    expect_known,
+    expect_none_damaged,
+    server_under_test,
+    sphere_at,
+)
 from bench.campaign.turn import Turn
 
 _SPACING_M = 9.0
@@ -32,8 +38,7 @@ def run(turn: Turn) -> None:
         turn.did("killed under load")
     with server_under_test(turn) as server, triquad_client.connect(server.endpoint) as client:
         _expect_kept(client, acknowledged)
-    aside = [path.name for path in (turn.folder / "store").rglob("*.damaged")]
-    expect(not aside, f"checkpoints were taken for damaged: {aside}")
+    expect_none_damaged(turn)
 
 
 def _live_and_die(turn: Turn, acknowledged: _Acknowledged) -> None:

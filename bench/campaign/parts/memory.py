@@ -5,6 +5,7 @@ import resource
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import triquad_client
@@ -14,9 +15,9 @@ from triquad_client import TriquadError
 from bench.campaign.server_under_test import (
     expect,
     expect_known,
+    expect_none_damaged,
     server_under_test,
     sphere_at,
-    virtual_bytes,
 )
 from bench.campaign.turn import Turn
 
@@ -40,8 +41,7 @@ def run(turn: Turn) -> None:
     kept = _Kept()
     while not turn.over:
         _serve_with_limits(turn, kept)
-    aside = [path.name for path in (turn.folder / "store").rglob("*.damaged")]
-    expect(not aside, f"checkpoints were taken for damaged: {aside}")
+    expect_none_damaged(turn)
 
 
 def _serve_with_limits(turn: Turn, kept: _Kept) -> None:
@@ -55,8 +55,7 @@ def _serve_with_limits(turn: Turn, kept: _Kept) -> None:
                 expect_known(client, kept.place * _SPACING_M)
             while not turn.over:
                 _keep(turn, client, kept)
-                room = int(_MOST_ROOM_BYTES * turn.random.random() ** 2)
-                with _address_space(pid, virtual_bytes(pid) + room):
+                with _room(pid, int(_MOST_ROOM_BYTES * turn.random.random() ** 2)):
                     _load(turn, client)
                 if server.process.poll() is not None or _OUT_OF_MEMORY in server.log:
                     server.wait()
@@ -95,9 +94,11 @@ def _expect_alive(client: triquad_client.Client, kept: _Kept) -> None:
 
 
 @contextlib.contextmanager
-def _address_space(pid: int, size: int) -> Iterator[None]:
-    """Limit the address space of another process for a while."""
+def _room(pid: int, room: int) -> Iterator[None]:
+    """Let another process take some bytes more of address space at most, for a while."""
     try:
+        pages = int(Path(f"/proc/{pid}/statm").read_text().split()[0])
+        size = pages * resource.getpagesize() + room
         _, hard = resource.prlimit(pid, resource.RLIMIT_AS)
         resource.prlimit(pid, resource.RLIMIT_AS, (size, hard))
         yield

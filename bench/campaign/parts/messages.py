@@ -3,7 +3,6 @@
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
-import triquad_client
 import zenoh
 from support import servers
 from triquad_format.errors import ERROR_CODES, FormatError
@@ -12,11 +11,10 @@ from triquad_format.wire.messages import ErrorReply
 
 from bench.campaign.mutated_messages import MutatedMessages
 from bench.campaign.server_under_test import (
-    MAX_GROWTH_BYTES,
     expect,
     expect_honest_service,
-    resident_bytes,
-    server_under_test,
+    expect_steady_memory,
+    learnt_server,
 )
 from bench.campaign.turn import Turn
 
@@ -27,14 +25,11 @@ _WARM_SHARE = 5  # memory is compared with that after one part in N
 
 def run(turn: Turn) -> None:
     """Send mutants from several threads, check every reply, then ask as an honest client."""
-    with server_under_test(turn) as server, servers.raw_session(connect=server.endpoint) as session:
-        with triquad_client.connect(server.endpoint) as client:
-            servers.learn(client)
+    with learnt_server(turn) as server, servers.raw_session(connect=server.endpoint) as session:
         senders = [_Sender(turn, session, number) for number in range(_SENDERS)]
         before = _send(turn, senders, turn.most // _WARM_SHARE, server)
         after = _send(turn, senders, turn.most, server)
-        turn.measured("growth MB", (after - before) / 2**20)
-        expect(after - before < MAX_GROWTH_BYTES, f"memory grew from {before} to {after} bytes")
+        expect_steady_memory(turn, before, after)
         expect_honest_service(server.endpoint)
 
 
@@ -44,7 +39,7 @@ def _send(turn: Turn, senders: "list[_Sender]", most: int, server: servers.Serve
         for sent in [pool.submit(sender.send_until, most) for sender in senders]:
             sent.result()
     expect(server.process.poll() is None, f"the server ended with {server.process.returncode}")
-    return resident_bytes(server.process.pid)
+    return server.resident_bytes
 
 
 class _Sender:

@@ -2,10 +2,7 @@
 
 import contextlib
 import signal
-import subprocess
-import sys
 import time
-from collections.abc import Iterator
 
 import numpy as np
 import triquad_client
@@ -13,35 +10,22 @@ from support import servers
 from triquad_client import TriquadError
 
 from bench.campaign.server_under_test import (
-    MAX_GROWTH_BYTES,
     expect,
     expect_honest_service,
-    resident_bytes,
-    server_under_test,
+    expect_steady_memory,
+    learnt_server,
 )
 from bench.campaign.turn import Turn
+from bench.clients.noisy_neighbours import neighbour
 
 _LONGEST_S = 2.0
 _MOST_WAIT_S = 10.0  # of an honest client, next to one that is stopped
-_GREEDY = """
-import sys
-import numpy as np
-import triquad_client
-
-points = np.random.default_rng(1).uniform(-4, 4, (100_000, 3))
-with triquad_client.connect(sys.argv[1]) as client:
-    print("asks", flush=True)
-    while True:
-        client.query_sdf(points, gradient=True)
-"""
 
 
 def run(turn: Turn) -> None:
     """Stop the server, or a client amid its replies, for a while."""
-    with server_under_test(turn) as server:
-        with triquad_client.connect(server.endpoint) as client:
-            servers.learn(client)
-        before = resident_bytes(server.process.pid)
+    with learnt_server(turn) as server:
+        before = server.resident_bytes
         while not turn.over:
             stopped_s = turn.random.uniform(0, _LONGEST_S)
             if turn.random.random() < 0.5:
@@ -50,9 +34,7 @@ def run(turn: Turn) -> None:
             else:
                 _stop_client(turn, server.endpoint, stopped_s)
                 turn.did("client")
-        growth = resident_bytes(server.process.pid) - before
-        turn.measured("growth MB", growth / 2**20)
-        expect(growth < MAX_GROWTH_BYTES, f"memory grew by {growth} bytes")
+        expect_steady_memory(turn, before, server.resident_bytes)
 
 
 def _stop_server(server: servers.ServerProcess, stopped_s: float) -> None:
@@ -71,8 +53,8 @@ def _stop_server(server: servers.ServerProcess, stopped_s: float) -> None:
 
 
 def _stop_client(turn: Turn, endpoint: str, stopped_s: float) -> None:
-    """Expect service while a greedy client is stopped amid its replies."""
-    with _greedy_client(endpoint) as greedy:
+    """Expect service while a client that asks for much is stopped amid its replies."""
+    with neighbour("unread", endpoint, servers.MAP) as greedy:
         time.sleep(turn.random.uniform(0, 0.2))
         greedy.send_signal(signal.SIGSTOP)
         until = time.monotonic() + stopped_s
@@ -85,16 +67,3 @@ def _stop_client(turn: Turn, endpoint: str, stopped_s: float) -> None:
                 expect(waited_s < _MOST_WAIT_S, f"an honest client waited {waited_s:.1f} s")
         greedy.send_signal(signal.SIGCONT)
     expect_honest_service(endpoint)
-
-
-@contextlib.contextmanager
-def _greedy_client(endpoint: str) -> Iterator["subprocess.Popen[str]"]:
-    """Run a client in a process of its own that asks without pause."""
-    command = [sys.executable, "-c", _GREEDY, endpoint]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout is not None
-            expect(process.stdout.readline() == "asks\n", "the greedy client did not start")
-            yield process
-        finally:
-            process.kill()

@@ -13,11 +13,7 @@ import zenoh
 from support import servers
 from support.event_loop import connected
 from support.watched_ball import SETTINGS, digests, half, learn
-from triquad_client import (
-    AsyncClient,
-    ClosedError,
-    KnownTiles,
-)
+from triquad_client import AsyncClient, ClosedError, KnownTiles
 from triquad_format.wire import codec, keys
 from triquad_format.wire.mesh_messages import TileChanges
 
@@ -116,18 +112,5 @@ def test_a_cancelled_wait_leaves_the_watch_in_order_until_the_client_is_closed(
             await waiting
         with pytest.raises(ClosedError):
             await watch.next(0.0)
-
-    connected(endpoint, use)
-
-
-def test_a_wait_for_bandwidth_can_be_cancelled(endpoint: str) -> None:
-    async def use(client: AsyncClient) -> None:
-        watch = client.watch_mesh(max_bytes_per_s=1)
-        assert (await watch.next(servers.WAIT_S)).changed
-        waiting = asyncio.ensure_future(watch.next())
-        await client.status()  # by then it waits
-        waiting.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await waiting
 
     connected(endpoint, use)

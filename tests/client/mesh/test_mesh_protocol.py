@@ -33,23 +33,6 @@ def client(endpoint: str) -> Iterator[Client]:
         yield client
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [{"minimum": np.full(3, np.nan)}, {"level": 7}],
-)
-def test_bad_requests_are_refused(endpoint: str, changes: dict[str, object]) -> None:
-    with servers.raw_session(connect=endpoint) as session:
-        peer = servers.RawPeer(session)
-        assert peer.refusal(keys.TILE_CHANGES, tile_changes(**changes)) == "bad_request"
-        told = by_hand(peer, tile_changes())
-        beyond = tile_changes(server=told.server, since=10**12)
-        assert peer.refusal(keys.TILE_CHANGES, beyond) == "bad_request"
-        tile = np.zeros((1, 3), np.int32)
-        assert peer.refusal(keys.MESH, MeshRequest(tile, 0, fill_m=1.0)) == "bad_request"
-        none = np.zeros((0, 3), np.int32)
-        assert peer.refusal(keys.MESH, MeshRequest(none, 0)) == "bad_request"
-
-
 def by_hand(peer: servers.RawPeer, request: TileChangesRequest) -> TileChanges:
     answer = peer.ask(keys.TILE_CHANGES, codec.encode(request))
     assert not isinstance(answer, ErrorReply)

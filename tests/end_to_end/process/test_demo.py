@@ -76,10 +76,3 @@ def test_a_broken_promise_is_named_with_its_value(
     broken = broken_promises(dataclasses.replace(GOOD, **{part: changed}))
     assert len(broken) == 1
     assert words in broken[0]
-
-
-@pytest.mark.parametrize("arguments", [("--scans", "0"), ("--seed", "x"), ("street",)])
-def test_wrong_usage_ends_with_code_2(arguments: tuple[str, ...]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        demo.main(arguments)
-    assert caught.value.code == 2

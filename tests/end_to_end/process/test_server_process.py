@@ -15,7 +15,6 @@ from triquad_format.mapfile.reader import read_map
 from triquad_map.compiled.kernel import CODE_FOLDER
 
 PROBES = np.concatenate([servers.sphere(50, radius) for radius in (2.0, 3.9, 4.0, 4.1)])
-POSE = np.eye(4)
 
 
 @pytest.fixture

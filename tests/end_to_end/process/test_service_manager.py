@@ -5,11 +5,10 @@ import queue
 import signal
 import socket
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -104,21 +103,10 @@ def manager(tmp_path, monkeypatch) -> Iterator[Manager]:
         yield manager
 
 
-@contextmanager
-def server_that_hangs_when_told(arguments: list[str]) -> Iterator[ServerProcess]:
+def server_that_hangs_when_told(arguments: list[str]) -> AbstractContextManager[ServerProcess]:
     """A server whose mapper or workers hang as soon as they have something to do."""
-    endpoint = servers.free_endpoint()
-    command = [sys.executable, "-c", HANGS_WHEN_TOLD, "--listen", endpoint]
-    command += ["--no-multicast-scouting", "--device", "cpu", *arguments]
-    pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
-        server = ServerProcess(process, endpoint)
-        try:
-            server.wait_for("ready: ")
-            yield server
-        finally:
-            process.kill()
-            server.wait()
+    program, pipe = ["-c", HANGS_WHEN_TOLD], subprocess.PIPE
+    return servers.server_process(arguments, program=program, stdin=pipe, stdout=pipe)
 
 
 def tell(server: ServerProcess, word: str) -> None:

@@ -1,37 +1,32 @@
 """``triquad-ros2 --serve``: one command serves a map and bridges robots to it."""
 
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 import triquad_client
+import zenoh
 from support import servers
 from support.attackers.beyond import from_beyond
 from support.ros.ros_bridge import stand
 from support.ros.ros_robot import robot
 from triquad_client import NoReplyError
+from triquad_format.wire import codec, keys
+from triquad_format.wire.messages import StatusRequest
 
 
 @contextmanager
 def one_command(folder: Path, listen: str, *arguments: str) -> Iterator[servers.ServerProcess]:
-    """``triquad-ros2 --serve``, once it listens to nodes; stopped at the end if it still runs."""
-    servers.compiled()
+    """``triquad-ros2 --serve``, once it listens to nodes."""
     (folder / "server.toml").write_text(servers.SMALL_TOML)
-    command = [sys.executable, "-m", "triquad_tools.commands.ros2", *arguments]
-    command += ["--serve", "--listen", listen, "--settings", str(folder / "server.toml")]
-    command += ["--store", str(folder / "maps"), "--device", "cpu", "--map", "yard"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        both = servers.ServerProcess(process, listen)
-        try:
-            both.wait_for("ros2: listening in domain 0")
-            yield both
-        finally:
-            process.terminate()
-            both.wait()
+    files = ["--settings", folder / "server.toml", "--store", folder / "maps"]
+    program = ["-m", "triquad_tools.commands.ros2", *arguments, "--serve"]
+    serving = servers.server_process(["--map", "yard", *files], listen, False, program=program)
+    with serving as both:
+        both.wait_for("ros2: listening in domain 0")
+        yield both
 
 
 def test_one_command_serves_a_map_and_bridges(tmp_path: Path) -> None:
@@ -65,6 +60,32 @@ def test_nodes_beyond_this_machine_take_part_but_do_not_change_the_map(tmp_path:
             assert client.status().epoch > 0
             with pytest.raises(NoReplyError, match="access control"):
                 client.reset()
+        nearby = listen.replace("0.0.0.0", "127.0.0.1")
+        with (
+            servers.raw_session(connect=nearby) as here,
+            servers.raw_session(connect=beyond) as there,
+        ):
+            assert_passes_for_no_server(there, here)
         both.process.kill()
         assert both.wait() == -signal.SIGKILL
     assert "INFO stopped" in both.log, "the server ends with the command that started it"
+
+
+def assert_passes_for_no_server(there: zenoh.Session, here: zenoh.Session) -> None:
+    """Who is not here publishes on any key but as the server, and receives no scans of others."""
+    heard = here.declare_subscriber("**")
+    scans = there.declare_subscriber("triquad/yard/scan/*")
+    mesh = there.declare_subscriber("triquad/mesh")
+    for session in (here, there):  # the subscriptions are known from here on
+        assert servers.RawPeer(session, "yard").ask(keys.STATUS, codec.encode(StatusRequest()))
+    for key in ("triquad/yard/status", "roof/points", "0/points/t/h", "last"):
+        there.put(key, b"theirs", congestion_control=zenoh.CongestionControl.BLOCK)
+    received: list[str] = []
+    while "last" not in received:
+        sample = heard.recv()
+        received += [str(sample.key_expr)] if sample.payload.to_bytes() == b"theirs" else []
+    assert received == ["roof/points", "0/points/t/h", "last"]
+    for key in ("triquad/yard/scan/a", "triquad/mesh"):
+        here.put(key, b"", congestion_control=zenoh.CongestionControl.BLOCK)
+    assert str(mesh.recv().key_expr) == "triquad/mesh"
+    assert scans.try_recv() is None

@@ -7,10 +7,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 from support.server_records import METRICS
-from triquad_format.wire.metrics_messages import (
-    OperationMetrics,
-    TimeHistogram,
-)
+from triquad_format.wire.metrics_messages import OperationMetrics, TimeHistogram
 
 BOUNDS_S = np.array([0.001, 0.01, 0.1, 1.0])
 OPERATION = "query/sdf"

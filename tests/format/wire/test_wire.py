@@ -131,13 +131,6 @@ def test_fields_of_another_type_are_refused_by_name(name, value):
         codec.decode(Scan, changed(SCAN, **{name: value}))
 
 
-def test_a_field_that_is_missing_is_named():
-    body = msgpack.unpackb(codec.encode(SCAN))
-    del body["session"]
-    with pytest.raises(WireError, match=r"Scan\.session: missing"):
-        codec.decode(Scan, msgpack.packb(body))
-
-
 def test_another_version_is_told_apart():
     with pytest.raises(ProtocolVersionError, match="version 2"):
         codec.decode(Scan, changed(SCAN, triquad=2))

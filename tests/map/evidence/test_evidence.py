@@ -3,7 +3,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.maps.seen_scans import see
 from triquad_format.records.status import Status
-from triquad_map.compiled.team import Work
 from triquad_map.evidence.carving import Reach
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.evidence.live_evidence import LiveEvidence
@@ -177,24 +176,3 @@ def test_voxels_marked_free_keep_their_surface() -> None:
     assert (status[at_surface] == Status.SURFACE).all()
     assert (status[inside & ~at_surface] == Status.FREE).all()
     assert (status[~inside] == Status.UNKNOWN).all()
-
-
-def test_threads_freeze_the_same_as_one() -> None:
-    ends = np.random.default_rng(4).uniform(0, SIDE, (20_000, 3))
-
-    def marked() -> LiveEvidence:
-        evidence = LiveEvidence(SIDE)
-        for scan in range(1, 4):
-            sighting = Sighting(np.full(3, 5.0 * scan), 0.2, scan, scan)
-            see(evidence, np.ascontiguousarray(ends[:: 2 * scan]), sighting)
-        return evidence
-
-    def in_parts(count: int, work: Work, least: int = 0) -> None:
-        assert count > least
-        for first in range(0, count, 100):
-            work(first, min(first + 100, count))
-
-    whole, parts = marked().freeze(), marked().freeze(in_parts)
-    for name in ("levels", "scans", "beyond"):
-        np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
-    assert len(np.unique(whole.levels)) > 2

@@ -48,27 +48,6 @@ def test_faces_look_into_free_space(tiles: dict[tuple[int, int, int], TileMesh])
     assert np.concatenate(agree).mean() > 0.9
 
 
-def test_neighbouring_tiles_meet_without_seams(
-    tiles: dict[tuple[int, int, int], TileMesh],
-) -> None:
-    """On their common face, both tiles have the same vertices."""
-    side = LATTICE.tile_side_m
-    met = []
-    for (x, y, z), tile in tiles.items():
-        other = tiles.get((x + 1, y, z))
-        if other is None:
-            continue
-        mine = tile.vertices[np.abs(tile.vertices[:, 0] - side) < 1e-5]
-        theirs = other.vertices[np.abs(other.vertices[:, 0]) < 1e-5]
-        if len(mine) == 0 or len(theirs) == 0:
-            continue
-        gaps = np.abs(mine[:, None, 1:] - theirs[None, :, 1:]).max(axis=2)
-        met.append(gaps.min(axis=1) < 1e-4)
-    # A vertex that meets none ends the mesh there: no surface was seen beyond.
-    assert np.concatenate(met).sum() > 200
-    assert np.concatenate(met).mean() > 0.8
-
-
 def test_nothing_is_meshed_where_nothing_was_seen(epoch: Epoch) -> None:
     for outside_or_below_ground in ((1000, 1000, 1000), (0, 0, -3)):
         assert len(mesh_tile(epoch, outside_or_below_ground, LATTICE).faces) == 0
@@ -102,16 +81,6 @@ def test_holes_of_tiles_are_those_of_the_map_in_one_piece(
 
 def _middles(tile: TileMesh) -> NDArray[np.float64]:
     return tile.origin + tile.vertices.astype(np.float64)[tile.faces].mean(axis=1)
-
-
-def test_meshes_are_repeatable(
-    epoch: Epoch,
-    tiles: dict[tuple[int, int, int], TileMesh],
-) -> None:
-    tile = max(tiles, key=lambda index: len(tiles[index].faces))
-    again = mesh_tile(epoch, tile, LATTICE)
-    np.testing.assert_array_equal(again.vertices, tiles[tile].vertices)
-    np.testing.assert_array_equal(again.faces, tiles[tile].faces)
 
 
 def test_every_tile_with_faces_is_listed_however_small_tiles_are() -> None:

@@ -16,7 +16,7 @@ from triquad_tools.simulation.lidar import Lidar
 from triquad_tools.simulation.scene import Scene
 from triquad_tools.simulation.solids import Solid, box, cylinder, half_space
 
-from bench.recorded import recorded_scans
+from bench.parts.revisited import recorded_scans
 from bench.street import settled_mapper
 
 SEOSAN = Path(__file__).resolve().parents[4] / "shared" / "data" / "seosan01"

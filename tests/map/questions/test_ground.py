@@ -1,7 +1,5 @@
 """Where a robot could stand: the ground of a known place, asked of a real server."""
 
-import asyncio
-
 import numpy as np
 import pytest
 import triquad_client
@@ -174,34 +172,3 @@ def test_parts_and_the_whole_agree(client):
     some = client.query_ground(points[::50])
     np.testing.assert_array_equal(whole.status[::50], some.status)
     np.testing.assert_allclose(whole.height_m[::50], some.height_m, atol=1e-3)
-
-
-def test_whoever_asks_gets_the_same_answer(client, endpoint, tmp_path):
-    points = points_over((2.1, 4.9), (0.5, 2.9), 0.3)
-    want = client.query_ground(points, 0.7)
-
-    async def ask():
-        async with triquad_client.connect_async(endpoint) as other:
-            return await other.query_ground(points, 0.7)
-
-    for have in (
-        asyncio.run(ask()),
-        client.pinned().query_ground(points, 0.7),
-        client.query_ground(points, 0.7, at_epoch=want.epoch),
-    ):
-        assert have.epoch == want.epoch
-        np.testing.assert_array_equal(have.status, want.status)
-        np.testing.assert_array_equal(have.height_m, want.height_m)
-
-
-def test_a_file_gives_the_same_answers_but_for_few_points_at_edges(client, tmp_path):
-    """A file has features of half precision."""
-    points = points_over((2.1, 4.9), (0.5, 2.9), 0.3)
-    want = client.query_ground(points, 0.7)
-    client.download_map(tmp_path / "map.triquad")
-    with triquad_client.open_map(tmp_path / "map.triquad") as offline:
-        have = offline.query_ground(points, 0.7)
-    assert have.epoch == want.epoch
-    same = have.status == want.status
-    assert same.mean() > 0.995
-    assert (np.abs(have.height_m - want.height_m)[same] < 0.02).mean() > 0.995

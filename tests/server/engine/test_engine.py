@@ -123,18 +123,6 @@ def test_fixed_rows_stay_as_they_are_and_all_others_learn(compiled: bool) -> Non
     assert all(kept)
 
 
-def test_points_outside_the_cube_get_values_without_features() -> None:
-    settings = FieldSettings(depth=8, frequencies=4)
-    field = trained(settings)
-    points = np.array([[100.0, 0, 0], [0, -26.0, 1], [25.6, 25.6, 25.6]], np.float32)
-    slow = in_tensors(field).evaluate(points, gradient=False)
-    np.testing.assert_allclose(
-        field.freeze().evaluate(points, gradient=False).sdf,
-        slow.sdf,
-        atol=1e-5,
-    )
-
-
 @pytest.mark.parametrize("levels", [1, 3, 4])
 def test_the_faces_of_the_cube_are_no_trap(levels: int) -> None:
     """Where rounding takes a point just outside, no vertex is looked for beyond its block."""

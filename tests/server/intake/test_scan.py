@@ -86,41 +86,6 @@ def test_poses_with_six_digits_are_rigid_enough() -> None:
     assert len(usable_rays(points((5, 0, 0)), turn, SETTINGS).ends) == 1
 
 
-def test_rays_that_met_nothing_reach_as_far_as_the_sensor() -> None:
-    turn = pose(m00=0, m01=-1, m10=1, m11=0, m03=100)
-    rays = usable_rays(
-        points((60, 0, 0), (0, 0, 3e38), (5, 0, 0)),
-        turn,
-        ScanSettings(range_max_m=30.0),
-        no_return=points((0, 1e-30, 0), (0, 0, -2)),
-    )
-    assert len(rays.ends) == 1
-    np.testing.assert_allclose(rays.far_ends, [[100, 30, 0], [100, 0, 30]], atol=1e-6)
-    np.testing.assert_allclose(rays.open_ends, [[70, 0, 0], [100, 0, -30]], atol=1e-6)
-    assert rays.points_dropped == {"too_far": 2}
-
-
-def test_a_scan_without_points_needs_rays_that_are_believed() -> None:
-    none = np.zeros((0, 3), np.float32)
-    up = points((0, 0, 1))
-    assert len(usable_rays(none, pose(), SETTINGS, no_return=up).open_ends) == 1
-    silent = SourceSettings(no_return=False)
-    with pytest.raises(ScanRefusedError, match="1 rays without a return .* no_return = false"):
-        usable_rays(none, pose(), SETTINGS, source=silent, no_return=up)
-    with pytest.raises(ScanRefusedError, match="0 points .* there is no ray without a return"):
-        usable_rays(none, pose(), SETTINGS, source=silent)
-
-
-def test_rays_that_are_not_believed_are_counted() -> None:
-    silent = SourceSettings(no_return=False)
-    up = points((0, 0, 1), (0, 1, 0))
-    rays = usable_rays(
-        points((5, 0, 0), (0.1, 0, 0)), pose(), SETTINGS, source=silent, no_return=up
-    )
-    assert (len(rays.ends), len(rays.open_ends)) == (1, 0)
-    assert rays.points_dropped == {"too_near": 1, "no_return": 2}
-
-
 @pytest.mark.parametrize("bad", [(0, 0, 0), (np.nan, 0, 1), (0, -np.inf, 0)])
 def test_what_is_no_direction_is_refused_by_its_index(bad: tuple[float, float, float]) -> None:
     with pytest.raises(ScanRefusedError, match="direction 1 of no_return") as refusal:

@@ -1,4 +1,3 @@
-import sys
 import threading
 
 from support import servers
@@ -25,28 +24,6 @@ def test_a_taken_scan_is_settled_at_once_but_done_only_when_published():
     ledger.publish()
     reply = ledger.outcome(*SOURCE, 0)
     assert (reply.taken, reply.refused, reply.lost) == (1, 0, 0)
-
-
-def test_no_scan_arrives_in_the_future():
-    """However soon after a question the next scan arrives, its age is no negative number."""
-    ledger, ended = SourceLedger(), threading.Event()
-    ledger.arrive(SCAN)
-
-    def arrive():
-        for sequence in range(1, 10_000):
-            ledger.arrive(servers.scan(sequence))
-        ended.set()
-
-    interval = sys.getswitchinterval()
-    sys.setswitchinterval(1e-6)
-    try:
-        threading.Thread(target=arrive, daemon=True).start()
-        ages = [ledger.metrics()["lidar"].age_s]
-        while not ended.is_set():
-            ages.append(ledger.metrics()["lidar"].age_s)
-    finally:
-        sys.setswitchinterval(interval)
-    assert min(ages) >= 0
 
 
 def test_gaps_count_as_lost_also_before_the_first_scan():

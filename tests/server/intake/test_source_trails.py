@@ -6,11 +6,7 @@ from hypothesis import strategies as st
 from triquad_format.wire.messages import Scan
 from triquad_format.wire.source_messages import SourcesRequest
 from triquad_server.intake.rays import ScanRays
-from triquad_server.intake.source_trails import (
-    MAX_POSITIONS,
-    MAX_SOURCES,
-    SourceTrails,
-)
+from triquad_server.intake.source_trails import MAX_POSITIONS, MAX_SOURCES, SourceTrails
 
 LEAF_M = 0.2
 

@@ -2,11 +2,7 @@
 
 import numpy as np
 import pytest
-from support.maps.small_world import (
-    settings,
-    settled_mapper,
-    world,
-)
+from support.maps.small_world import settings, settled_mapper, world
 from triquad_format.records import replay_rays
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.replay_rays import HELD_OUT

@@ -18,7 +18,6 @@ from triquad_format.records.region import MapRecord
 from triquad_format.records.status import Status
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.replay.kept_rays import RAY_BYTES
-from triquad_server.mapping.replay.ray_table import END, VALUE
 from triquad_server.settings import Settings
 from triquad_tools.sensors.sweep import moved
 
@@ -113,22 +112,6 @@ def test_a_place_left_behind_is_not_forgotten() -> None:
     settle(mapper)
     assert mapper.rays_kept <= 75_000
     assert surface_error(mapper.publish(), here) < before + 0.006
-
-
-def test_where_no_normal_is_known_the_field_tells_how_steep_rays_fall(mapped: Mapper) -> None:
-    told, steep, known = [], [], 0
-    for region in mapped.regions:
-        table = region.training.rays.pool.table
-        unsure = np.flatnonzero((table.rows[:, VALUE] < 0) & (table.origin_of >= 0))
-        ends = table.rows[unsure, END : END + 3].astype(np.float64)
-        ways = ends - table.origins[table.origin_of[unsure]]
-        along = (ways * world().scene.gradient(ends + region.centre)).sum(axis=1)
-        steep.append(np.abs(along) / np.linalg.norm(ways, axis=1))
-        told.append(-table.rows[unsure, VALUE])
-        known += len(table)
-    cosines, of_field = np.concatenate(steep), np.concatenate(told)
-    assert len(cosines) > 0.05 * known
-    assert np.abs(cosines - of_field).mean() < 0.5 * np.abs(cosines - 1).mean()
 
 
 def test_where_little_is_new_all_else_stays_to_the_bit(driven: Mapper) -> None:

@@ -140,13 +140,6 @@ def test_a_record_with_nothing_to_train_on_has_no_training_budget() -> None:
     assert restarted.samples_trained > 0
 
 
-def test_the_training_budget_survives_a_restart() -> None:
-    scan = world().scans[0]
-    mapper = mapper_of(scan)
-    restarted = Mapper("test", settings(), "cpu", mapper.changes_since(None).record)
-    assert not restarted.settled
-
-
 def test_reset_forgets_a_box_and_everything() -> None:
     mapper = settled_mapper(settings(samples_per_ray=3.0), world(2))
     hits = world(2).hits

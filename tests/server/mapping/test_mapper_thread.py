@@ -10,16 +10,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Event
 
-import numpy as np
 import pytest
 from support import servers
 from support.maps.small_world import settings, world
 from triquad_format.errors import RefusedError
-from triquad_format.wire.messages import CheckpointRequest, ResetRequest
+from triquad_format.wire.messages import CheckpointRequest
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.errors import MapperStoppedError
 from triquad_server.intake.scan_queue import ScanQueue
-from triquad_server.intake.source_trails import SourceTrails
 from triquad_server.mapping import mapper as mapper_module
 from triquad_server.mapping import publish_schedule
 from triquad_server.mapping.live_region import LiveRegion
@@ -28,7 +26,6 @@ from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.process.stop import Stop, Stops
 from triquad_server.settings import ServiceSettings, StoreSettings
 from triquad_server.store.checkpoint_writer import CheckpointWriter
-from triquad_server.store.resets import Resets
 from triquad_server.store.store import Store
 
 NEVER_S = 3600.0
@@ -130,13 +127,6 @@ def test_an_end_that_comes_as_a_turn_begins_is_not_slept_through(
         assert not closing_thread.is_alive()
 
 
-def test_commands_of_a_thread_that_ended_are_refused() -> None:
-    with running(Mapper("test", settings(), "cpu")) as mapping:
-        pass
-    with pytest.raises(MapperStoppedError, match="has stopped"):
-        mapping.thread.call(lambda mapper: mapper.settled)
-
-
 def test_however_much_is_flushed_epochs_keep_a_distance(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(publish_schedule, "_SOONEST_PUBLISH_S", NEVER_S)
     mapper = learning_mapper(CountedMapper)
@@ -211,16 +201,6 @@ def test_pending_commands_fail_when_the_thread_will_not_come_to_them() -> None:
         thread.close()
         with pytest.raises(MapperStoppedError, match="never started"):
             pending.result(servers.WAIT_S)
-
-
-def test_who_reset_the_map_finds_the_epoch_that_shows_it() -> None:
-    box = np.full(3, -np.inf), np.full(3, np.inf)
-    with running(learning_mapper()) as mapping:
-        checkpoints = CheckpointWriter(mapping.thread, None, 0.0, None)
-        resets = Resets(mapping.thread, checkpoints, 0, SourceTrails(0.2))
-        reply = resets.answer(ResetRequest(*box))
-        assert mapping.epochs.newest.number >= reply.epoch
-        assert mapping.epochs.get(reply.epoch).regions == 0
 
 
 def test_a_checkpoint_takes_one_epoch_however_fast_the_map_changes(tmp_path: Path) -> None:

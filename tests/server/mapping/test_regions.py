@@ -56,23 +56,6 @@ def test_a_street_across_a_corner_of_regions_is_nearly_as_right_as_in_the_middle
     assert errors[1] < 1.5 * errors[0]
 
 
-def test_the_same_scans_across_a_corner_leave_the_same_rays() -> None:
-    """Though which rays are kept is drawn while another thread records free space."""
-    chosen = Settings()
-    corner = chosen.field.region_pitch_m / 2
-    shift = np.eye(4)
-    shift[:3, 3] = (corner, corner, 0.0)
-    kept = []
-    for _ in range(2):
-        mapper = Mapper("test", chosen, "cpu")
-        for scan in world(4).scans:
-            mapper.ingest(scan.points, shift @ scan.world_from_sensor)
-        kept.append([region.training.rays.pool.table.rows for region in mapper.regions])
-    assert len(kept[0]) == 4
-    for one, other in zip(*kept, strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
 def surface_error_at(place: np.ndarray, chosen: Settings, drive_through: World) -> float:
     """The error of a settled map of a drive that begins at ``place`` [3]."""
     shift = np.eye(4)

@@ -5,14 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.maps.small_world import (
-    damage,
-    settings,
-    settle,
-    settled,
-    surface_error,
-    world,
-)
+from support.maps.small_world import damage, settings, settle, settled, surface_error, world
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.region import MapProgress, MapRecord
@@ -42,20 +35,6 @@ def take_one_more(mapper: Mapper) -> None:
     mapper.ingest(scan.points, scan.world_from_sensor)
 
 
-def test_counters_go_on(restarted: Mapper) -> None:
-    before = learnt().progress
-    assert before.scans_taken == SCANS
-    assert before.samples_trained > 1_000_000
-    assert before.loss > 0
-    assert restarted.progress == before
-    take_one_more(restarted)
-    restarted.train()
-    assert restarted.scans_taken == SCANS + 1
-    assert restarted.samples_trained > before.samples_trained
-    assert restarted.loss == pytest.approx(before.loss, rel=0.5), "the average goes on"
-    assert restarted.changes_since(None).record.progress == restarted.progress
-
-
 def test_a_download_without_training_state_tells_them_too(restarted: Mapper) -> None:
     assert restarted.publish().record().progress == learnt().progress
 
@@ -68,14 +47,6 @@ def test_a_map_that_was_reset_begins_anew(restarted: Mapper) -> None:
     assert restarted.changes_since(None).record.progress == MapProgress()
     take_one_more(restarted)
     assert restarted.scans_taken == 1
-
-
-def test_a_map_is_judged_before_anything_is_trained(restarted: Mapper) -> None:
-    """By the rays of the file, which are the same but for their rounding."""
-    live, now = map_fit(settled(SCANS).regions), map_fit(restarted.regions)
-    assert now.rays == pytest.approx(live.rays, rel=0.01)
-    assert now.median_m == pytest.approx(live.median_m, abs=5e-4)
-    assert now.upper_m == pytest.approx(live.upper_m, abs=2e-3)
 
 
 def test_what_the_field_forgets_after_a_restart_is_told(restarted: Mapper) -> None:

@@ -4,14 +4,7 @@ import dataclasses
 import os
 from contextlib import closing
 
-from support.files.growing_store import (
-    ROW,
-    changes,
-    drive,
-    grown,
-    parts_of,
-    paths,
-)
+from support.files.growing_store import ROW, changes, drive, grown, parts_of, paths
 from support.maps.map_records import assert_same
 from triquad_format.mapfile.checkpoint_folder import PartFiles
 from triquad_format.mapfile.index import read_checkpoint, write_checkpoint

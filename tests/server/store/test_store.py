@@ -107,12 +107,6 @@ def test_other_files_are_left_alone(store):
     assert len(names(store)) == 3
 
 
-def test_two_servers_do_not_share_a_folder(store, tmp_path):
-    with pytest.raises(StoreError, match="in use"):
-        Store(tmp_path, "lab", StoreSettings(keep=2))
-    Store(tmp_path, "other", StoreSettings(keep=2)).close()
-
-
 def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(StoreError, match="cannot be written"):

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import zenoh
-from support.servers import free_port
 from triquad_tools.credentials.certificates import Certificate
+
+from bench.clients.server_process import free_port
 
 
 def free_tls_endpoint() -> str:

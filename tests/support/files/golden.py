@@ -7,12 +7,7 @@ format changes, and then in one commit with ``docs/map-file.md``.
 import dataclasses
 from pathlib import Path
 
-from support.maps.map_records import (
-    SMALL,
-    random_record,
-    with_rays,
-    with_support,
-)
+from support.maps.map_records import SMALL, random_record, with_rays, with_support
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.region import MapProgress, MapRecord
 

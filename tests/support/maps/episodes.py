@@ -5,8 +5,7 @@ from triquad_tools.simulation.scene import Scene
 from triquad_tools.simulation.solids import box
 from triquad_tools.simulation.street import street
 
-from bench.scenes.episodes import Episode, Things, straight_lane
-from bench.scenes.thin_things import thin_things
+from bench.scenes.episodes import Episode, Things, straight_lane, thin_things
 
 
 def box_on_a_street(busy: int, empty: int, rain: float = 0.0) -> Episode:

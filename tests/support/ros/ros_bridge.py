@@ -1,6 +1,5 @@
 """Bridges to ROS 2 in this process, over a server of the test, and what tests wait for."""
 
-import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -47,11 +46,8 @@ class Bridged:
 
     def wait_for(self, holds: Callable[[], bool]) -> None:
         """Return once something holds."""
-        deadline = time.monotonic() + servers.WAIT_S
-        while not holds():
-            state = (self.bridge.published, self.bridge.dropped, self.client.status())
-            assert time.monotonic() < deadline, state
-            time.sleep(0.02)
+        bridge = self.bridge
+        servers.until(holds, lambda: (bridge.published, bridge.dropped, self.client.status()))
 
     def settle(self) -> None:
         self.wait_for(lambda: self.client.status().settled)

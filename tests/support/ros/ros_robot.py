@@ -12,15 +12,7 @@ import numpy as np
 import zenoh
 import zenoh.ext
 from numpy.typing import NDArray
-from support.ros.ros_messages import (
-    CAMERA_INFO,
-    CLOUD,
-    IMAGE,
-    ODOMETRY,
-    POSE,
-    TF,
-    RosMessages,
-)
+from support.ros.ros_messages import CAMERA_INFO, CLOUD, IMAGE, ODOMETRY, POSE, TF, RosMessages
 from support.servers import raw_session
 
 Array = NDArray[Any]

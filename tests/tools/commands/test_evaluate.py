@@ -70,17 +70,3 @@ def test_input_that_cannot_be_used_is_refused(tmp_path, capsys):
     assert "has no faces" in refusal(cloud, "--reference", cloud)
     assert "no.ply" in refusal(mesh, "--reference", tmp_path / "no.ply")
     assert "holds no trajectory" in refusal(mesh, "--reference", tmp_path)
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        (),
-        ("x.ply",),
-        ("x.ply", "--reference", "y.ply", "--threshold", "0"),
-    ],
-)
-def test_wrong_usage_ends_with_code_2(arguments):
-    with pytest.raises(SystemExit) as caught:
-        evaluate.main(arguments)
-    assert caught.value.code == 2

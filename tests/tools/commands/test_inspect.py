@@ -1,8 +1,6 @@
 import dataclasses
 import json
 import re
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -210,14 +208,3 @@ def test_a_picture_that_cannot_be_written_is_refused(map_file, tmp_path, name, r
     with pytest.raises(SystemExit, match="2"):
         main([str(map_file), "--plot", str(tmp_path / name)])
     assert reason in capsys.readouterr().err
-
-
-def test_inspecting_needs_neither_server_nor_pictures(map_file):
-    code = (
-        "import sys; from triquad_tools.commands.inspect import main; main([sys.argv[1]])\n"
-        "bad = {'torch', 'numba', 'zenoh', 'PIL', 'scipy', 'triquad_server'} & set(sys.modules)\n"
-        "assert not bad, bad"
-    )
-    command = [sys.executable, "-c", code, str(map_file)]
-    ended = subprocess.run(command, check=False, capture_output=True, text=True)
-    assert (ended.returncode, ended.stderr) == (0, "")

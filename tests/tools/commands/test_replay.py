@@ -139,19 +139,3 @@ def test_a_server_that_cannot_be_reached_is_a_failure(replay, tmp_path, capsys):
     assert f"cannot connect to {endpoint}" in capsys.readouterr().err
     assert replay(folder, "--map", "other") == 1
     assert "no server has a map 'other'; available: default" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        (),
-        ("x", "--rate", "0"),
-        ("x", "--rate", "fast"),
-        ("x", "--every", "0"),
-        ("x", "--range-min", "nan"),
-    ],
-)
-def test_wrong_usage_ends_with_code_2(arguments):
-    with pytest.raises(SystemExit) as caught:
-        main(arguments)
-    assert caught.value.code == 2

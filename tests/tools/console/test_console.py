@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,24 @@ def command(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
 def test_each_command_tells_its_version(name: str) -> None:
     done = command(name, "--version")
     assert (done.returncode, done.stdout) == (0, f"triquad {triquad_format.__version__}\n")
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("demo", ("--scans", "0")),
+        ("demo", ("street",)),
+        ("evaluate", ("x.ply",)),
+        ("evaluate", ("x.ply", "--reference", "y.ply", "--threshold", "0")),
+        ("replay", ("x", "--rate", "fast")),
+        ("replay", ("x", "--every", "0")),
+        ("replay", ("x", "--range-min", "nan")),
+    ],
+)
+def test_wrong_usage_ends_with_code_2(name: str, arguments: tuple[str, ...]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        import_module(f"triquad_tools.commands.{name}").main(arguments)
+    assert caught.value.code == 2
 
 
 def test_a_file_that_is_not_there_is_named_without_numbers(tmp_path: Path) -> None:

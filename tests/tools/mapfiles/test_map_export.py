@@ -6,18 +6,11 @@ from contextlib import suppress
 import numpy as np
 import pytest
 import trimesh
-from scipy.spatial import cKDTree
 from support.files.mapfile_edit import file_bytes
 from support.maps.map_records import random_record
-from support.maps.small_world import settings, settled_epoch
-from triquad_client import Mesh
+from support.maps.small_world import settled_epoch
 from triquad_format.mapfile.reader import read_map
 from triquad_map.composition.recorded_view import RecordedView
-from triquad_map.mesh.tile_mesh import mesh_tile
-from triquad_map.triangles import joined
-from triquad_server.mapping.mapper import Mapper
-from triquad_server.mesh.tile_cache import tile_lattice
-from triquad_server.mesh.tile_queries import surface_tiles
 from triquad_tools.commands.pack import main
 from triquad_tools.mapfiles.crop import crop_record
 from triquad_tools.mapfiles.meshfile import read_mesh
@@ -77,42 +70,6 @@ def test_a_mesh_without_faces_is_not_written(map_file, tmp_path, capsys):
     assert main([str(map_file), str(tmp_path / "air.ply"), *air]) == 1
     assert "no surface was seen in the box of --crop" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
-
-
-def test_other_programs_meshes_are_the_same(map_file, tmp_path):
-    options = ("--cell", "0.4")
-    ply = read_mesh(export(map_file, tmp_path, "mesh.ply", *options))
-    (tmp_path / "mesh.ply").unlink()
-    other = read_mesh(export(map_file, tmp_path, "mesh.stl", *options))
-    assert len(other.faces) == len(ply.faces)
-    corners = [mesh.vertices[mesh.faces] for mesh in (ply, other)]
-    np.testing.assert_allclose(corners[0], corners[1], atol=1e-5)
-
-
-def test_a_mesh_is_the_one_that_a_server_gives(map_file, tmp_path):
-    record = read_map(map_file)
-    epoch = Mapper("street", settings(), "cpu", record).publish()
-    everywhere = np.full(3, -np.inf), np.full(3, np.inf)
-    lattice = tile_lattice(settings().mesh, 0)
-    indices = surface_tiles(epoch, lattice).tolist()
-    tiles = [mesh_tile(epoch, tuple(index), lattice) for index in indices]
-    parts = [Mesh(tile.origin + tile.vertices, tile.faces) for tile in tiles]
-    served = joined(parts, lattice.tile_side_m, everywhere)
-    written = read_mesh(export(map_file, tmp_path, "mesh.ply"))
-    assert len(written.faces) == pytest.approx(len(served.faces), rel=0.01)
-    for one, other in ((written, served), (served, written)):
-        distances = cKDTree(other.vertices).query(one.vertices)[0]
-        # But for cells that can be filled in several ways, and single faces at the border.
-        assert np.quantile(distances, 0.99) < 1e-4
-
-
-def test_a_mesh_within_a_box(map_file, tmp_path):
-    whole = read_mesh(export(map_file, tmp_path, "mesh.ply", "--cell", "0.2"))
-    (tmp_path / "mesh.ply").unlink()
-    part = read_mesh(export(map_file, tmp_path, "mesh.ply", "--cell", "0.2", "--crop", *BOX))
-    middles = whole.vertices[whole.faces].mean(axis=1)
-    inside = ((middles >= LOW) & (middles <= HIGH)).all(axis=1)
-    assert 0 < len(part.faces) == inside.sum() < len(whole.faces)
 
 
 def test_a_map_that_has_seen_nothing(tmp_path, capsys):

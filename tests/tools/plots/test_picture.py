@@ -13,7 +13,7 @@ from triquad_client import Mesh
 from triquad_format.mapfile.writer import write_map
 from triquad_map.height_scale import HEIGHT_STOPS
 from triquad_tools.commands.pack import main
-from triquad_tools.plots.mesh_view import draw_faces, vertex_normals, view_along
+from triquad_tools.plots.mesh_view import draw_faces, view_along
 from triquad_tools.plots.picture import BACKGROUND, HEIGHT, TOP, WIDTH, draw_mesh
 
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
@@ -141,19 +141,6 @@ def test_nearer_things_hide_farther_ones_and_backs_are_left_out():
     np.testing.assert_array_equal(seen, rendered(both(plate, floor), view=view))
     ceiling = Mesh(plate.vertices, plate.faces[:, ::-1])  # seen from below
     np.testing.assert_array_equal(rendered(ceiling, view=view), EMPTY)
-
-
-def test_a_square_covers_its_pixels_once():
-    mesh = ground(6, 6)
-    covered = (np.abs(rendered(mesh) - EMPTY).max(axis=-1) > 20).sum()
-    x, y = in_picture(squares((0.0, 0.0, 0.0), side_m=6.0), of=mesh)
-    area = 0.5 * abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1)))
-    assert covered == pytest.approx(area, rel=0.01)
-
-
-def test_normals_of_vertices_are_those_around_them():
-    normals = vertex_normals(SQUARE, SQUARE_FACES)
-    np.testing.assert_allclose(normals, np.tile([0.0, 0.0, 1.0], (4, 1)))
 
 
 def test_the_legend_tells_heights_beyond_the_scale(tmp_path):

@@ -81,13 +81,6 @@ def test_distance_near_the_surface_is_exact_but_beside_seams(world: Scene) -> No
     assert np.mean(exact) > 0.95
 
 
-def test_gradient_is_a_unit_vector_and_the_slope_of_the_distance(world: Scene) -> None:
-    points = _near_surface(world, 5_000, seed=7)
-    gradients = world.gradient(points)
-    np.testing.assert_allclose(np.linalg.norm(gradients, axis=1), 1.0, atol=1e-12)
-    assert _gradient_error(world, points, gradients) < 0.005
-
-
 def test_inside_of_houses_is_deep_in_houses_only(world: Scene) -> None:
     rng = np.random.default_rng(8)
     points = rng.uniform(world.bounds[0], world.bounds[1], (50_000, 3))
@@ -95,17 +88,6 @@ def test_inside_of_houses_is_deep_in_houses_only(world: Scene) -> None:
     assert 0.02 < np.mean(inside) < 0.5
     assert np.all(world.sdf(points[inside]) < -0.8)
     assert not world.is_inside_house(np.array([[15.0, 0.0, 1.0], [15.0, 0.0, -3.0]])).any()
-
-
-def test_street_depends_on_its_seed_alone() -> None:
-    assert street(1, 20.0).solids == street(1, 20.0).solids
-    assert street(1, 20.0).solids != street(2, 20.0).solids
-
-
-@pytest.mark.parametrize("shape", [(3,), (4, 2)])
-def test_points_of_another_shape_are_refused(world: Scene, shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match=r"expected points \[N, 3\]"):
-        world.sdf(np.zeros(shape))
 
 
 def test_solids_of_impossible_size_are_refused() -> None:
