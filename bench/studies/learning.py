@@ -149,8 +149,9 @@ class _Learner:
 
 def _served(epoch: Epoch, ends: Doubles) -> Mesh:
     """Return the mesh of an epoch as a server gives it; rays ended in voxels around ``ends``."""
+    half_m = epoch.voxel_m / 2
     everywhere = (np.full(3, -np.inf), np.full(3, np.inf))
-    lattice = map_lattice(epoch.voxel_m, epoch.voxel_m / 2, whole=True)
+    lattice = map_lattice(half_m, half_m, whole=True)
     return MapTiles(epoch, ends, lattice, everywhere, 0.0).joined(None)
 
 

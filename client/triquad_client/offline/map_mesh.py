@@ -23,13 +23,9 @@ Report = Callable[[int, int], None]
 """A function that is called with how many tiles are done, and of how many."""
 
 
-_REACH_LEAVES = 0.1  # how far from a voxel with seen surface the middle of a face may lie
-
-
-def map_lattice(leaf_m: float, cell_m: float, *, whole: bool) -> TileLattice:
+def map_lattice(cell_m: float, reach_m: float, *, whole: bool) -> TileLattice:
     """Return the lattice of a map's tiles; ``whole``: all of them are made in a row."""
-    cells = WHOLE_TILE_CELLS if whole else TILE_CELLS
-    return TileLattice(cell_m, cells, _REACH_LEAVES * leaf_m)
+    return TileLattice(cell_m, WHOLE_TILE_CELLS if whole else TILE_CELLS, reach_m)
 
 
 class MapTiles:
