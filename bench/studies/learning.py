@@ -16,6 +16,7 @@ from unittest.mock import patch
 import numpy as np
 from triquad_client import Mesh, OfflineMap
 from triquad_client.offline.map_mesh import MapTiles, map_lattice
+from triquad_client.offline.offline_map import REACH_LEAVES
 from triquad_format.records.arrays import Doubles
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
@@ -149,9 +150,9 @@ class _Learner:
 
 def _served(epoch: Epoch, ends: Doubles) -> Mesh:
     """Return the mesh of an epoch as a server gives it; rays ended in voxels around ``ends``."""
-    half_m = epoch.voxel_m / 2
+    voxel_m = epoch.voxel_m
     everywhere = (np.full(3, -np.inf), np.full(3, np.inf))
-    lattice = map_lattice(half_m, half_m, whole=True)
+    lattice = map_lattice(voxel_m / 2, REACH_LEAVES * voxel_m, whole=True)
     return MapTiles(epoch, ends, lattice, everywhere, 0.0).joined(None)
 
 

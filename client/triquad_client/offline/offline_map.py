@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 CELL_RANGE_M = (0.005, 10.0)
 _CELL_LEAVES = 0.5
-_REACH_LEAVES = 0.1  # how far from a voxel with seen surface the middle of a face may lie
+REACH_LEAVES = 0.1  # how far from a voxel with seen surface the middle of a face may lie
 
 
 class LocalMap(Answering):
@@ -152,7 +152,7 @@ class OfflineMap(MapQueries):
         box, fill_m = checks.box(bounds), checks.within("fill_m", fill_m, MAX_FILL_M, least=0.0)
         from triquad_client.offline.map_mesh import MapTiles, map_lattice
 
-        lattice = map_lattice(checked_m, _REACH_LEAVES * self.leaf_m, whole=whole)
+        lattice = map_lattice(checked_m, REACH_LEAVES * self.leaf_m, whole=whole)
         return MapTiles(view, self.surface_voxels(), lattice, box, fill_m)
 
     def surface_voxels(self) -> Doubles:
@@ -169,7 +169,7 @@ class OfflineMap(MapQueries):
             InvalidInputError: the points are not [N, 3], or not finite.
             ClosedError: the map was closed.
         """
-        return self._map.view.near_ends(checks.query_points(points), _REACH_LEAVES * self.leaf_m)
+        return self._map.view.near_ends(checks.query_points(points), REACH_LEAVES * self.leaf_m)
 
 
 def open_map(path: str | Path) -> OfflineMap:
