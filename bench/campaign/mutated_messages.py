@@ -32,9 +32,9 @@ from triquad_format.wire.query_messages import (
     GroundRequest,
     RaysRequest,
     SegmentsRequest,
-    SourcesRequest,
     SpheresRequest,
 )
+from triquad_format.wire.source_messages import SourcesRequest
 
 NUMBERS = (0, 1, -1, 2, 7, 2**15, 2**31, -(2**31), 2**53, 2**62, 2**63 - 1, -(2**63), 2**64 - 1)
 _VALUES: tuple[Any, ...] = (

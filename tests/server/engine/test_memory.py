@@ -9,7 +9,7 @@ from triquad_server.engine.live_field import Batch, LiveField, Parameter, Rates,
 from triquad_server.engine.memory import ArrayMemory, Memory
 from triquad_server.engine.tensor_field import TensorMemory
 from triquad_server.engine.trainer import trainer_of
-from triquad_server.epochs.array_memory import buffers_of
+from triquad_server.epochs.epoch import buffers_of
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.process.threads import Teams
 
