@@ -85,7 +85,8 @@ class FollowedMesh:
     empty: Mapping[TileIndex, int] = field(default_factory=dict)  # versions of tiles without faces
     stale: frozenset[TileIndex] = frozenset()  # tiles that go unless they come again
     pending: tuple[TileIndex, ...] = ()  # tiles to be fetched, in this order
-    since: int = 0  # epoch as of which all tiles are known
+    since: int = 0  # revision as of which all tiles are known
+    revision: int = 0  # up to which the changes are known
     epoch: int = 0  # up to which the changes are known
     is_newest: bool = False  # that was the newest
 
@@ -160,6 +161,7 @@ class FollowedMesh:
             pending=tuple(pending),
             since=since,
             epoch=reply.epoch,
+            revision=reply.revision,
             is_newest=reply.is_newest,
         )
         return told._settled()
@@ -190,7 +192,7 @@ class FollowedMesh:
         if self.pending:
             return self
         tiles = {index: tile for index, tile in self.tiles.items() if index not in self.stale}
-        return replace(self, tiles=tiles, stale=frozenset(), since=self.epoch)
+        return replace(self, tiles=tiles, stale=frozenset(), since=self.revision)
 
     def _unpacked(self, asked: MeshRequest, reply: MeshReply) -> dict[TileIndex, MeshTile]:
         """Return the tiles of a reply; errors as of :meth:`TileDecoder.decode`."""

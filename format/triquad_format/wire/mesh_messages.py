@@ -16,6 +16,7 @@ from triquad_format.wire.limits import (
     TILE_INDEX_LIMIT,
 )
 from triquad_format.wire.messages import (
+    Count,
     Epoch,
     Epochs,
     Integers,
@@ -83,7 +84,8 @@ class TileChanges(Message):
     """Answer to :class:`TileChangesRequest`."""
 
     server: Name
-    epoch: Epoch  # up to which the changes are known, for the next request
+    epoch: Epoch  # up to which the changes are known
+    revision: Count  # number of the newest change of the level, for the next request
     is_newest: bool  # that is the newest epoch
     tile_side_m: Annotated[float, within(MIN_LENGTH_M, MAX_TILE_M)]
     cell_m: Annotated[float, within(MIN_LENGTH_M, MAX_CELL_M)]
@@ -96,10 +98,10 @@ class TileChanges(Message):
 
 @dataclass(frozen=True)
 class TileChangesRequest(Request[TileChanges], operation=keys.TILE_CHANGES, background=True):
-    """Ask in which mesh tiles of a box the surface changed since an epoch of a server."""
+    """Ask in which mesh tiles of a box the surface changed since a revision of a server."""
 
     minimum: Point
     maximum: UpperCorner  # of the box, map frame; an open side is infinite
     level: Level
-    server: str  # of the reply before, whose epoch is ``since``; empty at first
-    since: int  # every tile of the box is known as of this epoch; 0: none is
+    server: str  # of the reply before, whose revision is ``since``; empty at first
+    since: int  # every tile of the box is known as of this revision; 0: none is

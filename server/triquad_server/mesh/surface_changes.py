@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -189,23 +190,35 @@ class CachedTile:
     border: TileBorder
 
 
+class TileChange(NamedTuple):
+    """When the surface of a tile changed last."""
+
+    epoch: int
+    revision: int  # its number among all changes of the level: there are several in an epoch
+
+
+_NEVER = TileChange(0, 0)
+
+
 class TileLevel:
     """Keeps the tiles of one level of detail, and when the surface of each changed."""
 
     def __init__(self, lattice: TileLattice) -> None:
         self.lattice = lattice
         self.tiles: dict[TileIndex, CachedTile] = {}  # as they were last made
-        self.changed: dict[TileIndex, int] = {}  # epoch in which the surface last changed
+        self.changed: dict[TileIndex, TileChange] = {}  # the last one of each
+        self.revision = 0  # number of the newest change
 
     def clean(self, index: TileIndex) -> CachedTile | None:
         """Return the tile if it shows the current surface; None if it has to be made."""
         tile = self.tiles.get(index)
-        return None if tile is None or tile.made < self.changed.get(index, 0) else tile
+        return None if tile is None or tile.made < self.changed.get(index, _NEVER).epoch else tile
 
     def touch(self, index: TileIndex, epoch: int) -> None:
         """Record that the surface of a tile changed in ``epoch``."""
         self.changed.pop(index, None)
-        self.changed[index] = epoch  # those that changed last are last
+        self.revision += 1
+        self.changed[index] = TileChange(epoch, self.revision)  # the newest is last
 
     def record(self, changes: Changes, half_m: float, epoch: int) -> None:
         """Record what changed in ``epoch``; voxels have sides of twice ``half_m``."""
@@ -218,17 +231,17 @@ class TileLevel:
             self.touch((x, y, z), epoch)
 
     def changed_since(self, low: Doubles, high: Doubles, since: int) -> dict[TileIndex, int]:
-        """Return when the surface of tiles changed: of those for which it did after ``since``.
+        """Return the epoch in which the surface of each tile changed, after revision ``since``.
 
-        They meet a box with the corners ``low`` and ``high`` [3], metres, map frame. Since epoch 0,
+        They meet a box with the corners ``low`` and ``high`` [3], metres, map frame. Since 0,
         those that are known to have no faces are left out.
         """
         newest_first = itertools.takewhile(
-            lambda index: self.changed[index] > since, reversed(self.changed)
+            lambda index: self.changed[index].revision > since, reversed(self.changed)
         )
         found = [index for index in newest_first if since or not self._is_empty(index)]
         inside = self.lattice.meets(np.array(found, np.int64).reshape(-1, 3), low, high)
-        return {index: self.changed[index] for index in itertools.compress(found, inside)}
+        return {index: self.changed[index].epoch for index in itertools.compress(found, inside)}
 
     def _is_empty(self, index: TileIndex) -> bool:
         tile = self.clean(index)

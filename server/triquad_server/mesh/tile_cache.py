@@ -125,6 +125,11 @@ class TileCache:
         with self._lock:
             return self._levels[level].changed_since(low, high, since)
 
+    def revision(self, level: int) -> int:
+        """Return the number of the newest change of a level, for :meth:`changed`."""
+        with self._lock:
+            return self._levels[level].revision
+
     def kept(self, level: int, index: TileIndex) -> ShownTile | None:
         """Return a tile that shows the current surface; None if it has to be made, or made again.
 

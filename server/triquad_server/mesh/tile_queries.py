@@ -66,16 +66,18 @@ class TileQueries:
         self._refresh(newest)
         cache, lattice = self._cache, self._cache.lattice(request.level)
         since = request.since if request.server == self._server else 0
-        if not 0 <= since <= cache.epoch:
+        revision = cache.revision(request.level)
+        if not 0 <= since <= revision:
             raise RefusedError(
                 "bad_request",
-                f"since = {since} was never given by server {request.server!r}: use the epoch of "
-                "the reply before, or 0",
+                f"since = {since} was never given by server {request.server!r}: use the revision "
+                "of the reply before, or 0",
             )
         changed = cache.changed(request.level, request.minimum, request.maximum, since)
         return TileChanges(
             server=self._server,
             epoch=cache.epoch,
+            revision=revision,
             is_newest=cache.epoch >= newest.number,
             tile_side_m=lattice.tile_side_m,
             cell_m=lattice.cell_m,

@@ -30,7 +30,7 @@ def endpoint() -> Iterator[str]:
 def left(index: int, epoch: int) -> bytes:
     """A reply after which the tile ``(index, 0, 0)`` alone is there."""
     tile, changed = np.array([[index, 0, 0]], np.int32), np.ones(1, np.int64)
-    return codec.encode(TileChanges("s", epoch, True, 1.6, 0.1, tile, changed))
+    return codec.encode(TileChanges("s", epoch, epoch, True, 1.6, 0.1, tile, changed))
 
 
 def known_tiles(endpoint: str) -> KnownTiles:

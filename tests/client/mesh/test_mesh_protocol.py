@@ -62,7 +62,7 @@ def test_the_protocol_by_hand(client: Client, endpoint: str) -> None:
             for index, tile in watch.tiles.items():
                 np.testing.assert_array_equal(surfaces[index].positions(0.1), tile.vertices)
                 np.testing.assert_array_equal(surfaces[index].faces, tile.faces)
-        later = by_hand(peer, tile_changes(server=told.server, since=told.epoch))
+        later = by_hand(peer, tile_changes(server=told.server, since=told.revision))
         assert (later.is_newest, len(later.tiles)) == (True, 0)
         strange = by_hand(peer, tile_changes(server="another", since=10**6))
         assert strange.server == told.server

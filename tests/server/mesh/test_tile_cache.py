@@ -96,7 +96,7 @@ def test_surface_that_is_forgotten_goes_and_everybody_is_told() -> None:
     cache.refresh(mapper.publish())
     make_all(cache)
     before = surfaces(cache)
-    known = cache.epoch
+    known = cache.revision(0)
     mapper.reset(np.array([0.0, -50, -50]), np.array([200.0, 50, 50]))
     cache.refresh(mapper.publish())
     made = make_all(cache)
@@ -116,14 +116,15 @@ def test_who_knows_everything_is_told_nothing() -> None:
     first = ground(flat(0.3))
     cache.refresh(first)
     make_all(cache)
-    assert cache.changed(0, *EVERYWHERE, first.number) == {}
+    known = cache.revision(0)
+    assert cache.changed(0, *EVERYWHERE, known) == {}
     second = bump(4.0, 0.05)
     cache.refresh(second)
-    told = cache.changed(0, *EVERYWHERE, first.number)
+    told = cache.changed(0, *EVERYWHERE, known)
     assert 0 < len(told) < len(cache.changed(0, *EVERYWHERE, 0))
     assert set(told.values()) == {second.number}
     cache.refresh(first)  # an older one tells nothing
-    assert cache.changed(0, *EVERYWHERE, second.number) == {}
+    assert cache.changed(0, *EVERYWHERE, cache.revision(0)) == {}
 
 
 def test_only_tiles_of_the_box_are_told_of() -> None:
@@ -146,7 +147,7 @@ def test_tiles_whose_bytes_went_are_made_again_and_stay_the_same() -> None:
     for index in gone:
         again = cache.make(0, index)
         assert (again.version, again.data) == (made[index].version, made[index].data)
-    assert cache.changed(0, *EVERYWHERE, epoch.number) == {}
+    assert cache.changed(0, *EVERYWHERE, cache.revision(0)) == {}
 
 
 def test_tiles_that_are_unused_for_longest_are_dropped() -> None:

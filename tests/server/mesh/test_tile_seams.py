@@ -126,6 +126,23 @@ def seen_in_strips() -> tuple[Epoch, ...]:
     return tuple(epochs)
 
 
+def test_who_knows_an_epoch_is_told_what_changes_within_it() -> None:
+    """A tile that no longer fits its new neighbour is made again, and all who have it fetch it."""
+    cache = TileCache(MeshSettings(tile_cells=16, tolerance_m=0.03), TEAM)
+    box = (np.array([0.0, -8, -2]), np.array([10.0, 8, 6]))
+    told = 0
+    for epoch in seen_in_strips():
+        cache.refresh(epoch)
+        for index in to_make(cache, 0, box):
+            known = cache.revision(0)
+            cache.make(0, index)
+            changed = cache.changed(0, *box, known)
+            assert index not in changed
+            assert all(cache.kept(0, other) is None for other in changed)
+            told += len(changed)
+    assert told > 0
+
+
 @pytest.mark.parametrize(
     "level", [0, *(pytest.param(level, marks=pytest.mark.long) for level in range(1, LEVELS))]
 )
