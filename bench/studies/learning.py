@@ -38,6 +38,7 @@ _SAMPLES = (100_000, 300_000, 1_000_000, 3_000_000)
 _SCORED = 500_000  # samples of a mesh
 _RESTING = 60  # scans of a robot at rest
 _AGAIN = 8  # one part in this many of the place is seen again
+_EPOCH_SAMPLES = 200_000  # samples between two epochs, as on two cores
 _STEPS = 12  # of training that there is time for between two scans
 _NOISE = 0.1  # of the scans of a robot at rest, as a share of what counts as right
 
@@ -115,8 +116,12 @@ class _Learner:
 
     def learn(self, samples: float = np.inf) -> None:
         """Train until so many samples were trained on, or nothing is left to learn."""
+        published = self.mapper.samples_trained
         while self.mapper.samples_trained < samples and not self.mapper.settled:
             self.mapper.train()
+            if self.mapper.samples_trained >= published + _EPOCH_SAMPLES:
+                published = self.mapper.samples_trained
+                self.mapper.publish()
 
     def stream(self, scans: Sequence[PosedScan]) -> None:
         """Take in more scans, with time to train between them, then learn all."""

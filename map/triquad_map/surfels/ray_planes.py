@@ -3,7 +3,7 @@
 Near a surfel that rays alone show, the distance is the mean of those to the planes of all surfels
 around, the nearer ones counting more: implicit moving least squares (Kolluri 2005), as it is done
 for clouds of points with normals. After a drive of 50 scans through a street, before any training,
-the F-score of the mesh is 98 %, which the field alone reaches after 3 million samples.
+the F-score of the mesh is 97.8 %, and that of the field alone after 1 million samples 97.1 %.
 """
 
 from typing import NamedTuple
@@ -14,6 +14,7 @@ from triquad_format.records.arrays import Bools, Bytes, Floats, Ints
 from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.lanes import lowest_bit
 from triquad_map.compiled.voxel_index import LOW, SHIFT, Index, byte_of, find_row, pack
+from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.surface import SurfelKind, Surfels, level_confidence
 
 _REACH = 1.5
@@ -37,29 +38,30 @@ class RayPlanes(NamedTuple):
     unlearnt: Bools  # [S] which of them rays alone show
 
 
-def ray_planes(
-    blocks: Index, surface: Bytes, starts: Ints, surfels: Surfels, levels: Bytes
-) -> RayPlanes:
-    """Return the planes of ``surfels`` [S], of which each of ``blocks`` has its share.
+def ray_planes(evidence: FrozenEvidence, starts: Ints, surfels: Surfels) -> RayPlanes | None:
+    """Return the planes of ``surfels`` [S]; ``None``: the field has learnt all of them.
 
-    They are in the voxels in ``surface`` [blocks, BLOCK_BYTES]; ``starts`` [blocks + 1] are the
-    first of each block. ``levels`` [S] are those of their support.
+    They are those of the voxels in which rays ended; ``starts`` [blocks + 1] are the first of each
+    block.
     """
+    kinds, surface = surfels.kinds, evidence.surface
+    unlearnt = kinds >= SurfelKind.RAY_DISC
+    if not unlearnt.any():
+        return None
     used = np.diff(starts) > 0
     places = np.where(used, np.cumsum(used) - 1, -1).astype(np.int32)
     counts = _BITS[surface[used]]
     columns = starts[:-1][used, None] + np.cumsum(counts, axis=1) - counts
-    kinds = surfels.kinds
-    is_plane = (kinds == SurfelKind.DISC) | (kinds >= SurfelKind.RAY_DISC)
+    is_plane = (kinds == SurfelKind.DISC) | unlearnt
     return RayPlanes(
-        blocks,
+        evidence.seen.blocks,
         surface,
         places,
         columns.astype(np.int32),
         surfels.offsets,
         surfels.normals,
-        np.where(is_plane, level_confidence()[levels], np.float32(0)),
-        kinds >= SurfelKind.RAY_DISC,
+        np.where(is_plane, level_confidence()[evidence.levels], np.float32(0)),
+        unlearnt,
     )
 
 

@@ -148,17 +148,7 @@ class SurfelMap:
         places = fitted.places
         self._tree = surfel_tree(places.shape, voxels, fitted.surfels)
         kinds = fitted.surfels.kinds
-        self._planes = (
-            ray_planes(
-                evidence.seen.blocks,
-                places.surface,
-                places.starts,
-                fitted.surfels,
-                evidence.levels,
-            )
-            if (kinds >= SurfelKind.RAY_DISC).any()
-            else None
-        )
+        self._planes = ray_planes(evidence, places.starts, fitted.surfels)
         self._shown = ShownSurfels(
             kinds,
             normals=fitted.surfels.normals,
