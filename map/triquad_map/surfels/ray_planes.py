@@ -9,11 +9,11 @@ the F-score of the mesh is 97.8 %, and that of the field alone after 1 million s
 from typing import NamedTuple
 
 import numpy as np
-from triquad_format.records.arrays import Bools, Bytes, Floats, Ints
+from triquad_format.records.arrays import Bytes, Floats, Ints
 
 from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.lanes import lowest_bit
-from triquad_map.compiled.voxel_index import LOW, SHIFT, Index, byte_of, find_row, pack
+from triquad_map.compiled.voxel_index import LOW, SHIFT, Index, VoxelIndex, byte_of, find_row, pack
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.surface import SurfelKind, Surfels, level_confidence
 
@@ -28,95 +28,59 @@ _BITS = np.array([bin(byte).count("1") for byte in range(256)])
 class RayPlanes(NamedTuple):
     """Surfels by the voxels that they are in, as kernels take them."""
 
-    blocks: Index
-    surface: Bytes  # [blocks, BLOCK_BYTES] the voxels that have surfels
-    places: Ints  # [blocks] of each block in the next; -1: it has none
-    columns: Ints  # [places, BLOCK_BYTES] the first surfel of each column of voxels
-    offsets: Floats  # [S, 3] from the voxel's middle, voxels
-    normals: Floats  # [S, 3]
-    weights: Floats  # [S] how much each counts, by its support; 0: it is no plane
-    unlearnt: Bools  # [S] which of them rays alone show
+    blocks: Index  # that have surfels
+    surface: Bytes  # [blocks, BLOCK_BYTES] their voxels that have
+    columns: Ints  # [blocks, BLOCK_BYTES] the first surfel of each column of voxels
+    surfels: Floats  # [S, 8] place in the voxel, normal, weight, and weight if it is not learnt
 
 
 def ray_planes(evidence: FrozenEvidence, starts: Ints, surfels: Surfels) -> RayPlanes | None:
     """Return the planes of ``surfels`` [S]; ``None``: the field has learnt all of them.
 
     They are those of the voxels in which rays ended; ``starts`` [blocks + 1] are the first of each
-    block.
+    block. A surfel counts by its support, and not at all where it is no plane.
     """
-    kinds, surface = surfels.kinds, evidence.surface
+    kinds = surfels.kinds
     unlearnt = kinds >= SurfelKind.RAY_DISC
     if not unlearnt.any():
         return None
     used = np.diff(starts) > 0
-    places = np.where(used, np.cumsum(used) - 1, -1).astype(np.int32)
-    counts = _BITS[surface[used]]
+    surface, blocks = evidence.surface[used], VoxelIndex.of_cells(evidence.cells[used])
+    counts = _BITS[surface]
     columns = starts[:-1][used, None] + np.cumsum(counts, axis=1) - counts
+    rows = np.empty((len(kinds), 8), np.float32)
+    rows[:, :3], rows[:, 3:6] = surfels.offsets + np.float32(0.5), surfels.normals
     is_plane = (kinds == SurfelKind.DISC) | unlearnt
-    return RayPlanes(
-        evidence.seen.blocks,
-        surface,
-        places,
-        columns.astype(np.int32),
-        surfels.offsets,
-        surfels.normals,
-        np.where(is_plane, level_confidence()[evidence.levels], np.float32(0)),
-        unlearnt,
-    )
+    rows[:, 6] = np.where(is_plane, level_confidence()[evidence.levels], 0)
+    rows[:, 7] = np.where(unlearnt, rows[:, 6], 0)
+    return RayPlanes(blocks.arrays, surface, columns.astype(np.int32), rows)
 
 
-class _Sum(NamedTuple):
-    """The weighted sums over the surfels around a point."""
+@kernel(fastmath=True, inline="always")
+def _add(row: int, x: float, y: float, z: float, surfels: Floats, sums: Floats) -> None:
+    """Add the surfel of a row to the sums over those around a point.
 
-    weights: float
-    unlearnt: float  # the weights of what the field has not learnt
-    height: float  # over their planes, voxels
-    x: float  # of their normals
-    y: float
-    z: float
-
-
-@inner_kernel(fastmath=True)
-def _with_column(
-    total: _Sum,
-    at: tuple[float, float, float],
-    x: int,
-    y: int,
-    z: int,
-    bits: int,
-    first: int,
-    chosen: int,
-    planes: RayPlanes,
-) -> _Sum:
-    """Add the ``chosen`` surfels of a column of 8 voxels to a sum."""
-    while chosen:
-        bit = lowest_bit(chosen)
-        chosen &= chosen - 1
-        surfel = first + _BITS[bits & ((1 << bit) - 1)]
-        offset, normal = planes.offsets[surfel], planes.normals[surfel]
-        away_x = at[0] - x - 0.5 - offset[0]
-        away_y = at[1] - y - 0.5 - offset[1]
-        away_z = at[2] - z - bit - 0.5 - offset[2]
-        square = away_x**2 + away_y**2 + away_z**2
-        if square >= _REACH**2 or not planes.weights[surfel]:
-            continue
-        height = away_x * normal[0] + away_y * normal[1] + away_z * normal[2]
-        weight = (1 - square / _REACH**2) ** 4 * planes.weights[surfel]
-        total = _Sum(
-            total.weights + weight,
-            total.unlearnt + (weight if planes.unlearnt[surfel] else 0.0),
-            total.height + weight * height,
-            total.x + weight * normal[0],
-            total.y + weight * normal[1],
-            total.z + weight * normal[2],
-        )
-    return total
+    They are of weights, of those of what is not learnt, of heights over the planes, and of the
+    normals [6]. ``x``, ``y`` and ``z`` are the point's, from the corner of the surfel's voxel.
+    """
+    x -= surfels[row, 0]
+    y -= surfels[row, 1]
+    z -= surfels[row, 2]
+    near = np.float32(1) - (x * x + y * y + z * z) * np.float32(1 / _REACH**2)
+    if near > 0:
+        share = near * near * near * near
+        weight = share * surfels[row, 6]
+        sums[0] += weight
+        sums[1] += share * surfels[row, 7]
+        sums[2] += weight * (x * surfels[row, 3] + y * surfels[row, 4] + z * surfels[row, 5])
+        sums[3] += weight * surfels[row, 3]
+        sums[4] += weight * surfels[row, 4]
+        sums[5] += weight * surfels[row, 5]
 
 
 @inner_kernel(fastmath=True)
-def _sum_around(at: tuple[float, float, float], planes: RayPlanes) -> _Sum:
-    """Return the sum over the surfels around a point, in leaf coordinates."""
-    total = _Sum(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+def _add_around(at: tuple[float, float, float], planes: RayPlanes, sums: Floats) -> None:
+    """Add all surfels around a point in leaf coordinates, as :func:`_add`."""
     low_x, high_x = int(np.floor(at[0] - _REACH)), int(np.floor(at[0] + _REACH))
     low_y, high_y = int(np.floor(at[1] - _REACH)), int(np.floor(at[1] + _REACH))
     low_z, high_z = int(np.floor(at[2] - _REACH)), int(np.floor(at[2] + _REACH))
@@ -124,9 +88,8 @@ def _sum_around(at: tuple[float, float, float], planes: RayPlanes) -> _Sum:
         for j in range(low_y >> SHIFT, (high_y >> SHIFT) + 1):
             for k in range(low_z >> SHIFT, (high_z >> SHIFT) + 1):
                 block = find_row(planes.blocks, pack(i, j, k))
-                if block < 0 or planes.places[block] < 0:
+                if block < 0:
                     continue
-                columns = planes.columns[planes.places[block]]
                 corner = k << SHIFT
                 first, last = max(low_z - corner, 0), min(high_z - corner, LOW)
                 mask = (2 << last) - (1 << first)
@@ -134,11 +97,19 @@ def _sum_around(at: tuple[float, float, float], planes: RayPlanes) -> _Sum:
                     for y in range(max(low_y, j << SHIFT), min(high_y, (j << SHIFT) + LOW) + 1):
                         byte = byte_of(x, y)
                         bits = int(planes.surface[block, byte])
-                        if bits & mask:
-                            total = _with_column(
-                                total, at, x, y, corner, bits, columns[byte], bits & mask, planes
+                        chosen = bits & mask
+                        while chosen:
+                            bit = lowest_bit(chosen)
+                            chosen &= chosen - 1
+                            row = planes.columns[block, byte] + _BITS[bits & ((1 << bit) - 1)]
+                            _add(
+                                row,
+                                np.float32(at[0] - x),
+                                np.float32(at[1] - y),
+                                np.float32(at[2] - corner - bit),
+                                planes.surfels,
+                                sums,
                             )
-    return total
 
 
 @kernel(fastmath=True)
@@ -155,18 +126,19 @@ def put_planes(
         sdf: what the field says, which stays where it has learnt all that is near.
         gradients: the same of the gradients [N, 3]; [0, 3]: they are not asked for.
     """
+    sums = np.zeros(6, np.float32)
     for i in range(len(points)):
         at = (
             points[i, 0] / leaf_m + middle,
             points[i, 1] / leaf_m + middle,
             points[i, 2] / leaf_m + middle,
         )
-        total = _sum_around(at, planes)
-        if total.unlearnt == 0:
+        sums[:] = 0
+        _add_around(at, planes, sums)
+        if sums[1] == 0:
             continue
-        share = total.unlearnt / total.weights
-        sdf[i] += share * (total.height / total.weights * leaf_m - sdf[i])
+        share = sums[1] / sums[0]
+        sdf[i] += share * (sums[2] / sums[0] * leaf_m - sdf[i])
         if len(gradients):
-            gradients[i, 0] += share * (total.x / total.weights - gradients[i, 0])
-            gradients[i, 1] += share * (total.y / total.weights - gradients[i, 1])
-            gradients[i, 2] += share * (total.z / total.weights - gradients[i, 2])
+            for axis in range(3):
+                gradients[i, axis] += share * (sums[3 + axis] / sums[0] - gradients[i, axis])
