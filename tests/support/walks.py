@@ -1,6 +1,6 @@
 """Which files an operation passes through: a measure of how straight the ways in the code are.
 
-Run as ``python -m support.walks`` in the folder ``tests``. A real service and a real client run in
+Run as ``PYTHONPATH=tests:. python -m support.walks``. A real service and a real client run in
 this process. While an operation goes on, every function of the project that is called is recorded,
 in whatever thread; compiled code is followed by the names that its source uses.
 """

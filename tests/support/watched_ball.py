@@ -12,6 +12,17 @@ def digests(watch: MeshWatch | AsyncMeshWatch) -> dict[tuple[int, int, int], str
     return {index: tile.digest for index, tile in watch.tiles.items()}
 
 
+def agree(*watches: MeshWatch) -> bool:
+    """Let all catch up; return whether they hold the same bytes.
+
+    To fit a tile that one of them fetches, another may be made again, of which the first ones are
+    told when they ask next.
+    """
+    for watch in watches:
+        watch.catch_up(servers.WAIT_S)
+    return all(digests(watch) == digests(watches[0]) for watch in watches)
+
+
 def learn(client: Client, points: np.ndarray | None = None) -> None:
     """Have the server learn the ball, or other points, and settle."""
     for _ in range(3):

@@ -12,7 +12,7 @@ import pytest
 import triquad_client
 import zenoh
 from support import servers
-from support.watched_ball import SETTINGS, digests, half, learn
+from support.watched_ball import SETTINGS, agree, digests, half, learn
 from triquad_client import Client, InvalidInputError, RequestTimeoutError
 from triquad_format.wire import keys
 
@@ -64,12 +64,9 @@ def test_late_joiners_hold_the_same_bytes(client: Client, endpoint: str) -> None
             learn(client, half(-1))
             early.catch_up()
         client.settle(servers.WAIT_S)  # from then on all are of the same epoch
-        early.catch_up()
-        slow.catch_up(servers.WAIT_S)
         with triquad_client.connect(endpoint) as other, other.watch_mesh() as late:
-            late.catch_up()
+            servers.until(lambda: agree(early, slow, late))
             assert len(early.tiles) > 50
-            assert digests(late) == digests(early) == digests(slow)
             assert {i: t.version for i, t in late.tiles.items()} == {
                 i: t.version for i, t in early.tiles.items()
             }
@@ -170,9 +167,7 @@ def test_a_watch_that_waits_ends_when_something_comes(client: Client, endpoint: 
             learn(other, half(-1))
         assert all(future.result().changed for future in waiting)
     client.settle(servers.WAIT_S)  # from then on all are of the same epoch
-    for watch in watches:
-        watch.catch_up()
-    assert all(digests(watch) == digests(watches[0]) for watch in watches)
+    servers.until(lambda: agree(*watches))
 
 
 @pytest.mark.parametrize(
