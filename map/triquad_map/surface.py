@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
+from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Longs
 from triquad_format.records.region import MAX_LEVEL
 
@@ -57,6 +58,8 @@ are as good."""
 
 LEVELS = MAX_LEVEL + 1
 
+Rows = NDArray[np.intp]
+
 NEAR_M = 10.0
 """The range at which a ray counts half as much as at the sensor."""
 
@@ -89,6 +92,28 @@ class Surfels:
     normals: Floats  # [N, 3] unit vectors to free space; of points they mean little
     kinds: Bytes  # [N] SurfelKind
 
+    @classmethod
+    def none(cls, count: int) -> "Surfels":
+        """Return surfels of the kind ``NONE``."""
+        offsets, normals = np.zeros((2, count, 3), np.float32)
+        return cls(offsets, normals, np.full(count, SurfelKind.NONE, np.uint8))
+
+    @property
+    def are_unlearnt(self) -> Bools:
+        """[N] Whether rays alone show each: the field has still to learn it."""
+        unlearnt: Bools = self.kinds >= SurfelKind.RAY_DISC
+        return unlearnt
+
+    def take(self, rows: Rows, others: "Surfels") -> None:
+        """Put ``others`` [R] into ``rows`` [R]."""
+        self.offsets[rows] = others.offsets
+        self.normals[rows] = others.normals
+        self.kinds[rows] = others.kinds
+
+    def chosen(self, rows: Rows) -> "Surfels":
+        """Return copies of some surfels."""
+        return Surfels(self.offsets[rows], self.normals[rows], self.kinds[rows])
+
 
 @dataclass(frozen=True)
 class FieldSample:
@@ -111,8 +136,7 @@ ray ended there since the scan of that number."""
 
 def nothing_shown(voxels: Longs, _since: int = 0) -> Surfels:
     """Return no surfels, as of a map from a file: where in voxels rays ended is not known."""
-    offsets, normals = np.zeros((2, len(voxels), 3), np.float32)
-    return Surfels(offsets, normals, np.full(len(voxels), SurfelKind.NONE, np.uint8))
+    return Surfels.none(len(voxels))
 
 
 def fit_surfels(
@@ -128,8 +152,7 @@ def fit_surfels(
     is_noise = (kinds == SurfelKind.NONE) & (off < 0)
     is_off = (kinds == SurfelKind.POINT) | (np.abs(off) > _LEARNT)
     unlearnt = rows[is_off & ~is_noise]
-    for name, array in vars(surfels).items():
-        array[unlearnt] = getattr(shown, name)[unlearnt]
+    surfels.take(unlearnt, shown.chosen(unlearnt))
     return surfels
 
 

@@ -71,47 +71,54 @@ def test_a_server_that_waits_for_scans_is_healthy_as_long_as_it_hears_its_heartb
             thread.wake()  # as the heartbeat does, each second
 
 
-def test_a_thread_that_computes_for_long_is_healthy_until_that_is_absurd() -> None:
-    clock, begun, go_on = Clock(), Event(), Event()
+@contextmanager
+def at_work(thread: MapperThread, compute: Callable[[], None] = lambda: None) -> Iterator[None]:
+    """The thread has computed something, and does not come back before the context ends."""
+    begun, go_on = Event(), Event()
 
-    def compute(_: Mapper) -> None:
-        until_s = time.thread_time() + COMPUTED_S
-        while time.thread_time() < until_s:
-            pass
+    def work(_: Mapper) -> None:
+        compute()
         begun.set()
         assert go_on.wait(servers.WAIT_S)
 
-    with running(Mapper("test", settings(), "cpu"), clock) as (thread, health):
-        caller = Thread(target=thread.call, args=(compute,))
-        caller.start()
-        assert begun.wait(servers.WAIT_S)
+    caller = Thread(target=thread.call, args=(work,))
+    caller.start()
+    assert begun.wait(servers.WAIT_S)
+    yield
+    go_on.set()
+    caller.join()
+
+
+def compute_for_long() -> None:
+    """Take processor time."""
+    until_s = time.thread_time() + COMPUTED_S
+    while time.thread_time() < until_s:
+        pass
+
+
+def test_a_thread_that_computes_for_long_is_healthy_until_that_is_absurd() -> None:
+    clock = Clock()
+    with (
+        running(Mapper("test", settings(), "cpu"), clock) as (thread, health),
+        at_work(thread, compute_for_long),
+    ):
         clock.now_s += COMPUTED_S + STUCK_S / 2
         assert health.mapping_problem(stuck_s=STUCK_S / 2 + COMPUTED_S / 2) is None
         assert health.mapping_problem(stuck_s=STUCK_S / 2 - COMPUTED_S / 2) is not None
         clock.now_s += ENDLESS_S
         assert health.mapping_problem(stuck_s=2 * ENDLESS_S) is not None
-        go_on.set()
-        caller.join()
 
 
 def test_a_thread_that_comes_to_no_end_is_a_problem_until_it_does() -> None:
-    clock, begun, go_on = Clock(), Event(), Event()
-
-    def hang(_: Mapper) -> None:
-        begun.set()
-        assert go_on.wait(servers.WAIT_S)
-
+    clock = Clock()
     with running(Mapper("test", settings(), "cpu"), clock) as (thread, health):
-        caller = Thread(target=thread.call, args=(hang,))
-        caller.start()
-        assert begun.wait(servers.WAIT_S)
-        clock.now_s += STUCK_S - 1
-        assert health.mapping_problem() is None
-        clock.now_s += 2
-        problem = health.mapping_problem()
-        assert problem == f"mapping makes no progress: it is at commands since {STUCK_S + 1:.0f} s"
-        assert health.problem() == problem
-        go_on.set()
-        caller.join()
+        with at_work(thread):
+            clock.now_s += STUCK_S - 1
+            assert health.mapping_problem() is None
+            clock.now_s += 2
+            problem = health.mapping_problem()
+            told = f"mapping makes no progress: it is at commands since {STUCK_S + 1:.0f} s"
+            assert problem == told
+            assert health.problem() == problem
         thread.call(lambda mapper: mapper.settled)
         assert health.problem() is None

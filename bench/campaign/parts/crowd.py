@@ -28,13 +28,13 @@ def run(turn: Turn) -> None:
     """Let others come and go, round after round; an honest client comes after each."""
     with server_under_test(turn) as server:
         _use_honestly(server.endpoint)  # then all code that the others use is loaded
-        before = _beside_the_map(server.endpoint)
+        before = _outside_the_map(server.endpoint)
         while not turn.over:
             count = turn.random.randint(1, _MOST_AT_ONCE)
             _round(turn, server.endpoint, turn.random.choices(sorted(KINDS), k=count))
             expect_honest_service(server.endpoint, _HONEST_AT_M)
             turn.did("seconds", _ROUND_S)
-            expect_steady_memory(turn, before, _beside_the_map(server.endpoint))
+            expect_steady_memory(turn, before, _outside_the_map(server.endpoint))
 
 
 def _use_honestly(endpoint: str) -> None:
@@ -46,7 +46,7 @@ def _use_honestly(endpoint: str) -> None:
         client.query_segments(points[:50], points[50:], radius_m=0.3)
 
 
-def _beside_the_map(endpoint: str) -> int:
+def _outside_the_map(endpoint: str) -> int:
     """Return the memory of the server without the map, which the crowd's scans enlarge."""
     with triquad_client.connect(endpoint) as client:
         status = client.status()

@@ -41,9 +41,9 @@ class Exchange:
 
     def rows(self, field: str) -> int:
         """Return the rows of an array that stands next to the field, or around it."""
-        return len(self.beside(field))
+        return len(self.other(field))
 
-    def beside(self, field: str) -> Any:
+    def other(self, field: str) -> Any:
         """Return the value of a field that stands next to the one that is checked, or around it."""
         holder = next(message for message in self.around if field in message.forms())
         return getattr(holder, field)
@@ -174,7 +174,7 @@ def corner_above(field: str) -> Bound:
     """Bound the corner of a box to lie nowhere below another one; both may be infinite."""
 
     def problem(value: Any, exchange: Exchange) -> str | None:
-        low = exchange.beside(field)
+        low = exchange.other(field)
         return None if (low <= value).all() else f"not a box: from {low} to {value}"
 
     return Bound(problem)

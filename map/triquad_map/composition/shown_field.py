@@ -36,6 +36,7 @@ class ShownField:
     def evaluate_in_grid(self, axes: Floats, points: Longs) -> Floats:
         """Return distances [N] at points of a grid: :meth:`FrozenField.evaluate_in_grid`."""
         distances = self.trained.evaluate_in_grid(axes, points)
-        gradients = np.zeros((0, 3), np.float32)
-        self.surfels.put_planes(self.trained.settings, in_grid(axes, points), distances, gradients)
+        if not self.surfels.are_learnt:
+            places, gradients = in_grid(axes, points), np.zeros((0, 3), np.float32)
+            self.surfels.put_planes(self.trained.settings, places, distances, gradients)
         return distances

@@ -41,7 +41,7 @@ def ray_planes(evidence: FrozenEvidence, starts: Ints, surfels: Surfels) -> RayP
     block. A surfel counts by its support, and not at all where it is no plane.
     """
     kinds = surfels.kinds
-    unlearnt = kinds >= SurfelKind.RAY_DISC
+    unlearnt = surfels.are_unlearnt
     if not unlearnt.any():
         return None
     used = np.diff(starts) > 0

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
 from triquad_format.records.region import BLOCK_BYTES, surface_counts
@@ -16,6 +15,7 @@ from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.voxel_index import LOW, SHIFT, keys_of
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.surface import (
+    Rows,
     SampleField,
     ShownByRays,
     SurfelKind,
@@ -35,8 +35,6 @@ _NEVER = -1
 _FITTED_AT_ONCE = 32_768  # each takes half a kilobyte meanwhile
 
 _AROUND = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-
-Rows = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -176,6 +174,11 @@ class SurfelMap:
         """Improve ``nearest`` where a surfel lies nearer to ``points`` [N, 3] of the map frame."""
         improve_nearest(points, self._tree, self._shown, frame, nearest)
 
+    @property
+    def are_learnt(self) -> bool:
+        """Whether the field has learnt all of them: then :meth:`put_planes` changes nothing."""
+        return self._planes is None
+
     def put_planes(
         self, settings: FieldSettings, points: Floats, sdf: Floats, gradients: Floats
     ) -> None:
@@ -204,7 +207,7 @@ class SurfelMap:
         voxels = places.voxels()
         fitted = _carried(self._fitted, places, voxels)
         rows = _outdated(fitted, most)
-        _follow_rays(fitted.surfels, voxels, by_rays, since)
+        _follow_rays(fitted.surfels, voxels, rows, by_rays, since)
         return _fitted_again(
             evidence, fitted, voxels, rows, field=field, by_rays=by_rays, epoch=epoch
         )
@@ -221,16 +224,14 @@ def first_surfels(
 
 def _nothing_in(places: SurfelPlaces) -> _Fitted:
     count = int(places.starts[-1])
-    offsets, normals = np.zeros((2, count, 3), np.float32)
-    surfels = Surfels(offsets, normals, np.zeros(count, np.uint8))
-    return _Fitted(places, surfels, np.full(count, _NEVER, np.int64))
+    return _Fitted(places, Surfels.none(count), np.full(count, _NEVER, np.int64))
 
 
 def _carried(before: _Fitted, places: SurfelPlaces, voxels: Longs) -> _Fitted:
     """Return copies of surfels in later ``places``, which are of ``voxels`` [S, 3]."""
     if places is before.places:
-        copies = {name: array.copy() for name, array in vars(before.surfels).items()}
-        return _Fitted(places, Surfels(**copies), before.epochs.copy())
+        every = np.arange(len(before.epochs))
+        return _Fitted(places, before.surfels.chosen(every), before.epochs.copy())
     after = _nothing_in(places)
     carried = carry(before.rows, after.rows)
     if not carried.all():
@@ -246,13 +247,16 @@ def _beside(surfels: Surfels, voxels: Longs, gone: Longs) -> Rows:
     return rows[np.isin(keys_of(voxels[rows]), keys_of(around))]
 
 
-def _follow_rays(surfels: Surfels, voxels: Longs, by_rays: ShownByRays, since: int) -> None:
-    """Let those that rays alone show be what they show now, where any ended ``since`` a scan."""
-    rows = np.flatnonzero(surfels.kinds >= SurfelKind.RAY_DISC)
+def _follow_rays(
+    surfels: Surfels, voxels: Longs, fitted: Rows, by_rays: ShownByRays, since: int
+) -> None:
+    """Let those that rays alone show follow what ended ``since`` a scan, unless they are fitted."""
+    followed = surfels.are_unlearnt
+    followed[fitted] = False
+    rows = np.flatnonzero(followed)
     shown = by_rays(voxels[rows], since)
-    known = shown.kinds != SurfelKind.NONE
-    for name, array in vars(surfels).items():
-        array[rows[known]] = getattr(shown, name)[known]
+    known = np.flatnonzero(shown.kinds != SurfelKind.NONE)
+    surfels.take(rows[known], shown.chosen(known))
 
 
 def _outdated(fitted: _Fitted, most: int | None) -> Rows:
@@ -264,7 +268,7 @@ def _outdated(fitted: _Fitted, most: int | None) -> Rows:
     if most is None:
         return np.arange(len(fitted.epochs))
     never = fitted.epochs == _NEVER
-    unlearnt = ~never & (fitted.surfels.kinds >= SurfelKind.RAY_DISC)
+    unlearnt = ~never & fitted.surfels.are_unlearnt
     groups = [_oldest(fitted, group, most) for group in (unlearnt, ~never & ~unlearnt)]
     return np.concatenate([np.flatnonzero(never), *groups])
 
@@ -290,8 +294,6 @@ def _fitted_again(
     """Fit the surfels in some rows, of all ``voxels`` [S, 3]; changes ``fitted``."""
     for first in range(0, len(rows), _FITTED_AT_ONCE):
         part = rows[first : first + _FITTED_AT_ONCE]
-        new = fit_surfels(voxels[part], field, evidence.ended_in, by_rays)
-        for name, array in vars(new).items():
-            getattr(fitted.surfels, name)[part] = array
+        fitted.surfels.take(part, fit_surfels(voxels[part], field, evidence.ended_in, by_rays))
     fitted.epochs[rows] = epoch
     return SurfelMap(evidence, fitted, voxels)
