@@ -107,9 +107,10 @@ class _SyntheticMap:
         self._mapper.publish()
 
     def questions(self) -> None:
-        """Query the restored map for distances."""
+        """Query the map while it learns, and the restored one for distances."""
         epoch = self._restored.publish()
         points = self._directions * self._radius_m
+        self._mapper.publish().query(points, gradient=True)
         epoch.query(points, gradient=True)
         distances(epoch, points, DistanceOptions(unknown_distance=True))
 

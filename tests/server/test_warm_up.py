@@ -1,4 +1,4 @@
-"""Compiled code that cannot be used is compiled again before the server is ready."""
+"""All code is compiled before the server is ready, again where it cannot be used."""
 
 import subprocess
 import sys
@@ -53,3 +53,41 @@ def test_compiled_code_that_is_damaged_is_compiled_again(tmp_path, step, suffix,
     assert process.stdout.split() == ["42", "0"]
     assert "may be damaged" in process.stderr
     assert step().stdout.split() == ["42", "1"]
+
+
+_FIRST_DRIVE = """
+import numpy as np
+from triquad_map.compiled import kernel
+from triquad_map.questions.distance import DistanceOptions, distances
+from triquad_server.mapping.mapper import Mapper
+from triquad_server.mesh.tile_cache import TileCache
+from triquad_server.process.threads import Teams
+from triquad_server.settings import Settings
+from triquad_server.warm_up import warm_up
+
+def ready():
+    return {jit.__name__ for jit in kernel._kernels if jit.signatures}
+
+warm_up(Settings(), "cpu")
+before, teams = ready(), Teams()
+mapper = Mapper("test", Settings(), "cpu", teams=teams)
+angles = np.linspace(0, 2 * np.pi, 5000)
+points = np.stack([8 * np.cos(angles), 8 * np.sin(angles), np.sin(40 * angles)], axis=1)
+for steps in (0, 3):
+    mapper.ingest(points.astype(np.float32), np.eye(4))
+    for _ in range(steps):
+        mapper.train()
+    epoch = mapper.publish()
+    epoch.query(points, gradient=True)
+    distances(epoch, points, DistanceOptions(unknown_distance=True))
+    cache = TileCache(Settings().mesh, teams.meshing)
+    cache.refresh(epoch)
+    cache.make(0, (0, 0, 0))
+print(*sorted(ready() - before))
+"""
+
+
+def test_the_first_questions_wait_for_no_compiler():
+    command = [sys.executable, "-c", _FIRST_DRIVE]
+    process = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
+    assert process.stdout.split() == []
