@@ -1,6 +1,6 @@
 """What a map believes where things came and went, where it rains, and of what stands.
 
-A voxel of a thing counts once rays of some later scans passed it: within ``_PASSED_M`` of the
+A voxel of a thing counts once rays of some later scans passed it: within ``_PASSED`` voxels of the
 middle of the hits in it, and on beyond. So what no ray shows any more is nobody's fault.
 """
 
@@ -33,7 +33,7 @@ from bench.scenes.known_episodes import held_episodes, tuned_episodes
 
 _EMPTY_SCANS = 110  # of each place, once the things have left
 PASSES = (3, 10, 30, 100)  # scans whose rays pass, after which a voxel is looked at
-_PASSED_M = 0.06
+_PASSED = 0.3  # voxels: 6 cm where they are 0.2 m wide
 _BEYOND_M = 0.5  # that such a ray goes on
 _CLEAR_M = 0.35  # a voxel of a thing counts where nothing that stands is nearer
 _LANE_AFTER = 10  # scans of the empty place after which its lane is looked at
@@ -143,9 +143,10 @@ def follow(episode: Episode) -> Seen:
 class _Trail:
     """The voxels that a thing alone has left."""
 
-    def __init__(self, name: str, centres: Doubles, middles: Doubles) -> None:
+    def __init__(self, name: str, centres: Doubles, middles: Doubles, voxel_m: float) -> None:
         """Begin with voxels of ``centres`` [N, 3], hit about ``middles`` [N, 3]; none is passed."""
         self.name = name
+        self._within_m = _PASSED * voxel_m
         self.left: dict[int, tuple[int, int]] = {}
         self._centres, self._middles = centres, middles
         self._passes = np.zeros(len(centres), np.int64)
@@ -154,9 +155,8 @@ class _Trail:
     def passed_by(self, scan: EpisodeScan) -> bool:
         """Count a scan; return whether any voxel is to be looked at after it."""
         origin = scan.world_from_sensor[:3, 3]
-        passed = _passed(
-            self._middles - origin, moved(scan.points, scan.world_from_sensor) - origin
-        )
+        ends = moved(scan.points, scan.world_from_sensor) - origin
+        passed = _passed(self._middles - origin, ends, self._within_m)
         self._passes[passed] += 1
         self._due = passed & np.isin(self._passes, PASSES)
         return bool(self._due.any())
@@ -173,14 +173,13 @@ class _Trail:
             self.left[passes] = (before + int(surface), count + 1)
 
 
-def _passed(middles: Doubles, ends: Doubles) -> Bools:
+def _passed(middles: Doubles, ends: Doubles, within_m: float) -> Bools:
     """Return which places [N, 3] rays to ``ends`` [M, 3] pass; both are seen from the sensor."""
     ranges = np.linalg.norm(ends, axis=1)
     distances = np.linalg.norm(middles, axis=1)
     tree = cKDTree(ends / ranges[:, None])
-    near = tree.query_ball_point(
-        middles / distances[:, None], _PASSED_M / np.maximum(distances, _PASSED_M)
-    )
+    angles = within_m / np.maximum(distances, within_m)
+    near = tree.query_ball_point(middles / distances[:, None], angles)
     farthest = np.array([ranges[rays].max(initial=0.0) for rays in near])
     return np.asarray(farthest > distances + _BEYOND_M)
 
@@ -220,7 +219,7 @@ class _Record:
                 centres = voxel_centres(keys, voxel_m)
                 keys = keys[self._episode.standing.scene.sdf(centres) > _CLEAR_M]
                 middles = _middles(keys, np.concatenate(self._hits[number]), voxel_m)
-                found.append(_Trail(name, voxel_centres(keys, voxel_m), middles))
+                found.append(_Trail(name, voxel_centres(keys, voxel_m), middles, voxel_m))
         return found
 
     def kept(self, believed: Believed) -> dict[str, float]:

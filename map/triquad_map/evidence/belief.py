@@ -1,15 +1,16 @@
 """The belief in the surface of a voxel: which appears once rays end there, and goes once they pass.
 
-The logarithm of the odds that nothing is there is the sum of what hits say, what rays that crossed
-without ending say, and what the voxels around say:
+The logarithm of the odds that nothing is there is the sum of what the record of hits and misses
+says, what rays that crossed since the last hit say, and what the voxels around say:
 
-- Hits: ``max(vacant - stray * (hits + company), leaves)``. Nearly all space is vacant, and a return
-  where nothing is may happen, but hardly again in the same voxel, nor with others of the scan near
-  by: these count as one hit more. However often a surface was seen, it may have left since.
-- Misses in a row since the last hit: how improbable they are while the surface is there. A voxel's
-  own record of hits and misses gives a beta distribution of the chance that a ray ends in it; its
-  prediction of as many misses is a ratio of gamma functions. So a fence, hit and missed by turns,
-  is a fence.
+- Hits: ``vacant - stray * (hits + company)``. Nearly all space is vacant, and a return where
+  nothing is may happen, but hardly again in the same voxel, nor with others of the scan that tell
+  of a surface: these count as one hit more. How improbable the record of hits and misses would be
+  of a surface is added: what rays meet now and then may be drops. However often a surface was seen,
+  it may have left since: the sum is at least ``leaves``.
+- Misses in a row since the last hit: how improbable they are while the surface is there. The chance
+  that a ray ends in a voxel has a beta distribution, by Jeffreys' prior and the voxel's own record;
+  probabilities are ratios of beta functions. So a fence, hit and missed by turns, is a fence.
 - Around: a share of what two scans or more miss in the voxels around since this one was hit last,
   less as much for each that was hit since then. Things come and go as a whole.
 
@@ -25,6 +26,7 @@ from triquad_format.records.arrays import Bools, Ints, Longs
 from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.voxel_index import LOW, SHIFT, bit_of
 from triquad_map.evidence.observed import (
+    SAME_SURFACE,
     Observed,
     ObservedVoxel,
     Voxel,
@@ -37,10 +39,7 @@ from triquad_map.evidence.seen_voxels import SeenVoxels
 
 _REACH = 2  # voxels around one that may belong together with it
 
-_PRIOR_HITS, _PRIOR_MISSES = 1.5, 0.5  # scans: a ray that crosses a surface ends there, as a rule
-
-_SAME_SURFACE = 0.35
-"""Standard deviation of the height of a surface over the plane of one beside it, in voxels."""
+_PRIOR = 0.5  # hits and misses, scans: Jeffreys' prior of a chance
 
 
 class Belief(NamedTuple):
@@ -49,8 +48,7 @@ class Belief(NamedTuple):
     vacant: float = 5.0  # that nothing is in a voxel of which nothing was seen
     stray: float = 4.0  # how much less for each hit: one return in 50 is where nothing is
     leaves: float = -7.0  # that a surface has left, however often it was seen
-    around: float = 0.3  # share of what each voxel around says
-    most: float = 5.0  # that a voxel around says, and that all together say for the surface
+    around: float = 0.3  # share of what each voxel around says, at most `vacant`
 
 
 class Changes(NamedTuple):
@@ -84,12 +82,23 @@ def have_surface(rows: Ints, seen: SeenVoxels, observed: Observed) -> Bools:
 
 
 @inner_kernel()
+def _log_beta(hits: float, misses: float) -> float:
+    """Return the logarithm of the beta function at what was seen, with the prior."""
+    a, b = hits + _PRIOR, misses + _PRIOR
+    return math.lgamma(a) + math.lgamma(b) - math.lgamma(a + b)
+
+
+@inner_kernel()
+def _recorded(voxel: ObservedVoxel) -> float:
+    """Return how improbable a record of hits and misses is: minus the logarithm."""
+    return _log_beta(0.0, 0.0) - _log_beta(voxel.hits, voxel.earlier_misses)
+
+
+@inner_kernel()
 def _missed(voxel: ObservedVoxel) -> float:
-    """Return how improbable the misses since the last hit are: minus the logarithm."""
-    a, b = voxel.hits + _PRIOR_HITS, voxel.earlier_misses + _PRIOR_MISSES
-    missed = math.lgamma(b + voxel.misses) - math.lgamma(b)
-    missed += math.lgamma(a + b) - math.lgamma(a + b + voxel.misses)
-    return -missed
+    """Return how improbable the misses since the last hit are, after the record."""
+    all_misses = voxel.earlier_misses + voxel.misses
+    return _log_beta(voxel.hits, voxel.earlier_misses) - _log_beta(voxel.hits, all_misses)
 
 
 @inner_kernel()
@@ -107,14 +116,17 @@ def _coupling(row: int, other: int, seen: SeenVoxels, observed: Observed) -> flo
         height = dx * one.normal[0] + dy * one.normal[1] + dz * one.normal[2]
     else:
         height = 0.5 * np.sqrt(dx * dx + dy * dy + dz * dz)
-    return float(np.exp(-0.5 * (height / _SAME_SURFACE) ** 2))
+    return float(np.exp(-0.5 * (height / SAME_SURFACE) ** 2))
 
 
 @inner_kernel()
 def _own_odds(voxel: ObservedVoxel, belief: Belief) -> float:
     """Return the logarithm of the odds that a voxel has no surface, by its own record."""
-    hits = voxel.hits + (1.0 if voxel.company or is_flat(voxel) else 0.0)
-    return float(max(belief.vacant - belief.stray * hits, belief.leaves) + _missed(voxel))
+    hits = float(voxel.hits)
+    if voxel.company or is_flat(voxel):
+        hits = max(hits, 1.0) + 1.0  # a whole one, even if other rays of its scan passed
+    recorded = belief.vacant - belief.stray * hits + _recorded(voxel)
+    return float(max(recorded, belief.leaves) + _missed(voxel))
 
 
 @inner_kernel()
@@ -135,13 +147,13 @@ def _odds(row: int, near: Ints, seen: SeenVoxels, observed: Observed, belief: Be
             if one.missed_since == one.passed_scan:
                 continue  # a single scan may have a wrong pose: it is one witness for all it misses
             is_gone = not _has_surface(np.int64(other), seen, observed)
-            says = belief.most if is_gone else min(_missed(one), belief.most)
+            says = belief.vacant if is_gone else min(_missed(one), belief.vacant)
         elif one.misses == 0 and one.ends > 0 and one.hit_scan >= since:
-            says = -belief.most
+            says = -belief.vacant
         else:
             continue
         around += belief.around * _coupling(row, np.int64(other), seen, observed) * says
-    return float(_own_odds(voxel, belief) + max(around, -belief.most))
+    return float(_own_odds(voxel, belief) + max(around, -belief.vacant))
 
 
 @inner_kernel()
@@ -202,7 +214,7 @@ def believe(
     waiting = [np.int64(0) for _ in range(0)]
     for row in passed:
         # Those that are hardly missed go only after one near by.
-        if _own_odds(observed.voxels[row], belief) > -belief.most:
+        if _own_odds(observed.voxels[row], belief) > -belief.vacant:
             waiting.append(np.int64(row))
     _go(waiting, seen, observed, belief, gone)
     _appear(hit, seen, observed, belief, come)

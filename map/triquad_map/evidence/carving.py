@@ -22,6 +22,7 @@ from triquad_map.compiled.voxel_index import (
     make_row,
 )
 from triquad_map.evidence.observed import (
+    SAME_SURFACE,
     Observed,
     ObservedVoxel,
     Vector,
@@ -36,10 +37,6 @@ _LEAST_SPREAD = 0.05
 
 _PRIOR_SPREAD, _PRIOR_ENDS = 0.15, 2.0
 """The same before any end, in all directions, and as much as how many ends it weighs."""
-
-_SAME_SURFACE, _SAME_SLOPE = 0.2, 0.03
-"""Standard deviations of the height, in voxels, and of the slope, of where a ray would end on the
-same plane farther on."""
 
 
 class Passing(NamedTuple):
@@ -82,11 +79,9 @@ def _crosses(ray: Passing, corner: Voxel, voxel: ObservedVoxel) -> float:
     square = (u * u * vv - 2 * u * v * uv + v * v * uu) / (uu * vv - uv * uv)
     chance = np.exp(-0.5 * square)
     if is_flat(voxel):
-        rest = ray.length - along
         facing = way[0] * normal[0] + way[1] * normal[1] + way[2] * normal[2]
         height = to_x * normal[0] + to_y * normal[1] + to_z * normal[2] - ray.length * facing
-        variance = _SAME_SURFACE**2 + (_SAME_SLOPE * rest) ** 2
-        ends_on_it = np.exp(-0.5 * height * height / variance)
+        ends_on_it = np.exp(-0.5 * (height / SAME_SURFACE) ** 2)
         crossing = _crosses_plane(ray, voxel, (to_x, to_y, to_z), facing, share, prior)
         # Only a surface that extends along the ray can be met farther on.
         extends = share * _across(spread, way, way) * 12 + (1 - share)

@@ -1,12 +1,16 @@
-"""Which returns of a scan have others beside them: a surface gives several, a drop of rain one.
+"""Which returns of a scan have company: others of the scan tell that there is a surface.
 
-What is beside a return is told by the spacing of the scan's rays, so that a far wall, whose returns
-lie metres apart, is as much a wall as a near one (as in Charron et al., De-noising of lidar point
-clouds corrupted by snowfall, CRV 2018). The spacing is the scan's own: no sensor has to be known.
+A return has company if two others on neighbouring rays end at its range, or if it ends no nearer
+than most of them do: a drop of rain or a grain of dust hangs before what its neighbours meet. Rays
+are neighbours by their spacing, so that a far wall, whose returns lie metres apart, is as much a
+wall as a near one (as in Charron et al., De-noising of lidar point clouds corrupted by snowfall,
+CRV 2018). The spacing is the scan's own: no sensor has to be known.
 """
 
+from typing import NamedTuple
+
 import numpy as np
-from triquad_format.records.arrays import Bools, Doubles, Ints
+from triquad_format.records.arrays import Bools, Doubles, Ints, Longs
 
 from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.voxel_index import (
@@ -19,77 +23,111 @@ from triquad_map.compiled.voxel_index import (
     pack,
 )
 
-_SPACINGS = 3.0  # of the rays, within which others count
-_NEAREST = 1.0  # voxel, within which they count however dense the rays
+_SPACINGS = 3.0  # of the rays, within which they are neighbours
+_SAME_RANGE = 1.0  # voxel, by which the ranges of returns on one surface may differ
 _OTHERS = 2  # that a return on a surface has; of drops, two may be near each other
+_SHARE = 0.4  # of its neighbours, half of which end no farther than a return on smooth ground
+_MOST_COMPARED = 256  # rays with one: where they are spread evenly, some 100 are near enough
 _PATCH = 0.25  # radians: the sensor's field of view is counted in patches of this side
 
 
-def have_company(rays: Doubles) -> Bools:
-    """Return which ends of ``rays`` [N, 3], voxels from the sensor, have others beside them."""
-    reach = _SPACINGS * _spacing(rays, empty_keys(len(rays)))
-    cells = VoxelIndex(max(16, len(rays)))
-    return _have_company(rays, reach, cells.arrays, *np.empty((3, len(rays)), np.int32))
+class _Rays(NamedTuple):
+    """The rays of a scan, and lists of those whose directions lie in one cell."""
+
+    directions: Doubles  # [N, 3] unit vectors
+    ranges: Doubles  # [N] voxels
+    reach: float  # radians, within which rays are neighbours: the side of a cell
+    cells: Index
+    last: Ints  # [cells] the last ray of each
+    before: Ints  # [N] the one before each ray in its cell; -1: none
+
+
+def have_company(rays: Doubles, chosen: Longs) -> Bools:
+    """Return which of the ``chosen`` [M] rays have company.
+
+    Args:
+        rays: ends [N, 3] of all rays of a scan, voxels from the sensor.
+        chosen: numbers of those that are asked about.
+    """
+    directions, ranges = _directions(rays)
+    reach = _SPACINGS * _spacing(directions, empty_keys(len(rays)))
+    cells = VoxelIndex(max(16, len(rays))).arrays
+    last, before = np.empty((2, len(rays)), np.int32)
+    return _have_company(_Rays(directions, ranges, reach, cells, last, before), chosen)
 
 
 @kernel()
-def _spacing(rays: Doubles, patches: np.ndarray) -> float:
+def _directions(rays: Doubles) -> tuple[Doubles, Doubles]:
+    """Return unit vectors [N, 3] and lengths [N] of rays."""
+    directions, ranges = np.empty(rays.shape), np.empty(len(rays))
+    for i, (x, y, z) in enumerate(rays):
+        ranges[i] = np.sqrt(x * x + y * y + z * z)
+        for axis in range(3):
+            directions[i, axis] = rays[i, axis] / max(ranges[i], 1e-9)
+    return directions, ranges
+
+
+@kernel()
+def _spacing(directions: Doubles, patches: np.ndarray) -> float:
     """Return the angle, radians, between neighbouring rays, were they spread evenly."""
     count = 0
-    for x, y, z in rays:
-        length = max(np.sqrt(x * x + y * y + z * z), 1e-9)
-        count += enter(patches, x / length, y / length, z / length, _PATCH)
+    for x, y, z in directions:
+        count += enter(patches, x, y, z, _PATCH)
     # A sphere crosses 1.5 cubes of a lattice for each square of their side that it has.
-    return float(np.sqrt(count * _PATCH**2 / 1.5 / max(len(rays), 1)))
+    return float(np.sqrt(count * _PATCH**2 / 1.5 / max(len(directions), 1)))
 
 
 @inner_kernel()
-def _cell(ray: Doubles, reach: float) -> tuple[int, int, int]:
-    """Return the cell of a ray's end: by direction, and by place near the sensor.
+def _cell(i: int, rays: _Rays) -> tuple[int, int, int]:
+    """Return the cell of a ray's direction; its neighbours lie there or in those next to it."""
+    x, y, z = rays.directions[i]
+    return (
+        int(np.floor(x / rays.reach)),
+        int(np.floor(y / rays.reach)),
+        int(np.floor(z / rays.reach)),
+    )
 
-    All that is beside it lies in this cell and those next to it.
-    """
-    x, y, z = ray
-    length = max(np.sqrt(x * x + y * y + z * z), _NEAREST / reach)
-    side = reach * length
-    return int(np.floor(x / side)), int(np.floor(y / side)), int(np.floor(z / side))
+
+@inner_kernel()
+def _are_neighbours(i: int, j: int, rays: _Rays) -> bool:
+    """Return whether two rays are neighbours."""
+    one, other = rays.directions[i], rays.directions[j]
+    x, y, z = one[0] - other[0], one[1] - other[1], one[2] - other[2]
+    return bool(x * x + y * y + z * z <= rays.reach * rays.reach)
 
 
 @kernel()
-def _have_company(
-    rays: Doubles, reach: float, cells: Index, own: Ints, last: Ints, before: Ints
-) -> Bools:
-    """Count the others of each ray, first in its ``own`` [N] cell, where most have enough.
-
-    ``last`` [N] of each cell and those ``before`` [N] each make its list.
-    """
+def _have_company(rays: _Rays, chosen: Longs) -> Bools:
     used = 0
-    for i, ray in enumerate(rays):
-        x, y, z = _cell(ray, reach)
-        row = make_row(cells, used, pack(x, y, z))
-        before[i] = last[row] if row < used else -1
-        own[i], last[row] = row, i
+    for i in range(len(rays.ranges)):
+        x, y, z = _cell(i, rays)
+        row = make_row(rays.cells, used, pack(x, y, z))
+        rays.before[i] = rays.last[row] if row < used else -1
+        rays.last[row] = i
         used = max(used, row + 1)
-    found = np.zeros(len(rays), np.bool_)
-    for i, ray in enumerate(rays):
-        square = max(reach**2 * (ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2), _NEAREST**2)
-        others = _count(rays, i, square, last[own[i]], before, -1)  # itself is none
-        x, y, z = _cell(ray, reach)
-        for k in range(27):
-            if others >= _OTHERS:
-                break
-            row = find_row(cells, pack(x + k // 9 - 1, y + k // 3 % 3 - 1, z + k % 3 - 1))
-            if row >= 0 and row != own[i]:
-                others = _count(rays, i, square, last[row], before, others)
-        found[i] = others >= _OTHERS
+    found = np.zeros(len(chosen), np.bool_)
+    for n, i in enumerate(chosen):
+        found[n] = _has_company(i, rays)
     return found
 
 
 @inner_kernel()
-def _count(rays: Doubles, i: int, square: float, j: int, before: Ints, others: int) -> int:
-    """Add those of a list, which begins with ray ``j``, to the others beside ray ``i``."""
-    while j >= 0 and others < _OTHERS:
-        a, b, c = rays[i, 0] - rays[j, 0], rays[i, 1] - rays[j, 1], rays[i, 2] - rays[j, 2]
-        others += a * a + b * b + c * c <= square
-        j = before[j]
-    return others
+def _has_company(i: int, rays: _Rays) -> bool:
+    """Return whether two neighbours end at a ray's range, or a good part of them no farther."""
+    x, y, z = _cell(i, rays)
+    compared, count, same, no_farther = 0, 0, 0, 0
+    for k in range(27):
+        n = (k + 13) % 27  # its own cell comes first: there, most have enough
+        row = find_row(rays.cells, pack(x + n // 9 - 1, y + n // 3 % 3 - 1, z + n % 3 - 1))
+        j = rays.last[row] if row >= 0 else -1
+        while j >= 0 and compared < _MOST_COMPARED:
+            compared += 1
+            if j != i and _are_neighbours(i, np.int64(j), rays):
+                farther = rays.ranges[j] - rays.ranges[i]
+                count += 1
+                no_farther += farther <= _SAME_RANGE
+                same += abs(farther) <= _SAME_RANGE
+                if same >= _OTHERS:
+                    return True
+            j = rays.before[j]
+    return no_farther >= _OTHERS and no_farther >= _SHARE * count

@@ -75,14 +75,16 @@ class LiveEvidence:
         """
         self._frozen = None
         rows = np.empty(len(voxels), np.int32)
-        company = have_company(voxels - sighting.origin)
         done = 0
         while done < len(voxels):
             done, self._blocks.count = self._observations.record(
-                voxels, company, done, self._seen, self._blocks.count, sighting, rows
+                voxels, done, self._seen, self._blocks.count, sighting, rows
             )
             if self._blocks.count == self._blocks.capacity:
                 self._make_room(more=True)
+        company = self._observations.arrays.voxels["company"]
+        alone = np.flatnonzero(~company[rows] & (rows > 0))
+        company[rows[alone[have_company(voxels - sighting.origin, alone)]]] = True
         return rows
 
     def believe(self, hit: Ints, passed: Ints, belief: Belief) -> Changes:

@@ -7,7 +7,7 @@ passed. So has a voxel of which nothing is known.
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.records.arrays import Bools, Bytes, Doubles, Ints, Longs
+from triquad_format.records.arrays import Bytes, Doubles, Ints, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.region import (
     BLOCK_BYTES,
@@ -105,21 +105,20 @@ class Observations:
     def record(
         self,
         voxels: Doubles,
-        company: Bools,
         done: int,
         seen: SeenVoxels,
         blocks: int,
         sighting: Sighting,
         found: Ints,
     ) -> tuple[int, int]:
-        """Count rays that ended at ``voxels`` [N, 3], some in ``company`` [N], some ``done``.
+        """Count rays that ended at ``voxels`` [N, 3], some of which are ``done``.
 
         The row of each ray's voxel goes to ``found`` [N]; 0 outside the region. Returns (rays done,
         blocks in use); where ``seen`` has no more room, not all are done.
         """
         arrays = self.arrays
         done, blocks, self._places, self._rows = record_ends(
-            voxels, company, done, seen, blocks, sighting, arrays, self._places, self._rows, found
+            voxels, done, seen, blocks, sighting, arrays, self._places, self._rows, found
         )
         self._grow()
         return done, blocks

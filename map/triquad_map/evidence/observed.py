@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.records.arrays import Bools, Bytes, Doubles, Ints, Longs
+from triquad_format.records.arrays import Bytes, Doubles, Ints, Longs
 
 from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.voxel_index import (
@@ -32,7 +32,7 @@ OBSERVED_VOXEL = np.dtype(
         ("lowest", np.uint8, 3),  # eighths of the voxel in which any of its rays ended, and
         ("highest", np.uint8, 3),  # the last of these, on each axis
         ("scans", np.uint8),  # of which rays ended on the surface that is there now, to MOST_SCANS
-        ("company", np.bool_),  # a ray of a scan ended there, and others near by
+        ("company", np.bool_),  # others of its scan told that a ray ended on a surface there
         ("towards", np.float32, 3),  # from the last end to the sensor, voxels
         ("spread", np.float32, 6),  # covariance of the ends, voxels: xx, xy, xz, yy, yz, zz
         ("ends", np.float32),  # rays that ended on the surface that is there now, up to a limit
@@ -53,6 +53,9 @@ OBSERVED_VOXEL = np.dtype(
 
 EIGHTHS = 8
 MOST_SCANS = 255
+
+SAME_SURFACE = 0.35
+"""Standard deviation, in voxels, of the height of a surface farther on over its plane here."""
 
 MOST_SEEN = np.float32(10)
 """Scans' worth of rays that a record counts: what was seen longer is no surer."""
@@ -231,7 +234,6 @@ def _add_end(voxel: ObservedVoxel, end: Vector) -> None:
 @kernel()
 def record_ends(
     voxels: Doubles,
-    company: Bools,
     start: int,
     seen: SeenVoxels,
     blocks: int,
@@ -241,7 +243,7 @@ def record_ends(
     rows: int,
     found: Ints,
 ) -> tuple[int, int, int, int]:
-    """Count rays that ended at ``voxels`` [N, 3], some of them in ``company`` [N].
+    """Count rays that ended at ``voxels`` [N, 3].
 
     The row of each ray's voxel goes to ``found`` [N]; 0 outside the region. Returns (points done,
     blocks, places, rows in use); where there is no more room, not all points are done.
@@ -279,6 +281,5 @@ def record_ends(
         known = observed.voxels[row]
         _add_ray(known, end, sighting)
         _begin_hit(known, sighting.scan)
-        known.company |= company[i]
         _add_end(known, (end[0] - x, end[1] - y, end[2] - z))
     return len(voxels), blocks, places, rows
