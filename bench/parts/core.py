@@ -76,7 +76,7 @@ def seen_points(epoch: Epoch, made: DrivenStreet, rng: np.random.Generator) -> D
 def _training(region: LiveRegion) -> list[Figure]:
     learning = region.training
     trainer = TensorTrainer(region.field)
-    rates = Rates(_RATE, young_rate=_RATE)
+    rates = Rates(_RATE)
     rng = np.random.default_rng(0)
 
     def baseline() -> None:

@@ -91,8 +91,6 @@ class Rates(NamedTuple):
     """The rates at which values and moments follow the gradients."""
 
     learning_rate: float
-    young_rate: float
-    """The learning rate of rows that took few steps yet; at least that of the others."""
     mean_decay: float = 0.9  # beta1 of Adam, in [0, 1), as is the next
     variance_decay: float = 0.99  # beta2
 
@@ -100,9 +98,7 @@ class Rates(NamedTuple):
         """Return learning rates, shaped as ``ages``, of rows that took that many steps: one at
         least.
         """
-        shares = (_SOFT_STEPS / ages).clip(_HARDEST, 1)
-        young = (_YOUNG_STEPS / ages).clip(0, 1) ** 2
-        return self.learning_rate * shares + (self.young_rate - self.learning_rate) * young
+        return self.learning_rate * (_SOFT_STEPS / ages).clip(_HARDEST, 1)
 
 
 _SOFT_STEPS, _HARDEST = 800, 0.1
@@ -110,10 +106,6 @@ _SOFT_STEPS, _HARDEST = 800, 0.1
 of it), and the least share of the rate. So learnt values move little where others are trained."""
 
 LAST_AGE = int(_SOFT_STEPS / _HARDEST)  # from here on, no rate falls any more
-
-_YOUNG_STEPS = 200
-"""The steps for which a row learns at the rate of young ones; after n times as many, what is above
-the others' rate is down to ``1 / n**2`` of it."""
 
 _MLP_SOFT_STEPS, _MLP_HARDEST = 300, 0.02
 """The same of the MLP, which applies in addition to the above: all places of a region share it."""

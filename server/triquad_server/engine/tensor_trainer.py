@@ -71,9 +71,7 @@ class TensorTrainer:
     def _step_mlp(self, mlp: tuple[Tensor, ...], rates: Rates) -> None:
         first_row = torch.zeros(1, dtype=torch.int64, device=self._tensor_field.device)
         share = self._field.next_mlp_share()
-        mlp_rates = rates._replace(
-            learning_rate=share * rates.learning_rate, young_rate=share * rates.young_rate
-        )
+        mlp_rates = rates._replace(learning_rate=share * rates.learning_rate)
         for parameter, weight in zip(self._field.mlp, mlp, strict=True):
             assert weight.grad is not None
             tensors = ParameterTensors.of(parameter)

@@ -26,7 +26,7 @@ from triquad_server.engine.tensor_trainer import (
 from triquad_server.process.threads import Teams
 
 ARRAYS = ArrayMemory()
-RATES = Rates(learning_rate=0.01, young_rate=0.02)
+RATES = Rates(learning_rate=0.01)
 TEAM = Teams().mapping
 PARTS = ("values", "means", "variances", "steps")
 CASES = [

@@ -12,7 +12,7 @@ from triquad_server.engine.tensor_trainer import TensorTrainer
 
 ARRAYS = ArrayMemory()
 DEFAULT = FieldSettings(depth=8)
-RATES = Rates(learning_rate=0.01, young_rate=0.01)
+RATES = Rates(learning_rate=0.01)
 RADIUS = 9.0  # of the ball that is learnt, leaves
 
 

@@ -14,7 +14,7 @@ from triquad_server.mapping.mapper import Mapper
 from triquad_server.process.threads import Teams
 
 SETTINGS = FieldSettings(depth=8, frequencies=4)
-RATES = Rates(learning_rate=0.01, young_rate=0.02)
+RATES = Rates(learning_rate=0.01)
 IN_TENSORS = "cpu:0"  # as on a GPU, but where there is none
 MEMORIES = (ArrayMemory(), TensorMemory(IN_TENSORS))
 PARTS = ("values", "means", "variances", "steps")

@@ -67,7 +67,7 @@ def test_all_rays_together_fit_into_memory_at_any_size(voxels: int) -> None:
 def test_the_rate_begins_high_and_ends_low_however_little_may_be_learnt() -> None:
     budget = budget_of(rays=1000, most=500)
     first = budget.next_step(100, kept_rays=1000)
-    assert first.rates.learning_rate == first.rates.young_rate == SETTINGS.learning_rate
+    assert first.rates.learning_rate == SETTINGS.learning_rate
     for _ in range(4):
         budget.spend(budget.next_step(100, kept_rays=1000))
     last = budget.next_step(100, kept_rays=1000)

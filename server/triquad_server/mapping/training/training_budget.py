@@ -58,7 +58,6 @@ class TrainingBudget:
         self.discarded = 0  # samples so far beyond the limit of what may be left
         self._most = 0  # limit of what may be left
         self._fresh = 0  # of the samples, those that are to be on rays of the newest scan
-        self._new_rays = 0  # since nothing was left
 
     @property
     def learns_newest(self) -> bool:
@@ -67,9 +66,6 @@ class TrainingBudget:
 
     def add(self, rays: int) -> None:
         """Add new rays to learn from."""
-        if self.samples == 0:
-            self._new_rays = 0
-        self._new_rays += rays
         samples = int(rays * self._settings.samples_per_ray)
         self._fresh = int(samples * self._settings.fresh_share)
         self.samples += samples
@@ -83,7 +79,6 @@ class TrainingBudget:
     def restore(self, samples: int, rays: int) -> None:
         """Go on with ``samples`` from a record, on ``rays`` rays."""
         self.samples = samples if rays else 0
-        self._new_rays = rays
 
     def limit(self, most: int) -> None:
         """From now on, at most ``most`` samples are left."""
@@ -99,15 +94,8 @@ class TrainingBudget:
     def next_step(self, count: int, kept_rays: int) -> Step:
         """Return a step of ``count`` samples, where ``kept_rays`` rays are kept."""
         settings = self._settings
-        rates = Rates(
-            settings.learning_rate * self._cooling(kept_rays),
-            young_rate=settings.learning_rate * self._cooling(min(self._new_rays, kept_rays)),
-        )
-        return Step(
-            count,
-            fresh=min(self._fresh, int(count * settings.fresh_share)),
-            rates=rates,
-        )
+        fresh = min(self._fresh, int(count * settings.fresh_share))
+        return Step(count, fresh, Rates(settings.learning_rate * self._cooling(kept_rays)))
 
     def spend(self, step: Step) -> None:
         """Record that a step was taken."""
@@ -116,10 +104,6 @@ class TrainingBudget:
         self._fresh = self._fresh - step.fresh if self.samples else 0
 
     def _cooling(self, rays: int) -> float:
-        """Return the share of the learning rate: it falls with the budget, so the field settles.
-
-        It falls the later, the fewer the ``rays`` are from which there is something to learn: so
-        what is new learns quickly where much has settled.
-        """
+        """Return the share of the learning rate: it falls with the budget, so the field settles."""
         enough = max(1.0, min(_COOLDOWN * rays, _COOLDOWN_SHARE * self._most))
         return min(1.0, max(_LEAST_RATE, (self.samples / enough) ** 2))
