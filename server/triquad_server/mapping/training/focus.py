@@ -9,12 +9,9 @@ from triquad_map.evidence.live_evidence import LiveEvidence
 from triquad_server.engine.live_field import LiveField
 from triquad_server.mapping.replay.replay_pool import ReplayPool
 
-_GROWTH = 1.1
-"""The growth of blocks until new ones are taken into account: finding their rays and rows is
-expensive."""
-
-_LATEST_SAMPLES = 1 << 19
-"""The most samples that are trained on before new blocks are taken into account."""
+_APPLIED_AFTER = 1 << 19
+"""The samples, half a second of training, after which new blocks are taken into account: finding
+their rays and rows is expensive."""
 
 _MOST_SHARE = 0.25
 """If a larger share of the blocks with surface was seen since, all of the region learns."""
@@ -72,10 +69,9 @@ class Focus:
         if self._seen_since is None:
             return
         self._samples_since += samples
-        blocks, applied = len(self._seen_since), self._blocks_applied
-        is_late = self._samples_since >= _LATEST_SAMPLES
-        if blocks > (applied if is_late else _GROWTH * applied):
-            self._blocks_applied, self._samples_since = blocks, 0
+        is_due = self._samples_since >= _APPLIED_AFTER or self._blocks_applied == 0
+        if is_due and len(self._seen_since) > self._blocks_applied:
+            self._blocks_applied, self._samples_since = len(self._seen_since), 0
             self._keep_to(self._seen_since)
 
     def _keep_to(self, seen_since: Longs) -> None:

@@ -30,11 +30,7 @@ _VERTICES_PER_SAMPLE = 14
 _LEAST_BATCH = 4096  # below, the fixed cost of a step matters
 
 _JUDGED_AFTER_SAMPLES = 8_000_000
-"""A field that is being trained is judged after this many samples: a few seconds. If few rays are
-kept, it is as soon as each was sampled often enough to make a difference."""
-
-_JUDGED_AFTER_SHARE = 0.5
-"""A field that has settled is judged once this share of the rays that are held out is new."""
+"""A field is judged after this many samples, a few seconds, and once it has settled."""
 
 LEARNT_SCANS = 50
 """A surface is new for this many scans: a drive at 1 m a scan leaves it behind earlier."""
@@ -43,9 +39,6 @@ _NEW_SHARE = 0.01
 """A scan owes training once as many rays as this share of its own ended on new surface. The others
 show what is still there, but teach little: so the map of a robot at rest settles while scans come,
 though single rays always end, by chance, where none has ended before."""
-
-_SAMPLES_PER_RAY = 5
-"""The samples per kept ray, on average, that can make a difference."""
 
 _FEW_REMOVED = 32
 """If the surface of more voxels is removed, all of the region learns: rows that others use as well
@@ -85,7 +78,6 @@ class RegionTraining:
         self._slopes = Slopes(field, self.rays.pool)
         self._trainer = trainer_of(field, setup.sums, setup.team)
         self._unjudged_samples = 0  # samples that were trained since it was judged
-        self._unjudged_rays = 0  # rays that were held out since
         self._unlearnt: Longs = np.zeros(0, np.int64)  # keys of voxels whose surface was removed
         self._new_rays = 0  # that ended on new surface since the last scan that owed training
 
@@ -161,7 +153,6 @@ class RegionTraining:
         if len(passing) == 0:
             return
         held = self.rays.keep(passing)
-        self._unjudged_rays += int(held.sum())
         self.budget.add(int((~held).sum()) if shows_new else 0)
 
     def take_step(self) -> tuple[Loss, int]:
@@ -217,18 +208,16 @@ class RegionTraining:
 
     @property
     def _is_to_be_judged(self) -> bool:
-        if not self.is_settled:
-            enough = min(_JUDGED_AFTER_SAMPLES, _SAMPLES_PER_RAY * len(self.rays.pool))
-            return self._unjudged_samples >= enough
-        new = self._unjudged_rays >= _JUDGED_AFTER_SHARE * len(self.rays.held_out)
-        return self._unjudged_samples > 0 or new
+        if self.is_settled:
+            return self._unjudged_samples > 0 or self.fit is None
+        return self._unjudged_samples >= _JUDGED_AFTER_SAMPLES
 
     def _judge(self, field: FrozenField) -> None:
         """Find how well the field fits the rays that are held out: it should be zero at their ends.
 
         The error there includes the sensor's noise.
         """
-        self._unjudged_samples = self._unjudged_rays = 0
+        self._unjudged_samples = 0
         ends = self.rays.judging_ends
         if len(ends):
             sdf = field.evaluate(ends, gradient=False).sdf
