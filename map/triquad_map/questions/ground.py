@@ -85,7 +85,8 @@ def _stand(view: MapView, answer: Ground, rows: Longs, places: Doubles) -> None:
     """Put the ground into ``rows`` [R] of the answer, where ``places`` [R, 3] on it bear."""
     here = distances(view, places, DistanceOptions(view.voxel_m))
     up = here.gradient[:, 2]
-    bears = (up > _FACES_DOWN) & _ended_near(view, places)  # else met from behind, or not seen
+    # Else it is met from behind, or unknown: no ray ended near.
+    bears = (up > _FACES_DOWN) & (here.confidence > 0) & _ended_near(view, places)
     # The rest of the way to the surface, as if that were a plane.
     rest_m = here.distance_m / np.maximum(up, _LEAST_UP)
     heights = places[:, 2] - np.clip(rest_m, -_LONGEST_REST_M, _LONGEST_REST_M)
