@@ -54,9 +54,9 @@ class SurfelPlaces:
 
 def surfel_places(cells: Longs, surface: Bytes) -> SurfelPlaces:
     """Return places for voxels in ``surface`` [blocks, BLOCK_BYTES] of blocks ``cells`` [, 3]."""
-    counts = surface_counts(surface)
-    starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
-    return SurfelPlaces(cells, surface, starts, tree_shape(cells, surface, starts))
+    starts = np.append(0, np.cumsum(surface_counts(surface))).astype(np.int32)
+    shape = tree_shape(surfel_voxels(cells, surface, int(starts[-1])))
+    return SurfelPlaces(cells, surface, starts, shape)
 
 
 @kernel()

@@ -269,7 +269,7 @@ def find_nearest(points: Doubles, tree: SurfelTree, nearest: NearestSurfels) -> 
 
     Points are leaf coordinates of the region and may lie outside of it.
     """
-    if len(points) == 0 or len(tree.children) < 2:
+    if len(points) == 0 or len(tree.order) == 0:
         return
     room = Room(
         np.empty(_KEPT, np.int32),
