@@ -21,7 +21,6 @@ from triquad_format.records.arrays import Bools, Bytes, Doubles, Longs
 from triquad_format.records.cells import cell_names, cells_of_boxes
 from triquad_format.records.status import Status
 
-from triquad_map.clusters import rows_of
 from triquad_map.composition.composed_view import ComposedView
 from triquad_map.surface import FieldSample, SampleField, SurfelKind, fit_surfels
 
@@ -135,7 +134,7 @@ def _next_front(
     _, first = np.unique(names, return_index=True)
     fresh = first[~np.isin(names[first], cell_names(known - least))]
     patches = _distance_like(view, field, voxels[fresh])
-    after = rows_of(cell_names(patches.voxels - least), names)
+    after = _rows_of(cell_names(patches.voxels - least), names)
     pairs = np.flatnonzero(after >= 0)
     pairs = pairs[_aligned(front.chosen(before[pairs]), patches.chosen(after[pairs]))]
     sources = front.sources[before[pairs]]
@@ -195,10 +194,18 @@ def _beside_filled(filled: FilledVoxels, places: Doubles, voxel_m: float, reach_
     for shift in np.ndindex(2, 2, 2):
         left = np.flatnonzero(inside & ~found)
         beside = np.floor(places[left] + (2 * np.array(shift) - 1) * reach).astype(np.int64)
-        rows = rows_of(names[order], cell_names(beside - least))
+        rows = _rows_of(names[order], cell_names(beside - least))
         near = _box_distances(places[left], filled.sources[order[rows]]) <= limit
         found[left] = (rows >= 0) & near
     return found
+
+
+def _rows_of(keys: Longs, wanted: Longs) -> Longs:
+    """Return rows [N] of ``wanted`` [N] in increasing ``keys`` [K]; -1 for what is not there."""
+    if len(keys) == 0:
+        return np.full(len(wanted), -1, np.int64)
+    rows = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    return np.where(keys[rows] == wanted, rows, -1)
 
 
 def _middles(voxels: Longs) -> Doubles:

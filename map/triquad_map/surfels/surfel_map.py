@@ -208,18 +208,21 @@ class SurfelMap:
         fitted = _carried(self._fitted, places, voxels)
         rows = _outdated(fitted, most)
         _follow_rays(fitted.surfels, voxels, rows, by_rays, since)
-        return _fitted_again(
-            evidence, fitted, voxels, rows, field=field, by_rays=by_rays, epoch=epoch
-        )
+        for first in range(0, len(rows), _FITTED_AT_ONCE):
+            part = rows[first : first + _FITTED_AT_ONCE]
+            found = fit_surfels(voxels[part], field, evidence.ended_in, by_rays)
+            fitted.surfels.take(part, found)
+        fitted.epochs[rows] = epoch
+        return SurfelMap(evidence, fitted, voxels)
 
 
 def first_surfels(
     evidence: FrozenEvidence, field: SampleField, epoch: int, by_rays: ShownByRays = nothing_shown
 ) -> SurfelMap:
     """Return the surfels of all seen voxels, for an epoch."""
-    fitted = _nothing_in(surfel_places(evidence.cells, evidence.surface))
-    voxels, rows = fitted.places.voxels(), _outdated(fitted, None)
-    return _fitted_again(evidence, fitted, voxels, rows, field=field, by_rays=by_rays, epoch=epoch)
+    places = surfel_places(evidence.cells, evidence.surface)
+    nothing = SurfelMap(evidence, _nothing_in(places), places.voxels())
+    return nothing.updated(evidence, field, epoch, None, by_rays)
 
 
 def _nothing_in(places: SurfelPlaces) -> _Fitted:
@@ -279,21 +282,3 @@ def _oldest(fitted: _Fitted, chosen: Bools, most: int) -> Rows:
     if len(rows) <= most:
         return rows
     return rows[np.argpartition(fitted.epochs[rows], most)[:most]]
-
-
-def _fitted_again(
-    evidence: FrozenEvidence,
-    fitted: _Fitted,
-    voxels: Longs,
-    rows: Rows,
-    *,
-    field: SampleField,
-    by_rays: ShownByRays,
-    epoch: int,
-) -> SurfelMap:
-    """Fit the surfels in some rows, of all ``voxels`` [S, 3]; changes ``fitted``."""
-    for first in range(0, len(rows), _FITTED_AT_ONCE):
-        part = rows[first : first + _FITTED_AT_ONCE]
-        fitted.surfels.take(part, fit_surfels(voxels[part], field, evidence.ended_in, by_rays))
-    fitted.epochs[rows] = epoch
-    return SurfelMap(evidence, fitted, voxels)
