@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Longs
-from triquad_format.records.cells import same_cells
+from triquad_format.records.cells import rows_of, same_cells
 
 _CELL_VOXELS = 2
 """A cluster is made of cells of this side, which touch: its voxels lie up to as far apart."""
@@ -58,11 +58,9 @@ def connected(cells: Longs) -> NDArray[np.intp]:
     Cells touch at a corner, too.
     """
     first, number = same_cells(cells)
-    around = [cells[first] + step for step in ((0, 0, 0), *_HALF_THE_NEIGHBOURS)]
-    numbers = same_cells(np.concatenate(around))[1].reshape(len(around), -1)
-    known = np.full(numbers.max(initial=-1) + 1, -1)
-    known[numbers[0]] = np.arange(len(first))
-    beside = known[numbers[1:]]
+    known = cells[first]
+    around = np.concatenate([known + step for step in _HALF_THE_NEIGHBOURS])
+    beside = rows_of(known, around).reshape(len(_HALF_THE_NEIGHBOURS), -1)
     step, one = np.nonzero(beside >= 0)
     other = beside[step, one]
     label = np.arange(len(first))
