@@ -1,23 +1,12 @@
 """The field of a region as a map shows it, also before it has learnt what rays have shown."""
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from triquad_format.records.arrays import Floats, Longs
 
 from triquad_map.field.frozen_field import FieldValues, FrozenField, in_grid
 from triquad_map.surfels.surfel_map import SurfelMap
-
-
-class RegionField(Protocol):
-    """A field around the centre of a region, metres."""
-
-    def evaluate(self, points: Floats, gradient: bool) -> FieldValues:
-        """Return the field at points [N, 3], on the caller's thread."""
-
-    def evaluate_in_grid(self, axes: Floats, points: Longs) -> Floats:
-        """Return distances [N] at points of a grid: :meth:`FrozenField.evaluate_in_grid`."""
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,6 @@ Surfels stand in the order of the evidence: block by block, and within a block v
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Ints, Longs
@@ -78,41 +77,26 @@ def surfel_voxels(cells: Longs, surface: Bytes, count: int) -> Longs:
     return voxels
 
 
-class SurfelRows(NamedTuple):
-    """The arrays of surfels in blocks of voxels, as kernels take them."""
-
-    surface: Bytes  # [blocks, BLOCK_BYTES]
-    starts: Ints  # [blocks + 1]
-    offsets: Floats  # [S, 3]
-    normals: Floats  # [S, 3]
-    kinds: Bytes  # [S]
-    epochs: Longs  # [S]
-
-
 @kernel()
-def carry(before: SurfelRows, now: SurfelRows) -> Bools:
-    """Copy surfels to the same voxels of ``now``; return whether each [S] of ``before`` has one.
+def _rows_before(before: Bytes, surface: Bytes, count: int) -> Rows:
+    """Return the surfel of the same voxel ``before`` of each one [count] now; -1: it had none.
 
-    Blocks of ``now`` are those of ``before`` and more.
+    Their voxels are set in masks [blocks, BLOCK_BYTES]; the blocks are those before and more.
     """
-    carried = np.zeros(len(before.epochs), np.bool_)
-    for block in range(len(before.surface)):
-        new, old = now.starts[block], before.starts[block]
+    rows = np.full(count, -1, np.intp)
+    new = old = 0
+    for block in range(len(surface)):
         for byte in range(BLOCK_BYTES):
-            bits, old_bits = int(now.surface[block, byte]), int(before.surface[block, byte])
+            bits = int(surface[block, byte])
+            old_bits = int(before[block, byte]) if block < len(before) else 0
             if bits | old_bits == 0:  # as in most blocks, which are of open air
                 continue
             for z in range(BLOCK_VOXELS):
                 if bits >> z & old_bits >> z & 1:
-                    for axis in range(3):
-                        now.offsets[new, axis] = before.offsets[old, axis]
-                        now.normals[new, axis] = before.normals[old, axis]
-                    now.kinds[new] = before.kinds[old]
-                    now.epochs[new] = before.epochs[old]
-                    carried[old] = True
+                    rows[new] = old
                 new += bits >> z & 1
                 old += old_bits >> z & 1
-    return carried
+    return rows
 
 
 @dataclass(frozen=True)
@@ -122,19 +106,6 @@ class _Fitted:
     places: SurfelPlaces
     surfels: Surfels
     epochs: Longs  # [S] ``_NEVER`` where there is nothing yet
-
-    @property
-    def rows(self) -> SurfelRows:
-        """Their arrays."""
-        places, surfels = self.places, self.surfels
-        return SurfelRows(
-            places.surface,
-            places.starts,
-            offsets=surfels.offsets,
-            normals=surfels.normals,
-            kinds=surfels.kinds,
-            epochs=self.epochs,
-        )
 
 
 class SurfelMap:
@@ -236,10 +207,13 @@ def _carried(before: _Fitted, places: SurfelPlaces, voxels: Longs) -> _Fitted:
         every = np.arange(len(before.epochs))
         return _Fitted(places, before.surfels.chosen(every), before.epochs.copy())
     after = _nothing_in(places)
-    carried = carry(before.rows, after.rows)
-    if not carried.all():
-        beside = _beside(after.surfels, voxels, gone=before.places.voxels()[~carried])
-        after.epochs[beside] = _NEVER
+    found = _rows_before(before.places.surface, places.surface, len(voxels))
+    rows = np.flatnonzero(found >= 0)
+    after.surfels.take(rows, before.surfels.chosen(found[rows]))
+    after.epochs[rows] = before.epochs[found[rows]]
+    if len(rows) < len(before.epochs):
+        gone = np.delete(before.places.voxels(), found[rows], axis=0)
+        after.epochs[_beside(after.surfels, voxels, gone)] = _NEVER
     return after
 
 

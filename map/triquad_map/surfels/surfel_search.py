@@ -74,6 +74,7 @@ class NearestSurfels(NamedTuple):
     rows: Ints  # [N] number of the surfel, -1 where there is none
 
 
+@kernel()
 def no_surfels(limits: Doubles) -> NearestSurfels:
     """Return what is known of points before surfels within ``limits`` [N] voxels are found."""
     count = len(limits)
