@@ -17,10 +17,9 @@ from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.status import Status
 
 from triquad_map.compiled.team import MIN_SHARE, Split, in_one
-from triquad_map.composition.shown_field import ShownField
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.field.frozen_field import FieldValues, FrozenField, in_grid
-from triquad_map.surfels.surfel_map import SurfelMap
+from triquad_map.surfels.surfel_map import ShownField, SurfelMap
 from triquad_map.view import FieldAnswer
 
 _REACH_VOXELS = 0.5

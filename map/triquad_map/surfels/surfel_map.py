@@ -13,6 +13,7 @@ from triquad_format.records.region import BLOCK_BYTES, surface_counts
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.voxel_index import LOW, SHIFT, keys_of
 from triquad_map.evidence.evidence import FrozenEvidence
+from triquad_map.field.frozen_field import FieldValues, FrozenField, in_grid
 from triquad_map.surface import (
     Rows,
     SampleField,
@@ -145,11 +146,6 @@ class SurfelMap:
         """Improve ``nearest`` where a surfel lies nearer to ``points`` [N, 3] of the map frame."""
         improve_nearest(points, self._tree, self._shown, frame, nearest)
 
-    @property
-    def are_learnt(self) -> bool:
-        """Whether the field has learnt all of them: then :meth:`put_planes` changes nothing."""
-        return self._planes is None
-
     def put_planes(
         self, settings: FieldSettings, points: Floats, sdf: Floats, gradients: Floats
     ) -> None:
@@ -185,6 +181,28 @@ class SurfelMap:
             fitted.surfels.take(part, found)
         fitted.epochs[rows] = epoch
         return SurfelMap(evidence, fitted, voxels)
+
+
+@dataclass(frozen=True)
+class ShownField:
+    """A trained field, and near surface that it has not learnt, the planes that rays have shown."""
+
+    trained: FrozenField
+    surfels: SurfelMap
+
+    def evaluate(self, points: Floats, gradient: bool) -> FieldValues:
+        """Return the field at points [N, 3], on the caller's thread."""
+        values = self.trained.evaluate(points, gradient)
+        self.surfels.put_planes(self.trained.settings, points, values.sdf, values.gradient)
+        return values
+
+    def evaluate_in_grid(self, axes: Floats, points: Longs) -> Floats:
+        """Return distances [N] at points of a grid: :meth:`FrozenField.evaluate_in_grid`."""
+        distances = self.trained.evaluate_in_grid(axes, points)
+        if self.surfels.surfels.are_unlearnt.any():
+            places, gradients = in_grid(axes, points), np.zeros((0, 3), np.float32)
+            self.surfels.put_planes(self.trained.settings, places, distances, gradients)
+        return distances
 
 
 def first_surfels(
