@@ -224,13 +224,15 @@ def _carried(before: _Fitted, places: SurfelPlaces, voxels: Longs) -> _Fitted:
     if places is before.places:
         every = np.arange(len(before.epochs))
         return _Fitted(places, before.surfels.chosen(every), before.epochs.copy())
-    after = _nothing_in(places)
+    if not len(before.epochs):
+        return _nothing_in(places)
     found = _rows_before(before.places.surface, places.surface, len(voxels))
-    rows = np.flatnonzero(found >= 0)
-    after.surfels.take(rows, before.surfels.chosen(found[rows]))
-    after.epochs[rows] = before.epochs[found[rows]]
-    if len(rows) < len(before.epochs):
-        gone = np.delete(before.places.voxels(), found[rows], axis=0)
+    new = np.flatnonzero(found < 0)
+    after = _Fitted(places, before.surfels.chosen(found), before.epochs[found])
+    after.surfels.take(new, Surfels.none(len(new)))
+    after.epochs[new] = _NEVER
+    if len(voxels) - len(new) < len(before.epochs):
+        gone = np.delete(before.places.voxels(), found[found >= 0], axis=0)
         after.epochs[_beside(after.surfels, voxels, gone)] = _NEVER
     return after
 
