@@ -9,15 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Longs
-
-
-def rows_of(keys: Longs, wanted: Longs) -> Longs:
-    """Return rows [N] of ``wanted`` [N] in increasing ``keys`` [K]; -1 for what is not there."""
-    if len(keys) == 0:
-        return np.full(len(wanted), -1, np.int64)
-    rows = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-    return np.where(keys[rows] == wanted, rows, -1)
-
+from triquad_format.records.cells import rows_of, same_cells
 
 _CELL_VOXELS = 2
 """A cluster is made of cells of this side, which touch: its voxels lie up to as far apart."""
@@ -57,7 +49,7 @@ def tight_boxes(voxels: Longs, longest: int, scale: int = 1) -> Boxes:
     pieces = -(-size // (scale * longest))
     piece = (voxels - whole.low[cluster]) * pieces[cluster] // size[cluster]
     piece[:, 0] += (np.cumsum(pieces[:, 0]) - pieces[:, 0])[cluster]  # no two clusters share any
-    return _around(voxels, _CellSet(piece).number)
+    return _around(voxels, same_cells(piece)[1])
 
 
 def connected(cells: Longs) -> NDArray[np.intp]:
@@ -65,10 +57,13 @@ def connected(cells: Longs) -> NDArray[np.intp]:
 
     Cells touch at a corner, too.
     """
-    known = _CellSet(cells)
-    pairs = [known.neighbours(step) for step in _HALF_THE_NEIGHBOURS]
-    one, other = np.concatenate(pairs, axis=1)
-    label = np.arange(len(known.first))
+    first, number = same_cells(cells)
+    known = cells[first]
+    around = np.concatenate([known + step for step in _HALF_THE_NEIGHBOURS])
+    beside = rows_of(known, around).reshape(len(_HALF_THE_NEIGHBOURS), -1)
+    step, one = np.nonzero(beside >= 0)
+    other = beside[step, one]
+    label = np.arange(len(first))
     while True:
         # A cluster takes the least label of its neighbours; its members follow.
         least = np.minimum(label[one], label[other])
@@ -80,42 +75,7 @@ def connected(cells: Longs) -> NDArray[np.intp]:
             break
         label = new
     _, cluster = np.unique(label, return_inverse=True)
-    return cluster.reshape(-1)[known.number]
-
-
-def same_cells(cells: Longs) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return one row [K] for each different cell of ``cells`` [N, 3], and each's number [N]."""
-    known = _CellSet(cells)
-    return known.first, known.number
-
-
-class _CellSet:
-    """The different cells among some, found in two steps: the column, then the height in it.
-
-    So the coordinates may be of any size: no number has to contain all three.
-    """
-
-    first: NDArray[np.intp]  # [K] a row of each different cell
-    number: NDArray[np.intp]  # [N] of each cell
-
-    def __init__(self, cells: Longs) -> None:
-        low = cells.min(axis=0, initial=np.iinfo(np.int64).max)
-        x, y, z = (cells - low + 1).T  # a margin, so that nothing has neighbours beyond the ends
-        self._width, self._height = y.max(initial=0) + 2, z.max(initial=0) + 2
-        self._columns, column = np.unique(x * self._width + y, return_inverse=True)
-        keys = column.reshape(-1) * self._height + z
-        self._keys, self.first, number = np.unique(keys, return_index=True, return_inverse=True)
-        self.number = number.reshape(-1)
-
-    def neighbours(self, step: tuple[int, int, int]) -> NDArray[np.intp]:
-        """Return pairs [2, P] of numbers of cells, the second a ``step`` from the first."""
-        x, y, z = step
-        column = rows_of(self._columns, self._columns + x * self._width + y)
-        beside = column[self._keys // self._height]
-        wanted = beside * self._height + self._keys % self._height + z
-        found = np.where(beside >= 0, rows_of(self._keys, wanted), -1)
-        rows = np.flatnonzero(found >= 0)
-        return np.stack([rows, found[rows]])
+    return cluster.reshape(-1)[number]
 
 
 def _around(voxels: Longs, group: NDArray[np.intp]) -> Boxes:

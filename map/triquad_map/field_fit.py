@@ -9,18 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
+from triquad_format.records.cells import same_cells
 from triquad_format.records.field_settings import FieldSettings
 
 _PLACE_LEAVES = 32.0  # side of a place
-_AXIS_BITS = 20
-
-
-def place_keys(ends: NDArray[np.floating], settings: FieldSettings) -> Longs:
-    """Return the place [N] of each ray, which ends at ``ends`` [N, 3], metres from the centre."""
-    side_m = _PLACE_LEAVES * settings.leaf_m
-    cells = np.floor(ends / side_m).astype(np.int64) + (1 << (_AXIS_BITS - 1))
-    keys: Longs = cells[:, 0] << 2 * _AXIS_BITS | cells[:, 1] << _AXIS_BITS | cells[:, 2]
-    return keys
+_WORST = 5  # places that are reported
+_LEAST_RAYS = 24  # of such a place
+_UPPER = 0.9
 
 
 def in_cube(ends: NDArray[np.floating], settings: FieldSettings) -> Bools:
@@ -33,62 +28,28 @@ def in_cube(ends: NDArray[np.floating], settings: FieldSettings) -> Bools:
 
 
 @dataclass(frozen=True)
-class Places:
-    """The P places in which N rays end."""
-
-    keys: Longs  # [P] as of :func:`place_keys`, increasing
-    place_of: NDArray[np.intp]  # [N] row of each ray's place
-    rays: Longs  # [P] that end there, at least 1
-    settings: FieldSettings
-
-    @classmethod
-    def of(cls, ends: Floats, settings: FieldSettings) -> "Places":
-        """Return places of rays that end at ``ends`` [N, 3], metres from the region's centre."""
-        keys, place_of, rays = np.unique(
-            place_keys(ends, settings), return_inverse=True, return_counts=True
-        )
-        return cls(keys, place_of, rays, settings)
-
-    @property
-    def centres(self) -> Doubles:
-        """Their centres [P, 3], metres from the region's centre."""
-        shifts = np.array([2 * _AXIS_BITS, _AXIS_BITS, 0])
-        cells = (self.keys[:, None] >> shifts & (1 << _AXIS_BITS) - 1) - (1 << (_AXIS_BITS - 1))
-        centres: Doubles = (cells + 0.5) * (_PLACE_LEAVES * self.settings.leaf_m)
-        return centres
-
-    def medians(self, values: NDArray[np.floating]) -> Doubles:
-        """Return the median of the rays' ``values`` [N] in each place [P]."""
-        ordered = values[np.lexsort([values, self.place_of])]
-        middles = np.cumsum(self.rays) - self.rays + self.rays // 2
-        medians: Doubles = ordered[middles].astype(np.float64)
-        return medians
-
-
-_WORST = 5  # places that are reported
-_LEAST_RAYS = 24  # of such a place
-_UPPER = 0.9
-
-
-@dataclass(frozen=True)
 class PlaceFits:
-    """The fit of a region's field to the held-out rays of each of P places."""
+    """The fit of a region's field to N held-out rays, which end in P places."""
 
     centres: Doubles  # [P, 3] metres from the region's centre
-    rays: Longs  # [P]
+    rays: Longs  # [P] that end there, at least 1
     medians_m: Doubles  # [P] of how far from zero the field is at the rays' ends
     errors_m: Doubles  # [N] how far it is, for each ray
 
     @classmethod
-    def of(cls, places: Places, sdf: NDArray[np.floating]) -> "PlaceFits":
-        """Return the fit of a field with ``sdf`` [N], metres, where the rays of ``places`` end."""
-        errors_m = np.abs(sdf)
-        return cls(
-            places.centres,
-            places.rays,
-            places.medians(errors_m),
-            errors_m.astype(np.float64),
-        )
+    def of(cls, ends: Floats, settings: FieldSettings, sdf: Floats) -> "PlaceFits":
+        """Return the fit of a field with ``sdf`` [N], metres, where rays end.
+
+        ``ends`` [N, 3] are metres from the region's centre.
+        """
+        side_m = _PLACE_LEAVES * settings.leaf_m
+        cells = np.floor(ends / side_m).astype(np.int64)
+        first, place_of = same_cells(cells)
+        rays = np.bincount(place_of, minlength=len(first)).astype(np.int64)
+        errors_m = np.abs(sdf).astype(np.float64)
+        ordered = errors_m[np.lexsort([errors_m, place_of])]
+        medians_m = ordered[np.cumsum(rays) - rays + rays // 2]
+        return cls((cells[first] + 0.5) * side_m, rays, medians_m, errors_m)
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from triquad_format.mapfile.metadata import FRAME_ID
 from triquad_format.mapfile.parts.part import PREVIEW, Part, PartKey
 from triquad_format.mapfile.writer import Previews
 from triquad_format.records.arrays import Doubles
+from triquad_format.records.cells import same_cells
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import MapRecord, Region, seen_voxels
 
@@ -123,12 +124,12 @@ def coarse_mesh(region: Region, settings: FieldSettings, view: ComposedView) -> 
 def _merged(mesh: Triangles, cell_m: float) -> Triangles:
     """Return the mesh with one vertex, their mean, for all in a cube of side ``cell_m``."""
     cells = np.floor(mesh.vertices / cell_m).astype(np.int64)
-    _, of_vertex, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    of_vertex = of_vertex.reshape(-1)  # numpy 2.0 gives it the shape of the cells
+    of_vertex = same_cells(cells)[1]
+    counts = np.bincount(of_vertex)
     sums = [np.bincount(of_vertex, weights=axis) for axis in mesh.vertices.T]
     faces = of_vertex[mesh.faces]
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]  # with three corners
-    first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1]
+    first = same_cells(np.sort(faces, axis=1))[0]
     kept, corners = np.unique(faces[first], return_inverse=True)
     vertices = (np.stack(sums, axis=1) / counts[:, None])[kept]
     return Triangles(vertices, corners.reshape(-1, 3).astype(np.int32))

@@ -112,7 +112,8 @@ class Surfels:
 
     def chosen(self, rows: Rows) -> "Surfels":
         """Return copies of some surfels."""
-        return Surfels(self.offsets[rows], self.normals[rows], self.kinds[rows])
+        offsets, normals = self.offsets.take(rows, axis=0), self.normals.take(rows, axis=0)
+        return Surfels(offsets, normals, self.kinds.take(rows))
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Doubles, Longs
+from triquad_format.records.cells import same_cells
 
 
 @dataclass(frozen=True)
@@ -115,28 +116,7 @@ def _representatives(points: Doubles) -> NDArray[np.intp]:
     """Return the index of the point that stands for each point [N, 3]."""
     chosen = np.arange(len(points))
     for shift in _SHIFTS:
-        left, at = _numbered(chosen, len(points))
-        names = _names(np.floor(points[left] / WELD_M + shift).astype(np.int64))
-        _, firsts, same = np.unique(names, return_index=True, return_inverse=True)
+        left, at = np.unique(chosen, return_inverse=True)
+        firsts, same = same_cells(np.floor(points[left] / WELD_M + shift).astype(np.int64))
         chosen = left[firsts[same]][at]
     return chosen
-
-
-def _numbered(chosen: NDArray[np.intp], count: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the different numbers of [N] below ``count``, and which of these each is."""
-    used = np.zeros(count, np.bool_)
-    used[chosen] = True
-    return np.flatnonzero(used), (np.cumsum(used) - 1)[chosen]
-
-
-def _names(cells: Longs) -> Longs:
-    """Return a number for each of cells [N, 3], the same one for the same cell alone."""
-    if len(cells) == 0:
-        return np.zeros(0, np.int64)
-    x, y, z = (axis - axis.min() for axis in cells.T)
-    columns = x * (y.max() + 1) + y
-    if (int(x.max()) + 1) * (int(y.max()) + 1) * (int(z.max()) + 1) >= 2**63:
-        # 64 bits do not do for all cells of a large map: for those of the columns in use.
-        _, columns = np.unique(columns, return_inverse=True)
-    names: Longs = columns * (z.max() + 1) + z
-    return names

@@ -61,7 +61,7 @@ _define(operator.truediv, "fdiv")
 def _call(builder: Any, name: str, result: Any, args: Any) -> Any:
     kind = ir.FunctionType(result, [arg.type for arg in args])
     function = cgutils.get_or_insert_function(builder.module, kind, name)
-    return builder.call(function, args, fastmath=_FAST if result is not _INT64 else ())
+    return builder.call(function, args, fastmath=_FAST if result in (_FLOAT, _VECTOR) else ())
 
 
 def _address(context: Any, builder: Any, kinds: Any, args: Any) -> Any:
@@ -184,27 +184,18 @@ def lowest_bit(_: Any, bits: Any) -> Any:
     return types.int64(bits), generate
 
 
-_INT32 = ir.IntType(32)
-
-
 @kernel_code
 def prefetch_row(_: Any, table: Any, row: Any) -> Any:
     """Ask for ``table[row]`` to be brought into the cache."""
 
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        kind, row_kind = signature.args
-        data = context.make_array(kind)(context, builder, args[0])
-        number = context.cast(builder, args[1], row_kind, types.intp)
-        indices = [number, context.get_constant(types.intp, 0)]
-        row_start = cgutils.get_item_pointer(
-            context, builder, kind, data, indices, wraparound=False
-        )
-        bytes_ = ir.IntType(8).as_pointer()
-        address = builder.bitcast(row_start, bytes_)
-        kind_of_call = ir.FunctionType(ir.VoidType(), [bytes_, _INT32, _INT32, _INT32])
-        call = cgutils.get_or_insert_function(builder.module, kind_of_call, "llvm.prefetch.p0")
+    def generate(context: Any, builder: Any, kind: Any, args: Any) -> Any:
+        place = cgutils.pack_array(builder, [args[1], ir.Constant(args[1].type, 0)])
+        pair = types.UniTuple(kind.args[1], 2)
+        address = _address(context, builder, (kind.args[0], pair), (args[0], place))
         # To read, for all cache levels, data.
-        builder.call(call, [address, *(ir.Constant(_INT32, flag) for flag in (0, 3, 1))])
+        flags = [ir.Constant(_INT32, flag) for flag in (0, 3, 1)]
+        start = builder.bitcast(address, ir.IntType(8).as_pointer())
+        _call(builder, "llvm.prefetch.p0", ir.VoidType(), [start, *flags])
         return context.get_dummy_value()
 
     return types.void(table, row), generate

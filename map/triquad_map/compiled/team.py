@@ -6,8 +6,8 @@ import contextlib
 import os
 import sys
 import threading
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import Protocol, TypeVar
 
@@ -51,24 +51,24 @@ def in_one(count: int, work: Work, least: int = 0) -> None:  # noqa: ARG001
     work(0, count)
 
 
-class _Part:
-    """A part of some work, done by a thread or by the caller: by the first that is free."""
+def _do(work: Callable[[], None], done: "Future[None]") -> None:
+    """Do some work, unless the caller has taken it back."""
+    if not done.set_running_or_notify_cancel():
+        return
+    try:
+        work()
+    except BaseException as error:
+        done.set_exception(error)
+    else:
+        done.set_result(None)
 
-    def __init__(self, work: Callable[[], None]) -> None:
-        self._work = work
-        self._begun = threading.Lock()
-        self.done: Future[None] = Future()
 
-    def do(self) -> None:
-        """Do it, unless somebody has begun."""
-        if not self._begun.acquire(blocking=False):
-            return
-        try:
-            self._work()
-        except BaseException as error:
-            self.done.set_exception(error)
-        else:
-            self.done.set_result(None)
+def _finish(work: Callable[[], None], done: "Future[None]") -> None:
+    """Wait for work that a thread has begun, or do it."""
+    if done.cancel():
+        work()
+    else:
+        done.result()
 
 
 class Team:
@@ -108,37 +108,20 @@ class Team:
 
     def both(self, mine: Callable[[], MineT], other: Callable[[], OtherT]) -> tuple[MineT, OtherT]:
         """Return what two pieces of work return, done in parallel: the caller does ``mine``."""
-        found: list[OtherT] = []
-        part = self._offer(lambda: found.append(other()))
-        try:
-            result = mine()
-        finally:
-            _finish([part])
-        part.done.result()
-        return result, found[0]
+        my_result: list[MineT] = []
+        others: list[OtherT] = []
+        works = (lambda: my_result.append(mine()), lambda: others.append(other()))
+        self._run(lambda part: works[part](), 2)
+        return my_result[0], others[0]
 
     def _run(self, work: Callable[[int], None], parts: int) -> None:
-        others = [self._offer(partial(work, part)) for part in range(1, parts)]
-        try:
+        with contextlib.ExitStack() as rest:  # nobody goes on with it later, whatever happens
+            for part in range(1, parts):
+                piece, done = partial(work, part), Future[None]()
+                with contextlib.suppress(RuntimeError):  # closed, or no thread can be started
+                    self._pool.submit(_do, piece, done)
+                rest.callback(_finish, piece, done)
             work(0)
-        finally:
-            _finish(others)
-        for other in others:
-            other.done.result()
-
-    def _offer(self, work: Callable[[], None]) -> _Part:
-        """Let a thread do some work, if one comes to it before the caller."""
-        part = _Part(work)
-        with contextlib.suppress(RuntimeError):  # closed, or no thread can be started
-            self._pool.submit(part.do)
-        return part
-
-
-def _finish(parts: Sequence[_Part]) -> None:
-    """Let nobody go on with what the caller has left, whatever happens."""
-    for part in parts:
-        part.do()
-    wait([part.done for part in parts])
 
 
 def share(count: int, part: int, parts: int = THREADS) -> tuple[int, int]:

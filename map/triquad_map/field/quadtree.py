@@ -21,9 +21,7 @@ from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.voxel_index import (
     Index,
     VoxelIndex,
-    empty_keys,
     find_row,
-    find_slot,
     make_row,
     morton_code,
     with_room,
@@ -37,7 +35,6 @@ _NEW_BLOCKS = 27  # at most, of a leaf: 9 on each plane
 _NEW_ROWS = 48  # and as many vertices: 4 on each plane and level
 _NO_BLOCK = -2  # key of row 0, which is found by no other
 _MIN_CAPACITY = 256
-_MOST_COUNTED = 1 << 20  # new vertices, that are counted one by one
 
 
 class Vertices(NamedTuple):
@@ -106,35 +103,6 @@ def grow_vertices(
                         blocks = _enter(shape, vertices, plane, h, corner_u, corner_v, rows, blocks)
                         rows += 1
     return len(leaves), blocks, rows
-
-
-@kernel()
-def count_new_vertices(shape: Shape, vertices: Vertices, leaves: Longs, keys: Longs) -> int:
-    """Return how many vertices of ``leaves`` [N, 3] are not there; ``keys`` is their set.
-
-    It is cut short where the set is half full.
-    """
-    found = 0
-    for i in range(len(leaves)):
-        if 2 * found >= len(keys) - _NEW_ROWS:
-            return found * len(leaves) // i
-        for plane in range(3):
-            u, v = leaves[i, _AXES[plane, 0]], leaves[i, _AXES[plane, 1]]
-            for h in range(shape.levels):
-                down = shape.levels - 1 - h
-                node_u, node_v = u >> down, v >> down
-                block_u, block_v = node_u >> h, node_v >> h
-                block = max(0, find_row(vertices.blocks, block_key(plane, block_u, block_v)))
-                for corner in range(4):
-                    corner_u, corner_v = node_u + (corner & 1), node_v + (corner >> 1)
-                    local = (corner_u - (block_u << h)) * ((1 << h) + 1) + corner_v - (block_v << h)
-                    if vertices.rows[block, shape.starts[h] + local] == 0:
-                        owner = plane * shape.levels + h
-                        key = morton_code(corner_u, corner_v) | (owner << PLANE_BITS)
-                        slot = find_slot(keys, key)
-                        found += keys[slot] != key
-                        keys[slot] = key
-    return found
 
 
 @kernel()
@@ -248,11 +216,6 @@ class LiveQuadtree:
         marked = np.zeros(self._rows, np.bool_)
         mark_rows(self.shape, self.vertices, cubes, side, marked)
         return marked
-
-    def growth_by(self, leaves: Longs) -> int:
-        """Return how many rows :meth:`grow` would add; an estimate where they are very many."""
-        keys = empty_keys(min(_MOST_COUNTED, _NEW_ROWS * (1 + len(leaves))))
-        return int(count_new_vertices(self.shape, self.vertices, leaves, keys))
 
     def restore(self, plane: int, h: int, codes: Longs) -> None:
         """Give the next rows to the vertices ``codes`` [V] of one level, in their order."""

@@ -18,10 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Longs
-from triquad_format.records.cells import cell_names, cells_of_boxes
+from triquad_format.records.cells import cells_of_boxes, rows_of, same_cells
 from triquad_format.records.status import Status
 
-from triquad_map.clusters import rows_of
 from triquad_map.composition.composed_view import ComposedView
 from triquad_map.surface import FieldSample, SampleField, SurfelKind, fit_surfels
 
@@ -130,12 +129,10 @@ def _next_front(
     """Return the surface of ``front`` where it goes on in voxels next to it, not ``known``."""
     before = np.repeat(np.arange(len(front.voxels)), len(_AROUND))
     voxels = front.voxels[before] + np.tile(_AROUND, (len(front.voxels), 1))
-    least = known.min(axis=0) - 1
-    names = cell_names(voxels - least)
-    _, first = np.unique(names, return_index=True)
-    fresh = first[~np.isin(names[first], cell_names(known - least))]
+    first = same_cells(voxels)[0]
+    fresh = first[rows_of(known, voxels[first]) < 0]
     patches = _distance_like(view, field, voxels[fresh])
-    after = rows_of(cell_names(patches.voxels - least), names)
+    after = rows_of(patches.voxels, voxels)
     pairs = np.flatnonzero(after >= 0)
     pairs = pairs[_aligned(front.chosen(before[pairs]), patches.chosen(after[pairs]))]
     sources = front.sources[before[pairs]]
@@ -187,16 +184,14 @@ def _beside_filled(filled: FilledVoxels, places: Doubles, voxel_m: float, reach_
     found = np.zeros(len(places), np.bool_)
     if not len(filled.voxels):
         return found
-    least = filled.voxels.min(axis=0) - 2
-    names = cell_names(filled.voxels - least)
-    order = np.argsort(names)
     reach, limit = reach_m / voxel_m, filled.fill_m / voxel_m
-    inside = ((places >= least + 1) & (places < filled.voxels.max(axis=0) + 2)).all(axis=1)
+    low, high = filled.voxels.min(axis=0) - 1, filled.voxels.max(axis=0) + 2
+    inside = ((places >= low) & (places < high)).all(axis=1)
     for shift in np.ndindex(2, 2, 2):
         left = np.flatnonzero(inside & ~found)
         beside = np.floor(places[left] + (2 * np.array(shift) - 1) * reach).astype(np.int64)
-        rows = rows_of(names[order], cell_names(beside - least))
-        near = _box_distances(places[left], filled.sources[order[rows]]) <= limit
+        rows = rows_of(filled.voxels, beside)
+        near = _box_distances(places[left], filled.sources[rows]) <= limit
         found[left] = (rows >= 0) & near
     return found
 

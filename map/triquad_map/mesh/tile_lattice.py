@@ -5,16 +5,13 @@ so neighbouring tiles share the points of their common face and meet without sea
 """
 
 import dataclasses
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
-from triquad_format.records.cells import cells_of_boxes
-
-from triquad_map.compiled.kernel import kernel
+from triquad_format.records.cells import cells_of_boxes, same_cells
 
 TileIndex = tuple[int, int, int]
 
@@ -26,7 +23,6 @@ class TileLattice:
     cell_m: float
     cells: int  # along the side of a tile, the same on all levels
     reach_m: float  # centres of faces lie at most this far from voxels with seen surface
-    group: int = 8  # cells along the side of the groups in whose order faces come
 
     @property
     def tile_side_m(self) -> float:
@@ -39,17 +35,9 @@ class TileLattice:
         return self.cell_m + self.reach_m
 
     def at_level(self, level: int) -> "TileLattice":
-        """Return the lattice ``level`` levels coarser: a tile has ``2**level`` of these an axis.
-
-        Groups of cells keep their size, so that no level searches farther around than this one.
-        """
+        """Return the lattice ``level`` levels coarser: a tile has ``2**level`` of these an axis."""
         scale = 1 << level
-        return dataclasses.replace(
-            self,
-            cell_m=self.cell_m * scale,
-            reach_m=self.reach_m * scale,
-            group=max(1, self.group // scale),
-        )
+        return dataclasses.replace(self, cell_m=self.cell_m * scale, reach_m=self.reach_m * scale)
 
     def meets(self, tiles: NDArray[np.integer], low: Doubles, high: Doubles) -> Bools:
         """Return which [T] of tiles [T, 3] meet the box between corners [3], metres, map frame."""
@@ -61,41 +49,13 @@ class TileLattice:
 
         ``low`` and ``high`` [N, 3] are the boxes' corners, metres, map frame.
         """
-        boxes = _each_once(_tile_boxes(low, high, margin_m, self.tile_side_m))
-        return _each_once(cells_of_boxes(boxes[:, :3], boxes[:, 3:])[0])
-
-
-def _each_once(rows: Longs) -> Longs:
-    """Return the different rows among [N, D], in order."""
-    if len(rows) == 0:
-        return rows
-    columns = [np.ascontiguousarray(column) for column in rows.T]
-    lows = [int(column.min()) for column in columns]
-    sizes = [int(column.max()) - low + 1 for column, low in zip(columns, lows, strict=True)]
-    if math.prod(sizes) >= 2**62:
-        return np.asarray(np.unique(rows, axis=0))
-    # By one number each: numpy keeps Python's lock while it sorts rows.
-    names = np.zeros(len(rows), np.int64)
-    for column, low, size in zip(columns, lows, sizes, strict=True):
-        names = names * size + (column - low)
-    each = np.stack(np.unravel_index(np.unique(names), sizes), axis=1) + lows
-    return np.asarray(each, np.int64)
-
-
-@kernel()
-def _tile_boxes(low: Doubles, high: Doubles, margin_m: float, side_m: float) -> Longs:
-    """Return the first and last tiles [B, 6] of boxes [N, 3]; once for equal boxes in a row."""
-    boxes = np.empty((len(low), 6), np.int64)
-    count = 0
-    for i in range(len(low)):
-        for axis in range(3):
-            boxes[count, axis] = np.floor((low[i, axis] - margin_m) / side_m)
-            boxes[count, 3 + axis] = np.floor((high[i, axis] + margin_m) / side_m)
-        is_new = count == 0
-        for k in range(6):
-            is_new = is_new or boxes[count, k] != boxes[count - 1, k]
-        count += int(is_new)
-    return boxes[:count]
+        first = np.floor((low - margin_m) / self.tile_side_m).astype(np.int64)
+        last = np.floor((high + margin_m) / self.tile_side_m).astype(np.int64)
+        # Boxes that follow each other mostly meet the same tiles.
+        differ = (np.diff(first, axis=0) | np.diff(last, axis=0)).any(axis=1)
+        some = np.append(True, differ)[: len(first)]
+        tiles = cells_of_boxes(first[some], last[some])[0]
+        return tiles[same_cells(tiles)[0]]
 
 
 @dataclass(frozen=True)
@@ -108,7 +68,9 @@ class TileBorder:
     @classmethod
     def of_tile(cls, points: Longs, volume: Floats) -> "TileBorder":
         """Return the lattice points [P, 3] of a tile that lie on its faces."""
-        return cls(*_on_faces(points, volume))
+        x, y, z = ((axis == 0) | (axis == len(volume) - 1) for axis in points.T)
+        outer = points[x | y | z]
+        return cls(outer.astype(np.int16), volume[tuple(outer.T)])
 
     @classmethod
     def joined(cls, borders: Iterable["TileBorder"]) -> "TileBorder":
@@ -135,19 +97,3 @@ class TileBorder:
         places = tuple(self.points.T)
         waits = np.isnan(volume[places])
         volume[tuple(self.points[waits].T)] = self.values[waits]
-
-
-@kernel()
-def _on_faces(points: Longs, volume: Floats) -> tuple[NDArray[np.int16], Floats]:
-    """Return the lattice points [P, 3] of a tile that lie on its faces, and their values."""
-    last = len(volume) - 1
-    outer = np.empty((len(points), 3), np.int16)
-    values = np.empty(len(points), np.float32)
-    count = 0
-    for point in points:
-        x, y, z = point
-        if min(x, y, z) == 0 or max(x, y, z) == last:
-            outer[count, 0], outer[count, 1], outer[count, 2] = x, y, z
-            values[count] = volume[x, y, z]
-            count += 1
-    return outer[:count].copy(), values[:count].copy()

@@ -119,28 +119,7 @@ def _near_cells(
         around = cells_around(filled, view.voxel_m, lattice.cell_m, lattice.reach_m) - first
         inside = ((around >= 0) & (around < lattice.cells)).all(axis=1)
         near[tuple(around[inside].T)] = True
-    return _by_group(np.flatnonzero(near), lattice.cells, lattice.group)
-
-
-@kernel()
-def _by_group(names: Longs, side: int, group: int) -> Longs:
-    """Return the cells [C, 3] of a tile with these numbers [C], increasing: group by group."""
-    groups = -(-side // group)
-    starts = np.zeros(groups**3 + 1, np.int64)
-    homes = np.empty(len(names), np.int64)
-    for i in range(len(names)):
-        x, y, z = names[i] // (side * side), names[i] // side % side, names[i] % side
-        homes[i] = (x // group * groups + y // group) * groups + z // group
-        starts[homes[i] + 1] += 1
-    starts = np.cumsum(starts)
-    cells = np.empty((len(names), 3), np.int64)
-    for i in range(len(names)):
-        at = starts[homes[i]]
-        starts[homes[i]] += 1
-        cells[at, 0] = names[i] // (side * side)
-        cells[at, 1] = names[i] // side % side
-        cells[at, 2] = names[i] % side
-    return cells
+    return np.ascontiguousarray(np.argwhere(near))  # as kernels are compiled for
 
 
 @kernel()

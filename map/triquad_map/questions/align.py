@@ -152,10 +152,8 @@ def _descend(view: MapView, fine: Doubles, pose: Doubles, max_distance_m: float)
     scale = max(max_distance_m, final)
     overshoot, last = _OVERSHOOT, np.zeros(6)
     for iteration in range(1, MAX_ITERATIONS + 1):
-        normal = _normal(
-            view, points, pose, scale=scale, max_distance_m=max_distance_m, is_final=scale == final
-        )
-        if normal is None:
+        normal = _normal(view, points, pose, scale, max_distance_m)
+        if normal.weight == 0.0:
             return _Found(pose, iteration, False)
         step = normal.step()
         # Where steps go back and forth, shorter ones settle between.
@@ -175,27 +173,21 @@ def _descend(view: MapView, fine: Doubles, pose: Doubles, max_distance_m: float)
 
 
 def _normal(
-    view: MapView,
-    points: Doubles,
-    pose: Doubles,
-    scale: float,
-    max_distance_m: float,
-    is_final: bool,
-) -> _Normal | None:
-    """Return the normal equations at a pose; None where no point counts."""
+    view: MapView, points: Doubles, pose: Doubles, scale: float, max_distance_m: float
+) -> _Normal:
+    """Return the normal equations at a pose; their weight is 0 where no point counts."""
     turned = points @ pose[:3, :3].T
     reach_m = min(max_distance_m, _REACH_SCALES * scale)
     answer = distances(view, turned + pose[:3, 3], DistanceOptions(reach_m))
     distance = answer.distance_m.astype(np.float64)
+    is_final = scale == _FINAL_VOXELS * view.voxel_m
     spread = 1.0 if is_final else 1.0 + _PER_RANGE * np.linalg.norm(points, axis=1)
     counts = answer.found.astype(np.float64)
     if scale <= _SURE_VOXELS * view.voxel_m:
         counts = answer.confidence.astype(np.float64)  # 0 in unknown space
     weights = counts / spread / (1.0 + (distance / (scale * spread)) ** 2) ** 2
     weight = float(weights.sum())
-    if weight <= 0.0:
-        return None
-    share = weights / weight
+    share = weights / max(weight, 1e-12)
     arm_m = max(math.sqrt(float(share @ (turned**2).sum(axis=1))), 1e-6)
     slope = answer.gradient.astype(np.float64)
     rows = np.hstack([slope, np.cross(turned, slope) / arm_m])
@@ -220,18 +212,12 @@ def _judged(view: MapView, points: Doubles, found: _Found, max_distance_m: float
     share = count / max(int((answer.found | known).sum()), 1)
     squares = answer.distance_m[inliers].astype(np.float64) ** 2
     rms_m = math.sqrt(float(squares.sum()) / max(count, 1))
-    normal = _normal(
-        view, points, found.pose, scale=final, max_distance_m=max_distance_m, is_final=True
-    )
-    covariance = np.diag(np.repeat([_UNSEEN_M**2, _UNSEEN_RAD**2], 3))
-    all_seen = False
-    if normal is not None:
-        covariance = normal.covariance()
-        all_seen = len(normal.seen()[1]) == 6
+    normal = _normal(view, points, found.pose, final, max_distance_m)
+    all_seen = len(normal.seen()[1]) == 6
     enough = count >= _LEAST_INLIERS and share >= _LEAST_INLIER_SHARE
     return Alignment(
         world_from_sensor=found.pose,
-        covariance=covariance,
+        covariance=normal.covariance(),
         inlier_share=share,
         rms_m=rms_m,
         converged=found.settled and enough and all_seen,

@@ -53,10 +53,7 @@ Views = Callable[[int], AbstractContextManager[MapView]]
 
 
 class Answers:
-    """Answers questions; as many threads may ask as the views allow.
-
-    Whatever is asked for, :class:`RefusedError` says which argument cannot be used.
-    """
+    """Answers questions; as many threads may ask as the views allow."""
 
     def __init__(self, views: Views) -> None:
         self._view = views
@@ -66,119 +63,106 @@ class Answers:
 
         Raises:
             RefusedError: it is too large, what it says does not go together, or its epoch is not
-                kept.
+                kept; it says which argument cannot be used.
             KeyError: it is no question about the map.
         """
-        reply: ReplyT = QUESTIONS[type(request)](self, request)
+        question: Any = request
+        answer = QUESTIONS[type(request)]
+        with self._view(question.epoch) as view:
+            reply: ReplyT = answer(view, question)
         return reply
 
-    def sdf(self, request: SdfRequest) -> SdfReply:
-        """Return the trained field, and status."""
-        points = _points("point", request.origin, request.points, most=MAX_QUERY_POINTS)
-        with self._view(request.epoch) as view:
-            answer = view.query(points, request.gradient)
-            return _reply(SdfReply, answer, epoch=view.epoch)
 
-    def distance(self, request: DistanceRequest) -> DistanceReply:
-        """Return distances to the nearest surface."""
-        points = _searched("point", request.origin, request.points)
-        options = DistanceOptions(
-            request.max_distance_m, request.surface_point, request.unknown_distance
+def _sdf(view: MapView, request: SdfRequest) -> SdfReply:
+    points = _points("point", request.origin, request.points, most=MAX_QUERY_POINTS)
+    return _reply(SdfReply, view.query(points, request.gradient), epoch=view.epoch)
+
+
+def _distance(view: MapView, request: DistanceRequest) -> DistanceReply:
+    points = _searched("point", request.origin, request.points)
+    options = DistanceOptions(
+        request.max_distance_m, request.surface_point, request.unknown_distance
+    )
+    answer = distances(view, points, options)
+    return _reply(
+        DistanceReply,
+        answer,
+        surface_point=_relative(answer._surface_point, request.origin),
+        unknown_point=_relative(answer._unknown_point, request.origin),
+    )
+
+
+def _spheres(view: MapView, request: SpheresRequest) -> SpheresReply:
+    centres = _searched("sphere", request.origin, request.centres)
+    return _reply(SpheresReply, spheres(view, centres, request.radii_m.astype(np.float64)))
+
+
+def _segments(view: MapView, request: SegmentsRequest) -> SegmentsReply:
+    starts = _searched("start", request.origin, request.starts)
+    ends = _searched("end", request.origin, request.ends)
+    lengths = np.linalg.norm(ends - starts, axis=1)
+    if lengths.max(initial=0.0) > MAX_RANGE_M:  # each step waits for the one before
+        worst = int(lengths.argmax())
+        raise RefusedError(
+            "bad_request",
+            f"segment {worst} is {lengths[worst]:g} m long: use at most {MAX_RANGE_M:g} m",
         )
-        with self._view(request.epoch) as view:
-            answer = distances(view, points, options)
-        return _reply(
-            DistanceReply,
-            answer,
-            surface_point=_relative(answer._surface_point, request.origin),
-            unknown_point=_relative(answer._unknown_point, request.origin),
-        )
-
-    def spheres(self, request: SpheresRequest) -> SpheresReply:
-        """Return what spheres contain."""
-        centres = _searched("sphere", request.origin, request.centres)
-        with self._view(request.epoch) as view:
-            answer = spheres(view, centres, request.radii_m.astype(np.float64))
-        return _reply(SpheresReply, answer)
-
-    def segments(self, request: SegmentsRequest) -> SegmentsReply:
-        """Return what a ball meets on segments."""
-        starts = _searched("start", request.origin, request.starts)
-        ends = _searched("end", request.origin, request.ends)
-        lengths = np.linalg.norm(ends - starts, axis=1)
-        if lengths.max(initial=0.0) > MAX_RANGE_M:  # each step waits for the one before
-            worst = int(lengths.argmax())
-            raise RefusedError(
-                "bad_request",
-                f"segment {worst} is {lengths[worst]:g} m long: use at most {MAX_RANGE_M:g} m",
-            )
-        total_m = float(lengths.sum())
-        _check_count(total_m / SEGMENT_M_PER_SEARCH, f"segments of {total_m:.0f} m in all")
-        with self._view(request.epoch) as view:
-            answer = segments(
-                view, starts, ends, request.radius_m, max_distance_m=request.max_distance_m
-            )
-        return _reply(SegmentsReply, answer)
-
-    def rays(self, request: RaysRequest) -> RaysReply:
-        """Return how far rays reach."""
-        starts = _searched("start", request.origin, request.starts)
-        directions = request.directions.astype(np.float64)
-        lengths = np.linalg.norm(directions, axis=1)
-        bad = ~(np.abs(lengths - 1.0) < 1e-3)
-        if bad.any():
-            worst = int(bad.argmax())
-            raise RefusedError(
-                "bad_request", f"direction {worst} has length {lengths[worst]:g}, not 1"
-            )
-        reach_m = request.max_range_m
-        _check_count(
-            len(starts) * reach_m / RAY_M_PER_SEARCH, f"{len(starts)} rays of {reach_m:g} m"
-        )
-        directions /= lengths[:, None]
-        with self._view(request.epoch) as view:
-            answer = rays(view, starts, directions, reach_m, request.through_unknown)
-        return _reply(RaysReply, answer)
-
-    def ground(self, request: GroundRequest) -> GroundReply:
-        """Return what lies below points."""
-        points = _searched("point", request.origin, request.points)
-        drop_m = request.max_drop_m
-        _check_count(
-            len(points) * drop_m / RAY_M_PER_SEARCH, f"{len(points)} points with {drop_m:g} m below"
-        )
-        with self._view(request.epoch) as view:
-            answer = ground(view, points, drop_m)
-        below_m = (points[:, 2] - answer.height_m).astype(np.float32)
-        return _reply(GroundReply, answer, drop_m=below_m)
-
-    def grid(self, request: GridRequest) -> GridReply:
-        """Return distance and status at a grid's cells."""
-        counts = (int(request.counts[0]), int(request.counts[1]), int(request.counts[2]))
-        shape = GridShape(request.corner, request.cell_m, counts)
-        _check_count(shape.cells, f"{shape.cells} cells")
-        with self._view(request.epoch) as view:
-            answer = grid(view, shape, request.max_distance_m)
-        return _reply(GridReply, answer)
-
-    def align(self, request: AlignRequest) -> AlignReply:
-        """Return the pose of a scan near a guess."""
-        _check_count(len(request.points), f"{len(request.points)} points")
-        with self._view(request.epoch) as view:
-            points = request.points.astype(np.float64)
-            answer = align(view, points, request.world_from_sensor, request.max_distance_m)
-        return _reply(AlignReply, answer)
+    total_m = float(lengths.sum())
+    _check_count(total_m / SEGMENT_M_PER_SEARCH, f"segments of {total_m:.0f} m in all")
+    most_m = request.max_distance_m
+    return _reply(
+        SegmentsReply, segments(view, starts, ends, request.radius_m, max_distance_m=most_m)
+    )
 
 
-QUESTIONS: dict[type[Request[Any]], Callable[[Answers, Any], Any]] = {
-    SdfRequest: Answers.sdf,
-    DistanceRequest: Answers.distance,
-    SpheresRequest: Answers.spheres,
-    SegmentsRequest: Answers.segments,
-    RaysRequest: Answers.rays,
-    GroundRequest: Answers.ground,
-    GridRequest: Answers.grid,
-    AlignRequest: Answers.align,
+def _rays(view: MapView, request: RaysRequest) -> RaysReply:
+    starts = _searched("start", request.origin, request.starts)
+    directions = request.directions.astype(np.float64)
+    lengths = np.linalg.norm(directions, axis=1)
+    bad = ~(np.abs(lengths - 1.0) < 1e-3)
+    if bad.any():
+        worst = int(bad.argmax())
+        raise RefusedError("bad_request", f"direction {worst} has length {lengths[worst]:g}, not 1")
+    reach_m = request.max_range_m
+    _check_count(len(starts) * reach_m / RAY_M_PER_SEARCH, f"{len(starts)} rays of {reach_m:g} m")
+    directions /= lengths[:, None]
+    return _reply(RaysReply, rays(view, starts, directions, reach_m, request.through_unknown))
+
+
+def _ground(view: MapView, request: GroundRequest) -> GroundReply:
+    points = _searched("point", request.origin, request.points)
+    drop_m = request.max_drop_m
+    _check_count(
+        len(points) * drop_m / RAY_M_PER_SEARCH, f"{len(points)} points with {drop_m:g} m below"
+    )
+    answer = ground(view, points, drop_m)
+    below_m = (points[:, 2] - answer.height_m).astype(np.float32)
+    return _reply(GroundReply, answer, drop_m=below_m)
+
+
+def _grid(view: MapView, request: GridRequest) -> GridReply:
+    counts = (int(request.counts[0]), int(request.counts[1]), int(request.counts[2]))
+    shape = GridShape(request.corner, request.cell_m, counts)
+    _check_count(shape.cells, f"{shape.cells} cells")
+    return _reply(GridReply, grid(view, shape, request.max_distance_m))
+
+
+def _align(view: MapView, request: AlignRequest) -> AlignReply:
+    _check_count(len(request.points), f"{len(request.points)} points")
+    points = request.points.astype(np.float64)
+    answer = align(view, points, request.world_from_sensor, request.max_distance_m)
+    return _reply(AlignReply, answer)
+
+
+QUESTIONS: dict[type[Request[Any]], Callable[[MapView, Any], Any]] = {
+    SdfRequest: _sdf,
+    DistanceRequest: _distance,
+    SpheresRequest: _spheres,
+    SegmentsRequest: _segments,
+    RaysRequest: _rays,
+    GroundRequest: _ground,
+    GridRequest: _grid,
+    AlignRequest: _align,
 }
 """All questions about the map, and what makes their answers."""
 

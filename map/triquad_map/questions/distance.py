@@ -60,6 +60,18 @@ def refuse_unknown(what: str, meets: Bools) -> None:
         raise UnknownSpaceError(what, int(meets.argmax()), int(meets.sum()))
 
 
+def are_free(what: str, blocked: Bools, meets: Bools, unknown: UnknownLike) -> Bools:
+    """Return which of N things [N] can pass, where unknown space counts as asked.
+
+    Raises:
+        UnknownSpaceError: it counts as an error, and one of them ``meets`` it.
+        ValueError: ``unknown`` is no :class:`Unknown`.
+    """
+    if Unknown(unknown) is Unknown.ERROR:
+        refuse_unknown(what, meets)
+    return ~blocked if Unknown(unknown) is Unknown.FREE else ~(blocked | meets)
+
+
 @dataclass(frozen=True)
 class DistanceOptions:
     """The options of a query for distances."""

@@ -100,21 +100,17 @@ def _columns(view: MapView, points: Doubles, max_drop_m: float) -> _Columns:
     """Return the columns below ``points`` [N, 3]; those at a surface begin a little above."""
     starts = points.copy()
     depths = np.full(len(points), max_drop_m)
-    hit = _trace_down(view, starts, depths)
+    down = np.broadcast_to(_DOWN, starts.shape)
+    hit = trace(view, starts, down, ranges=depths)
     buried = hit & (depths <= 0)
     low = np.flatnonzero(buried)
     lift_m = _TOLERANCE_VOXELS * view.voxel_m
     starts[low, 2] += lift_m
     again = np.full(len(low), max_drop_m + lift_m)
-    hit[low] = _trace_down(view, starts[low], again)
+    hit[low] = trace(view, starts[low], down[low], ranges=again)
     depths[low] = again
     buried[low] = hit[low] & (again <= 0)
     return _Columns(starts, depths, hit & ~buried, buried)
-
-
-def _trace_down(view: MapView, starts: Doubles, depths: Doubles) -> Bools:
-    """Shorten ``depths`` [N] to the first surface below; return whether there is one."""
-    return trace(view, starts, np.broadcast_to(_DOWN, starts.shape), ranges=depths)
 
 
 def _seen_down(view: MapView, starts: Doubles, depths: Doubles) -> Doubles:

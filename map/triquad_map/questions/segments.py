@@ -10,9 +10,8 @@ from triquad_map.questions.distance import (
     DistanceOptions,
     Unknown,
     UnknownLike,
-    UnknownSpaceError,
+    are_free,
     distances,
-    refuse_unknown,
 )
 from triquad_map.view import MapView
 
@@ -44,10 +43,7 @@ class Segments:
             UnknownSpaceError: it counts as an error, and is met before any contact.
             ValueError: ``unknown`` is no :class:`Unknown`.
         """
-        if Unknown(unknown) is Unknown.ERROR:
-            refuse_unknown("segment", self.meets_unknown)
-        free = ~self.blocked
-        return free if Unknown(unknown) is Unknown.FREE else free & ~self.meets_unknown
+        return are_free("segment", self.blocked, self.meets_unknown, unknown)
 
 
 @dataclass(frozen=True)
@@ -164,9 +160,8 @@ class Polyline:
             UnknownSpaceError: it counts as an error, and is met before any contact.
             ValueError: ``unknown`` is no :class:`Unknown`.
         """
-        if Unknown(unknown) is Unknown.ERROR and self.meets_unknown:
-            raise UnknownSpaceError("polyline", 0, 1)
-        return not self.blocked and (Unknown(unknown) is Unknown.FREE or not self.meets_unknown)
+        blocked, meets = np.array([self.blocked]), np.array([self.meets_unknown])
+        return bool(are_free("polyline", blocked, meets, unknown)[0])
 
 
 def along_polyline(parts: Segments) -> Polyline:

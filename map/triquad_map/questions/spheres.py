@@ -10,8 +10,8 @@ from triquad_map.questions.distance import (
     DistanceOptions,
     Unknown,
     UnknownLike,
+    are_free,
     distances,
-    refuse_unknown,
 )
 from triquad_map.view import MapView
 
@@ -34,11 +34,8 @@ class Spheres:
             UnknownSpaceError: it counts as an error, and a sphere without a surface meets it.
             ValueError: ``unknown`` is no :class:`Unknown`.
         """
-        meets = self.status == Status.UNKNOWN
-        free: Bools = self.status == Status.FREE
-        if Unknown(unknown) is Unknown.ERROR:
-            refuse_unknown("sphere", meets)
-        return free | meets if Unknown(unknown) is Unknown.FREE else free
+        blocked, meets = self.status == Status.SURFACE, self.status == Status.UNKNOWN
+        return are_free("sphere", blocked, meets, unknown)
 
 
 def spheres(view: MapView, centres: Doubles, radii: Doubles) -> Spheres:

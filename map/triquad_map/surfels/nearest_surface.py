@@ -7,7 +7,7 @@ from triquad_format.records.arrays import Bytes, Doubles, Floats, Longs
 
 from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.surface import HALF_LIFE_S, SurfelKind
-from triquad_map.surfels.surfel_search import NearestSurfels, find_nearest
+from triquad_map.surfels.surfel_search import NearestSurfels, find_nearest, no_surfels
 from triquad_map.surfels.surfel_tree import SurfelTree
 from triquad_map.view import NO_LENGTH_M, NearestSurface
 
@@ -29,15 +29,6 @@ class ShownSurfels(NamedTuple):
     normals: Floats  # [S, 3]
     confidence: Floats  # [S]
     seen_s: Longs  # [S]
-
-
-@inner_kernel()
-def _leaf_coordinates(points: Doubles, frame: RegionFrame) -> Doubles:
-    places = np.empty((len(points), 3))
-    for i in range(len(points)):
-        for axis in range(3):
-            places[i, axis] = (points[i, axis] - frame.corner[axis]) / frame.leaf_m
-    return places
 
 
 @inner_kernel()
@@ -70,16 +61,10 @@ def improve_nearest(
     nearest: NearestSurface,
 ) -> None:
     """Improve ``nearest`` where a surfel lies nearer to ``points`` [N, 3] of the map frame."""
-    count = len(points)
-    places = _leaf_coordinates(points, frame)
-    found = NearestSurfels(
-        nearest.distance / frame.leaf_m,
-        np.empty((count, 3)),
-        np.empty((count, 3)),
-        np.full(count, -1, np.int32),
-    )
+    places = (points - np.array(frame.corner)) / frame.leaf_m
+    found = no_surfels(nearest.distance / frame.leaf_m)
     find_nearest(places, tree, found)
-    for i in range(count):
+    for i in range(len(points)):
         row = found.rows[i]
         if row < 0:
             continue

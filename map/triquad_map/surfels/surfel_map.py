@@ -4,7 +4,6 @@ Surfels stand in the order of the evidence: block by block, and within a block v
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Ints, Longs
@@ -14,6 +13,7 @@ from triquad_format.records.region import BLOCK_BYTES, surface_counts
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.voxel_index import LOW, SHIFT, keys_of
 from triquad_map.evidence.evidence import FrozenEvidence
+from triquad_map.field.frozen_field import FieldValues, FrozenField, in_grid
 from triquad_map.surface import (
     Rows,
     SampleField,
@@ -54,9 +54,9 @@ class SurfelPlaces:
 
 def surfel_places(cells: Longs, surface: Bytes) -> SurfelPlaces:
     """Return places for voxels in ``surface`` [blocks, BLOCK_BYTES] of blocks ``cells`` [, 3]."""
-    counts = surface_counts(surface)
-    starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
-    return SurfelPlaces(cells, surface, starts, tree_shape(cells, surface, starts))
+    starts = np.append(0, np.cumsum(surface_counts(surface))).astype(np.int32)
+    shape = tree_shape(surfel_voxels(cells, surface, int(starts[-1])))
+    return SurfelPlaces(cells, surface, starts, shape)
 
 
 @kernel()
@@ -78,41 +78,26 @@ def surfel_voxels(cells: Longs, surface: Bytes, count: int) -> Longs:
     return voxels
 
 
-class SurfelRows(NamedTuple):
-    """The arrays of surfels in blocks of voxels, as kernels take them."""
-
-    surface: Bytes  # [blocks, BLOCK_BYTES]
-    starts: Ints  # [blocks + 1]
-    offsets: Floats  # [S, 3]
-    normals: Floats  # [S, 3]
-    kinds: Bytes  # [S]
-    epochs: Longs  # [S]
-
-
 @kernel()
-def carry(before: SurfelRows, now: SurfelRows) -> Bools:
-    """Copy surfels to the same voxels of ``now``; return whether each [S] of ``before`` has one.
+def _rows_before(before: Bytes, surface: Bytes, count: int) -> Rows:
+    """Return the surfel of the same voxel ``before`` of each one [count] now; -1: it had none.
 
-    Blocks of ``now`` are those of ``before`` and more.
+    Their voxels are set in masks [blocks, BLOCK_BYTES]; the blocks are those before and more.
     """
-    carried = np.zeros(len(before.epochs), np.bool_)
-    for block in range(len(before.surface)):
-        new, old = now.starts[block], before.starts[block]
+    rows = np.full(count, -1, np.intp)
+    new = old = 0
+    for block in range(len(surface)):
         for byte in range(BLOCK_BYTES):
-            bits, old_bits = int(now.surface[block, byte]), int(before.surface[block, byte])
+            bits = int(surface[block, byte])
+            old_bits = int(before[block, byte]) if block < len(before) else 0
             if bits | old_bits == 0:  # as in most blocks, which are of open air
                 continue
             for z in range(BLOCK_VOXELS):
                 if bits >> z & old_bits >> z & 1:
-                    for axis in range(3):
-                        now.offsets[new, axis] = before.offsets[old, axis]
-                        now.normals[new, axis] = before.normals[old, axis]
-                    now.kinds[new] = before.kinds[old]
-                    now.epochs[new] = before.epochs[old]
-                    carried[old] = True
+                    rows[new] = old
                 new += bits >> z & 1
                 old += old_bits >> z & 1
-    return carried
+    return rows
 
 
 @dataclass(frozen=True)
@@ -122,19 +107,6 @@ class _Fitted:
     places: SurfelPlaces
     surfels: Surfels
     epochs: Longs  # [S] ``_NEVER`` where there is nothing yet
-
-    @property
-    def rows(self) -> SurfelRows:
-        """Their arrays."""
-        places, surfels = self.places, self.surfels
-        return SurfelRows(
-            places.surface,
-            places.starts,
-            offsets=surfels.offsets,
-            normals=surfels.normals,
-            kinds=surfels.kinds,
-            epochs=self.epochs,
-        )
 
 
 class SurfelMap:
@@ -174,11 +146,6 @@ class SurfelMap:
         """Improve ``nearest`` where a surfel lies nearer to ``points`` [N, 3] of the map frame."""
         improve_nearest(points, self._tree, self._shown, frame, nearest)
 
-    @property
-    def are_learnt(self) -> bool:
-        """Whether the field has learnt all of them: then :meth:`put_planes` changes nothing."""
-        return self._planes is None
-
     def put_planes(
         self, settings: FieldSettings, points: Floats, sdf: Floats, gradients: Floats
     ) -> None:
@@ -208,18 +175,43 @@ class SurfelMap:
         fitted = _carried(self._fitted, places, voxels)
         rows = _outdated(fitted, most)
         _follow_rays(fitted.surfels, voxels, rows, by_rays, since)
-        return _fitted_again(
-            evidence, fitted, voxels, rows, field=field, by_rays=by_rays, epoch=epoch
-        )
+        for first in range(0, len(rows), _FITTED_AT_ONCE):
+            part = rows[first : first + _FITTED_AT_ONCE]
+            found = fit_surfels(voxels[part], field, evidence.ended_in, by_rays)
+            fitted.surfels.take(part, found)
+        fitted.epochs[rows] = epoch
+        return SurfelMap(evidence, fitted, voxels)
+
+
+@dataclass(frozen=True)
+class ShownField:
+    """A trained field, and near surface that it has not learnt, the planes that rays have shown."""
+
+    trained: FrozenField
+    surfels: SurfelMap
+
+    def evaluate(self, points: Floats, gradient: bool) -> FieldValues:
+        """Return the field at points [N, 3], on the caller's thread."""
+        values = self.trained.evaluate(points, gradient)
+        self.surfels.put_planes(self.trained.settings, points, values.sdf, values.gradient)
+        return values
+
+    def evaluate_in_grid(self, axes: Floats, points: Longs) -> Floats:
+        """Return distances [N] at points of a grid: :meth:`FrozenField.evaluate_in_grid`."""
+        distances = self.trained.evaluate_in_grid(axes, points)
+        if self.surfels.surfels.are_unlearnt.any():
+            places, gradients = in_grid(axes, points), np.zeros((0, 3), np.float32)
+            self.surfels.put_planes(self.trained.settings, places, distances, gradients)
+        return distances
 
 
 def first_surfels(
     evidence: FrozenEvidence, field: SampleField, epoch: int, by_rays: ShownByRays = nothing_shown
 ) -> SurfelMap:
     """Return the surfels of all seen voxels, for an epoch."""
-    fitted = _nothing_in(surfel_places(evidence.cells, evidence.surface))
-    voxels, rows = fitted.places.voxels(), _outdated(fitted, None)
-    return _fitted_again(evidence, fitted, voxels, rows, field=field, by_rays=by_rays, epoch=epoch)
+    places = surfel_places(evidence.cells, evidence.surface)
+    nothing = SurfelMap(evidence, _nothing_in(places), places.voxels())
+    return nothing.updated(evidence, field, epoch, None, by_rays)
 
 
 def _nothing_in(places: SurfelPlaces) -> _Fitted:
@@ -232,11 +224,16 @@ def _carried(before: _Fitted, places: SurfelPlaces, voxels: Longs) -> _Fitted:
     if places is before.places:
         every = np.arange(len(before.epochs))
         return _Fitted(places, before.surfels.chosen(every), before.epochs.copy())
-    after = _nothing_in(places)
-    carried = carry(before.rows, after.rows)
-    if not carried.all():
-        beside = _beside(after.surfels, voxels, gone=before.places.voxels()[~carried])
-        after.epochs[beside] = _NEVER
+    if not len(before.epochs):
+        return _nothing_in(places)
+    found = _rows_before(before.places.surface, places.surface, len(voxels))
+    new = np.flatnonzero(found < 0)
+    after = _Fitted(places, before.surfels.chosen(found), before.epochs[found])
+    after.surfels.take(new, Surfels.none(len(new)))
+    after.epochs[new] = _NEVER
+    if len(voxels) - len(new) < len(before.epochs):
+        gone = np.delete(before.places.voxels(), found[found >= 0], axis=0)
+        after.epochs[_beside(after.surfels, voxels, gone)] = _NEVER
     return after
 
 
@@ -279,21 +276,3 @@ def _oldest(fitted: _Fitted, chosen: Bools, most: int) -> Rows:
     if len(rows) <= most:
         return rows
     return rows[np.argpartition(fitted.epochs[rows], most)[:most]]
-
-
-def _fitted_again(
-    evidence: FrozenEvidence,
-    fitted: _Fitted,
-    voxels: Longs,
-    rows: Rows,
-    *,
-    field: SampleField,
-    by_rays: ShownByRays,
-    epoch: int,
-) -> SurfelMap:
-    """Fit the surfels in some rows, of all ``voxels`` [S, 3]; changes ``fitted``."""
-    for first in range(0, len(rows), _FITTED_AT_ONCE):
-        part = rows[first : first + _FITTED_AT_ONCE]
-        fitted.surfels.take(part, fit_surfels(voxels[part], field, evidence.ended_in, by_rays))
-    fitted.epochs[rows] = epoch
-    return SurfelMap(evidence, fitted, voxels)

@@ -74,6 +74,7 @@ class NearestSurfels(NamedTuple):
     rows: Ints  # [N] number of the surfel, -1 where there is none
 
 
+@kernel()
 def no_surfels(limits: Doubles) -> NearestSurfels:
     """Return what is known of points before surfels within ``limits`` [N] voxels are found."""
     count = len(limits)
@@ -269,7 +270,7 @@ def find_nearest(points: Doubles, tree: SurfelTree, nearest: NearestSurfels) -> 
 
     Points are leaf coordinates of the region and may lie outside of it.
     """
-    if len(points) == 0 or len(tree.children) < 2:
+    if len(points) == 0 or len(tree.order) == 0:
         return
     room = Room(
         np.empty(_KEPT, np.int32),

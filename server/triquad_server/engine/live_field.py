@@ -197,8 +197,10 @@ class LiveField:
         self.features.append(new)
 
     def growth_by(self, leaves: Longs) -> int:
-        """Return how many vertices :meth:`grow` would add."""
-        return 0 if self.settings.encoding == "fourier" else self.tree.growth_by(leaves)
+        """Return the most vertices that :meth:`grow` would add: all those of the ``leaves``."""
+        return (
+            0 if self.settings.encoding == "fourier" else LiveQuadtree(self.settings).grow(leaves)
+        )
 
     def restore(self, plane: int, h: int, codes: Longs, features: Floats) -> None:
         """Add the vertices ``codes`` [V] of one level with their ``features`` [V, d]."""

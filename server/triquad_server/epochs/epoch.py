@@ -11,10 +11,9 @@ from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.region import MapProgress, MapRecord, Region
 from triquad_map.compiled.team import Split, in_one
 from triquad_map.composition.composed_view import ComposedView
-from triquad_map.composition.shown_field import ShownField
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.field.frozen_field import FrozenField
-from triquad_map.surfels.surfel_map import SurfelMap
+from triquad_map.surfels.surfel_map import ShownField, SurfelMap
 
 from triquad_server.engine.field_record import region_record
 

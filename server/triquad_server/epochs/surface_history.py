@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.errors import RefusedError
 from triquad_format.records.arrays import Bools, Bytes, Ints, Longs
+from triquad_format.records.cells import same_cells
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings, RegionIndex
 from triquad_format.records.region import BLOCK_BYTES
 from triquad_format.wire.query_messages import ChangesReply, ChangesRequest
-from triquad_map.clusters import Boxes, same_cells, tight_boxes
+from triquad_map.clusters import Boxes, tight_boxes
 from triquad_map.compiled.voxel_index import cells_of
 
 from triquad_server.epochs.epoch import Epoch, FrozenRegion

@@ -14,7 +14,7 @@ from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
 from triquad_format.records.region import MapProgress, MapRecord, Region
 from triquad_format.records.replay_rays import are_held_out
 from triquad_format.records.seen_space import owned_evidence
-from triquad_map.field_fit import MapFit, PlaceFits, Places, in_cube, map_fit
+from triquad_map.field_fit import MapFit, PlaceFits, in_cube, map_fit
 from triquad_map.record_view import open_view
 
 from triquad_tools.console.amounts import within
@@ -187,7 +187,7 @@ def _fit(record: MapRecord) -> MapFit | None:
         for number, points in ends.items():
             region = view.region_views[number]
             sdf = region.field.evaluate(points, gradient=False).sdf
-            fits.append((region.centre, PlaceFits.of(Places.of(points, record.settings), sdf)))
+            fits.append((region.centre, PlaceFits.of(points, record.settings, sdf)))
     return map_fit(fits)
 
 

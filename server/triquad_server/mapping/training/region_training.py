@@ -6,7 +6,7 @@ from triquad_format.records.region import TrainingState
 from triquad_map.compiled.voxel_index import keys_of
 from triquad_map.evidence.live_evidence import LiveEvidence
 from triquad_map.field.frozen_field import FrozenField
-from triquad_map.field_fit import PlaceFits, Places
+from triquad_map.field_fit import PlaceFits
 from triquad_map.surfels.surfel_map import SurfelMap
 from triquad_map.surfels.surfel_search import no_surfels
 
@@ -221,4 +221,4 @@ class RegionTraining:
         ends = self.rays.judging_ends
         if len(ends):
             sdf = field.evaluate(ends, gradient=False).sdf
-            self.fit = PlaceFits.of(Places.of(ends, self._setup.field), sdf)
+            self.fit = PlaceFits.of(ends, self._setup.field, sdf)
