@@ -95,11 +95,6 @@ class Service:
         """The number of the newest epoch."""
         return self._epochs.newest.number
 
-    @property
-    def own_name(self) -> str:
-        """The name of the server in requests to itself."""
-        return self._operations.own_name
-
     def close(self) -> None:
         """Refuse pending requests, stop mapping, and write a last checkpoint.
 
