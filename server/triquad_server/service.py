@@ -40,7 +40,6 @@ from triquad_server.serving.operations import Lane, Operations
 from triquad_server.settings import Settings
 from triquad_server.store.checkpoint_writer import CheckpointWriter
 from triquad_server.store.download import MapDownloads
-from triquad_server.store.resets import Resets
 from triquad_server.store.scrub import Scrubber
 from triquad_server.store.store import Store
 
@@ -168,10 +167,9 @@ class Service:
         serve(MetricsRequest, lambda _: health.metrics(), lane)
         serve(FlushRequest, flush.answer, lane)
 
-        keep_resets = self._settings.store.keep_resets
-        resets = Resets(self._mapper, health.checkpoints, keep_resets, self._trails)
-        serve(CheckpointRequest, health.checkpoints.answer, Lane.FILES)
-        serve(ResetRequest, resets.answer, Lane.FILES)
+        checkpoints, trails = health.checkpoints, self._trails
+        serve(CheckpointRequest, checkpoints.answer, Lane.FILES)
+        serve(ResetRequest, lambda request: checkpoints.reset(request, trails), Lane.FILES)
         serve(MapInfoRequest, downloads.info, Lane.FILES)
 
     def _announce(self, health: Health) -> None:
