@@ -24,10 +24,9 @@ from triquad_format.wire.source_messages import SourcesRequest
 from triquad_map.questions.answers import QUESTIONS, Answers
 
 from triquad_server.epochs.history import EpochHistory
-from triquad_server.epochs.surface_history import CHANGES_KEPT, ChangeQueries, SurfaceHistory
+from triquad_server.epochs.surface_history import CHANGES_KEPT, SurfaceHistory, changes_reply
 from triquad_server.intake.scan_queue import ScanIntake, ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
-from triquad_server.intake.source_ledger import FlushQueries
 from triquad_server.intake.source_trails import SourceTrails
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapListeners, MapperThread
@@ -152,20 +151,24 @@ class Service:
         for question in QUESTIONS:
             lane = Lane.LONG_QUESTIONS if question is GridRequest else Lane.QUESTIONS
             serve(question, answers.answer, lane, max_bytes)
-        changes = ChangeQueries(self._epochs, self._surface, health.server)
         mesh = TileQueries(self._epochs, tiles, health.server)
-        serve(ChangesRequest, changes.changes)
+        serve(
+            ChangesRequest,
+            lambda request: changes_reply(
+                request, self._surface, self._epochs.newest, health.server
+            ),
+        )
         serve(SourcesRequest, self._trails.answer)
         serve(TileListRequest, mesh.tiles, Lane.MESH)
         serve(TileChangesRequest, mesh.changes, Lane.MESH)
         serve(MeshRequest, mesh.mesh, Lane.MESH)
         serve(MapChunkRequest, downloads.chunk, Lane.LONG_QUESTIONS)
 
-        flush = FlushQueries(self._scans.ledger, self._mapper.publish_soon, self._warnings.of)
+        ledger, soon, warnings = self._scans.ledger, self._mapper.publish_soon, self._warnings.of
         lane = Lane.ADMINISTRATION
         serve(StatusRequest, lambda _: health.status(), lane)
         serve(MetricsRequest, lambda _: health.metrics(), lane)
-        serve(FlushRequest, flush.answer, lane)
+        serve(FlushRequest, lambda request: ledger.answer(request, soon, warnings), lane)
 
         checkpoints, trails = health.checkpoints, self._trails
         serve(CheckpointRequest, checkpoints.answer, Lane.FILES)
