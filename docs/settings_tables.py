@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from triquad_server.settings.leaf_lengths import IN_LEAVES
+from triquad_server.settings.sections import IN_LEAVES
 from triquad_server.settings.settings import setting_schemas
 
 PAGE = Path(__file__).with_name("settings.md")

@@ -22,7 +22,6 @@ from triquad_server.service import ServedMap, Service
 from triquad_server.settings import Settings
 from triquad_server.store.restore import ValidCheckpoint
 from triquad_server.store.store import Store
-from triquad_server.supervision import Supervision
 from triquad_server.warm_up import warm_up
 
 if TYPE_CHECKING:
@@ -55,20 +54,21 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
     _stop_where_a_thread_ends(stops)
     if options.store is None:
         _log.warning("no --store: the map is not kept when the server stops")
-    with closing(Supervision(ServiceManager())) as supervision:
-        try:
-            with opened(options, stops, supervision.starting) as service:
-                # A quarter of a million objects, most of them numba's, stay: a collection that goes
-                # through them stops all threads for a tenth of a second.
-                gc.collect()
-                gc.freeze()
-                supervision.serving(service)
-                why = wait_for_stop(stops)
-                supervision.stopping()
-        except StoppedEarlyError:
-            why = stops.get()
-            supervision.stopping()
-        return why
+    manager = ServiceManager()
+    try:
+        with opened(options, stops, manager.starting) as service:
+            # A quarter of a million objects, most of them numba's, stay: a collection that goes
+            # through them stops all threads for a tenth of a second.
+            gc.collect()
+            gc.freeze()
+            health = service.health
+            manager.notify("READY=1", status=health.summary())
+            why = wait_for_stop(stops, lambda: manager.serving(health.summary, health.stuck))
+            manager.stopping()
+    except StoppedEarlyError:
+        why = stops.get()
+        manager.stopping()
+    return why
 
 
 def _stop_where_a_thread_ends(stops: Stops) -> None:

@@ -131,6 +131,16 @@ class Health:
         at, for_s = current.activity.value, current.for_s
         return f"mapping makes no progress: it is at {at} since {for_s:.0f} s"
 
+    def stuck(self, longest_s: float) -> str | None:
+        """Return what is at the same work for longer than ``longest_s``: mapping, or a question."""
+        mapping = self.mapping_problem(min(STUCK_S, longest_s))
+        if mapping is not None:
+            return mapping
+        for_s = self.operations.longest_question_s
+        if for_s <= longest_s:
+            return None
+        return f"a question gets no answer: a worker is at it since {for_s:.0f} s"
+
     def problem(self) -> str | None:
         """Return why the server does not do all that it should; ``None`` if it does.
 

@@ -24,10 +24,9 @@ from triquad_format.wire.source_messages import SourcesRequest
 from triquad_map.questions.answers import QUESTIONS, Answers
 
 from triquad_server.epochs.history import EpochHistory
-from triquad_server.epochs.surface_history import CHANGES_KEPT, ChangeQueries, SurfaceHistory
+from triquad_server.epochs.surface_history import CHANGES_KEPT, SurfaceHistory, changes_reply
 from triquad_server.intake.scan_queue import ScanIntake, ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
-from triquad_server.intake.source_ledger import FlushQueries
 from triquad_server.intake.source_trails import SourceTrails
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapListeners, MapperThread
@@ -40,7 +39,6 @@ from triquad_server.serving.operations import Lane, Operations
 from triquad_server.settings import Settings
 from triquad_server.store.checkpoint_writer import CheckpointWriter
 from triquad_server.store.download import MapDownloads
-from triquad_server.store.resets import Resets
 from triquad_server.store.scrub import Scrubber
 from triquad_server.store.store import Store
 
@@ -94,11 +92,6 @@ class Service:
     def epoch(self) -> int:
         """The number of the newest epoch."""
         return self._epochs.newest.number
-
-    @property
-    def own_name(self) -> str:
-        """The name of the server in requests to itself."""
-        return self._operations.own_name
 
     def close(self) -> None:
         """Refuse pending requests, stop mapping, and write a last checkpoint.
@@ -158,25 +151,28 @@ class Service:
         for question in QUESTIONS:
             lane = Lane.LONG_QUESTIONS if question is GridRequest else Lane.QUESTIONS
             serve(question, answers.answer, lane, max_bytes)
-        changes = ChangeQueries(self._epochs, self._surface, health.server)
         mesh = TileQueries(self._epochs, tiles, health.server)
-        serve(ChangesRequest, changes.changes)
+        serve(
+            ChangesRequest,
+            lambda request: changes_reply(
+                request, self._surface, self._epochs.newest, health.server
+            ),
+        )
         serve(SourcesRequest, self._trails.answer)
         serve(TileListRequest, mesh.tiles, Lane.MESH)
         serve(TileChangesRequest, mesh.changes, Lane.MESH)
         serve(MeshRequest, mesh.mesh, Lane.MESH)
         serve(MapChunkRequest, downloads.chunk, Lane.LONG_QUESTIONS)
 
-        flush = FlushQueries(self._scans.ledger, self._mapper.publish_soon, self._warnings.of)
+        ledger, soon, warnings = self._scans.ledger, self._mapper.publish_soon, self._warnings.of
         lane = Lane.ADMINISTRATION
         serve(StatusRequest, lambda _: health.status(), lane)
         serve(MetricsRequest, lambda _: health.metrics(), lane)
-        serve(FlushRequest, flush.answer, lane)
+        serve(FlushRequest, lambda request: ledger.answer(request, soon, warnings), lane)
 
-        keep_resets = self._settings.store.keep_resets
-        resets = Resets(self._mapper, health.checkpoints, keep_resets, self._trails)
-        serve(CheckpointRequest, health.checkpoints.answer, Lane.FILES)
-        serve(ResetRequest, resets.answer, Lane.FILES)
+        checkpoints, trails = health.checkpoints, self._trails
+        serve(CheckpointRequest, checkpoints.answer, Lane.FILES)
+        serve(ResetRequest, lambda request: checkpoints.reset(request, trails), Lane.FILES)
         serve(MapInfoRequest, downloads.info, Lane.FILES)
 
     def _announce(self, health: Health) -> None:

@@ -4,7 +4,6 @@ import threading
 from collections import deque
 from dataclasses import dataclass
 from itertools import takewhile
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +17,6 @@ from triquad_map.clusters import Boxes, tight_boxes
 from triquad_map.compiled.voxel_index import cells_of
 
 from triquad_server.epochs.epoch import Epoch, FrozenRegion
-from triquad_server.epochs.history import EpochHistory
 
 MAX_BOXES = 256
 """The most boxes of one reply. Where there would be more, voxels twice as far apart share one, and
@@ -50,22 +48,36 @@ class _EpochChanges:
     appeared: Bools  # [N]
 
 
-class _Surface(NamedTuple):
+@dataclass(frozen=True)
+class _Surface:
     """The surface of a region as rays have shown it."""
 
     keys: Longs  # [B] of the blocks
     masks: Bytes  # [B, BLOCK_BYTES]
 
+    @staticmethod
+    def of(region: FrozenRegion | None) -> "_Surface":
+        """Return the surface of a region; none where there is no region."""
+        if region is None:
+            return _Surface(np.zeros(0, np.int64), np.zeros((0, BLOCK_BYTES), np.uint8))
+        seen = region.evidence.seen
+        return _Surface(seen.blocks.row_keys, seen.surface)
 
-class _Flips(NamedTuple):
-    """The differences between the surface of a region and an earlier one."""
+    def without(self, other: "_Surface") -> "_Surface":
+        """Return the voxels that ``other`` does not have; one of the two is the earlier one.
 
-    keys: Longs  # [B] of blocks
-    appeared: Bytes  # [B, BLOCK_BYTES]
-    vanished: Bytes  # [B, BLOCK_BYTES]
+        As a rule the blocks of the later one are those of the earlier one and more.
+        """
+        shared = min(len(self.keys), len(other.keys))
+        if not np.array_equal(self.keys[:shared], other.keys[:shared]):
+            shared = 0  # the region was forgotten and learnt again: all vanished, and all appeared
+        rows = _differing_rows(self.masks[:shared], other.masks[:shared])
+        return _Surface(
+            np.concatenate([self.keys[rows], self.keys[shared:]]),
+            np.concatenate([self.masks[rows] & ~other.masks[rows], self.masks[shared:]]),
+        )
 
 
-_NO_SURFACE = _Surface(np.zeros(0, np.int64), np.zeros((0, BLOCK_BYTES), np.uint8))
 CHANGES_KEPT = 1_000_000
 """The number of changes of voxels' surface that are kept, for clients that request them: 13 bytes
 each."""
@@ -143,33 +155,12 @@ def _changes(before: Epoch, now: Epoch) -> _EpochChanges:
         one, other = old.get(index), new.get(index)
         if one and other and one.evidence is other.evidence:
             continue
-        flips = _flips(_surface_of(one), _surface_of(other))
-        for masks, is_new in ((flips.appeared, True), (flips.vanished, False)):
-            if masks.any():
-                found = _map_voxels(index, flips.keys, masks, settings=now.field_settings)
-                voxels.append(found)
-                appeared.append(np.full(len(found), is_new))
+        was, has = _Surface.of(one), _Surface.of(other)
+        for changed, is_new in ((has.without(was), True), (was.without(has), False)):
+            found = _map_voxels(index, changed, now.field_settings)
+            voxels.append(found)
+            appeared.append(np.full(len(found), is_new))
     return _EpochChanges(now.number, np.concatenate(voxels), np.concatenate(appeared))
-
-
-def _surface_of(region: FrozenRegion | None) -> _Surface:
-    if region is None:
-        return _NO_SURFACE
-    seen = region.evidence.seen
-    return _Surface(seen.blocks.row_keys, seen.surface)
-
-
-def _flips(old: _Surface, new: _Surface) -> _Flips:
-    """Return the differences. As a rule the blocks of ``new`` are those of ``old`` and more."""
-    shared = min(len(old.keys), len(new.keys))
-    if not np.array_equal(old.keys[:shared], new.keys[:shared]):
-        shared = 0  # the region was forgotten and learnt again: all vanished, and all appeared
-    rows = _differing_rows(old.masks[:shared], new.masks[:shared])
-    gone, added = old.masks[shared:], new.masks[shared:]
-    before = np.concatenate([old.masks[rows], gone, np.zeros_like(added)])
-    now = np.concatenate([new.masks[rows], np.zeros_like(gone), added])
-    keys = np.concatenate([old.keys[rows], old.keys[shared:], new.keys[shared:]])
-    return _Flips(keys, now & ~before, before & ~now)
 
 
 def _differing_rows(one: Bytes, other: Bytes) -> NDArray[np.intp]:
@@ -178,103 +169,70 @@ def _differing_rows(one: Bytes, other: Bytes) -> NDArray[np.intp]:
     return np.unique(words // (BLOCK_BYTES // np.dtype(np.uint64).itemsize))
 
 
-def _map_voxels(index: RegionIndex, keys: Longs, masks: Bytes, settings: FieldSettings) -> Ints:
-    """Return the voxels [N, 3] of the map's lattice set in ``masks``, without those of neighbours.
+def _map_voxels(index: RegionIndex, surface: _Surface, settings: FieldSettings) -> Ints:
+    """Return the voxels [N, 3] of the map's lattice in a region, without those of its neighbours.
 
     Neighbouring regions overlap, and agree there.
     """
-    used = np.flatnonzero(masks.any(axis=1))
-    cells, mine = cells_of(keys[used]), settings.owned_blocks
+    used = np.flatnonzero(surface.masks.any(axis=1))
+    cells, mine = cells_of(surface.keys[used]), settings.owned_blocks
     owned = ((cells >= mine.start) & (cells < mine.stop)).all(axis=1)
-    bits = np.unpackbits(masks[used[owned]], bitorder="little").view(np.bool_)
+    bits = np.unpackbits(surface.masks[used[owned]], bitorder="little").view(np.bool_)
     block, *inner = np.unravel_index(np.flatnonzero(bits), (len(used), *[BLOCK_VOXELS] * 3))
     corner = np.rint(settings.region_corner(index) / settings.leaf_m).astype(np.int64)
     corners = (corner + cells[owned] * BLOCK_VOXELS).astype(np.int32)
     return corners[block] + np.stack(inner, axis=1, dtype=np.int32, casting="unsafe")
 
 
-class ChangeQueries:
-    """Answers what changed since an epoch."""
+def changes_reply(
+    request: ChangesRequest, history: SurfaceHistory, newest: Epoch, server: str
+) -> ChangesReply:
+    """Return what changed in the request's box until the ``newest`` epoch of this ``server``.
 
-    def __init__(self, epochs: EpochHistory, history: SurfaceHistory, server: str) -> None:
-        """Make the handler; ``server`` is the name that replies carry."""
-        self._epochs = epochs
-        self._history = history
-        self._server = server
-
-    def changes(self, request: ChangesRequest) -> ChangesReply:
-        """Return what changed in the request's box.
-
-        Raises:
-            RefusedError: it is not known what changed since then.
-        """
-        newest = self._epochs.newest
-        if request.server not in ("", self._server):
-            raise RefusedError(
-                "epoch_gone",
-                f"epoch {request.since} is one of server {request.server[:64]!r}, and this is "
-                f"{self._server!r}: it was restarted; ask for the map again, then for changes "
-                f"since its epoch, {newest.number} now or later",
-            )
-        since = request.since or newest.number
-        changes = self._history.between(since, newest.number)
-        inside = _inside(changes, request, newest)
-        return self._reply(_boxed(changes.part(inside)), since, newest)
-
-    def _reply(self, kinds: "list[_Boxed]", since: int, newest: Epoch) -> ChangesReply:
-        low, high = (
-            np.concatenate(corners) * newest.field_settings.leaf_m
-            for corners in zip(*((kind.boxes.low, kind.boxes.high) for kind in kinds), strict=True)
+    Raises:
+        RefusedError: it is not known what changed since then.
+    """
+    if request.server not in ("", server):
+        raise RefusedError(
+            "epoch_gone",
+            f"epoch {request.since} is one of server {request.server[:64]!r}, and this is "
+            f"{server!r}: it was restarted; ask for the map again, then for changes since its "
+            f"epoch, {newest.number} now or later",
         )
-        return ChangesReply(
-            epoch=newest.number,
-            server=self._server,
-            since=since,
-            minimum=low.round(_DECIMALS),
-            maximum=high.round(_DECIMALS),
-            appeared=np.concatenate([kind.appeared for kind in kinds]),
-            epochs=np.concatenate([kind.epochs for kind in kinds]),
-            voxels=np.concatenate([kind.counts for kind in kinds]),
-        )
-
-
-@dataclass(frozen=True)
-class _Boxed:
-    """The voxels that all appeared, or all vanished, and the boxes around them."""
-
-    voxels: VoxelChanges
-    boxes: Boxes
-
-    @property
-    def appeared(self) -> Bytes:
-        """Return 1 where surface appeared, 0 where it vanished, for each box."""
-        appeared = np.zeros(len(self.boxes.low), np.uint8)
-        appeared[self.boxes.box] = self.voxels.appeared
-        return appeared
-
-    @property
-    def epochs(self) -> Longs:
-        """Return the epoch of the newest change in each box."""
-        epochs = np.zeros(len(self.boxes.low), np.int64)
-        np.maximum.at(epochs, self.boxes.box, self.voxels.epochs)
-        return epochs
-
-    @property
-    def counts(self) -> Longs:
-        """Return the number of voxels in each box."""
-        return np.bincount(self.boxes.box, minlength=len(self.boxes.low)).astype(np.int64)
-
-
-def _boxed(changes: VoxelChanges) -> list[_Boxed]:
-    """Return boxes, few enough, around voxels that appeared, and around those that vanished."""
+    since = request.since or newest.number
+    changes = history.between(since, newest.number)
+    changes = changes.part(_inside(changes, request, newest))
+    # Surface that appeared and surface that vanished share no box.
     kinds = [changes.part(changes.appeared), changes.part(~changes.appeared)]
+    boxes = _boxes_around(kinds)
+    leaf_m = newest.field_settings.leaf_m
+    counts = [np.bincount(one.box, minlength=len(one.low)).astype(np.int64) for one in boxes]
+    return ChangesReply(
+        epoch=newest.number,
+        server=server,
+        since=since,
+        minimum=(np.concatenate([one.low for one in boxes]) * leaf_m).round(_DECIMALS),
+        maximum=(np.concatenate([one.high for one in boxes]) * leaf_m).round(_DECIMALS),
+        appeared=np.repeat(np.array([1, 0], np.uint8), [len(one.low) for one in boxes]),
+        epochs=np.concatenate([_newest_in(*of_kind) for of_kind in zip(boxes, kinds, strict=True)]),
+        voxels=np.concatenate(counts),
+    )
+
+
+def _newest_in(boxes: Boxes, changes: VoxelChanges) -> Longs:
+    """Return the epoch of the newest change in each box."""
+    epochs = np.zeros(len(boxes.low), np.int64)
+    np.maximum.at(epochs, boxes.box, changes.epochs)
+    return epochs
+
+
+def _boxes_around(kinds: list[VoxelChanges]) -> list[Boxes]:
+    """Return boxes, few enough, around the voxels of each kind."""
     scale = 1
     while True:
-        boxed = [
-            _Boxed(kind, tight_boxes(kind.voxels, _LONGEST_VOXELS, scale=scale)) for kind in kinds
-        ]
-        if sum(len(kind.boxes.low) for kind in boxed) <= MAX_BOXES:
-            return boxed
+        boxes = [tight_boxes(kind.voxels, _LONGEST_VOXELS, scale=scale) for kind in kinds]
+        if sum(len(one.low) for one in boxes) <= MAX_BOXES:
+            return boxes
         scale *= 2
 
 

@@ -101,13 +101,9 @@ def _check_shapes(points: Floats, no_return: Floats) -> None:
             raise ScanRefusedError(f"{what}_shape", f"{what}: {list(array.shape)}, not [N, 3]")
 
 
-def check_count(points: Floats, no_return: Floats | None, max_points: int) -> None:
-    """Refuse more than ``max_points`` points and rays without a return.
-
-    Raises:
-        ScanRefusedError: ``too_many_points``.
-    """
-    count = len(points) + (0 if no_return is None else len(no_return))
+def _check_count(points: Floats, no_return: Floats, max_points: int) -> None:
+    """Refuse more than ``max_points`` points and rays without a return."""
+    count = len(points) + len(no_return)
     if count > max_points:
         raise ScanRefusedError(
             "too_many_points",
@@ -249,7 +245,7 @@ def usable_rays(
     empty = np.empty((0, 3), np.float32) if no_return is None else no_return
     _check_pose(world_from_sensor)
     _check_shapes(points, empty)
-    check_count(points, no_return, settings.max_points)
+    _check_count(points, empty, settings.max_points)
     directions = _unit_vectors(empty) if source.no_return else np.empty((0, 3))
     disbelieved = 0 if source.no_return else len(empty)
     low, high = (np.array(corner, np.float64) for corner in source.robot_box_m or _NOWHERE)

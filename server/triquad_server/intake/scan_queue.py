@@ -13,9 +13,8 @@ from triquad_format.wire import codec, keys
 from triquad_format.wire.limits import payload_limit
 from triquad_format.wire.messages import Scan
 
-from triquad_server.errors import ScanRefusedError
 from triquad_server.fair_queue import FairQueue, Owner
-from triquad_server.intake.rays import ScanRays, check_count
+from triquad_server.intake.rays import ScanRays
 from triquad_server.intake.source_ledger import SourceLedger
 
 _log = logging.getLogger(__name__)
@@ -77,14 +76,6 @@ class ScanQueue:
             waiting = _WaitingScan(scan, time.monotonic())
             for pushed_out in self._scans.put(Owner(scan.source), waiting, _bytes_of(scan)):
                 self.ledger.push_out(pushed_out.scan)
-
-    def refuse(self, scan: Scan, reason: str, text: str) -> None:
-        """Record that a scan that arrived is not queued."""
-        with self._taken:
-            backwards = self.ledger.arrive(scan)
-            if backwards is None:
-                self.ledger.refuse(scan, text)
-            self.dropped[backwards or reason] += 1
 
     def receive(self, nbytes: int) -> None:
         """Count the bytes of a message that arrived."""
@@ -164,9 +155,9 @@ class ScanIntake:
     ) -> None:
         """Begin to receive; ``arrived`` is called after each scan that was queued.
 
-        Scans of more than ``max_points`` points are refused here, before they wait.
+        Messages that are larger than ``max_points`` points can be are dropped.
         """
-        self._max_points = max_points
+        self._max_bytes = payload_limit(max_points)
         self._queue = queue
         self._arrived = arrived
         # Decoded in the network's own threads: who sends too much is slowed down, and no other.
@@ -190,9 +181,8 @@ class ScanIntake:
         self._arrived()
 
     def _receive(self, key: str, payload: zenoh.ZBytes) -> None:
-        max_bytes = payload_limit(self._max_points)
-        if len(payload) > max_bytes:
-            self._drop("too_large", key, f"{len(payload)} bytes exceed {max_bytes}")
+        if len(payload) > self._max_bytes:
+            self._drop("too_large", key, f"{len(payload)} bytes exceed {self._max_bytes}")
             return
         try:
             scan = codec.decode(Scan, payload.to_bytes())
@@ -212,11 +202,6 @@ class ScanIntake:
             keys.check_name("source", scan.source)
         except FormatError as error:
             self._drop("bad_source", key, error)
-            return
-        try:
-            check_count(scan.points, scan.no_return, self._max_points)
-        except ScanRefusedError as error:
-            self._queue.refuse(scan, error.reason, str(error))
             return
         self._queue.put(scan)
 

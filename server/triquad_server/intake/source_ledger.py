@@ -172,6 +172,26 @@ class SourceLedger:
                 last_refusal=known.counts.last_refusal,
             )
 
+    def answer(
+        self,
+        request: FlushRequest,
+        publish_soon: Callable[[], None],
+        warnings: Callable[[str], str | None],
+    ) -> FlushReply:
+        """Return what became of the scans of a session, at once: who is not done asks again.
+
+        ``publish_soon`` requests an epoch from the mapper; ``warnings`` returns those about a
+        source.
+        """
+        scan = request.source, request.session, request.sequence
+        reply = self.outcome(*scan, overdue=request.waited_s >= ARRIVAL_GRACE_S)
+        if not reply.done:
+            if self.is_settled(*scan):
+                publish_soon()
+            return reply
+        lines = filter(None, (reply.warnings, warnings(request.source)))
+        return replace(reply, warnings="\n".join(lines) or None)
+
     def lost(self) -> dict[str, int]:
         """Return the number of lost scans, by source."""
         return {source: counts.lost for source, counts in self.by_source().items() if counts.lost}
@@ -232,32 +252,3 @@ def _of_stranger(source: str, sequence: int) -> FlushReply:
         "not let it publish as this source (a role names its sources), or the server was started "
         "again since",
     )
-
-
-class FlushQueries:
-    """Answers flush requests at once: a publisher asks again until all is done."""
-
-    def __init__(
-        self,
-        ledger: SourceLedger,
-        publish_soon: Callable[[], None],
-        warnings: Callable[[str], str | None] = lambda _: None,
-    ) -> None:
-        """Make the handler; ``publish_soon`` requests an epoch from the mapper.
-
-        ``warnings`` returns those about a source.
-        """
-        self._ledger = ledger
-        self._publish_soon = publish_soon
-        self._warnings = warnings
-
-    def answer(self, request: FlushRequest) -> FlushReply:
-        """Return what became of the scans of a session."""
-        scan = request.source, request.session, request.sequence
-        reply = self._ledger.outcome(*scan, overdue=request.waited_s >= ARRIVAL_GRACE_S)
-        if not reply.done:
-            if self._ledger.is_settled(*scan):
-                self._publish_soon()
-            return reply
-        lines = filter(None, (reply.warnings, self._warnings(request.source)))
-        return replace(reply, warnings="\n".join(lines) or None)

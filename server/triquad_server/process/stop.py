@@ -3,6 +3,7 @@
 import logging
 import queue
 import threading
+from collections.abc import Callable
 from contextlib import suppress
 from enum import Enum
 
@@ -25,14 +26,17 @@ Stops = queue.SimpleQueue[Stop]
 _WAKE_S = 0.5
 
 
-def wait_for_stop(stops: Stops) -> Stop:
+def wait_for_stop(stops: Stops, meanwhile: Callable[[], None] = lambda: None) -> Stop:
     """Wait until something asks the server to stop, or until the program's main thread has ended.
+
+    Twice a second ``meanwhile`` is called.
 
     The system may deliver a signal to any thread, a library's too, and its Python handler runs once
     the main thread does: so that thread must not block for good.
     """
     why: Stop | None = None
     while why is None and threading.main_thread().is_alive():
+        meanwhile()
         with suppress(queue.Empty):
             why = stops.get(timeout=_WAKE_S)
     why = why or Stop.ASKED

@@ -145,14 +145,15 @@ class Operations:
         self.counts: dict[str, OperationCounts] = {}  # by operation, such as "query/sdf"
 
     @property
-    def own_name(self) -> str:
-        """The name of the server in a request to itself, to have turns of its own."""
-        return self._sessions.own_name
-
-    @property
     def queue_metrics(self) -> dict[str, QueueMetrics]:
         """The state of each queue, by its name."""
         return {lane.value: queue.metrics for lane, queue in self._queues.items()}
+
+    @property
+    def longest_question_s(self) -> float:
+        """The seconds for which a worker has been at the same question."""
+        lanes = (Lane.QUESTIONS, Lane.LONG_QUESTIONS)
+        return max(self._queues[lane].longest_work_s for lane in lanes)
 
     def serve(
         self,

@@ -1,6 +1,5 @@
 """The queue of requests: client sessions take turns at a few workers."""
 
-import secrets
 import threading
 import time
 from collections.abc import Callable
@@ -56,7 +55,6 @@ class ClientSessions:
 
     def __init__(self, session: zenoh.Session) -> None:
         self._info = session.info
-        self.own_name = secrets.token_hex(16)  # in requests of the server to itself; known to none
         self._linked = frozenset[str]()  # Zenoh ids at the other ends of links
         self._read_s = 0.0  # when that was, monotonic
 
@@ -81,7 +79,7 @@ class ClientSessions:
         # A new client may send requests at once.
         if name not in self._linked or now > self._read_s + _FRESH_S:
             ids = (str(transport.zid) for transport in self._info.transports())
-            self._linked, self._read_s = frozenset((self.own_name, *ids)), now
+            self._linked, self._read_s = frozenset(ids), now
         return name in self._linked
 
 
@@ -118,7 +116,7 @@ class RequestQueue(Generic[RequestT]):
             requests_each,
             newest_go=True,
         )
-        self._working: set[RequestT] = set()
+        self._working: dict[RequestT, float] = {}  # with the time of their begin, monotonic
         self._sending: dict[RequestT, int] = {}  # with the bytes of the reply
 
     @property
@@ -126,6 +124,13 @@ class RequestQueue(Generic[RequestT]):
         """Return the state of the requests that wait for a worker."""
         with self._lock:
             return QueueMetrics(len(self._waiting), self._waiting.limit)
+
+    @property
+    def longest_work_s(self) -> float:
+        """The seconds for which a worker has been at the same request."""
+        with self._lock:
+            now = time.monotonic()
+            return now - min(self._working.values(), default=now)
 
     def put(self, request: RequestT, nbytes: int) -> list[RequestT]:
         """Queue a request for a worker; return those that are too many now."""
@@ -150,7 +155,7 @@ class RequestQueue(Generic[RequestT]):
                 and on_their_way + nbytes > _REPLY_BYTES
             ):
                 return False
-            self._working.discard(request)
+            del self._working[request]
             self._sending[request] = nbytes
             self._fill()
             return True
@@ -158,7 +163,7 @@ class RequestQueue(Generic[RequestT]):
     def finish(self, request: RequestT) -> None:
         """End a request: its reply is sent."""
         with self._lock:
-            self._working.discard(request)
+            self._working.pop(request, None)
             self._sending.pop(request, None)
             self._fill()
 
@@ -173,7 +178,7 @@ class RequestQueue(Generic[RequestT]):
             request = self._waiting.take(self._may_begin)
             if request is None:
                 return
-            self._working.add(request)
+            self._working[request] = time.monotonic()
             self._begin(request)
 
     def _may_begin(self, request: RequestT) -> bool:

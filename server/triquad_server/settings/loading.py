@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 from triquad_format.errors import SettingsError
 
-from triquad_server.settings.leaf_lengths import follows_leaf
+from triquad_server.settings.sections import follows_leaf
 from triquad_server.settings.settings import (
     SOURCE_SECTION,
     Settings,

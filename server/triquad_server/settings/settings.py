@@ -7,8 +7,8 @@ from triquad_format.errors import FormatError, SettingsError
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.wire.keys import check_name
 
-from triquad_server.settings.leaf_lengths import DEFAULT_LEAF_M, at_leaf, follows_leaf
 from triquad_server.settings.sections import (
+    DEFAULT_LEAF_M,
     RECORD,
     ChangeSettings,
     MemorySettings,
@@ -19,7 +19,9 @@ from triquad_server.settings.sections import (
     SourceSettings,
     StoreSettings,
     TrainingSettings,
+    at_leaf,
     check_robot_box,
+    follows_leaf,
 )
 
 SOURCE_SECTION = "sources.NAME"

@@ -1,4 +1,4 @@
-"""Writes checkpoints from time to time, on request, and at the end."""
+"""Writes checkpoints from time to time, on request, before each reset, and at the end."""
 
 import logging
 import threading
@@ -6,7 +6,12 @@ import time
 from dataclasses import replace
 
 from triquad_format.errors import RefusedError
-from triquad_format.wire.messages import CheckpointInfo, CheckpointRequest
+from triquad_format.wire.messages import (
+    CheckpointInfo,
+    CheckpointRequest,
+    ResetReply,
+    ResetRequest,
+)
 from triquad_format.wire.metrics_messages import CheckpointMetrics
 from triquad_map.compiled.team import lower_priority
 
@@ -16,6 +21,8 @@ from triquad_server.errors import (
     MapperStoppedError,
     StoreError,
 )
+from triquad_server.intake.source_trails import SourceTrails
+from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.process.threads import NICENESS
 from triquad_server.store.store import Store
@@ -97,6 +104,29 @@ class CheckpointWriter:
         except StoreError as error:
             raise RefusedError("store", str(error)) from error
 
+    def reset(self, request: ResetRequest, trails: SourceTrails) -> ResetReply:
+        """Forget what lies in the request's box, and reply once an epoch shows it.
+
+        The map as it was stays on disk, so that nothing is lost by mistake. Where sources have been
+        in the box is removed from ``trails``.
+
+        Raises:
+            RefusedError: the map as it is could not be kept, and was not reset.
+        """
+
+        def forget(mapper: Mapper) -> int:
+            mapper.reset(request.minimum, request.maximum)
+            trails.forget(request.minimum, request.maximum)
+            return mapper.publish().number
+
+        emptied = self._mapper.call(lambda mapper: None if mapper.regions else forget(mapper))
+        if emptied is not None:
+            return ResetReply(emptied, undo="the map was empty before")
+        kept, undo = self._keep()
+        epoch = self._mapper.call(forget)
+        _log.warning("the map was reset as of epoch %d: %s", epoch, undo)
+        return ResetReply(epoch, kept, undo)
+
     def found_damaged(self, name: str) -> None:
         """Write all of the map again, if the newest checkpoint needs the file ``name``."""
         with self._writing:
@@ -126,6 +156,26 @@ class CheckpointWriter:
                     self.error = str(error)
                     _log.error("%s", self.error)
                 raise
+
+    def _keep(self) -> tuple[int | None, str]:
+        """Write the map to a checkpoint that stays; return its epoch, and how to go back to it.
+
+        Raises:
+            RefusedError: it cannot be written.
+        """
+        if self._store is None or self._store.keep_resets == 0:
+            why = "store.keep_resets = 0" if self._store else "the server has no store"
+            return None, f"the map before was not kept: {why}"
+        try:
+            kept = self.write("a reset").epoch
+        except StoreError as error:
+            raise RefusedError(
+                "store", f"nothing was reset, for the map as it is could not be kept: {error}"
+            ) from error
+        return kept, (
+            f"epoch {kept}, the map before, is kept; to go back to it, stop the server and start "
+            f"it with --restore {kept}"
+        )
 
     def _write(self, store: Store, undoes: str) -> CheckpointInfo:
         """Do as :meth:`write`; an error is not recorded yet."""

@@ -36,7 +36,6 @@ from triquad_server.settings import StoreSettings
 from triquad_server.store.map_folder import StoreLock, delete_unneeded
 from triquad_server.store.restore import (
     ValidCheckpoint,
-    check_countable,
     newest_valid,
     valid_checkpoint,
 )
@@ -65,6 +64,7 @@ class Store:
             StoreError: the folder cannot be written to, or another server has locked it.
         """
         self.folder = root / map_name
+        self.keep_resets = settings.keep_resets
         self._newest: _Newest | None = None
         self._restored: Restored | None = None  # the last time that the map was restored
         self._settings = settings
@@ -161,7 +161,6 @@ class Store:
             chosen = checkpoint_of(self.folder, epoch)
             if chosen.epoch == files[0].epoch:
                 return
-            check_countable(files[0].path, files[0].epoch + 1)
             again = self._manifest_again(valid_checkpoint(chosen), files[0].epoch + 1)
             if newest is not None:
                 marked = dataclasses.replace(newest, undoes=f"restoring epoch {epoch}")

@@ -7,7 +7,7 @@ from triquad_format.wire import limits
 from triquad_format.wire.bounds import check_question
 from triquad_format.wire.messages import FlushReply, FlushRequest
 from triquad_server.intake import source_ledger
-from triquad_server.intake.source_ledger import ARRIVAL_GRACE_S, FlushQueries, SourceLedger
+from triquad_server.intake.source_ledger import ARRIVAL_GRACE_S, SourceLedger
 
 
 @pytest.fixture
@@ -17,7 +17,9 @@ def ledger():
 
 @pytest.fixture
 def flush(ledger):
-    return FlushQueries(ledger, lambda: None)
+    return lambda request, publish_soon=lambda: None: ledger.answer(
+        request, publish_soon, lambda _: None
+    )
 
 
 def asks(sequence=0, **changes):
@@ -53,41 +55,40 @@ def test_requests_out_of_range_are_refused_and_others_are_answered(flush, reques
     with pytest.raises(WireError, match=r"FlushRequest\."):
         check_question(request_)
     check_question(asks(2))
-    assert flush.answer(asks(2)) == none_arrived(3)
+    assert flush(asks(2)) == none_arrived(3)
 
 
 def test_a_scan_that_stays_out_of_the_map_is_not_done(flush, ledger):
     ledger.arrive(servers.scan(0))
-    assert flush.answer(asks()) == FlushReply(False, 0, 0, 0, None)
+    assert flush(asks()) == FlushReply(False, 0, 0, 0, None)
 
 
 def test_a_scan_that_may_still_arrive_is_not_done_and_lost_later(flush, ledger):
     ledger.arrive(servers.scan(0))
     ledger.take(servers.scan(0))
     ledger.publish()
-    assert flush.answer(asks(1, waited_s=0.0)) == FlushReply(False, 1, 0, 0, None)
-    assert flush.answer(asks(1)) == FlushReply(True, 1, 0, 1, None)
+    assert flush(asks(1, waited_s=0.0)) == FlushReply(False, 1, 0, 0, None)
+    assert flush(asks(1)) == FlushReply(True, 1, 0, 1, None)
     assert ledger.lost() == {}, "it may still come"
 
 
-def test_an_epoch_is_asked_for_once_the_scan_is_in_the_map(ledger):
+def test_an_epoch_is_asked_for_once_the_scan_is_in_the_map(flush, ledger):
     asked = []
-    flush = FlushQueries(ledger, lambda: asked.append(1))
     ledger.arrive(servers.scan(0))
-    assert not flush.answer(asks()).done
+    assert not flush(asks(), lambda: asked.append(1)).done
     assert not asked
     ledger.take(servers.scan(0))
-    assert not flush.answer(asks()).done
+    assert not flush(asks(), lambda: asked.append(1)).done
     assert asked
     ledger.publish()
-    assert flush.answer(asks()) == FlushReply(True, 1, 0, 0, None)
+    assert flush(asks()) == FlushReply(True, 1, 0, 0, None)
 
 
 def test_questions_about_strangers_push_nobody_out(flush, ledger, monkeypatch):
     monkeypatch.setattr(source_ledger, "MAX_SESSIONS", 2)
     ledger.arrive(servers.scan(0))
     for session in range(100, 110):
-        assert flush.answer(asks(4, session=session)) == none_arrived(5)
+        assert flush(asks(4, session=session)) == none_arrived(5)
     ledger.take(servers.scan(0))
     assert ledger.is_settled("lidar", 7, 0)
     assert ledger.lost() == {}

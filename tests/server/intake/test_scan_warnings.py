@@ -139,7 +139,10 @@ def test_scans_that_never_arrived_are_not_blamed_on_a_slow_server() -> None:
 def test_refused_scans_are_told_with_the_reason() -> None:
     scans = ScanQueue(2)
     warnings = ScanWarnings(scans, SETTINGS, Clock())
-    scans.refuse(servers.scan(0), "too_many_points", "7 points exceed scan.max_points = 5")
+    scans.put(servers.scan(0))
+    scan = scans.take()
+    assert scan is not None
+    scans.reject(scan, "too_many_points", "7 points exceed scan.max_points = 5")
     text = warnings.of("lidar")
     assert text == (
         "source 'lidar': 1 of its scans were refused, the last since scan 0: "

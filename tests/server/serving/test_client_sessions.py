@@ -37,12 +37,6 @@ def test_who_is_linked_has_turns_of_its_own_until_it_leaves():
         assert group(sessions, name) == ""
 
 
-def test_what_the_server_asks_itself_has_turns_that_nobody_else_can_take():
-    with raw_session("peer") as session:
-        sessions = ClientSessions(session)
-        assert group(sessions, sessions.own_name) == sessions.own_name
-
-
 def test_one_who_asks_before_its_link_is_known_has_turns_of_its_own():
     endpoint = free_endpoint()
     with raw_session("peer", listen=endpoint) as session:
