@@ -43,17 +43,27 @@ class Sighting:
         """Return some of the points."""
         return Sighting(self.points[rows], self.sdf[rows], self.status[rows], leaf_m=self.leaf_m)
 
-    def having(self, status: Status) -> Doubles:
+    def having(self, status: Status) -> "Sighting":
         """Return the points of which the other map says ``status``."""
-        return np.asarray(self.points[self.status == status])
+        return self.part(np.flatnonzero(self.status == status))
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two maps, seen from each other."""
+    """Two maps A and B, seen from each other."""
 
-    old: Sighting  # surface of the first map, asked in the second
-    new: Sighting  # surface of the second map, asked in the first
+    old: Sighting  # surface of A, asked in B
+    new: Sighting  # surface of B, asked in A
+
+    @property
+    def in_one_map(self) -> dict[str, Sighting]:
+        """The points that are surface in only one map, by what the other says of them."""
+        return {
+            "vanished": self.old.having(Status.FREE),
+            "appeared": self.new.having(Status.FREE),
+            "newly_seen": self.new.having(Status.UNKNOWN),
+            "no_longer_known": self.old.having(Status.UNKNOWN),
+        }
 
 
 @dataclass(frozen=True)
@@ -107,7 +117,7 @@ def difference(comparison: Comparison, tile_m: float) -> MapDiff:
         key=lambda tile: (tile.change.changed_m3, np.nan_to_num(tile.change.moved_p95_m)),
         reverse=True,
     )
-    return MapDiff(tile_m, _change(comparison.old, comparison.new), tuple(tiles))
+    return MapDiff(tile_m, _change(comparison), tuple(tiles))
 
 
 def surface_points(opened: "OfflineMap") -> Doubles:
@@ -163,26 +173,25 @@ def _tiles(comparison: Comparison, tile_m: float) -> Iterator[TileChange]:
     count = len(old.points)
     cells = np.floor(np.concatenate([old.points, new.points]) / tile_m).astype(np.int64)
     for cell, rows in rows_by_cell(cells):
-        change = _change(old.part(rows[rows < count]), new.part(rows[rows >= count] - count))
+        inside = Comparison(old.part(rows[rows < count]), new.part(rows[rows >= count] - count))
         low, high = (tuple((end * tile_m).round(6).tolist()) for end in (cell, cell + 1))
-        yield TileChange(low, high, change)
+        yield TileChange(low, high, _change(inside))
 
 
-def _change(old: Sighting, new: Sighting) -> Change:
-    moved = np.abs(old.sdf[old.status == Status.SURFACE]).astype(np.float64)
-    vanished, appeared = len(old.having(Status.FREE)), len(new.having(Status.FREE))
+def _change(comparison: Comparison) -> Change:
+    old, new = comparison.old, comparison.new
+    counts = {kind: len(found.points) for kind, found in comparison.in_one_map.items()}
+    moved = np.abs(old.having(Status.SURFACE).sdf).astype(np.float64)
     median, p95 = np.quantile(moved, [0.5, 0.95]) if len(moved) else (np.nan, np.nan)
     swept = float(moved[moved > NOISE_M].sum()) * old.leaf_m**2
+    came_and_went = counts["vanished"] * old.leaf_m**3 + counts["appeared"] * new.leaf_m**3
     return Change(
         points_a=len(old.points),
         points_b=len(new.points),
-        appeared=appeared,
-        vanished=vanished,
-        newly_seen=len(new.having(Status.UNKNOWN)),
-        no_longer_known=len(old.having(Status.UNKNOWN)),
+        **counts,
         moved_median_m=float(median),
         moved_p95_m=float(p95),
-        changed_m3=swept + vanished * old.leaf_m**3 + appeared * new.leaf_m**3,
+        changed_m3=swept + came_and_went,
     )
 
 

@@ -1,10 +1,10 @@
 """Objects that appeared or vanished between two maps; ``docs/tools.md`` has the rules."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from triquad_format.records.arrays import Doubles
-from triquad_format.records.status import Status
 from triquad_map.clusters import clusters
 
 from triquad_tools.console.lines import print_line
@@ -37,35 +37,19 @@ class Cluster:
         return np.subtract(self.high_m, self.low_m)
 
 
-@dataclass(frozen=True)
-class ObjectChanges:
-    """The objects in only one of two maps A and B, those of most points first.
+def object_changes(comparison: Comparison) -> dict[str, list[Cluster]]:
+    """Return the objects in only one of two maps, by kind, those of most points first.
 
     What moved vanished in one place and appeared in another.
     """
-
-    vanished: tuple[Cluster, ...]  # only in A: B has seen free space there
-    appeared: tuple[Cluster, ...]  # only in B: A has seen free space there
-    newly_seen: tuple[Cluster, ...]  # only in B: A has seen nothing there
-    no_longer_known: tuple[Cluster, ...]  # only in A: B has seen nothing there
+    return {kind: _clusters(found) for kind, found in comparison.in_one_map.items()}
 
 
-def object_changes(comparison: Comparison) -> ObjectChanges:
-    """Return what is in only one of two maps as a whole."""
-    old, new = comparison.old, comparison.new
-    return ObjectChanges(
-        vanished=_clusters(old, Status.FREE),
-        appeared=_clusters(new, Status.FREE),
-        newly_seen=_clusters(new, Status.UNKNOWN),
-        no_longer_known=_clusters(old, Status.UNKNOWN),
-    )
-
-
-def print_objects(changes: ObjectChanges) -> None:
+def print_objects(changes: Mapping[str, Sequence[Cluster]]) -> None:
     """Print a table of the first, and how many there are besides."""
     rows = [
         (kind.replace("_", " "), f"{one.points:,}", *_metres(one.middle_m), *_metres(one.size_m))
-        for kind, found in vars(changes).items()
+        for kind, found in changes.items()
         for one in found
     ]
     if not rows:
@@ -77,17 +61,16 @@ def print_objects(changes: ObjectChanges) -> None:
         print_line(f"  and {len(rows) - _LISTED} more: --json prints all")
 
 
-def _clusters(sighting: Sighting, status: Status) -> tuple[Cluster, ...]:
-    """Return clusters of points whose other status is ``status``, those of most points first."""
-    points = sighting.having(status)
+def _clusters(sighting: Sighting) -> list[Cluster]:
+    points = sighting.points
     voxels = np.floor(points / sighting.leaf_m).astype(np.int64)
-    members = (points[rows] for _, rows in rows_by_cell(clusters(voxels)[:, None]))
     found = []
-    for some in members:
-        low, high = (tuple(end.round(3).tolist()) for end in (some.min(axis=0), some.max(axis=0)))
-        if len(some) >= LEAST_POINTS:
-            found.append(Cluster(low, high, len(some)))
-    return tuple(sorted(found, key=lambda cluster: -cluster.points))
+    for _, rows in rows_by_cell(clusters(voxels)[:, None]):
+        if len(rows) >= LEAST_POINTS:
+            ends = points[rows].min(axis=0), points[rows].max(axis=0)
+            low, high = (tuple(end.round(3).tolist()) for end in ends)
+            found.append(Cluster(low, high, len(rows)))
+    return sorted(found, key=lambda cluster: -cluster.points)
 
 
 def _metres(place: Doubles) -> tuple[str, ...]:
