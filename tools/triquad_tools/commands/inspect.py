@@ -39,14 +39,9 @@ def _parser() -> argparse.ArgumentParser:
         "2 not readable (missing, or of a newer version), or wrong usage.",
     )
     add = parser.add_argument
-    add(
-        "files",
-        type=Path,
-        nargs="+",
-        metavar="FILE",
-        help="map file; folder of checkpoints, of which the newest is meant; or endpoint of a "
-        "server, such as tcp/127.0.0.1:7447, whose map is fetched",
-    )
+    maps = "map file; folder of checkpoints, of which the newest is meant; or endpoint of a "
+    maps += "server, such as tcp/127.0.0.1:7447, whose map is fetched"
+    add("files", type=Path, nargs="+", metavar="FILE", help=maps)
     add("--map", metavar="NAME", help="of the server (default: default)")
     add_config(parser)
     at = "the newest checkpoint of the folder FILE that is not after this, such as 120 or "
