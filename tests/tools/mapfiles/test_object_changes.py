@@ -116,4 +116,4 @@ def test_the_table_lists_them_and_programs_get_all(files, capsys):
     assert main([*files, "--diff", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)["objects"]
     assert found["vanished"][0].keys() == {"low_m", "high_m", "points"}
-    assert found.keys() == {"vanished", "appeared", "newly_seen", "no_longer_known"}
+    assert found.keys() == {"vanished", "appeared", "newly_seen", "no_longer_known", "moved"}

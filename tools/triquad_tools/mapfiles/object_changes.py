@@ -1,4 +1,4 @@
-"""Objects that appeared or vanished between two maps; ``docs/tools.md`` has the rules."""
+"""Objects that appeared, vanished or moved between two maps; ``docs/tools.md`` has the rules."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from triquad_map.clusters import clusters
 
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.report import print_columns
-from triquad_tools.mapfiles.diff import Comparison, Sighting, rows_by_cell
+from triquad_tools.mapfiles.diff import Comparison, Sighting
 
 LEAST_POINTS = 20
 """Clusters of fewer surface points are left out: noise makes them, too. These are 0.8 square metres
@@ -38,11 +38,11 @@ class Cluster:
 
 
 def object_changes(comparison: Comparison) -> dict[str, list[Cluster]]:
-    """Return the objects in only one of two maps, by kind, those of most points first.
+    """Return what changed as a whole between two maps, by kind, that of most points first.
 
-    What moved vanished in one place and appeared in another.
+    What moved by more than a voxel vanished in one place and appeared in another.
     """
-    return {kind: _clusters(found) for kind, found in comparison.in_one_map.items()}
+    return {kind: _clusters(found) for kind, found in comparison.changed.items()}
 
 
 def print_objects(changes: Mapping[str, Sequence[Cluster]]) -> None:
@@ -53,7 +53,7 @@ def print_objects(changes: Mapping[str, Sequence[Cluster]]) -> None:
         for one in found
     ]
     if not rows:
-        print_line("  nothing appeared or vanished as a whole")
+        print_line("  nothing appeared, vanished or moved as a whole")
         return
     titles = ("what", "points", "middle x m", "y m", "z m", "size x m", "y m", "z m")
     print_columns(titles, rows[:_LISTED])
@@ -63,9 +63,12 @@ def print_objects(changes: Mapping[str, Sequence[Cluster]]) -> None:
 
 def _clusters(sighting: Sighting) -> list[Cluster]:
     points = sighting.points
-    voxels = np.floor(points / sighting.leaf_m).astype(np.int64)
+    _, numbers = np.unique(
+        clusters(np.floor(points / sighting.leaf_m).astype(np.int64)), return_inverse=True
+    )
+    order, sizes = np.argsort(numbers, kind="stable"), np.bincount(numbers)
     found = []
-    for _, rows in rows_by_cell(clusters(voxels)[:, None]):
+    for rows in np.split(order, np.cumsum(sizes))[:-1]:
         if len(rows) >= LEAST_POINTS:
             ends = points[rows].min(axis=0), points[rows].max(axis=0)
             low, high = (tuple(end.round(3).tolist()) for end in ends)

@@ -114,14 +114,14 @@ def _draw_movement(axes: Axes, edges: Edges, old: Sighting) -> None:
 
 
 def _draw_presence(axes: Axes, edges: Edges, comparison: Comparison) -> None:
-    in_one = comparison.in_one_map
+    changed = comparison.changed
     # Later ones cover earlier ones: what only one map has seen says least.
     layers = (
         ("in both", FREE, comparison.old.having(Status.SURFACE)),
-        ("newly seen: only B has been there", NEWLY_SEEN, in_one["newly_seen"]),
-        ("no longer known: only A has been there", NO_LONGER_KNOWN, in_one["no_longer_known"]),
-        ("appeared: free space in A", APPEARED, in_one["appeared"]),
-        ("vanished: free space in B", VANISHED, in_one["vanished"]),
+        ("newly seen: only B has been there", NEWLY_SEEN, changed["newly_seen"]),
+        ("no longer known: only A has been there", NO_LONGER_KNOWN, changed["no_longer_known"]),
+        ("appeared: free space in A", APPEARED, changed["appeared"]),
+        ("vanished: free space in B", VANISHED, changed["vanished"]),
     )
     shown = np.full([len(along) - 1 for along in reversed(edges)], np.nan)
     for number, (_, _, found) in enumerate(layers):
