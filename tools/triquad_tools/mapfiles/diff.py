@@ -24,6 +24,7 @@ STILL_M = 1e-3
 NOISE_M = 0.02
 """Two maps that learnt the same differ by less, but for single points."""
 
+_BESIDE_LEAVES = 2  # along each axis, as far as points of one object may be apart
 _STEPS = 8
 _LEAST_SLOPE = 0.1  # a flatter field says nothing of where its zero is
 
@@ -56,14 +57,27 @@ class Comparison:
     @property
     def changed(self) -> dict[str, Sighting]:
         """The surface points that are not in both maps, or not where they were, by kind."""
-        near = self.old.having(Status.SURFACE)
+        vanished, hidden = self.old.having(Status.FREE), self.old.having(Status.UNKNOWN)
         return {
-            "vanished": self.old.having(Status.FREE),
+            "vanished": vanished,
             "appeared": self.new.having(Status.FREE),
             "newly_seen": self.new.having(Status.UNKNOWN),
-            "no_longer_known": self.old.having(Status.UNKNOWN),
-            "moved": near.part(np.flatnonzero(np.abs(near.sdf) > NOISE_M)),
+            "no_longer_known": hidden,
+            "moved": self._moved(np.concatenate([vanished.points, hidden.points])),
         }
+
+    def _moved(self, gone: Doubles) -> Sighting:
+        """Return points of A that B has elsewhere, but not those beside what is ``gone`` [N, 3].
+
+        The surface next to a thing that came or went is near the surface of that, too.
+        """
+        from scipy.spatial import cKDTree  # slow to import
+
+        near = self.old.having(Status.SURFACE)
+        moved = near.part(np.flatnonzero(np.abs(near.sdf) > NOISE_M))
+        beside_m = _BESIDE_LEAVES * moved.leaf_m
+        away_m = cKDTree(gone).query(moved.points, p=np.inf, distance_upper_bound=beside_m)[0]
+        return moved.part(np.flatnonzero(np.isinf(away_m)))
 
 
 @dataclass(frozen=True)
@@ -76,7 +90,7 @@ class Change:
     vanished: int  # of A: B has seen free space there
     newly_seen: int  # of B: A has seen nothing there
     no_longer_known: int  # of A: B has seen nothing there
-    moved: int  # of A: B has it near its surface, but by more than NOISE_M elsewhere
+    moved: int  # of A: B has it near its surface, but more than NOISE_M elsewhere
     moved_median_m: float  # of the points of A that B has near its surface; NaN if there are none
     moved_p95_m: float
 

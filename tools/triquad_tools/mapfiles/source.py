@@ -71,8 +71,8 @@ def map_file(
     """Yield a map's file: ``target`` itself, a checkpoint of it, or a server's newest epoch.
 
     The map ``map_name`` of a server, which is reached with a Zenoh configuration ``config``, is
-    downloaded, with its training state, and deleted afterwards. ``when`` says which checkpoint of
-    a folder; see :func:`chosen_file`.
+    downloaded, and deleted afterwards. ``when`` says which checkpoint of a folder; see
+    :func:`chosen_file`.
 
     Raises:
         ToolError: ``when`` is given, but ``target`` is no folder.
@@ -91,7 +91,7 @@ def map_file(
         path = Path(folder) / "map.triquad"
         connected = triquad_client.connect(target, map_name, config=config)
         with progress("downloading"), connected as client:
-            client.download_map(path, training=True)
+            client.download_map(path)
         yield path
 
 
