@@ -112,35 +112,15 @@ def _parser() -> argparse.ArgumentParser:
         epilog="Exit status: 0 done, whatever the figures, 1 a part failed, 2 wrong usage or input",
     )
     add = parser.add_argument
-    add(
-        "parts", nargs="*", type=_part, metavar="PART", help=f"of {', '.join(PARTS)} (default: all)"
-    )
-    add(
-        "--seed",
-        type=seed,
-        default=2,
-        metavar="N",
-        help="of streets, rooms and tables (default: 2)",
-    )
-    add(
-        "--device",
-        choices=("cpu", "cuda"),
-        default="cpu",
-        help="what part core trains on (default: cpu)",
-    )
-    add(
-        "--recorded",
-        type=Path,
-        metavar="FOLDER",
-        help="a folder of scans that part moving maps twice over, too",
-    )
-    add(
-        "--results",
-        type=Path,
-        default=RESULTS,
-        metavar="FOLDER",
-        help="where figures are kept (default: bench/results)",
-    )
+    add("parts", nargs="*", type=_part, metavar="PART", help="(default: all)")
+    seeds = "of streets, rooms and tables (default: 2)"
+    add("--seed", type=seed, default=2, metavar="N", help=seeds)
+    trains = "what part core trains on (default: cpu)"
+    add("--device", choices=("cpu", "cuda"), default="cpu", help=trains)
+    recorded = "a folder of scans that part moving maps twice over, too"
+    add("--recorded", type=Path, metavar="FOLDER", help=recorded)
+    kept = "where figures are kept (default: bench/results)"
+    add("--results", type=Path, default=RESULTS, metavar="FOLDER", help=kept)
     return parser
 
 

@@ -11,15 +11,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_client import Mesh, SdfResult
+from triquad_client import SdfResult
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.status import Status
 from triquad_map.view import FieldAnswer
-from triquad_tools.console.progress import progress
-from triquad_tools.evaluation.metrics import MeshScores, ScoreSettings, mean_or_nan, score_mesh
-from triquad_tools.recordings.cloud import merged
-from triquad_tools.simulation.lidar import SimulatedDrive, SimulatedScan
+from triquad_tools.evaluation.metrics import mean_or_nan
+from triquad_tools.simulation.lidar import SimulatedDrive
 from triquad_tools.simulation.scene import Scene
+
+from bench.driven import Driven, driven
 
 NEAR_M = 0.1  # distances are scored up to this far from the surface
 HOUSE_MARGIN_M = 0.5  # deeper than this in a house nothing can be seen
@@ -45,17 +45,10 @@ class StreetProbes:
 
 
 @dataclass(frozen=True)
-class DrivenStreet:
-    """A simulated drive, its scans, and the truth about what they show."""
+class DrivenStreet(Driven):
+    """A simulated drive along a street, and the truth about what it shows."""
 
-    drive: SimulatedDrive
-    scans: list[SimulatedScan]
     probes: StreetProbes
-    visible: Doubles  # [M, 3] exact surface points that the lidar hit within the scene's bounds
-
-    def mesh_scores(self, mesh: Mesh) -> MeshScores:
-        """Return scores of a mesh within the scene's bounds."""
-        return score_mesh(mesh, self.visible, ScoreSettings(), self.drive.scene.sdf)
 
 
 @dataclass(frozen=True)
@@ -83,16 +76,8 @@ def street_probes(drive: SimulatedDrive, rng: np.random.Generator) -> StreetProb
 
 def driven_street(drive: SimulatedDrive) -> DrivenStreet:
     """Make all scans of a drive."""
-    scans: list[SimulatedScan] = []
-    with progress("simulating the drive", len(drive)) as report:
-        for scan in drive:
-            scans.append(scan)
-            report(len(scans), f"{len(scans)} of {len(drive)} scans")
-    visible = merged((scan.true_hits for scan in scans), _VOXEL_M)
-    low, high = drive.scene.bounds  # to which meshes are cut
-    visible = visible[((visible >= low) & (visible <= high)).all(axis=1)]
     probes = street_probes(drive, np.random.default_rng(_SEED))
-    return DrivenStreet(drive, scans, probes, visible)
+    return DrivenStreet(**vars(driven(drive, _VOXEL_M)), probes=probes)
 
 
 def score_street(query: MapQuery, probes: StreetProbes) -> StreetScores:

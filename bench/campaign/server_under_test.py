@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import triquad_client
 from support import servers
-from triquad_client import Status
+from triquad_client import FlushReport, Status
 from triquad_format.mapfile.reader import read_map
 
 from bench.campaign.turn import BrokenError, Turn
 
+_SPACING_M = 9.0  # between places on the x axis, each with a sphere of its own
 _MAX_GROWTH_BYTES = 200 * 2**20
 WITHIN_S = 30.0  # an honest request is answered, also where much else goes on
 _SETTINGS = servers.SMALL_TOML + "max_regions = 40\n[store]\nkeep = 4\n"
@@ -62,31 +63,36 @@ def learnt_server(turn: Turn) -> Iterator[servers.ServerProcess]:
         yield server
 
 
-def sphere_at(x_m: float, points: int = 500) -> tuple[np.ndarray, np.ndarray]:
-    """Return points of a scan in the sensor frame, and its pose on the x axis."""
+def sphere_at(place: int, points: int = 500) -> tuple[np.ndarray, np.ndarray]:
+    """Return points of a scan in the sensor frame, and its pose at a place on the x axis."""
     pose = np.eye(4)
-    pose[0, 3] = x_m
+    pose[0, 3] = place * _SPACING_M
     return servers.sphere(points), pose
 
 
-def expect_known(client: triquad_client.Client, x_m: float) -> None:
-    """Expect the surface of the sphere at ``x_m`` to be in the map."""
-    points, pose = sphere_at(x_m, 200)
+def publish_at(client: triquad_client.Client, place: int, **options: str) -> FlushReport:
+    """Publish a scan of the sphere at a place, and wait until it is in the map."""
+    client.publish_scan(*sphere_at(place), **options)
+    return client.flush(servers.WAIT_S)
+
+
+def expect_known(client: triquad_client.Client, place: int) -> None:
+    """Expect the surface of the sphere at a place to be in the map."""
+    points, pose = sphere_at(place, 200)
     statuses = client.query_sdf(points + pose[:3, 3]).status
     known = float((statuses == Status.SURFACE).mean())
-    expect(known > 0.95, f"only {known:.0%} of the sphere at {x_m:g} m is in the map")
+    expect(known > 0.95, f"only {known:.0%} of the sphere at place {place} is in the map")
 
 
-def expect_honest_service(endpoint: str, x_m: float = 0.0) -> None:
+def expect_honest_service(endpoint: str, place: int = 0) -> None:
     """Expect a new client to publish a scan, see it in the map, and be answered in time."""
     started = time.monotonic()
     with triquad_client.connect(endpoint) as client:
         for _ in range(2):
-            points, pose = sphere_at(x_m)
-            client.publish_scan(points, pose, source="honest")
+            client.publish_scan(*sphere_at(place), source="honest")
         report = client.flush(WITHIN_S)
         expect(report.lost == report.refused == 0, f"an honest scan is not in the map: {report}")
-        expect_known(client, x_m)
+        expect_known(client, place)
         status = client.status()
         expect("internal" not in status.scans_dropped, "scans met internal errors")
         expect("internal" not in status.requests_refused, "requests met internal errors")
@@ -97,6 +103,13 @@ def expect_steady_memory(turn: Turn, before: int, after: int) -> None:
     """Expect a server to take hardly more bytes than before."""
     turn.measured("growth MB", (after - before) / 2**20)
     expect(after - before < _MAX_GROWTH_BYTES, f"memory grew from {before} to {after} bytes")
+
+
+def checkpoint(client: triquad_client.Client) -> triquad_client.CheckpointInfo:
+    """Have a checkpoint written, and expect it to be what is acknowledged."""
+    kept = client.checkpoint()
+    expect_whole(kept)
+    return kept
 
 
 def expect_whole(kept: triquad_client.CheckpointInfo) -> None:

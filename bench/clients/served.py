@@ -12,8 +12,9 @@ from triquad_client import Client, connect
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.region import MapRecord
-from triquad_tools.console.progress import progress
 from triquad_tools.demo.probe import Probe, ProbeReport
+from triquad_tools.recordings.publishing import publish_all
+from triquad_tools.recordings.recording import DEFAULT_SOURCE, ScanEntry
 from triquad_tools.sensors.sweep import PosedScan
 
 from bench.clients.server_process import server_process
@@ -80,14 +81,15 @@ def stream(
     published: Callable[[int], None] = lambda _: None,
 ) -> None:
     """Publish scans as a lidar does; ``published`` is called with the number of each."""
-    started, stamp_s = time.monotonic(), time.time()
-    with progress(title, len(scans)) as report:
+    due_s = [number / _RATE_HZ for number in range(len(scans))]
+    started_ns = time.time_ns()
+
+    def outgoing() -> Iterator[tuple[ScanEntry, PosedScan]]:
         for number, scan in enumerate(scans):
-            due_s = number / _RATE_HZ
-            time.sleep(max(0.0, started + due_s - time.monotonic()))
-            client.publish_scan(scan.points, scan.world_from_sensor, stamp_s + due_s)
+            yield ScanEntry(started_ns + round(1e9 * due_s[number]), DEFAULT_SOURCE), scan
             published(number)
-            report(number + 1, f"{number + 1} of {len(scans)} scans")
+
+    publish_all(client, outgoing(), len(scans), due_s, title)
 
 
 def stream_beside_planner(
@@ -100,12 +102,17 @@ def stream_beside_planner(
 
 
 def latency_figures(
-    name: str, met: ProbeReport, *, median_ms: float | None = None, tail_ms: float | None = None
+    name: str,
+    met: ProbeReport,
+    *,
+    median_ms: float | None = None,
+    tail_ms: float | None = None,
+    longest_ms: float | None = None,
 ) -> list[Figure]:
-    """Return how soon a planner was answered, and what the median and 99 % should be."""
+    """Return how soon a planner was answered, and what the median, 99 % and all should be."""
     return [
         Figure(f"{name}, median", met.latency_p50_ms, "ms", at_most=median_ms),
         Figure(f"{name}, 99 %", met.latency_p99_ms, "ms", at_most=tail_ms),
-        Figure(f"{name}, longest of {met.queries}", met.latency_max_ms, "ms"),
+        Figure(f"{name}, longest of {met.queries}", met.latency_max_ms, "ms", at_most=longest_ms),
         Figure(f"{name}, errors", met.errors, "", at_most=0),
     ]

@@ -1,22 +1,19 @@
 """Presets: the places and sensors that each is for, streamed at 10 Hz."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 from triquad_client import Mesh
-from triquad_format.records.arrays import Doubles
-from triquad_tools.console.progress import progress
-from triquad_tools.evaluation.metrics import ScoreSettings, score_mesh
-from triquad_tools.recordings.cloud import merged
+from triquad_tools.evaluation.metrics import ScoreSettings
 from triquad_tools.recordings.publishing import FLUSH_TIMEOUT_S, wait_until_settled
-from triquad_tools.sensors.sweep import PosedScan
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.street import street
 
 from bench.clients.served import served, stream
+from bench.driven import Driven, driven
 from bench.figures import Figure
 from bench.scenes.room import room_by_camera, room_by_lidar
 from bench.scenes.tabletop import tabletop_by_camera
@@ -71,47 +68,22 @@ def measure_presets(seed: int) -> list[Figure]:
     return [figure for place in PLACES for figure in _place_figures(place, seed)]
 
 
-@dataclass(frozen=True)
-class _Driven:
-    """The scans of a drive, and what could be seen."""
-
-    drive: SimulatedDrive
-    scans: list[PosedScan]
-    visible: Doubles  # [M, 3] exact surface points within the scene's bounds
-
-
-def _driven(place: Place, seed: int) -> _Driven:
-    made = place.make(seed)
-    low, high = made.scene.bounds
-    scans: list[PosedScan] = []
-
-    def hits() -> Iterator[Doubles]:
-        with progress(f"{place.name}: simulating", len(made)) as report:
-            for scan in made:
-                scans.append(PosedScan(scan.points, scan.world_from_sensor))
-                report(len(scans), f"{len(scans)} of {len(made)} scans")
-                yield scan.true_hits[((scan.true_hits >= low) & (scan.true_hits <= high)).all(1)]
-
-    visible = merged(hits(), place.voxel_m)
-    return _Driven(made, scans, visible)
-
-
 def _place_figures(place: Place, seed: int) -> list[Figure]:
-    driven = _driven(place, seed)
+    made = driven(place.make(seed), place.voxel_m, place.name)
     with served(arguments=("--preset", place.preset)) as server:
         client = server.client
-        stream(client, driven.scans, f"{place.name}: streaming at 10 Hz")
+        stream(client, made.scans, f"{place.name}: streaming at 10 Hz")
         report = client.flush(FLUSH_TIMEOUT_S)
         started = time.monotonic()
         status = wait_until_settled(client, _SETTLE_LIMIT_S)
         settled_s = time.monotonic() - started
-        mesh = client.mesh(driven.drive.scene.box)
-    points = float(np.mean([len(scan.points) for scan in driven.scans]))
+        mesh = client.mesh(made.drive.scene.box)
+    points = float(np.mean([len(scan.points) for scan in made.scans]))
     lost = report.lost + report.refused
     figures = [
         Figure("points of a scan", points, ""),
-        Figure(f"scans lost of {len(driven.scans)}", lost, "", at_most=0),
-        *_f_figures(place, driven, mesh),
+        Figure(f"scans lost of {len(made.scans)}", lost, "", at_most=0),
+        *_f_figures(place, made, mesh),
         Figure("from the last scan until settled", settled_s, "s"),
         Figure("parameters", status.parameters / 1e6, "M"),
         Figure("resident memory of the server", status.memory_bytes / 1e6, "MB"),
@@ -119,11 +91,11 @@ def _place_figures(place: Place, seed: int) -> list[Figure]:
     return [replace(figure, name=f"{place.name}: {figure.name}") for figure in figures]
 
 
-def _f_figures(place: Place, driven: _Driven, mesh: Mesh) -> list[Figure]:
+def _f_figures(place: Place, made: Driven, mesh: Mesh) -> list[Figure]:
     figures = []
     for within_m, wanted in place.f_scores.items():
         settings = ScoreSettings(threshold_m=within_m, voxel_m=place.voxel_m)
-        scores = score_mesh(mesh, driven.visible, settings, driven.drive.scene.sdf)
+        scores = made.mesh_scores(mesh, settings)
         name = f"F-score at {100 * within_m:g} cm"
         figures.append(Figure(name, 100 * scores.f_score, "%", at_least=wanted))
     return [

@@ -14,7 +14,7 @@ from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
 from triquad_server.store.store import Store
 
-from bench.clients.served import MAP, served, stream_beside_planner
+from bench.clients.served import MAP, latency_figures, served, stream_beside_planner
 from bench.figures import Figure
 from bench.street_scores import DrivenStreet
 
@@ -112,15 +112,7 @@ def _latencies(record: MapRecord, made: DrivenStreet) -> list[Figure]:
         last = server.client.checkpoint()
     name = "1,000 points with gradient, 16 regions, streaming"
     return [
-        Figure(f"{name}, 99 %", quiet.latency_p99_ms, "ms"),
-        Figure(f"{name}, longest of {quiet.queries}", quiet.latency_max_ms, "ms"),
-        Figure(f"{name} and checkpoints, 99 %", busy.latency_p99_ms, "ms"),
-        Figure(
-            f"{name} and checkpoints, longest of {busy.queries}",
-            busy.latency_max_ms,
-            "ms",
-            at_most=15,
-        ),
-        Figure("errors meanwhile", quiet.errors + busy.errors, "", at_most=0),
+        *latency_figures(name, quiet),
+        *latency_figures(f"{name} and checkpoints", busy, longest_ms=15),
         Figure("size of such a checkpoint", last.bytes / 1e6, "MB"),
     ]

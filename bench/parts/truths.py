@@ -156,7 +156,7 @@ def _corridor(probes: AnswerProbes, view: MapView) -> list[Figure]:
 def _along_rays(street: DrivenStreet, rng: np.random.Generator) -> Doubles:
     each = _ALONG_RAYS // len(street.scans)
     points = []
-    for scan in street.scans:
+    for scan in street.drive:
         ends = scan.true_hits[rng.integers(len(scan.true_hits), size=each)]
         origin = scan.world_from_sensor[:3, 3]
         lengths = np.linalg.norm(ends - origin, axis=1)

@@ -24,12 +24,12 @@ from triquad_server.mapping.training.focus import Focus
 from triquad_server.mapping.training.slopes import Slopes
 from triquad_server.settings.loading import load_settings
 from triquad_tools.console.report import Row, print_rows
-from triquad_tools.evaluation.metrics import ScoreSettings, score_mesh
-from triquad_tools.recordings.cloud import merged
+from triquad_tools.evaluation.metrics import ScoreSettings
 from triquad_tools.sensors.sweep import PosedScan
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.street import street
 
+from bench.driven import driven
 from bench.figures import Figure
 from bench.scenes.room import room_by_camera, room_by_lidar
 from bench.scenes.tabletop import tabletop_by_camera
@@ -98,15 +98,8 @@ class _Learner:
     """A map that learns a place, and is scored from time to time."""
 
     def __init__(self, place: Place) -> None:
-        self._place, self._drive = place, place.make()
-        low, high = self._drive.scene.bounds
-        self.scans: list[PosedScan] = []
-        hits = []
-        for simulated in self._drive:
-            self.scans.append(PosedScan(simulated.points, simulated.world_from_sensor))
-            inside = ((simulated.true_hits >= low) & (simulated.true_hits <= high)).all(axis=1)
-            hits.append(simulated.true_hits[inside])
-        self._visible = merged(hits, place.voxel_m)
+        self._place, self._driven = place, driven(place.make(), place.voxel_m)
+        self.scans = self._driven.scans
         self.mapper = Mapper("bench", load_settings(preset=place.preset), "cpu")
         for scan in self.scans:
             self.mapper.ingest(scan.points, scan.world_from_sensor)
@@ -146,7 +139,7 @@ class _Learner:
             meshes = {"served": _served(epoch, ends), "in a file": opened.mesh()}
         self.figures.append(Figure(f"{name}: samples", samples / 1e6, "M"))
         for where, mesh in meshes.items():
-            scores = score_mesh(mesh, self._visible, settings, self._drive.scene.sdf)
+            scores = self._driven.mesh_scores(mesh, settings)
             self.figures += [
                 Figure(f"{name}, {where}: F-score", 100 * scores.f_score, "%"),
                 Figure(f"{name}, {where}: accuracy", 100 * scores.accuracy_m, "cm"),

@@ -11,7 +11,7 @@ from triquad_format.mapfile.files import FileBytes
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_map.stored_map import StoredMap
-from triquad_tools.mapfiles.crop import crop_record, without_training
+from triquad_tools.mapfiles.crop import crop_record
 
 WIDE = dataclasses.replace(SMALL, depth=11, feature_levels=4)
 """A region of 512 m: 8 squares of 64 m along each side."""
@@ -42,7 +42,7 @@ def test_a_box_holds_what_it_needs(tmp_path, low, high):
     write_map(record, path)
     with StoredMap.open(path) as map_file:
         cropped = crop_record(map_file.box(low, high), low, high)
-    wanted = without_training(crop_record(read_map(path), low, high))
+    wanted = crop_record(read_map(path), low, high)
     if any(len(table.codes) == 0 for region in wanted.regions for table in region.tables):
         assert_same_places(cropped, wanted)
     else:

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from support.files.changing_store import EMPTY, box_at, write_checkpoint
 from triquad_tools.console.command import ToolError
-from triquad_tools.viewer.sources.map_source import COARSEST
 from triquad_tools.viewer.sources.stored_map import (
     DamagedError,
     History,
@@ -17,6 +16,7 @@ from triquad_tools.viewer.sources.stored_map import (
     StoredTiles,
     moment,
 )
+from triquad_tools.viewer.sources.tile_sizes import COARSEST
 
 ORIGIN = [[0.0, 0.0, 1.0]]
 

@@ -3,14 +3,13 @@
 from pathlib import Path
 
 import triquad_client
-from support import servers
 
 from bench.campaign.server_under_test import (
+    checkpoint,
     expect,
     expect_known,
-    expect_whole,
+    publish_at,
     server_under_test,
-    sphere_at,
 )
 from bench.campaign.turn import Turn
 
@@ -45,12 +44,10 @@ def run(turn: Turn) -> None:
             # Replaced as a whole, since the server may read it at any time.
             (turn.folder / "next").write_text(f"{jump_s:+d}")
             (turn.folder / "next").rename(shift)
-            client.publish_scan(*sphere_at(0.0))
-            report = client.flush(servers.WAIT_S)
+            report = publish_at(client, 0)
             expect(report.lost == report.refused == 0, f"scans were not taken: {report}")
-            expect_known(client, 0.0)
-            kept = client.checkpoint()
-            expect_whole(kept)
+            expect_known(client, 0)
+            kept = checkpoint(client)
             status = client.status()
             expect(0 <= status.uptime_s < 3_600, f"an uptime of {status.uptime_s} s")
             turn.did("forwards" if jump_s > 0 else "backwards")

@@ -21,7 +21,7 @@ from bench.clients.noisy_neighbours import KINDS, neighbour
 _ROUND_S = 10
 _MOST_AT_ONCE = 4
 _SOURCES_A_SECOND = 50
-_HONEST_AT_M = 60.0  # where no ray of the others contradicts what an honest client has seen
+_HONEST_PLACE = 7  # where no ray of the others contradicts what an honest client has seen
 
 
 def run(turn: Turn) -> None:
@@ -32,14 +32,14 @@ def run(turn: Turn) -> None:
         while not turn.over:
             count = turn.random.randint(1, _MOST_AT_ONCE)
             _round(turn, server.endpoint, turn.random.choices(sorted(KINDS), k=count))
-            expect_honest_service(server.endpoint, _HONEST_AT_M)
+            expect_honest_service(server.endpoint, _HONEST_PLACE)
             turn.did("seconds", _ROUND_S)
             expect_steady_memory(turn, before, _outside_the_map(server.endpoint))
 
 
 def _use_honestly(endpoint: str) -> None:
     """Ask once, and for little, for all that the others ask for."""
-    expect_honest_service(endpoint, _HONEST_AT_M)
+    expect_honest_service(endpoint, _HONEST_PLACE)
     with triquad_client.connect(endpoint) as client:
         points = servers.sphere(100)
         client.query_distance(points, unknown_distance=True)

@@ -22,7 +22,6 @@ from bench.campaign.server_under_test import (
 )
 from bench.campaign.turn import BrokenError, Turn
 
-_SPACING_M = 9.0
 _PLACES = 4
 
 
@@ -37,7 +36,7 @@ def run(turn: Turn) -> None:
 
 
 def _cut_amid_load(turn: Turn, proxy: CuttingProxy) -> None:
-    place = turn.random.randrange(_PLACES) * _SPACING_M
+    place = turn.random.randrange(_PLACES)
     stopping = threading.Event()
     with triquad_client.connect(proxy.endpoint, timeout_s=5.0) as client:
         failures: list[str] = []
@@ -60,7 +59,7 @@ def _cut_amid_load(turn: Turn, proxy: CuttingProxy) -> None:
 
 
 def _load(
-    client: triquad_client.Client, place: float, stopping: threading.Event, failures: list[str]
+    client: triquad_client.Client, place: int, stopping: threading.Event, failures: list[str]
 ) -> None:
     """Publish and ask; errors of triquad are allowed, but no others."""
     queries = servers.sphere(20_000)
@@ -75,7 +74,7 @@ def _load(
             return
 
 
-def _expect_served_again(client: triquad_client.Client, place: float) -> None:
+def _expect_served_again(client: triquad_client.Client, place: int) -> None:
     """Expect the same client to reconnect in time, and what it flushes to be in the map."""
     by = time.monotonic() + WITHIN_S
     while time.monotonic() < by:

@@ -17,7 +17,6 @@ from bench.campaign.server_under_test import (
 )
 from bench.campaign.turn import Turn
 
-_SPACING_M = 9.0
 _PLACES = 9  # so that the map stays small
 _LATEST_KILL_S = 1.5
 
@@ -64,7 +63,7 @@ def _expect_kept(client: triquad_client.Client, acknowledged: _Acknowledged) -> 
         f"epoch {acknowledged.epoch} was acknowledged, but the server is back at {epoch}",
     )
     for place in acknowledged.places:
-        expect_known(client, place * _SPACING_M)
+        expect_known(client, place)
 
 
 def _load(
@@ -78,8 +77,7 @@ def _load(
         while True:
             places = {turn.random.randrange(_PLACES) for _ in range(3)}
             for place in places:
-                points, pose = sphere_at(place * _SPACING_M)
-                client.publish_scan(points, pose)
+                client.publish_scan(*sphere_at(place))
             report = client.flush(5.0)
             epoch = client.checkpoint().epoch
             if report.lost == report.refused == 0:

@@ -16,12 +16,12 @@ from bench.campaign.server_under_test import (
     expect,
     expect_known,
     expect_none_damaged,
+    publish_at,
     server_under_test,
     sphere_at,
 )
 from bench.campaign.turn import Turn
 
-_SPACING_M = 9.0
 _PLACES = 8
 _MOST_ROOM_BYTES = 48 * 2**20
 _SQUEEZE_S = 3.0
@@ -52,7 +52,7 @@ def _serve_with_limits(turn: Turn, kept: _Kept) -> None:
             epoch = client.status().epoch
             expect(epoch >= kept.epoch, f"epoch {kept.epoch} was acknowledged, {epoch} is back")
             if kept.epoch:
-                expect_known(client, kept.place * _SPACING_M)
+                expect_known(client, kept.place)
             while not turn.over:
                 _keep(turn, client, kept)
                 with _room(pid, int(_MOST_ROOM_BYTES * turn.random.random() ** 2)):
@@ -68,8 +68,7 @@ def _serve_with_limits(turn: Turn, kept: _Kept) -> None:
 def _keep(turn: Turn, client: triquad_client.Client, kept: _Kept) -> None:
     place = turn.random.randrange(_PLACES)
     for _ in range(2):
-        client.publish_scan(*sphere_at(place * _SPACING_M), source="honest")
-    client.flush(servers.WAIT_S)
+        publish_at(client, place, source="honest")
     kept.epoch, kept.place = client.checkpoint().epoch, place
 
 
@@ -79,8 +78,8 @@ def _load(turn: Turn, client: triquad_client.Client) -> None:
     points = np.tile(servers.sphere(20_000), (turn.random.choice((1, 10)), 1))
     while time.monotonic() < until:
         with contextlib.suppress(TriquadError):
-            x_m = turn.random.randrange(_PLACES) * _SPACING_M  # elsewhere it shows free space
-            client.publish_scan(*sphere_at(x_m, 20_000))
+            place = turn.random.randrange(_PLACES)  # elsewhere it shows free space
+            client.publish_scan(*sphere_at(place, 20_000))
             client.query_sdf(points)
             client.checkpoint()
 
@@ -88,9 +87,8 @@ def _load(turn: Turn, client: triquad_client.Client) -> None:
 def _expect_alive(client: triquad_client.Client, kept: _Kept) -> None:
     """Expect the server to map and answer as before, with memory again."""
     for _ in range(2):
-        client.publish_scan(*sphere_at(kept.place * _SPACING_M), source="honest")
-    client.flush(servers.WAIT_S)
-    expect_known(client, kept.place * _SPACING_M)
+        publish_at(client, kept.place, source="honest")
+    expect_known(client, kept.place)
 
 
 @contextlib.contextmanager

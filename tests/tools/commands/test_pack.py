@@ -5,14 +5,16 @@ import itertools
 import pytest
 from mcap.reader import make_reader
 from support.files.checkpoint_folder import FIRST, HOUR_NS, START_NS, map_at, write_checkpoints
+from support.files.file_damage import first_chunk, flipped
 from support.files.mapfile_edit import file_bytes, rewritten
 from support.maps.map_records import SMALL, assert_same, random_record
-from triquad_format.mapfile.parts.part import REGION, PartKey
+from triquad_format.mapfile.parts.part import REGION, VERTICES, PartKey
 from triquad_format.mapfile.reader import read_map, read_map_file
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.region import MapProgress
 from triquad_tools.commands.pack import main
 from triquad_tools.mapfiles.crop import crop_record, without_training
+from triquad_tools.mapfiles.recovered_map import recover
 
 CUBE = tuple(itertools.product((0, 1), repeat=3))
 
@@ -27,18 +29,20 @@ def map_file(tmp_path):
 def test_tool_packs(map_file, tmp_path, capsys):
     out = tmp_path / "out.triquad"
     box = ["--crop", "-1", "-1", "-1", "2.5", "2", "2"]
-    assert main([str(map_file), str(out), *box, "--no-training"]) == 0
+    assert main([str(map_file), str(out), *box]) == 0
     assert "bytes" in capsys.readouterr().out
     assert out.stat().st_size < map_file.stat().st_size / 2
-    expected = crop_record(read_map(map_file), [-1, -1, -1], [2.5, 2, 2])
-    assert_same(read_map(out), without_training(expected))
+    whole = read_map(map_file)
+    assert_same(read_map(out), crop_record(whole, [-1, -1, -1], [2.5, 2, 2]))
+    assert main([str(map_file), str(out), "--no-training", "--force"]) == 0
+    assert_same(read_map(out), without_training(whole))
 
 
 def test_a_packed_map_still_tells_what_it_was_made_of(tmp_path):
     record = dataclasses.replace(random_record(1), progress=MapProgress(60, 116_000_000, 0.25))
     write_map(record, tmp_path / "in.triquad")
     out = tmp_path / "out.triquad"
-    options = ["--crop", "-4", "-4", "-4", "4", "4", "4", "--no-training"]
+    options = ["--crop", "-4", "-4", "-4", "4", "4", "4"]
     assert main([str(tmp_path / "in.triquad"), str(out), *options]) == 0
     assert read_map(out).progress == record.progress
 
@@ -140,3 +144,32 @@ def test_tool_refuses_newer_files(map_file, tmp_path, capsys):
     assert main([str(map_file), str(out)]) == 2
     assert "map file version 2" in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_recovery_tells_what_it_saved_and_lost(tmp_path, capsys):
+    broken, out = tmp_path / "broken.triquad", tmp_path / "out.triquad"
+    squares = dataclasses.replace(SMALL, depth=9)
+    record = random_record(5, settings=squares, indices=CUBE[:2], points=600)
+    data = file_bytes(record, preview=True, stamp_ns=10**18)
+    broken.write_bytes(data[:-100])
+    assert main([str(broken), str(out)]) == 1
+    assert "triquad-pack --recover" in capsys.readouterr().err
+    assert not out.exists()
+    assert main(["--recover", str(broken), str(out)]) == 0
+    assert "saved all" in capsys.readouterr().out
+    assert_same(read_map(out), record)
+    broken.write_bytes(flipped(data, first_chunk(data, VERTICES).middle))
+    assert main(["--recover", "--force", str(broken), str(out)]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("lost: training state of region 0 0 0")
+    assert lines[1] == (
+        "lost: vertices of plane XY of region 0 0 0: now UNKNOWN, "
+        "x -65.0 to 0.5 m, y -65.0 to 0.5 m, z -64.5 to 64.5 m"
+    )
+    assert lines[2].startswith("saved ")
+    assert_same(read_map(out), recover(broken).record)
+    before = out.read_bytes()
+    broken.write_bytes(data[:100])
+    assert main(["--recover", "--force", str(broken), str(out)]) == 2
+    assert "nothing can be saved" in capsys.readouterr().err
+    assert out.read_bytes() == before

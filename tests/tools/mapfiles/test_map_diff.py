@@ -1,14 +1,17 @@
 import json
 import math
 
+import numpy as np
 import pytest
 from support.maps.exact_maps import exact_map, flat, table
 from support.maps.map_records import random_record
 from support.maps.small_world import settings, settled_epoch, settled_mapper, world
 from triquad_client import OfflineMap
 from triquad_format.mapfile.writer import write_map
+from triquad_format.records.status import Status
 from triquad_tools.commands.inspect import main
 from triquad_tools.mapfiles.diff import compare, difference
+from triquad_tools.mapfiles.object_changes import object_changes
 
 GROUND = exact_map(flat(0.1))
 RAISED = exact_map(table(0.1, 0.15))  # by 5 cm, in a square of 4 m
@@ -17,59 +20,62 @@ POINTS = 100 * 100  # the ground is seen in a square of 20 m, a voxel is 0.2 m w
 IN_SQUARE = 20 * 20
 
 
-def diff(a, b, tile_m=1.0):
+def compared(a, b):
     with OfflineMap(a) as old, OfflineMap(b) as new:
-        return difference(compare(old, new), tile_m)
-
-
-def tile_at(found, *corner):
-    return next(tile for tile in found.tiles if tile.low_m == corner)
+        return compare(old, new)
 
 
 def test_a_map_does_not_differ_from_itself():
-    found = diff(RAISED, RAISED)
-    assert found.tiles == ()
-    assert found.total.points_a == found.total.points_b == POINTS
-    assert found.total.moved_p95_m < 2e-4
+    found = compared(RAISED, RAISED)
+    total = difference(found)
+    assert not total.differs
+    assert total.points_a == total.points_b == POINTS
+    assert total.moved_p95_m < 2e-4
+    assert not any(object_changes(found).values())
 
 
 def test_what_moved_by_5_cm_is_found_to_have_moved_by_5_cm():
-    found = diff(GROUND, RAISED)
-    for tile in found.tiles:
-        assert max(map(abs, (*tile.low_m[:2], *tile.high_m[:2]))) <= 3.0
-        assert tile.change.appeared == tile.change.vanished == 0
-    inner = tile_at(found, 0.0, 0.0, 0.0).change
-    assert inner.points_a == inner.points_b == 25
-    assert inner.moved_median_m == pytest.approx(0.05, abs=2e-4)
-    assert inner.moved_p95_m == pytest.approx(0.05, abs=2e-4)
-    assert inner.changed_m3 == pytest.approx(25 * 0.2**2 * 0.05, rel=0.01)
-    assert found.total.moved_median_m < 2e-4
-    volumes = [tile.change.changed_m3 for tile in found.tiles]
-    assert volumes == sorted(volumes, reverse=True)
+    found = compared(GROUND, RAISED)
+    total = difference(found)
+    assert total.differs
+    assert total.appeared == total.vanished == 0
+    assert total.moved_median_m < 2e-4
+    moved = found.changed["moved"]
+    np.testing.assert_allclose(np.abs(moved.sdf[inner(moved)]), 0.05, atol=2e-4)
+    (cluster,) = object_changes(found)["moved"]
+    np.testing.assert_allclose(cluster.middle_m[:2], 0.0, atol=0.1)
+    np.testing.assert_allclose(cluster.size_m[:2], 4.0, atol=0.4)
+    assert cluster.points == pytest.approx(IN_SQUARE, rel=0.15)
+
+
+def inner(sighting):
+    return np.abs(sighting.points[:, :2]).max(axis=1) < 1.5
 
 
 def test_what_appeared_was_free_and_hides_what_is_below():
-    found = diff(GROUND, TABLE)
-    top = tile_at(found, 0.0, 0.0, 1.0).change
-    assert (top.points_a, top.points_b, top.appeared, top.newly_seen) == (0, 25, 25, 0)
-    assert math.isnan(top.moved_median_m)
-    below = tile_at(found, 0.0, 0.0, 0.0).change
-    assert (below.points_a, below.points_b, below.no_longer_known, below.vanished) == (25, 0, 25, 0)
-    assert 0 < found.total.appeared <= IN_SQUARE
-    assert found.total.vanished == 0
+    found = compared(GROUND, TABLE)
+    top = found.new.part(np.flatnonzero(found.new.points[:, 2] > 0.6))
+    assert inner(top).any()
+    assert (top.status[inner(top)] == Status.FREE).all()
+    below = found.old.part(np.flatnonzero(inner(found.old)))
+    assert (below.status == Status.UNKNOWN).all()
+    total = difference(found)
+    assert 0 < total.appeared <= IN_SQUARE
+    assert total.vanished == 0
 
 
 def test_maps_of_different_places_have_seen_nothing_of_each_other():
-    found = diff(GROUND, random_record(indices=()))
-    assert found.total.no_longer_known == found.total.points_a == POINTS
-    assert found.total.changed_m3 == 0.0
-    assert diff(random_record(indices=()), GROUND).total.newly_seen == POINTS
+    nowhere = random_record(indices=())
+    total = difference(compared(GROUND, nowhere))
+    assert total.no_longer_known == total.points_a == POINTS
+    assert math.isnan(total.moved_median_m)
+    assert difference(compared(nowhere, GROUND)).newly_seen == POINTS
 
 
 def test_the_same_scans_give_maps_that_differ_by_their_noise_alone():
     few = settled_mapper(settings(samples_per_ray=9.0), world()).changes_since(None).record
     many = settled_epoch().record()
-    total = diff(few, many, 6.4).total
+    total = difference(compared(few, many))
     assert total.points_a > 10_000
     assert total.moved_median_m < 0.01
     assert total.moved_p95_m < 0.06
@@ -94,20 +100,18 @@ def test_table(files, capsys):
     assert lines[:2] == [
         f"{letter}  {path}: map 'ground', epoch 1" for letter, path in zip("AB", files, strict=True)
     ]
-    assert lines[2].split()[:3] == ["from", "x", "m"]
-    (total,) = (number for number, line in enumerate(lines) if line.startswith("  all"))
-    assert lines[total + 1].split()[0] == "what"
-    assert {line.split()[0] for line in lines[total + 2 :]} >= {"appeared"}
+    assert lines[2].split()[:2] == ["points", "A"]
+    assert lines[3].split()[0] == "10,000"
+    assert lines[4].split()[0] == "what"
+    assert {line.split()[0] for line in lines[5:]} >= {"appeared"}
 
 
 def test_json(files, capsys):
     assert main([*files, "--diff", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert found["tile_m"] == pytest.approx(6.4)
     assert found["total"]["points_a"] == POINTS
     assert found["total"]["appeared"] > 0
-    assert set(found["tiles"][0]) == {"low_m", "high_m", "change"}
-    assert found["tiles"][0]["change"].keys() == found["total"].keys()
+    assert found["objects"]["appeared"][0].keys() == {"low_m", "high_m", "points"}
 
 
 def test_nothing_to_tell(files, capsys):

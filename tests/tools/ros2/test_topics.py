@@ -8,15 +8,16 @@ from triquad_tools.ros2.options import Role, TopicChoice
 from triquad_tools.ros2.output.mesh_publisher import Action, marker_message
 from triquad_tools.ros2.topics import (
     ATTACHMENT,
+    NODE_NAME,
     Announcement,
     Delivery,
     End,
-    Entity,
     SequenceGaps,
     Topic,
     bridge_token,
     read_token,
     rmw_key,
+    rmw_prefix,
     rmw_token,
     rmw_topic_name,
     type_hash,
@@ -25,10 +26,11 @@ from triquad_tools.ros2.topics import (
 STRING = "std_msgs/msg/String"
 HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 CHATTER = Topic("/chatter", STRING)
-# docs/design.md of rmw_zenoh has these two, of the node ``listener``.
-NODE = "@ros2_lv/2/aac3178e146ba6f1fc6e6a4085e77f21/0/0/NN/%/%/listener"
+SESSION = "aac3178e146ba6f1fc6e6a4085e77f21"
+# docs/design.md of rmw_zenoh has these two, of a node ``listener``.
+NODE = f"@ros2_lv/2/{SESSION}/0/0/NN/%/%/{NODE_NAME}"
 SUBSCRIPTION = (
-    "@ros2_lv/2/aac3178e146ba6f1fc6e6a4085e77f21/0/10/MS/%/%/listener/%chatter/"
+    f"@ros2_lv/2/{SESSION}/0/10/MS/%/%/{NODE_NAME}/%chatter/"
     f"std_msgs::msg::dds_::String_/{HASH}/::,10:,:,:,,"
 )
 
@@ -42,11 +44,10 @@ def test_keys_are_those_of_the_documents() -> None:
 
 
 def test_tokens_are_those_of_the_documents() -> None:
-    listener = Entity("aac3178e146ba6f1fc6e6a4085e77f21", "listener", 0)
-    assert listener.rmw_prefix(2, "NN") == NODE
+    assert rmw_prefix(2, SESSION, 0, "NN") == NODE
     what = Announcement(End.SUBSCRIPTION, CHATTER, HASH)
-    entity = Entity(listener.session_id, listener.node, 10)
-    assert rmw_token(2, entity, what, Delivery(depth=10)) == SUBSCRIPTION
+    prefix = rmw_prefix(2, SESSION, 10, what.end.value)
+    assert rmw_token(prefix, what, Delivery(depth=10)) == SUBSCRIPTION
     assert read_token(SUBSCRIPTION) == what
 
 

@@ -19,8 +19,18 @@ def random_pose(rng: np.random.Generator) -> Pose:
     return Pose(rng.normal(size=3), quaternion / np.linalg.norm(quaternion))
 
 
-def edge(parent: str, child: str, stamp: int | None, pose: Pose) -> Transform:
+STILL = Pose((0, 0, 0), (0, 0, 0, 1))
+
+
+def edge(parent: str, child: str, stamp: int | None, pose: Pose = STILL) -> Transform:
     return Transform(parent, child, stamp, pose)
+
+
+def tree(*edges: Transform) -> FrameTree:
+    frames = FrameTree()
+    for each in edges:
+        frames.add(each)
+    return frames
 
 
 def at(*stamps: int) -> np.ndarray:
@@ -73,11 +83,8 @@ def test_a_track_says_nothing_of_before_after_and_gaps() -> None:
 def test_a_tree_composes_what_it_was_told(seed: int) -> None:
     rng = np.random.default_rng(seed)
     map_odom, odom_base, base_lidar, base_camera = (random_pose(rng) for _ in range(4))
-    frames = FrameTree()
-    frames.add(edge("base", "lidar", STATIC, base_lidar))
-    frames.add(edge("base", "camera", STATIC, base_camera))
-    frames.add(edge("map", "odom", T0, map_odom))
-    frames.add(edge("odom", "base", T0, odom_base))
+    sensors = edge("base", "lidar", STATIC, base_lidar), edge("base", "camera", STATIC, base_camera)
+    frames = tree(*sensors, edge("map", "odom", T0, map_odom), edge("odom", "base", T0, odom_base))
     expected = map_odom.matrix() @ odom_base.matrix() @ base_lidar.matrix()
     assert np.allclose(frames.poses("map", "lidar", at(T0))[0], expected)
     across = np.linalg.inv(base_camera.matrix()) @ base_lidar.matrix()
@@ -87,22 +94,16 @@ def test_a_tree_composes_what_it_was_told(seed: int) -> None:
 
 
 def test_a_tree_names_the_frame_to_map_in() -> None:
-    frames = FrameTree()
-    still = Pose((0, 0, 0), (0, 0, 0, 1))
-    frames.add(edge("odom", "base", T0, still))
-    frames.add(edge("base", "lidar", STATIC, still))
+    frames = tree(edge("odom", "base", T0), edge("base", "lidar", STATIC))
     assert frames.fixed_frame("lidar") == "odom"
-    frames.add(edge("map", "odom", T0, still))
-    frames.add(edge("earth", "map", STATIC, still))
+    frames.add(edge("map", "odom", T0))
+    frames.add(edge("earth", "map", STATIC))
     assert frames.fixed_frame("lidar") == "map"
     assert frames.fixed_frame("alone") == "alone"
 
 
 def test_a_tree_says_what_is_missing() -> None:
-    frames = FrameTree()
-    still = Pose((0, 0, 0), (0, 0, 0, 1))
-    frames.add(edge("odom", "base", T0, still))
-    frames.add(edge("ceiling", "camera", STATIC, still))
+    frames = tree(edge("odom", "base", T0), edge("ceiling", "camera", STATIC))
     for target, frame, words in (
         ("odom", "lidar", "no transform names the frame 'lidar' (known: base, camera"),
         ("map", "base", "no transform names the map frame 'map': base is in odom"),
@@ -117,11 +118,7 @@ def test_a_tree_says_what_is_missing() -> None:
 
 
 def test_frames_that_hang_on_each_other_do_no_harm() -> None:
-    frames = FrameTree()
-    still = Pose((0, 0, 0), (0, 0, 0, 1))
-    frames.add(edge("a", "b", STATIC, still))
-    frames.add(edge("b", "a", STATIC, still))
-    frames.add(edge("a", "a", STATIC, still))
+    frames = tree(edge("a", "b", STATIC), edge("b", "a", STATIC), edge("a", "a", STATIC))
     with pytest.raises(NoTransformError):
         frames.poses("c", "a", at(T0))
 

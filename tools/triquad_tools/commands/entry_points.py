@@ -4,8 +4,6 @@ import importlib
 import importlib.util
 import os
 import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 
 from triquad_tools.console.command import BAD_INPUT, INTERRUPTED, complain
@@ -13,15 +11,13 @@ from triquad_tools.console.command import BAD_INPUT, INTERRUPTED, complain
 
 def _run(command: str, module: str, *, extra: str = "tools", needs: tuple[str, ...] = ()) -> int:
     """Run the ``main`` of a command; ``needs`` are libraries that its processes import later."""
+    _leave_on_interrupt(command)
     try:
-        with _leaving_on_interrupt(command):
-            for name in needs:
-                if importlib.util.find_spec(name) is None:
-                    raise ModuleNotFoundError(name=name)
-            imported = importlib.import_module(f"triquad_tools.commands.{module}")
+        for name in needs:
+            if importlib.util.find_spec(name) is None:
+                raise ModuleNotFoundError(name=name)
+        imported = importlib.import_module(f"triquad_tools.commands.{module}")
         status = int(imported.main())
-    except KeyboardInterrupt:  # between the imports and the work
-        return complain(command, "interrupted", INTERRUPTED)
     except ModuleNotFoundError as error:
         if error.name is None or error.name.startswith("triquad"):
             raise
@@ -32,19 +28,16 @@ def _run(command: str, module: str, *, extra: str = "tools", needs: tuple[str, .
     return status
 
 
-@contextmanager
-def _leaving_on_interrupt(command: str) -> Iterator[None]:
-    """Let Ctrl-C end the process at once: an exception could be lost in an import."""
+def _leave_on_interrupt(command: str) -> None:
+    """Let Ctrl-C before and after the work end the process: an import could lose an exception."""
 
     def leave(*_: object) -> None:
         os.write(2, f"{command}: interrupted\n".encode())
         os._exit(INTERRUPTED)
 
-    before = signal.getsignal(signal.SIGINT)
-    if before is not signal.SIG_IGN:  # as for what a shell runs in the background
+    # What a shell runs in the background ignores it.
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, leave)
-    yield
-    signal.signal(signal.SIGINT, before)
 
 
 _run_with_server = partial(_run, extra="demo", needs=("numba", "foxglove_schemas_protobuf"))

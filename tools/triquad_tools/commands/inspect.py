@@ -21,7 +21,6 @@ from triquad_tools.mapfiles.store_log import print_log, read_log
 from triquad_tools.mapfiles.summary import print_summary, summarise
 
 _COMMAND = "triquad-inspect"
-_TILE_LEAVES = 32  # along the side of a tile in which differences are counted
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -39,14 +38,9 @@ def _parser() -> argparse.ArgumentParser:
         "2 not readable (missing, or of a newer version), or wrong usage.",
     )
     add = parser.add_argument
-    add(
-        "files",
-        type=Path,
-        nargs="+",
-        metavar="FILE",
-        help="map file; folder of checkpoints, of which the newest is meant; or endpoint of a "
-        "server, such as tcp/127.0.0.1:7447, whose map is fetched",
-    )
+    maps = "map file; folder of checkpoints, of which the newest is meant; or endpoint of a "
+    maps += "server, such as tcp/127.0.0.1:7447, whose map is fetched"
+    add("files", type=Path, nargs="+", metavar="FILE", help=maps)
     add("--map", metavar="NAME", help="of the server (default: default)")
     add_config(parser)
     at = "the newest checkpoint of the folder FILE that is not after this, such as 120 or "
@@ -123,17 +117,16 @@ def _diff(options: argparse.Namespace) -> int:
     titles = f"A  {_title(name_a, a)}\nB  {_title(name_b, b)}"
     with progress("comparing"), OfflineMap(a.record) as old, OfflineMap(b.record) as new:
         comparison = compare(old, new)
-    diff = difference(comparison, _TILE_LEAVES * comparison.old.leaf_m)
-    objects = object_changes(comparison)
+    total, objects = difference(comparison), object_changes(comparison)
     if options.plot:
         from triquad_tools.plots.diff_plan import draw_diff  # slow to import
 
         draw_diff(titles, comparison, objects, path=options.plot)
     if options.json:
-        print_line(json_text({**vars(diff), "objects": objects}))
+        print_line(json_text({"total": total, "objects": objects}))
     else:
         print_line(titles)
-        print_diff(diff)
+        print_diff(total)
         print_objects(objects)
     return OK
 

@@ -70,10 +70,10 @@ def _list(options: argparse.Namespace) -> int:
     folder = KeyFolder(options.folder)
     hosts = ", ".join(folder.hosts) or "this machine"
     rows = [(name, name, hosts, "", _day(folder.certificate(name).expires)) for name in LISTENING]
-    for entry in folder.entries.values():
-        holder, domain = entry.holder, entry.holder.ros2_domain
-        told = (", ".join(holder.sources), "" if domain is None else str(domain))
-        rows.append((holder.name, holder.role.value, *told, _day(entry.expires)))
+    for name, holder in folder.holders.items():
+        domain = "" if holder.ros2_domain is None else str(holder.ros2_domain)
+        until = _day(folder.expires[name])
+        rows.append((name, holder.role.value, ", ".join(holder.sources), domain, until))
     titles = ("name", "role", "hosts or sources", "ROS 2 domain", "expires")
     print_columns(titles, rows, words=("role", "hosts or sources", "expires"))
     return OK

@@ -97,13 +97,8 @@ def _parser() -> argparse.ArgumentParser:
     add("output", type=Path, metavar="OUT", help="its name ends in " + ", ".join(SUFFIXES))
     add("--preset", choices=PRESETS, help="settings for a kind of place and sensor")
     add("--settings", type=Path, metavar="FILE", help="settings of the map, as of triquad-server")
-    add(
-        "--set",
-        action="append",
-        default=[],
-        metavar="SECTION.KEY=VALUE",
-        help="one setting, such as field.leaf_m=0.05, repeatable",
-    )
+    one = "one setting, such as field.leaf_m=0.05, repeatable"
+    add("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help=one)
     add("--device", choices=DEVICES, default="cpu", help="what it trains on (default: cpu)")
     add("--training", action="store_true", help="keep what further training needs in the map file")
     add("--force", action="store_true", help="replace OUT where it exists")

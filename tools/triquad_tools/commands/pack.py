@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from triquad_format.wire.limits import MAX_FILL_M
 from triquad_tools.console.arguments import command_parser, within
 from triquad_tools.console.command import FAILED, OK, ToolError, refuse, run
 from triquad_tools.console.lines import print_line, print_remark
+from triquad_tools.mapfiles.crop import without_training
 from triquad_tools.mapfiles.quantise import quantise
 from triquad_tools.mapfiles.recovered_map import Loss, RecoveredMap, recover
 from triquad_tools.mapfiles.source import (
@@ -74,8 +76,8 @@ def _add_content(add: _Add) -> None:
     error += "0.002; drops training state"
     add("--max-error", type=partial(within, *_ERROR_RANGE_M), metavar="M", help=error)
     corners = ("XMIN", "YMIN", "ZMIN", "XMAX", "YMAX", "ZMAX")
-    box = "keep what answers in this box need, metres, map frame; only that is read, unless IN has "
-    box += "training state that is kept"
+    box = "keep what answers in this box need, metres, map frame: only that is read, and training "
+    box += "state is dropped"
     add("--crop", type=float, nargs=6, metavar=corners, help=box)
     add("--no-training", action="store_true", help="drop what only further training needs")
 
@@ -83,10 +85,8 @@ def _add_content(add: _Add) -> None:
 def _add_target(add: _Add) -> None:
     cell = "side of cells of a mesh or a picture (default: half a leaf)"
     add("--cell", type=partial(within, *_CELL_RANGE_M), metavar="M", help=cell)
-    fill = (
-        "of a mesh: continue surface into unknown space, where the field does, up to so far from "
-    )
-    fill += f"what was seen, at most {MAX_FILL_M:g} m; those faces are marked"
+    fill = "of a mesh: continue surface into unknown space, where the field does, up to so far "
+    fill += f"from what was seen, at most {MAX_FILL_M:g} m; those faces are marked"
     add("--fill", type=partial(within, 0.0, MAX_FILL_M), default=0.0, metavar="M", help=fill)
     add("--force", action="store_true", help="replace OUT where it exists")
 
@@ -140,8 +140,9 @@ def _check_target(source: Path, target: Path, force: bool) -> None:
 
 
 def _pack_map(options: argparse.Namespace, path: Path) -> int:
-    training = not options.no_training and options.max_error is None
-    source, complete = _source(options, path, box=_box(options.crop), training=training)
+    source, complete = _source(options, path, _box(options.crop))
+    if options.no_training:
+        source = replace(source, record=without_training(source.record))
     told = ""
     if options.max_error is not None:
         source, told = _quantised(source, options.max_error)
@@ -179,7 +180,7 @@ def _export(options: argparse.Namespace, path: Path) -> int:
     box, output = _box(options.crop), options.output
     margin_m = max(_MARGIN_M, _MARGIN_CELLS * (options.cell or 0.0)) + options.fill
     needed = None if box is None else box + [[-margin_m], [margin_m]]
-    source, complete = _source(options, path, needed, training=False)
+    source, complete = _source(options, path, needed)
     written = export(source, output, box=box, cell_m=options.cell, fill_m=options.fill)
     print_line(f"{output}: {written}")
     return OK if complete else FAILED
@@ -189,16 +190,14 @@ def _box(corners: list[float] | None) -> Box | None:
     return None if corners is None else np.reshape(np.array(corners), (2, 3))
 
 
-def _source(
-    options: argparse.Namespace, path: Path, box: Box | None, training: bool
-) -> tuple[SourceMap, bool]:
+def _source(options: argparse.Namespace, path: Path, box: Box | None) -> tuple[SourceMap, bool]:
     """Return the map, and whether nothing of it is lost."""
     if not options.recover:
-        return read_source(path, box, training), True
+        return read_source(path, box), True
     recovery = recover(path)
     _print_recovery(recovery)
     source = SourceMap(recovery.record, recovery.stamp_ns or None)
-    return cropped(source, box, training), recovery.complete
+    return source if box is None else cropped(source, box), recovery.complete
 
 
 def _print_recovery(recovery: RecoveredMap) -> None:

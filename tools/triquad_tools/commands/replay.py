@@ -10,15 +10,10 @@ from triquad_client import Client, FlushReport, connect
 from triquad_tools.console.arguments import DEFAULT_MAP, add_server, command_parser, positive
 from triquad_tools.console.command import FAILED, OK, run
 from triquad_tools.console.lines import print_line
-from triquad_tools.console.progress import progress
 from triquad_tools.console.report import print_columns
 from triquad_tools.recordings.opening import Selection, length_s, open_recording, open_selected
-from triquad_tools.recordings.publishing import (
-    FLUSH_TIMEOUT_S,
-    keep_few_pending,
-    wait_until_settled,
-)
-from triquad_tools.recordings.recording import add_recording, options_of
+from triquad_tools.recordings.publishing import FLUSH_TIMEOUT_S, publish_all, wait_until_settled
+from triquad_tools.recordings.recording import ScanEntry, add_recording, options_of
 
 _COMMAND = "triquad-replay"
 
@@ -79,24 +74,12 @@ def _replay(options: argparse.Namespace) -> int:
 def _publish(
     client: Client, selection: Selection, source: str | None, due_times: DueTimes | None
 ) -> int:
-    """Send all chosen scans, each when it is due; without times the server sets the pace.
-
-    Return how many had points, and were sent.
-    """
-    entries, total = selection.entries, len(selection)
-    due_s = due_times([entry.stamp_ns for entry in entries]) if due_times else [0.0] * total
-    started_s, published = time.monotonic(), 0
-    with progress("publishing", total) as report:
-        for done, (entry, scan) in enumerate(zip(entries, selection.scans(), strict=True), start=1):
-            time.sleep(max(0.0, started_s + due_s[done - 1] - time.monotonic()))
-            if len(scan.points):
-                stamp_s, name = entry.stamp_ns / 1e9, source or entry.source
-                client.publish_scan(scan.points, scan.world_from_sensor, stamp_s, source=name)
-                published += 1
-                if due_times is None:
-                    keep_few_pending(client, published)
-            report(done, f"{done} of {total} scans")
-    return published
+    """Send all chosen scans, each when it is due; return how many had points, and were sent."""
+    entries = selection.entries
+    due_s = due_times([entry.stamp_ns for entry in entries]) if due_times else ()
+    sent_as = [ScanEntry(entry.stamp_ns, source or entry.source) for entry in entries]
+    scans = zip(sent_as, selection.scans(), strict=True)
+    return publish_all(client, scans, len(entries), due_s)
 
 
 def _summary(published: int, skipped: int, flush: FlushReport, refusals: dict[str, int]) -> str:

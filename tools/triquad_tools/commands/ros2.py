@@ -7,7 +7,7 @@ import re
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import fields
 from functools import partial
@@ -144,33 +144,22 @@ def parser() -> argparse.ArgumentParser:
     )
     made.fromfile_prefix_chars = "@"
     add = made.add_argument
-    add(
-        "--serve",
-        nargs=argparse.REMAINDER,
-        metavar="...",
-        help="run a map server, too, which is the router of the nodes; what follows are arguments "
-        "of triquad-server, such as --store maps --preset indoor",
-    )
-    add(
-        "--router",
-        metavar="ENDPOINT",
-        help="of the nodes (default: that of --config or --serve, or tcp/127.0.0.1:7447)",
-    )
+    serve = "run a map server, too, which is the router of the nodes; what follows are arguments "
+    serve += "of triquad-server, such as --store maps --preset indoor"
+    add("--serve", nargs=argparse.REMAINDER, metavar="...", help=serve)
+    router = "of the nodes (default: that of --config or --serve, or tcp/127.0.0.1:7447)"
+    add("--router", metavar="ENDPOINT", help=router)
     add_server(made)
-    _add_topics(made.add_argument_group("what is taken in"))
-    _add_outputs(made.add_argument_group("what is published, while somebody subscribes"))
+    _add_topics(made.add_argument_group("what is taken in").add_argument)
+    outputs = made.add_argument_group("what is published, while somebody subscribes")
+    _add_outputs(outputs.add_argument)
     return made
 
 
-def _add_topics(group: argparse._ArgumentGroup) -> None:
-    add = group.add_argument
-    add(
-        "--domain",
-        type=partial(whole, 0, 232),
-        default=os.environ.get("ROS_DOMAIN_ID") or "0",
-        metavar="ID",
-        help="of nodes of rmw_zenoh (default: ROS_DOMAIN_ID of the environment, or 0)",
-    )
+def _add_topics(add: Callable[..., argparse.Action]) -> None:
+    own = os.environ.get("ROS_DOMAIN_ID") or "0"
+    domain = "of nodes of rmw_zenoh (default: ROS_DOMAIN_ID of the environment, or 0)"
+    add("--domain", type=partial(whole, 0, 232), default=own, metavar="ID", help=domain)
     add("--namespace", type=_topic, metavar="NAME", help="before all topics")
     for name, what in (
         ("clouds", "PointCloud2 (default: all, or none with --depth)"),
@@ -178,58 +167,29 @@ def _add_topics(group: argparse._ArgumentGroup) -> None:
     ):
         add(f"--{name}", type=_topic, nargs="+", default=[], metavar="TOPIC", help=what)
     add("--depth-stride", type=count, default=2, metavar="N", help="every Nth pixel (default: 2)")
-    add(
-        "--poses",
-        type=_topic,
-        default=TF_POSES,
-        metavar="TOPIC",
-        help="Odometry or PoseStamped (default: /tf)",
-    )
+    poses = "Odometry or PoseStamped (default: /tf)"
+    add("--poses", type=_topic, default=TF_POSES, metavar="TOPIC", help=poses)
     add("--body-frame", type=frame_name, default="base_link", metavar="NAME", help="of PoseStamped")
-    add(
-        "--map-frame",
-        type=frame_name,
-        default="",
-        metavar="NAME",
-        help="(default: map, odom or world, the first that there is)",
-    )
-    add(
-        "--clock",
-        choices=("header", "arrival"),
-        default="header",
-        help="which tells the time of messages (default: header)",
-    )
-    add(
-        "--wait-s",
-        type=partial(within, 0, 60),
-        default=2.0,
-        metavar="S",
-        help="for which a cloud waits for its transforms (default: 2)",
-    )
+    to_map_in = "(default: map, odom or world, the first that there is)"
+    add("--map-frame", type=frame_name, default="", metavar="NAME", help=to_map_in)
+    clock = "which tells the time of messages (default: header)"
+    add("--clock", choices=("header", "arrival"), default="header", help=clock)
+    waits = "for which a cloud waits for its transforms (default: 2)"
+    add("--wait-s", type=partial(within, 0, 60), default=2.0, metavar="S", help=waits)
 
 
-def _add_outputs(group: argparse._ArgumentGroup) -> None:
-    add = group.add_argument
+def _add_outputs(add: Callable[..., argparse.Action]) -> None:
     add("--mesh-level", type=int, choices=(0, 1, 2), default=1, help="of detail (default: 1)")
-    add(
-        "--mesh-bytes-per-s",
-        type=partial(whole, 1000, 2**40),
-        default=5_000_000,
-        metavar="N",
-        help="of markers, at most (default: 5000000)",
-    )
+    rate, most = partial(whole, 1000, 2**40), "of markers, at most (default: 5000000)"
+    add("--mesh-bytes-per-s", type=rate, default=5_000_000, metavar="N", help=most)
     for name, low, high, default in (
         ("height", -1e5, 1e5, 0.5),
         ("side", 0.1, 10_000, 40.0),
         ("cell", 0.01, 10, 0.1),
     ):
-        add(
-            f"--grid-{name}-m",
-            type=partial(within, low, high),
-            default=default,
-            metavar="M",
-            help=f"{name} of the occupancy grid (default: {default:g})",
-        )
+        metres, what = partial(within, low, high), f"{name} of the occupancy grid"
+        help_text = f"{what} (default: {default:g})"
+        add(f"--grid-{name}-m", type=metres, default=default, metavar="M", help=help_text)
 
 
 def _topic(text: str) -> str:

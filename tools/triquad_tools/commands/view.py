@@ -85,22 +85,12 @@ def _parser() -> argparse.ArgumentParser:
         description="Show a map in the browser: of a server, as it grows, or of a file.",
     )
     add = parser.add_argument
-    add(
-        "file",
-        type=Path,
-        nargs="?",
-        metavar="FILE_OR_STORE",
-        help="a map file, or a store with its history, to be shown without a server",
-    )
+    file = "a map file, or a store with its history, to be shown without a server"
+    add("file", type=Path, nargs="?", metavar="FILE_OR_STORE", help=file)
     add_server(parser)
     add("--host", default="127.0.0.1", metavar="ADDRESS", help="to serve the page at")
-    add(
-        "--allow-host",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="also answer where the page is asked for under this name, as behind a proxy; repeat "
-        "for more (addresses and the machine's host name are)",
-    )
+    name = "also answer where the page is asked for under this name, as behind a proxy; repeat for "
+    name += "more (addresses and the machine's host name are)"
+    add("--allow-host", action="append", default=[], metavar="NAME", help=name)
     add("--port", type=port, default=DEFAULT_PORT, metavar="PORT", help=f"default: {DEFAULT_PORT}")
     return parser

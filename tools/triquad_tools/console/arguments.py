@@ -74,25 +74,17 @@ port = partial(whole, 0, 65_535)
 
 def add_server(parser: argparse.ArgumentParser) -> None:
     """Add the map and the server; a command that can do without one gets ``None`` for each."""
-    add = parser.add_argument
-    add(
-        "--connect",
-        "-e",
-        metavar="ENDPOINT",
-        help=f"of the server (default: that of --config, or {DEFAULT_ENDPOINT})",
-    )
-    add("--map", metavar="NAME", help=f"of the server's maps (default: {DEFAULT_MAP})")
+    server = f"of the server (default: that of --config, or {DEFAULT_ENDPOINT})"
+    parser.add_argument("--connect", "-e", metavar="ENDPOINT", help=server)
+    name = f"of the server's maps (default: {DEFAULT_MAP})"
+    parser.add_argument("--map", metavar="NAME", help=name)
     add_config(parser)
 
 
 def add_config(parser: argparse.ArgumentParser) -> None:
     """Add the option for the credentials of a server."""
-    parser.add_argument(
-        "--config",
-        type=Path,
-        metavar="FILE",
-        help="Zenoh configuration (JSON5) to connect with, such as one of triquad-keys",
-    )
+    file = "Zenoh configuration (JSON5) to connect with, such as one of triquad-keys"
+    parser.add_argument("--config", type=Path, metavar="FILE", help=file)
 
 
 def server_name(options: argparse.Namespace) -> str:

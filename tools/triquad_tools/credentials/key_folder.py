@@ -17,13 +17,13 @@ import os
 import re
 import secrets
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from triquad_format.mapfile.files import replacing
-from triquad_format.wire.access_control import access_control
+from triquad_format.wire.access_control import Grant, access_control
 from triquad_format.wire.endpoints import DEFAULT_PORT
 
 from triquad_tools.console.command import ToolError
@@ -50,19 +50,11 @@ _NAME_LENGTH = 48  # with role and issue it has to fit into the 64 characters of
 _AUTHORITY = "authority"
 
 
-@dataclass(frozen=True)
-class Entry:
-    """A role that was given."""
-
-    holder: Holder
-    expires: datetime  # UTC
-
-
 class KeyFolder:
     """The keys of the servers and clients that trust one authority.
 
-    ``hosts`` are those of servers and routers, and ``entries`` the clients by name, in the order in
-    which they got their roles.
+    ``hosts`` are those of servers and routers. ``holders`` are the clients by name, in the order in
+    which they got their roles, and ``expires`` tells until when their certificates are valid, UTC.
     """
 
     def __init__(self, path: Path) -> None:
@@ -76,7 +68,12 @@ class KeyFolder:
         try:
             read = json.loads(self._register.read_bytes())
             self.hosts = tuple(read["hosts"])
-            self.entries = {role["name"]: _entry(**role) for role in read["roles"]}
+            self.holders: dict[str, Holder] = {}
+            self.expires: dict[str, datetime] = {}
+            for role in read["roles"]:
+                name, expires = role["name"], role.pop("expires")
+                self.holders[name] = _holder(**role)
+                self.expires[name] = datetime.fromisoformat(expires)
         except FileNotFoundError as error:
             raise ToolError(f"{path} holds no keys: triquad-keys init {path}") from error
         except (ValueError, KeyError, TypeError) as error:
@@ -121,7 +118,7 @@ class KeyFolder:
             raise ToolError(f"{holder.name!r} is not a name for a role: choose another")
         if len(holder.name) > _NAME_LENGTH:
             raise ToolError(f"{holder.name!r} has more than {_NAME_LENGTH} characters")
-        for other in (entry.holder for entry in self.entries.values()):
+        for other in self.holders.values():
             if other.name == holder.name:
                 raise ToolError(
                     f"{other.name!r} is there already, with the role {other.role.value}: "
@@ -153,7 +150,7 @@ class KeyFolder:
             ToolError: there is no such client.
             OSError: it cannot be written.
         """
-        del self.entries[self.holder(name).name]
+        del self.holders[self.holder(name).name]
         self._write_access()
         self._file(name).unlink(missing_ok=True)  # it may have been moved to its holder
 
@@ -163,10 +160,10 @@ class KeyFolder:
         Raises:
             ToolError: there is none.
         """
-        if name not in self.entries:
-            names = ", ".join(self.entries) or "nobody"
+        if name not in self.holders:
+            names = ", ".join(self.holders) or "nobody"
             raise ToolError(f"nobody is called {name!r}; there are: {names}")
-        return self.entries[name].holder
+        return self.holders[name]
 
     def certificate(self, name: str) -> Certificate:
         """Return the certificate of the server, the router or the authority."""
@@ -174,28 +171,66 @@ class KeyFolder:
         return Certificate(Path(f"{stem}.pem").read_bytes(), Path(f"{stem}-key.pem").read_bytes())
 
     def _issue(self, holder: Holder, days: float) -> Path:
-        own, authority = self.authority.client(holder.common_name, days), self.authority.own
-        file, title = self._file(holder.name), f"{holder.role.value} {holder.name}"
-        access, hosts = access_control(client_grants()), self.hosts or LOCAL_HOSTS[:1]
-        _write(file, _connecting(title, own, authority, access, hosts))
-        self.entries[holder.name] = Entry(holder, own.expires)
+        own = self.authority.client(holder.common_name, days)
+        endpoints = [_endpoint(host) for host in self.hosts or LOCAL_HOSTS[:1]]
+        values = {
+            "mode": "client",
+            # One attempt at each.
+            "connect": {"endpoints": endpoints, "timeout_ms": 0, "exit_on_failure": True},
+            # ROS 2 keeps the last messages of some topics, which needs their times.
+            "timestamping": {"enabled": True},
+        }
+        title = f"{holder.role.value} {holder.name}"
+        file = self._configure(holder.name, title, own, client_grants(), values)
+        self.holders[holder.name], self.expires[holder.name] = holder, own.expires
         self._write_access()
         return file
 
     def _write_access(self) -> None:
         """Write the register, and the files of the server and the router that follow from it."""
-        entries = self.entries.values()
+        holders = tuple(self.holders.values())
         roles = [
-            {**asdict(one.holder), "role": one.holder.role.value, "expires": str(one.expires)}
-            for one in entries
+            {**asdict(one), "role": one.role.value, "expires": str(self.expires[one.name])}
+            for one in holders
         ]
         register = json.dumps({"hosts": self.hosts, "roles": roles}, indent=2)
         _write(self._register, register.encode())
-        access = access_control(server_grants(tuple(one.holder for one in entries)))
+        listen = {"endpoints": [_endpoint("0.0.0.0")], "exit_on_failure": True}
+        values, grants = {"mode": "router", "listen": listen}, server_grants(holders)
         for name in LISTENING:
-            own, authority = self.certificate(name), self.authority.own
-            text = _listening(f"the {name}", own, authority, access)
-            _write(self._file(name), text)
+            self._configure(name, f"the {name}", self.certificate(name), grants, values)
+
+    def _configure(
+        self,
+        name: str,
+        title: str,
+        own: Certificate,
+        grants: Sequence[Grant],
+        values: Mapping[str, object],
+    ) -> Path:
+        """Write a file that neither looks for others nor shares memory, as zenoh_config.QUIET.
+
+        Both ends of a link show their certificates, and end it when one expires.
+        """
+        tls: dict[str, object] = {
+            "root_ca_certificate_base64": _base64(self.authority.own.pem),
+            "enable_mtls": True,
+            "verify_name_on_connect": True,
+            "close_link_on_expiration": True,
+        }
+        for side in ("listen", "connect") if "listen" in values else ("connect",):
+            tls[f"{side}_certificate_base64"] = _base64(own.pem)
+            tls[f"{side}_private_key_base64"] = _base64(own.key_pem)
+        off, link = {"enabled": False}, {"protocols": ["tls"], "tls": tls}
+        whole = {
+            **values,
+            "scouting": {"multicast": off, "gossip": off},
+            "transport": {"shared_memory": off, "link": link},
+            "access_control": access_control(grants),
+        }
+        file = self._file(name)
+        _write(file, (_WARNING.format(title=title) + json.dumps(whole, indent=2) + "\n").encode())
+        return file
 
     @property
     def _register(self) -> Path:
@@ -205,9 +240,8 @@ class KeyFolder:
         return self.path / f"{name}.json5"
 
 
-def _entry(*, role: str, sources: list[str], expires: str, **others: Any) -> Entry:
-    holder = Holder(role=Role(role), sources=tuple(sources), **others)
-    return Entry(holder, datetime.fromisoformat(expires))
+def _holder(*, role: str, sources: list[str], **others: Any) -> Holder:
+    return Holder(role=Role(role), sources=tuple(sources), **others)
 
 
 def _store(path: Path, name: str, certificate: Certificate) -> None:
@@ -219,47 +253,6 @@ def _write(path: Path, data: bytes) -> None:
     with replacing(path) as stream:
         os.fchmod(stream.fileno(), 0o600)  # before there is anything to read in it
         stream.write(data)
-
-
-def _listening(title: str, own: Certificate, authority: Certificate, access: object) -> bytes:
-    """Return the file of a server or router, with its section ``access_control``."""
-    listen = {"endpoints": [_endpoint("0.0.0.0")], "exit_on_failure": True}
-    tls = _tls(own, authority, "listen", "connect")
-    return _text(title, tls, access, {"mode": "router", "listen": listen})
-
-
-def _connecting(
-    title: str, own: Certificate, authority: Certificate, access: object, hosts: Sequence[str]
-) -> bytes:
-    """Return the file of a client, which finds the server at one of ``hosts``."""
-    once = {"timeout_ms": 0, "exit_on_failure": True}  # one attempt at each
-    connect = {"endpoints": [_endpoint(host) for host in hosts], **once}
-    # ROS 2 keeps the last messages of some topics, which needs their times.
-    values = {"mode": "client", "connect": connect, "timestamping": {"enabled": True}}
-    return _text(title, _tls(own, authority, "connect"), access, values)
-
-
-def _text(title: str, tls: object, access: object, values: Mapping[str, object]) -> bytes:
-    """Return a file that neither looks for others nor shares memory, as zenoh_config.QUIET."""
-    off = {"enabled": False}
-    transport = {"shared_memory": off, "link": {"protocols": ["tls"], "tls": tls}}
-    scouting = {"multicast": off, "gossip": off}
-    whole = {**values, "scouting": scouting, "transport": transport, "access_control": access}
-    return (_WARNING.format(title=title) + json.dumps(whole, indent=2) + "\n").encode()
-
-
-def _tls(own: Certificate, authority: Certificate, *sides: str) -> dict[str, object]:
-    """Have both ends of a link show their certificates, and end it when one expires."""
-    section: dict[str, object] = {
-        "root_ca_certificate_base64": _base64(authority.pem),
-        "enable_mtls": True,
-        "verify_name_on_connect": True,
-        "close_link_on_expiration": True,
-    }
-    for side in sides:
-        section[f"{side}_certificate_base64"] = _base64(own.pem)
-        section[f"{side}_private_key_base64"] = _base64(own.key_pem)
-    return section
 
 
 def _endpoint(host: str) -> str:

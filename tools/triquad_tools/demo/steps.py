@@ -15,7 +15,8 @@ from triquad_tools.console.progress import progress
 from triquad_tools.console.report import Row
 from triquad_tools.demo.probe import Probe, ProbeReport
 from triquad_tools.plots.picture import draw_mesh
-from triquad_tools.recordings.publishing import publish_all, wait_until_settled
+from triquad_tools.recordings.publishing import FLUSH_TIMEOUT_S, publish_all, wait_until_settled
+from triquad_tools.recordings.recording import DEFAULT_SOURCE, ScanEntry
 from triquad_tools.simulation.lidar import SimulatedDrive, SimulatedScan
 
 MAP = "demo"
@@ -142,7 +143,9 @@ def demonstrate(client: Client, endpoint: str, drive: SimulatedDrive, out: Path)
 def _learnt(client: Client, scans: Sequence[SimulatedScan]) -> Intake:
     """Stream the scans and wait until they are learnt."""
     started = time.monotonic()
-    flush = publish_all(client, scans)
+    published = ((ScanEntry(time.time_ns(), DEFAULT_SOURCE), scan) for scan in scans)
+    publish_all(client, published, len(scans))
+    flush = client.flush(FLUSH_TIMEOUT_S)
     taken_in = time.monotonic()
     status = wait_until_settled(client, _SETTLE_LIMIT_S)
     return Intake(

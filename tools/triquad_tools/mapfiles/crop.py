@@ -1,10 +1,9 @@
 """A map cut down to what lies in a box, or freed of training state."""
 
 import dataclasses
-from typing import TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from triquad_format.records import morton
 from triquad_format.records.arrays import Bytes
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
@@ -14,12 +13,9 @@ from triquad_format.records.region import (
     Evidence,
     MapRecord,
     Region,
-    TrainingState,
     VertexTable,
     masked,
 )
-
-_Number = TypeVar("_Number", bound=np.number)
 
 _REACH_VOXELS = 0.5
 """A point is near a surface where one was seen this far away."""
@@ -28,8 +24,8 @@ _REACH_VOXELS = 0.5
 def crop_record(record: MapRecord, minimum: ArrayLike, maximum: ArrayLike) -> MapRecord:
     """Return what a map needs to answer inside a box, to the last bit as before.
 
-    Regions whose cube meets the box stay, with the vertices whose hat functions reach into it,
-    the evidence in it, and the replay samples in it with their share of the training budget.
+    Regions whose cube meets the box stay, with the vertices whose hat functions reach into it and
+    the evidence in it, without the state that training needs.
 
     Args:
         record: the map.
@@ -55,53 +51,20 @@ def without_training(record: MapRecord) -> MapRecord:
 
 
 def _crop_region(settings: FieldSettings, region: Region, box: LeafBox) -> Region:
-    kept = [_reaching(settings, table, box) for table in region.tables]
-    tables = tuple(
-        dataclasses.replace(table, codes=table.codes[rows], features=table.features[rows])
-        for table, rows in zip(region.tables, kept, strict=True)
-    )
-    training = region.training
-    if training is not None:
-        training = _crop_training(settings, training, kept, box=box)
+    tables = tuple(_crop_table(settings, table, box) for table in region.tables)
     evidence = masked(region.evidence, status_voxels(region.evidence, box))
-    return dataclasses.replace(region, tables=tables, evidence=evidence, training=training)
+    return dataclasses.replace(region, tables=tables, evidence=evidence, training=None)
 
 
-def _reaching(settings: FieldSettings, table: VertexTable, box: LeafBox) -> NDArray[np.intp]:
-    """Return rows of the vertices that have a hat function that is not zero all over the box."""
+def _crop_table(settings: FieldSettings, table: VertexTable, box: LeafBox) -> VertexTable:
+    """Return the vertices that have a hat function that is not zero all over the box."""
     axes = list(AXES[table.plane])
     vertices = morton.decode(table.codes, 2)
     scale = 1 << (settings.depth - table.level)
     below = (vertices - 1) * scale <= box.high[axes]
     above = (vertices + 1) * scale >= box.low[axes]
-    return np.flatnonzero((below & above).all(axis=1))
-
-
-def _crop_training(
-    settings: FieldSettings, training: TrainingState, kept: list[NDArray[np.intp]], *, box: LeafBox
-) -> TrainingState:
-    leaves = settings.leaf_coordinates(training.sample_points)
-    inside = np.flatnonzero(((leaves >= box.low) & (leaves <= box.high)).all(axis=1))
-    ends = settings.leaf_coordinates(training.rays.ends_m(settings))
-    rays = np.flatnonzero(((ends >= box.low) & (ends <= box.high)).all(axis=1))
-    # Rounded up below, so that none is forgotten.
-    samples = training.budget_samples * (len(inside) + len(rays))
-    return dataclasses.replace(
-        training,
-        table_means=_rows(training.table_means, kept),
-        table_variances=_rows(training.table_variances, kept),
-        table_steps=_rows(training.table_steps, kept),
-        sample_points=training.sample_points[inside],
-        sample_labels=training.sample_labels[inside],
-        budget_samples=-(-samples // max(len(leaves) + len(ends), 1)),
-        rays=training.rays.chosen(rays),
-    )
-
-
-def _rows(
-    columns: tuple[NDArray[_Number], ...], kept: list[NDArray[np.intp]]
-) -> tuple[NDArray[_Number], ...]:
-    return tuple(column[rows] for column, rows in zip(columns, kept, strict=True))
+    kept = (below & above).all(axis=1)
+    return dataclasses.replace(table, codes=table.codes[kept], features=table.features[kept])
 
 
 def status_voxels(evidence: Evidence, box: LeafBox) -> Bytes:

@@ -1,13 +1,12 @@
-"""The places and sizes of differences of two maps; ``docs/tools.md`` defines every figure."""
+"""The sizes of differences of two maps; ``docs/tools.md`` defines every figure."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.records.arrays import Bytes, Doubles, Floats, Longs
+from triquad_format.records.arrays import Bytes, Doubles, Floats
 from triquad_format.records.status import Status
 
 from triquad_tools.console.lines import print_line
@@ -23,9 +22,9 @@ STILL_M = 1e-3
 """The least movement that counts: several times the error of a surface point."""
 
 NOISE_M = 0.02
-"""The greatest difference of two maps that learnt the same; it does not make a change great."""
+"""Two maps that learnt the same differ by less, but for single points."""
 
-_LISTED = 20  # tiles, at most
+_BESIDE_LEAVES = 2  # along each axis, as far as points of one object may be apart
 _STEPS = 8
 _LEAST_SLOPE = 0.1  # a flatter field says nothing of where its zero is
 
@@ -43,22 +42,47 @@ class Sighting:
         """Return some of the points."""
         return Sighting(self.points[rows], self.sdf[rows], self.status[rows], leaf_m=self.leaf_m)
 
-    def having(self, status: Status) -> Doubles:
+    def having(self, status: Status) -> "Sighting":
         """Return the points of which the other map says ``status``."""
-        return np.asarray(self.points[self.status == status])
+        return self.part(np.flatnonzero(self.status == status))
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two maps, seen from each other."""
+    """Two maps A and B, seen from each other."""
 
-    old: Sighting  # surface of the first map, asked in the second
-    new: Sighting  # surface of the second map, asked in the first
+    old: Sighting  # surface of A, asked in B
+    new: Sighting  # surface of B, asked in A
+
+    @property
+    def changed(self) -> dict[str, Sighting]:
+        """The surface points that are not in both maps, or not where they were, by kind."""
+        vanished, hidden = self.old.having(Status.FREE), self.old.having(Status.UNKNOWN)
+        return {
+            "vanished": vanished,
+            "appeared": self.new.having(Status.FREE),
+            "newly_seen": self.new.having(Status.UNKNOWN),
+            "no_longer_known": hidden,
+            "moved": self._moved(np.concatenate([vanished.points, hidden.points])),
+        }
+
+    def _moved(self, gone: Doubles) -> Sighting:
+        """Return points of A that B has elsewhere, but not those beside what is ``gone`` [N, 3].
+
+        The surface next to a thing that came or went is near the surface of that, too.
+        """
+        from scipy.spatial import cKDTree  # slow to import
+
+        near = self.old.having(Status.SURFACE)
+        moved = near.part(np.flatnonzero(np.abs(near.sdf) > NOISE_M))
+        beside_m = _BESIDE_LEAVES * moved.leaf_m
+        away_m = cKDTree(gone).query(moved.points, p=np.inf, distance_upper_bound=beside_m)[0]
+        return moved.part(np.flatnonzero(np.isinf(away_m)))
 
 
 @dataclass(frozen=True)
 class Change:
-    """The difference of the surface in some volume between maps A and B; counts are of points."""
+    """The difference of the surface between maps A and B; counts are of points."""
 
     points_a: int
     points_b: int
@@ -66,33 +90,15 @@ class Change:
     vanished: int  # of A: B has seen free space there
     newly_seen: int  # of B: A has seen nothing there
     no_longer_known: int  # of A: B has seen nothing there
+    moved: int  # of A: B has it near its surface, but more than NOISE_M elsewhere
     moved_median_m: float  # of the points of A that B has near its surface; NaN if there are none
     moved_p95_m: float
-    changed_m3: float  # swept by moves beyond NOISE_M, and what appeared and vanished
 
     @property
     def differs(self) -> bool:
         """Whether there is any difference to report."""
         only_in_one = self.appeared or self.vanished or self.newly_seen or self.no_longer_known
-        return bool(only_in_one) or self.moved_p95_m >= STILL_M
-
-
-@dataclass(frozen=True)
-class TileChange:
-    """The difference of two maps in one tile."""
-
-    low_m: tuple[float, ...]  # [3] corner, map frame
-    high_m: tuple[float, ...]  # [3] opposite corner
-    change: Change
-
-
-@dataclass(frozen=True)
-class MapDiff:
-    """The difference of two maps."""
-
-    tile_m: float
-    total: Change
-    tiles: tuple[TileChange, ...]  # those that differ, the greatest change first
+        return bool(only_in_one or self.moved) or self.moved_p95_m >= STILL_M
 
 
 def compare(a: "OfflineMap", b: "OfflineMap") -> Comparison:
@@ -100,14 +106,19 @@ def compare(a: "OfflineMap", b: "OfflineMap") -> Comparison:
     return Comparison(_sighting(a, b), _sighting(b, a))
 
 
-def difference(comparison: Comparison, tile_m: float) -> MapDiff:
-    """Return the figures of a comparison, in all and per cube of side ``tile_m``."""
-    tiles = [tile for tile in _tiles(comparison, tile_m) if tile.change.differs]
-    tiles.sort(
-        key=lambda tile: (tile.change.changed_m3, np.nan_to_num(tile.change.moved_p95_m)),
-        reverse=True,
+def difference(comparison: Comparison) -> Change:
+    """Return the figures of a comparison."""
+    old, new = comparison.old, comparison.new
+    counts = {kind: len(found.points) for kind, found in comparison.changed.items()}
+    moved = np.abs(old.having(Status.SURFACE).sdf).astype(np.float64)
+    median, p95 = np.quantile(moved, [0.5, 0.95]) if len(moved) else (np.nan, np.nan)
+    return Change(
+        points_a=len(old.points),
+        points_b=len(new.points),
+        **counts,
+        moved_median_m=float(median),
+        moved_p95_m=float(p95),
     )
-    return MapDiff(tile_m, _change(comparison.old, comparison.new), tuple(tiles))
 
 
 def surface_points(opened: "OfflineMap") -> Doubles:
@@ -136,20 +147,25 @@ def surface_points(opened: "OfflineMap") -> Doubles:
     return found[opened.has_surface(found)]
 
 
-def print_diff(diff: MapDiff) -> None:
-    """Print the totals, and a table of the tiles that changed most."""
-    if not diff.tiles:
-        print_line(f"  no difference at {diff.total.points_a:,} surface points")
+def print_diff(change: Change) -> None:
+    """Print the figures of a difference, if there is any."""
+    if not change.differs:
+        print_line(f"  no difference at {change.points_a:,} surface points")
         return
-    titles = ("from x m", "y m", "z m", "points A", "in B", "appeared %", "newly seen %",
-              "vanished %", "no longer known %", "moved cm", "95 % cm")  # fmt: skip
-    rows = [
-        (*(f"{low:g}" for low in tile.low_m), *_cells(tile.change)) for tile in diff.tiles[:_LISTED]
-    ]
-    print_columns(titles, [*rows, ("all", "", "", *_cells(diff.total))])
-    left = len(diff.tiles) - len(rows)
-    if left > 0:
-        print_line(f"  and {left} more: --json prints all")
+    titles = ("points A", "in B", "appeared %", "newly seen %", "vanished %", "no longer known %",
+              "moved %", "moved cm", "95 % cm")  # fmt: skip
+    row = (
+        f"{change.points_a:,}",
+        f"{change.points_b:,}",
+        _share(change.appeared, change.points_b),
+        _share(change.newly_seen, change.points_b),
+        _share(change.vanished, change.points_a),
+        _share(change.no_longer_known, change.points_a),
+        _share(change.moved, change.points_a),
+        _centimetres(change.moved_median_m),
+        _centimetres(change.moved_p95_m),
+    )
+    print_columns(titles, [row])
 
 
 def _sighting(of: "OfflineMap", by: "OfflineMap") -> Sighting:
@@ -158,58 +174,9 @@ def _sighting(of: "OfflineMap", by: "OfflineMap") -> Sighting:
     return Sighting(points, answer.sdf, answer.status, leaf_m=of.leaf_m)
 
 
-def _tiles(comparison: Comparison, tile_m: float) -> Iterator[TileChange]:
-    old, new = comparison.old, comparison.new
-    count = len(old.points)
-    cells = np.floor(np.concatenate([old.points, new.points]) / tile_m).astype(np.int64)
-    for cell, rows in rows_by_cell(cells):
-        change = _change(old.part(rows[rows < count]), new.part(rows[rows >= count] - count))
-        low, high = (tuple((end * tile_m).round(6).tolist()) for end in (cell, cell + 1))
-        yield TileChange(low, high, change)
-
-
-def _change(old: Sighting, new: Sighting) -> Change:
-    moved = np.abs(old.sdf[old.status == Status.SURFACE]).astype(np.float64)
-    vanished, appeared = len(old.having(Status.FREE)), len(new.having(Status.FREE))
-    median, p95 = np.quantile(moved, [0.5, 0.95]) if len(moved) else (np.nan, np.nan)
-    swept = float(moved[moved > NOISE_M].sum()) * old.leaf_m**2
-    return Change(
-        points_a=len(old.points),
-        points_b=len(new.points),
-        appeared=appeared,
-        vanished=vanished,
-        newly_seen=len(new.having(Status.UNKNOWN)),
-        no_longer_known=len(old.having(Status.UNKNOWN)),
-        moved_median_m=float(median),
-        moved_p95_m=float(p95),
-        changed_m3=swept + vanished * old.leaf_m**3 + appeared * new.leaf_m**3,
-    )
-
-
-def _cells(change: Change) -> tuple[str, ...]:
-    return (
-        f"{change.points_a:,}",
-        f"{change.points_b:,}",
-        _share(change.appeared, change.points_b),
-        _share(change.newly_seen, change.points_b),
-        _share(change.vanished, change.points_a),
-        _share(change.no_longer_known, change.points_a),
-        _centimetres(change.moved_median_m),
-        _centimetres(change.moved_p95_m),
-    )
-
-
 def _share(count: int, of: int) -> str:
     return f"{100 * count / of:.1f}" if count else "-"
 
 
 def _centimetres(metres: float) -> str:
     return "-" if np.isnan(metres) else f"{100 * metres:.2f}"
-
-
-def rows_by_cell(cells: Longs) -> Iterator[tuple[Longs, NDArray[np.intp]]]:
-    """Yield each different cell [3] of ``cells`` [N, 3], in order, with its ascending rows [K]."""
-    different, numbers = np.unique(cells, axis=0, return_inverse=True)
-    ends = np.cumsum(np.bincount(numbers.reshape(-1)))
-    rows = np.split(np.argsort(numbers.reshape(-1), kind="stable"), ends)
-    return zip(different, rows, strict=False)  # nothing is left behind the last end

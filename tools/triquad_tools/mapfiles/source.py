@@ -14,7 +14,6 @@ from triquad_format.mapfile.checkpoint_folder import (
     checkpoint_files,
     map_folder,
 )
-from triquad_format.mapfile.parts.part import TRAINING_TOPICS
 from triquad_format.mapfile.reader import open_manifest, read_map_file
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.region import MapRecord
@@ -22,7 +21,7 @@ from triquad_map.stored_map import StoredMap
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
-from triquad_tools.mapfiles.crop import crop_record, without_training
+from triquad_tools.mapfiles.crop import crop_record
 
 Box = Doubles
 """Opposite corners ``[2, 3]`` of a box, metres, map frame; the lower one first."""
@@ -72,8 +71,8 @@ def map_file(
     """Yield a map's file: ``target`` itself, a checkpoint of it, or a server's newest epoch.
 
     The map ``map_name`` of a server, which is reached with a Zenoh configuration ``config``, is
-    downloaded, with its training state, and deleted afterwards. ``when`` says which checkpoint of
-    a folder; see :func:`chosen_file`.
+    downloaded, and deleted afterwards. ``when`` says which checkpoint of a folder; see
+    :func:`chosen_file`.
 
     Raises:
         ToolError: ``when`` is given, but ``target`` is no folder.
@@ -92,39 +91,31 @@ def map_file(
         path = Path(folder) / "map.triquad"
         connected = triquad_client.connect(target, map_name, config=config)
         with progress("downloading"), connected as client:
-            client.download_map(path, training=True)
+            client.download_map(path)
         yield path
 
 
-def read_source(path: Path, box: Box | None, training: bool) -> SourceMap:
-    """Return the map in a file, cropped to a box, with training state if that is kept.
-
-    Only the parts that the box needs are read, unless there is training state and that is kept.
+def read_source(path: Path, box: Box | None) -> SourceMap:
+    """Return the map in a file; in a box it is :func:`cropped`, and only what that needs is read.
 
     Raises:
         NothingLeftError: no region lies in the box.
         FormatError: the box is empty, or the file cannot be read.
         OSError: it cannot be read.
     """
-    if box is not None:
-        with StoredMap.open(path) as stored:
-            manifest = stored.manifest
-            topics = {entry.key.topic for entry in manifest.entries}
-            if not (training and topics & set(TRAINING_TOPICS)):
-                part = SourceMap(stored.box(box[0], box[1]), manifest.stamp_ns or None)
-                return cropped(part, box, training)
-    file = read_map_file(path)
-    return cropped(SourceMap(file.record, file.manifest.stamp_ns or None), box, training)
+    if box is None:
+        file = read_map_file(path)
+        return SourceMap(file.record, file.manifest.stamp_ns or None)
+    with StoredMap.open(path) as stored:
+        return cropped(SourceMap(stored.box(*box), stored.manifest.stamp_ns or None), box)
 
 
-def cropped(source: SourceMap, box: Box | None, training: bool) -> SourceMap:
-    """Return the map in a box, with or without training state; raises as :func:`read_source`."""
-    record = source.record
-    if box is not None:
-        record = crop_record(record, box[0], box[1])
-        if not record.regions or (source.record.has_evidence and not record.has_evidence):
-            raise NothingLeftError("nothing of the map lies in the box of --crop")
-    return SourceMap(record if training else without_training(record), source.stamp_ns)
+def cropped(source: SourceMap, box: Box) -> SourceMap:
+    """Return the map in a box, without training state; raises as :func:`read_source`."""
+    record = crop_record(source.record, *box)
+    if not record.regions or (source.record.has_evidence and not record.has_evidence):
+        raise NothingLeftError("nothing of the map lies in the box of --crop")
+    return SourceMap(record, source.stamp_ns)
 
 
 def checkpoint_at(folder: Path, when: str) -> CheckpointFile:

@@ -1,37 +1,47 @@
-"""Publishing scans no faster than a server integrates them, and waiting until they are learnt."""
+"""Publishing scans, and waiting until they are learnt."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
-from triquad_client import Client, FlushReport, ServerStatus
+from triquad_client import Client, ServerStatus
 
 from triquad_tools.console.progress import progress
+from triquad_tools.recordings.recording import ScanEntry
 from triquad_tools.sensors.sweep import PosedScan
 
 _POLL_S = 0.5  # the server says how it is doing when it is asked, not when it changes
 
 FLUSH_TIMEOUT_S = 120.0
 
-_PENDING = 4
+_PENDING = 4  # so many to twice as many scans are, far fewer than a server queues
 
 
-def keep_few_pending(client: Client, published: int) -> None:
-    """Let 4 to 8 scans be pending, far fewer than a server queues. Call after each scan.
+def publish_all(
+    client: Client,
+    scans: Iterable[tuple[ScanEntry, PosedScan]],
+    total: int,
+    due_s: Sequence[float] = (),
+    title: str = "publishing",
+) -> int:
+    """Publish ``total`` scans, and return how many had points, and were sent.
 
-    Not after every scan, for the server publishes an epoch before it answers.
+    Each is sent when it is due, seconds after the beginning; without times the server sets the
+    pace, so that none is lost.
     """
-    if published % _PENDING == 0:
-        client.flush(FLUSH_TIMEOUT_S, pending=_PENDING)
-
-
-def publish_all(client: Client, scans: Sequence[PosedScan]) -> FlushReport:
-    """Publish scans, and wait until the server has integrated all of them."""
-    with progress("publishing scans", len(scans)) as report:
-        for number, scan in enumerate(scans, start=1):
-            client.publish_scan(scan.points, scan.world_from_sensor)
-            keep_few_pending(client, number)
-            report(number, f"{number} of {len(scans)} scans")
-        return client.flush(FLUSH_TIMEOUT_S)
+    started_s, published = time.monotonic(), 0
+    with progress(title, total) as report:
+        for done, (entry, scan) in enumerate(scans, start=1):
+            if due_s:
+                time.sleep(max(0.0, started_s + due_s[done - 1] - time.monotonic()))
+            if len(scan.points):
+                pose, stamp_s = scan.world_from_sensor, entry.stamp_ns / 1e9
+                client.publish_scan(scan.points, pose, stamp_s, source=entry.source)
+                published += 1
+                # Not after every scan, for the server publishes an epoch before it answers.
+                if not due_s and published % _PENDING == 0:
+                    client.flush(FLUSH_TIMEOUT_S, pending=_PENDING)
+            report(done, f"{done} of {total} scans")
+    return published
 
 
 def wait_until_settled(client: Client, limit_s: float | None = None) -> ServerStatus:

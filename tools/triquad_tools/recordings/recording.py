@@ -63,12 +63,8 @@ class ReadingOptions:
 
 def add_recording(parser: argparse.ArgumentParser) -> None:
     """Let a command take a recording, and choose from it."""
-    parser.add_argument(
-        "recording",
-        type=Path,
-        metavar="RECORDING",
-        help="a bag of ROS 1 or ROS 2, an MCAP file, or a folder of scans (docs/tools.md)",
-    )
+    kinds = "a bag of ROS 1 or ROS 2, an MCAP file, or a folder of scans (docs/tools.md)"
+    parser.add_argument("recording", type=Path, metavar="RECORDING", help=kinds)
     _add_choice(parser.add_argument_group("which scans").add_argument)
     _add_ros(parser.add_argument_group("bags and MCAP files").add_argument)
     _add_folder(parser.add_argument_group("folders of clouds or depth images").add_argument)

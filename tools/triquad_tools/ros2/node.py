@@ -11,17 +11,15 @@ from triquad_tools.ros2.topics import (
     Announcement,
     Delivery,
     End,
-    Entity,
     bridge_token,
     bridge_tokens,
     read_token,
+    rmw_prefix,
     rmw_token,
     rmw_tokens,
 )
 
 _log = logging.getLogger("triquad_ros2")
-
-NODE_NAME = "triquad"
 
 
 class Node:
@@ -33,11 +31,11 @@ class Node:
         self._session_id = str(session.zid())
         self._numbers = itertools.count()
         self._tokens: list[Any] = []
-        self._declare(self._entity().rmw_prefix(domain, "NN"))
+        self._declare(self._prefix("NN"))
 
     def announce(self, what: Announcement, delivery: Delivery) -> None:
         """Announce it to nodes of rmw_zenoh."""
-        self._declare(rmw_token(self._domain, self._entity(), what, delivery))
+        self._declare(rmw_token(self._prefix(what.end.value), what, delivery))
 
     def announce_to_bridges(self, what: Announcement, delivery: Delivery) -> None:
         """Announce it to zenoh-bridge-ros2dds."""
@@ -48,8 +46,8 @@ class Node:
         for token in reversed(self._tokens):
             token.undeclare()
 
-    def _entity(self) -> Entity:
-        return Entity(self._session_id, NODE_NAME, next(self._numbers))
+    def _prefix(self, kind: str) -> str:
+        return rmw_prefix(self._domain, self._session_id, next(self._numbers), kind)
 
     def _declare(self, token: str) -> None:
         self._tokens.append(self._session.liveliness().declare_token(token))

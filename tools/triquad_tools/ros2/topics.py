@@ -11,6 +11,8 @@ from enum import Enum
 
 from triquad_tools.sensors.ros.type_store import type_store
 
+NODE_NAME = "triquad"
+
 ANY_HASH = "*"
 NO_HASH = "TypeHashNotSupported"
 """The text that ROS 2 Humble, which knows no hashes of types, writes in their place."""
@@ -108,29 +110,21 @@ class Delivery:
     depth: int = 10
 
 
-@dataclass(frozen=True)
-class Entity:
-    """The owner of one end of a topic, in the graph that nodes of rmw_zenoh build."""
+def rmw_prefix(domain: int, session_id: str, number: int, kind: str) -> str:
+    """Return the prefix of all tokens of an entity of the bridge's node in the graph of rmw_zenoh.
 
-    session_id: str
-    node: str
-    number: int  # 0 is the node itself
-
-    def rmw_prefix(self, domain: int, kind: str) -> str:
-        """Return the prefix of all its tokens; it has no enclave and no namespace.
-
-        The token of a node, of kind ``NN``, is the prefix alone.
-        """
-        return f"@ros2_lv/{domain}/{self.session_id}/0/{self.number}/{kind}/%/%/{self.node}"
+    ``number`` is that of an end of a topic, or 0 for the node itself, whose token, of kind ``NN``,
+    is the prefix alone. It has no enclave and no namespace.
+    """
+    return f"@ros2_lv/{domain}/{session_id}/0/{number}/{kind}/%/%/{NODE_NAME}"
 
 
-def rmw_token(domain: int, entity: Entity, what: Announcement, delivery: Delivery) -> str:
+def rmw_token(prefix: str, what: Announcement, delivery: Delivery) -> str:
     """Return the token that says to nodes of rmw_zenoh what :func:`read_token` reads."""
     name = what.topic.name.replace("/", "%")
     type_key = f"{_dds_type(what.topic.type_name)}/{what.type_hash}"
     # Defaults are left out.
     kinds = f"{'' if delivery.reliable else 2}:{1 if delivery.latched else ''}"
-    prefix = entity.rmw_prefix(domain, what.end.value)
     return f"{prefix}/{name}/{type_key}/{kinds}:,{delivery.depth}:,:,:,,"
 
 

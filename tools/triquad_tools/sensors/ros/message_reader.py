@@ -42,11 +42,27 @@ class MessageReader:
     def transforms(
         self, kind: str, message: Any, came_ns: int, *, static: bool = False
     ) -> list[Transform]:
-        """Return the transforms of a message of transforms, ``static`` or not, or of a pose."""
-        found = transforms_of(kind, message, self.body_frame)
+        """Return the transforms of a message of transforms, ``static`` or not, or of a pose.
+
+        Without ``by_arrival`` they have the times of the headers.
+        """
+        found = self._transforms(kind, message)
         if static:
             return [replace(each, stamp_ns=STATIC) for each in found]
         return [replace(each, stamp_ns=came_ns) for each in found] if self.by_arrival else found
+
+    def _transforms(self, kind: str, message: Any) -> list[Transform]:
+        if kind == POSE:
+            where = message.pose
+            return [_transform(message.header, self.body_frame, where.position, where.orientation)]
+        if kind == ODOMETRY:
+            where, child = message.pose.pose, message.child_frame_id or self.body_frame
+            return [_transform(message.header, child, where.position, where.orientation)]
+        moved = [(each, each.transform) for each in message.transforms]
+        return [
+            _transform(each.header, each.child_frame_id, by.translation, by.rotation)
+            for each, by in moved
+        ]
 
     def _camera(self, topic: str) -> Any:
         if topic not in self.cameras:
@@ -65,25 +81,6 @@ class MessageReader:
                 f"{points} points exceed {self.max_points}: publish smaller clouds, or, of depth "
                 "images, raise --depth-stride",
             )
-
-
-def transforms_of(kind: str, message: Any, body_frame: str) -> list[Transform]:
-    """Return the transforms of a message of a kind, at the times of its headers.
-
-    ``body_frame`` is whose pose it is where it does not say so, as a ``PoseStamped``.
-    """
-    if kind == POSE:
-        where = message.pose
-        return [_transform(message.header, body_frame, where.position, where.orientation)]
-    if kind == ODOMETRY:
-        where, child = message.pose.pose, message.child_frame_id or body_frame
-        return [_transform(message.header, child, where.position, where.orientation)]
-    return [
-        _transform(
-            each.header, each.child_frame_id, each.transform.translation, each.transform.rotation
-        )
-        for each in message.transforms
-    ]
 
 
 def _transform(header: Any, child: str, position: Any, rotation: Any) -> Transform:

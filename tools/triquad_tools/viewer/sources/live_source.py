@@ -4,7 +4,7 @@ from triquad_client import Client
 from triquad_client.checks import Bounds
 from triquad_client.mesh.mesh_watch import MeshWatch
 
-from triquad_tools.viewer.sources.map_source import TileFollower, TileSizes
+from triquad_tools.viewer.sources.tile_sizes import TileSizes
 
 _POINT = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
@@ -13,6 +13,7 @@ class LiveSource:
     """The map of a server; the caller closes the client."""
 
     grows = True
+    """More of it may become known while it is shown."""
 
     def __init__(self, client: Client, endpoint: str) -> None:
         """Ask the server for the lengths of its mesh.
@@ -26,9 +27,10 @@ class LiveSource:
             watch.catch_up()
             self.sizes = TileSizes(watch.cell_m, watch.tile_side_m)
 
-    def follow(
-        self, level: int, bounds: Bounds | None = None, before: TileFollower | None = None
-    ) -> MeshWatch:
-        """Follow the mesh tiles of a level that meet ``bounds``, as the server makes them."""
+    def follow(self, level: int, bounds: Bounds | None = None, before: object = None) -> MeshWatch:
+        """Follow the mesh tiles of a level that meet ``bounds``, as the server makes them.
+
+        Those of a follower ``before``, of the same level, are not fetched again.
+        """
         known = before.known_tiles() if isinstance(before, MeshWatch) else None
         return self.client.watch_mesh(bounds, level, known=known)

@@ -23,7 +23,7 @@ from triquad_format.mapfile.metadata import utc_time
 from triquad_format.mapfile.reader import open_manifest
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.viewer.sources.map_source import COARSEST, TileFollower, TileSizes
+from triquad_tools.viewer.sources.tile_sizes import COARSEST, TileSizes
 
 _CELL_LEAVES = 0.5  # of a cell of level 0, as in a server's mesh
 _MAX_TILES = 500  # that are kept of an open map: some 50 to 200 MB
@@ -58,10 +58,14 @@ class StoredMap:
         """The tile of a level and an index, one of :meth:`indices`."""
 
     def follow(
-        self, level: int, bounds: Bounds | None = None, before: TileFollower | None = None
+        self, level: int, bounds: Bounds | None = None, before: object = None
     ) -> "StoredTiles":
-        """Make the mesh tiles of a level that meet ``bounds``."""
-        known, wanted = {} if before is None else before.tiles, self.indices(level, bounds)
+        """Make the mesh tiles of a level that meet ``bounds``, metres, map frame; ``None``: all.
+
+        Those of a follower ``before``, of the same level, are not made again.
+        """
+        known = before.tiles if isinstance(before, StoredTiles) else {}
+        wanted = self.indices(level, bounds)
         return StoredTiles(
             partial(self.tile, level),
             waiting=[index for index in wanted if index not in known],
