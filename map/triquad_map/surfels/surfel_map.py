@@ -146,6 +146,11 @@ class SurfelMap:
         """Improve ``nearest`` where a surfel lies nearer to ``points`` [N, 3] of the map frame."""
         improve_nearest(points, self._tree, self._shown, frame, nearest)
 
+    @property
+    def are_learnt(self) -> bool:
+        """Whether the field has learnt all of them: then :meth:`put_planes` changes nothing."""
+        return self._planes is None
+
     def put_planes(
         self, settings: FieldSettings, points: Floats, sdf: Floats, gradients: Floats
     ) -> None:
@@ -199,7 +204,7 @@ class ShownField:
     def evaluate_in_grid(self, axes: Floats, points: Longs) -> Floats:
         """Return distances [N] at points of a grid: :meth:`FrozenField.evaluate_in_grid`."""
         distances = self.trained.evaluate_in_grid(axes, points)
-        if self.surfels.surfels.are_unlearnt.any():
+        if not self.surfels.are_learnt:
             places, gradients = in_grid(axes, points), np.zeros((0, 3), np.float32)
             self.surfels.put_planes(self.trained.settings, places, distances, gradients)
         return distances
