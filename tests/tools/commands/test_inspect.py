@@ -1,10 +1,15 @@
+import dataclasses
 import json
+import re
 
+import numpy as np
 import pytest
 from support.files.checkpoint_folder import write_checkpoints
 from support.maps.exact_maps import SEEN_M, exact_map, flat
 from support.maps.map_records import random_record
 from triquad_format.mapfile.writer import write_map
+from triquad_format.records import morton
+from triquad_format.records.replay_rays import STEPS, ReplayRays, are_held_out
 from triquad_tools.commands.inspect import main
 
 
@@ -53,6 +58,57 @@ def test_json(map_file, capsys):
     assert report["regions"][1]["index"] == [-1, 0, 0]
     assert report["regions"][1]["centre_m"] == [-12.0, 0.0, 0.0]
     assert report["parts"]["/triquad/vertices"]["parts"] == 6
+
+
+def ground_with_rays():
+    """Flat ground at 0.1 m, above which rays end: by 2 cm, and by 8 cm in one place."""
+    record = exact_map(flat(0.1), label_error_m=0.0)
+    settings, (region,) = record.settings, record.regions
+    x, y = np.random.default_rng(0).uniform(-SEEN_M, SEEN_M, (2, 200_000))
+    z = 0.1 + np.where(np.minimum(x, y) > 6.4, 0.08, 0.02)
+    leaves = np.stack([x, y, z], axis=1) / settings.leaf_m + (1 << settings.depth)
+    ends = np.floor(leaves * STEPS).astype(np.int32)
+    ends = ends[np.argsort(morton.encode(ends // STEPS), kind="stable")]
+    rays = ReplayRays(
+        ends,
+        np.zeros(len(ends), np.int32),
+        np.full(len(ends), 255, np.uint8),
+        origins=np.array([[0, 0, 2]], np.float32),
+    )
+    training = dataclasses.replace(region.training, rays=rays)
+    region = dataclasses.replace(region, training=training)
+    return dataclasses.replace(record, regions=(region,))
+
+
+def test_how_well_a_map_fits_rays_that_it_was_not_trained_on(tmp_path, capsys):
+    record = ground_with_rays()
+    path = tmp_path / "ground.triquad"
+    write_map(record, path)
+    fit = summary_of(path, capsys)["fit"]
+    assert fit["rays"] == are_held_out(record.regions[0].training.rays.ends).sum()
+    assert fit["places"] == 16
+    assert fit["median_m"] == pytest.approx(0.02, abs=1e-3)
+    assert fit["upper_m"] == pytest.approx(0.02, abs=2e-3)
+    assert len(fit["worst"]) == 5
+    assert fit["worst"][0] == pytest.approx([9.6, 9.6, 3.2])
+    assert fit["worst_median_m"][0] == pytest.approx(0.08, abs=1e-3)
+    assert fit["worst_median_m"][1] < 0.03
+    assert main([str(path)]) == 0
+    out = capsys.readouterr().out
+    told = rf"held-out rays +within (19|20|21)\.\d mm, 90 % in (19|2\d)\.\d mm, of {fit['rays']:,} "
+    assert re.search(told, out)
+
+
+def test_a_map_without_rays_says_that_there_are_none_to_judge_it_by(map_file, tmp_path, capsys):
+    for record, why in (
+        (random_record(1, training=False), "no training state"),
+        (random_record(1), "no rays among it"),
+    ):
+        path = tmp_path / "map.triquad"
+        write_map(record, path)
+        assert summary_of(path, capsys)["fit"] is None
+        assert main([str(path)]) == 0
+        assert f"none to judge the map by, as there is {why}" in capsys.readouterr().out
 
 
 def test_volume_is_that_of_the_voxels_that_a_region_answers_for(tmp_path, capsys):

@@ -91,7 +91,7 @@ def map_file(
         path = Path(folder) / "map.triquad"
         connected = triquad_client.connect(target, map_name, config=config)
         with progress("downloading"), connected as client:
-            client.download_map(path)
+            client.download_map(path, training=True)
         yield path
 
 

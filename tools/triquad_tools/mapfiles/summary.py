@@ -1,17 +1,23 @@
 """The content of a map file, in figures."""
 
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
+from triquad_format.errors import NoCompiledCodeError
 from triquad_format.mapfile.manifest import Entry
 from triquad_format.mapfile.reader import MapFile
 from triquad_format.records import morton
-from triquad_format.records.arrays import Bytes, Doubles
+from triquad_format.records.arrays import Bytes, Doubles, Floats
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
 from triquad_format.records.region import MapProgress, MapRecord, Region
+from triquad_format.records.replay_rays import are_held_out
 from triquad_format.records.seen_space import owned_evidence
+from triquad_map.field_fit import MapFit, PlaceFits, in_cube, map_fit
+from triquad_map.record_view import open_view
 
+from triquad_tools.console.amounts import within
 from triquad_tools.console.report import Row, print_columns, print_rows
 
 
@@ -53,6 +59,7 @@ class MapSummary:
     free_m3: float
     progress: MapProgress
     training: bool
+    fit: MapFit | None  # to the rays that are held out; None: it holds none
     regions: tuple[RegionSummary, ...]
     parts: dict[str, TopicSummary]
 
@@ -73,6 +80,7 @@ def summarise(file: MapFile) -> MapSummary:
         free_m3=sum(region.free_m3 for region in regions),
         progress=record.progress,
         training=any(region.training is not None for region in record.regions),
+        fit=_fit(record),
         regions=regions,
         parts=_summarise_parts(file),
     )
@@ -112,6 +120,11 @@ def _facts(summary: MapSummary) -> Iterator[Row]:
     made = f"{done.scans_taken:,} scans, {done.samples_trained:,} training samples"
     yield Row("made of", made)
     yield Row("training state", "yes" if summary.training else "no")
+    fit, missing = summary.fit, "rays among it" if summary.training else "training state"
+    judged = f"none to judge the map by, as there is no {missing}"
+    if fit is not None:
+        judged = f"within {within(fit.median_m, fit.upper_m)}, of {fit.rays:,} rays"
+    yield Row("held-out rays", judged)
     settings = vars(summary.settings).items()
     yield Row("settings", ", ".join(f"{name} {value}" for name, value in settings))
 
@@ -154,6 +167,37 @@ def _summarise_parts(file: MapFile) -> dict[str, TopicSummary]:
         topic: TopicSummary(len(own), sum(e.size for e in own), sum(e.stored for e in own))
         for topic, own in by_topic.items()
     }
+
+
+def _fit(record: MapRecord) -> MapFit | None:
+    """Return how well a map fits rays that it was not trained on, as a server computes it.
+
+    ``None``: it has no held-out rays, which are training state, or numba is missing.
+    """
+    ends = {number: _held_out_ends(region, record) for number, region in enumerate(record.regions)}
+    ends = {number: points for number, points in ends.items() if len(points)}
+    if not ends:
+        return None
+    try:
+        view = open_view(record)
+    except NoCompiledCodeError:
+        return None
+    fits = []
+    with closing(view):
+        for number, points in ends.items():
+            region = view.region_views[number]
+            sdf = region.field.evaluate(points, gradient=False).sdf
+            fits.append((region.centre, PlaceFits.of(points, record.settings, sdf)))
+    return map_fit(fits)
+
+
+def _held_out_ends(region: Region, record: MapRecord) -> Floats:
+    """Return where a region's held-out rays end in its cube [N, 3], metres from its centre."""
+    if region.training is None:
+        return np.zeros((0, 3), np.float32)
+    rays = region.training.rays
+    ends = rays.ends_m(record.settings)[are_held_out(rays.ends)].astype(np.float32)
+    return ends[in_cube(ends, record.settings)]
 
 
 def _evidence_box(settings: FieldSettings, region: Region) -> Doubles | None:
