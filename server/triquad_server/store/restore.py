@@ -23,6 +23,10 @@ _log = logging.getLogger(__name__)
 
 _READ_BYTES = 2**20
 
+MAX_EPOCH = 2**52
+"""A map goes on from epochs below this: at a million a second, that is enough for 140 years. Those
+above were not counted by any server, and would end where no client takes numbers any more."""
+
 
 @dataclass(frozen=True)
 class ValidCheckpoint:
@@ -86,11 +90,22 @@ def valid_checkpoint(checkpoint: CheckpointFile) -> ValidCheckpoint:
     return _valid(checkpoint.path, file)
 
 
+def check_countable(path: Path, epoch: int) -> None:
+    """Raise :class:`StoreError` unless a map can go on from ``epoch``, the one of ``path``."""
+    if epoch >= MAX_EPOCH:
+        raise StoreError(
+            f"checkpoint {path} holds epoch {epoch}, and no map can go on from there: the number "
+            f"must be less than {MAX_EPOCH}. No server came so far: move the file away to go on "
+            "from an older one"
+        )
+
+
 def _read(checkpoint: CheckpointFile) -> MapFile | None:
     """Read a checkpoint; return ``None`` if it is damaged or not what its name says.
 
     Raises:
-        StoreError: it cannot be read now, though it may well be valid.
+        StoreError: it cannot be read now, though it may well be valid; or a map cannot go on from
+            its epoch.
     """
     path = checkpoint.path
     try:
@@ -109,6 +124,7 @@ def _read(checkpoint: CheckpointFile) -> MapFile | None:
             *(path, epoch, epoch, path.suffix),
         )
         return None
+    check_countable(path, epoch)
     return file
 
 

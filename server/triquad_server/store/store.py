@@ -36,6 +36,7 @@ from triquad_server.settings import StoreSettings
 from triquad_server.store.map_folder import StoreLock, delete_unneeded
 from triquad_server.store.restore import (
     ValidCheckpoint,
+    check_countable,
     newest_valid,
     valid_checkpoint,
 )
@@ -161,6 +162,7 @@ class Store:
             chosen = checkpoint_of(self.folder, epoch)
             if chosen.epoch == files[0].epoch:
                 return
+            check_countable(files[0].path, files[0].epoch + 1)
             again = self._manifest_again(valid_checkpoint(chosen), files[0].epoch + 1)
             if newest is not None:
                 marked = dataclasses.replace(newest, undoes=f"restoring epoch {epoch}")
