@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Longs
-from triquad_format.records.cells import rows_of, same_cells
+from triquad_format.records.cells import CellIndex, same_cells
 
 _CELL_VOXELS = 2
 """A cluster is made of cells of this side, which touch: its voxels lie up to as far apart."""
@@ -59,10 +59,10 @@ def connected(cells: Longs) -> NDArray[np.intp]:
     """
     first, number = same_cells(cells)
     known = cells[first]
-    around = np.concatenate([known + step for step in _HALF_THE_NEIGHBOURS])
-    beside = rows_of(known, around).reshape(len(_HALF_THE_NEIGHBOURS), -1)
-    step, one = np.nonzero(beside >= 0)
-    other = beside[step, one]
+    index = CellIndex(known)
+    touching = [index.rows_of(known + step) for step in _HALF_THE_NEIGHBOURS]
+    one = np.concatenate([np.flatnonzero(rows >= 0) for rows in touching])
+    other = np.concatenate([rows[rows >= 0] for rows in touching])
     label = np.arange(len(first))
     while True:
         # A cluster takes the least label of its neighbours; its members follow.

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Longs
-from triquad_format.records.cells import cells_of_boxes, rows_of, same_cells
+from triquad_format.records.cells import CellIndex, cells_of_boxes, same_cells
 from triquad_format.records.status import Status
 
 from triquad_map.composition.composed_view import ComposedView
@@ -130,9 +130,9 @@ def _next_front(
     before = np.repeat(np.arange(len(front.voxels)), len(_AROUND))
     voxels = front.voxels[before] + np.tile(_AROUND, (len(front.voxels), 1))
     first = same_cells(voxels)[0]
-    fresh = first[rows_of(known, voxels[first]) < 0]
+    fresh = first[CellIndex(known).rows_of(voxels[first]) < 0]
     patches = _distance_like(view, field, voxels[fresh])
-    after = rows_of(patches.voxels, voxels)
+    after = CellIndex(patches.voxels).rows_of(voxels)
     pairs = np.flatnonzero(after >= 0)
     pairs = pairs[_aligned(front.chosen(before[pairs]), patches.chosen(after[pairs]))]
     sources = front.sources[before[pairs]]
@@ -184,15 +184,16 @@ def _beside_filled(filled: FilledVoxels, places: Doubles, voxel_m: float, reach_
     found = np.zeros(len(places), np.bool_)
     if not len(filled.voxels):
         return found
+    index = CellIndex(filled.voxels)
     reach, limit = reach_m / voxel_m, filled.fill_m / voxel_m
     low, high = filled.voxels.min(axis=0) - 1, filled.voxels.max(axis=0) + 2
     inside = ((places >= low) & (places < high)).all(axis=1)
     for shift in np.ndindex(2, 2, 2):
         left = np.flatnonzero(inside & ~found)
-        beside = np.floor(places[left] + (2 * np.array(shift) - 1) * reach).astype(np.int64)
-        rows = rows_of(filled.voxels, beside)
-        near = _box_distances(places[left], filled.sources[rows]) <= limit
-        found[left] = (rows >= 0) & near
+        near = np.floor(places[left] + (2 * np.array(shift) - 1) * reach).astype(np.int64)
+        rows = index.rows_of(near)
+        is_within = _box_distances(places[left], filled.sources[rows]) <= limit
+        found[left] = (rows >= 0) & is_within
     return found
 
 
