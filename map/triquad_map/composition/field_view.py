@@ -77,6 +77,7 @@ class FieldView:
         self.region_views = tuple(regions)
         self._split = split
         self._regions_at = {region.index: region for region in regions}
+        self._cells = np.array([region.index for region in regions], np.float64).reshape(-1, 3).T
 
     def query(self, points: Doubles, gradient: bool = False) -> FieldAnswer:
         """Return signed distance, status and, on request, gradient at points [N, 3], map frame."""
@@ -216,8 +217,15 @@ class FieldView:
             places -= cells
         core_m = self._settings.region_side_m / 2 - self._settings.overlap_m
         off_m = np.abs(places, out=places).max(axis=0, initial=0.0) * self._settings.region_pitch_m
+        low = cells.min(axis=1, initial=np.inf)[:, None]
+        high = cells.max(axis=1, initial=-np.inf)[:, None]
+        outside = ((self._cells < low) | (self._cells > high)).any(axis=0)
         groups = []
-        for region in self.region_views:
+        for number in np.flatnonzero(~outside).tolist():
+            region = self.region_views[number]
+            if (low == high).all():
+                groups.append(Owned(region, slice(None)))
+                continue
             x, y, z = region.index
             mine = np.flatnonzero((cells[0] == x) & (cells[1] == y) & (cells[2] == z))
             if len(mine):

@@ -108,6 +108,20 @@ class _Fitted:
     surfels: Surfels
     epochs: Longs  # [S] ``_NEVER`` where there is nothing yet
 
+    def fit(
+        self,
+        rows: Rows,
+        voxels: Longs,
+        evidence: FrozenEvidence,
+        field: SampleField,
+        by_rays: ShownByRays,
+    ) -> None:
+        """Fit the surfels in ``rows`` [R], of ``voxels`` [R, 3], to a field."""
+        for first in range(0, len(rows), _FITTED_AT_ONCE):
+            part = slice(first, first + _FITTED_AT_ONCE)
+            found = fit_surfels(voxels[part], field, evidence.ended_in, by_rays)
+            self.surfels.take(rows[part], found)
+
 
 class SurfelMap:
     """Immutable: epochs share it."""
@@ -180,10 +194,7 @@ class SurfelMap:
         fitted = _carried(self._fitted, places, voxels)
         rows = _outdated(fitted, most)
         _follow_rays(fitted.surfels, voxels, rows, by_rays, since)
-        for first in range(0, len(rows), _FITTED_AT_ONCE):
-            part = rows[first : first + _FITTED_AT_ONCE]
-            found = fit_surfels(voxels[part], field, evidence.ended_in, by_rays)
-            fitted.surfels.take(part, found)
+        fitted.fit(rows, voxels[rows], evidence, field, by_rays)
         fitted.epochs[rows] = epoch
         return SurfelMap(evidence, fitted, voxels)
 
@@ -214,9 +225,11 @@ def first_surfels(
     evidence: FrozenEvidence, field: SampleField, epoch: int, by_rays: ShownByRays = nothing_shown
 ) -> SurfelMap:
     """Return the surfels of all seen voxels, for an epoch."""
-    places = surfel_places(evidence.cells, evidence.surface)
-    nothing = SurfelMap(evidence, _nothing_in(places), places.voxels())
-    return nothing.updated(evidence, field, epoch, None, by_rays)
+    fitted = _nothing_in(surfel_places(evidence.cells, evidence.surface))
+    voxels = fitted.places.voxels()
+    fitted.fit(np.arange(len(voxels)), voxels, evidence, field, by_rays)
+    fitted.epochs[:] = epoch
+    return SurfelMap(evidence, fitted, voxels)
 
 
 def _nothing_in(places: SurfelPlaces) -> _Fitted:

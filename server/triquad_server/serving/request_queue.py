@@ -155,7 +155,7 @@ class RequestQueue(Generic[RequestT]):
                 and on_their_way + nbytes > _REPLY_BYTES
             ):
                 return False
-            del self._working[request]
+            self._working.pop(request, None)
             self._sending[request] = nbytes
             self._fill()
             return True
