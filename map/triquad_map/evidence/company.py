@@ -1,10 +1,10 @@
 """Which returns of a scan have company: others of the scan tell that there is a surface.
 
 A return has company if two others on neighbouring rays end at its range, or if it ends no nearer
-than most of them do: a drop of rain or a grain of dust hangs before what its neighbours meet. Rays
-are neighbours by their spacing, so that a far wall, whose returns lie metres apart, is as much a
-wall as a near one (as in Charron et al., De-noising of lidar point clouds corrupted by snowfall,
-CRV 2018). The spacing is the scan's own: no sensor has to be known.
+than two in five of them do: a drop of rain or a grain of dust hangs before what its neighbours
+meet. Rays are neighbours by their spacing, so that a far wall, whose returns lie metres apart, is
+as much a wall as a near one (as in Charron et al., De-noising of lidar point clouds corrupted by
+snowfall, CRV 2018). The spacing is the scan's own: no sensor has to be known.
 """
 
 from typing import NamedTuple
@@ -113,7 +113,7 @@ def _have_company(rays: _Rays, chosen: Longs) -> Bools:
 
 @inner_kernel()
 def _has_company(i: int, rays: _Rays) -> bool:
-    """Return whether two neighbours end at a ray's range, or a good part of them no farther."""
+    """Return whether two neighbours end at a ray's range, or two in five of them no farther."""
     x, y, z = _cell(i, rays)
     compared, count, same, no_farther = 0, 0, 0, 0
     for k in range(27):

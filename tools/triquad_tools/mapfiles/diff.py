@@ -24,7 +24,7 @@ STILL_M = 1e-3
 NOISE_M = 0.02
 """Two maps that learnt the same differ by less, but for single points."""
 
-_BESIDE_LEAVES = 2  # along each axis, as far as points of one object may be apart
+_TOUCHING_LEAVES = 2  # along each axis, as far as points of one object may be apart
 _STEPS = 8
 _LEAST_SLOPE = 0.1  # a flatter field says nothing of where its zero is
 
@@ -67,7 +67,7 @@ class Comparison:
         }
 
     def _moved(self, gone: Doubles) -> Sighting:
-        """Return points of A that B has elsewhere, but not those beside what is ``gone`` [N, 3].
+        """Return points of A that B has elsewhere, but not those next to what is ``gone`` [N, 3].
 
         The surface next to a thing that came or went is near the surface of that, too.
         """
@@ -75,8 +75,8 @@ class Comparison:
 
         near = self.old.having(Status.SURFACE)
         moved = near.part(np.flatnonzero(np.abs(near.sdf) > NOISE_M))
-        beside_m = _BESIDE_LEAVES * moved.leaf_m
-        away_m = cKDTree(gone).query(moved.points, p=np.inf, distance_upper_bound=beside_m)[0]
+        touching_m = _TOUCHING_LEAVES * moved.leaf_m
+        away_m = cKDTree(gone).query(moved.points, p=np.inf, distance_upper_bound=touching_m)[0]
         return moved.part(np.flatnonzero(np.isinf(away_m)))
 
 

@@ -13,7 +13,7 @@ _POLL_S = 0.5  # the server says how it is doing when it is asked, not when it c
 
 FLUSH_TIMEOUT_S = 120.0
 
-_PENDING = 4  # so many to twice as many scans are, far fewer than a server queues
+_PENDING = 4  # scans, to twice as many, are on their way: far fewer than a server queues
 
 
 def publish_all(
