@@ -124,7 +124,7 @@ class Service:
             checkpoints=checkpoints,
             map_max_bytes=self._settings.memory.max_bytes,
         )
-        tiles = TileCache(self._settings.mesh, self._served.teams.meshing)
+        tiles = TileCache(self._settings.mesh, self._served.teams.background)
         downloads = MapDownloads(self._mapper, self._epochs, health.server)
         self._open_checkpoints(checkpoints)
         self._serve(tiles, downloads)

@@ -116,7 +116,7 @@ class _SyntheticMap:
 
     def meshes(self) -> None:
         """Make a tile of its mesh."""
-        cache = TileCache(self._settings.mesh, self._teams.meshing)
+        cache = TileCache(self._settings.mesh, self._teams.background)
         cache.refresh(self._restored.publish())
         end_m = self._directions[0] * self._radius_m
         x, y, z = np.floor(end_m / cache.lattice(0).tile_side_m).astype(int).tolist()

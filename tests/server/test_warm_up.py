@@ -80,7 +80,7 @@ for steps in (0, 3):
     epoch = mapper.publish()
     epoch.query(points, gradient=True)
     distances(epoch, points, DistanceOptions(unknown_distance=True))
-    cache = TileCache(Settings().mesh, teams.meshing)
+    cache = TileCache(Settings().mesh, teams.background)
     cache.refresh(epoch)
     cache.make(0, (0, 0, 0))
 print(*sorted(ready() - before))

@@ -12,17 +12,26 @@ from functools import partial
 from typing import Protocol, TypeVar
 
 
+_thread = threading.local()
+
+
 def lower_priority(niceness: int) -> None:
     """Have the calling thread leave the cores to threads of less ``niceness``, 0 being the least.
 
     The niceness is added to that of the process, whichever thread started this one. Where the
     system does not know priorities of single threads, nothing happens.
     """
+    _thread.niceness = niceness
     if niceness and sys.platform == "linux":
         # Not what the thread has: it may have been started by one that was lowered itself.
         nice = os.getpriority(os.PRIO_PROCESS, os.getpid()) + niceness
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), nice)
+
+
+def is_urgent() -> bool:
+    """Return whether the calling thread has the priority of the process, not a lower one."""
+    return getattr(_thread, "niceness", 0) == 0
 
 
 THREADS = max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1)

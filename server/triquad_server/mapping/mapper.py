@@ -194,7 +194,7 @@ class Mapper:
             number=self._number,
             settings=self._setup.field,
             regions=tuple(region.publish(self._number) for region in self.regions),
-            split=self._teams.answers.split,
+            split=self._teams.answer,
             progress=self.progress,
         )
         self._structure_changed = False

@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import ParamSpec
 
-from triquad_map.compiled.team import Team
+from triquad_map.compiled.team import MIN_SHARE, Team, Work, is_urgent
 
 _log = logging.getLogger(__name__)
 
@@ -20,15 +20,21 @@ NICENESS = 5
 class Teams:
     """The teams for the work of one map; their threads are started when they are first needed."""
 
-    answers: Team = field(default_factory=lambda: Team("triquad-answers"))  # for queries
+    # For questions that somebody waits for, such as a planner.
+    answers: Team = field(default_factory=lambda: Team("triquad-answers"))
     # Taking in scans and training; the mapper's own thread has the same niceness.
     mapping: Team = field(default_factory=lambda: Team("triquad-mapping", NICENESS))
-    # For tiles that nobody waits for at the moment.
-    meshing: Team = field(default_factory=lambda: Team("triquad-meshing", NICENESS))
+    # For long questions, and for tiles that nobody waits for at the moment.
+    background: Team = field(default_factory=lambda: Team("triquad-background", NICENESS))
+
+    def answer(self, count: int, work: Work, least: int = MIN_SHARE) -> None:
+        """Split the work of a question among threads of the caller's priority: a ``Split``."""
+        team = self.answers if is_urgent() else self.background
+        team.split(count, work, least)
 
     def close(self) -> None:
         """End the threads; work that still comes is left to the callers."""
-        for team in (self.answers, self.mapping, self.meshing):
+        for team in (self.answers, self.mapping, self.background):
             team.close()
 
 

@@ -25,7 +25,7 @@ from triquad_server.mesh.tile_cache import ShownTile, ShownTiles, TileCache, Til
 from triquad_server.process.threads import Teams
 from triquad_server.settings import MeshSettings, Settings
 
-TEAM = Teams().meshing
+TEAM = Teams().background
 
 
 def versions(cache: TileCache, level: int = 0) -> dict[TileIndex, int]:

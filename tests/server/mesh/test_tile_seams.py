@@ -21,7 +21,7 @@ from triquad_server.process.threads import Teams
 from triquad_server.settings import MeshSettings
 from triquad_tools.simulation.lidar import SimulatedScan
 
-TEAM = Teams().meshing
+TEAM = Teams().background
 
 
 def triangles(tiles: Iterable[tuple[TileIndex, TileSurface]], cells: int) -> NDArray[np.int64]:
