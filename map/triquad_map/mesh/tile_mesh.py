@@ -119,7 +119,8 @@ def _near_cells(
         around = cells_around(filled, view.voxel_m, lattice.cell_m, lattice.reach_m) - first
         inside = ((around >= 0) & (around < lattice.cells)).all(axis=1)
         near[tuple(around[inside].T)] = True
-    return np.ascontiguousarray(np.argwhere(near))  # as kernels are compiled for
+    places = np.flatnonzero(near)  # in three dimensions at once, numpy takes ten times as long
+    return np.stack(np.unravel_index(places, near.shape), axis=1)
 
 
 @kernel()
