@@ -23,7 +23,7 @@ _PER_RANGE = 0.1
 of the rotation moves far points most."""
 
 _REACH_SCALES = 3.0
-"""A distance of more scales than this has hardly any weight."""
+"""A distance of more scales than this has hardly any weight: in the end, it is no inlier's."""
 
 _SURE_VOXELS = 5.0
 """The scale from which points count by the map's confidence: not at all in unknown space. Before,
@@ -32,17 +32,13 @@ those count, too: of a scan that is off by a metre they lie behind walls, and le
 _FINAL_VOXELS = 0.5
 """Scale of the distances that count in the end; the noise of a lidar and of the map is less."""
 
-_SHRINK_LEAST, _SHRINK_MOST = 0.8, 0.4
-_SCALE_STEPS = 3.0
-"""The scale follows the steps: what is left is seldom more than this many of the last."""
-
-_OVERSHOOT = 1.5
-"""Nearest points keep a scan back a little; going farther than they ask comes out sooner."""
+_SHRINK = 0.7
+"""The scale becomes smaller by this factor with each step. With 0.5, scans that are off by 2 m and
+10 degrees are sometimes drawn to the wrong wall."""
 
 _COARSE_STEP_M, _FINE_STEP_M = 0.01, 0.002
 """A step that moves the points by less is the last with few points, and the last."""
 
-_INLIER_SCALES = 3.0
 _LEAST_INLIER_SHARE = 0.5
 _LEAST_INLIERS = 50
 
@@ -82,10 +78,10 @@ def align(view: MapView, points: Doubles, guess: Doubles, max_distance_m: float)
     """Move a scan from where it is guessed to be to where it fits the map best.
 
     The squared distances of its points to the nearest seen surface are made small by Gauss-Newton
-    steps on distance and gradient. Points count by a Geman-McClure kernel whose scale shrinks
-    from ``max_distance_m`` to half a voxel as the steps become small. Points in unknown space
-    pull at first (a scan that is off by a metre lies behind walls); in the end points count by the
-    map's confidence, and those in unknown space not at all.
+    steps on distance and gradient. Points count by a Geman-McClure kernel whose scale shrinks with
+    each step from ``max_distance_m`` to half a voxel (graduated non-convexity). Points in unknown
+    space pull at first (a scan that is off by a metre lies behind walls); in the end points count
+    by the map's confidence, and those in unknown space not at all.
 
     Args:
         view: the map.
@@ -150,21 +146,15 @@ def _descend(view: MapView, fine: Doubles, pose: Doubles, max_distance_m: float)
     points = thinned(fine, _COARSE_POINTS)
     final = _FINAL_VOXELS * view.voxel_m
     scale = max(max_distance_m, final)
-    overshoot, last = _OVERSHOOT, np.zeros(6)
     for iteration in range(1, MAX_ITERATIONS + 1):
         normal = _normal(view, points, pose, scale, max_distance_m)
         if normal.weight == 0.0:
             return _Found(pose, iteration, False)
         step = normal.step()
-        # Where steps go back and forth, shorter ones settle between.
-        overshoot = min(_OVERSHOOT, 1.25 * overshoot) if step @ last >= 0 else 0.5 * overshoot
-        last = step
-        taken = (overshoot if scale == final else 1.0) * step
-        size = float(np.linalg.norm(taken))
-        pose = moved(pose, taken[:3], taken[3:] / normal.arm_m)
+        size = float(np.linalg.norm(step))
+        pose = moved(pose, step[:3], step[3:] / normal.arm_m)
         if scale > final:
-            shrunk = np.clip(_SCALE_STEPS * size, _SHRINK_MOST * scale, _SHRINK_LEAST * scale)
-            scale = max(final, float(shrunk))
+            scale = max(final, _SHRINK * scale)
         elif points is fine and size < _FINE_STEP_M:
             return _Found(pose, iteration, True)
         elif size < _COARSE_STEP_M:
@@ -207,7 +197,7 @@ def _judged(view: MapView, points: Doubles, found: _Found, max_distance_m: float
     world = points @ found.pose[:3, :3].T + found.pose[:3, 3]
     answer = distances(view, world, DistanceOptions(max_distance_m))
     known = answer.status != Status.UNKNOWN
-    inliers = answer.found & known & (np.abs(answer.distance_m) <= _INLIER_SCALES * final)
+    inliers = answer.found & known & (np.abs(answer.distance_m) <= _REACH_SCALES * final)
     count = int(inliers.sum())
     share = count / max(int((answer.found | known).sum()), 1)
     squares = answer.distance_m[inliers].astype(np.float64) ** 2
