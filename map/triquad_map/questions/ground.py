@@ -15,14 +15,10 @@ _TOLERANCE_VOXELS = 0.5
 """The most that ground may lie above its point, and that need not be seen above the ground: a
 surface may cut the corner of a voxel in which no ray happened to end."""
 
-_BESIDE = 0.5
-"""The normal's z up to which a surface is a wall."""
-
-_FACES_DOWN = -0.5
-"""The normal's z up to which a wall's top edge was met: it leans as the field says."""
-
-_LEAST_UP = 0.5
-"""The least of the normal's z: what is steeper is not stepped down to as if it were a plane."""
+_STEEP = 0.5
+"""The normal's z of a surface at 60 degrees. What is steeper is a wall, which is not stepped down
+to as if it were a plane; down to as much overhang, the top edge of a wall bears: it leans as the
+field says."""
 
 _LONGEST_REST_M = 0.02
 """The longest way from where a ray met the surface to the surface."""
@@ -86,9 +82,9 @@ def _stand(view: MapView, answer: Ground, rows: Longs, places: Doubles) -> None:
     here = distances(view, places, DistanceOptions(view.voxel_m))
     up = here.gradient[:, 2]
     # Else it is met from behind, or unknown: no ray ended near.
-    bears = (up > _FACES_DOWN) & (here.confidence > 0) & _ended_near(view, places)
+    bears = (up > -_STEEP) & (here.confidence > 0) & _ended_near(view, places)
     # The rest of the way to the surface, as if that were a plane.
-    rest_m = here.distance_m / np.maximum(up, _LEAST_UP)
+    rest_m = here.distance_m / np.maximum(up, _STEEP)
     heights = places[:, 2] - np.clip(rest_m, -_LONGEST_REST_M, _LONGEST_REST_M)
     answer.status[rows[bears]] = Status.SURFACE
     answer.height_m[rows[bears]] = heights[bears]
@@ -141,7 +137,7 @@ def _is_new(view: MapView, places: Doubles, status: Bytes, left_m: Doubles) -> B
     new: Bools = (status == Status.SURFACE) & (left_m > view.voxel_m)
     rows = np.flatnonzero(new)
     nearest = view.nearest_surface(places[rows], view.voxel_m)
-    is_wall = nearest.normal.any(axis=1) & (np.abs(nearest.normal[:, 2]) < _BESIDE)
+    is_wall = nearest.normal.any(axis=1) & (np.abs(nearest.normal[:, 2]) < _STEEP)
     new[rows] = nearest.found & ~nearest.learnt & ~is_wall
     return new
 
