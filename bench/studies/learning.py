@@ -20,7 +20,6 @@ from triquad_client.offline.offline_map import REACH_LEAVES
 from triquad_format.records.arrays import Doubles
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mapping.training.focus import Focus
 from triquad_server.mapping.training.slopes import Slopes
 from triquad_server.settings.loading import load_settings
 from triquad_tools.console.report import Row, print_rows
@@ -80,7 +79,6 @@ def _never(*_args: object) -> None:
 RULES: dict[str, tuple[type, str] | None] = {
     "all rules": None,
     "without slopes": (Slopes, "after"),
-    "without focus": (Focus, "narrow"),
 }
 
 

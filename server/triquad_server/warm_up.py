@@ -12,7 +12,6 @@ from functools import cached_property, partial
 
 import numpy as np
 from triquad_format.records.arrays import Doubles
-from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_map.compiled.kernel import CODE_FOLDER, count_compiled, is_first_use
 from triquad_map.questions.distance import DistanceOptions, distances
 
@@ -123,13 +122,10 @@ class _SyntheticMap:
         cache.make(0, (x, y, z))
 
     def restored_training(self) -> None:
-        """Train the map further in part, as one that is restored and then seen again."""
+        """Train the map further, as one that is restored and then seen again."""
         (region, *_) = self._restored.regions
         pool = region.training.rays.pool
-        blocks = region.evidence.live.surface_blocks()
-        region.field.fix(region.field.tree.rows_under(blocks, BLOCK_VOXELS))
         region.field.live_view().evaluate(self._directions.astype(np.float32), gradient=True)
-        pool.focus(blocks)
         self._restored.train()
         pool.limit(len(pool) - 1)
         new = np.arange(len(pool)) < len(pool) // 4

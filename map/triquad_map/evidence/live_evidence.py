@@ -50,10 +50,6 @@ class LiveEvidence:
         observed = self._observations
         return EvidenceSize(self._blocks.count, observed.blocks, observed.voxels)
 
-    def surface_blocks(self) -> Longs:
-        """Return the blocks [B, 3] in which surface is believed."""
-        return self._blocks.cells()[self._seen.surface[: self._blocks.count].any(axis=1)]
-
     def new_ends(self, ends: Doubles) -> NewEnds:
         """Return what rays that end at ``ends`` [N, 3] would add; nothing is recorded."""
         return new_ends(ends, self._seen)

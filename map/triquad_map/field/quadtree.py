@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from triquad_format.records import morton
-from triquad_format.records.arrays import Bools, Bytes, Ints, Longs
+from triquad_format.records.arrays import Bytes, Ints, Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES
 
@@ -21,7 +21,6 @@ from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.voxel_index import (
     Index,
     VoxelIndex,
-    find_row,
     make_row,
     morton_code,
     with_room,
@@ -103,21 +102,6 @@ def grow_vertices(
                         blocks = _enter(shape, vertices, plane, h, corner_u, corner_v, rows, blocks)
                         rows += 1
     return len(leaves), blocks, rows
-
-
-@kernel()
-def mark_rows(shape: Shape, vertices: Vertices, cubes: Longs, side: int, marked: Bools) -> None:
-    """Mark the rows of the vertices on the shadows of ``cubes`` [N, 3] of ``side`` leaves."""
-    down = shape.levels - 1
-    for i in range(len(cubes)):
-        for plane in range(3):
-            u, v = cubes[i, _AXES[plane, 0]] * side, cubes[i, _AXES[plane, 1]] * side
-            for block_u in range(u >> down, (u + side - 1 >> down) + 1):
-                for block_v in range(v >> down, (v + side - 1 >> down) + 1):
-                    block = find_row(vertices.blocks, block_key(plane, block_u, block_v))
-                    if block >= 0:
-                        for row in vertices.rows[block]:
-                            marked[row] = row != 0
 
 
 @kernel()
@@ -207,15 +191,6 @@ class LiveQuadtree:
             len(leaves), lambda *state: grow_vertices(self.shape, self.vertices, leaves, *state)
         )
         return self._rows - before
-
-    def rows_under(self, cubes: Longs, side: int) -> Bools:
-        """Return which rows [rows] are of vertices in or next to the shadows of cubes of leaves.
-
-        ``cubes`` [N, 3] are counted in cubes of ``side`` leaves.
-        """
-        marked = np.zeros(self._rows, np.bool_)
-        mark_rows(self.shape, self.vertices, cubes, side, marked)
-        return marked
 
     def restore(self, plane: int, h: int, codes: Longs) -> None:
         """Give the next rows to the vertices ``codes`` [V] of one level, in their order."""

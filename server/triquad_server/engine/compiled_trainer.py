@@ -16,7 +16,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from triquad_format.records.arrays import Bools, Doubles, Floats, Ints
+from triquad_format.records.arrays import Doubles, Floats, Ints
 from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.lanes import prefetch_row
 from triquad_map.compiled.team import THREADS, Team, share
@@ -121,13 +121,11 @@ def _step_touched(
     touched: tuple[Touched, ...],
     sums: tuple[Floats, ...],
     parameter: ParameterRows,
-    fixed: Bools,
     rates: CompiledRates,
 ) -> None:
     """Apply Adam to the ``count`` rows that the thread ``part`` touched, and clear their sums.
 
-    A row that several threads touched is updated by the first of them. Rows that are ``fixed`` [N]
-    take no step.
+    A row that several threads touched is updated by the first of them.
     """
     rows = touched[part].rows
     for i in range(count):
@@ -147,9 +145,7 @@ def _step_touched(
             for k in range(sums[part].shape[1]):
                 sums[part][row, k] += sums[other][row, k]
                 sums[other][row, k] = 0
-        if mine and row < len(fixed) and fixed[row]:
-            sums[part][row] = 0
-        elif mine:
+        if mine:
             _step_row(row, sums[part], parameter, rates)
 
 
@@ -271,10 +267,7 @@ class CompiledTrainer:
     def _step(self, counts: list[int], mlp_sums: list[Mlp], rates: Rates) -> None:
         """Apply Adam to the MLP and to the touched rows, ``counts`` of them by each thread."""
         compiled = CompiledRates.of(rates)
-        fixed = self._field.fixed
-        if fixed is None:
-            self._step_mlp(mlp_sums, compiled)
-            fixed = np.zeros(0, np.bool_)
+        self._step_mlp(mlp_sums, compiled)
         sums, features = self._sums, _parameter_rows(self._field.features)
 
         def work(part: int) -> None:
@@ -285,7 +278,6 @@ class CompiledTrainer:
                 sums.touched,
                 sums.features,
                 parameter=features,
-                fixed=fixed,
                 rates=compiled,
             )
 

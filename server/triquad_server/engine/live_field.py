@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from triquad_format.records.arrays import Bools, Floats, Ints, Longs
+from triquad_format.records.arrays import Floats, Ints, Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_map.field.field import FieldArrays
 from triquad_map.field.frozen_field import FrozenField
@@ -147,23 +147,14 @@ class LiveField:
         for part in self.mlp:
             part.steps[:] = mlp_steps
         self.mlp_steps = mlp_steps  # to read its own from a GPU would have to wait for it
-        self.fixed: Rows | None = None
-        """The mask of the first rows [N] that stay fixed, as does the MLP; None: no rows."""
-
         self.version = 0  # rises with each step of training
         self._frequencies = memory.put(frequencies)
-        self._vertices_fixed = 0
         self._generator = generator
 
     @property
     def vertices(self) -> int:
         """The number of vertices on all planes and levels."""
         return len(self.features) - 1
-
-    @property
-    def vertices_that_learn(self) -> int:
-        """The number of vertices that are not fixed."""
-        return self.vertices - self._vertices_fixed
 
     @property
     def parameters(self) -> int:
@@ -215,14 +206,6 @@ class LiveField:
     def live_view(self) -> FrozenField:
         """Return the field for its thread alone; from arrays, it is valid until it changes."""
         return FrozenField(self.settings, self.tree.freeze(), self.arrays)
-
-    def fix(self, rows: Bools | None) -> None:
-        """From now on, keep the feature ``rows`` [N] and the MLP unchanged; None: train all.
-
-        Rows that are added later are trained.
-        """
-        self.fixed = None if rows is None else self.memory.put(rows)
-        self._vertices_fixed = 0 if rows is None else int(rows[1:].sum())
 
     def freeze(self) -> FrozenField:
         """Return the field as it is now; in arrays, both share numbers until this one changes.

@@ -51,8 +51,7 @@ class TensorTrainer:
             target = torch.sigmoid(labels / field.settings.logit_scale_m)
             loss = F.binary_cross_entropy_with_logits(logits, target)
             torch.autograd.backward(loss)
-        if self._field.fixed is None:
-            self._step_mlp(mlp, rates)
+        self._step_mlp(mlp, rates)
         if corners is not None and encoded is not None and encoded.grad is not None:
             self._step_features(corners, encoded.grad, rates)
         return loss.detach()
@@ -87,8 +86,6 @@ class TensorTrainer:
         touched = torch.zeros(len(total), dtype=torch.bool, device=total.device)
         touched[rows] = True
         touched[0] = False  # absent vertices stay zero
-        if (fixed := self._field.fixed) is not None:
-            touched[: len(fixed)] &= ~torch.as_tensor(fixed)
         if total.device.type == "cpu":
             chosen = touched.nonzero()[:, 0]
             step_rows(features, chosen, total[chosen], rates=rates)

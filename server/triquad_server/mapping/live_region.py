@@ -49,7 +49,7 @@ class LiveRegion:
         centre, (field_seed, seed) = setup.field.region_centre(index), setup.seeds(index)
         field = initial_field(setup.field, setup.memory, field_seed)
         evidence = RegionEvidence(LiveEvidence(1 << setup.field.depth), setup, centre, seed)
-        training = RegionTraining(field, evidence.live, setup, centre, seed)
+        training = RegionTraining(field, setup, centre, seed)
         return cls(index, setup, field, evidence, training)
 
     @classmethod
@@ -60,11 +60,9 @@ class LiveRegion:
         field = field_from_record(record, setup.field, setup.memory, seed=field_seed)
         evidence = RegionEvidence.restored(record.evidence, setup, centre, seed)
         if record.training is None:
-            training = RegionTraining(field, evidence.live, setup, centre, seed)
+            training = RegionTraining(field, setup, centre, seed)
         else:
-            training = RegionTraining.restored(
-                record.training, field, evidence.live, setup, centre, seed
-            )
+            training = RegionTraining.restored(record.training, field, setup, centre, seed)
         return cls(index, setup, field, evidence, training)
 
     @property

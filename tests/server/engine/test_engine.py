@@ -28,7 +28,6 @@ from triquad_server.process.threads import Teams
 ARRAYS = ArrayMemory()
 RATES = Rates(learning_rate=0.01)
 TEAM = Teams().mapping
-PARTS = ("values", "means", "variances", "steps")
 CASES = [
     FieldSettings(depth=8, frequencies=4),
     FieldSettings(depth=12),
@@ -93,34 +92,6 @@ def test_a_training_step_is_equal(settings: FieldSettings) -> None:
     for part, other in zip(fast.mlp, slow.mlp, strict=True):
         np.testing.assert_allclose(part.means, other.means, atol=1e-4, rtol=1e-3)
         np.testing.assert_allclose(part.values, other.values, atol=1e-3)
-
-
-@pytest.mark.parametrize("compiled", [False, True], ids=["tensors", "compiled"])
-def test_fixed_rows_stay_as_they_are_and_all_others_learn(compiled: bool) -> None:
-    settings = CASES[0]
-    batch = samples(settings, 4000, seed=2)
-    fields = [trained(settings) for _ in range(3)]
-    before, fixed_in, free = fields
-    rows = np.random.default_rng(0).random(len(fixed_in.features) - 50) < 0.5
-    fixed_in.fix(rows)
-    for field in (fixed_in, free):
-        trainer = CompiledTrainer(field, GradientSums(), TEAM) if compiled else TensorTrainer(field)
-        trainer.train(batch, RATES)
-    stay = np.zeros(len(before.features), np.bool_)
-    stay[: len(rows)] = rows
-    for part in PARTS:
-        held, old, new = (getattr(f.features, part) for f in (fixed_in, before, free))
-        np.testing.assert_array_equal(held[stay], old[stay])
-        np.testing.assert_allclose(held[~stay], new[~stay], rtol=1e-5, atol=1e-7)
-    pairs = zip(before.mlp, free.mlp, strict=True)
-    moved = [not np.array_equal(x.values, y.values) for x, y in pairs]
-    kept = [
-        np.array_equal(getattr(x, of), getattr(y, of))
-        for x, y in zip(before.mlp, fixed_in.mlp, strict=True)
-        for of in PARTS
-    ]
-    assert all(moved)
-    assert all(kept)
 
 
 @pytest.mark.parametrize("levels", [1, 3, 4])

@@ -8,7 +8,7 @@ import numpy as np
 from triquad_format.records.arrays import Bools, Floats, Ints, Longs
 from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.lanes import prefetch_row
-from triquad_map.compiled.voxel_index import Index, block_key, find_row, pack
+from triquad_map.compiled.voxel_index import Index, find_row, pack
 
 from triquad_server.mapping.replay.ray_table import COLUMNS, END, RayTable
 
@@ -91,20 +91,6 @@ def _voxel(row: Floats, leaf_m: float, middle: float) -> tuple[int, int, int]:
         int(np.floor(row[END + 1] / leaf_m + middle)),
         int(np.floor(row[END + 2] / leaf_m + middle)),
     )
-
-
-@kernel()
-def rays_ending_in(blocks: Index, leaf_m: float, middle: float, rows: Floats) -> Longs:
-    """Return which rays [N] end in blocks of voxels."""
-    chosen = np.empty(len(rows), np.int64)
-    count = 0
-    for i in range(len(rows)):
-        x, y, z = _voxel(rows[i], leaf_m, middle)
-        if find_row(blocks, block_key(x, y, z)) >= 0:
-            chosen[count] = i
-            count += 1
-    ending: Longs = chosen[:count].copy()
-    return ending
 
 
 @kernel()

@@ -4,11 +4,9 @@ import numpy as np
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_map.compiled.team import Team
-from triquad_map.compiled.voxel_index import Index, VoxelIndex
 
 from triquad_server.engine.live_field import Batch
 from triquad_server.mapping.replay.kept_rays import KeptRays
-from triquad_server.mapping.replay.ray_bins import rays_ending_in
 from triquad_server.mapping.replay.ray_table import (
     END,
     VALUE,
@@ -33,8 +31,6 @@ class ReplayPool:
         self._rng = np.random.default_rng(seed)
         self.kept = KeptRays(settings, self._rng)
         self._fresh = _NONE  # places of the newest
-        self._blocks: Index | None = None  # in which the rays end that are drawn on at random
-        self._focused: Longs | None = None  # their places; None: to be found
 
     def __len__(self) -> int:
         return len(self.kept)
@@ -47,24 +43,8 @@ class ReplayPool:
     def add(self, new: RayTable, fresh: bool = True) -> None:
         """Take in rays; if ``fresh``, they become the newest."""
         places = self.kept.add(new)
-        if self._focused is not None:
-            is_other = np.zeros(len(self), np.bool_)
-            is_other[places] = True
-            kept = self._focused[~is_other[self._focused]]
-            self._focused = np.concatenate([kept, self._ending_in_blocks(places)])
         if fresh:
             self._fresh = places
-
-    def focus(self, blocks: Longs | None) -> None:
-        """From now on, draw on rays that end in ``blocks`` [B, 3] of voxels alone; None: on all."""
-        self._blocks = None if blocks is None else VoxelIndex.of_cells(blocks).arrays
-        self._focused = None
-
-    @property
-    def rays_drawn_on(self) -> int:
-        """Return how many rays are drawn on at random."""
-        in_focus = self._in_focus()
-        return len(self) if in_focus is None else len(in_focus)
 
     def draw(self, count: int, fresh: int) -> Batch:
         """Draw ``count`` samples on rays at random, ``fresh`` of them on the newest."""
@@ -97,45 +77,21 @@ class ReplayPool:
         is_too_much = len(self) > capacity
         self.kept.limit(capacity)
         if is_too_much:
-            self._select_none()
+            self._fresh = _NONE
 
     def forget(self, low: Doubles, high: Doubles) -> None:
         """Drop the rays that end between two corners [3], metres from the region's centre."""
         self.kept.forget(low, high)
-        self._select_none()
+        self._fresh = _NONE
 
     def forget_ends(self, voxels: Longs) -> None:
         """Drop the rays that end in ``voxels`` [N, 3]."""
         self.kept.forget_ends(voxels)
         self._fresh = self._fresh[self._fresh < len(self)]
-        self._focused = None
 
     def _at_random(self, count: int, fresh: int) -> Longs:
         """Draw places [count] at random, ``fresh`` of them of the newest."""
-        in_focus = self._in_focus()
-        places: Longs = self._rng.integers(self.rays_drawn_on, size=count)
-        if in_focus is not None:
-            places = in_focus[places]
+        places: Longs = self._rng.integers(len(self), size=count)
         if fresh and len(self._fresh):
             places[:fresh] = self._fresh[self._rng.integers(len(self._fresh), size=fresh)]
         return places
-
-    def _in_focus(self) -> Longs | None:
-        """Return the places of the rays that are drawn on at random; None: all of them."""
-        if self._blocks is None:
-            return None
-        if self._focused is None:
-            self._focused = self._ending_in_blocks(np.arange(len(self)))
-        return self._focused if len(self._focused) else None
-
-    def _ending_in_blocks(self, places: Longs) -> Longs:
-        """Return which rays at ``places`` [N] end in the blocks in focus."""
-        assert self._blocks is not None
-        middle = float(1 << (self._settings.depth - 1))  # of the region, voxels
-        rows = self.table.rows[places]
-        return places[rays_ending_in(self._blocks, self._settings.leaf_m, middle, rows)]
-
-    def _select_none(self) -> None:
-        """Forget the selected places, since rays have others now."""
-        self._fresh = _NONE
-        self._focused = None

@@ -4,7 +4,6 @@ import numpy as np
 from triquad_format.records.arrays import Bools, Doubles, Longs
 from triquad_format.records.region import TrainingState
 from triquad_map.compiled.voxel_index import keys_of
-from triquad_map.evidence.live_evidence import LiveEvidence
 from triquad_map.field.frozen_field import FrozenField
 from triquad_map.field_fit import PlaceFits
 from triquad_map.surfels.surfel_map import SurfelMap
@@ -17,7 +16,6 @@ from triquad_server.intake.rays import ScanRays
 from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.mapping.replay.ray_table import rays_through, samples_alone
 from triquad_server.mapping.replay.region_rays import RegionRays
-from triquad_server.mapping.training.focus import Focus
 from triquad_server.mapping.training.slopes import Slopes
 from triquad_server.mapping.training.training_budget import FairShare, TrainingBudget
 
@@ -40,10 +38,6 @@ _NEW_SHARE = 0.01
 show what is still there, but teach little: so the map of a robot at rest settles while scans come,
 though single rays always end, by chance, where none has ended before."""
 
-_FEW_REMOVED = 32
-"""If the surface of more voxels is removed, all of the region learns: rows that others use as well
-have to forget it."""
-
 
 class RegionTraining:
     """Trains one region's field; it is notified of scans, and must be notified of epochs."""
@@ -51,7 +45,6 @@ class RegionTraining:
     def __init__(
         self,
         field: LiveField,
-        evidence: LiveEvidence,
         setup: RegionSetup,
         centre: Doubles,
         seed: int,
@@ -61,7 +54,6 @@ class RegionTraining:
 
         Args:
             field: what is trained.
-            evidence: of the same region.
             setup: what all regions have in common.
             centre: [3] of the region, map frame.
             seed: of all random choices.
@@ -74,7 +66,6 @@ class RegionTraining:
         self.rays = rays or RegionRays(setup, seed)
         self.budget = TrainingBudget(setup.training)
         self.fit: PlaceFits | None = None  # to the rays that are held out, as judged last
-        self._focus = Focus(field, evidence, self.rays.pool)
         self._slopes = Slopes(field, self.rays.pool)
         self._trainer = trainer_of(field, setup.sums, setup.team)
         self._unjudged_samples = 0  # samples that were trained since it was judged
@@ -86,14 +77,13 @@ class RegionTraining:
         cls,
         state: TrainingState,
         field: LiveField,
-        evidence: LiveEvidence,
         setup: RegionSetup,
         centre: Doubles,
         seed: int,
     ) -> "RegionTraining":
         """Continue as recorded."""
         rays = RegionRays.restored(state, setup, seed)
-        training = cls(field, evidence, setup, centre, seed, rays)
+        training = cls(field, setup, centre, seed, rays)
         training.budget.restore(state.budget_samples, len(rays.pool))
         training._judge(field.freeze())
         return training
@@ -110,12 +100,12 @@ class RegionTraining:
 
     @property
     def batch(self) -> int:
-        """The samples of a step: fewer where little learns, or it would take too few steps.
+        """The samples of a step: fewer where vertices are few, or it would take too few steps.
 
         They are halved while scans stream in: smaller steps learn sooner from as many samples.
         """
         most = self._setup.training.batch
-        wanted = min(most, self._field.vertices_that_learn // _VERTICES_PER_SAMPLE)
+        wanted = min(most, self._field.vertices // _VERTICES_PER_SAMPLE)
         if self.budget.learns_newest:
             wanted //= 2
         return min(most, max(_LEAST_BATCH, wanted))
@@ -140,14 +130,10 @@ class RegionTraining:
             normals: [N, 3] of the surface at their ends, NaN where unknown.
             is_new: [N] which of them end on new surface.
         """
-        if self.is_settled:
-            self._focus.narrow()
         self._new_rays += int(is_new.sum())
         shows_new = self._new_rays > _NEW_SHARE * len(is_new)
         if shows_new:
             self._new_rays = 0
-        ends = rays.ends[is_new & shows_new] - self._centre
-        self._focus.widen_to(self._setup.field.leaf_coordinates(ends))
         placement = self._setup.placement
         passing = rays_through(rays, normals, self._centre, placement, self._random)
         if len(passing) == 0:
@@ -157,9 +143,8 @@ class RegionTraining:
 
     def take_step(self) -> tuple[Loss, int]:
         """Take one optimiser step; return loss and samples. On a GPU, reading the loss waits."""
-        self._focus.apply(self.batch)
         pool = self.rays.pool
-        step = self.budget.next_step(self.batch, pool.rays_drawn_on)
+        step = self.budget.next_step(self.batch, len(pool))
         loss = self._trainer.train(pool.draw(step.samples, step.fresh), step.rates)
         self.budget.spend(step)
         self._unjudged_samples += step.samples
@@ -179,7 +164,6 @@ class RegionTraining:
 
     def forget(self, low: Doubles, high: Doubles) -> None:
         """Forget the rays that end between two corners [3], map frame."""
-        self._focus.release()
         self.rays.forget(low - self._centre, high - self._centre)
         if len(self.rays.pool) == 0:
             self.budget.clear()
@@ -193,10 +177,6 @@ class RegionTraining:
         settings = self._setup.field
         self.rays.forget_ends(removed)
         self._unlearnt = np.union1d(self._unlearnt, keys_of(removed))
-        if len(removed) > _FEW_REMOVED:
-            self._focus.release()
-        else:
-            self._focus.widen_to(removed)
         inside = self._random.random((_SAMPLES_PER_VOXEL, len(removed), 3))
         points = (removed + inside).reshape(-1, 3)
         nearest = no_surfels(np.full(len(points), self._setup.scan.truncation_m / settings.leaf_m))
