@@ -165,7 +165,7 @@ class TrainingSettings(BaseModel):
 
     pool_rays: Annotated[int, Field(ge=100, le=1_000_000_000)] = 1_200_000
     """Rays that are kept for training, over the whole map, spread evenly over its surface; a large
-    map keeps more, by `rays_per_voxel`."""
+    map keeps more, by `rays_per_voxel`. The training budget is at most 20 samples for each."""
 
     rays_per_voxel: Annotated[float, Field(ge=0.01, le=10_000)] = 12.0
     """Rays that a large map keeps for each voxel with surface."""
@@ -178,13 +178,6 @@ class TrainingSettings(BaseModel):
 
     samples_per_ray: Annotated[float, Field(ge=0, le=1000)] = 48.0
     """Samples by which each new ray raises the training budget of its region."""
-
-    max_budget_samples: Annotated[int, Field(ge=1, le=10_000_000_000)] = 24_000_000
-    """Largest training budget of the map, in samples, shared by its regions as they have surface; a
-    large map has a larger one, by `samples_per_voxel`."""
-
-    samples_per_voxel: Annotated[float, Field(ge=0.01, le=1_000_000)] = 240.0
-    """Largest training budget of a large map, in samples for each voxel with surface."""
 
     max_regions: Annotated[int, Field(ge=1, le=1_000_000)] = 256
     """Regions of the map; a scan that would need more is refused."""

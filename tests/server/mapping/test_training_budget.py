@@ -30,8 +30,6 @@ TRAINING = TrainingSettings(
     pool_rays=10_000,
     rays_per_voxel=4.0,
     pool_bytes=100_000 * RAY_BYTES,
-    max_budget_samples=500_000,
-    samples_per_voxel=100.0,
 )
 
 
@@ -39,7 +37,7 @@ def test_a_small_map_keeps_as_many_rays_and_owes_as_much_however_small_it_is() -
     for voxels in (10, 100, 1000):
         share = FairShare.of(voxels, TRAINING)
         assert 9000 < share.rays * voxels <= 10_000
-        assert share.samples * voxels == pytest.approx(500_000)
+        assert share.samples * voxels == pytest.approx(200_000)
         assert share.rays_share == 1.0
 
 
@@ -47,14 +45,14 @@ def test_a_large_map_has_as_much_for_each_voxel() -> None:
     small, large = FairShare.of(5000, TRAINING), FairShare.of(20_000, TRAINING)
     assert small == large
     assert 3.6 < large.rays <= 4.0
-    assert large.samples == 100.0
+    assert large.samples == 80.0
 
 
 def test_where_memory_has_no_room_each_voxel_has_less_and_this_is_told() -> None:
     share = FairShare.of(50_000, TRAINING)
     assert share.rays_share == pytest.approx(0.5)
     assert 1.8 < share.rays <= 2.0
-    assert share.samples == 100.0
+    assert share.samples == 80.0
 
 
 @given(st.integers(0, 2**40))
@@ -65,10 +63,15 @@ def test_all_rays_together_fit_into_memory_at_any_size(voxels: int) -> None:
 
 
 def test_the_rate_begins_high_and_ends_low_however_little_may_be_learnt() -> None:
-    budget = budget_of(rays=1000, most=500)
-    first = budget.next_step(100, kept_rays=1000)
-    assert first.rates.learning_rate == SETTINGS.learning_rate
-    for _ in range(4):
-        budget.spend(budget.next_step(100, kept_rays=1000))
-    last = budget.next_step(100, kept_rays=1000)
-    assert last.rates.learning_rate < 0.2 * SETTINGS.learning_rate
+    training = TrainingSettings(pool_rays=1000, rays_per_voxel=0.01)
+    share = FairShare.of(500, training)
+    rays = int(share.rays * 500)
+    budget = TrainingBudget(training)
+    budget.limit(int(share.samples * 500))
+    budget.add(10 * rays)
+    first = budget.next_step(100, kept_rays=rays)
+    assert first.rates.learning_rate == training.learning_rate
+    while budget.samples > 1000:
+        budget.spend(budget.next_step(100, kept_rays=rays))
+    last = budget.next_step(100, kept_rays=rays)
+    assert last.rates.learning_rate < 0.2 * training.learning_rate

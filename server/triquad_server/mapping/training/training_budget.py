@@ -12,6 +12,8 @@ _STEP = 1.1
 """The factor between the possible numbers of rays per voxel: changing it is expensive, so it is
 done seldom."""
 
+_MOST_PER_RAY = 20.0  # samples that may be left, for each ray that a map of this size keeps
+
 
 @dataclass(frozen=True)
 class FairShare:
@@ -29,16 +31,13 @@ class FairShare:
         kept = min(wanted, training.pool_bytes / RAY_BYTES / count)
         return cls(
             rays=_STEP ** math.floor(math.log(kept, _STEP)),
-            samples=max(training.max_budget_samples / count, training.samples_per_voxel),
+            samples=_MOST_PER_RAY * wanted,
             rays_share=min(1.0, kept / training.rays_per_voxel),
         )
 
 
 _LEAST_RATE = 0.02  # share of the learning rate with which the last samples are trained
 _COOLDOWN = 8.0  # samples left per ray below which the learning rate falls
-_COOLDOWN_SHARE = 0.5
-"""It does not fall before less than this share of the most that may be left is left: else, where
-little may be, it would begin low."""
 
 
 class Step(NamedTuple):
@@ -105,5 +104,5 @@ class TrainingBudget:
 
     def _cooling(self, rays: int) -> float:
         """Return the share of the learning rate: it falls with the budget, so the field settles."""
-        enough = max(1.0, min(_COOLDOWN * rays, _COOLDOWN_SHARE * self._most))
+        enough = max(1.0, _COOLDOWN * rays)
         return min(1.0, max(_LEAST_RATE, (self.samples / enough) ** 2))
