@@ -11,9 +11,6 @@ from triquad_server.engine.memory import Memory
 from triquad_server.mapping.replay.ray_table import Placement
 from triquad_server.settings import ChangeSettings, ScanSettings, TrainingSettings
 
-FREE_FROM = 0.3
-"""The share of the range from which on samples of free space are drawn."""
-
 
 @dataclass(frozen=True)
 class RegionSetup:
@@ -33,8 +30,6 @@ class RegionSetup:
         return Placement(
             surface_share=self.scan.surface_share,
             spread_m=self.scan.spread_m,
-            truncation_m=self.scan.truncation_m,
-            free_from=FREE_FROM,
             behind_m=self.scan.behind_m,
             half_side_m=self.field.region_side_m / 2,
         )

@@ -82,9 +82,6 @@ class ScanSettings(BaseModel):
     spread_m: float = length(0.08, least_m=1e-3, most_m=10)
     """Standard deviation of the distance of samples from their end point, along the ray."""
 
-    truncation_m: float = length(0.3, least_m=0.01, most_m=20)
-    """Largest distance of such samples from their end point."""
-
     behind_m: float = length(0.8, least_m=0, most_m=100)
     """Samples of free space end so far behind the end point."""
 

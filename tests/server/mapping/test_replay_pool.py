@@ -8,8 +8,6 @@ from triquad_server.process.threads import Teams
 PLACEMENT = Placement(
     surface_share=0.5,
     spread_m=0.08,
-    truncation_m=0.3,
-    free_from=0.3,
     behind_m=0.8,
     half_side_m=400.0,
 )

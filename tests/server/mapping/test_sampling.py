@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 from triquad_server.engine.live_field import Batch
 from triquad_server.intake.rays import ScanRays
-from triquad_server.mapping.region_setup import FREE_FROM
 from triquad_server.mapping.replay.ray_table import (
     Placement,
     RayTable,
@@ -28,8 +27,6 @@ def placed(settings: ScanSettings, half_side_m: float = HALF_SIDE_M) -> Placemen
     return Placement(
         settings.surface_share,
         settings.spread_m,
-        settings.truncation_m,
-        FREE_FROM,
         settings.behind_m,
         half_side_m,
     )
@@ -74,10 +71,10 @@ def test_samples_lie_where_the_settings_say() -> None:
     table = kept(rays, np.full((1, 3), np.nan), CENTRE, placed(settings))
     batch = draw(table, np.zeros(20_000, np.int64), placed(settings))
     reach = np.linalg.norm(batch.points + CENTRE - rays.origin, axis=1)
-    assert reach.min() >= 0.3 * range_m - 1e-4
+    assert reach.min() < 0.01 * range_m
     assert reach.max() <= range_m + 0.8 + 1e-4
     near = np.abs(reach - range_m) <= 0.3
-    free_near = 0.6 / (0.7 * range_m + 0.8)  # of the free samples that lie there by chance
+    free_near = 0.6 / (range_m + 0.8)  # of the free samples that lie there by chance
     assert near.mean() == pytest.approx(0.7 + 0.3 * free_near, abs=0.02)
     assert np.std(reach[near] - range_m) == pytest.approx(0.1, abs=0.02)
 

@@ -97,7 +97,7 @@ def test_lengths_follow_the_leaf_from_wherever_it_is_set(
     assert load_settings() == in_python
     scan, mesh = in_python.scan, in_python.mesh
     assert (scan.range_min_m, scan.range_max_m, scan.thin_m) == (0.375, 12.5, 0.0125)
-    assert (scan.spread_m, scan.truncation_m, scan.behind_m) == (0.02, 0.075, 0.2)
+    assert (scan.spread_m, scan.behind_m) == (0.02, 0.2)
     assert (mesh.cell_m, mesh.reach_m, mesh.tolerance_m) == (0.025, 0.005, 0.0025)
 
 

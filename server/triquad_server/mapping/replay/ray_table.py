@@ -5,7 +5,7 @@ behind it. The published label is the distance to the end point along the ray, w
 where the ray meets the surface at an angle. Where the surface's normal is known, the label here is
 the distance to its plane, so it changes by the cosine of the angle of incidence for each metre.
 Near edges and on small things the points around give no normal: there the label is the distance
-along the ray at first, and by the gradient of the field itself once that knows the surface.
+along the ray at first, then by the gradient of the field itself.
 
 All is in metres, relative to the region's centre. Every draw (3QFP, section III-C) makes new
 samples: a ray that is trained on again teaches other points of itself.
@@ -69,9 +69,7 @@ class Placement(NamedTuple):
 
     surface_share: float  # share of the samples that lie around the end points
     spread_m: float  # standard deviation of those
-    truncation_m: float  # and their largest distance
-    free_from: float  # the others lie from this share of the ray
-    behind_m: float  # to this distance behind its end
+    behind_m: float  # the others lie all along the ray, to this distance behind its end
     half_side_m: float  # of the region's cube: samples lie inside
 
 
@@ -113,7 +111,7 @@ def _free_part(
 ) -> tuple[float, float, float]:
     """Return where the free space of a ray in the cube begins and ends, metres behind the end point
     [3], and its share of that of the whole ray."""
-    first, last = (placement.free_from - 1) * reach_m, placement.behind_m
+    first, last = -reach_m, placement.behind_m
     whole = last - first
     leaves_cube = False
     for axis in range(3):
@@ -211,7 +209,6 @@ def _draw(
         if origin >= 0:
             reach_m = _set_direction(direction, table.origins[origin], row)
             offset = near[i] * placement.spread_m
-            offset = min(max(offset, -placement.truncation_m), placement.truncation_m)
             outside = False
             for axis in range(3):
                 place = row[END + axis] + offset * direction[axis]

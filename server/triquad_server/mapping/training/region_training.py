@@ -1,5 +1,7 @@
 """Training of one region of the live map: what it still has to learn, and how well it fits."""
 
+import math
+
 import numpy as np
 from triquad_format.records.arrays import Bools, Doubles, Longs
 from triquad_format.records.region import TrainingState
@@ -18,9 +20,6 @@ from triquad_server.mapping.replay.ray_table import rays_through, samples_alone
 from triquad_server.mapping.replay.region_rays import RegionRays
 from triquad_server.mapping.training.slopes import Slopes
 from triquad_server.mapping.training.training_budget import FairShare, TrainingBudget
-
-_SAMPLES_PER_VOXEL = 16  # samples that teach the free space of a removed surface
-_VISITS = 4  # times that each of them is trained on
 
 _VERTICES_PER_SAMPLE = 14
 """The vertices for each sample of a step: each vertex takes about as many steps in any region."""
@@ -173,18 +172,22 @@ class RegionTraining:
         return training_state(self._field, self.budget.samples)
 
     def _unlearn(self, removed: Longs, surfels: SurfelMap) -> None:
-        """Forget the rays that ended in voxels, and have the field learn what is there now."""
-        settings = self._setup.field
+        """Forget the rays that ended in voxels, and have the field learn what is there now.
+
+        It learns it from as many samples as a voxel with surface has rays, each as often as a ray.
+        """
+        settings, training = self._setup.field, self._setup.training
         self.rays.forget_ends(removed)
         self._unlearnt = np.union1d(self._unlearnt, keys_of(removed))
-        inside = self._random.random((_SAMPLES_PER_VOXEL, len(removed), 3))
+        count = math.ceil(training.rays_per_voxel)
+        inside = self._random.random((count, len(removed), 3))
         points = (removed + inside).reshape(-1, 3)
-        nearest = no_surfels(np.full(len(points), self._setup.scan.truncation_m / settings.leaf_m))
+        nearest = no_surfels(np.full(len(points), self._setup.scan.behind_m / settings.leaf_m))
         surfels.find_nearest(points, nearest)
         offsets = settings.offsets(points).astype(np.float32)
         samples = samples_alone(offsets, nearest.distances * settings.leaf_m)
         self.rays.pool.add(samples, fresh=False)
-        self.budget.add_samples(_VISITS * len(points))
+        self.budget.add_samples(int(training.samples_per_ray * len(points)))
 
     @property
     def _is_to_be_judged(self) -> bool:
