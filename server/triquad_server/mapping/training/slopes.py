@@ -14,8 +14,6 @@ from triquad_server.mapping.training.training_budget import Step
 
 _EVERY_SAMPLES = 1 << 15  # samples after which the field is queried
 _SHARE = 0.25  # share of the samples; as many rays are updated, each of them a few times
-_LEARNT_WITHIN = 0.25  # leaves: the surface of a field that knows it is this near to a ray's end
-_LEARNT_SLOPE = 0.5  # and its gradient is longer than this
 
 
 class Slopes:
@@ -40,10 +38,7 @@ class Slopes:
             return
         ends = np.ascontiguousarray(table.rows[rays, END : END + 3])
         values = self._field.live_view().evaluate(ends, gradient=True)
-        is_learnt = np.abs(values.sdf) < _LEARNT_WITHIN * self._field.settings.leaf_m
-        is_learnt &= np.linalg.norm(values.gradient, axis=1) > _LEARNT_SLOPE
-        rays, gradients = rays[is_learnt], values.gradient[is_learnt]
-        self._pool.set_slopes(rays, _slopes(table, rays, gradients))
+        self._pool.set_slopes(rays, _slopes(table, rays, values.gradient))
 
 
 def _slopes(table: RayTable, rays: Longs, gradients: Floats) -> Doubles:
