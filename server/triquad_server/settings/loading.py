@@ -34,8 +34,6 @@ _PRESET_FOLDER = Path(__file__).with_name("presets")
 PRESETS = ("street", "indoor", "tabletop", "long-range")
 """Settings that fit a kind of place and sensor; each is a file in the folder ``presets``."""
 
-_FILE = 1  # its place among the origins
-
 
 class _Origin(NamedTuple):
     """Settings from one place, as nested tables of values that are not checked yet."""
@@ -170,75 +168,36 @@ def _value(text: str) -> Any:
     with suppress(ValueError, RecursionError):
         return tomllib.loads(f"value = {text}")["value"]
     with suppress(ValueError):
-        return int(text)
-    with suppress(ValueError):
         return float(text)
     return text
 
 
 def _explain(details: ErrorDetails, origins: list[_Origin]) -> str:
-    """What is wrong with a setting, and what is right."""
-    location = details["loc"]
+    """Where a setting comes from, what it is, and what is wrong with it."""
     cause = details.get("ctx", {}).get("error")
-    keys = cause.keys if isinstance(cause, UnfitSettingsError) else [location]
-    givers = [origin for origin in origins if any(map(origin.gives, keys))]
-    problem = _problem(details, ".".join(map(str, location)))
-    if not givers:
-        return problem
-    # The last has the last word, and only a file has numbers beside text.
-    is_number = details["type"] in ("int_type", "float_type")
-    quoted = is_number and isinstance(details["input"], str) and givers[-1] == origins[_FILE]
-    return f"{givers[-1].name}: {problem}" + (", without quotes" if quoted else "")
+    keys = cause.keys if isinstance(cause, UnfitSettingsError) else [details["loc"]]
+    givers = [f"{origin.name}: " for origin in origins if any(map(origin.gives, keys))]
+    return "".join(givers[-1:]) + _problem(details)  # the last has the last word
 
 
-def _problem(details: ErrorDetails, name: str) -> str:
-    location, value = details["loc"], reprlib.repr(details["input"])
+def _problem(details: ErrorDetails) -> str:
+    location, value = details["loc"], details["input"]
+    name = ".".join(map(str, location))
     match details["type"]:
         case "value_error":
             return str(details["ctx"]["error"])
         case "extra_forbidden" | "unexpected_keyword_argument":
-            if location[0] == "sources" and isinstance(details["input"], dict):
-                return _split_name(location, details["input"])
+            if location[0] == "sources" and isinstance(value, dict):
+                return f'{name}: in a file, a name with points stands in quotes, [sources."a.b"]'
             return _unknown(location)
-        case "model_type" | "dataclass_type":
-            return f"{name} = {value} is not a section: write [{name}]"
-        case "dict_type":
-            return f"{name} = {value} is not a section: write [{SOURCE_SECTION}]"
-        case "bool_type":
-            return f"{name} = {value}: use true or false"
+        case "model_type" | "dataclass_type" | "dict_type":
+            section = SOURCE_SECTION if name == "sources" else name
+            right = f"it is not a section: write [{section}]"
         case "tuple_type" | "missing" | "too_long":
-            return f"{name} = {value}: write two corners, [[x, y, z], [x, y, z]]"
-        case "greater_than_equal" | "less_than_equal" | "finite_number":
-            return f"{name} = {value} is out of range: use {_allowed(location)}"
-        case "int_type" | "float_type":
-            return f"{name} = {value} is of another type: use {_allowed(location)}"
+            right = "write two corners, [[x, y, z], [x, y, z]]"
         case _:
-            return f"{name} = {value}: {details['msg']}"
-
-
-def _split_name(location: tuple[int | str, ...], table: dict[str, Any]) -> str:
-    """That a table lies in the section of a source, where the points of a name cut it up."""
-    section, *parts = map(str, location)
-    while len(table) == 1 and isinstance(inner := next(iter(table.values())), dict):
-        parts.extend(table)
-        table = inner
-    name = ".".join(parts)
-    return (
-        f"{section}.{name} is no section: in a file, the name of a source that has points in it "
-        f'stands in quotes, [{section}."{name}"]'
-    )
-
-
-def _allowed(location: tuple[int | str, ...]) -> str:
-    """The type and the range of a number."""
-    section, key, *inner = map(str, location)
-    if section == "sources":
-        section, key, *inner = SOURCE_SECTION, *inner
-    schema = setting_schemas()[section][key]
-    schema = schema.get("anyOf", [schema])[0]
-    for index in inner:
-        schema = schema["prefixItems"][int(index)]
-    return f"{schema['minimum']} to {schema['maximum']} ({schema['type']})"
+            right = details["msg"].replace("Input", "it", 1)
+    return f"{name} = {reprlib.repr(value)}: {right}"
 
 
 def _unknown(location: tuple[int | str, ...]) -> str:
