@@ -16,7 +16,7 @@ from triquad_client import Client
 from triquad_server import serve
 from triquad_tools.recordings.publishing import wait_until_settled
 from triquad_tools.simulation.street import street_drive
-from triquad_tools.viewer.sources.live_source import LiveSource
+from triquad_tools.viewer.sources import LiveSource
 from triquad_tools.viewer.viewer import Viewer
 
 from bench.clients.browser import opened_page, running_browser, wait_until_drawn

@@ -6,7 +6,7 @@ from contextlib import closing
 
 from playwright.sync_api import Browser, Page
 from triquad_tools.recordings.publishing import wait_until_settled
-from triquad_tools.viewer.sources.live_source import LiveSource
+from triquad_tools.viewer.sources import LiveSource
 from triquad_tools.viewer.viewer import Viewer
 
 from bench.clients.browser import opened_page, running_browser, wait_until_drawn

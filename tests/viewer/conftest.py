@@ -6,8 +6,7 @@ from contextlib import AbstractContextManager, closing, contextmanager
 import pytest
 from playwright.sync_api import Browser, Page, expect
 from triquad_tools.console.command import ToolError
-from triquad_tools.viewer.sources.map_source import MapSource
-from triquad_tools.viewer.sources.stored_map import History
+from triquad_tools.viewer.sources import History, MapSource
 from triquad_tools.viewer.viewer import Viewer
 
 from bench.clients import browser

@@ -10,7 +10,7 @@ import viser
 import websockets.asyncio.client
 from support.files.changing_store import EMPTY, write_checkpoint
 from triquad_tools.viewer.allowed_origins import refusal
-from triquad_tools.viewer.sources.stored_map import StoredMap
+from triquad_tools.viewer.sources import StoredMap
 from triquad_tools.viewer.viewer import Viewer
 from websockets.datastructures import Headers
 from websockets.exceptions import InvalidStatus

@@ -5,8 +5,7 @@ from support.servers import SMALL, learn, running_service
 from triquad_client import connect
 from triquad_tools.viewer.mesh.tile_colours import before_tone_mapping
 from triquad_tools.viewer.mesh.tiles_in_view import NearTiles, TilesInView
-from triquad_tools.viewer.sources.live_source import LiveSource
-from triquad_tools.viewer.sources.tile_sizes import COARSEST
+from triquad_tools.viewer.sources import COARSEST, LiveSource
 
 
 def test_near_tiles_are_those_of_the_server() -> None:

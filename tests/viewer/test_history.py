@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from support.files.changing_store import EMPTY, box_at, write_checkpoint
 from triquad_tools.console.command import ToolError
-from triquad_tools.viewer.sources.stored_map import (
+from triquad_tools.viewer.sources import (
+    COARSEST,
     DamagedError,
     History,
     StoredMap,
     StoredTiles,
     moment,
 )
-from triquad_tools.viewer.sources.tile_sizes import COARSEST
 
 ORIGIN = [[0.0, 0.0, 1.0]]
 

@@ -20,7 +20,7 @@ from triquad_format.records.arrays import Bytes
 from triquad_tools.console.command import ToolError
 from triquad_tools.plots.colours import BEHIND, DISTANCES, UNKNOWN
 from triquad_tools.recordings.publishing import wait_until_settled
-from triquad_tools.viewer.sources.live_source import LiveSource
+from triquad_tools.viewer.sources import LiveSource
 
 from bench.clients.browser import drawn_share, picture, wait_until, wait_until_drawn
 

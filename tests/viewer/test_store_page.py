@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from playwright.sync_api import Page, expect
 from support.files.changing_store import EMPTY, box_at, write_checkpoint
-from triquad_tools.viewer.sources.stored_map import History
+from triquad_tools.viewer.sources import History
 
 from bench.clients.browser import picture, wait_until, wait_until_drawn
 

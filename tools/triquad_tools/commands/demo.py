@@ -17,7 +17,7 @@ from triquad_tools.console.lines import print_line, print_remark
 from triquad_tools.console.report import json_text, print_rows
 from triquad_tools.demo.steps import MAP, DemoResults, broken_promises, demonstrate, table_rows
 from triquad_tools.simulation.street import street_drive
-from triquad_tools.viewer.sources.live_source import LiveSource
+from triquad_tools.viewer.sources import LiveSource
 from triquad_tools.viewer.viewer import DEFAULT_PORT, Viewer
 
 _COMMAND = "triquad-demo"

@@ -19,9 +19,7 @@ from triquad_tools.console.arguments import (
 from triquad_tools.console.command import OK, complain, refuse, run
 from triquad_tools.console.lines import print_line
 from triquad_tools.console.progress import progress
-from triquad_tools.viewer.sources.live_source import LiveSource
-from triquad_tools.viewer.sources.map_source import MapSource
-from triquad_tools.viewer.sources.stored_map import History, StoredMap, moment
+from triquad_tools.viewer.sources import History, LiveSource, MapSource, StoredMap, moment
 from triquad_tools.viewer.viewer import DEFAULT_PORT, Viewer
 
 _COMMAND = "triquad-view"

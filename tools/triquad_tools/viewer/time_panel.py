@@ -6,7 +6,7 @@ from triquad_tools.console.command import ToolError
 from triquad_tools.viewer.page.layer import Layer, newest_epoch
 from triquad_tools.viewer.page.legends import problem_html, text_html
 from triquad_tools.viewer.page.page import Page
-from triquad_tools.viewer.sources.stored_map import History, moment
+from triquad_tools.viewer.sources import History, moment
 
 _PERIOD_S = 1.0
 _PREVIOUS, _NEXT = "◀ Previous", "Next ▶"

@@ -18,9 +18,7 @@ from triquad_tools.viewer.page.page import Page
 from triquad_tools.viewer.questions.clicks import Clicks
 from triquad_tools.viewer.questions.slice import SliceQuestion
 from triquad_tools.viewer.questions.unknown_space import UnknownSpace
-from triquad_tools.viewer.sources.live_source import LiveSource
-from triquad_tools.viewer.sources.map_source import MapSource
-from triquad_tools.viewer.sources.stored_map import History
+from triquad_tools.viewer.sources import History, LiveSource, MapSource
 from triquad_tools.viewer.time_panel import TimePanel
 from triquad_tools.viewer.trail_layer import TrailLayer
 

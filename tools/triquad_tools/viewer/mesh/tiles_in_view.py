@@ -8,8 +8,7 @@ import numpy as np
 from triquad_client.mesh.followed_mesh import MeshTile, TileIndex
 from triquad_format.records.arrays import Doubles
 
-from triquad_tools.viewer.sources.map_source import MapSource, TileFollower
-from triquad_tools.viewer.sources.tile_sizes import COARSEST
+from triquad_tools.viewer.sources import COARSEST, MapSource, TileFollower
 
 _PERIOD_S = 1.0  # between questions what changed: more often, and a robot's planner would notice
 

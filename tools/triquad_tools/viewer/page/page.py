@@ -12,7 +12,7 @@ from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.records.status import Status
 
 from triquad_tools.viewer.page.legends import problem_html
-from triquad_tools.viewer.sources.map_source import MapSource
+from triquad_tools.viewer.sources import MapSource
 
 _GRID_M = 100.0
 _LEAST_SIDE_M, _MOST_SIDE_M = 2.0, 128.0

@@ -1,4 +1,4 @@
-"""Map files, shown without a server: one, or the checkpoints of a store in the order of time."""
+"""The sources of a page's map: a server that learns, a file, or the checkpoints of a store."""
 
 import threading
 import time
@@ -9,9 +9,10 @@ from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
-from triquad_client import open_map
+from triquad_client import Client, open_map
 from triquad_client.checks import Bounds
 from triquad_client.mesh.followed_mesh import MeshTile, TileIndex
+from triquad_client.mesh.mesh_watch import MeshWatch
 from triquad_client.offline.map_mesh import TILE_CELLS
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.checkpoint_folder import (
@@ -21,15 +22,62 @@ from triquad_format.mapfile.checkpoint_folder import (
 )
 from triquad_format.mapfile.metadata import utc_time
 from triquad_format.mapfile.reader import open_manifest
+from triquad_format.wire.limits import LEVELS
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.viewer.sources.tile_sizes import COARSEST, TileSizes
 
+_POINT = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 _CELL_LEAVES = 0.5  # of a cell of level 0, as in a server's mesh
 _MAX_TILES = 500  # that are kept of an open map: some 50 to 200 MB
 _WAIT_S = 0.1  # how long one refresh makes tiles
 
 _MAX_OPEN = 4  # maps that stay in memory beyond those that pages show
+
+COARSEST = LEVELS - 1
+"""Level of detail of the tiles of which a whole map is shown."""
+
+
+@dataclass(frozen=True)
+class TileSizes:
+    """Lengths of the mesh, metres."""
+
+    cell_m: float  # of level 0
+    tile_side_m: float  # of level 0
+
+    def cell_of(self, level: int) -> float:
+        """Return the side of the cells of a level."""
+        return self.cell_m * (1 << level)
+
+    def side_of(self, level: int) -> float:
+        """Return the side of the tiles of a level."""
+        return self.tile_side_m * (1 << level)
+
+
+class LiveSource:
+    """The map of a server; the caller closes the client."""
+
+    grows = True
+    """More of it may become known while it is shown."""
+
+    def __init__(self, client: Client, endpoint: str) -> None:
+        """Ask the server for the lengths of its mesh.
+
+        Raises:
+            TriquadError: it does not answer.
+        """
+        self.client = self.queries = client
+        self.title = f"{client.map_name} at {endpoint}"
+        with client.watch_mesh(_POINT) as watch:
+            watch.catch_up()
+            self.sizes = TileSizes(watch.cell_m, watch.tile_side_m)
+
+    def follow(self, level: int, bounds: Bounds | None = None, before: object = None) -> MeshWatch:
+        """Follow the mesh tiles of a level that meet ``bounds``, as the server makes them.
+
+        Those of a follower ``before``, of the same level, are not fetched again.
+        """
+        known = before.known_tiles() if isinstance(before, MeshWatch) else None
+        return self.client.watch_mesh(bounds, level, known=known)
 
 
 class StoredMap:
@@ -114,6 +162,13 @@ class StoredTiles:
 
     def close(self) -> None:
         """Do nothing: there is nothing to release."""
+
+
+MapSource = LiveSource | StoredMap
+"""A map to show: each has a title, queries, the sizes of its mesh, and tiles to follow."""
+
+TileFollower = MeshWatch | StoredTiles
+"""The mesh tiles of a level within a box, which ``next`` brings up to date bit by bit."""
 
 
 class DamagedError(ToolError):

@@ -1,1 +1,0 @@
-"""Sources of a page's map: a server, a file, or the checkpoints of a store."""
