@@ -17,6 +17,7 @@ from triquad_format.wire.messages import (
     SdfRequest,
     StatusRequest,
 )
+from triquad_format.wire.unpacking import unpacked
 
 POSE = np.array([[0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]], np.float64)
 POINTS = np.array([[1, 2, 3], [4, 5, 6]], np.float32)
@@ -188,3 +189,30 @@ def test_messages_with_a_changed_byte_are_read_or_refused(message, data):
 def test_values_that_do_not_fit_are_not_encoded(message):
     with pytest.raises(WireError):
         codec.encode(message)
+
+
+@pytest.mark.parametrize("innermost", [b"\x01", b"\xc4\x01x"])
+def test_what_holds_nothing_is_no_level_of_its_own(innermost):
+    unpacked(b"\x91" * 16 + innermost)
+    with pytest.raises(WireError, match="deep"):
+        unpacked(b"\x91" * 17 + innermost)
+
+
+@pytest.mark.parametrize(
+    ("payload", "words"),
+    [
+        (msgpack.packb([[[1] * 60] * 60] * 60), "objects"),
+        (msgpack.packb([{f"{number}": 0 for number in range(4096)}] * 6), "objects"),
+        (b"\xdd\xff\xff\xff\xff", "max_array_len"),
+        (b"\xdf\xff\xff\xff\xff", "max_map_len"),
+        (b"\x91" * 5000 + b"\x01", "not msgpack"),
+        (b"\x82\xa7triquad\x01\xa4kind" + b"\x91" * 1000 + b"\x01", "deep"),
+        (msgpack.packb({"a": 1}) + b"\x00", "extra data"),
+        (msgpack.packb({"a": b"123456"})[:-1], "incomplete"),
+        (msgpack.packb(msgpack.ExtType(3, b"x")), "max_ext_len"),
+        (b"", "incomplete"),
+    ],
+)
+def test_bombs_are_refused(payload, words):
+    with pytest.raises(WireError, match=words):
+        codec.decode(StatusRequest, payload)
