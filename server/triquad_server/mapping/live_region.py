@@ -1,7 +1,5 @@
 """One region of the live map: its field, its evidence and its training."""
 
-from dataclasses import replace
-
 import numpy as np
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.field_settings import RegionIndex
@@ -104,8 +102,7 @@ class LiveRegion:
         # A return that is not believed, a drop of rain or the first of far things, teaches nothing.
         ends_elsewhere = seen.rows == 0
         used = ends_elsewhere | self.evidence.live.is_surface(seen.rows)
-        of_used = replace(rays, ends=rays.ends[used])
-        self.training.scan_taken(of_used, normals[used], is_new[used])
+        self.training.scan_taken(rays, normals, used, is_new & used)
 
     def take_step(self) -> tuple[Loss, int]:
         """Take one optimiser step; return loss and samples. On a GPU, reading the loss waits."""

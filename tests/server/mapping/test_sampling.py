@@ -33,7 +33,8 @@ def placed(settings: ScanSettings, half_side_m: float = HALF_SIDE_M) -> Placemen
 
 
 def kept(rays: ScanRays, normals: np.ndarray, centre: np.ndarray, placement: Placement) -> RayTable:
-    return rays_through(rays, normals, centre, placement, np.random.default_rng(2))
+    used = np.ones(len(rays.ends), np.bool_)
+    return rays_through(rays, normals, used, centre, placement, np.random.default_rng(2))
 
 
 def draw(table: RayTable, chosen: np.ndarray, placement: Placement) -> Batch:

@@ -19,6 +19,7 @@ from triquad_server.mapping.replay.ray_bins import (
     bins_of,
     count_in_bins,
     put_rays,
+    remove_at_random,
     remove_ending_in,
 )
 from triquad_server.mapping.replay.ray_table import COLUMNS, END, NO_ORIGIN, RayTable
@@ -85,9 +86,16 @@ class KeptRays:
     def limit(self, capacity: int) -> None:
         """Change the capacity; surplus rays are removed at random."""
         self._capacity = capacity
-        if self._size > capacity:
-            self.discarded += self._size - capacity
-            self._keep(self._rng.permutation(self._size)[:capacity])
+        surplus = self._size - capacity
+        if surplus <= 0:
+            return
+        self.discarded += surplus
+        chances = self._rng.random(surplus)
+        of_rays = (self._rows, self._origin_of, self._occupancy)
+        remove_at_random(chances, self._bin_m, self._size, *of_rays)
+        self._size = capacity
+        if len(self._rows) > self._room:
+            self._give_room(self._room)
 
     def forget(self, low: Doubles, high: Doubles) -> None:
         """Drop the rays that end between two corners [3], metres from the region's centre."""
@@ -117,25 +125,29 @@ class KeptRays:
         self._size = len(places)
         self._occupancy = count_in_bins(self._rows, self._bin_m)
 
+    @property
+    def _room(self) -> int:
+        """The most rays that there is room for."""
+        return int(_ROOM * self._capacity)
+
     def _extend(self, size: int) -> None:
         if size > len(self._rows):
-            room = max(size, min(2 * len(self._rows), int(_ROOM * self._capacity)))
-            for name in ("_rows", "_origin_of"):
-                self._make_room(name, room)
+            self._give_room(max(size, min(2 * len(self._rows), self._room)))
         self._size = size
 
-    def _make_room(self, name: str, rows: int) -> None:
-        """Let an array have ``rows`` rows, in place.
+    def _give_room(self, rays: int) -> None:
+        """Have room for ``rays`` rays; the arrays are resized in place.
 
-        Copying it every few scans of new surface would take as long as all else here.
+        Copying them every few scans of new surface would take as long as all else here.
         """
-        array = vars(self).pop(name)  # numpy resizes an array in place if nothing else refers to it
-        try:
-            array.resize((rows, *array.shape[1:]))
-        except ValueError:
-            array = with_room(array, rows)
-        finally:
-            setattr(self, name, array)
+        for name in ("_rows", "_origin_of"):
+            array = vars(self).pop(name)  # numpy resizes it in place if nothing else refers to it
+            try:
+                array.resize((rays, *array.shape[1:]))
+            except ValueError:
+                array = with_room(array[:rays], rays)
+            finally:
+                setattr(self, name, array)
 
     def _add_origins(self, new: Floats) -> int:
         """Add origins [K, 3], in place of unused ones; return the first one's row."""

@@ -5,7 +5,7 @@ A bin is a cube of four leaves; cubes that lie far apart may share one. Rays are
 """
 
 import numpy as np
-from triquad_format.records.arrays import Bools, Floats, Ints, Longs
+from triquad_format.records.arrays import Bools, Doubles, Floats, Ints, Longs
 from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.lanes import prefetch_row
 from triquad_map.compiled.voxel_index import Index, find_row, pack
@@ -52,6 +52,9 @@ def best_to_push_out(
     half = size // 2
     chosen = np.empty(count, np.int64)
     for i in range(count):
+        ahead = (first + (i + _AHEAD) * stride) % half
+        prefetch_row(rows, ahead)
+        prefetch_row(rows, half + (ahead + offset) % half)
         left = (first + i * stride) % half
         right = half + (left + offset) % half
         on_left, on_right = (
@@ -60,6 +63,20 @@ def best_to_push_out(
         )
         chosen[i] = left if on_left > on_right else right
     return chosen
+
+
+@kernel()
+def remove_at_random(
+    chances: Doubles, bin_m: float, size: int, rows: Floats, origin_of: Ints, occupancy: Ints
+) -> None:
+    """Remove a ray for each of the ``chances`` [N] in [0, 1), and put the last one there."""
+    for i in range(len(chances)):
+        ahead = min(i + _AHEAD, len(chances) - 1)
+        prefetch_row(rows, int(chances[ahead] * (size - ahead + i)))
+        place = int(chances[i] * size)
+        occupancy[_bin(rows[place], bin_m)] -= 1
+        size -= 1
+        rows[place], origin_of[place] = rows[size], origin_of[size]
 
 
 @kernel()

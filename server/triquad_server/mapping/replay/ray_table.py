@@ -55,7 +55,8 @@ class RayTable(NamedTuple):
 
     def of(self, chosen: Bools) -> "RayTable":
         """Return the ``chosen`` [N] rays, with all origins."""
-        return RayTable(self.rows[chosen], self.origin_of[chosen], self.origins)
+        places = np.flatnonzero(chosen)  # by a mask, rows are copied a tenth as fast
+        return RayTable(self.rows.take(places, axis=0), self.origin_of[places], self.origins)
 
     @property
     def ends_newest_last(self) -> Floats:
@@ -128,16 +129,17 @@ def _fill(
     origin: Doubles,
     ends: Doubles,
     normals: Doubles,
+    used: Bools,
     placement: Placement,
     chances: Doubles,
     rows: Floats,
 ) -> int:
-    """Fill the rows with rays that pass the cube; return how many."""
+    """Fill the rows with rays that are used and pass the cube; return how many."""
     count = 0
     direction = np.empty(3)
     for i in range(len(ends)):
         reach_m = _set_direction(direction, origin, ends[i])
-        if reach_m == 0:
+        if reach_m == 0 or not used[i]:
             continue
         _, _, free = _free_part(ends[i], direction, reach_m, placement)
         ends_inside = True
@@ -159,6 +161,7 @@ def _fill(
 def rays_through(
     rays: ScanRays,
     normals: Doubles,
+    used: Bools,
     centre: Doubles,
     placement: Placement,
     rng: np.random.Generator,
@@ -170,6 +173,7 @@ def rays_through(
     Args:
         rays: N rays, map frame.
         normals: [N, 3] unit normals at the end points, NaN where unknown.
+        used: [N] those among which they are.
         centre: [3] of the region, map frame.
         placement: where on them samples are to lie.
         rng: chooses among rays that are partly in the cube.
@@ -177,7 +181,7 @@ def rays_through(
     rows = np.empty((len(rays.ends), COLUMNS), np.float32)
     origin = rays.origin - centre
     chances = rng.random(len(rows))
-    rows = rows[: _fill(origin, rays.ends - centre, normals, placement, chances, rows)]
+    rows = rows[: _fill(origin, rays.ends - centre, normals, used, placement, chances, rows)]
     return RayTable(rows, np.zeros(len(rows), np.int32), origin[None].astype(np.float32))
 
 

@@ -121,20 +121,21 @@ class RegionTraining:
             self._unlearnt = np.setdiff1d(self._unlearnt, keys_of(again))
             self.rays.forget_ends(again)
 
-    def scan_taken(self, rays: ScanRays, normals: Doubles, is_new: Bools) -> None:
+    def scan_taken(self, rays: ScanRays, normals: Doubles, used: Bools, is_new: Bools) -> None:
         """Keep the rays of a scan, to be trained on.
 
         Args:
             rays: N rays, map frame.
             normals: [N, 3] of the surface at their ends, NaN where unknown.
-            is_new: [N] which of them end on new surface.
+            used: [N] which of them are kept.
+            is_new: [N] which of these end on new surface.
         """
         self._new_rays += int(is_new.sum())
-        shows_new = self._new_rays > _NEW_SHARE * len(is_new)
+        shows_new = self._new_rays > _NEW_SHARE * int(used.sum())
         if shows_new:
             self._new_rays = 0
         placement = self._setup.placement
-        passing = rays_through(rays, normals, self._centre, placement, self._random)
+        passing = rays_through(rays, normals, used, self._centre, placement, self._random)
         if len(passing) == 0:
             return
         held = self.rays.keep(passing)
