@@ -43,18 +43,15 @@ _LONGEST_STEP = 0.5
 """The longest of them on each axis, in voxels. Where the field saturates, longer ones miss the
 surface: on a sparsely seen street distances are off by a sixth more."""
 
-_ON_SURFACE = 0.15
-"""The most, in voxels, that the field may be where the steps lead, for a surface to be there: where
-it is flat in the free space of a corner, it comes near zero without crossing it."""
+_ON_SURFACE = 0.1
+"""The most, in voxels, that the field may be off on a surface. Where the steps lead there is none
+if it is more: where it is flat in the free space of a corner, it comes near zero without crossing
+it. And it has learnt the surface in a voxel if it is no more at the mean of the ends there. With
+half of it or one and a half times, meshes of a street and of a room are as good."""
 
 _FLATTEST = 0.3
 """A field that is flatter than this, as a slope, was not trained there, and shows no surface. With
 less, more voxels have discs, and distances are off by more at most."""
-
-_LEARNT = 0.1
-"""The field has learnt the surface in a voxel where it is no more than this off, in voxels, at the
-mean of the ends there. With half of it or one and a half times, meshes of a street and of a room
-are as good."""
 
 LEVELS = MAX_LEVEL + 1
 
@@ -151,7 +148,7 @@ def fit_surfels(
     off, kinds = field(places).values, surfels.kinds[rows]
     # Next to a surface in the next voxel, noisy rays end on both sides of the border.
     is_noise = (kinds == SurfelKind.NONE) & (off < 0)
-    is_off = (kinds == SurfelKind.POINT) | (np.abs(off) > _LEARNT)
+    is_off = (kinds == SurfelKind.POINT) | (np.abs(off) > _ON_SURFACE)
     unlearnt = rows[is_off & ~is_noise]
     surfels.take(unlearnt, shown.chosen(unlearnt))
     return surfels

@@ -5,6 +5,7 @@ from triquad_format.records.arrays import Bytes, Floats, Longs
 
 from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.evidence.observed import (
+    COUNTED_ENDS,
     Observed,
     ObservedVoxel,
     is_flat,
@@ -16,9 +17,7 @@ from triquad_map.evidence.seen_voxels import SeenVoxels
 from triquad_map.surface import SurfelKind
 
 _DISC = int(SurfelKind.DISC)
-_DISC_ENDS, _DISC_SPREAD = 16.0, 0.08  # that a disc of the field stands for
-_FARTHEST_BESIDE = 0.75  # voxels from a voxel's middle to the disc of another one
-_OUTSIDE = 0.1  # voxels that a disc may reach out of its own voxel
+_DISC_SPREAD = 1 / 12  # variance of ends that lie evenly over the side of a voxel
 
 
 @kernel()
@@ -41,7 +40,7 @@ def set_discs(
             voxel.mean[axis] = offsets[i, axis] + 0.5 if is_disc else np.nan
             voxel.normal[axis] = normals[i, axis] if is_disc else 0.0
         _set_spread(voxel, _DISC_SPREAD)
-        voxel.ends = _DISC_ENDS if is_disc else 0
+        voxel.ends = COUNTED_ENDS if is_disc else 0
     for i in range(len(voxels)):
         row = row_of(seen, observed, voxels[i, 0], voxels[i, 1], voxels[i, 2])
         if row != 0 and observed.voxels[row].ends == 0:
@@ -64,7 +63,7 @@ def _set_disc_beside(row: int, seen: SeenVoxels, observed: Observed) -> None:
     The ends of noisy rays lie in voxels on both sides of a surface, and the disc in one of them.
     """
     voxel, corner = observed.voxels[row], voxel_of(row, seen, observed)
-    nearest = _FARTHEST_BESIDE
+    nearest = np.inf
     for near in rows_around(row, 1, seen, observed):
         disc = observed.voxels[near]
         normal, mean = disc.normal, disc.mean
@@ -77,10 +76,10 @@ def _set_disc_beside(row: int, seen: SeenVoxels, observed: Observed) -> None:
         is_there = abs(height) < nearest
         for axis in range(3):
             foot = corner[axis] + 0.5 - height * normal[axis] - beside[axis]
-            is_there = is_there and -_OUTSIDE <= foot <= 1 + _OUTSIDE
+            is_there = is_there and 0 <= foot <= 1
         if is_there:
             nearest = abs(height)
             for axis in range(3):
                 voxel.mean[axis] = 0.5 - height * normal[axis]
                 voxel.normal[axis] = normal[axis]
-            voxel.ends = _DISC_ENDS
+            voxel.ends = COUNTED_ENDS

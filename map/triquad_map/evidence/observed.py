@@ -151,7 +151,7 @@ def _add_rows(
     return count
 
 
-_COUNTED_ENDS = 64
+COUNTED_ENDS = 64
 """The ends of a voxel that count; the shape that further ones give counts as that of as many."""
 
 
@@ -209,7 +209,7 @@ def _begin_hit(voxel: ObservedVoxel, scan: int) -> None:
 def _add_end(voxel: ObservedVoxel, end: Vector) -> None:
     """Move the shape of the surface in a voxel by a ray that ended at a place in it."""
     mean, normal = voxel.mean, voxel.normal
-    count = min(voxel.ends + np.float32(1), np.float32(_COUNTED_ENDS))
+    count = min(voxel.ends + np.float32(1), np.float32(COUNTED_ENDS))
     if count == 1:
         for axis in range(3):
             mean[axis], normal[axis] = end[axis], 0
