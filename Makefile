@@ -1,7 +1,7 @@
 # make test      set up a virtual environment and run every check and test
 # make test-long   campaigns, deep fuzzing, every page of the browser, whole demonstrations: 45 minutes
 # make check     the checks alone: style, types, which package may import which
-# make docs      write the tables of docs/settings.md from the settings
+# make docs      write the tables of docs/settings.md and docs/numbers.md from the code
 # make pictures  make the pictures of the documentation anew; those of the viewer need Chromium
 # make pretrained   train the MLP that regions begin with, on simulated streets: 10 minutes
 # make bench     how fast and how good triquad is on this machine; PART=core: one part of it
@@ -44,6 +44,7 @@ test-long: kernels
 
 docs: $(INSTALLED)
 	$(BIN)/python docs/settings_tables.py
+	$(BIN)/python docs/numbers_table.py
 
 pictures: $(INSTALLED)
 	$(BIN)/python docs/pictures.py

@@ -5,9 +5,12 @@ The page names files and numbers; their values and what they mean are taken from
 
 import ast
 import io
+import json
 import re
 import tokenize
 from pathlib import Path
+
+from triquad_server.settings.settings import setting_schemas
 
 PAGE = Path(__file__).with_name("numbers.md")
 ROOT = PAGE.parent.parent
@@ -20,8 +23,15 @@ def with_tables(page: str) -> str:
 
 def _row(found: re.Match[str]) -> str:
     name, path = found[1], found[2]
-    value, meaning = _number(ROOT / path, name)
+    value, meaning = _setting(name) if path == "settings" else _number(ROOT / path, name)
     return f"| `{name}` {path} | {value} | {meaning} |\n"
+
+
+def _setting(key: str) -> tuple[str, str]:
+    """Return the default of a setting, and its description."""
+    section, _, name = key.partition(".")
+    schema = setting_schemas()[section][name]
+    return json.dumps(schema["default"]), " ".join(schema["description"].split())
 
 
 def _number(path: Path, name: str) -> tuple[str, str]:
@@ -37,10 +47,11 @@ def _number(path: Path, name: str) -> tuple[str, str]:
         for at, statement in enumerate(body if isinstance(body, list) else ()):
             values = _values(statement)
             if name in values:
-                meaning = _docstring(body[at + 1 : at + 2]) or comments.get(statement.end_lineno)
+                meaning = comments.get(statement.end_lineno) or _docstring(body[at + 1 :])
                 if meaning is None:
                     raise ValueError(f"{path}: nothing is written about {name}")
-                return ast.unparse(values[name]), meaning.replace("|", "\\|")
+                value = re.sub(r"np\.\w+\((.*)\)", r"\1", ast.unparse(values[name]))
+                return value, meaning.replace("|", "\\|")
     raise ValueError(f"{path} has no {name}: correct {PAGE}")
 
 
@@ -59,9 +70,12 @@ def _values(statement: ast.stmt) -> dict[str, ast.expr]:
 
 
 def _docstring(after: list[ast.stmt]) -> str | None:
-    """Return the docstring that follows an assignment, in one line."""
-    if after and isinstance(after[0], ast.Expr) and isinstance(after[0].value, ast.Constant):
-        return " ".join(str(after[0].value.value).split())
+    """Return the docstring that follows some assignments, in one line."""
+    for statement in after:
+        if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant):
+            return " ".join(str(statement.value.value).split())
+        if not _values(statement):
+            break
     return None
 
 

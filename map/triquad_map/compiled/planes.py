@@ -11,6 +11,7 @@ from triquad_map.compiled.kernel import inner_kernel, kernel
 MOMENTS = 10
 
 _MIN_POINTS = 6
+"""The fewest points that have a plane."""
 
 _FLAT = 0.1
 """The share of an extent, a standard deviation, below which the next smaller one is none: a plane

@@ -37,7 +37,8 @@ from triquad_map.evidence.observed import (
 )
 from triquad_map.evidence.seen_voxels import SeenVoxels
 
-_REACH = 2  # voxels around one that may belong together with it
+_REACH = 2
+"""The voxels around one that may belong together with it: far beams leave gaps of one."""
 
 _PRIOR = 0.5  # hits and misses, scans: Jeffreys' prior of a chance
 
@@ -45,10 +46,17 @@ _PRIOR = 0.5  # hits and misses, scans: Jeffreys' prior of a chance
 class Belief(NamedTuple):
     """The numbers of the model, logarithms of odds."""
 
-    vacant: float = 5.0  # that nothing is in a voxel of which nothing was seen
-    stray: float = 4.0  # how much less for each hit: one return in 50 is where nothing is
-    leaves: float = -7.0  # that a surface has left, however often it was seen
-    around: float = 0.3  # share of what each voxel around says, at most `vacant`
+    vacant: float = 5.0
+    """That nothing is in a voxel of which nothing was seen: 1 in 150 has surface."""
+
+    stray: float = 4.0
+    """By how much that falls with each hit: 1 return in 50 comes from where nothing is."""
+
+    leaves: float = -7.0
+    """That a surface has left, however often it was seen: it does once in 1,100 times."""
+
+    around: float = 0.3
+    """The share of what each voxel near by says that counts: it is no independent witness."""
 
 
 class Changes(NamedTuple):

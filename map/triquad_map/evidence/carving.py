@@ -36,7 +36,7 @@ _LEAST_SPREAD = 0.05
 """Standard deviation of the ends in a voxel in any direction, at least, in voxels."""
 
 _PRIOR_SPREAD, _PRIOR_ENDS = 0.15, 2.0
-"""The same before any end, in all directions, and as much as how many ends it weighs."""
+"""The same before any end, in all directions, and the number of ends that this counts as."""
 
 
 class Passing(NamedTuple):

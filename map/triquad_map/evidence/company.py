@@ -23,10 +23,20 @@ from triquad_map.compiled.voxel_index import (
     pack,
 )
 
-_SPACINGS = 3.0  # of the rays, within which they are neighbours
-_SAME_RANGE = 1.0  # voxel, by which the ranges of returns on one surface may differ
-_OTHERS = 2  # that a return on a surface has; of drops, two may be near each other
-_SHARE = 0.4  # of its neighbours, half of which end no farther than a return on smooth ground
+_SPACINGS = 3.0
+"""Spacings of a scan's rays within which two are neighbours: some 28 are, of each."""
+
+_SAME_RANGE = 1.0
+"""Voxels by which the ranges of returns on one surface may differ. With three spacings of the rays
+instead, 1.5 % of drops are surface, not 0.9."""
+
+_OTHERS = 2
+"""Returns at the same range that one on a surface has: of drops, two may be near each other."""
+
+_SHARE = 0.4
+"""The share of its neighbours than which such a return ends no nearer. Smooth ground has just half:
+with 0.5, a corridor at 16 beams loses 1 % of what stands at the first scan."""
+
 _MOST_COMPARED = 256  # rays with one: where they are spread evenly, some 100 are near enough
 _PATCH = 0.25  # radians: the sensor's field of view is counted in patches of this side
 

@@ -55,10 +55,12 @@ EIGHTHS = 8
 MOST_SCANS = 255
 
 SAME_SURFACE = 0.35
-"""Standard deviation, in voxels, of the height of a surface farther on over its plane here."""
+"""Standard deviation, in voxels, of the height of a surface over its plane next to it: two things
+are two where one is higher over the other."""
 
 MOST_SEEN = np.float32(10)
-"""Scans' worth of rays that a record counts: what was seen longer is no surer."""
+"""Scans' worth of rays that a record counts: what was seen longer is no surer, so that what stood
+for an hour goes as what stood for a minute."""
 
 ObservedVoxel = Any
 """A record of OBSERVED_VOXEL."""

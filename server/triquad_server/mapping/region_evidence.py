@@ -21,7 +21,10 @@ from triquad_server.intake.rays import ScanRays
 from triquad_server.mapping.region_setup import RegionSetup
 
 _CARVE_SHORT = 0.5  # voxels before its end up to which a ray shows free space
-_CLEAR_SHORT = 2.5  # voxels before its end up to which a ray shows that a surface is not there
+_CLEAR_SHORT = 2.5
+"""Voxels before its end up to which a ray shows that surface is not there: closer, it may belong to
+what it ends on."""
+
 _FAR_THINNED_AT, _OPEN_THINNED_AT = 0.5, 0.25  # shares of the rays' length
 
 _SURFELS_REFITTED = 8_000

@@ -200,7 +200,10 @@ def test_every_setting_is_read_somewhere() -> None:
             assert re.search(rf"\.{key}\b", code), f"{section}.{key} is unread"
 
 
-def test_the_page_is_the_one_that_the_settings_make() -> None:
-    page = (ROOT / "docs" / "settings.md").read_text()
-    with_tables = runpy.run_path(str(ROOT / "docs" / "settings_tables.py"))["with_tables"]
+@pytest.mark.parametrize(
+    ("name", "script"), [("settings.md", "settings_tables.py"), ("numbers.md", "numbers_table.py")]
+)
+def test_the_page_is_the_one_that_the_code_makes(name: str, script: str) -> None:
+    page = (ROOT / "docs" / name).read_text()
+    with_tables = runpy.run_path(str(ROOT / "docs" / script))["with_tables"]
     assert with_tables(page) == page, "run `make docs`"

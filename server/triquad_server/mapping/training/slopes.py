@@ -13,7 +13,9 @@ from triquad_server.mapping.replay.replay_pool import ReplayPool
 from triquad_server.mapping.training.training_budget import Step
 
 _EVERY_SAMPLES = 1 << 15  # samples after which the field is queried
-_SHARE = 0.25  # share of the samples; as many rays are updated, each of them a few times
+_SHARE = 0.25
+"""The share of the samples that are rays without a normal, whose slope follows the field. None
+at all: a street at 16 beams is learnt to 0.79 cm at first, but settles at 0.74 instead of 0.60."""
 
 
 class Slopes:

@@ -12,7 +12,8 @@ _STEP = 1.1
 """The factor between the possible numbers of rays per voxel: changing it is expensive, so it is
 done seldom."""
 
-_MOST_PER_RAY = 20.0  # samples that may be left, for each ray that a map of this size keeps
+_MOST_PER_RAY = 20.0
+"""Samples that may be left, for each ray that a map of this size keeps."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +37,12 @@ class FairShare:
         )
 
 
-_LEAST_RATE = 0.02  # share of the learning rate with which the last samples are trained
-_COOLDOWN = 8.0  # samples left per ray below which the learning rate falls
+_LEAST_RATE = 0.02
+"""The share of the learning rate with which the last samples are trained."""
+
+_COOLDOWN = 8.0
+"""Samples left per ray below which the learning rate falls. From 16 on, a street at 16 beams is
+learnt to 0.85 cm instead of 0.80."""
 
 
 class Step(NamedTuple):
