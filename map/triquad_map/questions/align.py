@@ -41,8 +41,8 @@ _COARSE_STEP_M, _FINE_STEP_M = 0.01, 0.002
 
 _LEAST_INLIER_SHARE = 0.5
 _LEAST_INLIERS = 50
-"""The least share of the points on surfaces, of those of which the map knows, and their number, for a
-pose to be found."""
+"""The least share of the points on surfaces, of those of which the map knows, and their number, for
+a pose to be found."""
 
 _OBSERVABLE = 0.01
 """A motion under which distances change by less (mean square, by that of the points) is not seen:

@@ -41,8 +41,8 @@ _SCANS_S = 0.05
 """The seconds for which scans are taken in before training goes on, at least."""
 
 _SCANS_SHARE = 6.0
-"""The time for which scans are taken in where many wait, as a multiple of what all else took. With 2, a
-lidar beside three clients that ask for too much lost 2 to 8 of 100 scans, with 6 none
+"""The time for which scans are taken in where many wait, as a multiple of what all else took. With
+2, a lidar beside three clients that ask for too much lost 2 to 8 of 100 scans, with 6 none
 (``make bench PART=server``)."""
 
 ResultT = TypeVar("ResultT")
