@@ -116,7 +116,10 @@ class _SyntheticMap:
     def meshes(self) -> None:
         """Make a tile of its mesh."""
         cache = TileCache(self._settings.mesh, self._teams.background)
-        cache.refresh(self._restored.publish())
+        epoch = self._restored.publish()
+        cache.refresh(epoch)
+        # A field that learnt so little may have no face in a tile.
+        epoch.near_ends(self._directions * self._radius_m, self._settings.mesh.reach_m)
         end_m = self._directions[0] * self._radius_m
         x, y, z = np.floor(end_m / cache.lattice(0).tile_side_m).astype(int).tolist()
         cache.make(0, (x, y, z))

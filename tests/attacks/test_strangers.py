@@ -20,6 +20,7 @@ from support.servers import (
     raw_session,
     server_process,
     sphere,
+    until,
 )
 from triquad_client import Client
 from triquad_format.wire import codec, keys
@@ -42,6 +43,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcess]:
     with server_process(arguments, endpoint) as running:
         with connected(running) as client:
             learn(client)
+            until(lambda: client.status().settled)  # later epochs have another cause than strangers
             client.checkpoint()
         yield running
 
