@@ -15,8 +15,8 @@ from triquad_format.records.region import MapRecord
 from triquad_format.records.seen_space import surface_voxels
 from triquad_format.wire.codec import Request
 from triquad_format.wire.limits import MAX_FILL_M
+from triquad_map.opening import open_view
 from triquad_map.questions.answers import Answers
-from triquad_map.record_view import open_view
 from triquad_map.view import MapView
 
 from triquad_client import checks

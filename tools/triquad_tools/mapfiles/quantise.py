@@ -17,7 +17,7 @@ import numpy as np
 from triquad_format.errors import FormatError
 from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.records.region import MAX_INTEGER, MapRecord, VertexTable, seen_voxels
-from triquad_map.record_view import open_view
+from triquad_map.opening import open_view
 
 _SEARCH_SEED, _MEASURE_SEED = 0, 1
 _FIRST_STEP = 1e-3  # in features of a table of one vertex; only where the search begins

@@ -15,7 +15,7 @@ from triquad_format.records.region import MapProgress, MapRecord, Region
 from triquad_format.records.replay_rays import are_held_out
 from triquad_format.records.seen_space import owned_evidence
 from triquad_map.field_fit import MapFit, PlaceFits, in_cube, map_fit
-from triquad_map.record_view import open_view
+from triquad_map.opening import open_view
 
 from triquad_tools.console.amounts import within
 from triquad_tools.console.report import Row, print_columns, print_rows
