@@ -5,7 +5,7 @@ behind it. The published label is the distance to the end point along the ray, w
 where the ray meets the surface at an angle. Where the surface's normal is known, the label here is
 the distance to its plane, so it changes by the cosine of the angle of incidence for each metre.
 Near edges and on small things the points around give no normal: there the label is the distance
-along the ray at first, then by the gradient of the field itself.
+along the ray at first, and by the gradient of the field itself once that knows the surface.
 
 All is in metres, relative to the region's centre. Every draw (3QFP, section III-C) makes new
 samples: a ray that is trained on again teaches other points of itself.
