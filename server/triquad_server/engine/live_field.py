@@ -108,8 +108,8 @@ of it), and the least share of the rate. So learnt values move little where othe
 LAST_AGE = int(_SOFT_STEPS / _HARDEST)  # from here on, no rate falls any more
 
 _MLP_SOFT_STEPS, _MLP_HARDEST = 300, 0.02
-"""The same of the MLP, which applies in addition to the above: all places of a region share it. With
-the numbers of rows, 6 % more tiles are sent where a street grows."""
+"""The same of the MLP, which applies in addition to the above: all places of a region share it.
+With the numbers of rows, 6 % more tiles are sent where a street grows."""
 
 
 class LiveField:

@@ -18,8 +18,8 @@ _SHARE = 0.25
 any, a street at 16 beams settles at 0.74 cm instead of 0.60."""
 
 _LEARNT_WITHIN, _LEARNT_SLOPE = 0.25, 0.5
-"""The surface of a field that knows it is as near to a ray's end, in leaves, and its gradient longer
-than that."""
+"""The surface of a field that knows it is as near to a ray's end, in leaves, and its gradient
+longer than that."""
 
 
 class Slopes:
