@@ -47,7 +47,7 @@ _ON_SURFACE = 0.1
 """The most, in voxels, that the field may be off on a surface. Where the steps lead there is none
 if it is more: where it is flat in the free space of a corner, it comes near zero without crossing
 it. And it has learnt the surface in a voxel if it is no more at the mean of the ends there. With
-half of it or one and a half times, meshes of a street and of a room are as good."""
+0.15, the mesh of a room is half a point of F-score worse after 0.3 million samples."""
 
 _FLATTEST = 0.3
 """A field that is flatter than this, as a slope, was not trained there, and shows no surface. With

@@ -38,7 +38,7 @@ from triquad_map.evidence.observed import (
 from triquad_map.evidence.seen_voxels import SeenVoxels
 
 _REACH = 2
-"""The voxels around one that may belong together with it: far beams leave gaps of one."""
+"""How many voxels away others may belong together with one: far beams leave gaps of one."""
 
 _PRIOR = 0.5  # hits and misses, scans: Jeffreys' prior of a chance
 

@@ -27,8 +27,8 @@ _SPACINGS = 3.0
 """Spacings of a scan's rays within which two are neighbours: some 28 are, of each."""
 
 _SAME_RANGE = 1.0
-"""Voxels by which the ranges of returns on one surface may differ. With three spacings of the rays
-instead, 1.5 % of drops are surface, not 0.9."""
+"""The largest difference of the ranges of two returns on one surface, in voxels. With three
+spacings of the rays instead, 1.5 % of drops are surface, not 0.9."""
 
 _OTHERS = 2
 """Returns at the same range that one on a surface has: of drops, two may be near each other."""

@@ -41,8 +41,8 @@ _SCANS_S = 0.05
 """The seconds for which scans are taken in before training goes on, at least."""
 
 _SCANS_SHARE = 6.0
-"""The time for which scans are taken in where many wait, as a multiple of what all else took. With
-2, a lidar beside three clients that ask for too much lost 2 to 8 of 100 scans, with 6 none
+"""The time for which scans are taken in where many wait, as a multiple of what all else took. While
+three clients ask for too much, a lidar loses 2 to 8 of 100 scans with 2, and none to 4 with 6
 (``make bench PART=server``)."""
 
 ResultT = TypeVar("ResultT")
