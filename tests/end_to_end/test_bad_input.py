@@ -88,7 +88,7 @@ GOOD = codec.encode(servers.scan())
         (changed(servers.scan(), source="radar"), "key_source_mismatch"),
         (changed(servers.scan(), sequence=-1), "bad_sequence"),
         (changed(servers.scan(), sequence=2**62), "bad_sequence"),
-        (codec.encode(servers.scan(points=np.zeros((600_000, 3), np.float32))), "too_large"),
+        (codec.encode(servers.scan(points=np.zeros((2_600_000, 3), np.float32))), "too_large"),
     ],
 )
 def test_scans_that_cannot_be_read_are_counted_by_reason(peer, client, payload, reason):
@@ -108,7 +108,6 @@ def test_scans_that_cannot_be_read_are_counted_by_reason(peer, client, payload, 
     ("changes", "reason"),
     [
         ({"points": np.zeros((0, 3), np.float32)}, "empty"),
-        ({"points": np.zeros((500_001, 3), np.float32)}, "too_many_points"),
         ({"world_from_sensor": np.full((4, 4), np.inf)}, "pose_not_finite"),
         ({"world_from_sensor": np.zeros((4, 4))}, "pose_not_rigid"),
         ({"world_from_sensor": np.eye(4) + np.eye(4, k=3) * 1e9}, "outside_world"),

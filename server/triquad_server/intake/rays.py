@@ -1,5 +1,6 @@
 """Turns a scan into the rays that are used: checked, classified by range, thinned, transformed."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -101,16 +102,6 @@ def _check_shapes(points: Floats, no_return: Floats) -> None:
             raise ScanRefusedError(f"{what}_shape", f"{what}: {list(array.shape)}, not [N, 3]")
 
 
-def _check_count(points: Floats, no_return: Floats, max_points: int) -> None:
-    """Refuse more than ``max_points`` points and rays without a return."""
-    count = len(points) + len(no_return)
-    if count > max_points:
-        raise ScanRefusedError(
-            "too_many_points",
-            f"{count} points and rays without a return exceed scan.max_points = {max_points}",
-        )
-
-
 def _unit_vectors(no_return: Floats) -> Doubles:
     """Return unit vectors [M, 3] along the rays without a return; refuse what is no direction."""
     vectors = no_return.astype(np.float64)
@@ -205,6 +196,12 @@ def _select(points: Floats, limits: _Limits, keys: Longs) -> _Selection:
     )
 
 
+def _thinned(rays: Doubles, limit: int, of_all: Sequence[Doubles]) -> Doubles:
+    """Return an even part of some rays [N, 3], so that at most ``limit`` are left of all kinds."""
+    step = -(-sum(map(len, of_all)) // limit)
+    return rays[::step] if step > 1 else rays
+
+
 def _why_empty(
     points: int, disbelieved: int, settings: ScanSettings, *, source: SourceSettings
 ) -> str:
@@ -245,10 +242,14 @@ def usable_rays(
     empty = np.empty((0, 3), np.float32) if no_return is None else no_return
     _check_pose(world_from_sensor)
     _check_shapes(points, empty)
-    _check_count(points, empty, settings.max_points)
     directions = _unit_vectors(empty) if source.no_return else np.empty((0, 3))
     disbelieved = 0 if source.no_return else len(empty)
-    low, high = (np.array(corner, np.float64) for corner in source.robot_box_m or _NOWHERE)
+    begin = np.array(source.ray_origin_m)
+    low, high = (np.array(corner) - begin for corner in source.robot_box_m or _NOWHERE)
+    if begin.any():
+        points = (points - begin).astype(np.float32)
+        world_from_sensor = world_from_sensor.copy()
+        world_from_sensor[:3, 3] += world_from_sensor[:3, :3] @ begin
     limits = _Limits(
         settings.range_min_m,
         settings.range_max_m,
@@ -264,12 +265,17 @@ def usable_rays(
         raise ScanRefusedError(
             "empty", _why_empty(len(points), disbelieved, settings, source=source)
         )
+    given_rays = found.kept, found.beyond, directions
+    used = [_thinned(rays, settings.max_points, given_rays) for rays in given_rays]
+    surplus = sum(map(len, given_rays)) - sum(map(len, used))
+    others = {"no_return": disbelieved, "too_many": surplus}
     rotation, origin = world_from_sensor[:3, :3], world_from_sensor[:3, 3]
+    ends, far, open_directions = (rays @ rotation.T for rays in used)
     return ScanRays(
         origin.copy(),
-        found.kept @ rotation.T + origin,
-        found.dropped | ({"no_return": disbelieved} if disbelieved else {}),
-        far_ends=found.beyond @ rotation.T + origin,
-        open_ends=settings.range_max_m * directions @ rotation.T + origin,
+        ends + origin,
+        found.dropped | {reason: count for reason, count in others.items() if count},
+        far_ends=far + origin,
+        open_ends=settings.range_max_m * open_directions + origin,
         robot=RobotBox(low, high, world_from_sensor) if source.robot_box_m else None,
     )

@@ -35,6 +35,9 @@ queue are lost."""
 _MAX_BYTES = 100_000_000
 """The bytes of the scans of all sources that wait; of the source that has most, the oldest goes."""
 
+_SURPLUS = 5
+"""So many times the points that are used may come: an image of 1920 x 1080 pixels, for one."""
+
 _SCAN_BYTES = 2_000  # memory of a scan in addition to its points
 
 
@@ -155,9 +158,9 @@ class ScanIntake:
     ) -> None:
         """Begin to receive; ``arrived`` is called after each scan that was queued.
 
-        Messages that are larger than ``max_points`` points can be are dropped.
+        Messages that are larger than five times ``max_points`` points can be are dropped.
         """
-        self._max_bytes = payload_limit(max_points)
+        self._max_bytes = payload_limit(_SURPLUS * max_points)
         self._queue = queue
         self._arrived = arrived
         # Decoded in the network's own threads: who sends too much is slowed down, and no other.

@@ -86,7 +86,8 @@ class ScanSettings(BaseModel):
     """Samples of free space end so far behind the end point."""
 
     max_points: Annotated[int, Field(ge=1, le=20_000_000)] = 500_000
-    """A larger scan is refused."""
+    """Of a scan with more rays, thinned, an even part is used. One of more than five times as many
+    points is refused."""
 
 
 _Coordinate = Annotated[float, Field(ge=-20, le=20)]
@@ -111,9 +112,13 @@ class SourceSettings(BaseModel):
     no_return: bool = True
     """Whether rays of which a scan says that they met nothing are believed."""
 
+    ray_origin_m: _Corner = (0.0, 0.0, 0.0)
+    """Where its rays begin, metres, in the frame of its scans: where the lidar sits, if a driver
+    publishes points in the frame of the robot's base. Ranges count from there."""
+
     robot_box_m: Box | None = None
-    """Two corners, metres, sensor frame, of the space that the robot takes up: points in it are
-    dropped, and where the robot has been it is free."""
+    """Two corners, metres, in the frame of its scans, of the space that the robot takes up: points
+    in it are dropped, and where the robot has been it is free."""
 
 
 ANY_SOURCE = SourceSettings()

@@ -71,7 +71,6 @@ def test_what_lies_well_behind_something_else_is_kept() -> None:
         ("points_shape", np.zeros((4, 2), np.float32), pose()),
         ("empty", np.zeros((0, 3), np.float32), pose()),
         ("empty", np.full((10, 3), np.nan, np.float32), pose()),
-        ("too_many_points", np.zeros((500_001, 3), np.float32), pose()),
     ],
 )
 def test_refusals_name_their_reason(reason: str, scan: np.ndarray, at: np.ndarray) -> None:
@@ -91,6 +90,39 @@ def test_what_is_no_direction_is_refused_by_its_index(bad: tuple[float, float, f
     with pytest.raises(ScanRefusedError, match="direction 1 of no_return") as refusal:
         usable_rays(points((5, 0, 0)), pose(), SETTINGS, no_return=points((0, 0, 1), bad))
     assert refusal.value.reason == "bad_no_return"
+
+
+def test_of_a_scan_with_too_many_rays_an_even_part_is_used() -> None:
+    at = np.arange(1_000)
+    ring = 20 * np.stack([np.cos(at / 100), np.sin(at / 100), 0 * at], 1).astype(np.float32)
+    few = SETTINGS.model_copy(update={"max_points": 400})
+    rays = usable_rays(ring, pose(), few, no_return=points(*np.eye(3)))
+    np.testing.assert_allclose(rays.ends, ring[::3], atol=1e-5)
+    assert len(rays.open_ends) == 1
+    assert rays.points_dropped == {"too_many": 1_003 - 334 - 1}
+
+
+def test_rays_that_begin_off_their_frame_are_those_of_the_sensor_there() -> None:
+    turn = pose()
+    turn[:3, :3] = Rotation.from_euler("xyz", [0.2, -0.3, 0.9]).as_matrix()
+    there = turn.copy()
+    there[:3, 3] += turn[:3, :3] @ (0.5, 0.2, 1.8)
+    scan = np.random.default_rng(0).normal(size=(200, 3)) * 9
+    box = np.array([[-2.0, -1, -1.8], [2, 1, 1]])
+    settings = {"ray_origin_m": (0.5, 0.2, 1.8), "robot_box_m": box + (0.5, 0.2, 1.8)}
+    base = usable_rays(
+        (scan + (0.5, 0.2, 1.8)).astype(np.float32),
+        turn,
+        SETTINGS,
+        source=SourceSettings(**settings),
+    )
+    sensor = usable_rays(
+        scan.astype(np.float32), there, SETTINGS, source=SourceSettings(robot_box_m=box)
+    )
+    np.testing.assert_allclose(base.origin, sensor.origin, atol=1e-12)
+    np.testing.assert_allclose(base.ends, sensor.ends, atol=1e-5)
+    assert base.points_dropped == sensor.points_dropped
+    np.testing.assert_allclose(base.robot.corners, sensor.robot.corners, atol=1e-12)
 
 
 def test_points_on_the_robot_are_told_from_near_ones() -> None:
