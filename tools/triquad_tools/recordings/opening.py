@@ -11,25 +11,29 @@ import numpy as np
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.lines import print_remark
 from triquad_tools.recordings.bag import find_bag
+from triquad_tools.recordings.checks import without_repeated
 from triquad_tools.recordings.cloud import points_in_range
 from triquad_tools.recordings.folders.cloud_folder import is_cloud_folder, read_cloud_folder
 from triquad_tools.recordings.folders.depth_folder import is_depth_folder, read_depth_folder
 from triquad_tools.recordings.folders.scan_folder import ScanFolder
-from triquad_tools.recordings.recording import ReadingOptions, ScanEntry, options_of
+from triquad_tools.recordings.recording import Place, ReadingOptions, ScanEntry, options_of
 from triquad_tools.recordings.ros_recording import RosRecording
 from triquad_tools.sensors.sweep import PosedScan
 
 Recording = RosRecording | ScanFolder
 """A recording that was checked as a whole, so that its errors are known."""
 
+_ORIGIN = 0.0, 0.0, 0.0
+
 _FLAGS = {"transforms": "--transform", "deskew": "--no-deskew"}
 """The flags whose names are not those of the choices that they set."""
 
 _OF_BAGS = {
     "topics", "poses", "map_frame", "body_frame", "transforms", "recorder_clock", "stride",
+    "points_in", "ray_origin",
 }  # fmt: skip
 _OF_DEPTH = {"trajectory", "intrinsics", "units_per_metre", "stride"}
-_OF_CLOUDS = {"trajectory", "points_in", "deskew"}
+_OF_CLOUDS = {"trajectory", "points_in", "ray_origin", "deskew"}
 """The choices that mean something for each kind of recording."""
 
 
@@ -72,6 +76,7 @@ class Selection:
     recording: Recording
     indices: Sequence[int]
     range_min_m: float
+    ray_origin: Place  # in the frame of the points
     way: str  # in which it is read: another one may give other scans
 
     def __len__(self) -> int:
@@ -86,8 +91,13 @@ class Selection:
     def scans(self, start: int = 0) -> Iterator[PosedScan]:
         """Yield the scans from number ``start`` on, one after the other."""
         for scan in self.recording.read(self.indices[start:]):
-            points = points_in_range(np.asarray(scan.points, np.float32), self.range_min_m)
-            yield PosedScan(points, scan.world_from_sensor)
+            points = without_repeated(np.asarray(scan.points, np.float32))
+            pose = scan.world_from_sensor
+            if any(self.ray_origin):
+                begin = np.array(self.ray_origin)
+                points = (points - begin).astype(np.float32)
+                pose = pose @ np.block([[np.eye(3), begin[:, None]], [0, 0, 0, 1]])
+            yield PosedScan(points_in_range(points, self.range_min_m), pose)
 
 
 def open_selected(options: argparse.Namespace) -> Selection:
@@ -110,7 +120,7 @@ def open_selected(options: argparse.Namespace) -> Selection:
             "see --start, --end and --every"
         )
     way = repr((options.recording.resolve(), reading, options.range_min))
-    return Selection(recording, indices, options.range_min, way)
+    return Selection(recording, indices, options.range_min, reading.ray_origin or _ORIGIN, way)
 
 
 def length_s(entries: Sequence[ScanEntry]) -> float:

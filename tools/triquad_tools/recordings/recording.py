@@ -9,12 +9,20 @@ from typing import Literal
 from triquad_client.depth_image import Intrinsics
 from triquad_client.pose import Pose
 
-from triquad_tools.console.arguments import count, not_negative, positive
+from triquad_tools.console.arguments import count, not_negative, positive, within
 from triquad_tools.sensors.motion.frame_tree import STATIC, Transform
 from triquad_tools.sensors.ros.header import frame_name
 
+WORLD, SENSOR = "world", "sensor"
+"""The frames in which points may be."""
+
 DEFAULT_SOURCE = "default"
 """The source of recordings that name no sensor: the client's default, too."""
+
+Place = tuple[float, float, float]
+"""Metres."""
+
+_FARTHEST_M = 100.0  # that a sensor sits from the frame of its clouds
 
 _Add = Callable[..., argparse.Action]
 
@@ -50,6 +58,7 @@ class ReadingOptions:
     recorder_clock: bool = False  # stamps are when a message was recorded
     trajectory: Path | None = None  # the file of poses; else that with a usual name
     points_in: Literal["sensor", "world"] | None = None  # frame of clouds; else sensor, and checked
+    ray_origin: Place | None = None  # of clouds, in their frame; else its origin, and checked
     deskew: bool = True  # take the sensor's motion out of clouds whose points have times
     intrinsics: Intrinsics | None = None  # of depth images; else those of a file in the folder
     units_per_metre: float | None = None  # of a pixel; else 5000 for TUM RGB-D, 1000 for others
@@ -84,6 +93,8 @@ def _add_choice(add: _Add) -> None:
     add("--every", type=count, default=1, metavar="N", help="take every Nth scan of each sensor")
     nearer = "leave out nearer points: the vehicle's own body (default: 0)"
     add("--range-min", type=not_negative, default=0.0, metavar="M", help=nearer)
+    begin = "where rays begin, metres, in the frame of the clouds (default: 0,0,0, and checked)"
+    add("--ray-origin", type=_place, metavar="X,Y,Z", help=begin)
 
 
 def _add_ros(add: _Add) -> None:
@@ -110,7 +121,7 @@ def _add_ros(add: _Add) -> None:
 def _add_folder(add: _Add) -> None:
     add("--trajectory", type=Path, metavar="FILE", help="of poses (default: one with a usual name)")
     frame = "frame of the points of clouds (default: sensor, and checked)"
-    add("--points-in", choices=("sensor", "world"), help=frame)
+    add("--points-in", choices=(SENSOR, WORLD), help=frame)
     skewed = "clouds are free of motion, though they have times"
     add("--no-deskew", dest="deskew", action="store_false", help=skewed)
     camera = "of the depth camera, pixels (default: of a file in the folder)"
@@ -134,6 +145,17 @@ def transform(text: str) -> Transform:
             f"'base_link lidar 0 0 1.5 0 0 0 1' ({error})"
         ) from error
     return Transform(frame_name(parent), frame_name(child), STATIC, pose)
+
+
+def _place(text: str) -> Place:
+    """Return a place such as ``0.9,0,1.8``, metres."""
+    try:
+        x, y, z = (within(-_FARTHEST_M, _FARTHEST_M, number) for number in text.split(","))
+    except (ValueError, argparse.ArgumentTypeError) as error:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}: use X,Y,Z in metres, such as 0.9,0,1.8 ({error})"
+        ) from error
+    return x, y, z
 
 
 def _intrinsics(text: str) -> Intrinsics:

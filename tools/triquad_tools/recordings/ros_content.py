@@ -10,6 +10,7 @@ from triquad_format.errors import InvalidInputError
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
 from triquad_tools.recordings.bag import Bag, Message
+from triquad_tools.recordings.checks import RayCheck
 from triquad_tools.sensors.motion.frame_tree import STATIC, FrameTree, Track, Transform
 from triquad_tools.sensors.ros import type_store
 from triquad_tools.sensors.ros.depth_camera import is_depth
@@ -60,6 +61,7 @@ class RosContent:
         self.kinds: dict[str, str] = {}
         self.counts: Counter[str] = Counter()
         self.clouds: list[SeenCloud] = []
+        self.rays = RayCheck()
         self.frames = FrameTree()
         self.poses: dict[str, PoseTopic] = defaultdict(PoseTopic)
         self.broken: dict[str, list[str]] = defaultdict(list)
@@ -109,6 +111,8 @@ class RosContent:
         except NoScanError as error:
             self.clouds.append(SeenCloud(topic, number, problem=error))
             return
+        if message.kind != type_store.IMAGE:
+            self.rays.see(topic, sweep.points)
         first_ns, last_ns = sweep.span_ns
         self.clouds.append(SeenCloud(topic, number, sweep.frame, sweep.stamp_ns, first_ns, last_ns))
 

@@ -8,14 +8,14 @@ import numpy as np
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.bag import Bag, Message
-from triquad_tools.recordings.recording import ReadingOptions, ScanEntry, Stream
+from triquad_tools.recordings.recording import SENSOR, WORLD, ReadingOptions, ScanEntry, Stream
 from triquad_tools.recordings.ros_content import RosContent, SeenCloud
 from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES, FrameTree
 from triquad_tools.sensors.motion.placing import place
 from triquad_tools.sensors.ros import type_store
 from triquad_tools.sensors.ros.header import source_of_topic
 from triquad_tools.sensors.ros.message_reader import MessageReader
-from triquad_tools.sensors.sweep import NoScanError, NoTransformError, PosedScan
+from triquad_tools.sensors.sweep import NoScanError, NoTransformError, PosedScan, Sweep, moved
 
 TF = "tf"
 """Stands for all transforms, whatever their topics."""
@@ -36,6 +36,12 @@ _MISSING = (
     "{count:,} messages that its index names could not be read: it is damaged; 'mcap recover', "
     "'rosbag reindex' or 'ros2 bag reindex' saves what is left"
 )
+_STANDS = (
+    "its points are in {frame}, which stands still in the map while {body} moves, so their rays do "
+    "not begin there: map the topic of clouds in the frame of the sensor. Where there is none, "
+    "--points-in world has them begin at {body}, or at the frame of --body-frame, and --ray-origin "
+    "X,Y,Z where the sensor sits on it; --points-in sensor is for a sensor that does stand there"
+)
 _NO_CLOUDS = "it holds no clouds (PointCloud2) and no depth images (Image): nothing to map"
 _NO_POSES = (
     "it holds no poses: record /tf with /tf_static, or a topic of odometry or poses, together with "
@@ -53,6 +59,17 @@ class PoseSource:
     target: str
     body: str  # the frame whose poses they are, or one that hangs on it
     assumed: bool = False  # nothing says that they are its poses
+
+    def moves(self, frame: str) -> bool:
+        """Return whether a frame moves in the one to map in."""
+        return self.frames.moves(self.target, frame)
+
+    def seen(self, scan: PosedScan, sweep: Sweep) -> PosedScan:
+        """Return a scan whose points stand still in the map as the body saw them."""
+        stamps = np.array([sweep.stamp_ns], np.int64)
+        (pose,) = self.frames.poses(self.target, self.body, stamps)
+        points = moved(scan.points, np.linalg.inv(pose) @ scan.world_from_sensor)
+        return PosedScan(points.astype(np.float32), pose)
 
     def find(self, cloud: SeenCloud) -> NoTransformError | None:
         """Return why the pose of a cloud is not known; None if it is."""
@@ -102,7 +119,7 @@ def _of_tf(frames: FrameTree, frame: str, options: ReadingOptions) -> PoseSource
     """Return all transforms. If they do not reach the sensor, finding a cloud says so."""
     body = frame
     if not frames.moves(frames.root(frame), frame):
-        body = next(iter(frames.moving), frame)
+        body = options.body_frame or next(iter(frames.moving), frame)
     return PoseSource(TF, frames, options.map_frame or frames.fixed_frame(body), body)
 
 
@@ -130,10 +147,11 @@ class RosRecording:
         self._reader = MessageReader(stride=options.stride, by_arrival=options.recorder_clock)
         self._content = RosContent(bag, self._reader)
         self._topics = _chosen_topics(self._content, options)
+        self._options = options
         self._poses: PoseSource | None = None
         self._placed: list[SeenCloud] = []
         self._left_out: dict[tuple[str, str], list[SeenCloud]] = defaultdict(list)
-        self._place_clouds(options)
+        self._place_clouds()
 
     @property
     def entries(self) -> Sequence[ScanEntry]:
@@ -186,16 +204,18 @@ class RosRecording:
         decoded, came_ns = message.decoded(), message.recorded_ns
         try:
             sweep = self._reader.sweep(message.topic, message.kind, decoded, came_ns)
-            return place(sweep, self._poses.frames, self._poses.target)
+            scan = place(sweep, self._poses.frames, self._poses.target)
+            stands = self._options.points_in == WORLD and not self._poses.moves(sweep.frame)
+            return self._poses.seen(scan, sweep) if stands else scan
         except NoScanError as error:
             raise ToolError(f"{self._bag.path}: a message on {message.topic}: {error}") from error
 
-    def _place_clouds(self, options: ReadingOptions) -> None:
+    def _place_clouds(self) -> None:
         """Choose the poses, and find out which clouds they place."""
         clouds = [cloud for cloud in self._content.clouds if cloud.topic in self._topics]
         good = [cloud for cloud in clouds if cloud.problem is None]
         if good:
-            self._poses = choose_poses(self._content, good, options)
+            self._poses = choose_poses(self._content, good, self._options)
         newest_ns: dict[str, int] = {}
         for cloud in clouds:
             problem = self._problem(cloud, newest_ns)
@@ -213,7 +233,18 @@ class RosRecording:
             return NoScanError("no_poses", _NO_POSES)
         if cloud.stamp_ns < newest_ns.get(cloud.topic, cloud.stamp_ns):
             return NoScanError("time_backwards", "its stamp lies before that of the one before it")
-        return self._poses.find(cloud)
+        return self._poses.find(cloud) or self._misplaced(cloud)
+
+    def _misplaced(self, cloud: SeenCloud) -> NoScanError | None:
+        """Return why the rays of a cloud, whose pose is known, do not begin at its frame."""
+        assert self._poses is not None
+        body, way = self._poses.body, self._options.points_in
+        if not self._poses.moves(cloud.frame) and way != SENSOR:
+            if way == WORLD:
+                return self._poses.find(replace(cloud, frame=body))
+            return NoScanError("map_frame", _STANDS.format(frame=cloud.frame, body=body))
+        is_said = self._options.ray_origin is not None
+        return None if is_said else self._content.rays.problem(cloud.topic)
 
     def _left_out_line(self, topic: str, reason: str) -> str:
         clouds = self._left_out[topic, reason]

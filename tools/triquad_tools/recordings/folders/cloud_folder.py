@@ -1,6 +1,6 @@
 """Folders of clouds, a file each, with a trajectory next to them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -8,6 +8,7 @@ import numpy as np
 from triquad_format.records.arrays import Floats
 
 from triquad_tools.console.command import ToolError
+from triquad_tools.recordings.checks import RayCheck
 from triquad_tools.recordings.folders.point_file import POINT_SUFFIXES, check_points, read_points
 from triquad_tools.recordings.folders.scan_folder import (
     PlacedFile,
@@ -16,14 +17,14 @@ from triquad_tools.recordings.folders.scan_folder import (
     in_order,
     place_files,
 )
-from triquad_tools.recordings.folders.trajectory import SENSOR, WORLD, Trajectory
-from triquad_tools.recordings.recording import ReadingOptions, Stream
+from triquad_tools.recordings.folders.trajectory import Trajectory
+from triquad_tools.recordings.recording import SENSOR, WORLD, ReadingOptions, Stream
 from triquad_tools.recordings.text_lines import parse_rigid, parse_stamps, read_lines
 from triquad_tools.sensors.motion.placing import place
 from triquad_tools.sensors.point_times import offsets_s
 from triquad_tools.sensors.sweep import NoTransformError, PosedScan, Sweep, moved
 
-_TRIED = 3  # clouds, to determine the frame of all
+_TRIED = 4  # clouds, to determine the frame of all
 _CLEARLY = 2.0  # times nearer to where the sensor was than to the origin, or the other way round
 
 _DEEPER = "velodyne_points/data"  # where KITTI's raw recordings have theirs
@@ -49,14 +50,18 @@ def read_cloud_folder(folder: Path, options: ReadingOptions | None = None) -> Sc
     first, poses, files = paths[0], placed.trajectory, placed.files
     if first.suffix == ".bin" and poses.frames is None:
         files = of_lidar(folder, files)
+    tried = [files[len(files) * (2 * step + 1) // (2 * _TRIED)] for step in range(_TRIED)]
     if options.points_in is None:
-        _check_frame(files)
+        _check_frame(tried)
+    read_file = partial(_read_scan, poses, options)
+    if options.ray_origin is None:
+        _check_rays(first.parent, map(read_file, tried))
     clouds, kind = f"{first.parent.name}/*{first.suffix}", first.suffix[1:].upper() + " clouds"
     streams = (
         Stream(clouds, kind, len(files), "scans", options.points_in or SENSOR),
         Stream(poses.path.name, poses.kind, len(poses.poses), "poses of the sensor"),
     )
-    return ScanFolder(files, partial(_read_scan, poses, options), streams, placed.remarks)
+    return ScanFolder(files, read_file, streams, placed.remarks)
 
 
 def _read_scan(trajectory: Trajectory, options: ReadingOptions, file: PlacedFile) -> PosedScan:
@@ -106,19 +111,32 @@ def _cloud_paths(folder: Path) -> list[Path]:
     return paths
 
 
-def _check_frame(files: Sequence[PlacedFile]) -> None:
+def _check_frame(tried: Sequence[PlacedFile]) -> None:
     """Check that points lie around their sensor, not around where it was in the world.
 
     Raises:
         ToolError: a few clouds from all over the recording lie around where it was.
     """
-    tried = [files[len(files) * (2 * step + 1) // (2 * _TRIED)] for step in range(_TRIED)]
     if all(map(_lies_around_its_place, tried)):
         raise ToolError(
-            f"{files[0].path.parent}: the points seem to be in the world frame: in "
+            f"{tried[0].path.parent}: the points seem to be in the world frame: in "
             f"{tried[0].path.name} they lie around where the sensor was, not around the origin; "
             "use --points-in world, or --points-in sensor if this is wrong"
         )
+
+
+def _check_rays(folder: Path, scans: Iterable[PosedScan]) -> None:
+    """Check that rays begin at the frame of the points.
+
+    Raises:
+        ToolError: they begin elsewhere.
+    """
+    rays = RayCheck()
+    for scan in scans:
+        rays.see(str(folder), scan.points)
+    problem = rays.problem(str(folder))
+    if problem is not None:
+        raise ToolError(f"{folder}: {problem}")
 
 
 def _lies_around_its_place(file: PlacedFile) -> bool:

@@ -15,6 +15,7 @@ from triquad_client.pose import Pose
 from triquad_format.records.arrays import Doubles, Longs
 
 from triquad_tools.console.command import ToolError
+from triquad_tools.recordings.recording import SENSOR, WORLD
 from triquad_tools.recordings.text_lines import (
     Line,
     parse_numbers,
@@ -27,9 +28,6 @@ from triquad_tools.sensors.sweep import NoTransformError
 
 DEFAULT_PERIOD_NS = 100_000_000
 """The time between scans of a recording without times."""
-
-WORLD, SENSOR = "world", "sensor"
-"""The frames of a trajectory."""
 
 _ROUNDING_NS = 1_000_000  # files write times with as few as three decimals
 

@@ -1,0 +1,127 @@
+"""Where rays begin: clouds that nobody can have seen from there are told, and can be put right."""
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.recordings.bags import Recorded, messages_for, write_bag
+from support.ros.ros_messages import CLOUD, TF
+from triquad_tools.console.command import ToolError
+from triquad_tools.recordings.checks import hidden_share, without_repeated
+from triquad_tools.recordings.opening import Selection, open_recording, open_selected
+from triquad_tools.recordings.recording import ReadingOptions, add_recording
+
+LOW, HIGH = np.array([-10.0, -5, 0]), np.array([90.0, 5, 6])  # a hall
+UP = np.array([0.4, 0, 1.7])  # the lidar on the robot's base, which is on the ground
+STAMPS = [1_700_000_000 * 10**9 + i * 10**8 for i in range(9)]
+ROS2 = messages_for("mcap")
+
+
+def base(number: int) -> np.ndarray:
+    turn, pose = 0.1 * number, np.eye(4)
+    pose[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    pose[:3, 3] = 3 * number, 0.2 * number, 0
+    return pose
+
+
+def seen_from(pose: np.ndarray) -> np.ndarray:
+    """What a lidar of 32 beams on the base sees of the hall, points [N, 3] in the base's frame."""
+    up, around = np.radians(np.meshgrid(np.linspace(-25, 15, 32), np.arange(360) + 0.3))
+    rays = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], -1)
+    rays = rays.reshape(-1, 3)
+    directions, eye = rays @ pose[:3, :3].T, pose[:3, :3] @ UP + pose[:3, 3]
+    lengths = (np.where(directions > 0, HIGH, LOW) - eye) / directions
+    return rays * lengths.min(axis=1, keepdims=True) + UP
+
+
+def in_frame(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    return (points @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)
+
+
+def recorded(frame: str) -> Iterator[Recorded]:
+    """A drive whose clouds are in the frame of the lidar, of the base or of the map."""
+    lidar = np.eye(4)
+    lidar[:3, 3] = UP
+    yield Recorded("/tf_static", TF, STAMPS[0] - 1, ROS2.tf(0, ("base_link", "lidar", lidar)))
+    for number, stamp in enumerate(STAMPS):
+        pose = base(number)
+        moved = {"lidar": np.linalg.inv(lidar), "base_link": np.eye(4), "camera_init": pose}[frame]
+        cloud = ROS2.cloud(in_frame(seen_from(pose), moved), stamp, frame)
+        yield Recorded("/tf", TF, stamp, ROS2.tf(stamp, ("camera_init", "base_link", pose)))
+        yield Recorded("/points", CLOUD, stamp + 1, cloud)
+
+
+def selected(path: Path, *arguments: str) -> Selection:
+    parser = argparse.ArgumentParser()
+    add_recording(parser)
+    return open_selected(parser.parse_args([str(path), *arguments]))
+
+
+def assert_right(selection: Selection) -> None:
+    """Rays begin at the lidar, and end where it saw something."""
+    assert len(selection) == len(STAMPS)
+    for number, scan in enumerate(selection.scans()):
+        pose = base(number)
+        np.testing.assert_allclose(scan.world_from_sensor[:3, 3], in_frame(UP, pose), atol=1e-5)
+        ends = in_frame(scan.points, scan.world_from_sensor)
+        np.testing.assert_allclose(ends, in_frame(seen_from(pose), pose), atol=1e-4)
+
+
+def test_clouds_in_the_frame_of_the_lidar_are_taken_as_they_are(tmp_path: Path) -> None:
+    assert_right(selected(write_bag(tmp_path / "bag", "mcap", recorded("lidar"))))
+
+
+def test_clouds_in_the_frame_of_the_base_need_the_place_of_the_lidar(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "bag", "mcap", recorded("base_link"))
+    recording = open_recording(bag, ReadingOptions())
+    assert not recording.entries
+    (remark,) = recording.remarks
+    assert "/points: 9 of 9 are left out: " in remark
+    assert "--ray-origin X,Y,Z" in remark
+    assert_right(selected(bag, "--ray-origin", "0.4,0,1.7"))
+    assert len(selected(bag, "--ray-origin", "0,0,0")) == len(STAMPS), "who says so is believed"
+
+
+def test_clouds_in_the_frame_of_the_map_need_a_body_that_saw_them(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "bag", "mcap", recorded("camera_init"))
+    recording = open_recording(bag, ReadingOptions())
+    assert not recording.entries
+    (remark,) = recording.remarks
+    assert "camera_init, which stands still in the map while base_link moves" in remark
+    assert "--points-in world" in remark
+    assert_right(selected(bag, "--points-in", "world", "--ray-origin", "0.4,0,1.7"))
+    assert_right(selected(bag, "--points-in", "world", "--body-frame", "lidar"))
+    stands = selected(bag, "--points-in", "sensor", "--ray-origin", "0,0,0")
+    assert all(np.array_equal(scan.world_from_sensor, np.eye(4)) for scan in stands.scans())
+
+
+def test_folders_of_clouds_are_checked_as_well(tmp_path: Path) -> None:
+    for number in range(len(STAMPS)):
+        points = in_frame(seen_from(base(number)), np.eye(4))
+        np.pad(points, ((0, 0), (0, 1))).tofile(tmp_path / f"{number:06d}.bin")
+    rows = [" ".join(map(str, base(number)[:3].ravel())) for number in range(len(STAMPS))]
+    (tmp_path / "poses.txt").write_text("\n".join(rows))
+    with pytest.raises(ToolError, match=r"lie behind others.*--ray-origin X,Y,Z"):
+        open_recording(tmp_path, ReadingOptions())
+    assert_right(selected(tmp_path, "--ray-origin", "0.4,0,1.7"))
+
+
+def test_few_points_lie_behind_others_from_the_sensor_alone() -> None:
+    points = seen_from(base(3))
+    assert hidden_share(points - UP) == 0
+    assert hidden_share(points) > 0.07
+    assert hidden_share(in_frame(points, base(3))) > 0.07
+    assert hidden_share(np.zeros((5, 3))) == hidden_share(np.zeros((0, 3))) == 0
+
+
+def test_points_that_many_are_equal_to_are_no_measurements() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(500, 3)).astype(np.float32)
+    points[:40, 0] = 1.5  # a wall
+    points[100:300:3] = UP
+    points[400] = np.nan
+    kept = without_repeated(points)
+    np.testing.assert_array_equal(kept, np.delete(points, np.arange(100, 300, 3), axis=0))
+    np.testing.assert_array_equal(without_repeated(points[:9]), points[:9])
