@@ -48,6 +48,16 @@ def test_clouds_and_transforms_become_a_map(endpoint: str, way: str, mode: str) 
         assert finds_its_sphere(bridged)
 
 
+def test_rays_that_begin_off_their_frame_are_told(
+    endpoint: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    with bridging(endpoint) as bridged, robot(endpoint) as r2:
+        stand(r2, 0, 1)
+        r2.cloud(0.1, np.concatenate([servers.sphere(), 2 * servers.sphere()]))
+        bridged.wait_for(lambda: "which the setting ray_origin_m of its source has" in caplog.text)
+    assert "/points: 50% of the points lie behind others" in caplog.text
+
+
 def test_clouds_wait_for_their_transforms_and_stay_in_order(endpoint: str) -> None:
     with bridging(endpoint, "--wait-s", 30) as bridged, robot(endpoint) as r2:
         for number in range(4):

@@ -22,6 +22,13 @@ DEFAULT_SOURCE = "default"
 Place = tuple[float, float, float]
 """Metres."""
 
+ORIGIN_REMEDIES = (
+    "--ray-origin X,Y,Z says where the sensor sits in it (metres; 0,0,0 if that is right); of "
+    "clouds that were merged, map those of each sensor; points in the frame of the map need "
+    "--points-in world"
+)
+"""What to do where rays begin elsewhere than at the frame of their points."""
+
 _FARTHEST_M = 100.0  # that a sensor sits from the frame of its clouds
 
 _Add = Callable[..., argparse.Action]

@@ -10,8 +10,8 @@ from triquad_format.errors import InvalidInputError
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
 from triquad_tools.recordings.bag import Bag, Message
-from triquad_tools.recordings.checks import RayCheck
 from triquad_tools.sensors.motion.frame_tree import STATIC, FrameTree, Track, Transform
+from triquad_tools.sensors.ray_check import RayCheck
 from triquad_tools.sensors.ros import type_store
 from triquad_tools.sensors.ros.depth_camera import is_depth
 from triquad_tools.sensors.ros.message_reader import MessageReader

@@ -8,7 +8,14 @@ import numpy as np
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.bag import Bag, Message
-from triquad_tools.recordings.recording import SENSOR, WORLD, ReadingOptions, ScanEntry, Stream
+from triquad_tools.recordings.recording import (
+    ORIGIN_REMEDIES,
+    SENSOR,
+    WORLD,
+    ReadingOptions,
+    ScanEntry,
+    Stream,
+)
 from triquad_tools.recordings.ros_content import RosContent, SeenCloud
 from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES, FrameTree
 from triquad_tools.sensors.motion.placing import place
@@ -243,8 +250,10 @@ class RosRecording:
             if way == WORLD:
                 return self._poses.find(replace(cloud, frame=body))
             return NoScanError("map_frame", _STANDS.format(frame=cloud.frame, body=body))
-        is_said = self._options.ray_origin is not None
-        return None if is_said else self._content.rays.problem(cloud.topic)
+        problem = self._content.rays.begin_elsewhere(cloud.topic)
+        if problem is None or self._options.ray_origin is not None:
+            return None
+        return NoScanError("ray_origin", f"{problem}: {ORIGIN_REMEDIES}")
 
     def _left_out_line(self, topic: str, reason: str) -> str:
         clouds = self._left_out[topic, reason]

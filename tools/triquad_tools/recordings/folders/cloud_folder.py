@@ -8,7 +8,6 @@ import numpy as np
 from triquad_format.records.arrays import Floats
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.checks import RayCheck
 from triquad_tools.recordings.folders.point_file import POINT_SUFFIXES, check_points, read_points
 from triquad_tools.recordings.folders.scan_folder import (
     PlacedFile,
@@ -18,10 +17,17 @@ from triquad_tools.recordings.folders.scan_folder import (
     place_files,
 )
 from triquad_tools.recordings.folders.trajectory import Trajectory
-from triquad_tools.recordings.recording import SENSOR, WORLD, ReadingOptions, Stream
+from triquad_tools.recordings.recording import (
+    ORIGIN_REMEDIES,
+    SENSOR,
+    WORLD,
+    ReadingOptions,
+    Stream,
+)
 from triquad_tools.recordings.text_lines import parse_rigid, parse_stamps, read_lines
 from triquad_tools.sensors.motion.placing import place
 from triquad_tools.sensors.point_times import offsets_s
+from triquad_tools.sensors.ray_check import RayCheck
 from triquad_tools.sensors.sweep import NoTransformError, PosedScan, Sweep, moved
 
 _TRIED = 4  # clouds, to determine the frame of all
@@ -134,9 +140,9 @@ def _check_rays(folder: Path, scans: Iterable[PosedScan]) -> None:
     rays = RayCheck()
     for scan in scans:
         rays.see(str(folder), scan.points)
-    problem = rays.problem(str(folder))
+    problem = rays.begin_elsewhere(str(folder))
     if problem is not None:
-        raise ToolError(f"{folder}: {problem}")
+        raise ToolError(f"{folder}: {problem}: {ORIGIN_REMEDIES}")
 
 
 def _lies_around_its_place(file: PlacedFile) -> bool:

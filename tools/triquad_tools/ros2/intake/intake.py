@@ -26,6 +26,7 @@ from triquad_tools.ros2.intake.topic_listener import (
 from triquad_tools.ros2.node import Node
 from triquad_tools.ros2.options import TYPES, BridgeOptions, Role
 from triquad_tools.ros2.topics import SequenceGaps
+from triquad_tools.sensors.ray_check import RayCheck
 from triquad_tools.sensors.ros.header import source_of_topic
 from triquad_tools.sensors.ros.message_reader import MessageReader
 from triquad_tools.sensors.ros.type_store import decode_cdr
@@ -48,6 +49,7 @@ _SCANS_UNREAD = QueueLimits(16, 256_000_000)
 _OTHERS_UNREAD = QueueLimits(4096, 16_000_000)  # 4 s of transforms at 1 kHz
 _WAITING_BYTES = 512_000_000  # of sweeps that wait for their transforms
 _TICK_S = 0.2
+_SETTING = "which the setting ray_origin_m of its source has to tell the server (docs/server.md)"
 
 
 @dataclass(frozen=True)
@@ -141,6 +143,7 @@ class Intake:
             _OTHERS_UNREAD,
             lambda gone: self.drops.add(gone.topic_name, "pushed_out", "too many messages wait"),
         )
+        self._rays = RayCheck()
         self._gaps = SequenceGaps()
         self._gaps_lock = threading.Lock()
         self._first_scan = FirstScan(options.topics, time.monotonic())
@@ -224,11 +227,20 @@ class Intake:
         if role is Role.CAMERA_INFO:
             self._reader.cameras[topic_name] = message
         elif role.brings_scans:
-            self._place(topic_name, self._reader.sweep(topic_name, kind, message, came_ns))
+            sweep = self._reader.sweep(topic_name, kind, message, came_ns)
+            if role is Role.CLOUD:
+                self._check_rays(topic_name, sweep)
+            self._place(topic_name, sweep)
         else:
             static = role is Role.TF_STATIC
             found = self._reader.transforms(kind, message, came_ns, static=static)
             self._motion.add(found, is_body=role is Role.POSE)
+
+    def _check_rays(self, topic_name: str, sweep: Sweep) -> None:
+        """Log that rays of a topic begin elsewhere than at the frame of its clouds."""
+        self._rays.see(topic_name, sweep.points)
+        if (problem := self._rays.begin_elsewhere(topic_name)) is not None:
+            self.drops.remark(topic_name, f"{problem}, {_SETTING}")
 
     def _place(self, topic_name: str, sweep: Sweep) -> None:
         if self.scans.time_went_back(topic_name, sweep.stamp_ns):

@@ -1,4 +1,4 @@
-"""Whether rays begin where a recording says: seen from there, few points lie behind others.
+"""Whether rays begin at the frame of their points: seen from there, few lie behind others.
 
 A direction in which a sensor looks has one return. From elsewhere, from the robot's base on the
 ground or from the map's origin, rays to the same points pass through other points: the ground lies
@@ -10,8 +10,6 @@ from collections import Counter, defaultdict
 
 import numpy as np
 from numpy.typing import NDArray
-
-from triquad_tools.sensors.sweep import NoScanError
 
 _BIN_RAD = np.radians(0.25)
 """The side of the cells of direction that are compared: about one ray of lidars."""
@@ -71,15 +69,12 @@ class RayCheck:
         if self._seen[stream].bit_count() == 1:  # the first, the second, fourth, eighth, ...
             self._shares[stream].append(hidden_share(without_repeated(points)))
 
-    def problem(self, stream: str) -> NoScanError | None:
-        """Return why no scans can be made of a stream: its rays begin elsewhere."""
+    def begin_elsewhere(self, stream: str) -> str | None:
+        """Return why rays of a stream cannot begin at the frame of its points; None: they may."""
         share = statistics.median(self._shares[stream] or [0.0])
-        return NoScanError("ray_origin", _ELSEWHERE.format(share)) if share > _WRONG else None
-
-
-_ELSEWHERE = (
-    "{:.0%} of the points lie behind others as seen from the origin of their frame, so their rays "
-    "begin elsewhere: --ray-origin X,Y,Z says where the sensor sits in it (metres; 0,0,0 if that "
-    "is right); of clouds that were merged, map those of each sensor; points in the frame of the "
-    "map need --points-in world"
-)
+        if share <= _WRONG:
+            return None
+        return (
+            f"{share:.0%} of the points lie behind others as seen from the origin of their frame, "
+            "so their rays begin elsewhere"
+        )

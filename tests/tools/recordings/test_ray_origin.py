@@ -9,9 +9,9 @@ import pytest
 from support.recordings.bags import Recorded, messages_for, write_bag
 from support.ros.ros_messages import CLOUD, TF
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.checks import hidden_share, without_repeated
 from triquad_tools.recordings.opening import Selection, open_recording, open_selected
 from triquad_tools.recordings.recording import ReadingOptions, add_recording
+from triquad_tools.sensors.ray_check import hidden_share, without_repeated
 
 LOW, HIGH = np.array([-10.0, -5, 0]), np.array([90.0, 5, 6])  # a hall
 UP = np.array([0.4, 0, 1.7])  # the lidar on the robot's base, which is on the ground
