@@ -149,7 +149,7 @@ def _served(epoch: Epoch, ends: Doubles) -> Mesh:
     voxel_m = epoch.voxel_m
     everywhere = (np.full(3, -np.inf), np.full(3, np.inf))
     lattice = map_lattice(voxel_m / 2, REACH_LEAVES * voxel_m, whole=True)
-    return MapTiles(epoch, ends, lattice, everywhere, 0.0).joined(None)
+    return MapTiles(epoch, ends, lattice, everywhere, 0.0, np.zeros(3)).joined(None)
 
 
 def measure_learning(place: Place) -> list[Figure]:

@@ -190,6 +190,7 @@ def connect_async(
     timeout_s: float = 10.0,
     config: str | Path | None = None,
     max_download_bytes: int = MAX_DOWNLOAD_BYTES,
+    coordinates: str = "map",
 ) -> Connecting:
     """Connect to a map server: ``async with connect_async(...) as client``, or await it and close.
 
@@ -197,6 +198,11 @@ def connect_async(
     """
     return Connecting(
         lambda: open_connection(
-            endpoint, map, timeout_s, config, max_download_bytes=max_download_bytes
+            endpoint,
+            map,
+            timeout_s,
+            config,
+            max_download_bytes=max_download_bytes,
+            coordinates=coordinates,
         )
     )

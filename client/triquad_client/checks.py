@@ -140,6 +140,13 @@ def count(name: str, value: int, most: int, *, least: int = 0) -> int:
     return value
 
 
+def are_local(coordinates: str) -> bool:
+    """Return whether ``coordinates`` are those that count from the map's origin."""
+    if coordinates not in ("map", "local"):
+        raise InvalidInputError(f"coordinates = {coordinates!r}: use 'map' or 'local'")
+    return coordinates == "local"
+
+
 def level_of_detail(level: int) -> int:
     """Return ``level`` where the mesh has such a level of detail."""
     return count("level", level, LEVELS - 1)

@@ -3,8 +3,10 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 from triquad_format.errors import InvalidInputError
 from triquad_format.printable import printable
+from triquad_format.records.arrays import Doubles
 from triquad_format.wire.limits import MAX_SAMPLE_POINTS
 from triquad_format.wire.messages import (
     CheckpointInfo,
@@ -40,8 +42,9 @@ _NO_SOURCES = SourceReport(server="", revision=0, sources={})
 class Client(ScanCalls, MapQueries, MeshCalls, ChangeCalls, DownloadCalls):
     """A connection to one map of a server. Close it, or use it in a ``with`` statement.
 
-    Positions are metres in the map frame. All methods may be called from several threads, and
-    raise a :class:`TriquadError` where they fail: :class:`RefusedError` where the server refuses,
+    Positions are metres in the map frame, or from the map's origin where it was connected with
+    ``coordinates="local"``. All methods may be called from several threads, and raise a
+    :class:`TriquadError` where they fail: :class:`RefusedError` where the server refuses,
     :class:`RequestTimeoutError` where it does not answer in time, :class:`InvalidInputError`
     where an argument cannot be used.
     """
@@ -61,6 +64,15 @@ class Client(ScanCalls, MapQueries, MeshCalls, ChangeCalls, DownloadCalls):
     def map_name(self) -> str:
         """The map this client works with."""
         return self._connection.map_name
+
+    @property
+    def origin_m(self) -> Doubles:
+        """[3] metres, map frame: from where the map counts; 0 0 0 unless its scans lie far away.
+
+        The first scan of the map decides: ask once it is taken in. Raises as :meth:`status`.
+        """
+        origin = self.status().origin_m
+        return np.zeros(3) if origin is None else origin
 
     def close(self) -> None:
         """End the connection. Scans that were published may still be on their way: flush first."""
@@ -186,6 +198,7 @@ def connect(
     timeout_s: float = 10.0,
     config: str | Path | None = None,
     max_download_bytes: int = MAX_DOWNLOAD_BYTES,
+    coordinates: str = "map",
 ) -> Client:
     """Connect to a map server.
 
@@ -198,6 +211,8 @@ def connect(
         config: Zenoh configuration file (JSON5), such as one of triquad-keys with credentials.
         max_download_bytes: the largest map file that is fetched from the server, and the most that
             the mesh of a box may take of memory, whatever the server announces.
+        coordinates: ``"map"``: all places are in the map frame, as the poses of its scans are;
+            ``"local"``: they are relative to :attr:`Client.origin_m`.
 
     Raises:
         ConnectError: nothing listens at the endpoint, or it does not let us in.
@@ -205,5 +220,12 @@ def connect(
         InvalidInputError: there cannot be an endpoint or a map of this name.
     """
     return Client(
-        open_connection(endpoint, map, timeout_s, config, max_download_bytes=max_download_bytes)
+        open_connection(
+            endpoint,
+            map,
+            timeout_s,
+            config,
+            max_download_bytes=max_download_bytes,
+            coordinates=coordinates,
+        )
     )

@@ -75,20 +75,19 @@ def previews_of(
         with closing(RecordedView(record)) as opened:
             return previews_of(record, opened, stamp_ns)
     parts = {
-        region.index: preview_part(region, record.settings, view, stamp_ns=stamp_ns or 0)
+        region.index: preview_part(record, region, view, stamp_ns=stamp_ns or 0)
         for region in record.regions
     }
     return Previews(preview_schema(), parts)
 
 
-def preview_part(
-    region: Region, settings: FieldSettings, view: ComposedView, stamp_ns: int
-) -> Part:
+def preview_part(record: MapRecord, region: Region, view: ComposedView, stamp_ns: int) -> Part:
     """Return the preview of one region of the map that ``view`` answers for."""
-    mesh = coarse_mesh(region, settings, view)
-    step_m = 2.0 ** math.floor(math.log2(settings.leaf_m / _STEPS_A_LEAF))
+    mesh = coarse_mesh(region, record.settings, view)
+    step_m = 2.0 ** math.floor(math.log2(record.settings.leaf_m / _STEPS_A_LEAF))
     vertices = np.round(mesh.vertices / step_m) * step_m
-    scale = HeightScale.around(vertices[:, 2])
+    heights_m = vertices[:, 2] + record.origin_m[2]
+    scale = HeightScale.around(heights_m)
     update = SceneUpdate()
     entity = update.entities.add()
     entity.timestamp.FromNanoseconds(stamp_ns)
@@ -98,9 +97,12 @@ def preview_part(
         entity.metadata.add(key=key, value=value)
     triangles = entity.triangles.add()
     triangles.pose.orientation.w = 1.0
+    if record.origin.any():
+        position = triangles.pose.position
+        position.x, position.y, position.z = record.origin_m
     for x, y, z in vertices.tolist():
         triangles.points.add(x=x, y=y, z=z)
-    for red, green, blue in _colours(vertices[:, 2], scale).tolist():
+    for red, green, blue in _colours(heights_m, scale).tolist():
         triangles.colors.add(r=red, g=green, b=blue, a=1.0)
     triangles.indices.extend(mesh.faces.ravel().tolist())
     payload: bytes = update.SerializeToString(deterministic=True)

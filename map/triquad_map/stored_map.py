@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Iterable
 from pathlib import Path
 
+import numpy as np
 from numpy.typing import ArrayLike
 from triquad_format.mapfile.container import RandomAccess
 from triquad_format.mapfile.files import FileBytes, named
@@ -94,7 +95,7 @@ class StoredMap:
 
     def parts_in(self, minimum: ArrayLike, maximum: ArrayLike) -> tuple[Entry, ...]:
         """Return the parts that :meth:`box` consists of; arguments and errors are the same."""
-        low, high = check_box(minimum, maximum)
+        low, high = np.subtract(check_box(minimum, maximum), self.manifest.facts.origin_m)
         boxes = {index: leaf_box(self._settings, index, low, high) for index in self._indices}
         return tuple(
             entry

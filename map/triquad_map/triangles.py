@@ -20,6 +20,10 @@ class Triangles:
     # status there is UNKNOWN; None where no holes were to be filled
     filled: Bools | None = None
 
+    def moved(self, by: Doubles) -> "Triangles":
+        """Return the triangles ``by`` [3] metres off."""
+        return dataclasses.replace(self, vertices=self.vertices + by) if by.any() else self
+
 
 WELD_M = 1e-4
 """Vertices closer than about this are one."""

@@ -12,6 +12,7 @@ import zenoh
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import ServerStatus
 from triquad_format.wire.metrics_messages import QueueMetrics, ServerMetrics
+from triquad_format.wire.places import moved
 
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.intake.scan_queue import ScanQueue
@@ -50,7 +51,7 @@ class Health:
     started_s: float = field(default_factory=time.monotonic)  # monotonic
 
     def status(self) -> ServerStatus:
-        """Return the status now."""
+        """Return the status now; its places count from the map's origin."""
         epoch = self.epochs.newest
         progress = self.mapper.progress
         refused: Counter[str] = Counter()  # of all operations, by error code
@@ -87,6 +88,7 @@ class Health:
             rays_discarded=progress.map.rays_discarded,
             replay_share=progress.map.replay_share,
             samples_discarded=progress.map.samples_discarded,
+            origin_m=self.mapper.origin,
         )
 
     def metrics(self) -> ServerMetrics:
@@ -193,7 +195,7 @@ class Heartbeat:
                 self._health.mapper.wake()  # as a sign of life, even where there is nothing to do
                 self._health.warnings.check()
                 status = self._health.status()
-                self._publisher.put(codec.encode(status))
+                self._publisher.put(codec.encode(moved(status, self._health.mapper.origin)))
             except MemoryError:
                 _log.error("the status could not be published: there is no memory")
                 continue

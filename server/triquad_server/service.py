@@ -71,7 +71,11 @@ class Service:
         self._settings = settings
         self._scans = ScanQueue(settings.service.scan_queue)
         self._operations = Operations(
-            session, served.name, settings.service, give_way=self._scans.give_way
+            session,
+            served.name,
+            settings.service,
+            give_way=self._scans.give_way,
+            origin=lambda: self._mapper.origin,
         )
         self._warnings = ScanWarnings(self._scans, settings)
         first = served.mapper.publish()

@@ -211,7 +211,8 @@ class ScanCalls:
                     f"stamp_s = {stamp_ns / 1e9!r} lies before {state.stamp_ns / 1e9!r}, that of "
                     f"an earlier scan of source {source!r}; publish in order"
                 )
-            scan = Scan(points, pose, stamp_ns, source, state.session, state.sequence, no_return)
+            session, sequence, local = state.session, state.sequence, self._connection.local
+            scan = Scan(points, pose, stamp_ns, source, session, sequence, no_return, local)
             self._connection.put(key, scan)
             state.sequence += 1
             state.stamp_ns = stamp_ns

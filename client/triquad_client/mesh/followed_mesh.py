@@ -29,7 +29,7 @@ TileIndex = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class MeshTile:
-    """The mesh of one tile: ``tile_side_m`` times its index is its minimum corner."""
+    """The mesh of one tile: its index counts sides of tiles from the map's origin."""
 
     index: TileIndex
     version: int  # epoch of which it is
@@ -81,6 +81,7 @@ class FollowedMesh:
     server: str = ""  # which reported all below
     tile_side_m: float = math.nan
     cell_m: float = math.nan
+    origin: Doubles = field(default_factory=lambda: np.zeros(3))  # [3] map frame: of tile 0 0 0
     tiles: Mapping[TileIndex, MeshTile] = field(default_factory=dict)
     empty: Mapping[TileIndex, int] = field(default_factory=dict)  # versions of tiles without faces
     stale: frozenset[TileIndex] = frozenset()  # tiles that go unless they come again
@@ -121,7 +122,9 @@ class FollowedMesh:
             for index, tile in known.tiles.items()
             if (tile.origin <= maximum).all() and (tile.origin + side_m >= minimum).all()
         }
-        return replace(empty, server=known.server, tile_side_m=side_m, tiles=tiles)
+        zeros = (tile.origin - side_m * np.array(index) for index, tile in tiles.items())
+        origin = next(zeros, empty.origin)
+        return replace(empty, server=known.server, tile_side_m=side_m, origin=origin, tiles=tiles)
 
     @property
     def complete(self) -> bool:
@@ -156,6 +159,7 @@ class FollowedMesh:
             server=reply.server,
             tile_side_m=reply.tile_side_m,
             cell_m=reply.cell_m,
+            origin=np.zeros(3) if reply.origin is None else reply.origin,
             empty=empty,
             stale=stale,
             pending=tuple(pending),
@@ -206,7 +210,7 @@ class FollowedMesh:
                 version=version,
                 digest=hashlib.sha256(tile.data).hexdigest(),
                 size_bytes=len(tile.data),
-                origin=np.array((x, y, z)) * self.tile_side_m,
+                origin=self.origin + np.array((x, y, z)) * self.tile_side_m,
                 vertices=tile.surface.positions(self.cell_m),
                 faces=tile.surface.faces,
             )
@@ -214,8 +218,12 @@ class FollowedMesh:
 
     def mesh(self) -> Mesh:
         """Return the tiles as one mesh, faces by their centroids within the bounds."""
-        tiles = (Triangles(tile.origin + tile.vertices, tile.faces) for tile in self.tiles.values())
-        whole = joined(tiles, self.tile_side_m, (self.minimum, self.maximum))
+        tiles = (
+            Triangles(tile.origin - self.origin + tile.vertices, tile.faces)
+            for tile in self.tiles.values()
+        )
+        box = self.minimum - self.origin, self.maximum - self.origin
+        whole = joined(tiles, self.tile_side_m, box).moved(self.origin)
         return Mesh.of(whole, self.epoch)
 
     def known_tiles(self) -> KnownTiles:

@@ -41,7 +41,10 @@ class MeshCalls:
 
         def fetch() -> Mesh:
             listed = self._connection.ask(request)
-            join = TileJoin(listed.tile_side_m, box, marked=fill_m > 0)
+            # Joined from where tiles count, which is a corner of one.
+            origin = np.zeros(3) if listed.origin is None else listed.origin
+            low, high = box[0] - origin, box[1] - origin
+            join = TileJoin(listed.tile_side_m, (low, high), marked=fill_m > 0)
             decoder = TileDecoder(self._connection.max_download_bytes)
             firsts = range(0, len(listed.tiles), each)
             parts = [listed.tiles[first : first + each] for first in firsts]
@@ -49,7 +52,7 @@ class MeshCalls:
             for tiles, reply in zip(parts, self._connection.replies(asked), strict=True):
                 for tile in _decoded(reply, tiles, decoder, filled=fill_m > 0):
                     join.add(tile)
-            return Mesh.of(join.mesh(), listed.epoch)
+            return Mesh.of(join.mesh().moved(origin), listed.epoch)
 
         return retried("epoch_gone", fetch)
 

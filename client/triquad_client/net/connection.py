@@ -59,7 +59,13 @@ class Connection(Answering):
     """An open session, bound to one map. Safe for use by several threads."""
 
     def __init__(
-        self, session: zenoh.Session, map_name: str, timeout_s: float, *, max_download_bytes: int
+        self,
+        session: zenoh.Session,
+        map_name: str,
+        timeout_s: float,
+        *,
+        max_download_bytes: int,
+        local: bool = False,
     ) -> None:
         self._session = session
         self._id = str(session.info.zid())
@@ -69,6 +75,7 @@ class Connection(Answering):
         self.map_name = map_name
         self.timeout_s = timeout_s
         self.max_download_bytes = max_download_bytes  # of a map file, or the mesh of a box
+        self.local = local  # places count from the map's origin
 
     @property
     def is_closed(self) -> bool:
@@ -143,7 +150,7 @@ class Connection(Answering):
                 self._key(request),
                 payload=codec.encode(request),
                 encoding=keys.encoding(type(request)),
-                attachment=codec.encode(RequestOrigin(self._id, timeout_s)),
+                attachment=codec.encode(RequestOrigin(self._id, timeout_s, self.local)),
                 timeout=timeout_s,
                 priority=zenoh.Priority.BACKGROUND if request.background else zenoh.Priority.DATA,
                 congestion_control=zenoh.CongestionControl.BLOCK,

@@ -34,10 +34,12 @@ def open_connection(
     config: str | Path | None,
     *,
     max_download_bytes: int,
+    coordinates: str,
 ) -> Connection:
     """Return a connection to a server; arguments and errors as of ``triquad_client.connect``."""
     timeout_s = checks.within("timeout_s", timeout_s, checks.LONGEST_S, least=0.0)
     most = checks.count("max_download_bytes", max_download_bytes, MAX_COUNT)
+    local = checks.are_local(coordinates)
     where = f"with {config}" if endpoint is None and config else f"to {endpoint or _HERE}"
     try:
         keys.check_name("map", map_name)
@@ -54,7 +56,7 @@ def open_connection(
             "credentials."
         )
         raise ConnectError(f"cannot connect {where}: {why}") from error
-    connection = Connection(session, map_name, timeout_s, max_download_bytes=most)
+    connection = Connection(session, map_name, timeout_s, max_download_bytes=most, local=local)
     try:
         # Asked for by name first: there may be any number of others.
         if not connection.maps(map_name):

@@ -7,7 +7,7 @@ from triquad_format.records.arrays import Doubles
 from triquad_map.composition.composed_view import ComposedView
 from triquad_map.mesh.tile_lattice import TileIndex, TileLattice
 from triquad_map.mesh.tile_mesh import mesh_tile
-from triquad_map.triangles import TileJoin
+from triquad_map.triangles import TileJoin, Triangles
 
 from triquad_client.mesh.mesh import Mesh
 
@@ -42,33 +42,36 @@ class MapTiles:
         lattice: TileLattice,
         box: tuple[Doubles, Doubles],
         fill_m: float,
+        origin: Doubles,
     ) -> None:
         """Use ``OfflineMap.mesh_tiles``.
 
         Args:
             view: the map.
-            ends: [N, 3] middles of the voxels in which rays ended, metres, map frame.
+            ends: [N, 3] middles of the voxels in which rays ended, metres from its origin.
             lattice: where the tiles lie.
             box: corners [3] of what is to be meshed, metres, map frame.
             fill_m: how far from seen surface holes are filled, metres.
+            origin: [3] of the map.
         """
         self._view = view
         self._lattice = lattice
-        self._box = box
+        self._box = box[0] - origin, box[1] - origin
+        self.origin = origin
         self._fill_m = fill_m
         self.side_m = lattice.tile_side_m
         """The side of a tile."""
         half_m = view.voxel_m / 2
         tiles = lattice.tiles_meeting(ends - half_m, ends + half_m, lattice.reach_m + fill_m)
         self.indices: list[TileIndex] = [
-            (x, y, z) for x, y, z in tiles[lattice.meets(tiles, *box)].tolist()
+            (x, y, z) for x, y, z in tiles[lattice.meets(tiles, *self._box)].tolist()
         ]
-        """The tiles in which there may be faces: their least corners, in sides of a tile."""
+        """The tiles in which there may be faces: their least corners, in sides of a tile from
+        the map's origin."""
 
     def mesh(self, index: TileIndex) -> Mesh:
         """Return all faces in one of :attr:`indices`."""
-        made = mesh_tile(self._view, index, self._lattice, fill_m=self._fill_m)
-        return Mesh.of(made.triangles, self._view.epoch)
+        return Mesh.of(self._made(index).moved(self.origin), self._view.epoch)
 
     def joined(self, report: Report | None) -> Mesh:
         """Return the faces of all tiles whose centroids lie in the box.
@@ -79,7 +82,7 @@ class MapTiles:
         join = TileJoin(self.side_m, self._box, marked=self._fill_m > 0)
         faces = 0
         for number, index in enumerate(self.indices, start=1):
-            part = self.mesh(index)
+            part = self._made(index)
             join.add(part)
             faces += len(part.faces)
             if faces > MAX_FACES:
@@ -89,4 +92,8 @@ class MapTiles:
                 )
             if report is not None:
                 report(number, len(self.indices))
-        return Mesh.of(join.mesh(), self._view.epoch)
+        return Mesh.of(join.mesh().moved(self.origin), self._view.epoch)
+
+    def _made(self, index: TileIndex) -> Triangles:
+        """Return all faces in a tile, from the map's origin."""
+        return mesh_tile(self._view, index, self._lattice, fill_m=self._fill_m).triangles

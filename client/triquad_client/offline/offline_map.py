@@ -15,6 +15,7 @@ from triquad_format.records.region import MapRecord
 from triquad_format.records.seen_space import surface_voxels
 from triquad_format.wire.codec import Request
 from triquad_format.wire.limits import MAX_FILL_M
+from triquad_format.wire.places import asked_from
 from triquad_map.opening import open_view
 from triquad_map.questions.answers import Answers
 from triquad_map.view import MapView
@@ -39,9 +40,11 @@ REACH_LEAVES = 0.1  # how far from a voxel with seen surface the middle of a fac
 class LocalMap(Answering):
     """Answers requests about the map in a record, as fast as possible here; for several threads."""
 
-    def __init__(self, record: MapRecord) -> None:
+    def __init__(self, record: MapRecord, *, local: bool = False) -> None:
         self._opened: RecordedView | None = open_view(record)
         self._answers = Answers(self._epoch)
+        self.origin = record.origin * (not local)
+        """[3] from where the map counts, in the coordinates of requests: 0 if those are local."""
 
     @property
     def view(self) -> "RecordedView":
@@ -62,7 +65,7 @@ class LocalMap(Answering):
 
     def replies(self, requests: Iterable[Request[ReplyT]]) -> Iterator[ReplyT]:
         """Yield the reply to each request, one after the other."""
-        return map(self._answers.answer, requests)
+        return (asked_from(self.origin, self._answers.answer, request) for request in requests)
 
     @contextmanager
     def _epoch(self, number: int) -> Iterator[MapView]:
@@ -80,9 +83,9 @@ class OfflineMap(MapQueries):
     the same.
     """
 
-    def __init__(self, record: MapRecord, stamp_ns: int = 0) -> None:
+    def __init__(self, record: MapRecord, stamp_ns: int = 0, *, coordinates: str = "map") -> None:
         """Open a map that is in memory already; use :func:`open_map` for a file."""
-        self._server = self._map = LocalMap(record)
+        self._server = self._map = LocalMap(record, local=checks.are_local(coordinates))
         # Meshes need no more of it: the view has the rest in a form of its own.
         self._seen = dataclasses.replace(
             record,
@@ -92,6 +95,8 @@ class OfflineMap(MapQueries):
         )
         self.name = record.name
         self.epoch = record.epoch
+        self.origin_m = record.origin
+        """[3] metres, map frame: from where the map itself counts."""
         self.leaf_m = record.settings.leaf_m
         """Side of the voxels in which rays ended."""
         self.stamp_ns = stamp_ns
@@ -153,11 +158,12 @@ class OfflineMap(MapQueries):
         from triquad_client.offline.map_mesh import MapTiles, map_lattice
 
         lattice = map_lattice(checked_m, REACH_LEAVES * self.leaf_m, whole=whole)
-        return MapTiles(view, self.surface_voxels(), lattice, box, fill_m)
+        ends = surface_voxels(self._seen)
+        return MapTiles(view, ends, lattice, box, fill_m, origin=self._map.origin)
 
     def surface_voxels(self) -> Doubles:
         """Return middles [N, 3] of the voxels in which rays ended, metres, map frame."""
-        return surface_voxels(self._seen)
+        return surface_voxels(self._seen) + self._map.origin
 
     def has_surface(self, points: ArrayLike) -> Bools:
         """Return whether :meth:`mesh` may have faces [N] at ``points`` [N, 3], metres, map frame.
@@ -169,10 +175,11 @@ class OfflineMap(MapQueries):
             InvalidInputError: the points are not [N, 3], or not finite.
             ClosedError: the map was closed.
         """
-        return self._map.view.near_ends(checks.query_points(points), REACH_LEAVES * self.leaf_m)
+        places = checks.query_points(points) - self._map.origin
+        return self._map.view.near_ends(places, REACH_LEAVES * self.leaf_m)
 
 
-def open_map(path: str | Path) -> OfflineMap:
+def open_map(path: str | Path, *, coordinates: str = "map") -> OfflineMap:
     """Return the map in a file, read whole and checked.
 
     It is answered as fast as by a server, by compiled code: that takes numba. The surfels, on which
@@ -181,6 +188,8 @@ def open_map(path: str | Path) -> OfflineMap:
 
     Args:
         path: a map file, or a server's store, of which the newest checkpoint is read.
+        coordinates: ``"map"``: all places are in the map frame, as the poses of its scans were;
+            ``"local"``: they are relative to :attr:`OfflineMap.origin_m`.
 
     Raises:
         MapFileError: it is no map file, is damaged, or needs a newer reader.
@@ -191,4 +200,4 @@ def open_map(path: str | Path) -> OfflineMap:
     if chosen.is_dir():
         chosen = checkpoint_files(map_folder(chosen))[0].path
     file = read_map_file(chosen)
-    return OfflineMap(file.record, file.manifest.stamp_ns)
+    return OfflineMap(file.record, file.manifest.stamp_ns, coordinates=coordinates)

@@ -8,6 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from triquad_format.errors import FormatError, MapFileError
 from triquad_format.mapfile.manifest import Entry, Manifest
 from triquad_format.mapfile.parts.part import EVIDENCE, Part, PartKey
@@ -120,7 +121,7 @@ class SyncedMap(MapQueries):
             remote = RemoteBytes(self._connection, info)
             try:
                 stored = StoredMap(remote)
-                wanted = stored.parts_in(self._low, self._high)
+                wanted = self._wanted(stored)
                 if not accept_emptier:
                     self._refuse_emptier(info, _seen_bytes(wanted))
                 kept = _kept(self._path, wanted)
@@ -141,7 +142,7 @@ class SyncedMap(MapQueries):
             )
             self._state = _State(
                 info.sha256,
-                LocalMap(record),
+                LocalMap(record, local=self._connection.local),
                 checked_s=asked_s,
                 report=report,
                 server=info.server,
@@ -176,8 +177,13 @@ class SyncedMap(MapQueries):
     def _seen_before(self) -> int:
         """Return what the file that is there knows of the box; it may be no map file."""
         with suppress(FormatError, FileNotFoundError), StoredMap.open(self._path) as older:
-            return _seen_bytes(older.parts_in(self._low, self._high))
+            return _seen_bytes(self._wanted(older))
         return 0
+
+    def _wanted(self, stored: StoredMap) -> tuple[Entry, ...]:
+        """Return the parts of a map that the box needs."""
+        zero = self._connection.local * np.array(stored.manifest.facts.origin_m)
+        return stored.parts_in(self._low + zero, self._high + zero)
 
 
 def _seen_bytes(parts: Iterable[Entry]) -> int:

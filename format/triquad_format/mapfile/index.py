@@ -25,7 +25,6 @@ from triquad_format.mapfile.manifest import (
     pack_manifest,
 )
 from triquad_format.mapfile.metadata import (
-    FORMAT_VERSION,
     PRODUCER,
     check_agreement,
     check_map_part,
@@ -191,7 +190,7 @@ class CheckpointIndex:
         self.checkpoint = _checkpoint(self.manifest, body)
         self.size = source.size + self.manifest.stored_bytes  # bytes, with all parts
         self.metadata = {
-            "format_version": f"{FORMAT_VERSION}",
+            "format_version": f"{self.manifest.facts.version}",
             "producer": body.value("producer", str),
         }
         if self.manifest.stamp_ns:

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 from typing import Any
 
+import numpy as np
+
 from triquad_format import __version__
 from triquad_format.errors import (
     DamagedMapFileError,
@@ -21,11 +23,12 @@ from triquad_format.errors import (
 from triquad_format.mapfile.parts.body import PartBody, unpack_body
 from triquad_format.mapfile.parts.part import MANIFEST, MAP
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import MapProgress, MapRecord
+from triquad_format.records.region import NO_ORIGIN, MapProgress, MapRecord, Region
+from triquad_format.wire.codec import pack_array
 from triquad_format.wire.keys import check_name
+from triquad_format.wire.limits import MAX_POSITION_M
 
-FORMAT_VERSION = 1
-MIN_READER_VERSION = 1
+FORMAT_VERSION = 2
 
 FRAME_ID = "map"
 UNITS = "m"
@@ -46,25 +49,39 @@ class MapFacts:
     epoch: int
     settings: FieldSettings
     progress: MapProgress
+    origin_m: tuple[float, float, float] = NO_ORIGIN
+
+    @property
+    def version(self) -> int:
+        """The oldest version of the format that has all of them."""
+        return 1 if self.origin_m == NO_ORIGIN else 2
 
     @classmethod
     def of(cls, record: MapRecord) -> "MapFacts":
         """Return the facts of a record."""
-        return cls(record.name, record.epoch, record.settings, record.progress)
+        return cls(record.name, record.epoch, record.settings, record.progress, record.origin_m)
+
+    def record(self, regions: tuple[Region, ...]) -> MapRecord:
+        """Return the map of these regions."""
+        return MapRecord(
+            self.name, self.epoch, self.settings, regions, self.progress, self.origin_m
+        )
 
 
 def pack_facts(facts: MapFacts) -> dict[str, object]:
     """Return the facts as a msgpack map."""
     defaults = dataclasses.asdict(FieldSettings())
     settings = dataclasses.asdict(facts.settings)
+    origin = {} if facts.version == 1 else {"origin": pack_array(np.array(facts.origin_m))}
     return {
-        "min_reader_version": MIN_READER_VERSION,
+        "min_reader_version": facts.version,
         "name": facts.name,
         "epoch": facts.epoch,
         "frame_id": FRAME_ID,
         "units": UNITS,
         "settings": {name: type(defaults[name])(value) for name, value in settings.items()},
         "progress": dataclasses.asdict(facts.progress),
+        **origin,
     }
 
 
@@ -87,7 +104,17 @@ def unpack_facts(body: PartBody) -> MapFacts:
         progress.check()
     except FormatError as error:
         raise DamagedMapFileError(f"{body.topic}: progress: {error}") from error
-    return MapFacts(name, body.count("epoch"), settings, progress)
+    return MapFacts(name, body.count("epoch"), settings, progress, _origin(body))
+
+
+def _origin(body: PartBody) -> tuple[float, float, float]:
+    """Return the origin of the map in a part; files of version 1 have none."""
+    if not body.has("origin"):
+        return NO_ORIGIN
+    x, y, z = body.array("origin", "<f8", (3,)).tolist()
+    if not all(abs(along) <= MAX_POSITION_M for along in (x, y, z)):
+        raise DamagedMapFileError(f"{body.topic}: origin = {[x, y, z]} is no place")
+    return x, y, z
 
 
 def check_map_part(payload: bytes, facts: MapFacts) -> None:
@@ -117,8 +144,8 @@ def pack_metadata(
     ``stamp_ns`` is the time of its epoch, nanoseconds since 1970; ``None``: not known.
     """
     entries = {
-        "format_version": str(FORMAT_VERSION),
-        "min_reader_version": str(MIN_READER_VERSION),
+        "format_version": str(facts.version),
+        "min_reader_version": str(facts.version),
         "producer": PRODUCER,
         **_facts_in_metadata(facts),
         "manifest": f"{offset} {stored}",

@@ -84,4 +84,4 @@ def assemble(manifest: Manifest, payload_of: Callable[[Entry], bytes]) -> MapRec
         for entry in entries:
             parts.add(entry.key, payload_of(entry))
         regions.append(parts.region())
-    return MapRecord(facts.name, facts.epoch, facts.settings, tuple(regions), facts.progress)
+    return facts.record(tuple(regions))

@@ -29,6 +29,7 @@ from triquad_format.records.region import (
 from triquad_format.records.replay_rays import STEPS, ReplayRays
 from triquad_format.wire.codec import ArraySpec
 from triquad_format.wire.keys import check_name
+from triquad_format.wire.limits import MAX_POSITION_M
 
 
 def check_record(record: MapRecord) -> None:
@@ -36,6 +37,8 @@ def check_record(record: MapRecord) -> None:
     check_name("map", record.name)
     _check_count("epoch", record.epoch)
     record.progress.check()
+    if len(record.origin_m) != 3 or not np.abs(record.origin_m).max() <= MAX_POSITION_M:
+        raise FormatError(f"origin_m = {record.origin_m} is no place")
     indices = [region.index for region in record.regions]
     if len(set(indices)) != len(indices):
         raise FormatError("two regions have the same index")

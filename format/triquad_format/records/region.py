@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from triquad_format.errors import FormatError
 from triquad_format.records import morton
-from triquad_format.records.arrays import Bytes, Floats, Ints, Longs
+from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings, RegionIndex
 from triquad_format.records.replay_rays import ReplayRays, no_rays
 
@@ -40,6 +40,9 @@ MAX_INTEGER = 32_639
 """Largest integer feature: its two bytes, both signed, reach no further."""
 
 MLP_LAYERS = 3
+
+NO_ORIGIN = (0.0, 0.0, 0.0)
+"""Of a map that counts from where its user does."""
 
 FLOATS = ("<f2", "<f4")
 """Precisions of long columns of floats."""
@@ -168,6 +171,13 @@ class MapRecord:
     settings: FieldSettings
     regions: tuple[Region, ...]
     progress: MapProgress = MapProgress()
+    # [3] of the coordinates that its user gives: from there all else in the record counts
+    origin_m: tuple[float, float, float] = NO_ORIGIN
+
+    @property
+    def origin(self) -> Doubles:
+        """[3] metres: :attr:`origin_m`."""
+        return np.array(self.origin_m)
 
     @property
     def has_evidence(self) -> bool:

@@ -16,7 +16,7 @@ def owned_evidence(settings: FieldSettings, region: Region) -> Evidence:
 
 
 def surface_voxels(record: MapRecord) -> Doubles:
-    """Return middles [N, 3] of the voxels in which rays ended, metres, map frame."""
+    """Return middles [N, 3] of the voxels in which rays ended, metres from the map's origin."""
     settings, parts = record.settings, [np.empty((0, 3))]
     for region in record.regions:
         evidence = owned_evidence(settings, region)

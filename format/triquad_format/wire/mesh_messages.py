@@ -38,8 +38,9 @@ class TileList(MapReply):
     """Answer to :class:`TileListRequest`."""
 
     tile_side_m: Annotated[float, within(MIN_LENGTH_M, MAX_TILE_M)]
-    # [T, 3]: tile t covers [t, t + 1) * tile_side_m
+    # [T, 3]: tile t covers origin + [t, t + 1) * tile_side_m
     tiles: Annotated[TileIndices, _IN_RANGE]
+    origin: Annotated[Point, within()] | None = None  # metres, map frame; None: 0 0 0
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,7 @@ class TileChanges(Message):
     tiles: Annotated[TileIndices, _IN_RANGE]
     # [T] the surface of each last changed in this epoch
     changed: Annotated[Epochs, rows_of("tiles")]
+    origin: Annotated[Point, within()] | None = None  # from where tiles count, as in TileList
 
 
 @dataclass(frozen=True)

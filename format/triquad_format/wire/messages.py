@@ -25,6 +25,7 @@ from triquad_format.wire.bounds import (
 )
 from triquad_format.wire.codec import ArraySpec, Message, Request, decode
 from triquad_format.wire.limits import MAX_CHUNK_BYTES, MAX_SEQUENCE, WRITES_S
+from triquad_format.wire.places import PLACE
 
 MAX_ORIGIN_BYTES = 1024
 """A longer attachment is not read."""
@@ -34,8 +35,9 @@ _REMEMBERED = 256
 Positions = Annotated[NDArray[np.float32], ArraySpec("<f4", (None, 3))]
 Values = Annotated[NDArray[np.float32], ArraySpec("<f4", (None,))]
 StatusCodes = Annotated[NDArray[np.uint8], ArraySpec("|u1", (None,))]
-Point = Annotated[NDArray[np.float64], ArraySpec("<f8", (3,))]
-Pose = Annotated[NDArray[np.float64], ArraySpec("<f8", (4, 4))]
+# Those of the map frame: triquad_format.wire.places.
+Point = Annotated[NDArray[np.float64], ArraySpec("<f8", (3,)), PLACE]
+Pose = Annotated[NDArray[np.float64], ArraySpec("<f8", (4, 4)), PLACE]
 TileIndices = Annotated[NDArray[np.int32], ArraySpec("<i4", (None, 3))]
 Integers = Annotated[NDArray[np.int64], ArraySpec("<i8", (None,))]
 
@@ -47,7 +49,8 @@ Duration = Annotated[float, within(0)]  # seconds
 Length = Annotated[float, within(0)]  # metres
 Statuses = Annotated[StatusCodes, within(0, 2)]  # triquad_format.records.status.Status
 FinitePositions = Annotated[Positions, within()]
-FinitePoints = Annotated[NDArray[np.float64], ArraySpec("<f8", (None, 3)), within()]
+FinitePoints = Annotated[NDArray[np.float64], ArraySpec("<f8", (None, 3)), within(), PLACE]
+Origin = Annotated[NDArray[np.float64], ArraySpec("<f8", (3,)), within()]
 Lengths = Annotated[Values, within(0)]
 Name = Annotated[str, text(256)]
 UpperCorner = Annotated[Point, corner_above("minimum")]
@@ -70,6 +73,7 @@ class Scan(Message):
     session: int
     sequence: int
     no_return: Positions | None = None  # [M, 3] directions of rays that met nothing, sensor frame
+    local: bool = False  # the pose counts from the map's origin
 
 
 @dataclass(frozen=True)
@@ -163,6 +167,7 @@ class ServerStatus(Message):
     """The share of the rays that each place is to keep for which memory has room."""
 
     samples_discarded: Count = 0  # above the limit of a region's training budget
+    origin_m: Origin | None = None  # [3] from where the map itself counts; None: from 0 0 0
 
 
 @dataclass(frozen=True)
@@ -265,6 +270,7 @@ class RequestOrigin(Message):
 
     client: str  # Zenoh id of the session that asks, hexadecimal
     timeout_s: float  # nobody waits for the reply for longer
+    local: bool = False  # places of the request and of its reply count from the map's origin
 
 
 def read_origin(attachment: bytes) -> RequestOrigin | None:

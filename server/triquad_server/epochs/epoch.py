@@ -20,6 +20,8 @@ from triquad_server.engine.field_record import region_record
 Buffers = Mapping[int, int]
 """The bytes of pieces of memory, by start address: arrays that share one count once."""
 
+_NO_ORIGIN = np.zeros(3)
+
 
 @dataclass(frozen=True)
 class FrozenRegion:
@@ -56,16 +58,20 @@ class Epoch(ComposedView):
         regions: tuple[FrozenRegion, ...],
         split: Split,
         progress: MapProgress | None = None,
+        origin: Doubles = _NO_ORIGIN,
     ) -> None:
         """Make an epoch of the map called ``name``; ``split`` runs the work of its answers.
 
-        ``progress`` is how far the map had come; ``None``: it was just begun.
+        ``progress`` is how far the map had come; ``None``: it was just begun. ``origin`` [3] is
+        from where it counts, in the user's coordinates.
         """
         super().__init__(number, settings, regions, split=split)
         self.number = number
         self.field_settings = settings
         self.frozen_regions = regions
         self.progress = progress or MapProgress()
+        x, y, z = origin.tolist()
+        self.origin_m = x, y, z
         self._name = name
 
     def with_split(self, split: Split = in_one) -> ComposedView:
@@ -99,7 +105,7 @@ class Epoch(ComposedView):
         """Return the epoch as a map file holds it, without training state."""
         regions = tuple(region.record() for region in self.frozen_regions)
         return MapRecord(
-            self._name, self.number, self.field_settings, regions, progress=self.progress
+            self._name, self.number, self.field_settings, regions, self.progress, self.origin_m
         )
 
 

@@ -11,10 +11,8 @@ from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.voxel_index import empty_keys, enter
 
 from triquad_server.errors import ScanRefusedError
+from triquad_server.intake.map_origin import first_origin, local_pose
 from triquad_server.settings import ANY_SOURCE, ScanSettings, SourceSettings
-
-WORLD_LIMIT_M = 100_000.0
-"""A sensor farther than this from the map's origin is refused."""
 
 _SHELL = 0.18
 """The logarithm of the ratio of a shell's outer to its inner radius."""
@@ -53,7 +51,7 @@ class RobotBox:
 
 @dataclass(frozen=True)
 class ScanRays:
-    """The usable rays of a scan, in the map frame, metres."""
+    """The usable rays of a scan, metres, from the map's origin."""
 
     origin: Doubles  # [3] the sensor
     ends: Doubles  # [N, 3] where rays met a surface
@@ -63,6 +61,8 @@ class ScanRays:
     # [M, 3] the range on rays that met nothing
     open_ends: Doubles = field(default_factory=lambda: np.empty((0, 3)))
     robot: RobotBox | None = None
+    # [3] of the user's coordinates: all of the above counts from there
+    map_origin: Doubles = field(default_factory=lambda: np.zeros(3))
 
     @property
     def free_corners(self) -> Doubles:
@@ -72,7 +72,7 @@ class ScanRays:
 
 
 def _check_pose(world_from_sensor: Doubles) -> None:
-    """Refuse a pose [4, 4] that is not finite, not rigid or outside the world."""
+    """Refuse a pose [4, 4] that is not finite or not rigid."""
     pose = world_from_sensor
     if pose.shape != (4, 4):
         raise ScanRefusedError("pose_shape", f"the pose is {list(pose.shape)}, not [4, 4]")
@@ -85,13 +85,6 @@ def _check_pose(world_from_sensor: Doubles) -> None:
             "pose_not_rigid",
             f"the pose is not a rotation and a translation (rotation off by "
             f"{rotation_error(pose):.2g}, last row {pose[3]}); scale and shear are not allowed",
-        )
-    far = float(np.abs(pose[:3, 3]).max())
-    if far > WORLD_LIMIT_M:
-        raise ScanRefusedError(
-            "outside_world",
-            f"the sensor is {far:.0f} m from the map's origin, more than {WORLD_LIMIT_M:.0f} m; "
-            "subtract an offset from the poses",
         )
 
 
@@ -226,6 +219,7 @@ def usable_rays(
     *,
     source: SourceSettings = ANY_SOURCE,
     no_return: Floats | None = None,
+    map_origin: Doubles | None = None,
 ) -> ScanRays:
     """Return the rays of a scan that are finite, in range and thinned, and those that met nothing.
 
@@ -235,12 +229,19 @@ def usable_rays(
         settings: thinning, and the ranges of the source.
         source: what else is particular to the source.
         no_return: directions [M, 3], sensor frame, of rays that met nothing.
+        map_origin: [3] from where the map counts, in the coordinates of the pose; ``None``: that
+            of a map whose first scan this is.
+
+    Returns:
+        The rays, from that origin.
 
     Raises:
         ScanRefusedError: the pose or a direction is bad, or no ray can be used.
     """
     empty = np.empty((0, 3), np.float32) if no_return is None else no_return
     _check_pose(world_from_sensor)
+    map_origin = first_origin(world_from_sensor) if map_origin is None else map_origin
+    pose = local_pose(world_from_sensor, map_origin)
     _check_shapes(points, empty)
     directions = _unit_vectors(empty) if source.no_return else np.empty((0, 3))
     disbelieved = 0 if source.no_return else len(empty)
@@ -248,8 +249,8 @@ def usable_rays(
     low, high = (np.array(corner) - begin for corner in source.robot_box_m or _NOWHERE)
     if begin.any():
         points = (points - begin).astype(np.float32)
-        world_from_sensor = world_from_sensor.copy()
-        world_from_sensor[:3, 3] += world_from_sensor[:3, :3] @ begin
+        pose = pose.copy()
+        pose[:3, 3] += pose[:3, :3] @ begin
     limits = _Limits(
         settings.range_min_m,
         settings.range_max_m,
@@ -269,7 +270,7 @@ def usable_rays(
     used = [_thinned(rays, settings.max_points, given_rays) for rays in given_rays]
     surplus = sum(map(len, given_rays)) - sum(map(len, used))
     others = {"no_return": disbelieved, "too_many": surplus}
-    rotation, origin = world_from_sensor[:3, :3], world_from_sensor[:3, 3]
+    rotation, origin = pose[:3, :3], pose[:3, 3]
     ends, far, open_directions = (rays @ rotation.T for rays in used)
     return ScanRays(
         origin.copy(),
@@ -277,5 +278,6 @@ def usable_rays(
         found.dropped | {reason: count for reason, count in others.items() if count},
         far_ends=far + origin,
         open_ends=settings.range_max_m * open_directions + origin,
-        robot=RobotBox(low, high, world_from_sensor) if source.robot_box_m else None,
+        robot=RobotBox(low, high, pose) if source.robot_box_m else None,
+        map_origin=map_origin,
     )

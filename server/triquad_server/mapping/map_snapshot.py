@@ -65,5 +65,7 @@ class MapSnapshot:
         """Return the records of the changes, which takes a second for 100 m of a street."""
         regions = tuple(region.record() for region in self.changed)
         epoch = self.epoch
-        record = MapRecord(self.name, epoch.number, self.settings, regions, progress=epoch.progress)
+        record = MapRecord(
+            self.name, epoch.number, self.settings, regions, epoch.progress, epoch.origin_m
+        )
         return MapChanges(record, self.regions, epoch)

@@ -3,6 +3,7 @@
 import logging
 import math
 
+import numpy as np
 from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.records.region import MapProgress, MapRecord
 
@@ -24,6 +25,8 @@ from triquad_server.settings import ANY_SOURCE, Settings
 _log = logging.getLogger(__name__)
 
 _LOSS_MEMORY = 0.95
+
+_NOWHERE_YET = np.zeros(3)  # the same object each time: who asked sees whether it was chosen since
 
 
 class Mapper:
@@ -55,6 +58,10 @@ class Mapper:
         self._number = record.epoch if record else 0
         self._epoch: Epoch | None = None
         self._structure_changed = True
+        # Chosen by the first scan, and kept as long as this process runs: what was known before a
+        # reset counts from there as well.
+        is_begun = record is not None and (record.regions or record.progress.scans_taken)
+        self._origin = record.origin if record is not None and is_begun else None
         # Of the map: a restart goes on counting.
         progress = record.progress if record else MapProgress()
         self.scans_taken = progress.scans_taken
@@ -65,6 +72,11 @@ class Mapper:
             for region in self.regions:
                 self._normals.restore(region.training.rays.ends + region.centre)
             self.regions.share_out()
+
+    @property
+    def origin(self) -> Doubles:
+        """[3] of the user's coordinates, from where the map counts: 0 0 0 until it is chosen."""
+        return _NOWHERE_YET if self._origin is None else self._origin
 
     @property
     def settled(self) -> bool:
@@ -117,6 +129,7 @@ class Mapper:
         *,
         source: str = "",
         no_return: Floats | None = None,
+        local: bool = False,
     ) -> ScanRays:
         """Take in a scan.
 
@@ -126,30 +139,46 @@ class Mapper:
             stamp_s: when it was taken, seconds since 1970.
             source: its settings apply; empty: those of no particular source.
             no_return: directions [M, 3], sensor frame, of rays that met nothing.
+            local: whether the pose counts from the map's origin.
 
         Returns:
-            What of it is used, and how many points and rays without a return are not.
+            What of it is used, from the map's origin, and how many points and rays without a
+            return are not.
 
         Raises:
             ScanRefusedError: the scan cannot be used; the map is unchanged. After any other
                 exception a part of the scan is in the map, which must not be used any more.
         """
-        rays = self._usable_rays(points, world_from_sensor, source, no_return)
+        origin = np.zeros(3) if local else self._origin
+        rays = self._usable_rays(points, world_from_sensor, source, no_return, origin)
         count = len(self.regions)
-        self._take_in(rays, self.regions.reached_by(rays), stamp_s)
+        reached = self.regions.reached_by(rays)
+        if self._origin is None:
+            self._origin = rays.map_origin
+        self._take_in(rays, reached, stamp_s)
         self._structure_changed |= len(self.regions) > count
         self.scans_taken += 1
         return rays
 
     def _usable_rays(
-        self, points: Floats, world_from_sensor: Doubles, source: str, no_return: Floats | None
+        self,
+        points: Floats,
+        world_from_sensor: Doubles,
+        source: str,
+        no_return: Floats | None,
+        origin: Doubles | None,
     ) -> ScanRays:
         """Return a scan's usable rays. A defect due to its numbers must not stop the mapping."""
         of_source = self._settings.sources.get(source, ANY_SOURCE)
         settings = self._settings.scan_of(of_source)
         try:
             return usable_rays(
-                points, world_from_sensor, settings, source=of_source, no_return=no_return
+                points,
+                world_from_sensor,
+                settings,
+                source=of_source,
+                no_return=no_return,
+                map_origin=origin,
             )
         except ScanRefusedError:
             raise
@@ -196,6 +225,7 @@ class Mapper:
             regions=tuple(region.publish(self._number) for region in self.regions),
             split=self._teams.answer,
             progress=self.progress,
+            origin=self.origin,
         )
         self._structure_changed = False
         return self._epoch
@@ -205,7 +235,7 @@ class Mapper:
         self._setup.sums.clear()
 
     def reset(self, minimum: Doubles, maximum: Doubles) -> None:
-        """Forget what lies between two corners [3], metres, map frame.
+        """Forget what lies between two corners [3], metres, from the map's origin, which stays.
 
         Regions wholly between them disappear; where no region is left, the map begins again.
         """

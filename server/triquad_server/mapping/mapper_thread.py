@@ -8,7 +8,9 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 from triquad_format.errors import TriquadError
+from triquad_format.records.arrays import Doubles
 from triquad_format.wire.messages import Scan
+from triquad_format.wire.places import moved
 from triquad_map.compiled.team import lower_priority
 
 from triquad_server.epochs.epoch import Epoch
@@ -29,7 +31,8 @@ from triquad_server.process.threads import NICENESS
 class MapListeners:
     """Functions that the mapper's thread calls; they are quick, and raise nothing."""
 
-    scan_taken: Sequence[Callable[[Scan, ScanRays], None]] = ()  # with what of it is used
+    # With what of it is used; both count from the map's origin.
+    scan_taken: Sequence[Callable[[Scan, ScanRays], None]] = ()
     published: Sequence[Callable[[Epoch], None]] = ()  # before others can see the epoch
 
 
@@ -85,6 +88,11 @@ class MapperThread:
         self.progress = Progress(loss=mapper.loss, fit=map_fit(mapper.regions))
         self._record_progress()
         self._thread = threading.Thread(target=self._run, name="mapper")
+
+    @property
+    def origin(self) -> Doubles:
+        """[3] from where the map counts; another object once a scan has chosen it."""
+        return self._mapper.origin
 
     @property
     def ended(self) -> str | None:
@@ -231,13 +239,15 @@ class MapperThread:
                 scan.stamp_ns // 1_000_000_000,
                 source=scan.source,
                 no_return=scan.no_return,
+                local=scan.local,
             )
         except ScanRefusedError as error:
             self._scans.reject(scan, error.reason, str(error))
             _log.debug("scan %d of %s refused: %s", scan.sequence, scan.source, error)
             return
+        seen = moved(scan, -rays.map_origin)
         for listener in self._listeners.scan_taken:
-            listener(scan, rays)
+            listener(seen, rays)
         self._schedule.is_changed = True
         self._scans.taken(scan, rays)
 

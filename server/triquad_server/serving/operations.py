@@ -10,11 +10,14 @@ from enum import Enum
 from functools import partial
 from typing import Any
 
+import numpy as np
 import zenoh
 from triquad_format.errors import RefusedError
+from triquad_format.records.arrays import Doubles
 from triquad_format.wire import codec, keys
 from triquad_format.wire.limits import MAX_WAIT_S
 from triquad_format.wire.metrics_messages import QueueMetrics
+from triquad_format.wire.places import asked_from
 from triquad_map.compiled.team import THREADS, lower_priority
 
 from triquad_server.errors import NO_MEMORY, MapperStoppedError
@@ -28,6 +31,7 @@ _log = logging.getLogger(__name__)
 _QUEUE_BYTES = 64_000_000  # of the requests of all clients that wait in a lane
 _PLAIN_BYTES = 16_384  # of a request that holds neither points nor tiles
 _STOPPING = "the server is stopping"
+_NO_ORIGIN = np.zeros(3)
 
 _REFUSING_THREADS = 2
 
@@ -130,11 +134,17 @@ class Operations:
         map_name: str,
         settings: ServiceSettings,
         give_way: Callable[[float], None] = lambda _: None,
+        origin: Callable[[], Doubles] = lambda: _NO_ORIGIN,
     ) -> None:
-        """Begin; ``give_way`` returns when a query may begin, as far as other work is concerned."""
+        """Begin.
+
+        ``give_way`` returns when a query may begin, as far as other work is concerned; ``origin``
+        returns from where the map counts, [3] of its user's coordinates.
+        """
         self._session = session
         self._map_name = map_name
         self._give_way = give_way
+        self._origin = origin
         self._sessions = ClientSessions(session)
         self._refusals = RefusalSender()
         self._operations: dict[str, _Operation] = {}  # by key
@@ -169,7 +179,10 @@ class Operations:
         key = keys.operation_key(self._map_name, kind.operation)
         counts = self.counts[kind.operation] = OperationCounts()
         self._operations[key] = _Operation(
-            lambda request: request.answer(answer(request.read(kind))), counts, lane, max_bytes
+            lambda request: request.answer(self._answered(request, kind, answer)),
+            counts,
+            lane,
+            max_bytes,
         )
         # This runs in the network's own threads, so it only queues requests.
         receive = zenoh.handlers.Callback(partial(self._receive, key), indirect=False)
@@ -194,6 +207,22 @@ class Operations:
         for pool in self._pools:
             pool.shutdown()
         self._refusals.close()
+
+    def _answered(
+        self,
+        request: Request,
+        kind: type[codec.Request[codec.ReplyT]],
+        answer: Callable[[Any], codec.ReplyT],
+    ) -> codec.ReplyT:
+        """Return the reply of a map that counts from its origin, in the client's coordinates."""
+        question = request.read(kind)
+        if request.local:
+            return answer(question)
+        while True:
+            origin = self._origin()
+            reply = asked_from(origin, answer, question)
+            if self._origin() is origin:
+                return reply  # else the map's first scan came meanwhile
 
     def _queue(self, lane: Lane, requests_each: int) -> RequestQueue[Request]:
         """Return a queue with workers, whose threads are started when they are needed."""
@@ -226,7 +255,7 @@ class Operations:
         source = self._sessions.source(query, MAX_WAIT_S)
         is_long = operation.lane is Lane.QUESTIONS and payload_size(query) > _LONG_BYTES
         queue = self._queues[Lane.LONG_QUESTIONS if is_long else operation.lane]
-        request = Request(query, key, operation.counts, source.owner, source.deadline_s, queue.send)
+        request = Request(query, key, operation.counts, source, queue.send)
         if request.size > operation.max_bytes:
             text = f"{request.size} bytes exceed the limit of {operation.max_bytes}: split it"
             self._refusals.send(request, "too_large", text)

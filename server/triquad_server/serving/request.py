@@ -15,7 +15,7 @@ from triquad_format.wire.codec import Message, MessageT
 from triquad_format.wire.messages import ErrorReply
 from triquad_format.wire.metrics_messages import OperationMetrics, TimeHistogram
 
-from triquad_server.fair_queue import Owner
+from triquad_server.serving.request_queue import Source
 
 _log = logging.getLogger(__name__)
 
@@ -110,19 +110,19 @@ class Request:
         query: zenoh.Query,
         key: str,
         counts: OperationCounts,
-        owner: Owner,
-        deadline_s: float,
+        source: Source,
         sends: Callable[["Request", int], bool],
     ) -> None:
         """Make a request; ``key`` is that of the operation, whose ``counts`` record the result.
 
-        ``owner`` is the client session, which waits until ``deadline_s``, monotonic. ``sends`` is
-        called before a reply of N bytes is sent, which takes as long as the client likes;
-        a reply that it rejects is not sent.
+        ``source`` is who asks, and how. ``sends`` is called
+        before a reply of N bytes is sent, which takes as long as the client likes; a reply that it
+        rejects is not sent.
         """
         self.key = key
-        self.owner = owner
-        self.deadline_s = deadline_s
+        self.owner = source.owner
+        self.deadline_s = source.deadline_s  # monotonic
+        self.local = source.local  # places count from the map's origin
         self._query = query
         self._counts = counts
         self._sends = sends

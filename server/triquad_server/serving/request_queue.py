@@ -39,10 +39,11 @@ _FRESH_S = 1.0  # so long a session may have left unnoticed
 
 @dataclass(frozen=True)
 class Source:
-    """The owner of a request, and the time until which its answer is waited for."""
+    """The owner of a request, and what its sender says of it."""
 
     owner: Owner
-    deadline_s: float  # monotonic
+    deadline_s: float  # monotonic: until then the answer is waited for
+    local: bool = False  # places count from the map's origin
 
 
 class ClientSessions:
@@ -68,7 +69,7 @@ class ClientSessions:
         # Written so that NaN counts as not given.
         wait_s = origin.timeout_s if 0 <= origin.timeout_s <= longest_s else longest_s
         group = origin.client if self._is_linked(origin.client) else _UNLINKED
-        return Source(Owner(group, origin.client), now + wait_s + _GRACE_S)
+        return Source(Owner(group, origin.client), now + wait_s + _GRACE_S, origin.local)
 
     def have_left(self, owner: Owner) -> bool:
         """Return whether the link to the client that sent a request is closed."""

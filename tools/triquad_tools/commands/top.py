@@ -164,6 +164,8 @@ def _rows(sample: Sample) -> Iterator[Sequence[str]]:
     status, metrics = sample.status, sample.metrics
     yield "epoch", f"{status.epoch:,}, {duration(metrics.epoch_age_s)} old"
     yield "samples left", "nothing, settled" if status.settled else count(status.samples_left)
+    if status.origin_m is not None and status.origin_m.any():
+        yield "origin", "{:.12g} {:.12g} {:.12g} m".format(*status.origin_m)
     if status.fit is not None:
         yield "held-out rays within", within(status.fit.median_m, status.fit.upper_m)
     if status.last_checkpoint is not None:

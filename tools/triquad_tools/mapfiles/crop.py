@@ -35,7 +35,7 @@ def crop_record(record: MapRecord, minimum: ArrayLike, maximum: ArrayLike) -> Ma
     Raises:
         FormatError: the corners are not finite or not in order.
     """
-    low, high = check_box(minimum, maximum)
+    low, high = np.subtract(check_box(minimum, maximum), record.origin)
     regions = []
     for region in record.regions:
         box = leaf_box(record.settings, region.index, low=low, high=high)

@@ -111,9 +111,8 @@ def _recovered(found: IntactParts) -> RecoveredMap:
         loss_of(key, settings) for key in sorted(lost, key=lambda key: (key.region, key))
     )
     regions = _masked_where_lost(settings, regions, losses)
-    facts = found.facts
     return RecoveredMap(
-        MapRecord(facts.name, facts.epoch, settings, tuple(regions), facts.progress),
+        found.facts.record(tuple(regions)),
         losses,
         parts_intact=len(found.payloads),
         parts_listed=None if found.manifest is None else len(found.listed),

@@ -53,6 +53,7 @@ class MapSummary:
     map: str
     epoch: int
     settings: FieldSettings
+    origin_m: tuple[float, ...]  # [3] map frame: from where the map itself counts
     vertices: int
     parameters: int
     surface_m3: float
@@ -74,6 +75,7 @@ def summarise(file: MapFile) -> MapSummary:
         map=record.name,
         epoch=record.epoch,
         settings=record.settings,
+        origin_m=record.origin_m,
         vertices=sum(region.vertices for region in regions),
         parameters=sum(region.parameters for region in regions),
         surface_m3=sum(region.surface_m3 for region in regions),
@@ -112,6 +114,8 @@ def print_summary(name: str, summary: MapSummary) -> None:
 def _facts(summary: MapSummary) -> Iterator[Row]:
     for key in ("format_version", "producer", "created"):
         yield Row(key.replace("_", " "), summary.metadata.get(key, "not given"))
+    if any(summary.origin_m):
+        yield Row("origin", "{:.12g} {:.12g} {:.12g} m".format(*summary.origin_m))
     yield Row("regions", str(len(summary.regions)))
     yield Row("vertices", f"{summary.vertices:,}")
     yield Row("parameters", f"{summary.parameters:,}")
@@ -139,11 +143,11 @@ def _summarise_region(record: MapRecord, region: Region) -> RegionSummary:
     voxel_m3 = record.settings.leaf_m**3
     return RegionSummary(
         index=region.index,
-        centre_m=_rounded(record.settings.region_centre(region.index)),
+        centre_m=_rounded(record.origin + record.settings.region_centre(region.index)),
         parameters=region.parameters,
         precision=", ".join(sorted({table.features.dtype.name for table in region.tables})),
         vertices=sum(len(table.codes) for table in region.tables),
-        evidence_box_m=None if box is None else tuple(map(_rounded, box)),
+        evidence_box_m=None if box is None else tuple(map(_rounded, record.origin + box)),
         surface_m3=_bits(evidence.surface) * voxel_m3,
         free_m3=_bits(evidence.free & ~evidence.surface) * voxel_m3,
     )
@@ -187,7 +191,8 @@ def _fit(record: MapRecord) -> MapFit | None:
         for number, points in ends.items():
             region = view.region_views[number]
             sdf = region.field.evaluate(points, gradient=False).sdf
-            fits.append((region.centre, PlaceFits.of(points, record.settings, sdf)))
+            centre = record.origin + region.centre
+            fits.append((centre, PlaceFits.of(points, record.settings, sdf)))
     return map_fit(fits)
 
 
@@ -201,7 +206,7 @@ def _held_out_ends(region: Region, record: MapRecord) -> Floats:
 
 
 def _evidence_box(settings: FieldSettings, region: Region) -> Doubles | None:
-    """Return the box [2, 3] around a region's evidence, to whole blocks, metres, map frame.
+    """Return the box [2, 3] around a region's evidence, to whole blocks, from the map's origin.
 
     ``None`` where there is no evidence.
     """

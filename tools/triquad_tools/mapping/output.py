@@ -49,7 +49,9 @@ def write_output(record: MapRecord, path: Path, *, cell_m: float, training: bool
     if path.suffix != MAP_SUFFIX:
         return export(source, path, cell_m=cell_m)
     size = write_map_file(source, path)
-    return f"{size:,} bytes, {len(record.regions)} regions, epoch {record.epoch}"
+    origin = " {:.12g} {:.12g} {:.12g} m".format(*record.origin_m) if record.origin.any() else ""
+    counted = f", origin{origin}" if origin else ""
+    return f"{size:,} bytes, {len(record.regions)} regions, epoch {record.epoch}{counted}"
 
 
 def write_map_file(source: SourceMap, path: Path, *, feature_dtype: str = "<f2") -> int:

@@ -126,13 +126,13 @@ class StoredMap:
         if bounds is None:
             return listed
         (low, high), side_m = np.asarray(bounds, np.float64), self.sizes.side_of(level)
-        tiles = np.array(listed, np.int64).reshape(-1, 3)
-        meets = ((tiles * side_m <= high) & ((tiles + 1) * side_m >= low)).all(axis=1)
+        corners = self._tiles[level].origin + np.array(listed, np.int64).reshape(-1, 3) * side_m
+        meets = ((corners <= high) & (corners + side_m >= low)).all(axis=1)
         return [index for index, is_met in zip(listed, meets, strict=True) if is_met]
 
     def _made(self, level: int, index: TileIndex) -> MeshTile:
         mesh = self._tiles[level].mesh(index)
-        origin = np.array(index) * self.sizes.side_of(level)
+        origin = self._tiles[level].origin + np.array(index) * self.sizes.side_of(level)
         vertices = (mesh.vertices - origin).astype(np.float32)
         return MeshTile(
             index, self.queries.epoch, "", 0, origin=origin, vertices=vertices, faces=mesh.faces

@@ -37,7 +37,7 @@ class NearTiles:
         """Whether all that is followed was complete once."""
         return self._roots <= self.ready
 
-    def refresh(self, roots: list[TileIndex], *, changes: bool = True) -> None:
+    def refresh(self, roots: list[MeshTile], *, changes: bool = True) -> None:
         """Fetch some of the tiles within ``roots``, of the coarsest level; none: as before.
 
         Where all were complete once, only if ``changes`` are wanted.
@@ -63,9 +63,10 @@ class NearTiles:
         if self._follower is not None:
             self._follower.close()
 
-    def _follow(self, roots: list[TileIndex]) -> None:
+    def _follow(self, roots: list[MeshTile]) -> None:
         """Follow the box around some tiles of the coarsest level."""
-        low, high = np.min(roots, axis=0), np.max(roots, axis=0)
+        indices = [root.index for root in roots]
+        low, high = np.min(indices, axis=0), np.max(indices, axis=0)
         steps = np.ndindex(*(high - low + 1))
         around = {(int(low[0] + x), int(low[1] + y), int(low[2] + z)) for x, y, z in steps}
         if around == self._roots:
@@ -73,7 +74,9 @@ class NearTiles:
         # To the middles of the outermost tiles: those at their side do not meet the box.
         sizes = self._source.sizes
         side_m, inwards_m = sizes.side_of(COARSEST), 0.5 * sizes.side_of(self.level)
-        ends = (low * side_m + inwards_m).tolist(), ((high + 1) * side_m - inwards_m).tolist()
+        corners = [root.origin for root in roots]
+        least, most = np.min(corners, axis=0), np.max(corners, axis=0) + side_m
+        ends = (least + inwards_m).tolist(), (most - inwards_m).tolist()
         before = self._follower
         self._follower = self._source.follow(self.level, ends, before)
         if before is not None:
@@ -115,13 +118,13 @@ class TilesInView:
         if changes or not self._whole_loaded:
             self._whole.next(0.0)
             self._whole_loaded |= self._whole.complete
-        roots = list(self.roots)
         parts = {root: {TileName(COARSEST, root): tile} for root, tile in self.roots.items()}
         for near in reversed(self._near):  # finer ones replace coarser ones
             reach_m = self.source.sizes.cell_of(near.level + 1) / coarsest_m
+            roots = list(self.roots.values())
             chosen = near_columns(roots, self.source.sizes.side_of(COARSEST), eye, reach_m)
             near.refresh(chosen, changes=changes)
-            for root in near.ready.intersection(chosen):
+            for root in near.ready.intersection(tile.index for tile in chosen):
                 parts[root] = dict(near.within(root))
         return {name: tile for tiles in parts.values() for name, tile in tiles.items()}
 
@@ -133,14 +136,15 @@ class TilesInView:
 
 
 def near_columns(
-    roots: list[TileIndex], side_m: float, eye: Doubles, reach_m: float
-) -> list[TileIndex]:
+    roots: list[MeshTile], side_m: float, eye: Doubles, reach_m: float
+) -> list[MeshTile]:
     """Return the tiles above and below which there is one no farther from the eye than ``reach_m``.
 
     Tiles above each other have one level: where the ground lies in the side between two of them,
     as at z = 0, meshes of two levels would leave holes all over it.
     """
-    corners = np.array(roots, np.float64).reshape(-1, 3) * side_m
+    corners = np.array([root.origin for root in roots], np.float64).reshape(-1, 3)
     away_m = np.linalg.norm(np.clip(eye, corners, corners + side_m) - eye, axis=1)
-    columns = {(x, y) for (x, y, _), far_m in zip(roots, away_m, strict=True) if far_m <= reach_m}
-    return [root for root in roots if root[:2] in columns]
+    near = [root for root, far_m in zip(roots, away_m, strict=True) if far_m <= reach_m]
+    columns = {root.index[:2] for root in near}
+    return [root for root in roots if root.index[:2] in columns]
