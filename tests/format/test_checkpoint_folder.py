@@ -152,7 +152,7 @@ def test_every_byte_of_a_checkpoint_is_checked(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "error", "text"),
     [
-        ({"min_reader_version": 2}, UnsupportedMapFileError, "version 2"),
+        ({"min_reader_version": 3}, UnsupportedMapFileError, "version 3"),
         ({"undoes": 5}, DamagedMapFileError, "undoes"),
         ({"restored": [1, 2]}, DamagedMapFileError, "restored"),
         ({"restored": {"epoch": -1, "as_epoch": 2}}, DamagedMapFileError, "epoch = -1"),

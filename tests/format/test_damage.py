@@ -136,7 +136,7 @@ def test_other_mcap_files(names: list[str]) -> None:
 @pytest.mark.parametrize(
     ("changes", "error", "text"),
     [
-        ({"min_reader_version": "2"}, UnsupportedMapFileError, "version 2.*triquad 0.1.0"),
+        ({"min_reader_version": "3"}, UnsupportedMapFileError, "version 3.*triquad 0.1.0"),
         ({"min_reader_version": None}, DamagedMapFileError, "min_reader_version"),
         ({"min_reader_version": "9" * 5000}, DamagedMapFileError, "min_reader_version"),
         ({"epoch": "8"}, DamagedMapFileError, "epoch"),

@@ -1,11 +1,17 @@
 """How finely what is drawn, from where, and in which colours."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
+from support.maps.exact_maps import exact_map, flat
 from support.servers import SMALL, learn, running_service
 from triquad_client import connect
+from triquad_format.mapfile.writer import write_map
+from triquad_format.records.arrays import Doubles
 from triquad_tools.viewer.mesh.tile_colours import before_tone_mapping
 from triquad_tools.viewer.mesh.tiles_in_view import NearTiles, TilesInView
-from triquad_tools.viewer.sources import COARSEST, LiveSource
+from triquad_tools.viewer.sources import COARSEST, LiveSource, MapSource, StoredMap
 
 
 def test_near_tiles_are_those_of_the_server() -> None:
@@ -34,13 +40,27 @@ def test_near_tiles_are_those_of_the_server() -> None:
             near.refresh([(40, 40, 40)])
             assert not near.ready & set(roots)
             near.close()
-        tiles = TilesInView(source)
-        for eye, level in (np.zeros(3), 0), (np.array([1e4, 0.0, 0.0]), COARSEST):
+        assert_detail_near(source, np.zeros(3))
+
+
+def test_tiles_far_from_zero_are_as_fine(tmp_path: Path) -> None:
+    path, far = tmp_path / "far.triquad", (450_000.0, 5_400_000.0, 0.0)
+    write_map(replace(exact_map(flat(0.0)), origin_m=far), path)
+    assert_detail_near(StoredMap(path, "here"), np.array(far))
+
+
+def assert_detail_near(source: MapSource, place: Doubles) -> None:
+    """Tiles are the finest where the eye is at a place of the map, and coarse where it is not."""
+    tiles = TilesInView(source)
+    for eye, level in (place, 0), (place + [1e4, 0.0, 0.0], COARSEST):
+        tiles.refresh(eye, 1.0)
+        while not tiles.loaded:
             tiles.refresh(eye, 1.0)
-            while not tiles.loaded:
-                tiles.refresh(eye, 1.0)
-            assert {name.level for name in tiles.refresh(eye, 1.0)} == {level}
-        tiles.close()
+        shown = tiles.refresh(eye, 1.0)
+        assert {name.level for name in shown} == {level}
+        for tile in shown.values():
+            assert np.abs(tile.origin + tile.vertices - place).max() < 20.0
+    tiles.close()
 
 
 def test_the_browser_shows_the_colours_of_the_legend() -> None:

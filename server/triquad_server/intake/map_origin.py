@@ -39,8 +39,8 @@ def local_pose(world_from_sensor: Doubles, origin: Doubles) -> Doubles:
         raise ScanRefusedError(
             "outside_world",
             f"the sensor is at {world_from_sensor[:3, 3].tolist()} m, {far:.0f} m from the map's "
-            f"origin {x:.12g} {y:.12g} {z:.12g}, which the first scan of the map chose, and more than "
-            f"{WORLD_LIMIT_M:.0f} m: poses that begin in one frame and go on in another, as where "
-            "a first GPS fix comes late, are of two maps",
+            f"origin {x:.12g} {y:.12g} {z:.12g}, which the first scan of the map chose, and more "
+            f"than {WORLD_LIMIT_M:.0f} m: poses that begin in one frame and go on in another, as "
+            "where a first GPS fix comes late, are of two maps",
         )
     return local

@@ -23,6 +23,8 @@ from triquad_server.mesh.tile_cache import ShownTile, TileCache
 MAX_TILES = 1_000_000
 """The most tiles of one list."""
 
+_ORIGIN = np.zeros(3)  # from where tiles count, which is told in the client's coordinates
+
 _GIVE_WAY_S = 0.1  # seconds that the making of tiles waits for queries before each, at most
 _MAX_REFRESH_SHARE = 4
 """Searches for changed tiles take at most one part in this many of the time."""
@@ -54,7 +56,7 @@ class TileQueries:
         tiles = tiles[lattice.meets(tiles, request.minimum, request.maximum)]
         if len(tiles) > MAX_TILES:
             raise RefusedError("too_large", f"{len(tiles)} tiles: ask for a smaller box")
-        return TileList(epoch.number, lattice.tile_side_m, tiles)
+        return TileList(epoch.number, lattice.tile_side_m, tiles, origin=_ORIGIN)
 
     def changes(self, request: TileChangesRequest) -> TileChanges:
         """Return in which tiles the surface changed.
@@ -83,6 +85,7 @@ class TileQueries:
             cell_m=lattice.cell_m,
             tiles=np.array(list(changed), np.int32).reshape(-1, 3),
             changed=np.array(list(changed.values()), np.int64),
+            origin=_ORIGIN,
         )
 
     def mesh(self, request: MeshRequest) -> MeshReply:

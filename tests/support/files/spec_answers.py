@@ -1,4 +1,4 @@
-"""Answers of a version 1 map, from section 8 of docs/map-file.md and nothing of the project."""
+"""Answers of a map, from section 8 of docs/map-file.md and nothing of the project."""
 
 from typing import Any
 
@@ -79,11 +79,13 @@ class Map:
 
     def __init__(self, facts: dict[str, Any], parts: dict[Key, bytes]) -> None:
         self.settings = Settings(facts["settings"])
+        self.origin = origin_of(facts)
         heads = [key[1] for key in parts if key[0] == "/triquad/region"]
         self.regions = {index: Region(self.settings, parts, index) for index in heads}
 
     def distance(self, points: Array) -> tuple[Array, Array]:
         """Section 8.2: distance and gradient."""
+        points = points - self.origin
         total, value = np.zeros((2, len(points)))
         slope, total_slope = np.zeros((2, len(points), 3))
         for region in self.regions.values():
@@ -101,6 +103,7 @@ class Map:
 
     def status(self, points: Array) -> NDArray[np.uint8]:
         """Section 8.3."""
+        points = points - self.origin
         result = np.full(len(points), UNKNOWN, np.uint8)
         owners = np.floor(points / self.settings.pitch + 0.5).astype(np.int64)
         for region in self.regions.values():
@@ -111,6 +114,12 @@ class Map:
             free = bits(region.free, np.floor(u))
             result[owned] = np.where(surface, SURFACE, np.where(free, FREE, UNKNOWN))
         return result
+
+
+def origin_of(facts: dict[str, Any]) -> Array:
+    """Section 5.1: from where all else in the map counts."""
+    packed = facts.get("origin")
+    return np.zeros(3) if packed is None else np.frombuffer(packed["data"], "<f8")
 
 
 def weight(settings: Settings, d: Array) -> tuple[Array, Array]:

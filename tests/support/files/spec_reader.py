@@ -15,7 +15,7 @@ from typing import Any
 import msgpack
 import numpy as np
 import zstandard
-from support.files.spec_answers import Map
+from support.files.spec_answers import Map, origin_of
 from support.files.spec_parts import Array, Key, Settings, check, plain, rays_of
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -165,7 +165,7 @@ def manifest_in(payload: bytes) -> dict[str, Any]:
     """The values of a manifest."""
     check(topic_of(payload) == "/triquad/manifest", "no manifest")
     values: dict[str, Any] = msgpack.unpackb(payload)
-    check(values["min_reader_version"] <= 1, "a newer version")
+    check(values["min_reader_version"] <= 2, "a newer version")
     return values
 
 
@@ -175,7 +175,7 @@ class MapFile:
     def __init__(self, path: Path) -> None:
         self.file = OpenFile(path)
         metadata = self.file.metadata()
-        check(int(metadata["min_reader_version"]) <= 1, "a newer version")
+        check(int(metadata["min_reader_version"]) <= 2, "a newer version")
         place = map(int, metadata["manifest"].split(" "))
         self.values = manifest_in(unpacked("/triquad/manifest", message_in(self.file.at(*place))))
         pairs = (("map", "name"), ("epoch", "epoch"), ("frame_id", "frame_id"), ("units", "units"))
@@ -203,7 +203,8 @@ def read_near(path: Path, points: Array) -> tuple[MapFile, dict[Key, bytes]]:
     """Section 9: only the parts which the answers at the points need."""
     whole = MapFile(path)
     settings = Settings(whole.values["settings"])
-    rows = (row for row in whole.rows if settings.needs(row.key, points))
+    places = points - origin_of(whole.values)
+    rows = (row for row in whole.rows if settings.needs(row.key, places))
     return whole, {row.key: whole.read(row) for row in rows}
 
 

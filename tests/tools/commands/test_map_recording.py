@@ -189,6 +189,21 @@ def test_a_recording_of_which_nothing_can_be_used_is_told(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_poses_that_go_on_in_another_frame_are_refused(
+    tmp_path: Path, settings: str, capsys
+) -> None:
+    """As where a first GPS fix comes late. A single pose that is wrong is left out and told."""
+    for lost, status in ((1, 0), (3, 2)):
+        poses, output = POSES.copy(), tmp_path / f"{lost}.triquad"
+        poses[3 : 3 + lost, :3, 3] += (450_000.0, 5_400_000.0, 400.0)
+        write_folder(tmp_path / f"{lost}", scans(), poses, STAMPS)
+        assert main([str(tmp_path / f"{lost}"), str(output), "--settings", settings]) == status
+        assert output.exists() == (status == 0)
+        told = capsys.readouterr().err
+        assert "from the map's origin 0 0 0, which the first scan" in told
+        assert ("scan 4: " in told and "0.400 s after the first" in told) == (lost == 3)
+
+
 def test_input_that_cannot_be_used_is_refused(tmp_path: Path, recording: str, capsys) -> None:
     exists, other = tmp_path / "exists.triquad", tmp_path / "a.triquad"
     exists.write_bytes(b"x")

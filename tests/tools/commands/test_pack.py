@@ -139,10 +139,10 @@ def test_tool_takes_an_epoch_of_a_store(tmp_path, capsys):
 
 def test_tool_refuses_newer_files(map_file, tmp_path, capsys):
     out = tmp_path / "out.triquad"
-    newer = rewritten(map_file.read_bytes(), metadata={"min_reader_version": "2"})
+    newer = rewritten(map_file.read_bytes(), metadata={"min_reader_version": "3"})
     map_file.write_bytes(newer)
     assert main([str(map_file), str(out)]) == 2
-    assert "map file version 2" in capsys.readouterr().err
+    assert "map file version 3" in capsys.readouterr().err
     assert not out.exists()
 
 

@@ -256,11 +256,11 @@ def test_a_file_rewritten_by_another_program(
 
 
 def test_a_newer_file_is_refused(recovered: Recover) -> None:
-    newer = edited(DATA, MANIFEST, set_field("min_reader_version", 2))
-    with pytest.raises(UnsupportedMapFileError, match="version 2"):
+    newer = edited(DATA, MANIFEST, set_field("min_reader_version", 3))
+    with pytest.raises(UnsupportedMapFileError, match="version 3"):
         recovered(newer[:-100])
-    newer = edited(DATA, MAP, set_field("min_reader_version", 2))
-    with pytest.raises(UnsupportedMapFileError, match="version 2"):
+    newer = edited(DATA, MAP, set_field("min_reader_version", 3))
+    with pytest.raises(UnsupportedMapFileError, match="version 3"):
         recovered(newer[: len(newer) // 2])
 
 

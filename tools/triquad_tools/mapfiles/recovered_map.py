@@ -111,9 +111,13 @@ def _recovered(found: IntactParts) -> RecoveredMap:
         loss_of(key, settings) for key in sorted(lost, key=lambda key: (key.region, key))
     )
     regions = _masked_where_lost(settings, regions, losses)
+    record = found.facts.record(tuple(regions))
     return RecoveredMap(
-        found.facts.record(tuple(regions)),
-        losses,
+        record,
+        tuple(
+            Loss(loss.key, record.origin + loss.minimum, record.origin + loss.maximum)
+            for loss in losses
+        ),
         parts_intact=len(found.payloads),
         parts_listed=None if found.manifest is None else len(found.listed),
         stamp_ns=0 if found.manifest is None else found.manifest.stamp_ns,
@@ -190,14 +194,14 @@ def _masked_where_lost(
 
 
 def loss_of(key: PartKey, settings: FieldSettings) -> Loss:
-    """Return the loss of a part; its box reaches as far as a status may change."""
+    """Return the loss of a part; its box, from the origin, has all whose status may change."""
     low, high = effect_box(key, settings)
     reach_m = STATUS_REACH_LEAVES * settings.leaf_m
     return Loss(key, low - reach_m, high + reach_m)
 
 
 def effect_box(key: PartKey, settings: FieldSettings) -> Doubles:
-    """Return corners [2, 3] of the box in which a part has an effect itself, metres, map frame."""
+    """Return corners [2, 3], from the origin, of the box in which a part has an effect itself."""
     box = extent(settings, key)
     if key.topic == VERTICES:
         # A vertex has an effect as far as the side of its level's nodes; those at the upper border

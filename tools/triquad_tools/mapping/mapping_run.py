@@ -85,10 +85,15 @@ class MappingRun:
         self._warnings = ScanWarnings(ScanQueue(1), self.settings)
         self._next_save_s = time.monotonic() + _SAVE_PERIOD_S
         self.refusals: Counter[str] = Counter()
+        self._outside = False  # the last scan was too far from the map's origin
         self.last_refusal = ""
 
     def take(self, selection: Selection) -> None:
-        """Integrate the scans that are left, and train between them."""
+        """Integrate the scans that are left, and train between them.
+
+        Raises:
+            ToolError: the poses go on in another frame: two scans in a row are out of the world.
+        """
         total, entries = len(selection), selection.entries
         with progress("mapping", total) as report:
             for scan in selection.scans(self.scans_taken):
@@ -100,9 +105,16 @@ class MappingRun:
                     rays = self.mapper.ingest(scan.points, pose, stamp_s, source=source)
                     self._warnings.add(source, len(scan.points), rays)
                     self._warnings.check()
+                    self._outside = False
                 except ScanRefusedError as error:
                     self.refusals[error.reason] += 1
                     self.last_refusal = f"scan {self.scans_taken}: {error}"
+                    was_outside, self._outside = self._outside, error.reason == "outside_world"
+                    if self._outside and was_outside:
+                        after_s = (entry.stamp_ns - entries[0].stamp_ns) / 1e9
+                        told = f"{self.last_refusal}; this one is {after_s:.3f} s after the first:"
+                        told += " map what is before by --end, or what is after by --start"
+                        raise ToolError(told) from error
                 self.scans_taken += 1
                 self.mapper.train()
                 report(self.scans_taken, f"{self.scans_taken} of {total} scans")

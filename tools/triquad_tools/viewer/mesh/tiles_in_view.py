@@ -29,6 +29,8 @@ class NearTiles:
         self.level = level
         self._follower: TileFollower | None = None
         self._roots: set[TileIndex] = set()  # tiles of the coarsest level that are followed
+        self.zero: Doubles = np.zeros(3)
+        """[3] metres, map frame: from where tiles count."""
         self.ready: set[TileIndex] = set()
         """The tiles of the coarsest level in which all tiles of this level are loaded."""
 
@@ -37,7 +39,7 @@ class NearTiles:
         """Whether all that is followed was complete once."""
         return self._roots <= self.ready
 
-    def refresh(self, roots: list[MeshTile], *, changes: bool = True) -> None:
+    def refresh(self, roots: list[TileIndex], *, changes: bool = True) -> None:
         """Fetch some of the tiles within ``roots``, of the coarsest level; none: as before.
 
         Where all were complete once, only if ``changes`` are wanted.
@@ -63,10 +65,9 @@ class NearTiles:
         if self._follower is not None:
             self._follower.close()
 
-    def _follow(self, roots: list[MeshTile]) -> None:
+    def _follow(self, roots: list[TileIndex]) -> None:
         """Follow the box around some tiles of the coarsest level."""
-        indices = [root.index for root in roots]
-        low, high = np.min(indices, axis=0), np.max(indices, axis=0)
+        low, high = np.min(roots, axis=0), np.max(roots, axis=0)
         steps = np.ndindex(*(high - low + 1))
         around = {(int(low[0] + x), int(low[1] + y), int(low[2] + z)) for x, y, z in steps}
         if around == self._roots:
@@ -74,9 +75,8 @@ class NearTiles:
         # To the middles of the outermost tiles: those at their side do not meet the box.
         sizes = self._source.sizes
         side_m, inwards_m = sizes.side_of(COARSEST), 0.5 * sizes.side_of(self.level)
-        corners = [root.origin for root in roots]
-        least, most = np.min(corners, axis=0), np.max(corners, axis=0) + side_m
-        ends = (least + inwards_m).tolist(), (most - inwards_m).tolist()
+        least, most = low * side_m + inwards_m, (high + 1) * side_m - inwards_m
+        ends = (self.zero + least).tolist(), (self.zero + most).tolist()
         before = self._follower
         self._follower = self._source.follow(self.level, ends, before)
         if before is not None:
@@ -118,13 +118,16 @@ class TilesInView:
         if changes or not self._whole_loaded:
             self._whole.next(0.0)
             self._whole_loaded |= self._whole.complete
+        roots = list(self.roots)
         parts = {root: {TileName(COARSEST, root): tile} for root, tile in self.roots.items()}
+        side_m = self.source.sizes.side_of(COARSEST)
+        zeros = (tile.origin - side_m * np.array(root) for root, tile in self.roots.items())
+        zero = next(zeros, np.zeros(3))
         for near in reversed(self._near):  # finer ones replace coarser ones
-            reach_m = self.source.sizes.cell_of(near.level + 1) / coarsest_m
-            roots = list(self.roots.values())
-            chosen = near_columns(roots, self.source.sizes.side_of(COARSEST), eye, reach_m)
+            reach_m, near.zero = self.source.sizes.cell_of(near.level + 1) / coarsest_m, zero
+            chosen = near_columns(roots, side_m, eye - zero, reach_m)
             near.refresh(chosen, changes=changes)
-            for root in near.ready.intersection(tile.index for tile in chosen):
+            for root in near.ready.intersection(chosen):
                 parts[root] = dict(near.within(root))
         return {name: tile for tiles in parts.values() for name, tile in tiles.items()}
 
@@ -136,15 +139,16 @@ class TilesInView:
 
 
 def near_columns(
-    roots: list[MeshTile], side_m: float, eye: Doubles, reach_m: float
-) -> list[MeshTile]:
+    roots: list[TileIndex], side_m: float, eye: Doubles, reach_m: float
+) -> list[TileIndex]:
     """Return the tiles above and below which there is one no farther from the eye than ``reach_m``.
+
+    The position [3] of the eye counts from where tiles do.
 
     Tiles above each other have one level: where the ground lies in the side between two of them,
     as at z = 0, meshes of two levels would leave holes all over it.
     """
-    corners = np.array([root.origin for root in roots], np.float64).reshape(-1, 3)
+    corners = np.array(roots, np.float64).reshape(-1, 3) * side_m
     away_m = np.linalg.norm(np.clip(eye, corners, corners + side_m) - eye, axis=1)
-    near = [root for root, far_m in zip(roots, away_m, strict=True) if far_m <= reach_m]
-    columns = {root.index[:2] for root in near}
-    return [root for root in roots if root.index[:2] in columns]
+    columns = {(x, y) for (x, y, _), far_m in zip(roots, away_m, strict=True) if far_m <= reach_m}
+    return [root for root in roots if root[:2] in columns]
