@@ -141,7 +141,8 @@ class FollowedMesh:
         Raises:
             BadReplyError: it contradicts the reply before.
         """
-        is_same = reply.server == self.server
+        origin = np.zeros(3) if reply.origin is None else reply.origin
+        is_same = reply.server == self.server and bool((origin == self.origin).all())
         if is_same and reply.epoch < self.epoch:
             raise BadReplyError(f"epoch {reply.epoch} comes after epoch {self.epoch}")
         since, empty = (self.since, self.empty) if is_same else (0, {})
@@ -159,7 +160,7 @@ class FollowedMesh:
             server=reply.server,
             tile_side_m=reply.tile_side_m,
             cell_m=reply.cell_m,
-            origin=np.zeros(3) if reply.origin is None else reply.origin,
+            origin=origin,
             empty=empty,
             stale=stale,
             pending=tuple(pending),

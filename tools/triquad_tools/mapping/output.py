@@ -49,9 +49,9 @@ def write_output(record: MapRecord, path: Path, *, cell_m: float, training: bool
     if path.suffix != MAP_SUFFIX:
         return export(source, path, cell_m=cell_m)
     size = write_map_file(source, path)
-    origin = " {:.12g} {:.12g} {:.12g} m".format(*record.origin_m) if record.origin.any() else ""
-    counted = f", origin{origin}" if origin else ""
-    return f"{size:,} bytes, {len(record.regions)} regions, epoch {record.epoch}{counted}"
+    told = f"{size:,} bytes, {len(record.regions)} regions, epoch {record.epoch}"
+    origin = ", origin {:.12g} {:.12g} {:.12g} m".format(*record.origin_m)
+    return told + origin if record.origin.any() else told
 
 
 def write_map_file(source: SourceMap, path: Path, *, feature_dtype: str = "<f2") -> int:
