@@ -114,7 +114,8 @@ class MutatedMessages:
             body = msgpack.unpackb(payload)
             if how < 0.6:
                 for _ in range(self._chance.choice((1, 1, 2, 4))):
-                    self._replace(*self._chance.choice([*_values(body)]))
+                    if places := [*_values(body)]:  # all may have been left out by now
+                        self._replace(*self._chance.choice(places))
             else:
                 self._nudge(body)
             return bytes(msgpack.packb(body))
