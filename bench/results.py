@@ -83,7 +83,7 @@ def write_page(folder: Path) -> None:
 
 
 def _section(result: Result) -> str:
-    lines = [f"## {result.part}", "", f"{result.title}.", ""]
+    lines = [f"## {result.title}", ""]
     bounded = [figure for figure in result.figures if figure.wanted]
     if bounded:
         lines += ["| figure | measured | wanted | kept |", "|---|---|---|---|"]

@@ -36,7 +36,7 @@ def test_a_figure_keeps_to_its_bounds_or_not() -> None:
 def test_the_page_tells_what_is_missed_and_why(tmp_path: Path) -> None:
     MEASURED.write(tmp_path)
     text = page(tmp_path)
-    assert "core: 2026-01-31, a machine, street 2." in text
+    assert "## core: 2026-01-31, a machine, street 2" in text
     assert "| a | 1 s | at most 2 | yes |" in text
     assert "| b | 5 | at least 6 | **no** |" in text
     assert "| d | nan s | at most 1 | **no** |" in text
