@@ -11,12 +11,8 @@ from triquad_format.wire.codec import Form, Message, MessageT
 
 Doubles = NDArray[np.float64]
 
-
-class Place:
-    """Marks a field's annotation: points [3] or [N, 3], or a pose [4, 4], of the map frame."""
-
-
-PLACE = Place()
+PLACE = "a place"
+"""Marks a field's annotation: points [3] or [N, 3], or a pose [4, 4], of the map frame."""
 
 
 def moved(message: MessageT, by: Doubles) -> MessageT:

@@ -15,6 +15,8 @@ FAR_M = 10_000.0
 
 _STEP_M = 100.0  # of an origin: whole metres, which doubles represent exactly and people can read
 
+_DECIMALS = 6  # of positions from an origin, metres: a drive gives the same map wherever it is
+
 WORLD_LIMIT_M = 100_000.0
 """A sensor farther than this from the map's origin is refused."""
 
@@ -33,6 +35,8 @@ def local_pose(world_from_sensor: Doubles, origin: Doubles) -> Doubles:
         ScanRefusedError: ``outside_world``: it is too far from there.
     """
     local = moved_pose(world_from_sensor, -origin)
+    if origin.any():  # as it was given: in coordinates of UTM the last digits are of nanometres
+        local[:3, 3] = local[:3, 3].round(_DECIMALS)
     far = float(np.abs(local[:3, 3]).max())
     if far > WORLD_LIMIT_M:
         x, y, z = origin.tolist()

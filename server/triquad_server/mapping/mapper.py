@@ -163,7 +163,7 @@ class Mapper:
     def _usable_rays(
         self,
         points: Floats,
-        world_from_sensor: Doubles,
+        pose: Doubles,
         source: str,
         no_return: Floats | None,
         origin: Doubles | None,
@@ -173,12 +173,7 @@ class Mapper:
         settings = self._settings.scan_of(of_source)
         try:
             return usable_rays(
-                points,
-                world_from_sensor,
-                settings,
-                source=of_source,
-                no_return=no_return,
-                map_origin=origin,
+                points, pose, settings, source=of_source, no_return=no_return, map_origin=origin
             )
         except ScanRefusedError:
             raise

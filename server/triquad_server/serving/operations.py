@@ -136,10 +136,9 @@ class Operations:
         give_way: Callable[[float], None] = lambda _: None,
         origin: Callable[[], Doubles] = lambda: _NO_ORIGIN,
     ) -> None:
-        """Begin.
+        """Begin; ``give_way`` returns when a query may begin, as far as other work is concerned.
 
-        ``give_way`` returns when a query may begin, as far as other work is concerned; ``origin``
-        returns from where the map counts, [3] of its user's coordinates.
+        ``origin`` returns from where the map counts, [3] of its user's coordinates.
         """
         self._session = session
         self._map_name = map_name
