@@ -173,7 +173,7 @@ def test_given_intrinsics_of_larger_images_are_refused(tmp_path):
         ("1.0\n", "depth.txt:1: '1.0' where a line is the time"),
         ("soon depth/a.png\n", "depth.txt:1: 'soon' is not a number of seconds"),
         ("1.0 depth/none.png\n", "depth.txt:1: .*none.png: no such file"),
-        ("2.0 depth.txt\n1.0 depth.txt\n", "depth.txt:2: 1.0 s is before the line above"),
+        ("2.0 depth.txt\n1.0 depth.txt\n", "depth.txt:2: 1.0 is before the line above"),
     ],
 )
 def test_a_list_that_is_not_understood_is_refused(tmp_path, text, words):

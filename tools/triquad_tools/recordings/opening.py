@@ -28,8 +28,8 @@ _FLAGS = {"transforms": "--transform", "deskew": "--no-deskew"}
 _OF_BAGS = {
     "topics", "poses", "map_frame", "body_frame", "transforms", "recorder_clock", "stride",
 }  # fmt: skip
-_OF_DEPTH = {"trajectory", "intrinsics", "units_per_metre", "stride"}
-_OF_CLOUDS = {"trajectory", "points_in", "deskew"}
+_OF_DEPTH = {"trajectory", "quaternion", "intrinsics", "units_per_metre", "stride"}
+_OF_CLOUDS = {"trajectory", "quaternion", "points_in", "deskew"}
 """The choices that mean something for each kind of recording."""
 
 

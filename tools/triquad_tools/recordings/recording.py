@@ -49,6 +49,7 @@ class ReadingOptions:
     transforms: tuple[Transform, ...] = ()  # that the recording lacks
     recorder_clock: bool = False  # stamps are when a message was recorded
     trajectory: Path | None = None  # the file of poses; else that with a usual name
+    quaternion: Literal["xyzw", "wxyz"] | None = None  # order in it; else as its form has it
     points_in: Literal["sensor", "world"] | None = None  # frame of clouds; else sensor, and checked
     deskew: bool = True  # take the sensor's motion out of clouds whose points have times
     intrinsics: Intrinsics | None = None  # of depth images; else those of a file in the folder
@@ -109,6 +110,8 @@ def _add_ros(add: _Add) -> None:
 
 def _add_folder(add: _Add) -> None:
     add("--trajectory", type=Path, metavar="FILE", help="of poses (default: one with a usual name)")
+    order = "order of its quaternions (default: as its header or form has it)"
+    add("--quaternion", choices=("xyzw", "wxyz"), help=order)
     frame = "frame of the points of clouds (default: sensor, and checked)"
     add("--points-in", choices=("sensor", "world"), help=frame)
     skewed = "clouds are free of motion, though they have times"

@@ -27,6 +27,8 @@ _TRIED = 3  # clouds, to determine the frame of all
 _CLEARLY = 2.0  # times nearer to where the sensor was than to the origin, or the other way round
 
 _DEEPER = "velodyne_points/data"  # where KITTI's raw recordings have theirs
+_KITTI, _KITTI_360 = "calib.txt", "calib_cam_to_velo.txt"
+_DRIVE_M, _ALONG_Z = 5.0, 0.9  # a way that tells the axes, and how much of it is along z
 
 
 def is_cloud_folder(folder: Path) -> bool:
@@ -43,12 +45,14 @@ def read_cloud_folder(folder: Path, options: ReadingOptions | None = None) -> Sc
     """
     options = options or ReadingOptions()
     paths = _cloud_paths(folder)
-    placed = place_files(folder, options.trajectory, paths, read_times(folder, len(paths)))
+    placed = place_files(
+        folder, options, paths, read_times([folder, paths[0].parent.parent], len(paths))
+    )
     if not sum(check_all(paths, check_points)):
         raise ToolError(f"{paths[0].parent}: none of the {len(paths)} files holds any points")
     first, poses, files = paths[0], placed.trajectory, placed.files
     if first.suffix == ".bin" and poses.frames is None:
-        files = of_lidar(folder, files)
+        files = _of_lidar([folder, first.parent, first.parent.parent, poses.path.parent], files)
     if options.points_in is None:
         _check_frame(files)
     clouds, kind = f"{first.parent.name}/*{first.suffix}", first.suffix[1:].upper() + " clouds"
@@ -131,14 +135,14 @@ def _lies_around_its_place(file: PlacedFile) -> bool:
     return bool(from_place * _CLEARLY < from_origin)
 
 
-def read_times(folder: Path, scans: int) -> list[int] | None:
-    """Return the nanoseconds at which the scans of a folder were taken; None where it has no times.
+def read_times(folders: Sequence[Path], scans: int) -> list[int] | None:
+    """Return the nanoseconds at which scans were taken; None where no folder says it.
 
     Raises:
         ToolError: a time is not a number, times run backwards, or there are not as many as scans.
     """
-    path = folder / "times.txt"
-    if not path.is_file():
+    path = next((each / "times.txt" for each in folders if (each / "times.txt").is_file()), None)
+    if path is None:
         return None
     stamps = parse_stamps(read_lines(path))
     if len(stamps) != scans:
@@ -146,25 +150,48 @@ def read_times(folder: Path, scans: int) -> list[int] | None:
     return stamps
 
 
-def of_lidar(folder: Path, files: Sequence[PlacedFile]) -> list[PlacedFile]:
-    """Return files with the poses of the lidar, by the calibration of the folder, if it has one.
+def _of_lidar(folders: Sequence[Path], files: Sequence[PlacedFile]) -> list[PlacedFile]:
+    """Return files with the poses of the lidar, by the calibration in one of the folders, if any.
 
     In ``calib.txt`` the line ``Tr:`` is ``camera_from_lidar``: the poses are then those of the
-    camera, as KITTI gives them.
+    camera, as KITTI gives them. ``calib_cam_to_velo.txt`` of KITTI-360 is ``lidar_from_camera``.
 
     Raises:
-        ToolError: the calibration is not a rigid motion.
+        ToolError: the calibration is no rigid motion, or lacks where the poses are of a camera.
     """
-    path = folder / "calib.txt"
-    if not path.is_file():
+    of_camera = (each / name for each in folders for name in (_KITTI, _KITTI_360))
+    path = next((each for each in of_camera if each.is_file()), None)
+    if path is None:
+        _check_axes(folders[0], files)
         return list(files)
+    is_360 = path.name == _KITTI_360
     for line in read_lines(path):
-        name, _, numbers = line.text.partition(":")
-        if name.strip() == "Tr":
-            camera_from_lidar = parse_rigid(line.place, numbers.split())
-            turned = np.linalg.inv(camera_from_lidar)
+        name, _, numbers = line.text.rpartition(":")
+        if is_360 or name.strip() == "Tr":
+            given = parse_rigid(line.place, numbers.split())
+            inverse = np.linalg.inv(given)
+            # KITTI's world lies as the first camera does; that of KITTI-360 has z up.
+            world, of_lidar = (np.eye(4), inverse) if is_360 else (inverse, given)
             return [
-                file._replace(world_from_sensor=turned @ file.world_from_sensor @ camera_from_lidar)
+                file._replace(world_from_sensor=world @ file.world_from_sensor @ of_lidar)
                 for file in files
             ]
     raise ToolError(f"{path}: has no line 'Tr:'")
+
+
+def _check_axes(folder: Path, files: Sequence[PlacedFile]) -> None:
+    """Check that a lidar drives along its x or y, not along z as a camera does.
+
+    Raises:
+        ToolError: it goes along z nearly all the time.
+    """
+    poses = np.array([file.world_from_sensor for file in files])
+    steps = np.diff(poses[:, :3, 3], axis=0)
+    ahead = np.abs(np.einsum("nij,ni->nj", poses[:-1, :3, :3], steps))  # in the sensor's frame
+    length = np.linalg.norm(steps, axis=1).sum()
+    if length > _DRIVE_M and ahead[:, 2].sum() > _ALONG_Z * length:
+        raise ToolError(
+            f"{folder}: by its poses the lidar drives along its z, as a camera does, and there is "
+            f"no {_KITTI} with a line 'Tr:': put that of the sequence there, or one with "
+            "'Tr: 1 0 0 0 0 1 0 0 0 0 1 0' if the poses are those of the lidar"
+        )

@@ -129,7 +129,7 @@ def read_depth_folder(folder: Path, options: ReadingOptions) -> ScanFolder:
     """
     images = _images(folder)
     camera = choose_camera(folder, options.intrinsics)
-    placed = place_files(folder, options.trajectory, images.paths, images.stamps_ns)
+    placed = place_files(folder, options, images.paths, images.stamps_ns)
     for path, pixels in zip(images.paths, check_all(images.paths, read_depth), strict=True):
         check_fits(camera, pixels.shape, path)
     units = options.units_per_metre or images.units_per_metre

@@ -7,17 +7,27 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
+import numpy as np
 from triquad_format.records.arrays import Doubles
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
-from triquad_tools.recordings.folders.trajectory import Trajectory, read_trajectory
-from triquad_tools.recordings.recording import DEFAULT_SOURCE, ScanEntry, Stream
+from triquad_tools.recordings.folders.trajectory import (
+    DEFAULT_PERIOD_NS,
+    Trajectory,
+    number_of,
+    read_pose_files,
+    read_trajectory,
+)
+from triquad_tools.recordings.recording import DEFAULT_SOURCE, ReadingOptions, ScanEntry, Stream
 from triquad_tools.sensors.sweep import NoTransformError, PosedScan
 
 _Read = TypeVar("_Read")
 
-TRAJECTORY_NAMES = ("trajectory.txt", "trajectory.log", "poses.txt", "groundtruth.txt", "*.tum")
+TRAJECTORY_NAMES = (
+    "trajectory.txt", "trajectory.log", "poses.txt", "groundtruth.txt", "traj.txt", "*.tum", "*.csv"
+)  # fmt: skip
+_POSE_FOLDERS = ("pose", "poses")  # with a file for each scan
 _WHY = {
     "pose_early": "before the first pose",
     "pose_late": "after the last pose",
@@ -89,27 +99,50 @@ class PlacedFiles(NamedTuple):
 
 def place_files(
     folder: Path,
-    given: Path | None,
+    options: ReadingOptions,
     paths: Sequence[Path],
     stamps_ns: Sequence[int] | None = None,
 ) -> PlacedFiles:
-    """Give the files of a folder their poses: by their times, or else one to one in order.
+    """Give the files of a folder their poses: by their times or numbers, or else in order.
 
     Args:
         folder: holds the trajectory, unless that is given.
-        given: the file of the trajectory.
+        options: name the file of the trajectory, and the order of its quaternions.
         paths: the files, one at least, in order.
         stamps_ns: when each was taken; ``None``: as their names say, if they do.
 
     Raises:
-        ToolError: there is no trajectory, or neither way is possible.
+        ToolError: there is no trajectory, or no way is possible.
     """
-    path, remarks = _choose(folder, given)
-    trajectory = read_trajectory(path)
+    trajectory, remarks = _choose(folder, paths, options)
+    remarks += trajectory.remarks
+    placed = _placed(paths, stamps_ns, trajectory, remarks)
+    known = [file for file in placed.files if np.isfinite(file.world_from_sensor).all()]
+    if not known:
+        raise ToolError(f"{trajectory.path}: says no pose for any of {len(paths)} files")
+    if len(known) < len(placed.files):
+        count = len(placed.files) - len(known)
+        told = f"{count} of {len(paths)} files are left out, as {trajectory.path.name} says no pose"
+        placed.remarks.append(f"{told} for them")
+    return placed._replace(files=known)
+
+
+def _placed(
+    paths: Sequence[Path],
+    stamps_ns: Sequence[int] | None,
+    trajectory: Trajectory,
+    remarks: list[str],
+) -> PlacedFiles:
+    """Return the files that have poses, some of which may not be finite."""
+    path = trajectory.path
     stamps = stamps_of_names(paths) if stamps_ns is None else stamps_ns
     timed = stamps is not None and trajectory.frames is not None
     if stamps is not None and timed:
         placed = _by_time(paths, stamps, trajectory, remarks)
+        if placed.files:
+            return placed
+    if trajectory.numbers is not None:
+        placed = _by_number(paths, stamps, trajectory, remarks)
         if placed.files:
             return placed
     if len(paths) == len(trajectory.poses):
@@ -133,21 +166,51 @@ def place_files(
     )
 
 
-def _choose(folder: Path, given: Path | None) -> tuple[Path, list[str]]:
-    """Return the file of the trajectory, and a remark where there are several."""
+def _choose(
+    folder: Path, paths: Sequence[Path], options: ReadingOptions
+) -> tuple[Trajectory, list[str]]:
+    """Return the trajectory, and a remark where there are several."""
+    given, order = options.trajectory, options.quaternion
     if given is not None:
-        if not given.is_file():
+        path = next((each for each in (given, folder / given) if each.exists()), None)
+        if path is None:
             raise ToolError(f"{given}: no such file")
-        return given, []
+        if path.is_file():
+            return read_trajectory(path, order), []
+        if files := in_order(path.glob("*.txt")):
+            return read_pose_files(files), []
     found = [path for name in TRAJECTORY_NAMES for path in sorted(folder.glob(name))]
-    if not found:
-        raise ToolError(
-            f"{folder}: holds no trajectory, {', '.join(TRAJECTORY_NAMES)}: put one there, or name "
-            "it with --trajectory"
-        )
-    others = ", ".join(path.name for path in found[1:])
-    remark = f"poses are those of {found[0].name}, not of {others}: --trajectory FILE chooses"
-    return found[0], [remark] if others else []
+    if found:
+        others = ", ".join(path.name for path in found[1:])
+        remark = f"poses are those of {found[0].name}, not of {others}: --trajectory FILE chooses"
+        return read_trajectory(found[0], order), [remark] if others else []
+    of_files = [paths[0].parent.glob("*.pose.txt")]
+    of_files += [(folder / name).glob("*.txt") for name in _POSE_FOLDERS]
+    if files := next(filter(None, map(in_order, of_files)), []):
+        return read_pose_files(files), []
+    raise ToolError(
+        f"{folder}: holds no trajectory, {', '.join(TRAJECTORY_NAMES)}: put one there, or name it "
+        "with --trajectory"
+    )
+
+
+def _by_number(
+    paths: Sequence[Path],
+    stamps_ns: Sequence[int] | None,
+    trajectory: Trajectory,
+    remarks: list[str],
+) -> PlacedFiles:
+    """Return the files whose numbers have a pose; their times are ten a second if unknown."""
+    pose_of = dict(zip(trajectory.numbers or (), trajectory.poses, strict=True))
+    placed: list[PlacedFile] = []
+    for index, path in enumerate(paths):
+        number = number_of(path)
+        if number is not None and number in pose_of:
+            stamp = number * DEFAULT_PERIOD_NS if stamps_ns is None else stamps_ns[index]
+            placed.append(PlacedFile(path, stamp, pose_of[number]))
+    left_out = len(paths) - len(placed)
+    told = f"{left_out} of {len(paths)} files are left out: {trajectory.path} has no pose for them"
+    return PlacedFiles(placed, trajectory, [*remarks, told] if left_out and placed else remarks)
 
 
 def _by_time(
