@@ -198,6 +198,7 @@ def test_commas_and_comments_are_allowed(tmp_path):
         (["1700000000.25.ply", "cloud_1700000001.5.ply"], [START_NS + 250_000_000, None]),
         (["scan1700000000250.pcd"], [START_NS + 250_000_000]),
         (["1700000000.pcd"], [START_NS]),
+        (["n015__LIDAR_TOP__1700000000250000.pcd.bin"], [START_NS + 250_000_000]),
         (["a_1700000000_250000000.pcd"], [START_NS + 250_000_000]),
         (["1700000000_25000000.pcd", "1700000000_250000000.pcd"], [START_NS + 25_000_000, None]),
         (["frame-12.5.laz"], [12_500_000_000]),

@@ -29,7 +29,7 @@ _OF_BAGS = {
     "topics", "poses", "map_frame", "body_frame", "transforms", "recorder_clock", "stride",
 }  # fmt: skip
 _OF_DEPTH = {"trajectory", "quaternion", "intrinsics", "units_per_metre", "stride"}
-_OF_CLOUDS = {"trajectory", "quaternion", "points_in", "deskew"}
+_OF_CLOUDS = {"trajectory", "quaternion", "points_in", "columns", "deskew"}
 """The choices that mean something for each kind of recording."""
 
 

@@ -51,6 +51,7 @@ class ReadingOptions:
     trajectory: Path | None = None  # the file of poses; else that with a usual name
     quaternion: Literal["xyzw", "wxyz"] | None = None  # order in it; else as its form has it
     points_in: Literal["sensor", "world"] | None = None  # frame of clouds; else sensor, and checked
+    columns: tuple[str, ...] | None = None  # of .bin clouds; else as KITTI has them, and checked
     deskew: bool = True  # take the sensor's motion out of clouds whose points have times
     intrinsics: Intrinsics | None = None  # of depth images; else those of a file in the folder
     units_per_metre: float | None = None  # of a pixel; else 5000 for TUM RGB-D, 1000 for others
@@ -114,6 +115,8 @@ def _add_folder(add: _Add) -> None:
     add("--quaternion", choices=("xyzw", "wxyz"), help=order)
     frame = "frame of the points of clouds (default: sensor, and checked)"
     add("--points-in", choices=("sensor", "world"), help=frame)
+    columns = "of .bin clouds, float32 (default: xyzi, and checked)"
+    add("--columns", type=_columns, metavar="xyzirt|x,y,z,NAME", help=columns)
     skewed = "clouds are free of motion, though they have times"
     add("--no-deskew", dest="deskew", action="store_false", help=skewed)
     camera = "of the depth camera, pixels (default: of a file in the folder)"
@@ -137,6 +140,21 @@ def transform(text: str) -> Transform:
             f"'base_link lidar 0 0 1.5 0 0 0 1' ({error})"
         ) from error
     return Transform(frame_name(parent), frame_name(child), STATIC, pose)
+
+
+def _columns(text: str) -> tuple[str, ...]:
+    """Return the names of columns, which may be one letter each."""
+    letters = {"i": "intensity", "r": "ring"}
+    names = [
+        letters.get(name.strip(), name.strip())
+        for name in (text.split(",") if "," in text else text)
+    ]
+    if sorted(name for name in names if name in ("x", "y", "z")) != ["x", "y", "z"]:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}: use x, y and z once each, such as xyzirt or x,y,z,intensity,ring,t; _ is "
+            "a column that is not used"
+        )
+    return tuple(names)
 
 
 def _intrinsics(text: str) -> Intrinsics:

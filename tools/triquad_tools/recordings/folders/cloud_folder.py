@@ -8,7 +8,13 @@ import numpy as np
 from triquad_format.records.arrays import Floats
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.folders.point_file import POINT_SUFFIXES, check_points, read_points
+from triquad_tools.recordings.folders.point_file import (
+    KITTI_COLUMNS,
+    POINT_SUFFIXES,
+    check_columns,
+    check_points,
+    read_points,
+)
 from triquad_tools.recordings.folders.scan_folder import (
     PlacedFile,
     ScanFolder,
@@ -45,16 +51,19 @@ def read_cloud_folder(folder: Path, options: ReadingOptions | None = None) -> Sc
     """
     options = options or ReadingOptions()
     paths = _cloud_paths(folder)
+    if paths[0].suffix.lower() == ".bin" and options.columns is None:
+        check_columns(paths)
     placed = place_files(
         folder, options, paths, read_times([folder, paths[0].parent.parent], len(paths))
     )
-    if not sum(check_all(paths, check_points)):
+    columns = options.columns or KITTI_COLUMNS
+    if not sum(check_all(paths, partial(check_points, columns=columns))):
         raise ToolError(f"{paths[0].parent}: none of the {len(paths)} files holds any points")
     first, poses, files = paths[0], placed.trajectory, placed.files
-    if first.suffix == ".bin" and poses.frames is None:
+    if first.suffix.lower() == ".bin" and poses.frames is None:
         files = _of_lidar([folder, first.parent, first.parent.parent, poses.path.parent], files)
     if options.points_in is None:
-        _check_frame(files)
+        _check_frame(files, columns)
     clouds, kind = f"{first.parent.name}/*{first.suffix}", first.suffix[1:].upper() + " clouds"
     streams = (
         Stream(clouds, kind, len(files), "scans", options.points_in or SENSOR),
@@ -65,7 +74,7 @@ def read_cloud_folder(folder: Path, options: ReadingOptions | None = None) -> Sc
 
 def _read_scan(trajectory: Trajectory, options: ReadingOptions, file: PlacedFile) -> PosedScan:
     """Return the finite points of a cloud, in the frame of the sensor."""
-    points, times = read_points(file.path)
+    points, times = read_points(file.path, options.columns or KITTI_COLUMNS)
     finite = np.isfinite(points).all(axis=1)
     points = points[finite]
     if options.points_in == WORLD:
@@ -110,14 +119,14 @@ def _cloud_paths(folder: Path) -> list[Path]:
     return paths
 
 
-def _check_frame(files: Sequence[PlacedFile]) -> None:
+def _check_frame(files: Sequence[PlacedFile], columns: Sequence[str]) -> None:
     """Check that points lie around their sensor, not around where it was in the world.
 
     Raises:
         ToolError: a few clouds from all over the recording lie around where it was.
     """
     tried = [files[len(files) * (2 * step + 1) // (2 * _TRIED)] for step in range(_TRIED)]
-    if all(map(_lies_around_its_place, tried)):
+    if all(_lies_around_its_place(file, columns) for file in tried):
         raise ToolError(
             f"{files[0].path.parent}: the points seem to be in the world frame: in "
             f"{tried[0].path.name} they lie around where the sensor was, not around the origin; "
@@ -125,8 +134,8 @@ def _check_frame(files: Sequence[PlacedFile]) -> None:
         )
 
 
-def _lies_around_its_place(file: PlacedFile) -> bool:
-    points = read_points(file.path).points
+def _lies_around_its_place(file: PlacedFile, columns: Sequence[str]) -> bool:
+    points = read_points(file.path, columns).points
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) == 0:
         return False

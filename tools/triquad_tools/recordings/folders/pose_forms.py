@@ -154,7 +154,8 @@ def _form_of_header(line: Line, count: int) -> Form | None:
         unit = unit_ns if roles[-1] == "t" else unit
     missing = {*_XYZ.split(), *_XYZW.split()} - {*roles}
     if not missing and len(roles) == count:
-        return Form("trajectory", roles, unit, has_header=True)
+        known = next((form.name for form in _FORMS if form.columns == roles), "trajectory")
+        return Form(known, roles, unit, has_header=True)
     if "x" in roles and not line.is_comment:
         what = f"no {', '.join(sorted(missing))}" if missing else f"{len(roles)} of {count} columns"
         raise ToolError(f"{line.place}: names {what}: name them t {_XYZ} {_XYZW}")

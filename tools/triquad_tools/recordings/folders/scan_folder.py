@@ -261,14 +261,13 @@ def stamps_of_names(paths: Sequence[Path]) -> list[int] | None:
     ``1700000000_250000000``, seconds and a fraction of them in whole units. Small whole numbers
     are counts, not times, and so are those that begin with 0.
     """
-    pairs = [_PAIR.fullmatch(path.stem) for path in paths]
+    stems = [path.stem.removesuffix(".pcd") for path in paths]  # nuScenes: .pcd.bin
+    pairs = [_PAIR.fullmatch(stem) for stem in stems]
     longest = max((len(pair[2]) for pair in pairs if pair), default=0)
     unit_ns = next(10 ** (9 - places) for places in _PLACES if places >= longest)
     stamps: list[int] = []
-    for path, pair in zip(paths, pairs, strict=True):
-        stamp = (
-            _stamp_of(path.stem) if pair is None else int(pair[1]) * 10**9 + int(pair[2]) * unit_ns
-        )
+    for stem, pair in zip(stems, pairs, strict=True):
+        stamp = _stamp_of(stem) if pair is None else int(pair[1]) * 10**9 + int(pair[2]) * unit_ns
         if stamp is None:
             return None
         stamps.append(stamp)
