@@ -173,6 +173,26 @@ def test_another_trajectory_can_be_chosen(tmp_path):
     assert np.linalg.norm(second.world_from_sensor[:2, 3]) == pytest.approx(9.0, rel=1e-3)
 
 
+def test_viewpoints_are_poses_where_they_differ_and_no_others_are_there(tmp_path):
+    for stamp, cloud in zip(STAMPS, CLOUDS, strict=True):
+        write_pcd(tmp_path / f"{_name(stamp)}.pcd", columns(cloud))
+    with pytest.raises(ToolError, match="holds no trajectory"):
+        read_cloud_folder(tmp_path)
+    for stamp, pose in zip(STAMPS, POSES, strict=True):
+        path = tmp_path / f"{_name(stamp)}.pcd"
+        (x, y, z), (qx, qy, qz, qw) = pose.position_m, pose.quaternion_xyzw
+        said = f"VIEWPOINT {x} {y} {z} {qw} {qx} {qy} {qz}".encode()
+        path.write_bytes(re.sub(rb"VIEWPOINT.*", said, path.read_bytes(), count=1))
+    recording = read_cloud_folder(tmp_path)
+    assert [entry.stamp_ns for entry in recording.entries] == STAMPS
+    assert recording.remarks[0].startswith("poses are the VIEWPOINT of each PCD")
+    for scan, pose in zip(recording.read(range(COUNT)), matrices(POSES), strict=True):
+        np.testing.assert_allclose(scan.world_from_sensor, pose, atol=1e-9)
+    (tmp_path / f"{_name(STAMPS[2])}.pcd").write_bytes(b"")
+    with pytest.raises(ToolError, match="holds no trajectory"):
+        read_cloud_folder(tmp_path)
+
+
 def test_what_is_missing_or_too_much_is_named(tmp_path):
     with pytest.raises(ToolError, match="nowhere: no such folder"):
         read_cloud_folder(tmp_path / "nowhere")

@@ -3,7 +3,9 @@
 A ``.bin`` has ``float32`` numbers and no header: in KITTI x, y, z and intensity of each point.
 """
 
+import io
 import logging
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,6 +25,11 @@ _FILES, _SAMPLE, _ENOUGH = 4, 240_000, 4_000  # files, and numbers of each and o
 _CLEARLY, _AT_LEAST = 1.1, 0.01  # times more than other numbers of columns explain, and how much
 _HALF = 0.85  # of what twice as many columns explain: they are two points
 _PLAUSIBLE = 1e-8, 1e5  # m, of numbers other than 0
+
+
+_HEADER_END = re.compile(rb"^(DATA|end_header)\b[^\n]*\n", re.MULTILINE)
+_HEADER_BYTES = 65_536  # at most
+_COMMENTS = ("#", "comment", "obj_info")
 
 
 class FilePoints(NamedTuple):
@@ -133,10 +140,41 @@ def _bin(path: Path, columns: Sequence[str]) -> _Table:
     return _Table(dict(zip(columns, table.T, strict=True)), len(table))
 
 
+def read_header(path: Path) -> list[list[str]]:
+    """Return the words of each line in the header of a PLY or PCD, without its comments.
+
+    Raises:
+        ValueError: it has none.
+    """
+    with path.open("rb") as file:
+        return _parse_header(file.read(_HEADER_BYTES))[0]
+
+
+def _parse_header(content: bytes) -> tuple[list[list[str]], int]:
+    """Return a header as :func:`read_header`, and how many bytes it has."""
+    end = _HEADER_END.search(content, 0, _HEADER_BYTES)
+    if end is None:
+        raise ValueError("it does not begin with the header of such a file")
+    lines = [line.split() for line in content[: end.end()].decode(errors="replace").splitlines()]
+    return [line for line in lines if line and line[0] not in _COMMENTS], end.end()
+
+
+def _mended(path: Path, mend: Callable[[list[list[str]]], None]) -> io.BytesIO:
+    """Return the content of a file, its header mended and without comments."""
+    content = path.read_bytes()
+    header, size = _parse_header(content)
+    mend(header)
+    return io.BytesIO("".join(" ".join(line) + "\n" for line in header).encode() + content[size:])
+
+
 def _ply(path: Path) -> _Table:
     import trimesh
 
-    loaded: Any = trimesh.load(path, process=False)
+    def mend(header: list[list[str]]) -> None:
+        for line in header:
+            line[-1:] = [line[-1].lower()] if line[-1] in ("X", "Y", "Z") else line[-1:]
+
+    loaded: Any = trimesh.load(_mended(path, mend), file_type="ply", process=False)
     if "_ply_raw" not in loaded.metadata:  # of a file without points
         return _Table({}, 0)
     vertices = loaded.metadata["_ply_raw"]["vertex"]
@@ -146,7 +184,14 @@ def _ply(path: Path) -> _Table:
 def _pcd(path: Path) -> _Table:
     from pypcd4.pypcd4 import PointCloud
 
-    cloud = PointCloud.from_path(path)
+    def mend(header: list[list[str]]) -> None:
+        counts = next((line[1:] for line in header if line[0] == "COUNT"), [])
+        for line in header:
+            if line[0] in ("FIELDS", "SIZE", "TYPE", "COUNT"):
+                kept = [word for word, count in zip(line[1:], counts, strict=True) if count != "0"]
+                line[1:] = [word.lower() for word in kept] if line[0] == "FIELDS" else kept
+
+    cloud = PointCloud.from_fileobj(_mended(path, mend))
     return _Table(_by_name(cloud.pc_data), cloud.metadata.points)
 
 

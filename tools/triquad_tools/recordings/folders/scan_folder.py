@@ -12,12 +12,14 @@ from triquad_format.records.arrays import Doubles
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
+from triquad_tools.recordings.folders.point_file import read_header
 from triquad_tools.recordings.folders.trajectory import (
     DEFAULT_PERIOD_NS,
     Trajectory,
     number_of,
     read_pose_files,
     read_trajectory,
+    read_viewpoints,
 )
 from triquad_tools.recordings.recording import DEFAULT_SOURCE, ReadingOptions, ScanEntry, Stream
 from triquad_tools.sensors.sweep import NoTransformError, PosedScan
@@ -188,10 +190,25 @@ def _choose(
     of_files += [(folder / name).glob("*.txt") for name in _POSE_FOLDERS]
     if files := next(filter(None, map(in_order, of_files)), []):
         return read_pose_files(files), []
+    if (viewpoints := _viewpoints(paths)) is not None:
+        return viewpoints, ["poses are the VIEWPOINT of each PCD, as there is no trajectory"]
     raise ToolError(
         f"{folder}: holds no trajectory, {', '.join(TRAJECTORY_NAMES)}: put one there, or name it "
         "with --trajectory"
     )
+
+
+def _viewpoints(paths: Sequence[Path]) -> Trajectory | None:
+    """Return the poses in the headers of PCD files, if they differ from each other."""
+    if paths[0].suffix.lower() != ".pcd":
+        return None
+    try:
+        headers = [line for path in paths for line in read_header(path)]
+    except ValueError:  # told when the points are read
+        return None
+    said = [" ".join(line[1:]) for line in headers if line[0] == "VIEWPOINT"]
+    is_posed = len(said) == len(paths) and len({*said}) > 1
+    return read_viewpoints(paths, said) if is_posed else None
 
 
 def _by_number(

@@ -108,6 +108,13 @@ def read_pose_files(paths: Sequence[Path]) -> Trajectory:
     return replace(_trajectory(files, "a pose a file", lines, np.array(poses)), numbers=numbers)
 
 
+def read_viewpoints(paths: Sequence[Path], texts: Sequence[str]) -> Trajectory:
+    """Return the poses that PCD files have as ``VIEWPOINT``, in the order of the files."""
+    form = Form("VIEWPOINT", ["x", "y", "z", "qw", "qx", "qy", "qz"], has_header=True)
+    lines = [Line(str(path), text) for path, text in zip(paths, texts, strict=True)]
+    return _trajectory(paths[0].parent / "*.pcd", form.name, lines, _poses(form, lines, None))
+
+
 def number_of(path: Path) -> int | None:
     """Return the last whole number in a name, such as 12 of ``frame-000012.pose.txt``."""
     found = re.findall(r"\d+", path.name.partition(".")[0])
