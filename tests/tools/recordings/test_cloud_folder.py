@@ -193,6 +193,23 @@ def test_viewpoints_are_poses_where_they_differ_and_no_others_are_there(tmp_path
         read_cloud_folder(tmp_path)
 
 
+def test_folders_that_follow_each_other_are_joined_and_sensors_at_one_time_are_not(tmp_path):
+    _timed(tmp_path, STAMPS[:3], "b")
+    for stamp, cloud in zip(STAMPS[3:], CLOUDS[3:], strict=True):
+        (tmp_path / "a").mkdir(exist_ok=True)
+        write_ply(tmp_path / "a" / f"{_name(stamp)}.ply", columns(cloud))
+    recording = read_cloud_folder(tmp_path)
+    assert recording.streams[0].name == "b/*.ply, a/*.ply"
+    assert [entry.stamp_ns for entry in recording.entries] == STAMPS
+    for scan, cloud in zip(recording.read(range(COUNT)), CLOUDS, strict=True):
+        np.testing.assert_array_equal(scan.points, cloud)
+    write_ply(tmp_path / "a" / f"{_name(STAMPS[1] + 1)}.ply", columns(CLOUDS[0]))
+    with pytest.raises(ToolError, match="not one after the other in time: .*give one of these"):
+        read_cloud_folder(tmp_path)
+    one = read_cloud_folder(tmp_path / "a", trajectory=Path("../trajectory.txt"))
+    assert len(one.entries) == 4
+
+
 def test_what_is_missing_or_too_much_is_named(tmp_path):
     with pytest.raises(ToolError, match="nowhere: no such folder"):
         read_cloud_folder(tmp_path / "nowhere")
@@ -215,7 +232,8 @@ def test_what_is_missing_or_too_much_is_named(tmp_path):
     with pytest.raises(ToolError, match=r"holds .pcd and .ply: leave only one"):
         read_cloud_folder(tmp_path)
     _counted(tmp_path / "map", 1)
-    with pytest.raises(ToolError, match=r"clouds lie in .* \(4\), .*map \(1\): leave only"):
+    words = r"clouds lie in .* \(4\), .*map \(1\), .* leave only those .* or give one of these"
+    with pytest.raises(ToolError, match=words):
         read_cloud_folder(tmp_path)
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from triquad_tools.recordings.folders.scan_folder import (
     check_all,
     in_order,
     place_files,
+    stamps_of_names,
 )
 from triquad_tools.recordings.folders.trajectory import SENSOR, WORLD, Trajectory
 from triquad_tools.recordings.recording import ReadingOptions, Stream
@@ -64,7 +66,9 @@ def read_cloud_folder(folder: Path, options: ReadingOptions | None = None) -> Sc
         files = _of_lidar([folder, first.parent, first.parent.parent, poses.path.parent], files)
     if options.points_in is None:
         _check_frame(files, columns)
-    clouds, kind = f"{first.parent.name}/*{first.suffix}", first.suffix[1:].upper() + " clouds"
+    names = dict.fromkeys(path.parent.name for path in paths)
+    clouds = ", ".join(f"{name}/*{first.suffix}" for name in names)
+    kind = first.suffix[1:].upper() + " clouds"
     streams = (
         Stream(clouds, kind, len(files), "scans", options.points_in or SENSOR),
         Stream(poses.path.name, poses.kind, len(poses.poses), "poses of the sensor"),
@@ -107,10 +111,17 @@ def _cloud_paths(folder: Path) -> list[Path]:
     found = _folders_of_clouds(folder)
     if not found:
         raise ToolError(f"{folder}: holds no {', '.join(POINT_SUFFIXES)}, nor does a folder in it")
-    if len(found) > 1:
+    parts = list(found.values())
+    spans = [(min(stamps), max(stamps)) for stamps in map(stamps_of_names, parts) if stamps]
+    ordered = sorted(zip(spans, parts, strict=False))
+    following = all(a[0][1] < b[0][0] for a, b in pairwise(ordered))
+    if len(parts) > 1 and not (len(spans) == len(parts) and following):
         folders = ", ".join(f"{each} ({len(paths)})" for each, paths in found.items())
-        raise ToolError(f"{folder}: clouds lie in {folders}: leave only those that are scans")
-    (paths,) = found.values()
+        raise ToolError(
+            f"{folder}: clouds lie in {folders}, and not one after the other in time: leave only "
+            f"those that are scans, or give one of these folders, with --trajectory"
+        )
+    paths = [path for part in ([part for _, part in ordered] or parts) for path in part]
     suffixes = sorted({path.suffix for path in paths})
     if len(suffixes) > 1:
         raise ToolError(

@@ -159,12 +159,13 @@ def _parse_header(content: bytes) -> tuple[list[list[str]], int]:
     return [line for line in lines if line and line[0] not in _COMMENTS], end.end()
 
 
-def _mended(path: Path, mend: Callable[[list[list[str]]], None]) -> io.BytesIO:
+def _mended(path: Path, mend: Callable[[list[list[str]]], None]) -> io.BufferedReader:
     """Return the content of a file, its header mended and without comments."""
     content = path.read_bytes()
     header, size = _parse_header(content)
     mend(header)
-    return io.BytesIO("".join(" ".join(line) + "\n" for line in header).encode() + content[size:])
+    lines = "".join(" ".join(line) + "\n" for line in header)
+    return io.BufferedReader(io.BytesIO(lines.encode() + content[size:]))
 
 
 def _ply(path: Path) -> _Table:
