@@ -22,6 +22,20 @@ def points_in_range(points: NDArray[np.floating], range_min_m: float) -> NDArray
     return kept
 
 
+def at_most(points: NDArray[np.floating], count: int) -> NDArray[np.floating]:
+    """Return at most ``count`` points of ``[N, 3]``, finite ones where there are more.
+
+    One is drawn from each of as many runs of them: every second may be of every second laser.
+    """
+    if len(points) > count:
+        points = points[np.isfinite(points).all(axis=1)]
+    if len(points) > count:
+        runs = np.arange(count + 1) * len(points) // count
+        draws = np.random.default_rng(0).random(count)
+        points = points[runs[:-1] + (draws * np.diff(runs)).astype(np.int64)]
+    return points
+
+
 def world_points(scan: PosedScan, range_min_m: float = 0.0) -> Doubles:
     """Return the finite points ``[N, 3]`` of a scan that are no nearer than this, world frame."""
     points = points_in_range(scan.points, range_min_m)

@@ -11,13 +11,28 @@ import numpy as np
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.lines import print_remark
 from triquad_tools.recordings.bag import find_bag
-from triquad_tools.recordings.cloud import points_in_range
+from triquad_tools.recordings.cloud import at_most, points_in_range
 from triquad_tools.recordings.folders.cloud_folder import is_cloud_folder, read_cloud_folder
 from triquad_tools.recordings.folders.depth_folder import is_depth_folder, read_depth_folder
 from triquad_tools.recordings.folders.scan_folder import ScanFolder
 from triquad_tools.recordings.recording import ReadingOptions, ScanEntry, options_of
 from triquad_tools.recordings.ros_recording import RosRecording
 from triquad_tools.sensors.sweep import PosedScan
+
+MAX_POINTS = 500_000
+"""The points of a scan that a server takes, unless its ``scan.max_points`` is another."""
+
+_UNPACK = {
+    (".zip",): "unzip",
+    (".7z", ".rar"): "7z x",
+    (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tar.xz", ".tar.zst"): "tar -xf",
+    (".gz",): "gunzip",
+    (".bz2",): "bunzip2",
+    (".xz",): "unxz",
+    (".zst", ".zstd"): "unzstd",
+    (".lz4",): "unlz4",
+}
+"""The commands that unpack files, by how their names end; the first one counts."""
 
 Recording = RosRecording | ScanFolder
 """A recording that was checked as a whole, so that its errors are known."""
@@ -41,6 +56,9 @@ def open_recording(path: Path, options: ReadingOptions) -> Recording:
     """
     if not path.exists():
         raise ToolError(f"{path}: no such file or folder")
+    ends = (command for end, command in _UNPACK.items() if path.name.lower().endswith(end))
+    if path.is_file() and (command := next(ends, None)):
+        raise ToolError(f"{path}: is packed: unpack it with '{command} {path}' first")
     bag = find_bag(path)
     if bag is not None:
         _refuse_others(f"{path} is a bag", _OF_BAGS, options)
@@ -67,12 +85,13 @@ def _refuse_others(what: str, meaningful: set[str], options: ReadingOptions) -> 
 
 @dataclass(frozen=True)
 class Selection:
-    """Some scans of a recording, without points that are too near."""
+    """Some scans of a recording, without points that are too near, or more than are taken."""
 
     recording: Recording
     indices: Sequence[int]
     range_min_m: float
     way: str  # in which it is read: another one may give other scans
+    max_points: int = MAX_POINTS
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -84,13 +103,20 @@ class Selection:
         return [entries[index] for index in self.indices]
 
     def scans(self, start: int = 0) -> Iterator[PosedScan]:
-        """Yield the scans from number ``start`` on, one after the other."""
+        """Yield the scans from number ``start`` on; the first that is thinned is told."""
+        is_told = False
         for scan in self.recording.read(self.indices[start:]):
             points = points_in_range(np.asarray(scan.points, np.float32), self.range_min_m)
-            yield PosedScan(points, scan.world_from_sensor)
+            if len(points) > self.max_points and not is_told:
+                is_told = True
+                print_remark(
+                    f"scans of more than {self.max_points:,} points, such as one of "
+                    f"{len(points):,}, are thinned to these: scan.max_points"
+                )
+            yield PosedScan(at_most(points, self.max_points), scan.world_from_sensor)
 
 
-def open_selected(options: argparse.Namespace) -> Selection:
+def open_selected(options: argparse.Namespace, max_points: int = MAX_POINTS) -> Selection:
     """Return the recording of the arguments and the scans they choose; its remarks are printed.
 
     Raises:
@@ -110,7 +136,7 @@ def open_selected(options: argparse.Namespace) -> Selection:
             "see --start, --end and --every"
         )
     way = repr((options.recording.resolve(), reading, options.range_min))
-    return Selection(recording, indices, options.range_min, way)
+    return Selection(recording, indices, options.range_min, way, max_points)
 
 
 def length_s(entries: Sequence[ScanEntry]) -> float:
