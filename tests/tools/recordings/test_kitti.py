@@ -88,9 +88,12 @@ def test_poses_and_calibration_may_lie_elsewhere(tmp_path: Path) -> None:
     (tmp_path / "00.txt").write_text("\n".join(rows))
     folder_360 = read_cloud_folder(folder, of_camera)
     assert _stamps(folder_360) == [100_000_000, 200_000_000]
-    assert folder_360.remarks[0].startswith("1 of 3 files are left out: ")
+    assert folder_360.remarks[0].startswith("1 of 3 files are left out, as 00.txt")
     np.testing.assert_allclose(_poses(folder_360)[:, :3, :3], 2 * [np.eye(3)], atol=1e-12)
     np.testing.assert_allclose(_poses(folder_360)[:, 0, 3], [4.5, 8.5], atol=1e-12)
+    (tmp_path / "00.txt").write_text("\n".join([*rows, "3" + rows[1][1:]]))
+    with pytest.raises(ToolError, match="3 poses in .* their numbers are not those of the poses"):
+        read_cloud_folder(folder, of_camera)
 
 
 def test_calibration_turns_rotations_too(tmp_path: Path) -> None:

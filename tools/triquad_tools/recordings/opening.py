@@ -23,16 +23,11 @@ MAX_POINTS = 500_000
 """The points of a scan that a server takes, unless its ``scan.max_points`` is another."""
 
 _UNPACK = {
-    (".zip",): "unzip",
-    (".7z", ".rar"): "7z x",
-    (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tar.xz", ".tar.zst"): "tar -xf",
-    (".gz",): "gunzip",
-    (".bz2",): "bunzip2",
-    (".xz",): "unxz",
-    (".zst", ".zstd"): "unzstd",
-    (".lz4",): "unlz4",
-}
-"""The commands that unpack files, by how their names end; the first one counts."""
+    ".zip": "unzip", ".7z": "7z x", ".tar": "tar -xf", ".tgz": "tar -xf", ".tar.gz": "tar -xf",
+    ".tar.bz2": "tar -xf", ".tar.xz": "tar -xf", ".tar.zst": "tar -xf", ".gz": "gunzip",
+    ".bz2": "bunzip2", ".xz": "unxz", ".zst": "unzstd", ".zstd": "unzstd", ".lz4": "unlz4",
+}  # fmt: skip
+"""The commands that unpack files, by how their names end: the first one counts."""
 
 Recording = RosRecording | ScanFolder
 """A recording that was checked as a whole, so that its errors are known."""

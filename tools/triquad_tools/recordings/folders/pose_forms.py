@@ -74,6 +74,7 @@ _NUMBERS = {"n", "num", "number", "counter", "index", "frame", "id", "seq"}
 _OF_POSITION = {"p", "t", "pos", "position", "trans", "translation"}
 _OF_ROTATION = {"q", "quat", "quaternion", "orientation", "rot", "rotation"}
 _UNITS_NS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9, "sec": 10**9}
+_NUMBER = re.compile(r"[+-]?(\.?\d|nan|inf)", re.IGNORECASE)  # the beginning of one
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+(,\d+(e[+-]?\d+)?)?", re.IGNORECASE)
 _ENOUGH, _MOST = 200, 0.9  # lines, to determine a form, and how many of them have to fit
 _LEVEL = 0.1  # at most, of the x and y of a quaternion: a robot that leans by 11 degrees
@@ -90,8 +91,8 @@ def read_form(path: Path) -> tuple[Form | None, list[Line]]:
     header: list[Line] = []
     lines: list[Line] = []
     for line in all_lines(path):
-        is_name = not lines and not _is_number(line.words[0]) if line.words else True
-        (header if line.is_comment or is_name else lines).append(line)
+        is_header = line.is_comment or not (lines or _NUMBER.match(line.text))
+        (header if is_header else lines).append(line)
     if not lines:
         raise ToolError(f"{path}: holds no poses")
     first, count = lines[0], len(lines[0].words)
@@ -210,10 +211,11 @@ def _fits(form: Form, lines: Sequence[Line]) -> bool:
     if not good or np.mean(good) < _MOST:
         return False
     counts, times = form.numbers(lines, "n", "nsec"), form.numbers(lines, "t")
-    whole_and_small = [
-        np.all(np.isnan(part) | (part == np.floor(part)) & (part < 1e9)) for part in (counts, times)
-    ]
-    return bool(whole_and_small[0] and not (times.size and whole_and_small[1]))
+    return bool(_is_count(counts) and not (times.size and _is_count(times)))
+
+
+def _is_count(numbers: Doubles) -> bool:
+    return bool(np.all(np.isnan(numbers) | (numbers == np.floor(numbers)) & (numbers < 1e9)))
 
 
 def parse_number(line: Line, word: str) -> float:
@@ -222,11 +224,3 @@ def parse_number(line: Line, word: str) -> float:
         return float(word)
     except ValueError:
         raise ToolError(f"{line.place}: {word!r} is not a number") from None
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True

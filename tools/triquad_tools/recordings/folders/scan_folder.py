@@ -143,11 +143,19 @@ def _placed(
         placed = _by_time(paths, stamps, trajectory, remarks)
         if placed.files:
             return placed
-    if trajectory.numbers is not None:
-        placed = _by_number(paths, stamps, trajectory, remarks)
-        if placed.files:
-            return placed
-    if len(paths) == len(trajectory.poses):
+    pose_of = dict(zip(trajectory.numbers or (), trajectory.poses, strict=False))
+    numbers = [number_of(path) or 0 for path in paths]
+    if (
+        pose_of
+        and {*numbers} <= {*pose_of}
+        or len(paths) != len(pose_of)
+        and {*numbers} & {*pose_of}
+    ):
+        when = stamps or [number * DEFAULT_PERIOD_NS for number in numbers]
+        found = [pose_of.get(number, np.full((4, 4), np.nan)) for number in numbers]
+        files = list(map(PlacedFile, paths, when, found))
+        return PlacedFiles(files, trajectory, remarks)
+    if len(paths) == len(trajectory.poses) and not pose_of:
         when = trajectory.stamps_ns.tolist()
         if stamps is not None and not timed:
             when = list(stamps)
@@ -161,6 +169,7 @@ def _placed(
     if stamps is not None and timed:
         raise _no_common_time(stamps, trajectory, paths[0].parent)
     what = "the trajectory has no times" if stamps is not None else "their names hold no times"
+    what = "their numbers are not those of the poses" if pose_of else what
     raise ToolError(
         f"{paths[0].parent}: {len(paths)} files such as {paths[0].name}, and "
         f"{len(trajectory.poses)} poses in {path}, and {what}: give every file one pose, or times "
@@ -209,25 +218,6 @@ def _viewpoints(paths: Sequence[Path]) -> Trajectory | None:
     said = [" ".join(line[1:]) for line in headers if line[0] == "VIEWPOINT"]
     is_posed = len(said) == len(paths) and len({*said}) > 1
     return read_viewpoints(paths, said) if is_posed else None
-
-
-def _by_number(
-    paths: Sequence[Path],
-    stamps_ns: Sequence[int] | None,
-    trajectory: Trajectory,
-    remarks: list[str],
-) -> PlacedFiles:
-    """Return the files whose numbers have a pose; their times are ten a second if unknown."""
-    pose_of = dict(zip(trajectory.numbers or (), trajectory.poses, strict=True))
-    placed: list[PlacedFile] = []
-    for index, path in enumerate(paths):
-        number = number_of(path)
-        if number is not None and number in pose_of:
-            stamp = number * DEFAULT_PERIOD_NS if stamps_ns is None else stamps_ns[index]
-            placed.append(PlacedFile(path, stamp, pose_of[number]))
-    left_out = len(paths) - len(placed)
-    told = f"{left_out} of {len(paths)} files are left out: {trajectory.path} has no pose for them"
-    return PlacedFiles(placed, trajectory, [*remarks, told] if left_out and placed else remarks)
 
 
 def _by_time(
