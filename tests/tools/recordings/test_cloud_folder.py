@@ -109,6 +109,15 @@ def test_counted_clouds_go_with_poses_in_order(tmp_path):
         np.testing.assert_allclose(scan.world_from_sensor, poses[number].matrix(), atol=1e-7)
 
 
+def test_poses_without_times_go_to_files_in_the_order_of_the_times_in_their_names(tmp_path):
+    write_log(tmp_path / "trajectory.log", POSES[:4])
+    for name in ("0.5.ply", "0.25.ply", "1.0.ply", "0.75.ply"):
+        write_ply(tmp_path / name, columns(CLOUDS[0]))
+    files = read_cloud_folder(tmp_path).files
+    assert [file.path.name for file in files] == ["0.25.ply", "0.5.ply", "0.75.ply", "1.0.ply"]
+    np.testing.assert_allclose(files[2].world_from_sensor, POSES[2].matrix(), atol=1e-7)
+
+
 def test_as_many_poses_of_another_clock_go_in_order_and_it_is_said(tmp_path):
     write_tum(_timed(tmp_path) / "trajectory.txt", [s - START_NS for s in STAMPS], POSES)
     recording = read_cloud_folder(tmp_path)

@@ -53,17 +53,16 @@ def read_cloud_folder(folder: Path, options: ReadingOptions | None = None) -> Sc
     """
     options = options or ReadingOptions()
     paths = _cloud_paths(folder)
-    if paths[0].suffix.lower() == ".bin" and options.columns is None:
+    first, above = paths[0], paths[0].parent.parent
+    if first.suffix.lower() == ".bin" and options.columns is None:
         check_columns(paths)
-    placed = place_files(
-        folder, options, paths, read_times([folder, paths[0].parent.parent], len(paths))
-    )
+    placed = place_files(folder, options, paths, read_times([folder, above], len(paths)))
     columns = options.columns or KITTI_COLUMNS
     if not sum(check_all(paths, partial(check_points, columns=columns))):
-        raise ToolError(f"{paths[0].parent}: none of the {len(paths)} files holds any points")
-    first, poses, files = paths[0], placed.trajectory, placed.files
+        raise ToolError(f"{first.parent}: none of the {len(paths)} files holds any points")
+    poses, files = placed.trajectory, placed.files
     if first.suffix.lower() == ".bin" and poses.frames is None:
-        files = _of_lidar([folder, first.parent, first.parent.parent, poses.path.parent], files)
+        files = _of_lidar([folder, above, poses.path.parent], files)
     if options.points_in is None:
         _check_frame(files, columns)
     names = dict.fromkeys(path.parent.name for path in paths)
@@ -119,7 +118,7 @@ def _cloud_paths(folder: Path) -> list[Path]:
         folders = ", ".join(f"{each} ({len(paths)})" for each, paths in found.items())
         raise ToolError(
             f"{folder}: clouds lie in {folders}, and not one after the other in time: leave only "
-            f"those that are scans, or give one of these folders, with --trajectory"
+            "those that are scans, or give one of these folders, with --trajectory"
         )
     paths = [path for part in ([part for _, part in ordered] or parts) for path in part]
     suffixes = sorted({path.suffix for path in paths})

@@ -155,15 +155,20 @@ def _parse_header(content: bytes) -> tuple[list[list[str]], int]:
     end = _HEADER_END.search(content, 0, _HEADER_BYTES)
     if end is None:
         raise ValueError("it does not begin with the header of such a file")
-    lines = [line.split() for line in content[: end.end()].decode(errors="replace").splitlines()]
+    lines = map(str.split, content[: end.end()].decode(errors="replace").splitlines())
     return [line for line in lines if line and line[0] not in _COMMENTS], end.end()
 
 
-def _mended(path: Path, mend: Callable[[list[list[str]]], None]) -> io.BufferedReader:
-    """Return the content of a file, its header mended and without comments."""
+def _mended(path: Path) -> io.BufferedReader:
+    """Return the content of a PLY or PCD as the libraries want it: x y z, no fields of COUNT 0."""
     content = path.read_bytes()
     header, size = _parse_header(content)
-    mend(header)
+    counts = next((line[1:] for line in header if line[0] == "COUNT"), [])
+    for line in header:
+        if line[0] in ("FIELDS", "SIZE", "TYPE", "COUNT"):
+            line[1:] = [word for word, n in zip(line[1:], counts, strict=True) if n != "0"]
+        if line[0] in ("FIELDS", "property"):
+            line[1:] = [word.lower() if word in ("X", "Y", "Z") else word for word in line[1:]]
     lines = "".join(" ".join(line) + "\n" for line in header)
     return io.BufferedReader(io.BytesIO(lines.encode() + content[size:]))
 
@@ -171,11 +176,7 @@ def _mended(path: Path, mend: Callable[[list[list[str]]], None]) -> io.BufferedR
 def _ply(path: Path) -> _Table:
     import trimesh
 
-    def mend(header: list[list[str]]) -> None:
-        for line in header:
-            line[-1:] = [line[-1].lower()] if line[-1] in ("X", "Y", "Z") else line[-1:]
-
-    loaded: Any = trimesh.load(_mended(path, mend), file_type="ply", process=False)
+    loaded: Any = trimesh.load(_mended(path), file_type="ply", process=False)
     if "_ply_raw" not in loaded.metadata:  # of a file without points
         return _Table({}, 0)
     vertices = loaded.metadata["_ply_raw"]["vertex"]
@@ -185,14 +186,7 @@ def _ply(path: Path) -> _Table:
 def _pcd(path: Path) -> _Table:
     from pypcd4.pypcd4 import PointCloud
 
-    def mend(header: list[list[str]]) -> None:
-        counts = next((line[1:] for line in header if line[0] == "COUNT"), [])
-        for line in header:
-            if line[0] in ("FIELDS", "SIZE", "TYPE", "COUNT"):
-                kept = [word for word, count in zip(line[1:], counts, strict=True) if count != "0"]
-                line[1:] = [word.lower() for word in kept] if line[0] == "FIELDS" else kept
-
-    cloud = PointCloud.from_fileobj(_mended(path, mend))
+    cloud = PointCloud.from_fileobj(_mended(path))
     return _Table(_by_name(cloud.pc_data), cloud.metadata.points)
 
 

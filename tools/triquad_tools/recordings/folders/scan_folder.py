@@ -118,6 +118,8 @@ def place_files(
     """
     trajectory, remarks = _choose(folder, paths, options)
     remarks += trajectory.remarks
+    if stamps_ns is None and (stamps_ns := stamps_of_names(paths)) is not None:
+        stamps_ns, paths = zip(*sorted(zip(stamps_ns, paths, strict=True)), strict=True)
     placed = _placed(paths, stamps_ns, trajectory, remarks)
     known = [file for file in placed.files if np.isfinite(file.world_from_sensor).all()]
     if not known:
@@ -131,13 +133,12 @@ def place_files(
 
 def _placed(
     paths: Sequence[Path],
-    stamps_ns: Sequence[int] | None,
+    stamps: Sequence[int] | None,
     trajectory: Trajectory,
     remarks: list[str],
 ) -> PlacedFiles:
     """Return the files that have poses, some of which may not be finite."""
     path = trajectory.path
-    stamps = stamps_of_names(paths) if stamps_ns is None else stamps_ns
     timed = stamps is not None and trajectory.frames is not None
     if stamps is not None and timed:
         placed = _by_time(paths, stamps, trajectory, remarks)
