@@ -12,6 +12,10 @@ from triquad_format.records.pose import is_rotation, orthonormal, rotation_error
 
 from triquad_tools.console.command import ToolError
 
+NS_OF_DIGITS = {10: 10**9, 13: 10**6, 16: 10**3, 19: 1}
+"""Whole numbers with as many digits are times since 1970, from 2001 to 2286, in a unit of
+nanoseconds: seconds, milliseconds, microseconds or nanoseconds."""
+
 
 class Line(NamedTuple):
     """A line that is neither blank nor a comment."""
@@ -45,34 +49,35 @@ def read_lines(path: Path) -> list[Line]:
     return [line for line in all_lines(path) if not line.is_comment]
 
 
+def parse_number(place: str, word: str) -> float:
+    """Return the number that a word is, which need not be finite; else raise a ToolError."""
+    try:
+        return float(word)
+    except ValueError:
+        raise ToolError(f"{place}: {word!r} is not a number") from None
+
+
 def parse_numbers(place: str, words: Sequence[str]) -> list[float]:
     """Return the finite numbers that the words are.
 
     Raises:
         ToolError: a word is none.
     """
-    numbers = []
-    for word in words:
-        try:
-            numbers.append(float(word))
-        except ValueError:
-            raise ToolError(f"{place}: {word!r} is not a number") from None
-        if not math.isfinite(numbers[-1]):
+    numbers = [parse_number(place, word) for word in words]
+    for word, number in zip(words, numbers, strict=True):
+        if not math.isfinite(number):
             raise ToolError(f"{place}: {word!r} is not finite")
     return numbers
 
 
 def unit_ns(line: Line, word: str) -> int:
-    """Return the nanoseconds of the unit of a time, by its size.
-
-    Since 1970 it is seconds with at most 11 digits, milliseconds with 13, microseconds with 16, and
-    nanoseconds with 19.
+    """Return the nanoseconds of the unit of a time, by its size: seconds if it is small.
 
     Raises:
         ToolError: it is no number, or has another number of digits.
     """
     digits = len(str(parse_time(line, word, 1)))
-    unit = 10**9 if digits <= 11 else {13: 10**6, 16: 10**3, 19: 1}.get(digits)
+    unit = 10**9 if digits < 10 else NS_OF_DIGITS.get(digits)
     if unit is None:
         raise ToolError(
             f"{line.place}: {word} is out of range: times are seconds, from 0 on, or whole "

@@ -163,6 +163,9 @@ def _mended(path: Path) -> io.BufferedReader:
     """Return the content of a PLY or PCD as the libraries want it: x y z, no fields of COUNT 0."""
     content = path.read_bytes()
     header, size = _parse_header(content)
+    fields = next((len(line) - 1 for line in header if line[0] == "FIELDS"), 0)
+    if fields and not any(line[0] == "COUNT" for line in header):
+        header.insert(0, ["COUNT", *["1"] * fields])
     counts = next((line[1:] for line in header if line[0] == "COUNT"), [])
     for line in header:
         if line[0] in ("FIELDS", "SIZE", "TYPE", "COUNT"):

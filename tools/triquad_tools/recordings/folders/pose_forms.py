@@ -15,7 +15,7 @@ from triquad_format.records.arrays import Doubles
 from triquad_format.records.pose import is_rotation
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.text_lines import Line, all_lines
+from triquad_tools.recordings.text_lines import Line, all_lines, parse_number
 
 
 class Form(NamedTuple):
@@ -38,7 +38,7 @@ class Form(NamedTuple):
             ToolError: a word is no number.
         """
         places = [i for name in wanted for i, each in enumerate(self.columns) if each == name]
-        rows = [[parse_number(line, line.words[i]) for i in places] for line in lines]
+        rows = [[parse_number(line.place, line.words[i]) for i in places] for line in lines]
         return np.array(rows, np.float64).reshape(len(lines), len(places))
 
 
@@ -216,11 +216,3 @@ def _fits(form: Form, lines: Sequence[Line]) -> bool:
 
 def _is_count(numbers: Doubles) -> bool:
     return bool(np.all(np.isnan(numbers) | (numbers == np.floor(numbers)) & (numbers < 1e9)))
-
-
-def parse_number(line: Line, word: str) -> float:
-    """Return a number, which need not be finite."""
-    try:
-        return float(word)
-    except ValueError:
-        raise ToolError(f"{line.place}: {word!r} is not a number") from None

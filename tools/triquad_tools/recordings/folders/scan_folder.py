@@ -22,6 +22,7 @@ from triquad_tools.recordings.folders.trajectory import (
     read_viewpoints,
 )
 from triquad_tools.recordings.recording import DEFAULT_SOURCE, ReadingOptions, ScanEntry, Stream
+from triquad_tools.recordings.text_lines import NS_OF_DIGITS
 from triquad_tools.sensors.sweep import NoTransformError, PosedScan
 
 _Read = TypeVar("_Read")
@@ -36,10 +37,6 @@ _WHY = {
     "pose_gap": "between poses that lie too far apart",
 }
 _NUMBERS = re.compile(r"(\d+)")
-_NS_OF_DIGITS = {10: 10**9, 13: 10**6, 16: 10**3, 19: 1}
-"""Whole numbers with as many digits are times since 1970, from 2001 to 2286, in a unit of
-nanoseconds: seconds, milliseconds, microseconds or nanoseconds."""
-
 _WHOLE = re.compile(r"(?:.*\D)?([1-9]\d+)")
 _DECIMAL = re.compile(r"(?:.*[^\d.])?(\d{1,10})\.(\d{1,9})")
 _PAIR = re.compile(r"(?:.*\D)?([1-9]\d{9})[_-](\d{1,9})")
@@ -287,5 +284,5 @@ def _stamp_of(stem: str) -> int | None:
     if decimal is not None:
         return int(decimal[1]) * 10**9 + int(decimal[2].ljust(9, "0"))
     whole = _WHOLE.fullmatch(stem)
-    unit_ns = None if whole is None else _NS_OF_DIGITS.get(len(whole[1]))
+    unit_ns = None if whole is None else NS_OF_DIGITS.get(len(whole[1]))
     return None if whole is None or unit_ns is None else int(whole[1]) * unit_ns

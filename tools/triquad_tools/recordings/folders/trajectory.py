@@ -19,10 +19,16 @@ from triquad_tools.recordings.folders.pose_forms import (
     UNIT_TOLERANCE,
     Form,
     order_of,
-    parse_number,
     read_form,
 )
-from triquad_tools.recordings.text_lines import Line, parse_time, read_lines, rigid, unit_ns
+from triquad_tools.recordings.text_lines import (
+    Line,
+    parse_number,
+    parse_time,
+    read_lines,
+    rigid,
+    unit_ns,
+)
 from triquad_tools.sensors.motion.frame_tree import FrameTree, Transform
 from triquad_tools.sensors.sweep import NoTransformError
 
@@ -102,7 +108,7 @@ def read_pose_files(paths: Sequence[Path]) -> Trajectory:
         words = [word for each in read_lines(path) for word in each.words]
         if len(words) not in (12, 16):
             raise ToolError(f"{path}: {len(words)} numbers where a pose has 16")
-        poses.append(_matrix(line, [parse_number(line, word) for word in words]))
+        poses.append(_matrix(line, [parse_number(line.place, word) for word in words]))
     files = paths[0].parent / f"*{''.join(paths[0].suffixes)}"
     numbers = [number_of(path) or 0 for path in paths]
     return replace(_trajectory(files, "a pose a file", lines, np.array(poses)), numbers=numbers)
@@ -222,6 +228,6 @@ def _blocks(path: Path, lines: Sequence[Line]) -> tuple[list[Line], Doubles]:
             raise ToolError(
                 f"{lines[start].place}: not 3 numbers and four rows of 4, as in Open3D's .log"
             )
-        numbers = [parse_number(row, word) for row in rows for word in row.words]
+        numbers = [parse_number(row.place, word) for row in rows for word in row.words]
         poses.append(_matrix(lines[start], numbers))
     return list(lines[::size]), np.array(poses)
