@@ -141,15 +141,14 @@ def _placed(
         placed = _by_time(paths, stamps, trajectory, remarks)
         if placed.files:
             return placed
-    pose_of = dict(zip(trajectory.numbers or (), trajectory.poses, strict=False))
-    numbers = [number_of(path) or 0 for path in paths]
-    if (
-        pose_of
-        and {*numbers} <= {*pose_of}
-        or len(paths) != len(pose_of)
-        and {*numbers} & {*pose_of}
-    ):
-        when = stamps or [number * DEFAULT_PERIOD_NS for number in numbers]
+    pose_of: dict[int | None, Doubles] = dict(
+        zip(trajectory.numbers or (), trajectory.poses, strict=False)
+    )
+    numbers = [number_of(path) for path in paths]
+    shared = {*numbers} & {*pose_of}
+    # As many files as poses, of which not all have common numbers, may be counted in two ways.
+    if shared and (len(shared) == len(paths) or len(pose_of) != len(paths)):
+        when = stamps or [(number or 0) * DEFAULT_PERIOD_NS for number in numbers]
         found = [pose_of.get(number, np.full((4, 4), np.nan)) for number in numbers]
         files = list(map(PlacedFile, paths, when, found))
         return PlacedFiles(files, trajectory, remarks)

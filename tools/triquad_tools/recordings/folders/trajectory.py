@@ -153,10 +153,11 @@ def _timed(found: Trajectory, stamps: Longs) -> Trajectory:
     order = np.argsort(stamps, kind="stable")
     poses, ordered = found.poses[order], stamps[order]
     backwards, repeated = int((np.diff(stamps) < 0).sum()), int((np.diff(ordered) == 0).sum())
+    of_all = f"{found.path}: has {len(stamps)} poses, some with a time"
     if backwards:
-        remarks.append(f"{found.path}: {backwards} times are before the line above: sorted by time")
+        remarks.append(f"{of_all} before that of the line above ({backwards}): sorted by time")
     if repeated:
-        remarks.append(f"{found.path}: {repeated} times are those of another pose: the last counts")
+        remarks.append(f"{of_all} that of another pose ({repeated}): the last of each is taken")
     known = np.isfinite(poses[:, 0, 3])
     turns = Rotation.from_matrix(poses[known, :3, :3]).as_quat()
     for stamp, pose, turn in zip(ordered[known].tolist(), poses[known], turns, strict=True):
