@@ -21,11 +21,10 @@ KITTI_COLUMNS = ("x", "y", "z", "intensity")
 """Those of a ``.bin`` of which nothing else is said."""
 
 _OTHER_COLUMNS = {3: "xyz", 5: "xyzir", 6: "xyzirt"}  # as data sets have them
-_FILES, _SAMPLE, _ENOUGH = 4, 240_000, 4_000  # files, and numbers of each and of all, to tell them
+_FILES, _SAMPLE, _ENOUGH = 4, 240_000, 1_000  # files, and numbers of each and of all, to tell them
 _CLEARLY, _AT_LEAST = 1.1, 0.01  # times more than other numbers of columns explain, and how much
 _HALF = 0.85  # of what twice as many columns explain: they are two points
-_PLAUSIBLE = 1e-8, 1e5  # m, of numbers other than 0
-
+_PLAUSIBLE = 1e-8, 1e8  # m, of numbers other than 0
 
 _HEADER_END = re.compile(rb"^(DATA|end_header)\b[^\n]*\n", re.MULTILINE)
 _HEADER_BYTES = 65_536  # at most
@@ -62,7 +61,10 @@ def check_columns(paths: Sequence[Path]) -> None:
     sizes = np.abs(np.concatenate(flats))
     sizes = sizes[(sizes != 0) & np.isfinite(sizes)]
     if not len(sizes) or np.mean((sizes < _PLAUSIBLE[0]) | (sizes > _PLAUSIBLE[1])) > _AT_LEAST:
-        raise ToolError(f"{some[0]}: its numbers are no metres, read as float32: write them so")
+        raise ToolError(
+            f"{some[0]}: its numbers are no metres, read as float32: say what they "
+            "are with --columns, or write them so"
+        )
     share = {count: _explained(flats, count) for count in (4, *_OTHER_COLUMNS)}
     best = max(_OTHER_COLUMNS, key=lambda count: share[count])
     if share[4] < max(_AT_LEAST, _CLEARLY * share[best]):
@@ -135,7 +137,10 @@ def check_points(path: Path, columns: Sequence[str] = KITTI_COLUMNS) -> int:
 def _bin(path: Path, columns: Sequence[str]) -> _Table:
     size, width = path.stat().st_size, 4 * len(columns)
     if size % width:
-        raise ValueError(f"{size} bytes are not whole points of {width}: {' '.join(columns)}")
+        raise ValueError(
+            f"{size} bytes are not whole points of {width} ({' '.join(columns)}); --columns says "
+            "which others"
+        )
     table = np.fromfile(path, "<f4").reshape(-1, len(columns))
     return _Table(dict(zip(columns, table.T, strict=True)), len(table))
 
