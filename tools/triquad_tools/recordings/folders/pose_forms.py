@@ -38,8 +38,11 @@ class Form(NamedTuple):
             ToolError: a word is no number.
         """
         places = [i for name in wanted for i, each in enumerate(self.columns) if each == name]
-        rows = [[parse_number(line.place, line.words[i]) for i in places] for line in lines]
-        return np.array(rows, np.float64).reshape(len(lines), len(places))
+        table = np.empty((len(lines), len(places)))
+        for row, line in zip(table, lines, strict=True):
+            words = line.words
+            row[:] = [parse_number(line.place, words[place]) for place in places]
+        return table
 
 
 UNIT_TOLERANCE = 1e-2
