@@ -190,9 +190,16 @@ def _select(points: Floats, limits: _Limits, keys: Longs) -> _Selection:
 
 
 def _thinned(rays: Doubles, limit: int, of_all: Sequence[Doubles]) -> Doubles:
-    """Return an even part of some rays [N, 3], so that at most ``limit`` are left of all kinds."""
+    """Return an even part of some rays [N, 3], so that at most ``limit`` are left of all kinds.
+
+    One is drawn of each few in a row: every second one may be of every second laser.
+    """
     step = -(-sum(map(len, of_all)) // limit)
-    return rays[::step] if step > 1 else rays
+    if step <= 1:
+        return rays
+    chosen = np.arange(0, len(rays), step)
+    chosen += np.random.default_rng(0).integers(step, size=len(chosen))
+    return rays[np.minimum(chosen, len(rays) - 1)]
 
 
 def _why_empty(

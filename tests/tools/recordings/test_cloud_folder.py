@@ -109,6 +109,15 @@ def test_counted_clouds_go_with_poses_in_order(tmp_path):
         np.testing.assert_allclose(scan.world_from_sensor, poses[number].matrix(), atol=1e-7)
 
 
+def test_poses_without_times_go_to_files_in_the_order_of_the_times_in_their_names(tmp_path):
+    write_log(tmp_path / "trajectory.log", POSES[:4])
+    for name in ("0.5.ply", "0.25.ply", "1.0.ply", "0.75.ply"):
+        write_ply(tmp_path / name, columns(CLOUDS[0]))
+    files = read_cloud_folder(tmp_path).files
+    assert [file.path.name for file in files] == ["0.25.ply", "0.5.ply", "0.75.ply", "1.0.ply"]
+    np.testing.assert_allclose(files[2].world_from_sensor, POSES[2].matrix(), atol=1e-7)
+
+
 def test_as_many_poses_of_another_clock_go_in_order_and_it_is_said(tmp_path):
     write_tum(_timed(tmp_path) / "trajectory.txt", [s - START_NS for s in STAMPS], POSES)
     recording = read_cloud_folder(tmp_path)
@@ -173,6 +182,43 @@ def test_another_trajectory_can_be_chosen(tmp_path):
     assert np.linalg.norm(second.world_from_sensor[:2, 3]) == pytest.approx(9.0, rel=1e-3)
 
 
+def test_viewpoints_are_poses_where_they_differ_and_no_others_are_there(tmp_path):
+    for stamp, cloud in zip(STAMPS, CLOUDS, strict=True):
+        write_pcd(tmp_path / f"{_name(stamp)}.pcd", columns(cloud))
+    with pytest.raises(ToolError, match="holds no trajectory"):
+        read_cloud_folder(tmp_path)
+    for stamp, pose in zip(STAMPS, POSES, strict=True):
+        path = tmp_path / f"{_name(stamp)}.pcd"
+        (x, y, z), (qx, qy, qz, qw) = pose.position_m, pose.quaternion_xyzw
+        said = f"VIEWPOINT {x} {y} {z} {qw} {qx} {qy} {qz}".encode()
+        path.write_bytes(re.sub(rb"VIEWPOINT.*", said, path.read_bytes(), count=1))
+    recording = read_cloud_folder(tmp_path)
+    assert [entry.stamp_ns for entry in recording.entries] == STAMPS
+    assert recording.remarks[0].startswith("poses are the VIEWPOINT of each PCD")
+    for scan, pose in zip(recording.read(range(COUNT)), matrices(POSES), strict=True):
+        np.testing.assert_allclose(scan.world_from_sensor, pose, atol=1e-9)
+    (tmp_path / f"{_name(STAMPS[2])}.pcd").write_bytes(b"")
+    with pytest.raises(ToolError, match="holds no trajectory"):
+        read_cloud_folder(tmp_path)
+
+
+def test_folders_that_follow_each_other_are_joined_and_sensors_at_one_time_are_not(tmp_path):
+    _timed(tmp_path, STAMPS[:3], "b")
+    for stamp, cloud in zip(STAMPS[3:], CLOUDS[3:], strict=True):
+        (tmp_path / "a").mkdir(exist_ok=True)
+        write_ply(tmp_path / "a" / f"{_name(stamp)}.ply", columns(cloud))
+    recording = read_cloud_folder(tmp_path)
+    assert recording.streams[0].name == "b/*.ply, a/*.ply"
+    assert [entry.stamp_ns for entry in recording.entries] == STAMPS
+    for scan, cloud in zip(recording.read(range(COUNT)), CLOUDS, strict=True):
+        np.testing.assert_array_equal(scan.points, cloud)
+    write_ply(tmp_path / "a" / f"{_name(STAMPS[1] + 1)}.ply", columns(CLOUDS[0]))
+    with pytest.raises(ToolError, match="not one after the other in time: .*give one of these"):
+        read_cloud_folder(tmp_path)
+    one = read_cloud_folder(tmp_path / "a", trajectory=Path("../trajectory.txt"))
+    assert len(one.entries) == 4
+
+
 def test_what_is_missing_or_too_much_is_named(tmp_path):
     with pytest.raises(ToolError, match="nowhere: no such folder"):
         read_cloud_folder(tmp_path / "nowhere")
@@ -195,7 +241,8 @@ def test_what_is_missing_or_too_much_is_named(tmp_path):
     with pytest.raises(ToolError, match=r"holds .pcd and .ply: leave only one"):
         read_cloud_folder(tmp_path)
     _counted(tmp_path / "map", 1)
-    with pytest.raises(ToolError, match=r"clouds lie in .* \(4\), .*map \(1\): leave only"):
+    words = r"clouds lie in .* \(4\), .*map \(1\), .* leave only those .* or give one of these"
+    with pytest.raises(ToolError, match=words):
         read_cloud_folder(tmp_path)
 
 

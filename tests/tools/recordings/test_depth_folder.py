@@ -1,3 +1,4 @@
+import json
 import re
 from pathlib import Path
 
@@ -91,6 +92,65 @@ def test_images_of_open3d_go_with_a_trajectory_of_tum_by_their_times(tmp_path):
     assert _off_the_walls_m(recording) < 2e-3
 
 
+def _write_images(folder: Path, name: str, units: float) -> None:
+    for number, pose in enumerate(matrices(POSES)):
+        write_depth(folder / name.format(number), room_depth(pose), units)
+
+
+def _write_poses(folder: Path, name: str, lost: int | None = None) -> None:
+    folder.mkdir(exist_ok=True)
+    for number, pose in enumerate(matrices(POSES)):
+        pose = np.full((4, 4), -np.inf) if number == lost else pose
+        np.savetxt(folder / name.format(number), pose, fmt="%.9f")
+
+
+def test_images_of_replica_show_the_room(tmp_path):
+    folder = tmp_path / "office0"
+    _write_images(folder, "results/depth{:06d}.png", 6553.5)
+    (folder / "results" / "frame000000.jpg").write_bytes(b"colour")
+    np.savetxt(folder / "traj.txt", matrices(POSES).reshape(-1, 16), fmt="%.9f")
+    with pytest.raises(ToolError, match="camera is not known"):
+        read_depth_folder(folder)
+    said = {"w": 64, "h": 48, "fx": 60, "fy": 62, "cx": 31.5, "cy": 23.5, "scale": 6553.5}
+    (tmp_path / "cam_params.json").write_text(json.dumps({"camera": said}))
+    recording = read_depth_folder(folder)
+    assert is_depth_folder(folder)
+    assert _off_the_walls_m(recording) < 5e-4
+    (tmp_path / "cam_params.json").write_text(json.dumps({"camera": {**said, "scale": 3276.75}}))
+    assert _off_the_walls_m(read_depth_folder(folder)) > 0.5
+
+
+def test_images_of_scannet_show_the_room_where_it_knows_a_pose(tmp_path):
+    _write_images(tmp_path, "depth/{}.png", 1000.0)
+    _write_poses(tmp_path / "pose", "{}.txt", lost=2)
+    (tmp_path / "intrinsic").mkdir()
+    matrix = np.diag([60.0, 62, 1, 1])
+    matrix[:2, 2] = 31.5, 23.5
+    np.savetxt(tmp_path / "intrinsic" / "intrinsic_depth.txt", matrix)
+    recording = read_depth_folder(tmp_path)
+    assert [file.path.name for file in recording.files] == ["0.png", "1.png", "3.png", "4.png"]
+    assert _off_the_walls_m(recording) < 2e-3
+    assert "1 of 5 poses are left out" in recording.remarks[0]
+    assert recording.remarks[0].endswith("pose/2.txt")
+
+
+def test_images_of_7_scenes_show_the_room_where_they_are_measured(tmp_path):
+    folder = tmp_path / "seq-01"
+    _write_poses(folder, "frame-{:06d}.pose.txt")
+    _write_images(folder, "frame-{:06d}.depth.png", 1000.0)
+    (folder / "frame-000000.color.png").write_bytes(b"colour")
+    (folder / "frame-000003.pose.txt").unlink()
+    with pytest.raises(ToolError, match=r"64 x 48 pixels, and the camera of the page of 7-Scenes"):
+        read_depth_folder(folder)
+    depth = room_depth(matrices(POSES)[0])
+    depth[10:20] = 65.535
+    write_depth(folder / "frame-000000.depth.png", depth, 1000.0)
+    recording = read_depth_folder(folder, intrinsics=CAMERA)
+    assert _off_the_walls_m(recording) < 2e-3
+    assert len(next(iter(recording.read([0]))).points) == 38 * 64
+    assert recording.remarks[0].startswith("1 of 5 files are left out, as *")
+
+
 def test_units_and_stride_can_be_given(tmp_path):
     folder = _open3d(tmp_path, units=6553.5)
     recording = read_depth_folder(folder, units_per_metre=6553.5, stride=4)
@@ -173,7 +233,7 @@ def test_given_intrinsics_of_larger_images_are_refused(tmp_path):
         ("1.0\n", "depth.txt:1: '1.0' where a line is the time"),
         ("soon depth/a.png\n", "depth.txt:1: 'soon' is not a number of seconds"),
         ("1.0 depth/none.png\n", "depth.txt:1: .*none.png: no such file"),
-        ("2.0 depth.txt\n1.0 depth.txt\n", "depth.txt:2: 1.0 s is before the line above"),
+        ("2.0 depth.txt\n1.0 depth.txt\n", "depth.txt:2: 1.0 is before the line above"),
     ],
 )
 def test_a_list_that_is_not_understood_is_refused(tmp_path, text, words):

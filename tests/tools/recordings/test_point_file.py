@@ -67,6 +67,31 @@ def test_times_of_points_are_found_among_other_fields(tmp_path, name, form):
     np.testing.assert_allclose(read.points, CLOUD, rtol=1e-5)
 
 
+@pytest.mark.parametrize(("name", "form"), FILES[:6])
+def test_headers_of_other_programs_are_understood(tmp_path, name, form):
+    """Names in upper case, comments, fields of which there are none, faces after the points."""
+    path = _file(tmp_path / name, form, CLOUD, ring=np.arange(400, dtype=np.uint8))
+    content = path.read_bytes()
+    for axis in (b" x", b" y", b" z"):
+        content = content.replace(axis, axis.upper(), 1)
+    if name == "a.ply":
+        content = content.replace(b"ply\n", b"ply\ncomment TextureFile none.jpg\n", 1)
+        content = content.replace(b"element face 0", b"obj_info Z\nelement face 1")
+        big = {"binary_big_endian": ">", "binary_little_endian": "<"}.get(form)
+        face = np.array([0, 1, 2], f"{big or '<'}i4").tobytes()
+        content += b"3 0 1 2\n" if big is None else b"\x03" + face
+    else:
+        for line, more in ((b"FIELDS", b" none _"), (b"SIZE", b" 2 4"), (b"TYPE", b" U F")):
+            at = content.index(b"\n", content.index(line))
+            content = content[:at] + more + content[at:]
+        at = content.index(b"\n", content.index(b"COUNT"))
+        content = content[:at] + b" 0 0" + content[at:]
+    path.write_bytes(content)
+    np.testing.assert_allclose(read_points(path).points, CLOUD, rtol=1e-5)
+    path.write_bytes(re.sub(rb"COUNT.*\n", b"", _file(path, form).read_bytes()))
+    np.testing.assert_allclose(read_points(path).points, CLOUD, rtol=1e-5)
+
+
 @pytest.mark.parametrize("name", ["a.ply", "a.pcd"])
 def test_a_file_may_hold_no_points(tmp_path, name):
     form = "binary_little_endian" if name == "a.ply" else "binary"

@@ -44,21 +44,84 @@ def test_open3d_and_kitti_come_without_times(tmp_path):
     np.testing.assert_allclose(read_trajectory(tmp_path / "poses.txt").poses, matrices(poses))
 
 
+EUROC = "p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []"
+MORE = "".join(
+    f", {name}_{axis} [m s^-1]" for name in ("v_RS_R", "b_w_RS_S", "b_a_RS_S") for axis in "xyz"
+)
+ROS = ["%time", "field.header.stamp", "field.header.frame_id"]
+ROS += [f"field.pose.position.{axis}" for axis in "xyz"]
+ROS += [f"field.pose.orientation.{axis}" for axis in "xyzw"]
+NUMBERS = " 1" * 9
+
+
+@pytest.mark.parametrize(
+    ("header", "form", "separator"),
+    [
+        ("", "{t} {p} {xyzw}", " "),
+        ("# timestamp tx ty tz qx qy qz qw", "{t} {p} {xyzw}", " "),
+        ("\ufeff# t, x, y, z, qw, qx, qy, qz\r\n", "{t} {p} {wxyz}", ","),
+        ("time_ns;x;y;z;qx;qy;qz;qw", "{ns} {p} {xyzw}", ";"),
+        ("", "{ns} {p} {xyzw}", " "),  # HeLiPR
+        ("", "{ns} {p} {xyzw}", ","),
+        ("", "{ns} {p} {wxyz}", ","),  # EuRoC without its header
+        (f"#timestamp [ns], {EUROC}", "{ns} {p} {wxyz}", ","),
+        (f"#timestamp, {EUROC}{MORE}", "{ns} {p} {wxyz}" + NUMBERS, ","),
+        ("", "{ns} {p} {wxyz}" + NUMBERS, ","),
+        ("#sec,nsec,x,y,z,qx,qy,qz,qw", "{sec} {nsec} {p} {xyzw}", ","),
+        ("", "{sec} {nsec} {p} {xyzw}", ","),
+        ("counter, sec, nsec, x, y, z, qx, qy, qz, qw", "{n} {sec} {nsec} {p} {xyzw}", ", "),
+        ("", "{n} {sec} {nsec} {p} {xyzw}", ","),
+        ("num,t,x,y,z,qx,qy,qz,qw", "{n} {t} {p} {xyzw}", ","),
+        ("", "{n} {t} {p} {xyzw}", ","),
+        ("#timestamp x y z qx qy qz qw id", "{t} {p} {xyzw} {n}", " "),
+        ("", "{t} {p} {xyzw} {n}", " "),
+        ("", "{ns} {rows}", ","),  # MulRan
+        ("", "{t} {rows} 0 0 0 1", " "),
+        (",".join(ROS), "{late} {ns} odom {p} {xyzw}", ","),
+    ],
+)
+def test_lines_of_data_sets_are_read(tmp_path, header, form, separator):
+    stamps, lines = [START_NS + 100_000_001 * number for number in range(30)], [header]
+    poses = drive(30)
+    for number, (stamp, pose) in enumerate(zip(stamps, poses, strict=True)):
+        x, y, z, w = map(repr, map(float, pose.quaternion_xyzw))
+        seconds, rest = str(stamp // 10**9), str(stamp % 10**9)
+        words = {"ns": stamp, "sec": seconds, "nsec": rest, "t": f"{seconds}.{rest:0>9}"}
+        words |= {"n": number, "late": stamp + 7, "xyzw": f"{x} {y} {z} {w}"}
+        words |= {"wxyz": f"{w} {x} {y} {z}", "p": " ".join(map(repr, pose.position_m.tolist()))}
+        words["rows"] = " ".join(map(repr, pose.matrix()[:3].ravel().tolist()))
+        lines.append(form.format(**words).replace(" ", separator))
+    path = tmp_path / "a.txt"
+    path.write_text("\n".join(lines), encoding="utf-8")
+    read = read_trajectory(path)
+    np.testing.assert_allclose(read.poses, matrices(poses), atol=1e-12)
+    assert read.stamps_ns.tolist() == stamps
+    assert read.frames is not None
+    assert not read.remarks
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
         ("", "holds no poses"),
-        ("1 2 3 4 5\n", ":1: 5 numbers, where a pose has 8 .t x y z qx qy qz qw."),
-        ("time x y z qx qy qz qw\n", ":1: 'time' is not a number of seconds"),
+        ("time x y z qx qy qz qw\n", "holds no poses"),
+        ("1 2 3 4 5\n", ":1: 5 numbers are no pose in a form that is known; the nearest is "),
+        ("1 0 0 0 0.1 0.2 0.3\n", ":1: the quaternion .* length .* a line is x y z qx qy qz qw"),
+        ("t x y z roll pitch yaw\n1 0 0 0 0 0 0\n", ":1: names no qw, qx, qy, qz: name them t x"),
+        ("t x y z qx qy qz qw\n1 0 0 0 0 0 0 1 5\n", ":1: names 8 of 9 columns"),
+        ("1 0 0 0 1 0 0 0 5\n1 0 0 0 2 0 0 0 5\n", ":1: 9 numbers are no pose"),
         (f"{LINE}\n2 0 0 0\n", ":2: 4 numbers where a pose has 8"),
         (f"{LINE}\n2 0 0 zero 0 0 0 1\n", ":2: 'zero' is not a number"),
-        (f"{LINE}\n2 0 0 nan 0 0 0 1\n", ":2: 'nan' is not finite"),
         (f"{LINE}\n2 0 0 0 1 0 0 1\n", ":2: .* has the length 1.414, not 1"),
-        (f"{LINE}\n0.5 0 0 0 0 0 0 1\n", ":2: 0.5 s is before the line above: sort"),
-        ("1700000000000000000 0 0 0 0 0 0 1\n", ":1: .* out of range: times are seconds"),
+        ("nan 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 0\n", ":1: no finite pose, nor in any other line"),
+        ("-1 0 0 0 0 0 0 1\n", ":1: -1 s is out of range: times are seconds"),
+        ("170000000000000000 0 0 0 0 0 0 1\n", ":1: .* is out of range: times are seconds"),
+        ("1 0,5 0,0 0 0 0 0 1\n", ":1: 0,5 has a comma for its point: write points"),
+        ("1,5 0,0 0,0 0,0 0,0 0,0 0,0 1,0\n", ":1: 1,5 has a comma for its point: write points"),
+        ("1 0 0 0 1 0 0 0\n2 0 0 0 0.99 0 0 0.141\n", ":1: .* give --quaternion wxyz or --quat"),
         ("0 0 1\n1 0 0 0\n0 1 0 0\n", "3 lines are not whole poses of Open3D's .log"),
         ("0 0 1\n1 0 0 0\n0 1 0\n0 0 1 0\n0 0 0 1\n", ":1: not 3 numbers and four rows of 4"),
-        ("0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 1 1\n", ":5: '0 0 1 1' where a pose ends"),
+        ("0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 1 1\n", ":1: .* where a pose ends with 0 0 0 1"),
         ("0 0 1\n1 0 0 0\n0 2 0 0\n0 0 1 0\n0 0 0 1\n", ":1: not a rotation"),
     ],
 )
@@ -67,6 +130,39 @@ def test_what_is_no_trajectory_is_refused_with_its_place(tmp_path, text, words):
     path.write_text(text)
     with pytest.raises(ToolError, match=words):
         read_trajectory(path)
+
+
+def test_lines_out_of_order_are_sorted_and_lines_without_a_pose_counted(tmp_path):
+    path = tmp_path / "a.tum"
+    path.write_text("3 3 0 0 0 0 0 1\n1 1 0 0 0 0 0 1\n2 nan 0 0 0 0 0 1\n3 3 0 0 0 0 0 1\n")
+    read = read_trajectory(path)
+    assert read.stamps_ns.tolist() == [10**9, 2 * 10**9, 3 * 10**9, 3 * 10**9]
+    assert np.isnan(read.pose_at(19 * 10**8)).all()
+    assert read.pose_at(3 * 10**9)[0, 3] == 3
+    assert [remark.removeprefix(f"{path}: ")[:34] for remark in read.remarks] == [
+        "1 of 4 poses are left out, as they",
+        "has 4 poses, some with a time befo",
+        "has 4 poses, some with a time that",
+    ]
+    assert read.remarks[0].endswith("a.tum:3")
+
+
+def test_a_quaternion_with_w_first_can_be_told(tmp_path):
+    path = tmp_path / "a.tum"
+    path.write_text("1 0 0 0 1 0 0 0\n2 0 0 0 0.8 0 0 0.6\n")
+    read = read_trajectory(path, "wxyz")
+    assert read.poses[:, 2, 2].tolist() == [1, 1]
+    assert read.poses[1, 0, 0] == pytest.approx(0.64 - 0.36)
+    assert read_trajectory(path, "xyzw").poses[0, 2, 2] == -1
+
+
+def test_poses_may_have_the_numbers_of_scans(tmp_path):
+    path = tmp_path / "poses.txt"
+    row = " ".join(map(str, np.eye(4).ravel()))
+    path.write_text(f"3 {row}\n7 {row}\n")
+    assert read_trajectory(path).numbers == [3, 7]
+    path.write_text(f"3 {row[: row.rindex('0.0 0.0 0.0 1.0')]}\n")
+    assert read_trajectory(path).numbers == [3]
 
 
 words = st.sampled_from(["0", "1", "-1", "2.5", "nan", "1e400", "x", "#"]) | st.text(max_size=4)
@@ -83,7 +179,9 @@ def test_whatever_a_file_says_it_is_poses_or_one_line(tmp_path_factory, text):
         told = str(error)
     else:
         told = f"{path}"
-        assert np.isfinite(read.poses).all()
+        lost = int((~np.isfinite(read.poses).all(axis=(1, 2))).sum())
+        assert lost < len(read.poses)
+        assert lost == 0 or " poses are left out" in read.remarks[0]
     assert told.startswith(str(path))
     assert "\n" not in told
 
@@ -100,6 +198,7 @@ def test_commas_and_comments_are_allowed(tmp_path):
         (["1700000000.25.ply", "cloud_1700000001.5.ply"], [START_NS + 250_000_000, None]),
         (["scan1700000000250.pcd"], [START_NS + 250_000_000]),
         (["1700000000.pcd"], [START_NS]),
+        (["n015__LIDAR_TOP__1700000000250000.pcd.bin"], [START_NS + 250_000_000]),
         (["a_1700000000_250000000.pcd"], [START_NS + 250_000_000]),
         (["1700000000_25000000.pcd", "1700000000_250000000.pcd"], [START_NS + 25_000_000, None]),
         (["frame-12.5.laz"], [12_500_000_000]),

@@ -18,7 +18,7 @@ from triquad_tools.console.command import OK, ToolError, run
 from triquad_tools.console.lines import print_line, print_remark
 from triquad_tools.console.progress import progress
 from triquad_tools.mapping.mapping_run import MAP_NAME, MappingRun, mapping_key, read_unfinished
-from triquad_tools.mapping.output import SUFFIXES, check_target, write_output
+from triquad_tools.mapping.output import SUFFIXES, check_target, why, write_output
 from triquad_tools.recordings.opening import Selection, open_selected
 from triquad_tools.recordings.recording import add_recording
 
@@ -61,7 +61,7 @@ def _map(options: argparse.Namespace) -> int:
             )
         except OSError as error:
             raise StoreError(
-                f"{output} cannot be written: {error}; the map is in {part}: the same "
+                f"{output} cannot be written: {why(error)}; the map is in {part}: the same "
                 "command writes it once there is room"
             ) from error
     part.unlink()

@@ -19,6 +19,7 @@ from triquad_server.settings import Settings
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
+from triquad_tools.mapping.output import why
 from triquad_tools.recordings.opening import Selection
 
 MAP_NAME = "recording"
@@ -143,6 +144,9 @@ class MappingRun:
         try:
             write_map(replace(record, name=f"{self.key}.{self.scans_taken}"), self.unfinished)
         except OSError as error:
-            raise StoreError(f"{self.unfinished} cannot be written: {error}") from error
+            raise StoreError(
+                f"{self.unfinished} cannot be written: {why(error)}; what was saved before is "
+                "kept: the same command goes on from it"
+            ) from error
         ended_s = time.monotonic()
         self._next_save_s = ended_s + max(_SAVE_PERIOD_S, (ended_s - started_s) / _SAVE_SHARE)

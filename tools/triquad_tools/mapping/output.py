@@ -1,5 +1,6 @@
 """Maps as files of the kind that the name says, and the places where none is written."""
 
+import errno
 import os
 import time
 from pathlib import Path
@@ -19,6 +20,12 @@ from triquad_tools.mapfiles.source import Box, NothingLeftError, SourceMap
 
 MAP_SUFFIX, PICTURE_SUFFIX = ".triquad", ".png"
 SUFFIXES = (MAP_SUFFIX, *MESH_SUFFIXES, PICTURE_SUFFIX)
+
+
+def why(error: OSError) -> str:
+    """Return why something could not be written, in words where the disk is full."""
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+    return f"the disk is full ({error})" if full else str(error)
 
 
 def check_target(path: Path, *, force: bool) -> None:

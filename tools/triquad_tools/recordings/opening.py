@@ -20,6 +20,13 @@ from triquad_tools.recordings.ros_recording import RosRecording
 from triquad_tools.sensors.ray_check import without_repeated
 from triquad_tools.sensors.sweep import PosedScan
 
+_UNPACK = {
+    ".zip": "unzip", ".7z": "7z x", ".tar": "tar -xf", ".tgz": "tar -xf", ".tar.gz": "tar -xf",
+    ".tar.bz2": "tar -xf", ".tar.xz": "tar -xf", ".tar.zst": "tar -xf", ".gz": "gunzip",
+    ".bz2": "bunzip2", ".xz": "unxz", ".zst": "unzstd", ".zstd": "unzstd", ".lz4": "unlz4",
+}  # fmt: skip
+"""The commands that unpack files, by how their names end: the first one counts."""
+
 Recording = RosRecording | ScanFolder
 """A recording that was checked as a whole, so that its errors are known."""
 
@@ -32,8 +39,8 @@ _OF_BAGS = {
     "topics", "poses", "map_frame", "body_frame", "transforms", "recorder_clock", "stride",
     "points_in", "ray_origin",
 }  # fmt: skip
-_OF_DEPTH = {"trajectory", "intrinsics", "units_per_metre", "stride"}
-_OF_CLOUDS = {"trajectory", "points_in", "ray_origin", "deskew"}
+_OF_DEPTH = {"trajectory", "quaternion", "intrinsics", "units_per_metre", "stride"}
+_OF_CLOUDS = {"trajectory", "quaternion", "points_in", "columns", "ray_origin", "deskew"}
 """The choices that mean something for each kind of recording."""
 
 
@@ -45,6 +52,9 @@ def open_recording(path: Path, options: ReadingOptions) -> Recording:
     """
     if not path.exists():
         raise ToolError(f"{path}: no such file or folder")
+    ends = (command for end, command in _UNPACK.items() if path.name.lower().endswith(end))
+    if path.is_file() and (command := next(ends, None)):
+        raise ToolError(f"{path}: is packed: unpack it with '{command} {path}' first")
     bag = find_bag(path)
     if bag is not None:
         _refuse_others(f"{path} is a bag", _OF_BAGS, options)
@@ -71,7 +81,7 @@ def _refuse_others(what: str, meaningful: set[str], options: ReadingOptions) -> 
 
 @dataclass(frozen=True)
 class Selection:
-    """Some scans of a recording, without points that are too near."""
+    """Some scans of a recording, without points that are too near, or more than are taken."""
 
     recording: Recording
     indices: Sequence[int]

@@ -64,8 +64,10 @@ class ReadingOptions:
     transforms: tuple[Transform, ...] = ()  # that the recording lacks
     recorder_clock: bool = False  # stamps are when a message was recorded
     trajectory: Path | None = None  # the file of poses; else that with a usual name
+    quaternion: Literal["xyzw", "wxyz"] | None = None  # order in it; else as its form has it
     points_in: Literal["sensor", "world"] | None = None  # frame of clouds; else sensor, and checked
     ray_origin: Place | None = None  # of clouds, in their frame; else its origin, and checked
+    columns: tuple[str, ...] | None = None  # of .bin clouds; else as KITTI has them, and checked
     deskew: bool = True  # take the sensor's motion out of clouds whose points have times
     intrinsics: Intrinsics | None = None  # of depth images; else those of a file in the folder
     units_per_metre: float | None = None  # of a pixel; else 5000 for TUM RGB-D, 1000 for others
@@ -127,8 +129,12 @@ def _add_ros(add: _Add) -> None:
 
 def _add_folder(add: _Add) -> None:
     add("--trajectory", type=Path, metavar="FILE", help="of poses (default: one with a usual name)")
+    order = "order of its quaternions (default: as its header or form has it)"
+    add("--quaternion", choices=("xyzw", "wxyz"), help=order)
     frame = "frame of the points of clouds (default: sensor, and checked)"
     add("--points-in", choices=(SENSOR, WORLD), help=frame)
+    columns = "of .bin clouds, float32 (default: xyzi, and checked)"
+    add("--columns", type=_columns, metavar="xyzirt|x,y,z,NAME", help=columns)
     skewed = "clouds are free of motion, though they have times"
     add("--no-deskew", dest="deskew", action="store_false", help=skewed)
     camera = "of the depth camera, pixels (default: of a file in the folder)"
@@ -163,6 +169,21 @@ def _place(text: str) -> Place:
             f"{text!r}: use X,Y,Z in metres, such as 0.9,0,1.8 ({error})"
         ) from error
     return x, y, z
+
+
+def _columns(text: str) -> tuple[str, ...]:
+    """Return the names of columns, which may be one letter each."""
+    letters = {"i": "intensity", "r": "ring"}
+    names = [
+        letters.get(name.strip(), name.strip())
+        for name in (text.split(",") if "," in text else text)
+    ]
+    if sorted(name for name in names if name in ("x", "y", "z")) != ["x", "y", "z"]:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}: use x, y and z once each, such as xyzirt or x,y,z,intensity,ring,t; _ is "
+            "a column that is not used"
+        )
+    return tuple(names)
 
 
 def _intrinsics(text: str) -> Intrinsics:

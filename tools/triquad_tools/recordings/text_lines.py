@@ -12,6 +12,10 @@ from triquad_format.records.pose import is_rotation, orthonormal, rotation_error
 
 from triquad_tools.console.command import ToolError
 
+NS_OF_DIGITS = {10: 10**9, 13: 10**6, 16: 10**3, 19: 1}
+"""Whole numbers with as many digits are times since 1970, from 2001 to 2286, in a unit of
+nanoseconds: seconds, milliseconds, microseconds or nanoseconds."""
+
 
 class Line(NamedTuple):
     """A line that is neither blank nor a comment."""
@@ -21,18 +25,36 @@ class Line(NamedTuple):
 
     @property
     def words(self) -> list[str]:
-        """The words between blanks or commas."""
-        return self.text.replace(",", " ").split()
+        """The words between blanks, commas or semicolons."""
+        return self.text.replace(",", " ").replace(";", " ").split()
+
+    @property
+    def is_comment(self) -> bool:
+        """Whether it begins with ``#``, or with ``%`` as those of ``rostopic echo -p``."""
+        return self.text.startswith(("#", "%"))
 
 
-def read_lines(path: Path) -> list[Line]:
-    """Return the lines of a file that are neither blank nor comments, which begin with ``#``."""
-    lines = path.read_text(errors="replace").splitlines()
+def all_lines(path: Path) -> list[Line]:
+    """Return the lines of a file that are not blank, without the mark of its encoding."""
+    lines = path.read_text("utf-8-sig", errors="replace").splitlines()
     return [
         Line(f"{path}:{number}", line.strip())
         for number, line in enumerate(lines, start=1)
-        if line.strip() and not line.lstrip().startswith("#")
+        if line.strip()
     ]
+
+
+def read_lines(path: Path) -> list[Line]:
+    """Return the lines of a file that are neither blank nor comments."""
+    return [line for line in all_lines(path) if not line.is_comment]
+
+
+def parse_number(place: str, word: str) -> float:
+    """Return the number that a word is, which need not be finite; else raise a ToolError."""
+    try:
+        return float(word)
+    except ValueError:
+        raise ToolError(f"{place}: {word!r} is not a number") from None
 
 
 def parse_numbers(place: str, words: Sequence[str]) -> list[float]:
@@ -41,36 +63,58 @@ def parse_numbers(place: str, words: Sequence[str]) -> list[float]:
     Raises:
         ToolError: a word is none.
     """
-    numbers = []
-    for word in words:
-        try:
-            numbers.append(float(word))
-        except ValueError:
-            raise ToolError(f"{place}: {word!r} is not a number") from None
-        if not math.isfinite(numbers[-1]):
+    numbers = [parse_number(place, word) for word in words]
+    for word, number in zip(words, numbers, strict=True):
+        if not math.isfinite(number):
             raise ToolError(f"{place}: {word!r} is not finite")
     return numbers
 
 
-def parse_stamps(lines: Sequence[Line]) -> list[int]:
-    """Return the times with which lines begin, nanoseconds: as floats they would be off by 100 ns.
+def unit_ns(line: Line, word: str) -> int:
+    """Return the nanoseconds of the unit of a time, by its size: seconds if it is small.
 
     Raises:
-        ToolError: a line begins with no number of seconds, or with one before that of the line
-            above.
+        ToolError: it is no number, or has another number of digits.
+    """
+    digits = len(str(parse_time(line, word, 1)))
+    unit = 10**9 if digits < 10 else NS_OF_DIGITS.get(digits)
+    if unit is None:
+        raise ToolError(
+            f"{line.place}: {word} is out of range: times are seconds, from 0 on, or whole "
+            "milliseconds, microseconds or nanoseconds since 1970"
+        )
+    return unit
+
+
+def parse_time(line: Line, word: str, unit: int) -> int:
+    """Return nanoseconds, exactly: as a float they would be off by 100.
+
+    Raises:
+        ToolError: it is not a number, or out of range.
+    """
+    try:
+        stamp = int(Decimal(word) * unit)
+    except (ArithmeticError, ValueError):  # those of decimal numbers among them
+        raise ToolError(f"{line.place}: {word!r} is not a number of seconds") from None
+    if not 0 <= stamp < 2**63:
+        raise ToolError(f"{line.place}: {word} s is out of range: times are seconds, from 0 on")
+    return stamp
+
+
+def parse_stamps(lines: Sequence[Line]) -> list[int]:
+    """Return the times with which lines begin, nanoseconds.
+
+    Raises:
+        ToolError: a line begins with no time, or with one before that of the line above.
     """
     stamps = [0]
+    unit = unit_ns(lines[0], lines[0].words[0]) if lines else 1
     for line in lines:
         word = line.words[0]
-        try:
-            stamps.append(int(Decimal(word) * 10**9))
-        except (ArithmeticError, ValueError):  # those of decimal numbers among them
-            raise ToolError(f"{line.place}: {word!r} is not a number of seconds") from None
-        if not 0 <= stamps[-1] < 2**63:
-            raise ToolError(f"{line.place}: {word} s is out of range: times are seconds, from 0 on")
+        stamps.append(parse_time(line, word, unit))
         if stamps[-1] < stamps[-2]:
             raise ToolError(
-                f"{line.place}: {word} s is before the line above: sort the lines by time"
+                f"{line.place}: {word} is before the line above: sort the lines by time"
             )
     return stamps[1:]
 
@@ -83,8 +127,15 @@ def parse_rigid(place: str, words: Sequence[str]) -> Doubles:
     """
     if len(words) != 12:
         raise ToolError(f"{place}: {len(words)} numbers where a pose has 12")
+    return rigid(place, parse_numbers(place, words))
+
+
+def rigid(place: str, numbers: Sequence[float] | Doubles) -> Doubles:
+    """Return the pose ``[4, 4]`` of 12 or 16 numbers, as :func:`parse_rigid`."""
     pose = np.eye(4)
-    pose[:3] = np.reshape(parse_numbers(place, words), (3, 4))
+    pose.reshape(-1)[: len(numbers)] = numbers
+    if pose[3].tolist() != [0, 0, 0, 1]:
+        raise ToolError(f"{place}: {pose[3].tolist()} where a pose ends with 0 0 0 1")
     if not is_rotation(pose):
         raise ToolError(
             f"{place}: not a rotation: off orthonormal by {rotation_error(pose):.3g}, "

@@ -2,19 +2,27 @@
 
 from collections.abc import Iterable, Sequence
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from triquad_format.records.arrays import Floats
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.folders.point_file import POINT_SUFFIXES, check_points, read_points
+from triquad_tools.recordings.folders.point_file import (
+    KITTI_COLUMNS,
+    POINT_SUFFIXES,
+    check_columns,
+    check_points,
+    read_points,
+)
 from triquad_tools.recordings.folders.scan_folder import (
     PlacedFile,
     ScanFolder,
     check_all,
     in_order,
     place_files,
+    stamps_of_names,
 )
 from triquad_tools.recordings.folders.trajectory import Trajectory
 from triquad_tools.recordings.recording import (
@@ -34,6 +42,8 @@ _TRIED = 4  # clouds, to determine the frame of all
 _CLEARLY = 2.0  # times nearer to where the sensor was than to the origin, or the other way round
 
 _DEEPER = "velodyne_points/data"  # where KITTI's raw recordings have theirs
+_KITTI, _KITTI_360 = "calib.txt", "calib_cam_to_velo.txt"
+_DRIVE_M, _ALONG_Z = 5.0, 0.9  # a way that tells the axes, and how much of it is along z
 
 
 def is_cloud_folder(folder: Path) -> bool:
@@ -50,19 +60,25 @@ def read_cloud_folder(folder: Path, options: ReadingOptions | None = None) -> Sc
     """
     options = options or ReadingOptions()
     paths = _cloud_paths(folder)
-    placed = place_files(folder, options.trajectory, paths, read_times(folder, len(paths)))
-    if not sum(check_all(paths, check_points)):
-        raise ToolError(f"{paths[0].parent}: none of the {len(paths)} files holds any points")
-    first, poses, files = paths[0], placed.trajectory, placed.files
-    if first.suffix == ".bin" and poses.frames is None:
-        files = of_lidar(folder, files)
+    first, above = paths[0], paths[0].parent.parent
+    if first.suffix.lower() == ".bin" and options.columns is None:
+        check_columns(paths)
+    placed = place_files(folder, options, paths, read_times([folder, above], len(paths)))
+    columns = options.columns or KITTI_COLUMNS
+    if not sum(check_all(paths, partial(check_points, columns=columns))):
+        raise ToolError(f"{first.parent}: none of the {len(paths)} files holds any points")
+    poses, files = placed.trajectory, placed.files
+    if first.suffix.lower() == ".bin" and poses.frames is None:
+        files = _of_lidar([folder, above, poses.path.parent], files)
     tried = [files[len(files) * (2 * step + 1) // (2 * _TRIED)] for step in range(_TRIED)]
     if options.points_in is None:
-        _check_frame(tried)
+        _check_frame(tried, columns)
     read_file = partial(_read_scan, poses, options)
     if options.ray_origin is None:
         _check_rays(first.parent, map(read_file, tried))
-    clouds, kind = f"{first.parent.name}/*{first.suffix}", first.suffix[1:].upper() + " clouds"
+    names = dict.fromkeys(path.parent.name for path in paths)
+    clouds = ", ".join(f"{name}/*{first.suffix}" for name in names)
+    kind = first.suffix[1:].upper() + " clouds"
     streams = (
         Stream(clouds, kind, len(files), "scans", options.points_in or SENSOR),
         Stream(poses.path.name, poses.kind, len(poses.poses), "poses of the sensor"),
@@ -72,7 +88,7 @@ def read_cloud_folder(folder: Path, options: ReadingOptions | None = None) -> Sc
 
 def _read_scan(trajectory: Trajectory, options: ReadingOptions, file: PlacedFile) -> PosedScan:
     """Return the finite points of a cloud, in the frame of the sensor."""
-    points, times = read_points(file.path)
+    points, times = read_points(file.path, options.columns or KITTI_COLUMNS)
     finite = np.isfinite(points).all(axis=1)
     points = points[finite]
     if options.points_in == WORLD:
@@ -105,10 +121,17 @@ def _cloud_paths(folder: Path) -> list[Path]:
     found = _folders_of_clouds(folder)
     if not found:
         raise ToolError(f"{folder}: holds no {', '.join(POINT_SUFFIXES)}, nor does a folder in it")
-    if len(found) > 1:
+    parts = list(found.values())
+    spans = [(min(stamps), max(stamps)) for stamps in map(stamps_of_names, parts) if stamps]
+    ordered = sorted(zip(spans, parts, strict=False))
+    following = all(a[0][1] < b[0][0] for a, b in pairwise(ordered))
+    if len(parts) > 1 and not (len(spans) == len(parts) and following):
         folders = ", ".join(f"{each} ({len(paths)})" for each, paths in found.items())
-        raise ToolError(f"{folder}: clouds lie in {folders}: leave only those that are scans")
-    (paths,) = found.values()
+        raise ToolError(
+            f"{folder}: clouds lie in {folders}, and not one after the other in time: leave only "
+            "those that are scans, or give one of these folders, with --trajectory"
+        )
+    paths = [path for part in ([part for _, part in ordered] or parts) for path in part]
     suffixes = sorted({path.suffix for path in paths})
     if len(suffixes) > 1:
         raise ToolError(
@@ -117,13 +140,13 @@ def _cloud_paths(folder: Path) -> list[Path]:
     return paths
 
 
-def _check_frame(tried: Sequence[PlacedFile]) -> None:
+def _check_frame(tried: Sequence[PlacedFile], columns: Sequence[str]) -> None:
     """Check that points lie around their sensor, not around where it was in the world.
 
     Raises:
         ToolError: a few clouds from all over the recording lie around where it was.
     """
-    if all(map(_lies_around_its_place, tried)):
+    if all(_lies_around_its_place(file, columns) for file in tried):
         raise ToolError(
             f"{tried[0].path.parent}: the points seem to be in the world frame: in "
             f"{tried[0].path.name} they lie around where the sensor was, not around the origin; "
@@ -145,8 +168,8 @@ def _check_rays(folder: Path, scans: Iterable[PosedScan]) -> None:
         raise ToolError(f"{folder}: {problem}: {ORIGIN_REMEDIES}")
 
 
-def _lies_around_its_place(file: PlacedFile) -> bool:
-    points = read_points(file.path).points
+def _lies_around_its_place(file: PlacedFile, columns: Sequence[str]) -> bool:
+    points = read_points(file.path, columns).points
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) == 0:
         return False
@@ -155,14 +178,14 @@ def _lies_around_its_place(file: PlacedFile) -> bool:
     return bool(from_place * _CLEARLY < from_origin)
 
 
-def read_times(folder: Path, scans: int) -> list[int] | None:
-    """Return the nanoseconds at which the scans of a folder were taken; None where it has no times.
+def read_times(folders: Sequence[Path], scans: int) -> list[int] | None:
+    """Return the nanoseconds at which scans were taken; None where no folder says it.
 
     Raises:
         ToolError: a time is not a number, times run backwards, or there are not as many as scans.
     """
-    path = folder / "times.txt"
-    if not path.is_file():
+    path = next((each / "times.txt" for each in folders if (each / "times.txt").is_file()), None)
+    if path is None:
         return None
     stamps = parse_stamps(read_lines(path))
     if len(stamps) != scans:
@@ -170,25 +193,48 @@ def read_times(folder: Path, scans: int) -> list[int] | None:
     return stamps
 
 
-def of_lidar(folder: Path, files: Sequence[PlacedFile]) -> list[PlacedFile]:
-    """Return files with the poses of the lidar, by the calibration of the folder, if it has one.
+def _of_lidar(folders: Sequence[Path], files: Sequence[PlacedFile]) -> list[PlacedFile]:
+    """Return files with the poses of the lidar, by the calibration in one of the folders, if any.
 
     In ``calib.txt`` the line ``Tr:`` is ``camera_from_lidar``: the poses are then those of the
-    camera, as KITTI gives them.
+    camera, as KITTI gives them. ``calib_cam_to_velo.txt`` of KITTI-360 is ``lidar_from_camera``.
 
     Raises:
-        ToolError: the calibration is not a rigid motion.
+        ToolError: the calibration is no rigid motion, or lacks where the poses are of a camera.
     """
-    path = folder / "calib.txt"
-    if not path.is_file():
+    of_camera = (each / name for each in folders for name in (_KITTI, _KITTI_360))
+    path = next((each for each in of_camera if each.is_file()), None)
+    if path is None:
+        _check_axes(folders[0], files)
         return list(files)
+    is_360 = path.name == _KITTI_360
     for line in read_lines(path):
-        name, _, numbers = line.text.partition(":")
-        if name.strip() == "Tr":
-            camera_from_lidar = parse_rigid(line.place, numbers.split())
-            turned = np.linalg.inv(camera_from_lidar)
+        name, _, numbers = line.text.rpartition(":")
+        if is_360 or name.strip() == "Tr":
+            given = parse_rigid(line.place, numbers.split())
+            inverse = np.linalg.inv(given)
+            # KITTI's world lies as the first camera does; that of KITTI-360 has z up.
+            world, of_lidar = (np.eye(4), inverse) if is_360 else (inverse, given)
             return [
-                file._replace(world_from_sensor=turned @ file.world_from_sensor @ camera_from_lidar)
+                file._replace(world_from_sensor=world @ file.world_from_sensor @ of_lidar)
                 for file in files
             ]
     raise ToolError(f"{path}: has no line 'Tr:'")
+
+
+def _check_axes(folder: Path, files: Sequence[PlacedFile]) -> None:
+    """Check that a lidar drives along its x or y, not along z as a camera does.
+
+    Raises:
+        ToolError: it goes along z nearly all the time.
+    """
+    poses = np.array([file.world_from_sensor for file in files])
+    steps = np.diff(poses[:, :3, 3], axis=0)
+    ahead = np.abs(np.einsum("nij,ni->nj", poses[:-1, :3, :3], steps))  # in the sensor's frame
+    length = np.linalg.norm(steps, axis=1).sum()
+    if length > _DRIVE_M and ahead[:, 2].sum() > _ALONG_Z * length:
+        raise ToolError(
+            f"{folder}: by its poses the lidar drives along its z, as a camera does, and there is "
+            f"no {_KITTI} with a line 'Tr:': put that of the sequence there, or one with "
+            "'Tr: 1 0 0 0 0 1 0 0 0 0 1 0' if the poses are those of the lidar"
+        )

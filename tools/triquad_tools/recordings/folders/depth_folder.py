@@ -1,4 +1,4 @@
-"""Folders of depth images with a trajectory of the camera: those of TUM RGB-D, and of Open3D."""
+"""Folders of depth images with the poses of the camera, as data sets lay them out."""
 
 import json
 from functools import partial
@@ -19,15 +19,26 @@ from triquad_tools.recordings.folders.scan_folder import (
     place_files,
 )
 from triquad_tools.recordings.recording import ReadingOptions, Stream
-from triquad_tools.recordings.text_lines import parse_stamps, read_lines
+from triquad_tools.recordings.text_lines import parse_numbers, parse_stamps, read_lines
 from triquad_tools.sensors.sweep import PosedScan
 
 INTRINSICS_NAMES = ("camera_intrinsic.json", "intrinsic.json", "camera_primesense.json")
 """Names that Open3D and its data give them."""
 
+_REPLICA = "cam_params.json"
+_MATRICES = ("intrinsic/intrinsic_depth.txt", "intrinsic_depth.txt", "camera-intrinsics.txt")
+"""Names of files with a matrix, of ScanNet and of 3DMatch."""
+
 _LIST_NAME = "depth.txt"  # of TUM RGB-D
-_FOLDER_NAME = "depth"  # of Open3D
-_TUM_UNITS_PER_M, _OPEN3D_UNITS_PER_M = 5000.0, 1000.0
+_TUM_UNITS_PER_M = 5000.0
+_LAYOUTS = (
+    ("results/depth*.png", 6553.5),  # Replica
+    ("depth/*.png", 1000.0),  # Open3D, Redwood, ScanNet
+    ("frame-*.depth.png", 1000.0),  # 7-Scenes, 3DMatch
+)
+"""Where images lie in a folder, and how many units of theirs are a metre."""
+
+_NOTHING = np.iinfo(np.uint16).max  # of a pixel without a measurement, in 7-Scenes and 3DMatch
 _GREY_MODES = ("I;16", "I;16B", "I")  # 16 bits, as versions of Pillow name them
 
 
@@ -37,11 +48,16 @@ class Camera(NamedTuple):
     intrinsics: Intrinsics
     shape: tuple[int, ...] | None  # rows and columns
     origin: str  # where this is said, for messages
+    units_per_metre: float | None = None  # of its images, where that is said, too
 
 
 _TUM = Camera(Intrinsics(525.0, 525.0, 319.5, 239.5), (480, 640), "the documentation of TUM RGB-D")
 """The intrinsics of all three cameras, whose depth was registered by OpenNI:
 https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats"""
+
+_SEVEN_SCENES = Camera(Intrinsics(585.0, 585.0, 320.0, 240.0), (480, 640), "the page of 7-Scenes")
+"""The intrinsics of its depth images:
+https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes/"""
 
 
 def choose_camera(folder: Path, given: Intrinsics | None) -> Camera:
@@ -52,9 +68,14 @@ def choose_camera(folder: Path, given: Intrinsics | None) -> Camera:
     """
     if given is not None:
         return Camera(given, None, "--intrinsics")
-    for name in INTRINSICS_NAMES:
+    for path in (each / name for each in (folder, folder.parent) for name in _MATRICES):
+        if path.is_file():
+            return _read_matrix(path)
+    for name in (*INTRINSICS_NAMES, _REPLICA, f"../{_REPLICA}"):
         if (folder / name).is_file():
             return _read_camera(folder / name)
+    if any(folder.glob(_LAYOUTS[-1][0])):
+        return _SEVEN_SCENES
     if "freiburg" in folder.resolve().name:
         return _TUM
     raise ToolError(
@@ -83,13 +104,33 @@ def check_fits(camera: Camera, shape: tuple[int, ...], path: Path) -> None:
         )
 
 
-def _read_camera(path: Path) -> Camera:
-    """Return the camera of a file as Open3D writes it.
+def _read_matrix(path: Path) -> Camera:
+    """Return the camera of a file with a matrix of 3 x 3 or 4 x 4 numbers, row by row."""
+    lines = read_lines(path)
+    numbers = [number for line in lines for number in parse_numbers(line.place, line.words)]
+    size = {9: 3, 16: 4}.get(len(numbers))
+    if size is None:
+        raise ToolError(f"{path}: {len(numbers)} numbers, where a camera matrix has 9 or 16")
+    try:
+        matrix = np.reshape(numbers, (size, size))[:3, :3]
+        return Camera(Intrinsics.from_matrix(matrix), None, path.name)
+    except InvalidScanError as error:
+        raise ToolError(f"{path}: {error}") from error
 
-    JSON with ``width``, ``height`` and ``intrinsic_matrix``, nine numbers, column by column.
+
+def _read_camera(path: Path) -> Camera:
+    """Return the camera of a file as Open3D writes it, or as Replica has it.
+
+    JSON with ``width``, ``height`` and ``intrinsic_matrix``, nine numbers, column by column; or
+    ``camera`` with ``w``, ``h``, ``fx``, ``fy``, ``cx``, ``cy`` and ``scale``, units a metre.
     """
     try:
-        said = json.loads(path.read_text())
+        said = json.loads(path.read_text("utf-8-sig"))
+        if path.name == _REPLICA:
+            said = said["camera"]
+            intrinsics = Intrinsics(*(float(said[name]) for name in ("fx", "fy", "cx", "cy")))
+            shape = int(said["h"]), int(said["w"])
+            return Camera(intrinsics, shape, path.name, float(said["scale"]))
         columns = [said["intrinsic_matrix"][start : start + 3] for start in (0, 3, 6)]
         matrix = [list(row) for row in zip(*columns, strict=True)]
         shape = int(said["height"]), int(said["width"])
@@ -114,8 +155,9 @@ class _Images(NamedTuple):
 
 
 def is_depth_folder(folder: Path) -> bool:
-    """Return whether a folder is laid out as those of TUM RGB-D or of Open3D are."""
-    return (folder / _LIST_NAME).is_file() or bool(in_order((folder / _FOLDER_NAME).glob("*.png")))
+    """Return whether a folder is laid out as one of those that are known."""
+    found = (in_order(folder.glob(pattern)) for pattern, _ in _LAYOUTS)
+    return (folder / _LIST_NAME).is_file() or any(found)
 
 
 def read_depth_folder(folder: Path, options: ReadingOptions) -> ScanFolder:
@@ -129,10 +171,10 @@ def read_depth_folder(folder: Path, options: ReadingOptions) -> ScanFolder:
     """
     images = _images(folder)
     camera = choose_camera(folder, options.intrinsics)
-    placed = place_files(folder, options.trajectory, images.paths, images.stamps_ns)
+    placed = place_files(folder, options, images.paths, images.stamps_ns)
     for path, pixels in zip(images.paths, check_all(images.paths, read_depth), strict=True):
         check_fits(camera, pixels.shape, path)
-    units = options.units_per_metre or images.units_per_metre
+    units = options.units_per_metre or camera.units_per_metre or images.units_per_metre
     use = f"scans: {units:g} units a metre, camera of {camera.origin}"
     poses = placed.trajectory
     streams = (
@@ -170,6 +212,7 @@ def read_depth(path: Path) -> NDArray[np.uint16]:
 
 def _read_scan(camera: Camera, units: float, stride: int, file: PlacedFile) -> PosedScan:
     pixels = read_depth(file.path)
+    pixels[pixels == _NOTHING] = 0
     points: NDArray[Any] = np.empty((0, 3), np.float32)
     if pixels[::stride, ::stride].any():
         points = depth_points(pixels / np.float32(units), camera.intrinsics, stride)
@@ -177,10 +220,11 @@ def _read_scan(camera: Camera, units: float, stride: int, file: PlacedFile) -> P
 
 
 def _images(folder: Path) -> _Images:
-    """Return the images that TUM lists with their times, or that lie where Open3D has them."""
+    """Return the images that TUM lists with their times, or that lie where others have them."""
     if not (folder / _LIST_NAME).is_file():
-        found = in_order((folder / _FOLDER_NAME).glob("*.png"))
-        return _Images(found, None, _OPEN3D_UNITS_PER_M)
+        found = ((in_order(folder.glob(pattern)), units) for pattern, units in _LAYOUTS)
+        images, units = next(filter(lambda each: each[0], found))
+        return _Images(images, None, units)
     paths: list[Path] = []
     lines = read_lines(folder / _LIST_NAME)
     stamps = parse_stamps(lines)

@@ -7,27 +7,36 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
+import numpy as np
 from triquad_format.records.arrays import Doubles
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
-from triquad_tools.recordings.folders.trajectory import Trajectory, read_trajectory
-from triquad_tools.recordings.recording import DEFAULT_SOURCE, ScanEntry, Stream
+from triquad_tools.recordings.folders.point_file import read_header
+from triquad_tools.recordings.folders.trajectory import (
+    DEFAULT_PERIOD_NS,
+    Trajectory,
+    number_of,
+    read_pose_files,
+    read_trajectory,
+    read_viewpoints,
+)
+from triquad_tools.recordings.recording import DEFAULT_SOURCE, ReadingOptions, ScanEntry, Stream
+from triquad_tools.recordings.text_lines import NS_OF_DIGITS
 from triquad_tools.sensors.sweep import NoTransformError, PosedScan
 
 _Read = TypeVar("_Read")
 
-TRAJECTORY_NAMES = ("trajectory.txt", "trajectory.log", "poses.txt", "groundtruth.txt", "*.tum")
+TRAJECTORY_NAMES = (
+    "trajectory.txt", "trajectory.log", "poses.txt", "groundtruth.txt", "traj.txt", "*.tum", "*.csv"
+)  # fmt: skip
+_POSE_FOLDERS = ("pose", "poses")  # with a file for each scan
 _WHY = {
     "pose_early": "before the first pose",
     "pose_late": "after the last pose",
     "pose_gap": "between poses that lie too far apart",
 }
 _NUMBERS = re.compile(r"(\d+)")
-_NS_OF_DIGITS = {10: 10**9, 13: 10**6, 16: 10**3, 19: 1}
-"""Whole numbers with as many digits are times since 1970, from 2001 to 2286, in a unit of
-nanoseconds: seconds, milliseconds, microseconds or nanoseconds."""
-
 _WHOLE = re.compile(r"(?:.*\D)?([1-9]\d+)")
 _DECIMAL = re.compile(r"(?:.*[^\d.])?(\d{1,10})\.(\d{1,9})")
 _PAIR = re.compile(r"(?:.*\D)?([1-9]\d{9})[_-](\d{1,9})")
@@ -89,30 +98,61 @@ class PlacedFiles(NamedTuple):
 
 def place_files(
     folder: Path,
-    given: Path | None,
+    options: ReadingOptions,
     paths: Sequence[Path],
     stamps_ns: Sequence[int] | None = None,
 ) -> PlacedFiles:
-    """Give the files of a folder their poses: by their times, or else one to one in order.
+    """Give the files of a folder their poses: by their times or numbers, or else in order.
 
     Args:
         folder: holds the trajectory, unless that is given.
-        given: the file of the trajectory.
+        options: name the file of the trajectory, and the order of its quaternions.
         paths: the files, one at least, in order.
         stamps_ns: when each was taken; ``None``: as their names say, if they do.
 
     Raises:
-        ToolError: there is no trajectory, or neither way is possible.
+        ToolError: there is no trajectory, or no way is possible.
     """
-    path, remarks = _choose(folder, given)
-    trajectory = read_trajectory(path)
-    stamps = stamps_of_names(paths) if stamps_ns is None else stamps_ns
+    trajectory, remarks = _choose(folder, paths, options)
+    remarks += trajectory.remarks
+    if stamps_ns is None and (stamps_ns := stamps_of_names(paths)) is not None:
+        stamps_ns, paths = zip(*sorted(zip(stamps_ns, paths, strict=True)), strict=True)
+    placed = _placed(paths, stamps_ns, trajectory, remarks)
+    known = [file for file in placed.files if np.isfinite(file.world_from_sensor).all()]
+    if not known:
+        raise ToolError(f"{trajectory.path}: says no pose for any of {len(paths)} files")
+    if len(known) < len(placed.files):
+        count = len(placed.files) - len(known)
+        told = f"{count} of {len(paths)} files are left out, as {trajectory.path.name} says no pose"
+        placed.remarks.append(f"{told} for them")
+    return placed._replace(files=known)
+
+
+def _placed(
+    paths: Sequence[Path],
+    stamps: Sequence[int] | None,
+    trajectory: Trajectory,
+    remarks: list[str],
+) -> PlacedFiles:
+    """Return the files that have poses, some of which may not be finite."""
+    path = trajectory.path
     timed = stamps is not None and trajectory.frames is not None
     if stamps is not None and timed:
         placed = _by_time(paths, stamps, trajectory, remarks)
         if placed.files:
             return placed
-    if len(paths) == len(trajectory.poses):
+    pose_of: dict[int | None, Doubles] = dict(
+        zip(trajectory.numbers or (), trajectory.poses, strict=False)
+    )
+    numbers = [number_of(path) for path in paths]
+    shared = {*numbers} & {*pose_of}
+    # As many files as poses, of which not all have common numbers, may be counted in two ways.
+    if shared and (len(shared) == len(paths) or len(pose_of) != len(paths)):
+        when = stamps or [(number or 0) * DEFAULT_PERIOD_NS for number in numbers]
+        found = [pose_of.get(number, np.full((4, 4), np.nan)) for number in numbers]
+        files = list(map(PlacedFile, paths, when, found))
+        return PlacedFiles(files, trajectory, remarks)
+    if len(paths) == len(trajectory.poses) and not pose_of:
         when = trajectory.stamps_ns.tolist()
         if stamps is not None and not timed:
             when = list(stamps)
@@ -126,6 +166,7 @@ def place_files(
     if stamps is not None and timed:
         raise _no_common_time(stamps, trajectory, paths[0].parent)
     what = "the trajectory has no times" if stamps is not None else "their names hold no times"
+    what = "their numbers are not those of the poses" if pose_of else what
     raise ToolError(
         f"{paths[0].parent}: {len(paths)} files such as {paths[0].name}, and "
         f"{len(trajectory.poses)} poses in {path}, and {what}: give every file one pose, or times "
@@ -133,21 +174,47 @@ def place_files(
     )
 
 
-def _choose(folder: Path, given: Path | None) -> tuple[Path, list[str]]:
-    """Return the file of the trajectory, and a remark where there are several."""
+def _choose(
+    folder: Path, paths: Sequence[Path], options: ReadingOptions
+) -> tuple[Trajectory, list[str]]:
+    """Return the trajectory, and a remark where there are several."""
+    given, order = options.trajectory, options.quaternion
     if given is not None:
-        if not given.is_file():
+        path = next((each for each in (given, folder / given) if each.exists()), None)
+        if path is None:
             raise ToolError(f"{given}: no such file")
-        return given, []
+        if path.is_file():
+            return read_trajectory(path, order), []
+        if files := in_order(path.glob("*.txt")):
+            return read_pose_files(files), []
     found = [path for name in TRAJECTORY_NAMES for path in sorted(folder.glob(name))]
-    if not found:
-        raise ToolError(
-            f"{folder}: holds no trajectory, {', '.join(TRAJECTORY_NAMES)}: put one there, or name "
-            "it with --trajectory"
-        )
-    others = ", ".join(path.name for path in found[1:])
-    remark = f"poses are those of {found[0].name}, not of {others}: --trajectory FILE chooses"
-    return found[0], [remark] if others else []
+    if found:
+        others = ", ".join(path.name for path in found[1:])
+        remark = f"poses are those of {found[0].name}, not of {others}: --trajectory FILE chooses"
+        return read_trajectory(found[0], order), [remark] if others else []
+    of_files = [paths[0].parent.glob("*.pose.txt")]
+    of_files += [(folder / name).glob("*.txt") for name in _POSE_FOLDERS]
+    if files := next(filter(None, map(in_order, of_files)), []):
+        return read_pose_files(files), []
+    if (viewpoints := _viewpoints(paths)) is not None:
+        return viewpoints, ["poses are the VIEWPOINT of each PCD, as there is no trajectory"]
+    raise ToolError(
+        f"{folder}: holds no trajectory, {', '.join(TRAJECTORY_NAMES)}: put one there, or name it "
+        "with --trajectory"
+    )
+
+
+def _viewpoints(paths: Sequence[Path]) -> Trajectory | None:
+    """Return the poses in the headers of PCD files, if they differ from each other."""
+    if paths[0].suffix.lower() != ".pcd":
+        return None
+    try:
+        headers = [line for path in paths for line in read_header(path)]
+    except ValueError:  # told when the points are read
+        return None
+    said = [" ".join(line[1:]) for line in headers if line[0] == "VIEWPOINT"]
+    is_posed = len(said) == len(paths) and len({*said}) > 1
+    return read_viewpoints(paths, said) if is_posed else None
 
 
 def _by_time(
@@ -198,14 +265,13 @@ def stamps_of_names(paths: Sequence[Path]) -> list[int] | None:
     ``1700000000_250000000``, seconds and a fraction of them in whole units. Small whole numbers
     are counts, not times, and so are those that begin with 0.
     """
-    pairs = [_PAIR.fullmatch(path.stem) for path in paths]
+    stems = [path.stem.removesuffix(".pcd") for path in paths]  # nuScenes: .pcd.bin
+    pairs = [_PAIR.fullmatch(stem) for stem in stems]
     longest = max((len(pair[2]) for pair in pairs if pair), default=0)
     unit_ns = next(10 ** (9 - places) for places in _PLACES if places >= longest)
     stamps: list[int] = []
-    for path, pair in zip(paths, pairs, strict=True):
-        stamp = (
-            _stamp_of(path.stem) if pair is None else int(pair[1]) * 10**9 + int(pair[2]) * unit_ns
-        )
+    for stem, pair in zip(stems, pairs, strict=True):
+        stamp = _stamp_of(stem) if pair is None else int(pair[1]) * 10**9 + int(pair[2]) * unit_ns
         if stamp is None:
             return None
         stamps.append(stamp)
@@ -217,5 +283,5 @@ def _stamp_of(stem: str) -> int | None:
     if decimal is not None:
         return int(decimal[1]) * 10**9 + int(decimal[2].ljust(9, "0"))
     whole = _WHOLE.fullmatch(stem)
-    unit_ns = None if whole is None else _NS_OF_DIGITS.get(len(whole[1]))
+    unit_ns = None if whole is None else NS_OF_DIGITS.get(len(whole[1]))
     return None if whole is None or unit_ns is None else int(whole[1]) * unit_ns

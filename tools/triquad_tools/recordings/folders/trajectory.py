@@ -1,27 +1,34 @@
-"""Files that say where a sensor was.
+"""Files that say where a sensor was: a pose a line, a pose in several lines, or a file for each.
 
-Which format a file has follows from its first line: 8 numbers of TUM (``t x y z qx qy qz qw``,
-seconds), 12 of KITTI (a row-major 3 x 4 pose a line, without times), or the 3 with which each
-pose begins in a ``.log`` of Open3D (then a 4 x 4 pose in four lines, without times).
+The form of lines is told by :mod:`pose_forms`. A ``.log`` of Open3D has five lines a pose: three
+whole numbers and the rows of a matrix; a file of ScanNet or 7-Scenes has the four rows.
 """
 
+import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from triquad_client.errors import InvalidScanError
-from triquad_client.pose import Pose
+from scipy.spatial.transform import Rotation
+from triquad_client.pose import Pose, pose_matrices
 from triquad_format.records.arrays import Doubles, Longs
 
 from triquad_tools.console.command import ToolError
+from triquad_tools.recordings.folders.pose_forms import (
+    UNIT_TOLERANCE,
+    Form,
+    order_of,
+    read_form,
+)
 from triquad_tools.recordings.recording import SENSOR, WORLD
 from triquad_tools.recordings.text_lines import (
     Line,
-    parse_numbers,
-    parse_rigid,
-    parse_stamps,
+    parse_number,
+    parse_time,
     read_lines,
+    rigid,
+    unit_ns,
 )
 from triquad_tools.sensors.motion.frame_tree import FrameTree, Transform
 from triquad_tools.sensors.sweep import NoTransformError
@@ -34,92 +41,192 @@ _ROUNDING_NS = 1_000_000  # files write times with as few as three decimals
 
 @dataclass(frozen=True)
 class Trajectory:
-    """The poses of a sensor, at some times or merely in some order."""
+    """The poses of a sensor, at some times, of scans with some numbers, or merely in some order."""
 
     path: Path
     kind: str
-    poses: Doubles  # [n, 4, 4] world_from_sensor
-    stamps_ns: Longs  # [n]; ten a second where the file has no times
-    frames: FrameTree | None  # the sensor's motion; None where the file has no times
+    poses: Doubles  # [n, 4, 4] world_from_sensor; not finite where the file says no pose
+    stamps_ns: Longs  # [n] in order; ten a second where the file has no times
+    frames: FrameTree | None = None  # the sensor's motion; None where the file has no times
+    numbers: Sequence[int] | None = None  # [n] of the scans, where the file has them
+    remarks: tuple[str, ...] = ()
 
     def pose_at(self, stamp_ns: int) -> Doubles:
         """Return the pose [4, 4] at a time, of a trajectory that has times.
+
+        It is not finite where the file says no pose for this time.
 
         Raises:
             NoTransformError: the time lies before the first pose, after the last or in a gap.
         """
         assert self.frames is not None
+        nearest = int(np.abs(self.stamps_ns - stamp_ns).argmin())
+        pose: Doubles = self.poses[nearest]
         try:
-            pose: Doubles = self.frames.poses(WORLD, SENSOR, np.array([stamp_ns]))[0]
+            if np.isfinite(pose).all():
+                pose = self.frames.poses(WORLD, SENSOR, np.array([stamp_ns]))[0]
         except NoTransformError:
-            nearest = int(np.abs(self.stamps_ns - stamp_ns).argmin())
             if abs(int(self.stamps_ns[nearest]) - stamp_ns) > _ROUNDING_NS:
                 raise
-            pose = self.poses[nearest]
         return pose
 
 
-def read_trajectory(path: Path) -> Trajectory:
-    """Return the poses of a file.
+def read_trajectory(path: Path, order: str | None = None) -> Trajectory:
+    """Return the poses of a file; ``order`` says how it writes quaternions, ``xyzw`` or ``wxyz``.
+
+    A pose that is not finite is no pose, and lines are sorted by their times; both is remarked.
 
     Raises:
-        ToolError: it has none, a line is no pose, or times run backwards.
+        ToolError: it has no poses, or a line is none.
     """
-    lines = read_lines(path)
-    if not lines:
-        raise ToolError(f"{path}: holds no poses")
-    match len(lines[0].words):
-        case 8:
-            return _read_tum(path, lines)
-        case 12:
-            poses = [parse_rigid(line.place, line.words) for line in lines]
-            return _untimed(path, "KITTI poses", poses)
-        case 3:
-            return _untimed(path, "Open3D log", _poses_of_log(path, lines))
-        case count:
-            raise ToolError(
-                f"{lines[0].place}: {count} numbers, where a pose has 8 (t x y z qx qy qz qw), 12 "
-                "(3 x 4), or begins with 3 (Open3D's .log); comments begin with #"
-            )
+    form, lines = read_form(path)
+    if form is None:
+        first, poses = _blocks(path, lines)
+        return _trajectory(path, "Open3D log", first, poses)
+    is_timed = bool({"t", "sec"} & {*form.columns})
+    keys = form.numbers(lines, *(("t", "sec", "nsec") if is_timed else ("n",)))
+    finite = np.isfinite(keys).all(axis=1)
+    without = [lines[index] for index in np.flatnonzero(~finite).tolist()]
+    lines = [lines[index] for index in np.flatnonzero(finite).tolist()]
+    found = _trajectory(path, form.name, lines, _poses(form, lines, order), without)
+    if is_timed:
+        return _timed(found, _stamps(form, lines))
+    numbers = form.numbers(lines, "n").ravel().tolist()
+    return replace(found, numbers=[int(number) for number in numbers] or None)
 
 
-def _read_tum(path: Path, lines: Sequence[Line]) -> Trajectory:
-    frames, stamps = FrameTree(), parse_stamps(lines)
-    poses: list[Doubles] = []
-    for line, stamp_ns in zip(lines, stamps, strict=True):
-        if len(line.words) != 8:
-            raise ToolError(f"{line.place}: {len(line.words)} numbers where a pose has 8")
-        numbers = parse_numbers(line.place, line.words[1:])
-        pose = Pose(numbers[:3], numbers[3:])
-        try:
-            poses.append(pose.matrix())
-        except InvalidScanError as error:
-            raise ToolError(
-                f"{line.place}: {error}; a line is t x y z qx qy qz qw, w last"
-            ) from error
-        frames.add(Transform(WORLD, SENSOR, stamp_ns, pose))
-    return Trajectory(path, "TUM trajectory", np.array(poses), np.array(stamps), frames)
+def read_pose_files(paths: Sequence[Path]) -> Trajectory:
+    """Return the poses of files of one matrix each, for scans with the same numbers in their names.
+
+    Raises:
+        ToolError: a file does not hold 12 or 16 numbers, or all say no pose.
+    """
+    lines, poses = [Line(str(path), "") for path in paths], []
+    for path, line in zip(paths, lines, strict=True):
+        words = [word for each in read_lines(path) for word in each.words]
+        if len(words) not in (12, 16):
+            raise ToolError(f"{path}: {len(words)} numbers where a pose has 16")
+        poses.append(_matrix(line, [parse_number(line.place, word) for word in words]))
+    files = paths[0].parent / f"*{''.join(paths[0].suffixes)}"
+    numbers = [number_of(path) or 0 for path in paths]
+    return replace(_trajectory(files, "a pose a file", lines, np.array(poses)), numbers=numbers)
 
 
-def _poses_of_log(path: Path, lines: Sequence[Line]) -> list[Doubles]:
-    """Return poses of five lines each: three whole numbers, and the rows of a matrix."""
-    if len(lines) % 5:
+def read_viewpoints(paths: Sequence[Path], texts: Sequence[str]) -> Trajectory:
+    """Return the poses that PCD files have as ``VIEWPOINT``, in the order of the files."""
+    form = Form("VIEWPOINT", ["x", "y", "z", "qw", "qx", "qy", "qz"], has_header=True)
+    lines = [Line(str(path), text) for path, text in zip(paths, texts, strict=True)]
+    return _trajectory(paths[0].parent / "*.pcd", form.name, lines, _poses(form, lines, None))
+
+
+def number_of(path: Path) -> int | None:
+    """Return the last whole number in a name, such as 12 of ``frame-000012.pose.txt``."""
+    found = re.findall(r"\d+", path.name.partition(".")[0])
+    return int(found[-1]) if found else None
+
+
+def _trajectory(
+    path: Path, kind: str, lines: Sequence[Line], poses: Doubles, others: Sequence[Line] = ()
+) -> Trajectory:
+    """Return poses without times, with a remark on those, and on other lines, that are none.
+
+    Raises:
+        ToolError: all are none.
+    """
+    nowhere = np.isnan(poses[:, 0, 3])
+    unknown = [*others, *(lines[index] for index in np.flatnonzero(nowhere).tolist())]
+    remarks: tuple[str, ...] = ()
+    if len(unknown) == len(lines) + len(others):
+        raise ToolError(f"{unknown[0].place}: no finite pose, nor in any other line")
+    if unknown:
+        told = f"{len(unknown)} of {len(lines) + len(others)} poses are left out, as they are not "
+        remarks = (f"{told}finite or no rotation, the first at {unknown[0].place}",)
+    stamps = np.arange(len(poses), dtype=np.int64) * DEFAULT_PERIOD_NS
+    return Trajectory(path, kind, poses, stamps, remarks=remarks)
+
+
+def _timed(found: Trajectory, stamps: Longs) -> Trajectory:
+    """Return a trajectory with times [n], sorted by them."""
+    remarks, frames = list(found.remarks), FrameTree()
+    order = np.argsort(stamps, kind="stable")
+    poses, ordered = found.poses[order], stamps[order]
+    backwards, repeated = int((np.diff(stamps) < 0).sum()), int((np.diff(ordered) == 0).sum())
+    of_all = f"{found.path}: has {len(stamps)} poses, some with a time"
+    if backwards:
+        remarks.append(f"{of_all} before that of the line above ({backwards}): sorted by time")
+    if repeated:
+        remarks.append(f"{of_all} that of another pose ({repeated}): the last of each is taken")
+    known = np.isfinite(poses[:, 0, 3])
+    turns = Rotation.from_matrix(poses[known, :3, :3]).as_quat()
+    for stamp, pose, turn in zip(ordered[known].tolist(), poses[known], turns, strict=True):
+        frames.add(Transform(WORLD, SENSOR, stamp, Pose(pose[:3, 3], turn)))
+    return Trajectory(found.path, found.kind, poses, ordered, frames, None, tuple(remarks))
+
+
+def _stamps(form: Form, lines: Sequence[Line]) -> Longs:
+    """Return the times of lines, nanoseconds: a time, or its seconds and nanoseconds."""
+    parts = [form.columns.index(name) for name in ("t", "sec", "nsec") if name in form.columns]
+    units = [10**9, 1][: len(parts)]
+    if len(parts) == 1 and lines:
+        units = [form.unit_ns or unit_ns(lines[0], lines[0].words[parts[0]])]
+    stamps = [
+        sum(parse_time(line, line.words[i], unit) for i, unit in zip(parts, units, strict=True))
+        for line in lines
+    ]
+    return np.array(stamps, np.int64)
+
+
+def _poses(form: Form, lines: Sequence[Line], order: str | None) -> Doubles:
+    """Return poses [n, 4, 4] of lines, not finite where a line says none.
+
+    Raises:
+        ToolError: a line is no pose, or it is not clear where the quaternion has its w.
+    """
+    if "m" in form.columns:
+        rows = zip(lines, form.numbers(lines, "m"), strict=True)
+        return np.array([_matrix(line, row) for line, row in rows]).reshape(-1, 4, 4)
+    positions = form.numbers(lines, "x", "y", "z")
+    names = [name for name in form.columns if name[0] == "q"]  # in the order of the file
+    quaternions = form.numbers(lines, *names)
+    finite = np.isfinite(positions).all(axis=1) & np.isfinite(quaternions).all(axis=1)
+    finite &= np.abs(quaternions).max(axis=1, initial=0.0) > 0
+    lengths = np.linalg.norm(quaternions, axis=1)
+    for index in np.flatnonzero(finite & (np.abs(lengths - 1) > UNIT_TOLERANCE)).tolist():
         raise ToolError(
-            f"{path}: {len(lines)} lines are not whole poses of Open3D's .log, which take 5 each; "
-            "copy it again"
+            f"{lines[index].place}: the quaternion {quaternions[index].tolist()} has the length "
+            f"{lengths[index]:.4g}, not 1; a line is {' '.join(form.columns)}"
         )
-    poses = []
-    for start in range(0, len(lines), 5):
-        first, *rows = lines[start : start + 5]
-        lengths = [len(row.words) for row in rows]
-        if len(first.words) != 3 or lengths != [4, 4, 4, 4]:
-            raise ToolError(f"{first.place}: not 3 numbers and four rows of 4, as in Open3D's .log")
-        if parse_numbers(rows[3].place, rows[3].words) != [0, 0, 0, 1]:
-            raise ToolError(f"{rows[3].place}: {rows[3].text!r} where a pose ends with 0 0 0 1")
-        poses.append(parse_rigid(first.place, [word for row in rows[:3] for word in row.words]))
+    order = order or order_of(form, quaternions[finite], lines)
+    names = [f"q{axis}" for axis in order] if order != form.order else names
+    quaternions = quaternions[:, [names.index(f"q{axis}") for axis in "xyzw"]]
+    poses = np.full((len(lines), 4, 4), np.nan)
+    units = quaternions[finite] / lengths[finite, None]
+    poses[finite] = pose_matrices(positions[finite], units)
     return poses
 
 
-def _untimed(path: Path, kind: str, poses: Sequence[Doubles]) -> Trajectory:
-    stamps = np.arange(len(poses), dtype=np.int64) * DEFAULT_PERIOD_NS
-    return Trajectory(path, kind, np.array(poses), stamps, frames=None)
+def _matrix(line: Line, numbers: Sequence[float] | Doubles) -> Doubles:
+    """Return the pose of 12 or 16 numbers; not finite where they are not."""
+    if not np.isfinite(numbers).all():
+        return np.full((4, 4), np.nan)
+    return rigid(line.place, numbers)
+
+
+def _blocks(path: Path, lines: Sequence[Line]) -> tuple[list[Line], Doubles]:
+    """Return the first line of each pose, and poses of four rows, before which may stand a line."""
+    size = 5 if len(lines[0].words) == 3 else 4
+    if len(lines) % size:
+        raise ToolError(
+            f"{path}: {len(lines)} lines are not whole poses of Open3D's .log, which take 5 each, "
+            "or of four rows; copy it again"
+        )
+    poses = []
+    for start in range(0, len(lines), size):
+        rows = lines[start : start + size][-4:]
+        if len(lines[start].words) != len(lines[0].words) or any(len(r.words) != 4 for r in rows):
+            raise ToolError(
+                f"{lines[start].place}: not 3 numbers and four rows of 4, as in Open3D's .log"
+            )
+        numbers = [parse_number(row.place, word) for row in rows for word in row.words]
+        poses.append(_matrix(lines[start], numbers))
+    return list(lines[::size]), np.array(poses)
