@@ -24,7 +24,7 @@ _OTHER_COLUMNS = {3: "xyz", 5: "xyzir", 6: "xyzirt"}  # as data sets have them
 _FILES, _SAMPLE, _ENOUGH = 4, 240_000, 1_000  # files, and numbers of each and of all, to tell them
 _CLEARLY, _AT_LEAST = 1.1, 0.01  # times more than other numbers of columns explain, and how much
 _HALF = 0.85  # of what twice as many columns explain: they are two points
-_PLAUSIBLE = 1e-8, 1e8  # m, of numbers other than 0
+_FARTHEST_M = 1e8  # numbers of another type, read as float32, have all sizes
 
 _HEADER_END = re.compile(rb"^(DATA|end_header)\b[^\n]*\n", re.MULTILINE)
 _HEADER_BYTES = 65_536  # at most
@@ -60,7 +60,7 @@ def check_columns(paths: Sequence[Path]) -> None:
         return
     sizes = np.abs(np.concatenate(flats))
     sizes = sizes[(sizes != 0) & np.isfinite(sizes)]
-    if not len(sizes) or np.mean((sizes < _PLAUSIBLE[0]) | (sizes > _PLAUSIBLE[1])) > _AT_LEAST:
+    if not len(sizes) or np.mean(sizes > _FARTHEST_M) > _AT_LEAST:
         raise ToolError(
             f"{some[0]}: its numbers are no metres, read as float32: say what they "
             "are with --columns, or write them so"
