@@ -145,8 +145,8 @@ class MappingRun:
             write_map(replace(record, name=f"{self.key}.{self.scans_taken}"), self.unfinished)
         except OSError as error:
             raise StoreError(
-                f"{self.unfinished} cannot be written: {why(error)}; what was saved before is "
-                "kept: the same command goes on from it"
+                f"{self.unfinished} cannot be written: {why(error)}; with room for it the "
+                "same command goes on where the map was saved last"
             ) from error
         ended_s = time.monotonic()
         self._next_save_s = ended_s + max(_SAVE_PERIOD_S, (ended_s - started_s) / _SAVE_SHARE)

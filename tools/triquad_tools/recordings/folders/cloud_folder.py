@@ -198,9 +198,6 @@ def _of_lidar(folders: Sequence[Path], files: Sequence[PlacedFile]) -> list[Plac
 
     In ``calib.txt`` the line ``Tr:`` is ``camera_from_lidar``: the poses are then those of the
     camera, as KITTI gives them. ``calib_cam_to_velo.txt`` of KITTI-360 is ``lidar_from_camera``.
-
-    Raises:
-        ToolError: the calibration is no rigid motion, or lacks where the poses are of a camera.
     """
     of_camera = (each / name for each in folders for name in (_KITTI, _KITTI_360))
     path = next((each for each in of_camera if each.is_file()), None)
@@ -223,11 +220,7 @@ def _of_lidar(folders: Sequence[Path], files: Sequence[PlacedFile]) -> list[Plac
 
 
 def _check_axes(folder: Path, files: Sequence[PlacedFile]) -> None:
-    """Check that a lidar drives along its x or y, not along z as a camera does.
-
-    Raises:
-        ToolError: it goes along z nearly all the time.
-    """
+    """Check that a lidar drives along its x or y, not along z as a camera does."""
     poses = np.array([file.world_from_sensor for file in files])
     steps = np.diff(poses[:, :3, 3], axis=0)
     ahead = np.abs(np.einsum("nij,ni->nj", poses[:-1, :3, :3], steps))  # in the sensor's frame

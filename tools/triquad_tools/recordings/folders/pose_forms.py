@@ -140,11 +140,7 @@ def order_of(form: Form, quaternions: Doubles, lines: Sequence[Line]) -> str:
 
 
 def _form_of_header(line: Line, count: int) -> Form | None:
-    """Return the form that a line names, if it names all that a pose needs.
-
-    Raises:
-        ToolError: it is no comment, and names a position, but not all of the rest.
-    """
+    """Return the form that a line names, if it names all that a pose needs."""
     text = line.text.lstrip("#%/ ").lower()
     separator = next((each for each in ",;\t" if each in text), None)
     names = re.sub(r"\s*[\[(]\s*([^\])]*)[\])]", r"_\1", text).split(separator)
@@ -183,11 +179,7 @@ def _role(name: str) -> tuple[str, int | None]:
 
 
 def _form_of_numbers(lines: Sequence[Line]) -> Form:
-    """Return the form of lines without a header.
-
-    Raises:
-        ToolError: there is none, or not one only.
-    """
+    """Return the form of lines without a header."""
     count = len(lines[0].words)
     fitting = [form for form in _FORMS if len(form.columns) == count]
     if len(fitting) > 1:

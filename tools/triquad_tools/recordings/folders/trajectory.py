@@ -1,6 +1,6 @@
 """Files that say where a sensor was: a pose a line, a pose in several lines, or a file for each.
 
-The form of lines is told by :mod:`pose_forms`. A ``.log`` of Open3D has five lines a pose: three
+The form of lines is told by ``pose_forms.py``. A ``.log`` of Open3D has five lines a pose: three
 whole numbers and the rows of a matrix; a file of ScanNet or 7-Scenes has the four rows.
 """
 
@@ -128,11 +128,7 @@ def number_of(path: Path) -> int | None:
 def _trajectory(
     path: Path, kind: str, lines: Sequence[Line], poses: Doubles, others: Sequence[Line] = ()
 ) -> Trajectory:
-    """Return poses without times, with a remark on those, and on other lines, that are none.
-
-    Raises:
-        ToolError: all are none.
-    """
+    """Return poses without times, with a remark on those, and on other lines, that are none."""
     nowhere = np.isnan(poses[:, 0, 3])
     unknown = [*others, *(lines[index] for index in np.flatnonzero(nowhere).tolist())]
     remarks: tuple[str, ...] = ()
@@ -177,11 +173,7 @@ def _stamps(form: Form, lines: Sequence[Line]) -> Longs:
 
 
 def _poses(form: Form, lines: Sequence[Line], order: str | None) -> Doubles:
-    """Return poses [n, 4, 4] of lines, not finite where a line says none.
-
-    Raises:
-        ToolError: a line is no pose, or it is not clear where the quaternion has its w.
-    """
+    """Return poses [n, 4, 4] of lines, not finite where a line says none."""
     if "m" in form.columns:
         rows = zip(lines, form.numbers(lines, "m"), strict=True)
         return np.array([_matrix(line, row) for line, row in rows]).reshape(-1, 4, 4)
