@@ -257,7 +257,7 @@ def test_poses_that_are_none_are_left_out_and_counted(tmp_path: Path) -> None:
     assert "/tf: 1 poses are left out: quaternion_xyzw" in only_remark(recording)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["sqlite3", "ros1"])
 def test_a_damaged_bag_is_refused_with_the_remedy(tmp_path: Path, kind: BagKind) -> None:
     messages = drive(messages_for(kind), SCANS, poses(), STAMPS, LIDAR)
     path = write_bag(tmp_path / "bag", kind, messages)

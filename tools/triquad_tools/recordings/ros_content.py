@@ -4,12 +4,10 @@ from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 from typing import Any
 
-from rosbags.interfaces import Connection
 from triquad_format.errors import InvalidInputError
 
-from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
-from triquad_tools.recordings.bag import Bag, Message
+from triquad_tools.recordings.bag import Bag, Channel, Message
 from triquad_tools.sensors.motion.frame_tree import STATIC, FrameTree, Track, Transform
 from triquad_tools.sensors.ros import type_store
 from triquad_tools.sensors.ros.depth_camera import is_depth
@@ -19,7 +17,8 @@ from triquad_tools.sensors.sweep import NoScanError
 _TRANSFORMS = (type_store.TF, type_store.TF_OF_ROS_1)
 _POSES = (type_store.ODOMETRY, type_store.POSE)
 _SCANS = (type_store.POINT_CLOUD, type_store.IMAGE)
-_USED = (type_store.CAMERA_INFO, *_TRANSFORMS, *_POSES, *_SCANS)
+_USED = (*_TRANSFORMS, *_POSES, *_SCANS)
+_REPORTED = 500  # messages, after which the progress is shown again
 
 
 @dataclass(frozen=True)
@@ -67,26 +66,36 @@ class RosContent:
         self._colours: set[str] = set()  # topics of images that hold no depth
         self._numbers: Counter[str] = Counter()
         self._reader = reader
-        total = 0
-        for connection in bag.connections():
-            self.kinds[connection.topic] = connection.msgtype
-            self.counts[connection.topic] += connection.msgcount
-            total += connection.msgcount if connection.msgtype in _USED else 0
+        self.foreign: dict[str, str] = {}  # encodings of topics that are not of ROS
+        total, cameras = 0, set[str]()
+        for channel in bag.channels():
+            self.kinds[channel.topic] = channel.kind
+            self.counts[channel.topic] += channel.count
+            if channel.foreign:
+                self.foreign[channel.topic] = channel.foreign
+            elif channel.count and _is_camera(channel):
+                cameras.add(channel.topic)
+            total += channel.count if _is_read(channel) else 0
         # Cameras first: an image may come before what is known of its camera.
-        messages = bag.messages(
-            _is_camera, lambda one: one.msgtype in _USED and not _is_camera(one)
-        )
+        for message in bag.messages(_is_camera) if cameras else ():
+            self._take(message)
+            cameras.discard(message.topic)
+            if not cameras:
+                break
         done = 0
         with progress("looking through the recording", total) as report:
-            for done, message in enumerate(messages, start=1):
+            for done, message in enumerate(bag.messages(_is_read), start=1):
                 if message.topic not in self._colours:
-                    self._take(message, message.decoded())
-                report(done, f"{done} of {total} messages")
+                    self._take(message)
+                if done % _REPORTED == 0:
+                    report(done, f"{done} of {total} messages")
+            report(done, f"{done} of {total} messages")
         self.missing = total - done
 
-    def _take(self, message: Message, decoded: Any) -> None:
+    def _take(self, message: Message) -> None:
         topic, kind = message.topic, message.kind
         try:
+            decoded = message.decoded()
             if kind == type_store.CAMERA_INFO:
                 self._reader.cameras[topic] = decoded
             elif kind in (*_TRANSFORMS, *_POSES):
@@ -97,19 +106,26 @@ class RosContent:
                 self._colours.add(topic)
             else:
                 self._add_cloud(message, decoded)
+        except NoScanError as error:
+            self._leave_out(message, error)
         except AttributeError as error:  # a bag brings its own definitions of types
-            raise ToolError(f"{topic}: messages are not as {kind} is defined: {error}") from error
+            text = f"not as {kind} is defined: {error}"
+            self._leave_out(message, NoScanError("decode", text))
+
+    def _leave_out(self, message: Message, problem: NoScanError) -> None:
+        """Count a message that cannot be read."""
+        topic = message.topic
+        if message.kind in _SCANS:
+            self.clouds.append(SeenCloud(topic, self._numbers[topic], problem=problem))
+            self._numbers[topic] += 1
+        else:
+            self.broken[topic].append(str(problem))
 
     def _add_cloud(self, message: Message, decoded: Any) -> None:
         topic = message.topic
-        number = self._numbers[topic]
+        sweep = self._reader.sweep(topic, message.kind, decoded, message.recorded_ns)
+        number, (first_ns, last_ns) = self._numbers[topic], sweep.span_ns
         self._numbers[topic] += 1
-        try:
-            sweep = self._reader.sweep(topic, message.kind, decoded, message.recorded_ns)
-        except NoScanError as error:
-            self.clouds.append(SeenCloud(topic, number, problem=error))
-            return
-        first_ns, last_ns = sweep.span_ns
         self.clouds.append(SeenCloud(topic, number, sweep.frame, sweep.stamp_ns, first_ns, last_ns))
 
     def _add(self, topic: str, transform: Transform, *, is_pose: bool) -> None:
@@ -128,5 +144,9 @@ class RosContent:
         known.track.add(transform.stamp_ns, position, quaternion)
 
 
-def _is_camera(connection: Connection) -> bool:
-    return connection.msgtype == type_store.CAMERA_INFO
+def _is_camera(channel: Channel) -> bool:
+    return channel.kind == type_store.CAMERA_INFO and not channel.foreign
+
+
+def _is_read(channel: Channel) -> bool:
+    return channel.kind in _USED and not channel.foreign

@@ -149,7 +149,11 @@ class RosRecording:
     def remarks(self) -> Sequence[str]:
         """The problems: what is left out and why, and what to do about it, a line each."""
         found = self._content
-        lines = [_MISSING.format(count=found.missing)] if found.missing > 0 else []
+        lines = [*self._bag.remarks]
+        lines += [_MISSING.format(count=found.missing)] if found.missing > 0 else []
+        if found.foreign:
+            others = ", ".join(f"{topic} ({what})" for topic, what in found.foreign.items())
+            lines.append(f"left out, since they are not encoded as messages of ROS: {others}")
         if not found.clouds:
             return [*lines, _NO_CLOUDS]
         lines += [
@@ -169,7 +173,7 @@ class RosRecording:
         wanted = {(self._placed[i].topic, self._placed[i].number) for i in indices}
         topics = {topic for topic, _ in wanted}
         numbers: Counter[str] = Counter()
-        for message in self._bag.messages(lambda connection: connection.topic in topics):
+        for message in self._bag.messages(lambda channel: channel.topic in topics):
             key = message.topic, numbers[message.topic]
             numbers[message.topic] += 1
             if key in wanted:
@@ -247,6 +251,8 @@ class RosRecording:
                 return "the poses" if chosen == topic else f"other poses: --poses {topic}"
             case type_store.CAMERA_INFO:
                 return "a camera"
+        if topic in self._content.foreign:
+            return f"not read: {self._content.foreign[topic]}, not a message of ROS"
         if not any(cloud.topic == topic for cloud in self._content.clouds):
             return "not used"
         return "none can be placed" if topic in self._topics else f"other scans: --topics {topic}"

@@ -1,0 +1,193 @@
+"""MCAP files of any writer, read from front to back: without index, and where they are cut off."""
+
+import heapq
+import struct
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cache, partial
+from io import BytesIO
+from pathlib import Path
+from typing import IO, Any, TypeAlias
+
+import zstandard
+from mcap import records
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.reader import SeekingReader
+from mcap.stream_reader import StreamReader, get_chunk_data_stream
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.msg import normalize_msgtype
+from rosbags.typesys.store import Typestore
+
+from triquad_tools.recordings.bag import MCAP, Bag, Channel, Message, Wanted, bag_files
+
+_RECORD = struct.Struct("<BQ")  # opcode, length
+_MESSAGE = struct.Struct("<HIQQ")  # channel, number, times of recording and of publishing
+_ZSTD = b"\x28\xb5\x2f\xfd"  # what rosbag2 compresses message by message begins so
+
+Found: TypeAlias = tuple[int, int, bytes]  # channel, time of recording, payload
+
+
+def find_bag(path: Path) -> Bag | None:
+    """Return the bag at a path: a file, a folder that ROS 2 wrote, or one of parts of a bag."""
+    files = bag_files(path)
+    is_mcap = all(file.name.endswith(MCAP) for file in files)
+    return (McapBag if is_mcap else Bag)(path, files) if files else None
+
+
+class McapBag(Bag):
+    """MCAP files: what is not of ROS is named with its encoding."""
+
+    def channels(self) -> list[Channel]:
+        """Return the recorded channels, of a file without an index after all of it was read."""
+        return [each for file in self.files for each in self._channels(file)]
+
+    def messages(self, *wanted: Wanted) -> Iterator[Message]:
+        """Yield messages, as of other bags."""
+        for is_wanted in wanted:
+            files = [self._messages(file, is_wanted) for file in self.files]
+            yield from heapq.merge(*files, key=lambda one: one[1]) if len(files) > 1 else files[0]
+
+    def _channels(self, file: Path) -> list[Channel]:
+        summary, contents = _summary(file), _Contents(file)
+        if summary is not None:
+            counts = Counter(summary.statistics.channel_message_counts)
+            for record in (*summary.schemas.values(), *summary.channels.values()):
+                contents.learn(record)
+        else:
+            counts = Counter(number for number, _, _ in self._found(contents))
+        return [replace(x, count=counts[number]) for number, x in contents.channels.items()]
+
+    def _messages(self, file: Path, is_wanted: Wanted) -> Iterator[Message]:
+        contents = _Contents(file)
+        channels, wanted = contents.channels, dict[int, bool]()
+        for number, recorded_ns, payload in self._found(contents):
+            if number not in wanted:
+                wanted[number] = number in channels and is_wanted(channels[number])
+            if wanted[number]:
+                if payload.startswith(_ZSTD):
+                    payload = zstandard.decompress(payload)
+                yield Message(channels[number], recorded_ns, payload)
+
+    def _found(self, contents: "_Contents") -> Iterator[Found]:
+        """Yield all messages; the channels are added to ``contents`` as they come."""
+        file, broken = contents.file, 0  # chunks
+        with _opened(file) as stream:
+            reading = StreamReader(stream, emit_chunks=True).records
+            while True:
+                try:
+                    record = next(reading, None)
+                except Exception as error:  # where it is cut off, anything may come
+                    if not contents.channels:
+                        raise self.damaged(error) from error
+                    self._tell(file, f"cut off or damaged at {stream.tell() / 1e6:.3g} MB")
+                    return
+                if isinstance(record, records.Message):
+                    yield record.channel_id, record.log_time, record.data
+                elif isinstance(record, records.Chunk):
+                    try:
+                        messages = contents.unpacked(record)
+                    except Exception:  # as above
+                        broken += 1
+                        continue
+                    yield from messages
+                elif record is None:
+                    break
+                else:
+                    contents.learn(record)
+        if broken:
+            self._tell(file, f"{broken} of its chunks are damaged")
+
+    def _tell(self, file: Path, what: str) -> None:
+        size = f"of {file.stat().st_size / 1e6:.3g} MB"
+        line = f"{file.name} ({size}) is not whole: {what}; the rest of it is read"
+        if line not in self.remarks:
+            self.remarks.append(line)
+
+
+class _Contents:
+    """What is known of a file while it is read."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        self.channels: dict[int, Channel] = {}
+        self._schemas: dict[int, records.Schema] = {}
+
+    def learn(self, record: object) -> None:
+        """Remember a schema or a channel."""
+        if isinstance(record, records.Schema):
+            self._schemas[record.id] = record
+        elif isinstance(record, records.Channel) and record.id not in self.channels:
+            schema = self._schemas.get(record.schema_id)
+            self.channels[record.id] = _channel(self.file, record, schema)
+
+    def unpacked(self, chunk: records.Chunk) -> list[Found]:
+        """Return the messages of a chunk: faster than the library does, record by record."""
+        stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+        data, at = stream.read(size), 0
+        found: list[Found] = []
+        while at < size:
+            opcode, length = _RECORD.unpack_from(data, at)
+            at += _RECORD.size
+            if opcode == Opcode.MESSAGE:
+                number, _, recorded_ns, _ = _MESSAGE.unpack_from(data, at)
+                found.append((number, recorded_ns, data[at + _MESSAGE.size : at + length]))
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                kind: Any = records.Schema if opcode == Opcode.SCHEMA else records.Channel
+                self.learn(kind.read(ReadDataStream(BytesIO(data[at : at + length]))))
+            at += length
+        return found
+
+
+def _channel(file: Path, channel: records.Channel, schema: records.Schema | None) -> Channel:
+    encoding = channel.message_encoding
+    name = schema.name.replace("::", "/") if schema is not None else ""
+    if encoding not in ("cdr", "ros1") or not name:
+        what = encoding or "unknown"
+        return Channel(channel.topic, name or what, 0, file, _not_of_ros, foreign=what)
+    kind, is_ros_1 = normalize_msgtype(name), encoding == "ros1"
+    text = schema.data.decode(errors="replace") if schema is not None else ""
+    decode = partial(_decode, kind, text, is_ros_1)
+    return Channel(channel.topic, kind, 0, file, decode, is_ros_1)
+
+
+def _not_of_ros(_payload: bytes) -> Any:
+    raise ValueError("no message of ROS")
+
+
+def _decode(kind: str, text: str, is_ros_1: bool, payload: bytes) -> Any:
+    types = _types(kind, text, is_ros_1)
+    read = types.deserialize_ros1 if is_ros_1 else types.deserialize_cdr
+    return read(payload, kind)
+
+
+@cache
+def _types(kind: str, text: str, is_ros_1: bool) -> Typestore:
+    """Return the types that a schema defines, or, where it is not understood, those of ROS."""
+    try:
+        types = get_typestore(Stores.EMPTY)
+        types.register(get_types_from_msg(text, kind))
+        types.get_msgdef(kind)
+    except Exception:  # a text of whatever writer, or of IDL
+        return get_typestore(Stores.ROS1_NOETIC if is_ros_1 else Stores.LATEST)
+    return types
+
+
+def _summary(file: Path) -> Any:
+    """Return the index of a file; None where it has none, or not all of it."""
+    if not file.name.endswith(".mcap"):
+        return None
+    try:
+        with file.open("rb") as stream:
+            summary = SeekingReader(stream).get_summary()
+    except Exception:  # as of any damaged file
+        return None
+    if summary is None or summary.statistics is None:
+        return None
+    is_whole = summary.statistics.channel_message_counts.keys() <= summary.channels.keys()
+    return summary if is_whole and summary.channels else None
+
+
+def _opened(file: Path) -> IO[bytes]:
+    return zstandard.open(file, "rb") if file.name.endswith(".zstd") else file.open("rb")
