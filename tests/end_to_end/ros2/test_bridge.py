@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from support import servers
 from support.ros.ros_bridge import AT, MAST, Bridged, bridging, stand
-from support.ros.ros_messages import CLOUD
-from support.ros.ros_robot import T0, robot, shifted
+from support.ros.ros_messages import CLOUD, PATH, POSE_WITH_COVARIANCE, TRANSFORM
+from support.ros.ros_robot import T0, robot, shifted, stamp
 from triquad_client import Client, Status
 from triquad_server.settings import SourceSettings
 from triquad_tools.ros2.intake import drop_log
@@ -149,7 +149,14 @@ def test_sensors_are_sources_of_their_own(endpoint: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("topic", "frame", "way"), [("/odom", "/odom", "rmw"), ("/pose", "/map", "bridge")]
+    ("topic", "frame", "way"),
+    [
+        ("/odom", "/odom", "rmw"),
+        ("/pose", "/map", "bridge"),
+        ("/covariance", "/map", "rmw"),
+        ("/transform", "/map", "bridge"),
+        ("/path", "/map", "rmw"),
+    ],
 )
 def test_poses_come_from_a_topic(endpoint: str, topic: str, frame: str, way: str) -> None:
     frames = ("--map-frame", frame, "--body-frame", "/body")
@@ -158,10 +165,22 @@ def test_poses_come_from_a_topic(endpoint: str, topic: str, frame: str, way: str
         for second in (0, 1):
             # What transforms say of the body does not count then.
             r2.tf(second, ("map", "body", shifted(x=99)))
-            if topic == "/odom":
-                r2.odometry(second, shifted(*AT), "body")
-            else:
-                r2.pose(second, shifted(*AT))
+            at = stamp(second), shifted(*AT)
+            match topic:
+                case "/odom":
+                    r2.odometry(second, shifted(*AT), "body")
+                case "/pose":
+                    r2.pose(second, shifted(*AT))
+                case "/covariance":
+                    message = r2.messages.pose_with_covariance(*at, "map")
+                    r2.send(topic, POSE_WITH_COVARIANCE, message)
+                case "/transform":
+                    (edge,) = r2.messages.tf(at[0], ("map", "body", at[1])).transforms
+                    r2.send(topic, TRANSFORM, edge)
+                case "/path":
+                    stamps = [stamp(each) for each in range(second + 1)]
+                    path = r2.messages.path(stamps, [at[1]] * len(stamps), "map")
+                    r2.send(topic, PATH, path)
         r2.cloud(0.5, servers.sphere())
         bridged.wait_for(lambda: bridged.taken == 1)
         assert finds_its_sphere(bridged)

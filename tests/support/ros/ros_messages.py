@@ -1,6 +1,6 @@
 """Messages of ROS as robots send them, built with the types of a release."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,9 @@ CLOUD = "sensor_msgs/msg/PointCloud2"
 TF = "tf2_msgs/msg/TFMessage"
 ODOMETRY = "nav_msgs/msg/Odometry"
 POSE = "geometry_msgs/msg/PoseStamped"
+POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+TRANSFORM = "geometry_msgs/msg/TransformStamped"
+PATH = "nav_msgs/msg/Path"
 IMAGE = "sensor_msgs/msg/Image"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 
@@ -106,6 +109,14 @@ class RosMessages:
 
     def pose(self, stamp_ns: int, pose: NDArray[Any], parent: str) -> Any:
         return self._new(POSE, self.header(stamp_ns, parent), self._pose(pose))
+
+    def pose_with_covariance(self, stamp_ns: int, pose: NDArray[Any], parent: str) -> Any:
+        inner = self._new("geometry_msgs/msg/PoseWithCovariance", self._pose(pose), np.zeros(36))
+        return self._new(POSE_WITH_COVARIANCE, self.header(stamp_ns, parent), inner)
+
+    def path(self, stamps_ns: Sequence[int], poses: NDArray[Any], parent: str) -> Any:
+        stamped = [self.pose(*each, "") for each in zip(stamps_ns, poses, strict=True)]
+        return self._new(PATH, self.header(stamps_ns[-1], parent), stamped)
 
     def image(
         self, pixels: NDArray[Any], encoding: str, stamp_ns: int, frame: str = "optical"

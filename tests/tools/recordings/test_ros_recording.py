@@ -7,7 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.recordings.bags import KINDS, BagKind, Recorded, drive, messages_for, write_bag
-from support.ros.ros_messages import CAMERA_INFO, CLOUD, IMAGE, ODOMETRY, POSE, TF
+from support.ros.ros_messages import (
+    CAMERA_INFO,
+    CLOUD,
+    IMAGE,
+    ODOMETRY,
+    PATH,
+    POSE,
+    POSE_WITH_COVARIANCE,
+    TF,
+    TRANSFORM,
+)
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.opening import Recording, open_recording
 from triquad_tools.recordings.recording import ReadingOptions, transform
@@ -108,6 +118,28 @@ def test_poses_without_a_name_are_those_of_what_the_sensor_is_fixed_to(tmp_path:
     of_lidar = open_recording(tmp_path / "bag", ReadingOptions(body_frame="lidar"))
     for scan, pose in zip(of_lidar.read(range(COUNT)), poses(), strict=True):
         assert np.allclose(scan.world_from_sensor, pose @ np.linalg.inv(LIDAR))
+
+
+@pytest.mark.parametrize("kind", [TRANSFORM, POSE_WITH_COVARIANCE, PATH])
+def test_poses_come_in_many_types(tmp_path: Path, kind: str) -> None:
+    messages = without(a_drive(), "/tf")
+    for index, (pose, stamp) in enumerate(zip(poses(), STAMPS, strict=True)):
+        body = pose @ np.linalg.inv(LIDAR)
+        message = {
+            TRANSFORM: lambda s, b: ROS2.tf(s, ("map", "base_link", b)).transforms[0],
+            POSE_WITH_COVARIANCE: lambda s, b: ROS2.pose_with_covariance(s, b, "map"),
+            PATH: lambda _, b, n=index: ROS2.path(
+                STAMPS[: n + 1], [*poses()[:n] @ np.linalg.inv(LIDAR), b], "map"
+            ),
+        }[kind](stamp, body)
+        messages.append(Recorded("/where", kind, stamp, message))
+    recording = opened(tmp_path, messages)
+    for scan, pose in zip(recording.read(range(COUNT)), poses(), strict=True):
+        assert np.allclose(scan.world_from_sensor, pose)
+    unstamped = ROS2.path([0] * COUNT, poses(), "map")
+    messages = [*without(messages, "/where"), Recorded("/where", PATH, STAMPS[-1], unstamped)]
+    remarks = opened(tmp_path / "unstamped", messages).remarks
+    assert "/where: 1 poses are left out: they have no times of their own" in remarks
 
 
 def test_depth_images_are_mapped_in_the_optical_frame(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from support.ros.ros_messages import IMAGE, RosMessages
 from triquad_tools.sensors.ros.depth_camera import sweep_of_depth
-from triquad_tools.sensors.ros.type_store import decode_cdr
+from triquad_tools.sensors.ros.from_bytes import decode_cdr
 from triquad_tools.sensors.sweep import NoScanError
 
 ROS = RosMessages()

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.ros.ros_messages import CLOUD, RosMessages
+from triquad_tools.sensors.ros.from_bytes import decode_cdr
 from triquad_tools.sensors.ros.point_cloud import sweep_of_cloud
-from triquad_tools.sensors.ros.type_store import decode_cdr
 from triquad_tools.sensors.sweep import NoScanError
 
 ROS = RosMessages()

@@ -11,6 +11,7 @@ from rosbags.interfaces import Connection
 from rosbags.typesys import Stores, get_typestore
 
 from triquad_tools.console.command import ToolError
+from triquad_tools.sensors.ros.from_bytes import decode
 from triquad_tools.sensors.sweep import NoScanError
 
 MCAP = (".mcap", ".mcap.zstd")
@@ -65,8 +66,9 @@ class Message(NamedTuple):
         Raises:
             NoScanError: its bytes are no such message.
         """
+        channel = self.channel
         try:
-            return self.channel.decode(self.payload)
+            return decode(self.payload, channel.kind, channel.decode, is_ros_1=channel.is_ros_1)
         except Exception as error:  # damaged bytes lead the decoders anywhere
             raise NoScanError("decode", f"no {self.kind}: {error!r}") from error
 
@@ -90,19 +92,15 @@ class Bag:
         except Exception as error:  # a damaged file leads the readers anywhere
             raise self.damaged(error) from error
 
-    def messages(self, *wanted: Wanted) -> Iterator[Message]:
-        """Yield the messages of the channels that are wanted first, then of others, and so on.
-
-        Each time they come in the order in which they were recorded.
-        """
+    def messages(self, is_wanted: Wanted) -> Iterator[Message]:
+        """Yield the messages of channels that are wanted in the order of their recording."""
         try:
             with self._reader() as reader:
                 channels = {id(each): _channel(reader, each) for each in reader.connections}
-                for is_wanted in wanted:
-                    chosen = [x for x in reader.connections if is_wanted(channels[id(x)])]
-                    # Of no connections the reader would yield the messages of all.
-                    for each, recorded_ns, payload in reader.messages(chosen) if chosen else ():
-                        yield Message(channels[id(each)], recorded_ns, payload)
+                chosen = [x for x in reader.connections if is_wanted(channels[id(x)])]
+                # Of no connections the reader would yield the messages of all.
+                for each, recorded_ns, payload in reader.messages(chosen) if chosen else ():
+                    yield Message(channels[id(each)], recorded_ns, payload)
         except Exception as error:  # as above
             raise self.damaged(error) from error
 
@@ -125,7 +123,10 @@ class Bag:
 
 
 def _channel(reader: AnyReader, known: Connection) -> Channel:
-    decode = partial(reader.deserialize, typ=known.msgtype)
+    types = reader.typestore
+    decode = partial(
+        types.deserialize_cdr if reader.is2 else types.deserialize_ros1, typename=known.msgtype
+    )
     file = Path(str(getattr(known.owner, "path", reader.paths[0])))
     return Channel(known.topic, known.msgtype, known.msgcount, file, decode, not reader.is2)
 

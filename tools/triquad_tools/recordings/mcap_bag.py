@@ -43,11 +43,10 @@ class McapBag(Bag):
         """Return the recorded channels, of a file without an index after all of it was read."""
         return [each for file in self.files for each in self._channels(file)]
 
-    def messages(self, *wanted: Wanted) -> Iterator[Message]:
+    def messages(self, is_wanted: Wanted) -> Iterator[Message]:
         """Yield messages, as of other bags."""
-        for is_wanted in wanted:
-            files = [self._messages(file, is_wanted) for file in self.files]
-            yield from heapq.merge(*files, key=lambda one: one[1]) if len(files) > 1 else files[0]
+        files = [self._messages(file, is_wanted) for file in self.files]
+        return heapq.merge(*files, key=lambda one: one[1]) if len(files) > 1 else files[0]
 
     def _channels(self, file: Path) -> list[Channel]:
         summary, contents = _summary(file), _Contents(file)

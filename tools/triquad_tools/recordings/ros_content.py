@@ -12,12 +12,11 @@ from triquad_tools.sensors.motion.frame_tree import STATIC, FrameTree, Track, Tr
 from triquad_tools.sensors.ros import type_store
 from triquad_tools.sensors.ros.depth_camera import is_depth
 from triquad_tools.sensors.ros.message_reader import MessageReader
+from triquad_tools.sensors.ros.type_store import PATH, POSES, TRANSFORMS
 from triquad_tools.sensors.sweep import NoScanError
 
-_TRANSFORMS = (type_store.TF, type_store.TF_OF_ROS_1)
-_POSES = (type_store.ODOMETRY, type_store.POSE)
 _SCANS = (type_store.POINT_CLOUD, type_store.IMAGE)
-_USED = (*_TRANSFORMS, *_POSES, *_SCANS)
+_USED = (*TRANSFORMS, *POSES, *_SCANS)
 _REPORTED = 500  # messages, after which the progress is shown again
 
 
@@ -67,29 +66,35 @@ class RosContent:
         self._numbers: Counter[str] = Counter()
         self._reader = reader
         self.foreign: dict[str, str] = {}  # encodings of topics that are not of ROS
-        total, cameras = 0, set[str]()
-        for channel in bag.channels():
+        channels = bag.channels()
+        for channel in channels:
             self.kinds[channel.topic] = channel.kind
             self.counts[channel.topic] += channel.count
             if channel.foreign:
                 self.foreign[channel.topic] = channel.foreign
-            elif channel.count and _is_camera(channel):
-                cameras.add(channel.topic)
-            total += channel.count if _is_read(channel) else 0
         # Cameras first: an image may come before what is known of its camera.
+        cameras = {each.topic for each in channels if _is_camera(each) and each.count}
         for message in bag.messages(_is_camera) if cameras else ():
             self._take(message)
             cameras.discard(message.topic)
             if not cameras:
                 break
-        done = 0
+        self._read(bag, sum(each.count for each in channels if _is_read(each)))
+
+    def _read(self, bag: Bag, total: int) -> None:
+        """Read all but cameras."""
+        done, paths = 0, dict[str, Message]()
         with progress("looking through the recording", total) as report:
             for done, message in enumerate(bag.messages(_is_read), start=1):
-                if message.topic not in self._colours:
+                if message.kind == PATH:
+                    paths[message.topic] = message  # the newest one has all poses
+                elif message.topic not in self._colours:
                     self._take(message)
                 if done % _REPORTED == 0:
                     report(done, f"{done} of {total} messages")
             report(done, f"{done} of {total} messages")
+        for path in paths.values():
+            self._take(path)
         self.missing = total - done
 
     def _take(self, message: Message) -> None:
@@ -98,10 +103,13 @@ class RosContent:
             decoded = message.decoded()
             if kind == type_store.CAMERA_INFO:
                 self._reader.cameras[topic] = decoded
-            elif kind in (*_TRANSFORMS, *_POSES):
+            elif kind in (*TRANSFORMS, *POSES):
                 static, came_ns = topic.endswith("tf_static"), message.recorded_ns
-                for each in self._reader.transforms(kind, decoded, came_ns, static=static):
-                    self._add(topic, each, is_pose=kind in _POSES)
+                found = self._reader.transforms(kind, decoded, came_ns, static=static)
+                for each in found:
+                    self._add(topic, each, is_pose=kind in POSES)
+                if kind == PATH and len(self.poses[topic].track) < len(found):
+                    self.broken[topic].append("they have no times of their own")
             elif kind == type_store.IMAGE and not is_depth(decoded.encoding):
                 self._colours.add(topic)
             else:

@@ -244,13 +244,13 @@ class RosRecording:
         if placed:
             return f"{placed} scans, source {source_of_topic(topic)}"
         chosen = self._poses.name if self._poses else ""
-        match self._content.kinds[topic]:
-            case type_store.TF | type_store.TF_OF_ROS_1:
-                return "the poses" if chosen == TF else "where sensors sit"
-            case type_store.ODOMETRY | type_store.POSE:
-                return "the poses" if chosen == topic else f"other poses: --poses {topic}"
-            case type_store.CAMERA_INFO:
-                return "a camera"
+        kind = self._content.kinds[topic]
+        if kind in type_store.TRANSFORMS:
+            return "the poses" if chosen == TF else "where sensors sit"
+        if kind in type_store.POSES:
+            return "the poses" if chosen == topic else f"other poses: --poses {topic}"
+        if kind == type_store.CAMERA_INFO:
+            return "a camera"
         if topic in self._content.foreign:
             return f"not read: {self._content.foreign[topic]}, not a message of ROS"
         if not any(cloud.topic == topic for cloud in self._content.clouds):
