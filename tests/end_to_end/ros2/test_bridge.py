@@ -148,6 +148,20 @@ def test_sensors_are_sources_of_their_own(endpoint: str) -> None:
         assert len(seen["lidar.near"].newest.points) == 0 < len(seen["rear"].newest.points)
 
 
+@pytest.mark.parametrize("frame", ["odom", "map", ""])
+def test_a_rare_correction_stays_and_two_parents_are_refused(endpoint: str, frame: str) -> None:
+    chosen = ("--map-frame", frame) if frame else ()
+    with bridging(endpoint, *chosen) as bridged, robot(endpoint) as r2:
+        r2.tf(0, ("base_link", "lidar", MAST), static=True)
+        r2.tf(0, ("map", "slam", shifted()))
+        for second in range(8):
+            r2.tf(second, ("odom", "base_link", shifted(*AT)), ("slam", "base_link", shifted(*AT)))
+        r2.cloud(6.5, servers.sphere())
+        bridged.wait_for(lambda: bridged.accounted == 1)
+        assert bridged.bridge.dropped == ({} if frame else {"two_parents": 1})
+        assert not frame or finds_its_sphere(bridged)
+
+
 @pytest.mark.parametrize(
     ("topic", "frame", "way"),
     [

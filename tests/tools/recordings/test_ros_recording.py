@@ -206,6 +206,23 @@ def test_a_cloud_of_the_whole_map_is_no_scan(tmp_path: Path) -> None:
     assert streams["/map_cloud"].use == "other scans: --topics /map_cloud"
 
 
+def test_two_that_publish_one_transform_are_named_and_one_can_be_chosen(tmp_path: Path) -> None:
+    """Of another parent, or of the same one and told apart by the topic alone."""
+    for parent, choice in (("map", {"map_frame": "odom"}), ("odom", {"poses": "/tf"})):
+        messages = a_drive()
+        for pose, stamp in zip(poses(), STAMPS, strict=True):
+            pose[1, 3] += 0.4
+            other = ROS2.tf(stamp + 9, (parent, "base_link", pose @ np.linalg.inv(LIDAR)))
+            messages.append(Recorded("/other/tf", TF, stamp + 9, other))
+        both = opened(tmp_path / parent, messages)
+        assert not both.entries
+        assert "choose" in only_remark(both)
+        assert "6 times" in only_remark(both) or "jumps to and fro, 9 times" in only_remark(both)
+        chosen = open_recording(tmp_path / parent / "bag", ReadingOptions(**choice))
+        for scan, pose in zip(chosen.read(range(COUNT)), poses(), strict=True):
+            assert np.allclose(scan.world_from_sensor, pose)
+
+
 def test_missing_poses_and_transforms_are_named_with_the_remedy(tmp_path: Path) -> None:
     nothing = opened(tmp_path / "a", without(a_drive(), "/tf"))
     assert not nothing.entries

@@ -8,7 +8,8 @@ from triquad_format.errors import InvalidInputError
 
 from triquad_tools.console.progress import progress
 from triquad_tools.recordings.bag import Bag, Channel, Message
-from triquad_tools.sensors.motion.frame_tree import STATIC, FrameTree, Track, Transform
+from triquad_tools.sensors.motion.frame_tree import STATIC, FrameTree, Transform
+from triquad_tools.sensors.motion.track import Track
 from triquad_tools.sensors.ros import type_store
 from triquad_tools.sensors.ros.depth_camera import is_depth
 from triquad_tools.sensors.ros.message_reader import MessageReader
@@ -49,8 +50,8 @@ class RosContent:
     order of their recording, and ``broken`` says by topic what is wrong with its poses.
     """
 
-    def __init__(self, bag: Bag, reader: MessageReader) -> None:
-        """Read all of a bag.
+    def __init__(self, bag: Bag, reader: MessageReader, poses: str | None = None) -> None:
+        """Read all of a bag; where ``poses`` is a topic of transforms, no others that move.
 
         Raises:
             ToolError: it is damaged.
@@ -67,6 +68,9 @@ class RosContent:
         self._reader = reader
         self.foreign: dict[str, str] = {}  # encodings of topics that are not of ROS
         channels = bag.channels()
+        self._only = next(
+            (x.topic for x in channels if x.topic == poses and x.kind in TRANSFORMS), ""
+        )
         for channel in channels:
             self.kinds[channel.topic] = channel.kind
             self.counts[channel.topic] += channel.count
@@ -105,6 +109,8 @@ class RosContent:
                 self._reader.cameras[topic] = decoded
             elif kind in (*TRANSFORMS, *POSES):
                 static, came_ns = topic.endswith("tf_static"), message.recorded_ns
+                if kind in TRANSFORMS and not static and self._only not in ("", topic):
+                    return
                 found = self._reader.transforms(kind, decoded, came_ns, static=static)
                 for each in found:
                     self._add(topic, each, is_pose=kind in POSES)
@@ -142,7 +148,7 @@ class RosContent:
             if not is_pose:
                 self.frames.add(transform)
                 return
-            position, quaternion = transform.pose.numbers()
+            position, quaternion = transform.numbers()
         except InvalidInputError as error:
             self.broken[topic].append(str(error))
             return

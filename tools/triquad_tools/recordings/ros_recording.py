@@ -15,6 +15,7 @@ from triquad_tools.sensors.motion.placing import place
 from triquad_tools.sensors.ros import type_store
 from triquad_tools.sensors.ros.header import source_of_topic
 from triquad_tools.sensors.ros.message_reader import MessageReader
+from triquad_tools.sensors.ros.type_store import TRANSFORMS
 from triquad_tools.sensors.sweep import NoScanError, NoTransformError, PosedScan
 
 TF = "tf"
@@ -74,9 +75,10 @@ def choose_poses(
     """
     for transform in options.transforms:
         content.frames.add(transform)
+    content.frames.wanted = options.map_frame or ""
     frame = clouds[0].frame
     names = [TF, *content.poses]
-    if options.poses is not None:
+    if options.poses is not None and content.kinds.get(options.poses) not in TRANSFORMS:
         if options.poses not in names:
             raise ToolError(
                 f"--poses {options.poses}: there are no such poses, only {', '.join(names)}"
@@ -88,6 +90,8 @@ def choose_poses(
         else _of_topic(content, name, frame, options)
         for name in names
     ]
+    for source in sources:
+        source.frames.check()
     # Transforms that always hold are no poses.
     moving = [source for source in sources if source.frames.moves(source.target, source.body)]
 
@@ -128,7 +132,7 @@ class RosRecording:
         """
         self._bag = bag
         self._reader = MessageReader(stride=options.stride, by_arrival=options.recorder_clock)
-        self._content = RosContent(bag, self._reader)
+        self._content = RosContent(bag, self._reader, options.poses)
         self._topics = _chosen_topics(self._content, options)
         self._poses: PoseSource | None = None
         self._placed: list[SeenCloud] = []
@@ -162,6 +166,11 @@ class RosRecording:
         ]
         if self._poses is not None and self._poses.assumed:
             lines.append(_ASSUMED.format(topic=self._poses.name, body=self._poses.body))
+        if self._poses is not None:
+            frames, target = self._poses.frames, self._poses.target
+            sensors = dict.fromkeys(cloud.frame for cloud in self._placed)
+            corrected = (frames.corrections(target, frame) for frame in sensors)
+            lines += dict.fromkeys(line for each in corrected for line in each)
         return [*lines, *(self._left_out_line(*key) for key in self._left_out)]
 
     def read(self, indices: Sequence[int]) -> Iterator[PosedScan]:
@@ -245,7 +254,7 @@ class RosRecording:
             return f"{placed} scans, source {source_of_topic(topic)}"
         chosen = self._poses.name if self._poses else ""
         kind = self._content.kinds[topic]
-        if kind in type_store.TRANSFORMS:
+        if kind in TRANSFORMS:
             return "the poses" if chosen == TF else "where sensors sit"
         if kind in type_store.POSES:
             return "the poses" if chosen == topic else f"other poses: --poses {topic}"

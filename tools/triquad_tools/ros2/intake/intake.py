@@ -127,7 +127,7 @@ class Intake:
         self._start = Place(frame, np.zeros(3), stamp_ns=0) if frame else None
         self.drops = DropLog()
         self.scans = ScanPublisher(client)
-        self._motion = Motion(from_topic=options.topics.poses is not None)
+        self._motion = Motion(from_topic=options.topics.poses is not None, map_frame=frame)
         self._reader = MessageReader(
             stride=options.depth_stride,
             body_frame=options.body_frame,
