@@ -218,15 +218,16 @@ def test_a_bridge_that_starts_late_learns_the_static_transforms(
             assert bridged.taken == 1, bridged.bridge.dropped
 
 
-def test_depth_images_are_mapped_with_the_camera_beside_them(endpoint: str) -> None:
+@pytest.mark.parametrize("topic", ["/camera/depth", "/camera/depth/compressedDepth"])
+def test_depth_images_are_mapped_with_the_camera_beside_them(endpoint: str, topic: str) -> None:
     matrix = np.array([[100.0, 0, 80], [0, 100, 60], [0, 0, 1]])
     forward = shifted(*AT)
     forward[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]  # the optical axis is the map's x
     wall = np.full((120, 160), 3000, np.uint16)
-    with bridging(endpoint, "--depth", "/camera/depth") as bridged, robot(endpoint) as r2:
+    with bridging(endpoint, "--depth", topic) as bridged, robot(endpoint) as r2:
         for second in (0, 1):
             r2.tf(second, ("map", "optical", forward))
-        r2.depth(0.1, wall)
+        r2.depth(0.1, wall, topic)
         bridged.wait_for(lambda: bridged.bridge.dropped == {"no_camera_info": 1})
         # The camera publishes what it sees as a cloud too, which nobody chose.
         r2.cloud(0.1, np.zeros((10, 3)), topic="/camera/points", frame="map")
@@ -235,7 +236,7 @@ def test_depth_images_are_mapped_with_the_camera_beside_them(endpoint: str) -> N
 
         def is_mapped() -> bool:
             if bridged.taken == 0:  # the camera may be heard of later than an image
-                r2.depth(next(times), wall)
+                r2.depth(next(times), wall, topic)
             return bridged.taken > 0
 
         bridged.wait_for(is_mapped)

@@ -1,10 +1,12 @@
 """Messages of ROS as robots send them, built with the types of a release."""
 
+import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
@@ -16,6 +18,7 @@ POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 TRANSFORM = "geometry_msgs/msg/TransformStamped"
 PATH = "nav_msgs/msg/Path"
 IMAGE = "sensor_msgs/msg/Image"
+COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 
 _NUMBERS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
@@ -132,6 +135,18 @@ class RosMessages:
             columns * pixels.dtype.itemsize,
             np.ascontiguousarray(pixels).view(np.uint8).reshape(-1),
         )
+
+    def compressed_depth(
+        self,
+        pixels: NDArray[np.uint16],
+        stamp_ns: int,
+        form: str = "16UC1; compressedDepth png",
+        header: bytes = bytes(12),
+    ) -> Any:
+        buffer = io.BytesIO()
+        Image.fromarray(pixels).save(buffer, "PNG")
+        data = np.frombuffer(header + buffer.getvalue(), np.uint8)
+        return self._new(COMPRESSED_IMAGE, self.header(stamp_ns, "optical"), form, data)
 
     def camera_info(
         self, size: tuple[int, int], matrix: NDArray[Any], stamp_ns: int, frame: str = "optical"

@@ -11,12 +11,12 @@ from triquad_tools.recordings.bag import Bag, Channel, Message
 from triquad_tools.sensors.motion.frame_tree import STATIC, FrameTree, Transform
 from triquad_tools.sensors.motion.track import Track
 from triquad_tools.sensors.ros import type_store
-from triquad_tools.sensors.ros.depth_camera import is_depth
+from triquad_tools.sensors.ros.depth_camera import holds_depth
 from triquad_tools.sensors.ros.message_reader import MessageReader
 from triquad_tools.sensors.ros.type_store import PATH, POSES, TRANSFORMS
 from triquad_tools.sensors.sweep import NoScanError
 
-_SCANS = (type_store.POINT_CLOUD, type_store.IMAGE)
+_SCANS = (type_store.POINT_CLOUD, *type_store.IMAGES)
 _USED = (*TRANSFORMS, *POSES, *_SCANS)
 _REPORTED = 500  # messages, after which the progress is shown again
 
@@ -31,6 +31,7 @@ class SeenCloud:
     stamp_ns: int = 0
     first_ns: int = 0  # when its first point was measured
     last_ns: int = 0
+    note: str = ""  # how it was read, for a user
     problem: NoScanError | None = None  # why no scan can be made of it
 
 
@@ -116,7 +117,7 @@ class RosContent:
                     self._add(topic, each, is_pose=kind in POSES)
                 if kind == PATH and len(self.poses[topic].track) < len(found):
                     self.broken[topic].append("they have no times of their own")
-            elif kind == type_store.IMAGE and not is_depth(decoded.encoding):
+            elif kind in type_store.IMAGES and not holds_depth(decoded):
                 self._colours.add(topic)
             else:
                 self._add_cloud(message, decoded)
@@ -140,7 +141,8 @@ class RosContent:
         sweep = self._reader.sweep(topic, message.kind, decoded, message.recorded_ns)
         number, (first_ns, last_ns) = self._numbers[topic], sweep.span_ns
         self._numbers[topic] += 1
-        self.clouds.append(SeenCloud(topic, number, sweep.frame, sweep.stamp_ns, first_ns, last_ns))
+        about = sweep.frame, sweep.stamp_ns, first_ns, last_ns, sweep.note
+        self.clouds.append(SeenCloud(topic, number, *about))
 
     def _add(self, topic: str, transform: Transform, *, is_pose: bool) -> None:
         """Add a transform to all, or a pose to those of its topic."""

@@ -13,6 +13,7 @@ from triquad_tools.recordings.ros_content import RosContent, SeenCloud
 from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES, FrameTree
 from triquad_tools.sensors.motion.placing import place
 from triquad_tools.sensors.ros import type_store
+from triquad_tools.sensors.ros.depth_camera import raw_topic
 from triquad_tools.sensors.ros.header import source_of_topic
 from triquad_tools.sensors.ros.message_reader import MessageReader
 from triquad_tools.sensors.ros.type_store import TRANSFORMS
@@ -251,7 +252,9 @@ class RosRecording:
         """Return what a topic is used for."""
         placed = sum(each.topic == topic for each in self._placed)
         if placed:
-            return f"{placed} scans, source {source_of_topic(topic)}"
+            notes = dict.fromkeys(each.note for each in self._placed if each.topic == topic)
+            words = f"{placed} scans", f"source {source_of_topic(topic)}", *notes
+            return ", ".join(filter(None, words))
         chosen = self._poses.name if self._poses else ""
         kind = self._content.kinds[topic]
         if kind in TRANSFORMS:
@@ -284,5 +287,6 @@ def _chosen_topics(found: RosContent, options: ReadingOptions) -> set[str]:
         return set(options.topics)
     # A cloud in a frame that stands still is no scan, but a map made of scans.
     scans = {cloud.topic for cloud in found.clouds if cloud.frame not in ROOT_NAMES} or there
-    clouds = {topic for topic in scans if found.kinds[topic] == type_store.POINT_CLOUD}
-    return clouds or scans
+    clouds = {topic for topic in scans if found.kinds[topic] not in type_store.IMAGES}
+    # Of an image that was recorded twice, as it is and compressed, the first is enough.
+    return clouds or {each for each in scans if raw_topic(each) not in scans - {each}}

@@ -12,7 +12,7 @@ from triquad_tools.ros2.topics import Topic, bridge_key, rmw_key
 from triquad_tools.sensors.ros.depth_camera import camera_topic
 from triquad_tools.sensors.ros.type_store import (
     CAMERA_INFO,
-    IMAGE,
+    IMAGES,
     POINT_CLOUD,
     POSES,
     TF,
@@ -42,7 +42,7 @@ class Role(Enum):
 
 TYPES: dict[Role, tuple[str, ...]] = {
     Role.CLOUD: (POINT_CLOUD,),
-    Role.DEPTH: (IMAGE,),
+    Role.DEPTH: IMAGES,
     Role.CAMERA_INFO: (CAMERA_INFO,),
     Role.TF: (TF,),
     Role.TF_STATIC: (TF,),

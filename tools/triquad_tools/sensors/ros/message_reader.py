@@ -43,9 +43,9 @@ class MessageReader:
             self._check_count(message.width * message.height)
             sweep = sweep_of_cloud(message)
         else:
-            stride = self.stride
-            self._check_count(-(-message.width // stride) * -(-message.height // stride))
-            sweep = sweep_of_depth(message, self._camera(camera_topic(topic)), stride)
+            stride, info = self.stride, self._camera(camera_topic(topic))
+            self._check_count(-(-info.width // stride) * -(-info.height // stride))
+            sweep = sweep_of_depth(message, info, topic, stride)
         return replace(sweep, stamp_ns=came_ns) if self.by_arrival else sweep
 
     def transforms(
