@@ -148,6 +148,29 @@ def test_sensors_are_sources_of_their_own(endpoint: str) -> None:
         assert len(seen["lidar.near"].newest.points) == 0 < len(seen["rear"].newest.points)
 
 
+@pytest.mark.parametrize("way", ["rmw", "bridge"])
+def test_scans_of_livox_are_clouds_too(endpoint: str, way: str) -> None:
+    kind = "livox_ros_driver2/msg/CustomMsg"
+    with bridging(endpoint) as bridged, robot(endpoint, way) as r2:
+        r2.tf(0, ("base_link", "livox", MAST), static=True)
+        stand(r2, 0, 1)
+        points = servers.sphere()
+        offsets_ns = np.linspace(0, 1e8, len(points))
+        message = r2.messages.livox(points, offsets_ns, stamp(0.5), kind)
+        times = 0
+
+        def is_mapped() -> bool:
+            nonlocal times
+            if bridged.taken == 0:  # the bridge may find the topic later than the first
+                times += 1
+                message.header.stamp.nanosec += times
+                r2.send("/livox/lidar", kind, message)
+            return bridged.taken > 0
+
+        bridged.wait_for(is_mapped)
+        assert finds_its_sphere(bridged)
+
+
 @pytest.mark.parametrize("frame", ["odom", "map", ""])
 def test_a_rare_correction_stays_and_two_parents_are_refused(endpoint: str, frame: str) -> None:
     chosen = ("--map-frame", frame) if frame else ()

@@ -80,6 +80,29 @@ class RosMessages:
             False,
         )
 
+    def livox(
+        self, points: NDArray[Any], offsets_ns: NDArray[Any], stamp_ns: int, kind: str
+    ) -> Any:
+        """A scan of a Livox, of the type ``kind`` of one of its drivers."""
+        package = kind.partition("/")[0]
+        point = (
+            "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\n"
+        )
+        scan = (
+            "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\n"
+            f"uint8[3] rsvd\n{package}/CustomPoint[] points"
+        )
+        inner = f"{package}/msg/CustomPoint"
+        if kind not in self.types.types:
+            types = get_types_from_msg(point + "uint8 line", inner)
+            self.types.register({**types, **get_types_from_msg(scan, kind)})
+        rows = [
+            self._new(inner, int(t), *map(float, point), 0, 0, 0)
+            for t, point in zip(offsets_ns, points, strict=True)
+        ]
+        header, rest = self.header(stamp_ns, "livox"), np.zeros(3, np.uint8)
+        return self._new(kind, header, stamp_ns, len(rows), 0, rest, rows)
+
     def tf(self, stamp_ns: int, *edges: tuple[str, str, NDArray[Any]]) -> Any:
         """Of edges from parent to child with the pose [4, 4] of the child."""
         return self._new(

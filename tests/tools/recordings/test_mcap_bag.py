@@ -22,7 +22,7 @@ BARE = {"index_types": IndexType.NONE, "repeat_channels": False, "use_statistics
 
 
 def written(path: Path, is_ros_1: bool = False, **options: object) -> Path:
-    """A drive, with a channel of JSON before it."""
+    """A drive, with a channel of JSON and one of packets before it."""
     ros = messages_for("ros1" if is_ros_1 else "mcap")
     messages: Iterable[Recorded] = drive(ros, SCANS, POSES, STAMPS, np.eye(4))
     options = {"chunk_size": 4000, "compression": CompressionType.ZSTD, **options}
@@ -32,6 +32,9 @@ def written(path: Path, is_ros_1: bool = False, **options: object) -> Path:
         schema = writer.register_schema("foxglove.Log", "jsonschema", b"{}")
         log = writer.register_channel("/log", "json", schema)
         writer.add_message(log, STAMPS[0], b"{}", STAMPS[0])
+        schema = writer.register_schema("velodyne_msgs/VelodyneScan", "ros1msg", b"")
+        packets = writer.register_channel("/packets", "ros1" if is_ros_1 else "cdr", schema)
+        writer.add_message(packets, STAMPS[0], b"packets", STAMPS[0])
         channels: dict[str, int] = {}
         for topic, kind, stamp, message in messages:
             if topic not in channels:
@@ -65,6 +68,7 @@ def test_a_drive_is_read_from_whatever_a_writer_makes_of_it(
     assert remark.endswith("not encoded as messages of ROS: /log (json)")
     streams = {stream.name: stream for stream in recording.streams}
     assert streams["/lidar/points"].count == COUNT
+    assert streams["/packets"].use.startswith("packets: play it to velodyne_pointcloud")
     assert streams["/log"].use == "not read: json, not a message of ROS"
     for scan, points, pose in zip(recording.read(range(COUNT)), SCANS, POSES, strict=True):
         assert np.array_equal(scan.points, points)

@@ -86,9 +86,36 @@ def test_a_bare_file_and_a_folder_of_parts_are_bags_too(tmp_path: Path) -> None:
     messages = drive(ros, SCANS, poses(), STAMPS, LIDAR)
     parts = tmp_path / "parts"
     parts.mkdir()
-    write_bag(parts / "a", "ros1", messages[:6])
-    write_bag(parts / "b", "ros1", messages[6:])
-    assert len(open_recording(parts, ReadingOptions()).entries) == COUNT
+    write_bag(parts / "b", "ros1", messages[:6])
+    write_bag(parts / "a", "ros1", messages[6:])
+    recording = open_recording(parts, ReadingOptions())
+    assert [entry.stamp_ns for entry in recording.entries] == STAMPS
+    assert all(map(np.array_equal, (scan.points for scan in recording.read(range(COUNT))), SCANS))
+
+
+@pytest.mark.parametrize("kind", ["mcap", "ros1"])
+def test_bags_of_one_folder_that_are_no_parts_of_one_recording_are_refused(
+    tmp_path: Path, kind: BagKind
+) -> None:
+    ros = messages_for(kind)
+    elsewhere = poses() + [[0, 0, 0, 30], [0] * 4, [0] * 4, [0] * 4]
+
+    def both(name: str, places: np.ndarray, after_s: float) -> Path:
+        stamps = [stamp + round(after_s * SECOND) for stamp in STAMPS]
+        for part, (where, when) in enumerate(((poses(), STAMPS), (places, stamps))):
+            bag = write_bag(tmp_path / f"{name}{part}", kind, drive(ros, SCANS, where, when, LIDAR))
+            file = bag if bag.is_file() else next(bag.glob("*.mcap"))
+            target = tmp_path / name / f"{part}{file.suffix}"
+            target.parent.mkdir(exist_ok=True)
+            file.rename(target)
+        return tmp_path / name
+
+    with pytest.raises(ToolError, match=r"0\.\w+ and 1\.\w+ overlap by 0.2 s on /lidar/points"):
+        open_recording(both("overlap", poses(), 0.3), ReadingOptions())
+    jump = both("jump", elsewhere, 3600)
+    with pytest.raises(ToolError, match=r"is 25\.\d m elsewhere: .* use --map-frame odom"):
+        open_recording(jump, ReadingOptions())
+    assert len(open_recording(jump, ReadingOptions(map_frame="odom")).entries) == 2 * COUNT
 
 
 def test_streams_tell_what_is_made_of_each_topic(tmp_path: Path) -> None:
@@ -100,8 +127,10 @@ def test_streams_tell_what_is_made_of_each_topic(tmp_path: Path) -> None:
     streams = {stream.name: stream for stream in opened(tmp_path, messages).streams}
     assert (streams["/lidar/points"].kind, streams["/lidar/points"].count) == (CLOUD, COUNT)
     assert streams["/lidar/points"].frame == "lidar"
-    assert streams["/lidar/points"].use == f"{COUNT} scans, source lidar.points"
-    assert streams["/tf"].use == "the poses"
+    assert streams["/lidar/points"].use == (
+        f"{COUNT} scans, source lidar.points, no point times: motion is not taken out, 10 Hz"
+    )
+    assert streams["/tf"].use == "the poses, 10 Hz"
     assert streams["/odom"].use == "other poses: --poses /odom"
     assert streams["/odom"].frame == "odom > base_link"
 

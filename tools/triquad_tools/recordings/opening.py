@@ -27,6 +27,7 @@ _FLAGS = {"transforms": "--transform", "deskew": "--no-deskew"}
 
 _OF_BAGS = {
     "topics", "poses", "map_frame", "body_frame", "transforms", "recorder_clock", "stride",
+    "deskew",
 }  # fmt: skip
 _OF_DEPTH = {"trajectory", "intrinsics", "units_per_metre", "stride"}
 _OF_CLOUDS = {"trajectory", "points_in", "deskew"}

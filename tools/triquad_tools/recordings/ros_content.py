@@ -2,6 +2,7 @@
 
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from triquad_format.errors import InvalidInputError
@@ -16,7 +17,7 @@ from triquad_tools.sensors.ros.message_reader import MessageReader
 from triquad_tools.sensors.ros.type_store import PATH, POSES, TRANSFORMS
 from triquad_tools.sensors.sweep import NoScanError
 
-_SCANS = (type_store.POINT_CLOUD, *type_store.IMAGES)
+_SCANS = (*type_store.CLOUDS, *type_store.IMAGES)
 _USED = (*TRANSFORMS, *POSES, *_SCANS)
 _REPORTED = 500  # messages, after which the progress is shown again
 
@@ -32,6 +33,7 @@ class SeenCloud:
     first_ns: int = 0  # when its first point was measured
     last_ns: int = 0
     note: str = ""  # how it was read, for a user
+    file: Path = Path()  # which has it
     problem: NoScanError | None = None  # why no scan can be made of it
 
 
@@ -67,6 +69,7 @@ class RosContent:
         self._colours: set[str] = set()  # topics of images that hold no depth
         self._numbers: Counter[str] = Counter()
         self._reader = reader
+        self.spans_ns: dict[str, list[int]] = {}  # when the first and last of a topic was recorded
         self.foreign: dict[str, str] = {}  # encodings of topics that are not of ROS
         channels = bag.channels()
         self._only = next(
@@ -91,6 +94,8 @@ class RosContent:
         done, paths = 0, dict[str, Message]()
         with progress("looking through the recording", total) as report:
             for done, message in enumerate(bag.messages(_is_read), start=1):
+                span_ns = self.spans_ns.setdefault(message.topic, [message.recorded_ns] * 2)
+                span_ns[1] = message.recorded_ns
                 if message.kind == PATH:
                     paths[message.topic] = message  # the newest one has all poses
                 elif message.topic not in self._colours:
@@ -141,7 +146,7 @@ class RosContent:
         sweep = self._reader.sweep(topic, message.kind, decoded, message.recorded_ns)
         number, (first_ns, last_ns) = self._numbers[topic], sweep.span_ns
         self._numbers[topic] += 1
-        about = sweep.frame, sweep.stamp_ns, first_ns, last_ns, sweep.note
+        about = sweep.frame, sweep.stamp_ns, first_ns, last_ns, sweep.note, message.channel.file
         self.clouds.append(SeenCloud(topic, number, *about))
 
     def _add(self, topic: str, transform: Transform, *, is_pose: bool) -> None:

@@ -2,25 +2,22 @@
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-
-import numpy as np
+from dataclasses import replace
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.bag import Bag, Message
+from triquad_tools.recordings.parts import check_places, check_times
+from triquad_tools.recordings.pose_source import TF, PoseSource, choose_poses
 from triquad_tools.recordings.recording import ReadingOptions, ScanEntry, Stream
 from triquad_tools.recordings.ros_content import RosContent, SeenCloud
-from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES, FrameTree
+from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES
 from triquad_tools.sensors.motion.placing import place
 from triquad_tools.sensors.ros import type_store
 from triquad_tools.sensors.ros.depth_camera import raw_topic
 from triquad_tools.sensors.ros.header import source_of_topic
 from triquad_tools.sensors.ros.message_reader import MessageReader
 from triquad_tools.sensors.ros.type_store import TRANSFORMS
-from triquad_tools.sensors.sweep import NoScanError, NoTransformError, PosedScan
-
-TF = "tf"
-"""Stands for all transforms, whatever their topics."""
+from triquad_tools.sensors.sweep import NoScanError, PosedScan
 
 _CLOCKS = (
     "no cloud's stamp lies within the times of the poses: where they are of another clock, "
@@ -38,88 +35,26 @@ _MISSING = (
     "{count:,} messages that its index names could not be read: it is damaged; 'mcap recover', "
     "'rosbag reindex' or 'ros2 bag reindex' saves what is left"
 )
-_NO_CLOUDS = "it holds no clouds (PointCloud2) and no depth images (Image): nothing to map"
+_NO_CLOUDS = (
+    "it holds no clouds (PointCloud2, Livox CustomMsg) and no depth images (Image): nothing to map"
+)
 _NO_POSES = (
     "it holds no poses: record /tf with /tf_static, or a topic of odometry or poses, together with "
     "the clouds"
 )
+_PACKETS = {
+    package: f"packets: play it to {driver}, and record the PointCloud2 that this publishes"
+    for driver, packages in {
+        "velodyne_pointcloud": ("velodyne_msgs",),
+        "os_cloud of ouster_ros": ("ouster_ros", "ouster_msgs", "ouster_sensor_msgs"),
+        "the driver of Hesai": ("hesai_ros_driver", "pandar_msgs", "hesai_lidar"),
+        "rslidar_sdk": ("rslidar_msg", "rslidar_msgs"),
+        "laser_geometry": ("sensor_msgs",),
+    }.items()
+    for package in packages
+}
+"""What makes clouds of packets, and of scans of one plane, by the packages of their types."""
 _OF_TIME = ("pose_early", "pose_late")
-
-
-@dataclass(frozen=True)
-class PoseSource:
-    """Poses that may be used, and the frame to map in."""
-
-    name: str  # a topic, or TF
-    frames: FrameTree
-    target: str
-    body: str  # the frame whose poses they are, or one that hangs on it
-    assumed: bool = False  # nothing says that they are its poses
-
-    def find(self, cloud: SeenCloud) -> NoTransformError | None:
-        """Return why the pose of a cloud is not known; None if it is."""
-        times = np.array([cloud.first_ns, cloud.last_ns], np.int64)
-        try:
-            self.frames.poses(self.target, cloud.frame, times)
-        except NoTransformError as error:
-            return error
-        return None
-
-
-def choose_poses(
-    content: RosContent, clouds: Sequence[SeenCloud], options: ReadingOptions
-) -> PoseSource | None:
-    """Return the source that places the most clouds; None if there is no pose at all.
-
-    Raises:
-        ToolError: the source that was asked for does not exist.
-    """
-    for transform in options.transforms:
-        content.frames.add(transform)
-    content.frames.wanted = options.map_frame or ""
-    frame = clouds[0].frame
-    names = [TF, *content.poses]
-    if options.poses is not None and content.kinds.get(options.poses) not in TRANSFORMS:
-        if options.poses not in names:
-            raise ToolError(
-                f"--poses {options.poses}: there are no such poses, only {', '.join(names)}"
-            )
-        names = [options.poses]
-    sources = [
-        _of_tf(content.frames, frame, options)
-        if name == TF
-        else _of_topic(content, name, frame, options)
-        for name in names
-    ]
-    for source in sources:
-        source.frames.check()
-    # Transforms that always hold are no poses.
-    moving = [source for source in sources if source.frames.moves(source.target, source.body)]
-
-    def merit(source: PoseSource) -> tuple[int, bool]:
-        placed = sum(source.find(cloud) is None for cloud in clouds)
-        return placed, source.target in ROOT_NAMES
-
-    return max(moving, key=merit, default=None)
-
-
-def _of_tf(frames: FrameTree, frame: str, options: ReadingOptions) -> PoseSource:
-    """Return all transforms. If they do not reach the sensor, finding a cloud says so."""
-    body = frame
-    if not frames.moves(frames.root(frame), frame):
-        body = next(iter(frames.moving), frame)
-    return PoseSource(TF, frames, options.map_frame or frames.fixed_frame(body), body)
-
-
-def _of_topic(content: RosContent, topic: str, frame: str, options: ReadingOptions) -> PoseSource:
-    """Return the poses of a topic, in the tree of all transforms but those that say the same."""
-    poses = content.poses[topic]
-    # Where a topic does not name the body, it is what the sensor is fixed to.
-    body = options.body_frame or poses.child or content.frames.root(frame)
-    frames = content.frames.with_track(poses.parent, body, poses.track)
-    target = options.map_frame or frames.fixed_frame(body)
-    assumed = not (options.body_frame or poses.child)
-    return PoseSource(topic, frames, target, body, assumed=assumed)
 
 
 class RosRecording:
@@ -132,13 +67,17 @@ class RosRecording:
             ToolError: it is damaged, or does not hold what ``options`` ask for.
         """
         self._bag = bag
-        self._reader = MessageReader(stride=options.stride, by_arrival=options.recorder_clock)
+        self._reader = MessageReader(
+            options.stride, deskew=options.deskew, by_arrival=options.recorder_clock
+        )
         self._content = RosContent(bag, self._reader, options.poses)
         self._topics = _chosen_topics(self._content, options)
         self._poses: PoseSource | None = None
         self._placed: list[SeenCloud] = []
         self._left_out: dict[tuple[str, str], list[SeenCloud]] = defaultdict(list)
         self._place_clouds(options)
+        if self._poses is not None and options.map_frame is None:
+            check_places(self._placed, self._poses)
 
     @property
     def entries(self) -> Sequence[ScanEntry]:
@@ -208,6 +147,7 @@ class RosRecording:
         """Choose the poses, and find out which clouds they place."""
         clouds = [cloud for cloud in self._content.clouds if cloud.topic in self._topics]
         good = [cloud for cloud in clouds if cloud.problem is None]
+        check_times(good)
         if good:
             self._poses = choose_poses(self._content, good, options)
         newest_ns: dict[str, int] = {}
@@ -246,15 +186,19 @@ class RosRecording:
             poses = found.poses[topic]
             frames = {f"{poses.parent} > {poses.child or '?'}"}
         frame = ", ".join(sorted(frames))
-        return Stream(topic, found.kinds[topic], found.counts[topic], self._use(topic), frame)
+        use, count = self._use(topic), found.counts[topic]
+        first_ns, last_ns = found.spans_ns.get(topic, (0, 0))
+        if last_ns > first_ns:
+            use += f", {(count - 1) / (last_ns - first_ns) * 1e9:.3g} Hz"
+        return Stream(topic, found.kinds[topic], count, use, frame)
 
     def _use(self, topic: str) -> str:
         """Return what a topic is used for."""
         placed = sum(each.topic == topic for each in self._placed)
         if placed:
-            notes = dict.fromkeys(each.note for each in self._placed if each.topic == topic)
-            words = f"{placed} scans", f"source {source_of_topic(topic)}", *notes
-            return ", ".join(filter(None, words))
+            notes = Counter(each.note for each in self._placed if each.topic == topic)
+            words = [note for note, _ in notes.most_common(2) if note]
+            return ", ".join([f"{placed} scans", f"source {source_of_topic(topic)}", *words])
         chosen = self._poses.name if self._poses else ""
         kind = self._content.kinds[topic]
         if kind in TRANSFORMS:
@@ -266,7 +210,12 @@ class RosRecording:
         if topic in self._content.foreign:
             return f"not read: {self._content.foreign[topic]}, not a message of ROS"
         if not any(cloud.topic == topic for cloud in self._content.clouds):
-            return "not used"
+            package = kind.partition("/")[0]
+            return (
+                _PACKETS.get(package, "not used")
+                if "Pack" in kind or "Scan" in kind
+                else "not used"
+            )
         return "none can be placed" if topic in self._topics else f"other scans: --topics {topic}"
 
 

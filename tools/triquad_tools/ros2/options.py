@@ -12,8 +12,8 @@ from triquad_tools.ros2.topics import Topic, bridge_key, rmw_key
 from triquad_tools.sensors.ros.depth_camera import camera_topic
 from triquad_tools.sensors.ros.type_store import (
     CAMERA_INFO,
+    CLOUDS,
     IMAGES,
-    POINT_CLOUD,
     POSES,
     TF,
 )
@@ -41,7 +41,7 @@ class Role(Enum):
 
 
 TYPES: dict[Role, tuple[str, ...]] = {
-    Role.CLOUD: (POINT_CLOUD,),
+    Role.CLOUD: CLOUDS,
     Role.DEPTH: IMAGES,
     Role.CAMERA_INFO: (CAMERA_INFO,),
     Role.TF: (TF,),

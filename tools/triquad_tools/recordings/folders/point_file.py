@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.sensors.point_times import TIME_FIELDS
+from triquad_tools.sensors.point_times import time_fields
 
 _BIN_BYTES = 16  # of a point
 
@@ -59,7 +59,7 @@ def read_points(path: Path) -> FilePoints:
         raise ToolError(
             f"{path}: is truncated: it holds {len(points):,} of {rows:,} points; copy it again"
         )
-    time = next((name for name in TIME_FIELDS if name in columns), None)
+    time = next(iter(time_fields(columns)), None)
     return FilePoints(points, None if time is None else np.asarray(columns[time]).ravel())
 
 

@@ -76,9 +76,9 @@ def sweep_of_depth(image: Any, info: Any, topic: str = "", stride: int = 1) -> S
         points = depth_points(pixels, camera, stride)
     except InvalidScanError as error:
         raise NoScanError("depth", str(error)) from error
-    note = ""
+    note = f"camera {camera_topic(topic)}"
     if isinstance(camera, LensCamera):
-        points, note = points[np.isfinite(points).all(axis=1)], camera.note
+        points, note = points[np.isfinite(points).all(axis=1)], f"{note}, {camera.note}"
     return Sweep(points, frame_name(image.header.frame_id), stamp_ns(image.header), note=note)
 
 

@@ -5,15 +5,18 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import numpy as np
 from rosbags.serde import SerdeError
 from triquad_client.pose import Pose
 
 from triquad_tools.sensors.motion.frame_tree import Transform
 from triquad_tools.sensors.ros.header import frame_name
-from triquad_tools.sensors.ros.type_store import TRANSFORMS, type_store
-from triquad_tools.sensors.sweep import NoScanError
+from triquad_tools.sensors.ros.type_store import LIVOX, TRANSFORMS, type_store
+from triquad_tools.sensors.sweep import NoScanError, Sweep
 
 _COUNT, _TIME, _POSE = struct.Struct("<I"), struct.Struct("<iI"), struct.Struct("<7d")
+_LIVOX = struct.Struct("<QI4sI")  # timebase, points, number of the lidar, points again
+_SAME_CLOCK_NS = 10**9
 _ENCAPSULATION = b"\x00\x01"  # of CDR, little endian
 
 
@@ -33,10 +36,15 @@ def decode_cdr(payload: bytes, kind: str) -> Any:
 def decode(
     payload: bytes, kind: str, library: Callable[[bytes], Any], *, is_ros_1: bool = False
 ) -> Any:
-    """Return a message: a list of transforms, or else what the ``library`` makes of it."""
-    if kind in TRANSFORMS and (is_ros_1 or payload[:2] == _ENCAPSULATION):
-        return _transforms(payload, is_ros_1)
-    return library(payload)
+    """Return a message: transforms, the sweep of a Livox, or else what the ``library`` makes."""
+    is_understood = is_ros_1 or payload[:2] == _ENCAPSULATION
+    if kind in LIVOX:
+        if not is_understood:
+            raise ValueError("it is big endian")
+        return _livox(payload, is_ros_1)
+    return (
+        _transforms(payload, is_ros_1) if kind in TRANSFORMS and is_understood else library(payload)
+    )
 
 
 def _transforms(data: bytes, is_ros_1: bool) -> list[Transform]:
@@ -54,6 +62,24 @@ def _transforms(data: bytes, is_ros_1: bool) -> list[Transform]:
     if at != len(data):
         raise ValueError(f"{len(data)} bytes, not {at}")
     return found
+
+
+def _livox(data: bytes, is_ros_1: bool) -> Sweep:
+    """Return the points of a CustomMsg, whose times count from its ``timebase``."""
+    start = 0 if is_ros_1 else 4
+    stamp_ns, frame, at = _header(data, start, is_ros_1)
+    at += 0 if is_ros_1 else -(at - start) % 8
+    base_ns, _, _, count = _LIVOX.unpack_from(data, at)
+    dtype = np.dtype([("t", "<u4"), ("xyz", "<f4", 3), ("more", "u1", 3 if is_ros_1 else 4)])
+    table = data[at + _LIVOX.size :] + bytes(0 if is_ros_1 else 1)  # the last is not padded
+    if len(table) != count * dtype.itemsize and count:
+        raise ValueError(f"{len(table)} bytes are not {count} points")
+    rows = np.frombuffer(table, dtype, count)
+    rows = rows[np.isfinite(rows["xyz"]).all(axis=1) & rows["xyz"].any(axis=1)]  # 0: no return
+    since_ns = base_ns - stamp_ns if abs(base_ns - stamp_ns) < _SAME_CLOCK_NS else 0
+    offsets_s = (rows["t"] + np.float64(since_ns)) / 1e9
+    note = f"point times: offset_time, {np.ptp(offsets_s) if len(rows) else 0:.1g} s"
+    return Sweep(rows["xyz"].copy(), frame_name(frame), stamp_ns, offsets_s, note)
 
 
 def _header(data: bytes, at: int, is_ros_1: bool) -> tuple[int, str, int]:

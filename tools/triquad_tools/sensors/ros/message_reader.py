@@ -28,6 +28,7 @@ class MessageReader:
 
     stride: int = 1  # every how many rows and columns of a depth image one is taken
     body_frame: str = ""  # whose poses are those that do not say whose they are
+    deskew: bool = True  # take the sensor's motion out of clouds whose points have times
     by_arrival: bool = False  # stamps are when messages came, not those of their headers
     max_points: float = math.inf  # of a scan; what has more is refused
     path_poses: int = sys.maxsize  # of a path, the newest that are read
@@ -39,13 +40,18 @@ class MessageReader:
         Raises:
             NoScanError: it is none, or has too many points, or its camera is not known.
         """
-        if kind == POINT_CLOUD:
+        if isinstance(message, Sweep):
+            sweep = message
+            self._check_count(len(sweep.points))
+        elif kind == POINT_CLOUD:
             self._check_count(message.width * message.height)
             sweep = sweep_of_cloud(message)
         else:
             stride, info = self.stride, self._camera(camera_topic(topic))
             self._check_count(-(-info.width // stride) * -(-info.height // stride))
             sweep = sweep_of_depth(message, info, topic, stride)
+        if sweep.offsets_s is not None and not self.deskew:
+            sweep = replace(sweep, offsets_s=None, note="point times are not used")
         return replace(sweep, stamp_ns=came_ns) if self.by_arrival else sweep
 
     def transforms(
