@@ -50,16 +50,6 @@ class Message(NamedTuple):
     recorded_ns: int  # nanoseconds since 1970, by the recorder's clock
     payload: bytes
 
-    @property
-    def topic(self) -> str:
-        """The name of its topic."""
-        return self.channel.topic
-
-    @property
-    def kind(self) -> str:
-        """Its type."""
-        return self.channel.kind
-
     def decoded(self) -> Any:
         """Return the message as an object with the fields that its type has.
 
@@ -70,7 +60,7 @@ class Message(NamedTuple):
         try:
             return decode(self.payload, channel.kind, channel.decode, is_ros_1=channel.is_ros_1)
         except Exception as error:  # damaged bytes lead the decoders anywhere
-            raise NoScanError("decode", f"no {self.kind}: {error!r}") from error
+            raise NoScanError("decode", f"no {channel.kind}: {error!r}") from error
 
 
 @dataclass(frozen=True)
@@ -110,15 +100,11 @@ class Bag:
         repairs = sorted({_REPAIR[_ending(file)] for file in files})
         words = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
         return ToolError(
-            f"{self.path}: the bag cannot be read ({words}); where it was cut off or damaged, "
-            f"{' or '.join(map(repr, repairs)) or 'a copy'} saves what is left"
+            f"{self.path}: the bag cannot be read ({words}); where it was cut off, damaged, or has "
+            f"no index, {' or '.join(map(repr, repairs)) or 'a copy'} saves what is left"
         )
 
     def _reader(self) -> AnyReader:
-        for file in self.files:
-            if _ending(file) in (".bag.active", ".db3.zstd"):
-                text = f"{file.name} has no index, or is compressed"
-                raise ValueError(f"{text}: make a bag of it by {_REPAIR[_ending(file)]!r}")
         return AnyReader(self.files, default_typestore=get_typestore(Stores.LATEST))
 
 

@@ -1,32 +1,24 @@
 """MCAP files of any writer, read from front to back: without index, and where they are cut off."""
 
 import heapq
-import struct
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache, partial
-from io import BytesIO
 from pathlib import Path
-from typing import IO, Any, TypeAlias
+from typing import Any
 
 import zstandard
 from mcap import records
-from mcap.data_stream import ReadDataStream
-from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.stream_reader import StreamReader, get_chunk_data_stream
+from mcap.stream_reader import StreamReader, breakup_chunk
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
 
 from triquad_tools.recordings.bag import MCAP, Bag, Channel, Message, Wanted, bag_files
 
-_RECORD = struct.Struct("<BQ")  # opcode, length
-_MESSAGE = struct.Struct("<HIQQ")  # channel, number, times of recording and of publishing
 _ZSTD = b"\x28\xb5\x2f\xfd"  # what rosbag2 compresses message by message begins so
-
-Found: TypeAlias = tuple[int, int, bytes]  # channel, time of recording, payload
 
 
 def find_bag(path: Path) -> Bag | None:
@@ -55,24 +47,25 @@ class McapBag(Bag):
             for record in (*summary.schemas.values(), *summary.channels.values()):
                 contents.learn(record)
         else:
-            counts = Counter(number for number, _, _ in self._found(contents))
+            counts = Counter(message.channel_id for message in self._found(contents))
         return [replace(x, count=counts[number]) for number, x in contents.channels.items()]
 
     def _messages(self, file: Path, is_wanted: Wanted) -> Iterator[Message]:
-        contents = _Contents(file)
-        channels, wanted = contents.channels, dict[int, bool]()
-        for number, recorded_ns, payload in self._found(contents):
+        contents, wanted = _Contents(file), dict[int, bool]()
+        for message in self._found(contents):
+            number, payload = message.channel_id, message.data
+            channel = contents.channels.get(number)
             if number not in wanted:
-                wanted[number] = number in channels and is_wanted(channels[number])
-            if wanted[number]:
+                wanted[number] = channel is not None and is_wanted(channel)
+            if channel is not None and wanted[number]:
                 if payload.startswith(_ZSTD):
                     payload = zstandard.decompress(payload)
-                yield Message(channels[number], recorded_ns, payload)
+                yield Message(channel, message.log_time, payload)
 
-    def _found(self, contents: "_Contents") -> Iterator[Found]:
+    def _found(self, contents: "_Contents") -> Iterator[records.Message]:
         """Yield all messages; the channels are added to ``contents`` as they come."""
         file, broken = contents.file, 0  # chunks
-        with _opened(file) as stream:
+        with zstandard.open(file, "rb") if file.suffix == ".zstd" else file.open("rb") as stream:
             reading = StreamReader(stream, emit_chunks=True).records
             while True:
                 try:
@@ -82,19 +75,20 @@ class McapBag(Bag):
                         raise self.damaged(error) from error
                     self._tell(file, f"cut off or damaged at {stream.tell() / 1e6:.3g} MB")
                     return
-                if isinstance(record, records.Message):
-                    yield record.channel_id, record.log_time, record.data
-                elif isinstance(record, records.Chunk):
-                    try:
-                        messages = contents.unpacked(record)
-                    except Exception:  # as above
-                        broken += 1
-                        continue
-                    yield from messages
-                elif record is None:
+                if record is None:
                     break
-                else:
-                    contents.learn(record)
+                inside = [record]
+                try:
+                    if isinstance(record, records.Chunk):
+                        inside = breakup_chunk(record, validate_crc=True)
+                except Exception:  # as above
+                    broken += 1
+                    continue
+                for each in inside:
+                    if isinstance(each, records.Message):
+                        yield each
+                    else:
+                        contents.learn(each)
         if broken:
             self._tell(file, f"{broken} of its chunks are damaged")
 
@@ -121,38 +115,17 @@ class _Contents:
             schema = self._schemas.get(record.schema_id)
             self.channels[record.id] = _channel(self.file, record, schema)
 
-    def unpacked(self, chunk: records.Chunk) -> list[Found]:
-        """Return the messages of a chunk: faster than the library does, record by record."""
-        stream, size = get_chunk_data_stream(chunk, validate_crc=True)
-        data, at = stream.read(size), 0
-        found: list[Found] = []
-        while at < size:
-            opcode, length = _RECORD.unpack_from(data, at)
-            at += _RECORD.size
-            if opcode == Opcode.MESSAGE:
-                number, _, recorded_ns, _ = _MESSAGE.unpack_from(data, at)
-                found.append((number, recorded_ns, data[at + _MESSAGE.size : at + length]))
-            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                kind: Any = records.Schema if opcode == Opcode.SCHEMA else records.Channel
-                self.learn(kind.read(ReadDataStream(BytesIO(data[at : at + length]))))
-            at += length
-        return found
-
 
 def _channel(file: Path, channel: records.Channel, schema: records.Schema | None) -> Channel:
     encoding = channel.message_encoding
     name = schema.name.replace("::", "/") if schema is not None else ""
     if encoding not in ("cdr", "ros1") or not name:
         what = encoding or "unknown"
-        return Channel(channel.topic, name or what, 0, file, _not_of_ros, foreign=what)
+        return Channel(channel.topic, name or what, 0, file, bytes, foreign=what)
     kind, is_ros_1 = normalize_msgtype(name), encoding == "ros1"
     text = schema.data.decode(errors="replace") if schema is not None else ""
     decode = partial(_decode, kind, text, is_ros_1)
     return Channel(channel.topic, kind, 0, file, decode, is_ros_1)
-
-
-def _not_of_ros(_payload: bytes) -> Any:
-    raise ValueError("no message of ROS")
 
 
 def _decode(kind: str, text: str, is_ros_1: bool, payload: bytes) -> Any:
@@ -175,8 +148,6 @@ def _types(kind: str, text: str, is_ros_1: bool) -> Typestore:
 
 def _summary(file: Path) -> Any:
     """Return the index of a file; None where it has none, or not all of it."""
-    if not file.name.endswith(".mcap"):
-        return None
     try:
         with file.open("rb") as stream:
             summary = SeekingReader(stream).get_summary()
@@ -186,7 +157,3 @@ def _summary(file: Path) -> Any:
         return None
     is_whole = summary.statistics.channel_message_counts.keys() <= summary.channels.keys()
     return summary if is_whole and summary.channels else None
-
-
-def _opened(file: Path) -> IO[bytes]:
-    return zstandard.open(file, "rb") if file.name.endswith(".zstd") else file.open("rb")

@@ -84,7 +84,7 @@ class RosContent:
         cameras = {each.topic for each in channels if _is_camera(each) and each.count}
         for message in bag.messages(_is_camera) if cameras else ():
             self._take(message)
-            cameras.discard(message.topic)
+            cameras.discard(message.channel.topic)
             if not cameras:
                 break
         self._read(bag, sum(each.count for each in channels if _is_read(each)))
@@ -94,11 +94,11 @@ class RosContent:
         done, paths = 0, dict[str, Message]()
         with progress("looking through the recording", total) as report:
             for done, message in enumerate(bag.messages(_is_read), start=1):
-                span_ns = self.spans_ns.setdefault(message.topic, [message.recorded_ns] * 2)
-                span_ns[1] = message.recorded_ns
-                if message.kind == PATH:
-                    paths[message.topic] = message  # the newest one has all poses
-                elif message.topic not in self._colours:
+                topic = message.channel.topic
+                self.spans_ns.setdefault(topic, [message.recorded_ns] * 2)[1] = message.recorded_ns
+                if message.channel.kind == PATH:
+                    paths[topic] = message  # the newest one has all poses
+                elif topic not in self._colours:
                     self._take(message)
                 if done % _REPORTED == 0:
                     report(done, f"{done} of {total} messages")
@@ -108,7 +108,7 @@ class RosContent:
         self.missing = total - done
 
     def _take(self, message: Message) -> None:
-        topic, kind = message.topic, message.kind
+        topic, kind = message.channel.topic, message.channel.kind
         try:
             decoded = message.decoded()
             if kind == type_store.CAMERA_INFO:
@@ -134,16 +134,16 @@ class RosContent:
 
     def _leave_out(self, message: Message, problem: NoScanError) -> None:
         """Count a message that cannot be read."""
-        topic = message.topic
-        if message.kind in _SCANS:
+        topic = message.channel.topic
+        if message.channel.kind in _SCANS:
             self.clouds.append(SeenCloud(topic, self._numbers[topic], problem=problem))
             self._numbers[topic] += 1
         else:
             self.broken[topic].append(str(problem))
 
     def _add_cloud(self, message: Message, decoded: Any) -> None:
-        topic = message.topic
-        sweep = self._reader.sweep(topic, message.kind, decoded, message.recorded_ns)
+        topic = message.channel.topic
+        sweep = self._reader.sweep(topic, message.channel.kind, decoded, message.recorded_ns)
         number, (first_ns, last_ns) = self._numbers[topic], sweep.span_ns
         self._numbers[topic] += 1
         about = sweep.frame, sweep.stamp_ns, first_ns, last_ns, sweep.note, message.channel.file

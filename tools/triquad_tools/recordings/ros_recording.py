@@ -123,8 +123,9 @@ class RosRecording:
         topics = {topic for topic, _ in wanted}
         numbers: Counter[str] = Counter()
         for message in self._bag.messages(lambda channel: channel.topic in topics):
-            key = message.topic, numbers[message.topic]
-            numbers[message.topic] += 1
+            topic = message.channel.topic
+            key = topic, numbers[topic]
+            numbers[topic] += 1
             if key in wanted:
                 wanted.discard(key)
                 yield self._read(message)
@@ -136,12 +137,12 @@ class RosRecording:
 
     def _read(self, message: Message) -> PosedScan:
         assert self._poses is not None
-        decoded, came_ns = message.decoded(), message.recorded_ns
+        topic, kind = message.channel.topic, message.channel.kind
         try:
-            sweep = self._reader.sweep(message.topic, message.kind, decoded, came_ns)
+            sweep = self._reader.sweep(topic, kind, message.decoded(), message.recorded_ns)
             return place(sweep, self._poses.frames, self._poses.target)
         except NoScanError as error:
-            raise ToolError(f"{self._bag.path}: a message on {message.topic}: {error}") from error
+            raise ToolError(f"{self._bag.path}: a message on {topic}: {error}") from error
 
     def _place_clouds(self, options: ReadingOptions) -> None:
         """Choose the poses, and find out which clouds they place."""
