@@ -128,9 +128,9 @@ def test_streams_tell_what_is_made_of_each_topic(tmp_path: Path) -> None:
     assert (streams["/lidar/points"].kind, streams["/lidar/points"].count) == (CLOUD, COUNT)
     assert streams["/lidar/points"].frame == "lidar"
     assert streams["/lidar/points"].use == (
-        f"{COUNT} scans, source lidar.points, no point times: motion is not taken out, 10 Hz"
+        f"{COUNT} scans, source lidar.points, no point times: motion is not taken out, 10.0 Hz"
     )
-    assert streams["/tf"].use == "the poses, 10 Hz"
+    assert streams["/tf"].use == "the poses, 10.0 Hz"
     assert streams["/odom"].use == "other poses: --poses /odom"
     assert streams["/odom"].frame == "odom > base_link"
 

@@ -190,7 +190,7 @@ class RosRecording:
         use, count = self._use(topic), found.counts[topic]
         first_ns, last_ns = found.spans_ns.get(topic, (0, 0))
         if last_ns > first_ns:
-            use += f", {(count - 1) / (last_ns - first_ns) * 1e9:.3g} Hz"
+            use += f", {(count - 1) / (last_ns - first_ns) * 1e9:.1f} Hz"
         return Stream(topic, found.kinds[topic], count, use, frame)
 
     def _use(self, topic: str) -> str:
@@ -211,12 +211,8 @@ class RosRecording:
         if topic in self._content.foreign:
             return f"not read: {self._content.foreign[topic]}, not a message of ROS"
         if not any(cloud.topic == topic for cloud in self._content.clouds):
-            package = kind.partition("/")[0]
-            return (
-                _PACKETS.get(package, "not used")
-                if "Pack" in kind or "Scan" in kind
-                else "not used"
-            )
+            is_raw = "Pack" in kind or "Scan" in kind
+            return _PACKETS.get(kind.partition("/")[0], "not used") if is_raw else "not used"
         return "none can be placed" if topic in self._topics else f"other scans: --topics {topic}"
 
 

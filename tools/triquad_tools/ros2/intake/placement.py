@@ -41,7 +41,7 @@ class Motion:
         Raises:
             NoScanError: one of them is of no use; the others were added.
         """
-        if is_body:
+        if is_body and transforms:  # a path may be empty
             self._body, self.body_parent = transforms[0].child, transforms[0].parent
         refusal = None
         for transform in transforms:
