@@ -9,7 +9,6 @@ import zstandard
 from mcap.writer import CompressionType, IndexType, Writer
 from support.recordings.bags import Recorded, drive, messages_for
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.mcap_bag import McapBag, find_bag
 from triquad_tools.recordings.opening import open_recording
 from triquad_tools.recordings.recording import ReadingOptions
 
@@ -82,7 +81,10 @@ def test_what_was_cut_off_is_read_up_to_there_and_told(tmp_path: Path) -> None:
     recording = open_recording(path, ReadingOptions())
     count = len(recording.entries)
     assert COUNT // 3 < count < COUNT
-    assert any("drive.mcap (of 0.0" in line and "cut off" in line for line in recording.remarks)
+    assert any(
+        "drive.mcap (of 0.0" in line and "cut off or damaged after" in line
+        for line in recording.remarks
+    )
     assert all(map(np.array_equal, (s.points for s in recording.read(range(count))), SCANS))
     path.write_bytes(whole[:20])
     with pytest.raises(ToolError, match="'mcap recover' saves what is left"):
@@ -96,14 +98,8 @@ def test_damaged_chunks_and_messages_are_left_out_and_counted(tmp_path: Path) ->
     path.write_bytes(data)
     recording = open_recording(path, ReadingOptions())
     assert COUNT // 2 < len(recording.entries) < COUNT
-    assert any("1 of its chunks are damaged; the rest" in line for line in recording.remarks)
+    assert any("1 of its chunks are damaged; what is whole" in line for line in recording.remarks)
     assert any("messages that its index names" in line for line in recording.remarks)
-
-    data = path.read_bytes().replace(b"ros2msg", b"ros9msg").replace(b"int32", b"what3")
-    path.write_bytes(data)
-    bag = find_bag(path)
-    assert isinstance(bag, McapBag)
-    assert {channel.topic for channel in bag.channels()} >= {"/lidar/points", "/tf"}
 
 
 def test_a_message_that_cannot_be_decoded_does_not_end_a_bag(tmp_path: Path) -> None:

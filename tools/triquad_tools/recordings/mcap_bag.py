@@ -64,7 +64,7 @@ class McapBag(Bag):
 
     def _found(self, contents: "_Contents") -> Iterator[records.Message]:
         """Yield all messages; the channels are added to ``contents`` as they come."""
-        file, broken = contents.file, 0  # chunks
+        file, broken, count = contents.file, 0, 0  # chunks, and messages
         with zstandard.open(file, "rb") if file.suffix == ".zstd" else file.open("rb") as stream:
             reading = StreamReader(stream, emit_chunks=True).records
             while True:
@@ -73,7 +73,7 @@ class McapBag(Bag):
                 except Exception as error:  # where it is cut off, anything may come
                     if not contents.channels:
                         raise self.damaged(error) from error
-                    self._tell(file, f"cut off or damaged at {stream.tell() / 1e6:.3g} MB")
+                    self._tell(file, f"cut off or damaged after {count} messages")
                     return
                 if record is None:
                     break
@@ -86,6 +86,7 @@ class McapBag(Bag):
                     continue
                 for each in inside:
                     if isinstance(each, records.Message):
+                        count += 1
                         yield each
                     else:
                         contents.learn(each)
@@ -94,7 +95,7 @@ class McapBag(Bag):
 
     def _tell(self, file: Path, what: str) -> None:
         size = f"of {file.stat().st_size / 1e6:.3g} MB"
-        line = f"{file.name} ({size}) is not whole: {what}; the rest of it is read"
+        line = f"{file.name} ({size}) is not whole: {what}; what is whole of it is read"
         if line not in self.remarks:
             self.remarks.append(line)
 
