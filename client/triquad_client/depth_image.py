@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from triquad_format.records.arrays import Floats
+from triquad_format.records.arrays import Doubles, Floats
 
 from triquad_client.errors import NO_NUMBER, InvalidScanError
 
@@ -49,13 +49,19 @@ class Intrinsics:
             )
         return cls(fx, fy, cx, cy)
 
+    def slopes(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Doubles:
+        """Return x and y per metre of depth [2, N] of pixels [N]."""
+        slopes: Doubles = np.stack([(columns - self.cx) / self.fx, (rows - self.cy) / self.fy])
+        return slopes
+
 
 def depth_points(depth: ArrayLike, intrinsics: Intrinsics, stride: int = 1) -> Floats:
     """Return the points [N, 3] that a depth image shows, row by row.
 
     Args:
         depth: [rows, columns] along the optical axis: metres as floating numbers, or millimetres
-            as integers without sign (``16UC1``). A pixel that is 0 or not finite shows nothing.
+            as integers without sign (``16UC1``). A pixel that is 0, not finite (REP 117), negative
+            or the largest integer shows nothing.
         intrinsics: of the camera.
         stride: every how many rows and columns one is taken.
 
@@ -63,20 +69,24 @@ def depth_points(depth: ArrayLike, intrinsics: Intrinsics, stride: int = 1) -> F
         Metres, in the camera's optical frame: x to the right, y down, z forward.
 
     Raises:
-        InvalidScanError: the image is not one, shows nothing, or the stride is below 1.
+        InvalidScanError: the image is not one, shows nothing, most of it is negative, or the
+            stride is below 1.
     """
     image = _metres(depth)
     if isinstance(stride, bool) or not isinstance(stride, int) or stride < 1:
         raise InvalidScanError(f"stride = {stride!r}: use 1 or more")
     image = image[::stride, ::stride]
-    if (image < 0).any():
-        raise InvalidScanError(f"depth {image.min():g} m is negative: depths lie before the camera")
-    rows, columns = np.nonzero(np.isfinite(image) & (image > 0))
+    finite = np.isfinite(image)
+    rows, columns = np.nonzero(finite & (image > 0))
+    if np.count_nonzero(finite & (image < 0)) > len(rows):
+        lowest = image[finite].min()
+        raise InvalidScanError(
+            f"depth {lowest:g} m is negative, as most: depths lie before the camera"
+        )
     if len(rows) == 0:
         raise InvalidScanError("the depth image shows nothing: each pixel is 0 or not finite")
     z = image[rows, columns]
-    x = (columns * stride - intrinsics.cx) / intrinsics.fx * z
-    y = (rows * stride - intrinsics.cy) / intrinsics.fy * z
+    x, y = intrinsics.slopes(rows * stride, columns * stride) * z
     return np.stack([x, y, z], axis=1).astype(np.float32)
 
 
@@ -88,6 +98,7 @@ def _metres(depth: ArrayLike) -> NDArray[np.floating]:
         return image
     if image.dtype.kind == "u" and image.dtype.itemsize > 1:
         metres: NDArray[np.floating] = image / np.float32(_MILLIMETRES_PER_M)
+        metres[image == np.iinfo(image.dtype).max] = 0.0
         return metres
     raise InvalidScanError(
         f"depth is {image.dtype}: use floating metres, or millimetres as uint16 or uint32"

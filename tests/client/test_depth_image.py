@@ -54,6 +54,13 @@ def test_what_shows_nothing_is_left_out_and_a_stride_thins() -> None:
     depth = wall_depth()
     depth[0, 0], depth[2, 2], depth[1, 1] = np.nan, np.inf, 0
     assert len(depth_points(depth, CAMERA)) == depth.size - 3
+    rep_117 = depth.copy()
+    rep_117[1, 2:4] = -np.inf, -0.5
+    assert len(depth_points(rep_117, CAMERA)) == depth.size - 5
+    for kind in (np.uint16, np.uint32):
+        millimetres = np.full(SHAPE, 2000, kind)
+        millimetres[0, :2] = 0, np.iinfo(kind).max
+        assert len(depth_points(millimetres, CAMERA)) == depth.size - 2
     thinned = depth_points(depth, CAMERA, stride=2)
     whole = depth_points(wall_depth(), CAMERA).reshape(*SHAPE, 3)
     np.testing.assert_array_equal(

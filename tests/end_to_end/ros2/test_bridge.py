@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from support import servers
 from support.ros.ros_bridge import AT, MAST, Bridged, bridging, stand
-from support.ros.ros_messages import CLOUD
-from support.ros.ros_robot import T0, robot, shifted
+from support.ros.ros_messages import CLOUD, PATH, POSE_WITH_COVARIANCE, TRANSFORM
+from support.ros.ros_robot import T0, robot, shifted, stamp
 from triquad_client import Client, Status
 from triquad_server.settings import SourceSettings
 from triquad_tools.ros2.intake import drop_log
@@ -158,8 +158,52 @@ def test_sensors_are_sources_of_their_own(endpoint: str) -> None:
         assert len(seen["lidar.near"].newest.points) == 0 < len(seen["rear"].newest.points)
 
 
+@pytest.mark.parametrize("way", ["rmw", "bridge"])
+def test_scans_of_livox_are_clouds_too(endpoint: str, way: str) -> None:
+    kind = "livox_ros_driver2/msg/CustomMsg"
+    with bridging(endpoint) as bridged, robot(endpoint, way) as r2:
+        r2.tf(0, ("base_link", "livox", MAST), static=True)
+        stand(r2, 0, 1)
+        points = servers.sphere()
+        offsets_ns = np.linspace(0, 1e8, len(points))
+        message = r2.messages.livox(points, offsets_ns, stamp(0.5), kind)
+        times = 0
+
+        def is_mapped() -> bool:
+            nonlocal times
+            if bridged.taken == 0:  # the bridge may find the topic later than the first
+                times += 1
+                message.header.stamp.nanosec += times
+                r2.send("/livox/lidar", kind, message)
+            return bridged.taken > 0
+
+        bridged.wait_for(is_mapped)
+        assert finds_its_sphere(bridged)
+
+
+@pytest.mark.parametrize("frame", ["odom", "map", ""])
+def test_a_rare_correction_stays_and_two_parents_are_refused(endpoint: str, frame: str) -> None:
+    chosen = ("--map-frame", frame) if frame else ()
+    with bridging(endpoint, *chosen) as bridged, robot(endpoint) as r2:
+        r2.tf(0, ("base_link", "lidar", MAST), static=True)
+        r2.tf(0, ("map", "slam", shifted()))
+        for second in range(8):
+            r2.tf(second, ("odom", "base_link", shifted(*AT)), ("slam", "base_link", shifted(*AT)))
+        r2.cloud(6.5, servers.sphere())
+        bridged.wait_for(lambda: bridged.accounted == 1)
+        assert bridged.bridge.dropped == ({} if frame else {"two_parents": 1})
+        assert not frame or finds_its_sphere(bridged)
+
+
 @pytest.mark.parametrize(
-    ("topic", "frame", "way"), [("/odom", "/odom", "rmw"), ("/pose", "/map", "bridge")]
+    ("topic", "frame", "way"),
+    [
+        ("/odom", "/odom", "rmw"),
+        ("/pose", "/map", "bridge"),
+        ("/covariance", "/map", "rmw"),
+        ("/transform", "/map", "bridge"),
+        ("/path", "/map", "rmw"),
+    ],
 )
 def test_poses_come_from_a_topic(endpoint: str, topic: str, frame: str, way: str) -> None:
     frames = ("--map-frame", frame, "--body-frame", "/body")
@@ -168,10 +212,22 @@ def test_poses_come_from_a_topic(endpoint: str, topic: str, frame: str, way: str
         for second in (0, 1):
             # What transforms say of the body does not count then.
             r2.tf(second, ("map", "body", shifted(x=99)))
-            if topic == "/odom":
-                r2.odometry(second, shifted(*AT), "body")
-            else:
-                r2.pose(second, shifted(*AT))
+            at = stamp(second), shifted(*AT)
+            match topic:
+                case "/odom":
+                    r2.odometry(second, shifted(*AT), "body")
+                case "/pose":
+                    r2.pose(second, shifted(*AT))
+                case "/covariance":
+                    message = r2.messages.pose_with_covariance(*at, "map")
+                    r2.send(topic, POSE_WITH_COVARIANCE, message)
+                case "/transform":
+                    (edge,) = r2.messages.tf(at[0], ("map", "body", at[1])).transforms
+                    r2.send(topic, TRANSFORM, edge)
+                case "/path":
+                    stamps = [stamp(each) for each in range(second + 1)]
+                    path = r2.messages.path(stamps, [at[1]] * len(stamps), "map")
+                    r2.send(topic, PATH, path)
         r2.cloud(0.5, servers.sphere())
         bridged.wait_for(lambda: bridged.taken == 1)
         assert finds_its_sphere(bridged)
@@ -195,15 +251,16 @@ def test_a_bridge_that_starts_late_learns_the_static_transforms(
             assert bridged.taken == 1, bridged.bridge.dropped
 
 
-def test_depth_images_are_mapped_with_the_camera_beside_them(endpoint: str) -> None:
+@pytest.mark.parametrize("topic", ["/camera/depth", "/camera/depth/compressedDepth"])
+def test_depth_images_are_mapped_with_the_camera_beside_them(endpoint: str, topic: str) -> None:
     matrix = np.array([[100.0, 0, 80], [0, 100, 60], [0, 0, 1]])
     forward = shifted(*AT)
     forward[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]  # the optical axis is the map's x
     wall = np.full((120, 160), 3000, np.uint16)
-    with bridging(endpoint, "--depth", "/camera/depth") as bridged, robot(endpoint) as r2:
+    with bridging(endpoint, "--depth", topic) as bridged, robot(endpoint) as r2:
         for second in (0, 1):
             r2.tf(second, ("map", "optical", forward))
-        r2.depth(0.1, wall)
+        r2.depth(0.1, wall, topic)
         bridged.wait_for(lambda: bridged.bridge.dropped == {"no_camera_info": 1})
         # The camera publishes what it sees as a cloud too, which nobody chose.
         r2.cloud(0.1, np.zeros((10, 3)), topic="/camera/points", frame="map")
@@ -212,7 +269,7 @@ def test_depth_images_are_mapped_with_the_camera_beside_them(endpoint: str) -> N
 
         def is_mapped() -> bool:
             if bridged.taken == 0:  # the camera may be heard of later than an image
-                r2.depth(next(times), wall)
+                r2.depth(next(times), wall, topic)
             return bridged.taken > 0
 
         bridged.wait_for(is_mapped)

@@ -1,10 +1,12 @@
 """Messages of ROS as robots send them, built with the types of a release."""
 
-from collections.abc import Mapping
+import io
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
@@ -12,7 +14,11 @@ CLOUD = "sensor_msgs/msg/PointCloud2"
 TF = "tf2_msgs/msg/TFMessage"
 ODOMETRY = "nav_msgs/msg/Odometry"
 POSE = "geometry_msgs/msg/PoseStamped"
+POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+TRANSFORM = "geometry_msgs/msg/TransformStamped"
+PATH = "nav_msgs/msg/Path"
 IMAGE = "sensor_msgs/msg/Image"
+COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 
 _NUMBERS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
@@ -74,6 +80,29 @@ class RosMessages:
             False,
         )
 
+    def livox(
+        self, points: NDArray[Any], offsets_ns: NDArray[Any], stamp_ns: int, kind: str
+    ) -> Any:
+        """A scan of a Livox, of the type ``kind`` of one of its drivers."""
+        package = kind.partition("/")[0]
+        point = (
+            "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\n"
+        )
+        scan = (
+            "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\n"
+            f"uint8[3] rsvd\n{package}/CustomPoint[] points"
+        )
+        inner = f"{package}/msg/CustomPoint"
+        if kind not in self.types.types:
+            types = get_types_from_msg(point + "uint8 line", inner)
+            self.types.register({**types, **get_types_from_msg(scan, kind)})
+        rows = [
+            self._new(inner, int(t), *map(float, point), 0, 0, 0)
+            for t, point in zip(offsets_ns, points, strict=True)
+        ]
+        header, rest = self.header(stamp_ns, "livox"), np.zeros(3, np.uint8)
+        return self._new(kind, header, stamp_ns, len(rows), 0, rest, rows)
+
     def tf(self, stamp_ns: int, *edges: tuple[str, str, NDArray[Any]]) -> Any:
         """Of edges from parent to child with the pose [4, 4] of the child."""
         return self._new(
@@ -107,6 +136,14 @@ class RosMessages:
     def pose(self, stamp_ns: int, pose: NDArray[Any], parent: str) -> Any:
         return self._new(POSE, self.header(stamp_ns, parent), self._pose(pose))
 
+    def pose_with_covariance(self, stamp_ns: int, pose: NDArray[Any], parent: str) -> Any:
+        inner = self._new("geometry_msgs/msg/PoseWithCovariance", self._pose(pose), np.zeros(36))
+        return self._new(POSE_WITH_COVARIANCE, self.header(stamp_ns, parent), inner)
+
+    def path(self, stamps_ns: Sequence[int], poses: NDArray[Any], parent: str) -> Any:
+        stamped = [self.pose(*each, "") for each in zip(stamps_ns, poses, strict=True)]
+        return self._new(PATH, self.header(stamps_ns[-1], parent), stamped)
+
     def image(
         self, pixels: NDArray[Any], encoding: str, stamp_ns: int, frame: str = "optical"
     ) -> Any:
@@ -121,6 +158,18 @@ class RosMessages:
             columns * pixels.dtype.itemsize,
             np.ascontiguousarray(pixels).view(np.uint8).reshape(-1),
         )
+
+    def compressed_depth(
+        self,
+        pixels: NDArray[np.uint16],
+        stamp_ns: int,
+        form: str = "16UC1; compressedDepth png",
+        header: bytes = bytes(12),
+    ) -> Any:
+        buffer = io.BytesIO()
+        Image.fromarray(pixels).save(buffer, "PNG")
+        data = np.frombuffer(header + buffer.getvalue(), np.uint8)
+        return self._new(COMPRESSED_IMAGE, self.header(stamp_ns, "optical"), form, data)
 
     def camera_info(
         self, size: tuple[int, int], matrix: NDArray[Any], stamp_ns: int, frame: str = "optical"

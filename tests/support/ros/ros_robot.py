@@ -12,7 +12,16 @@ import numpy as np
 import zenoh
 import zenoh.ext
 from numpy.typing import NDArray
-from support.ros.ros_messages import CAMERA_INFO, CLOUD, IMAGE, ODOMETRY, POSE, TF, RosMessages
+from support.ros.ros_messages import (
+    CAMERA_INFO,
+    CLOUD,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    ODOMETRY,
+    POSE,
+    TF,
+    RosMessages,
+)
 from support.servers import raw_session
 
 Array = NDArray[Any]
@@ -152,7 +161,11 @@ class Robot:
         self.send(topic, POSE, self.messages.pose(stamp(second), pose, "map"))
 
     def depth(self, second: float, pixels: Array, topic: str = "/camera/depth") -> None:
-        self.send(topic, IMAGE, self.messages.image(pixels, "16UC1", stamp(second)))
+        if topic.endswith("/compressedDepth"):
+            message = self.messages.compressed_depth(pixels, stamp(second))
+            self.send(topic, COMPRESSED_IMAGE, message)
+        else:
+            self.send(topic, IMAGE, self.messages.image(pixels, "16UC1", stamp(second)))
 
     def camera(self, second: float, size: tuple[int, int], matrix: Array) -> None:
         message = self.messages.camera_info(size, matrix, stamp(second))

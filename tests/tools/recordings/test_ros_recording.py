@@ -7,7 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.recordings.bags import KINDS, BagKind, Recorded, drive, messages_for, write_bag
-from support.ros.ros_messages import CAMERA_INFO, CLOUD, IMAGE, ODOMETRY, POSE, TF
+from support.ros.ros_messages import (
+    CAMERA_INFO,
+    CLOUD,
+    IMAGE,
+    ODOMETRY,
+    PATH,
+    POSE,
+    POSE_WITH_COVARIANCE,
+    TF,
+    TRANSFORM,
+)
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.opening import Recording, open_recording
 from triquad_tools.recordings.recording import ReadingOptions, transform
@@ -76,9 +86,36 @@ def test_a_bare_file_and_a_folder_of_parts_are_bags_too(tmp_path: Path) -> None:
     messages = drive(ros, SCANS, poses(), STAMPS, LIDAR)
     parts = tmp_path / "parts"
     parts.mkdir()
-    write_bag(parts / "a", "ros1", messages[:6])
-    write_bag(parts / "b", "ros1", messages[6:])
-    assert len(open_recording(parts, ReadingOptions()).entries) == COUNT
+    write_bag(parts / "b", "ros1", messages[:6])
+    write_bag(parts / "a", "ros1", messages[6:])
+    recording = open_recording(parts, ReadingOptions())
+    assert [entry.stamp_ns for entry in recording.entries] == STAMPS
+    assert all(map(np.array_equal, (scan.points for scan in recording.read(range(COUNT))), SCANS))
+
+
+@pytest.mark.parametrize("kind", ["mcap", "ros1"])
+def test_bags_of_one_folder_that_are_no_parts_of_one_recording_are_refused(
+    tmp_path: Path, kind: BagKind
+) -> None:
+    ros = messages_for(kind)
+    elsewhere = poses() + [[0, 0, 0, 30], [0] * 4, [0] * 4, [0] * 4]
+
+    def both(name: str, places: np.ndarray, after_s: float) -> Path:
+        stamps = [stamp + round(after_s * SECOND) for stamp in STAMPS]
+        for part, (where, when) in enumerate(((poses(), STAMPS), (places, stamps))):
+            bag = write_bag(tmp_path / f"{name}{part}", kind, drive(ros, SCANS, where, when, LIDAR))
+            file = bag if bag.is_file() else next(bag.glob("*.mcap"))
+            target = tmp_path / name / f"{part}{file.suffix}"
+            target.parent.mkdir(exist_ok=True)
+            file.rename(target)
+        return tmp_path / name
+
+    with pytest.raises(ToolError, match=r"0\.\w+ and 1\.\w+ overlap by 0.2 s on /lidar/points"):
+        open_recording(both("overlap", poses(), 0.3), ReadingOptions())
+    jump = both("jump", elsewhere, 3600)
+    with pytest.raises(ToolError, match=r"is 25\.\d m elsewhere: .* use --map-frame odom"):
+        open_recording(jump, ReadingOptions())
+    assert len(open_recording(jump, ReadingOptions(map_frame="odom")).entries) == 2 * COUNT
 
 
 def test_streams_tell_what_is_made_of_each_topic(tmp_path: Path) -> None:
@@ -90,8 +127,10 @@ def test_streams_tell_what_is_made_of_each_topic(tmp_path: Path) -> None:
     streams = {stream.name: stream for stream in opened(tmp_path, messages).streams}
     assert (streams["/lidar/points"].kind, streams["/lidar/points"].count) == (CLOUD, COUNT)
     assert streams["/lidar/points"].frame == "lidar"
-    assert streams["/lidar/points"].use == f"{COUNT} scans, source lidar.points"
-    assert streams["/tf"].use == "the poses"
+    assert streams["/lidar/points"].use == (
+        f"{COUNT} scans, source lidar.points, no point times: motion is not taken out, 10.0 Hz"
+    )
+    assert streams["/tf"].use == "the poses, 10.0 Hz"
     assert streams["/odom"].use == "other poses: --poses /odom"
     assert streams["/odom"].frame == "odom > base_link"
 
@@ -108,6 +147,28 @@ def test_poses_without_a_name_are_those_of_what_the_sensor_is_fixed_to(tmp_path:
     of_lidar = open_recording(tmp_path / "bag", ReadingOptions(body_frame="lidar"))
     for scan, pose in zip(of_lidar.read(range(COUNT)), poses(), strict=True):
         assert np.allclose(scan.world_from_sensor, pose @ np.linalg.inv(LIDAR))
+
+
+@pytest.mark.parametrize("kind", [TRANSFORM, POSE_WITH_COVARIANCE, PATH])
+def test_poses_come_in_many_types(tmp_path: Path, kind: str) -> None:
+    messages = without(a_drive(), "/tf")
+    for index, (pose, stamp) in enumerate(zip(poses(), STAMPS, strict=True)):
+        body = pose @ np.linalg.inv(LIDAR)
+        message = {
+            TRANSFORM: lambda s, b: ROS2.tf(s, ("map", "base_link", b)).transforms[0],
+            POSE_WITH_COVARIANCE: lambda s, b: ROS2.pose_with_covariance(s, b, "map"),
+            PATH: lambda _, b, n=index: ROS2.path(
+                STAMPS[: n + 1], [*poses()[:n] @ np.linalg.inv(LIDAR), b], "map"
+            ),
+        }[kind](stamp, body)
+        messages.append(Recorded("/where", kind, stamp, message))
+    recording = opened(tmp_path, messages)
+    for scan, pose in zip(recording.read(range(COUNT)), poses(), strict=True):
+        assert np.allclose(scan.world_from_sensor, pose)
+    unstamped = ROS2.path([0] * COUNT, poses(), "map")
+    messages = [*without(messages, "/where"), Recorded("/where", PATH, STAMPS[-1], unstamped)]
+    remarks = opened(tmp_path / "unstamped", messages).remarks
+    assert "/where: 1 poses are left out: they have no times of their own" in remarks
 
 
 def test_depth_images_are_mapped_in_the_optical_frame(tmp_path: Path) -> None:
@@ -172,6 +233,23 @@ def test_a_cloud_of_the_whole_map_is_no_scan(tmp_path: Path) -> None:
     assert {entry.source for entry in recording.entries} == {"lidar.points"}
     streams = {stream.name: stream for stream in recording.streams}
     assert streams["/map_cloud"].use == "other scans: --topics /map_cloud"
+
+
+def test_two_that_publish_one_transform_are_named_and_one_can_be_chosen(tmp_path: Path) -> None:
+    """Of another parent, or of the same one and told apart by the topic alone."""
+    for parent, choice in (("map", {"map_frame": "odom"}), ("odom", {"poses": "/tf"})):
+        messages = a_drive()
+        for pose, stamp in zip(poses(), STAMPS, strict=True):
+            pose[1, 3] += 0.4
+            other = ROS2.tf(stamp + 9, (parent, "base_link", pose @ np.linalg.inv(LIDAR)))
+            messages.append(Recorded("/other/tf", TF, stamp + 9, other))
+        both = opened(tmp_path / parent, messages)
+        assert not both.entries
+        assert "choose" in only_remark(both)
+        assert "6 times" in only_remark(both) or "jumps to and fro, 9 times" in only_remark(both)
+        chosen = open_recording(tmp_path / parent / "bag", ReadingOptions(**choice))
+        for scan, pose in zip(chosen.read(range(COUNT)), poses(), strict=True):
+            assert np.allclose(scan.world_from_sensor, pose)
 
 
 def test_missing_poses_and_transforms_are_named_with_the_remedy(tmp_path: Path) -> None:
@@ -257,7 +335,7 @@ def test_poses_that_are_none_are_left_out_and_counted(tmp_path: Path) -> None:
     assert "/tf: 1 poses are left out: quaternion_xyzw" in only_remark(recording)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["sqlite3", "ros1"])
 def test_a_damaged_bag_is_refused_with_the_remedy(tmp_path: Path, kind: BagKind) -> None:
     messages = drive(messages_for(kind), SCANS, poses(), STAMPS, LIDAR)
     path = write_bag(tmp_path / "bag", kind, messages)

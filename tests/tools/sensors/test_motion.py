@@ -6,8 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 from triquad_client.pose import Pose
-from triquad_tools.sensors.motion.frame_tree import STATIC, FrameTree, Track, Transform
+from triquad_tools.sensors.motion.frame_tree import STATIC, FrameTree, Transform
 from triquad_tools.sensors.motion.placing import place
+from triquad_tools.sensors.motion.track import Track
 from triquad_tools.sensors.sweep import NoTransformError, Sweep
 
 SECOND = 10**9
@@ -121,6 +122,78 @@ def test_frames_that_hang_on_each_other_do_no_harm() -> None:
     frames = tree(edge("a", "b", STATIC), edge("b", "a", STATIC), edge("a", "a", STATIC))
     with pytest.raises(NoTransformError):
         frames.poses("c", "a", at(T0))
+
+
+def at_x(x: float) -> Pose:
+    return Pose((x, 0, 0), (0, 0, 0, 1))
+
+
+def test_a_rare_correction_stays_or_moves_evenly_and_odometry_does_not() -> None:
+    times = [T0 + i * SECOND // 5 for i in range(100)]
+    frames = tree(*(edge("odom", "base", t, at_x((t - T0) / 1e9)) for t in times))
+    for second, x in ((0, 0.0), (5, 0.2), (10, 3.2)):
+        frames.add(edge("map", "odom", T0 + second * SECOND, at_x(x)))
+
+    def correction(*seconds: float) -> list[float]:
+        stamps = at(*(T0 + round(each * SECOND) for each in seconds))
+        return (frames.poses("map", "base", stamps)[:, 0, 3] - seconds).round(6).tolist()
+
+    # By drift, evenly; by a loop, only when it is told; and after the last it stays.
+    assert correction(0, 2.5, 5, 7.5, 10, 19) == [0, 0.1, 0.2, 0.2, 3.2, 3.2]
+    assert frames.corrections("map", "base")[0].startswith("map from odom comes up to 5.0 s apart")
+    with pytest.raises(NoTransformError, match="odom from base: .* after the last pose"):
+        correction(25)
+    frames.add(edge("odom", "base", T0 + 24 * SECOND))
+    with pytest.raises(NoTransformError, match="odom from base: between two poses"):
+        correction(22)
+    alone = tree(*(edge("map", "base", T0 + n * 5 * SECOND, at_x(n)) for n in range(3)))
+    with pytest.raises(NoTransformError, match="between two poses"):
+        alone.poses("map", "base", at(T0 + SECOND))
+
+
+def test_of_two_parents_the_one_that_is_wanted_counts() -> None:
+    for limit in (None, 100):
+        frames = FrameTree(limit)
+        for n in range(10):
+            frames.add(edge("odom", "base", T0 + n * SECOND, at_x(n)))
+            frames.add(edge("map", "base", T0 + n * SECOND, at_x(-n)))
+        with pytest.raises(NoTransformError) as caught:
+            frames.poses("map", "base", at(T0))
+        assert (caught.value.reason, caught.value.late) == ("two_parents", False)
+        assert "base is in odom (10 times) and map (10 times): choose by --map-frame odom" in (
+            str(caught.value)
+        )
+        for wanted, sign in (("odom", 1), ("map", -1)):
+            frames.wanted = wanted
+            assert frames.fixed_frame("base") == wanted
+            assert frames.poses(wanted, "base", at(T0 + SECOND))[0, 0, 3] == sign
+        frames.wanted = ""
+        frames.add(edge("map", "base", T0 + 30 * SECOND))
+        assert frames.moves("map", "base")
+    assert np.allclose(frames.poses("map", "base", at(T0 + 30 * SECOND)), np.eye(4))
+
+
+def test_a_static_parent_that_leads_nowhere_is_never_used() -> None:
+    frames = tree(edge("odom", "base", T0), edge("world", "base", STATIC))
+    assert frames.poses("odom", "base", at(T0)).shape == (1, 4, 4)
+
+
+@pytest.mark.parametrize("same_time", [False, True])
+def test_two_publishers_of_the_same_poses_are_told(same_time: bool) -> None:
+    frames = FrameTree()
+    for n in range(50):
+        stamp = T0 + n * SECOND // 10
+        frames.add(edge("odom", "base", stamp, at_x(n / 10)))
+        frames.add(edge("odom", "base", stamp + (0 if same_time else 5), at_x(n / 10 + 0.5)))
+    single = tree(*(edge("odom", "base", T0 + n, at_x(n + n % 2 / 10)) for n in range(50)))
+    single.check()
+    assert len(single.poses("odom", "base", at(T0))) == 1
+    frames.check()
+    with pytest.raises(
+        NoTransformError, match=r"jumps to and fro, \d+ times, by 0.(15|5) m"
+    ) as caught:
+        frames.poses("odom", "base", at(T0))
+    assert caught.value.reason == "two_publishers"
 
 
 def moving(stamp_ns: int) -> Pose:

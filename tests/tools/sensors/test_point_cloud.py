@@ -1,12 +1,15 @@
 """Clouds of ROS: every layout that drivers write, and those that are broken."""
 
+import struct
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rosbags.typesys import Stores
 from support.ros.ros_messages import CLOUD, RosMessages
+from triquad_tools.sensors.ros.from_bytes import decode, decode_cdr
 from triquad_tools.sensors.ros.point_cloud import sweep_of_cloud
-from triquad_tools.sensors.ros.type_store import decode_cdr
 from triquad_tools.sensors.sweep import NoScanError
 
 ROS = RosMessages()
@@ -71,6 +74,12 @@ STAMP_S = STAMP_NS / 1e9
         ("timestamp", SWEEP_S + STAMP_S, SWEEP_S),  # Hesai, RoboSense
         ("timestamp", (SWEEP_S + STAMP_S) * 1e9, SWEEP_S),  # Livox in nanoseconds since 1970
         ("timestamp", SWEEP_S + 4000.0, SWEEP_S),  # a clock of its own, that of the lidar
+        ("time_offset_ns", (SWEEP_S * 1e9).astype("u4"), SWEEP_S),
+        ("offset_us", (SWEEP_S * 1e6).astype("u4"), SWEEP_S),
+        ("timeOffset", SWEEP_S.astype("f4"), SWEEP_S),
+        ("t_ns", (SWEEP_S * 1e6).astype("u4"), None),  # 0.1 ms: of a flash, not 0.1 s
+        ("relative_time", (SWEEP_S * 1e3).astype("f4"), SWEEP_S),
+        ("intensity", SWEEP_S.astype("f4"), None),
         ("t", np.zeros(1000, "u4"), None),  # written by nobody
         ("time", np.full(1000, np.nan, "f4"), None),
         ("ring", SWEEP_S.astype("f4"), None),
@@ -82,9 +91,30 @@ def test_the_times_of_points_are_understood(
     sweep = sweep_of_cloud(ROS.cloud(points(1000), STAMP_NS, more={name: values}))
     if expected_s is None:
         assert sweep.offsets_s is None
+        assert sweep.note == "no point times: motion is not taken out"
     else:
+        assert sweep.note == f"point times: {name}, 0.1 s"
         assert sweep.offsets_s is not None
         assert np.abs(sweep.offsets_s - expected_s).max() < 2e-6
+
+
+@pytest.mark.parametrize("release", [Stores.ROS2_JAZZY, Stores.ROS1_NOETIC])
+@pytest.mark.parametrize("driver", ["livox_ros_driver", "livox_ros_driver2"])
+def test_scans_of_livox_are_read_from_their_bytes(release: Stores, driver: str) -> None:
+    ros, kind = RosMessages(release), f"{driver}/msg/CustomMsg"
+    is_ros_1 = release is Stores.ROS1_NOETIC
+    for count in (0, 1, 500):
+        expected, offsets_ns = points(count), np.linspace(0, 1e8, count).astype("u4")
+        expected[3:4] = 0  # no return
+        payload = ros.encode(ros.livox(expected, offsets_ns, STAMP_NS, kind), kind)
+        sweep = decode(payload, kind, bytes, is_ros_1=is_ros_1)
+        kept = np.arange(count) != 3
+        assert np.array_equal(sweep.points, expected[kept])
+        assert np.allclose(sweep.offsets_s, offsets_ns[kept] / 1e9)
+        assert (sweep.frame, sweep.stamp_ns) == ("livox", STAMP_NS)
+    for broken in (payload[:-7], payload + b"1234567", payload[:40]):
+        with pytest.raises((ValueError, struct.error)):
+            decode(broken, kind, bytes, is_ros_1=is_ros_1)
 
 
 def test_empty_points_do_not_spoil_absolute_times() -> None:

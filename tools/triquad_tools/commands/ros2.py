@@ -167,9 +167,9 @@ def _add_topics(add: Callable[..., argparse.Action]) -> None:
     ):
         add(f"--{name}", type=_topic, nargs="+", default=[], metavar="TOPIC", help=what)
     add("--depth-stride", type=count, default=2, metavar="N", help="every Nth pixel (default: 2)")
-    poses = "Odometry or PoseStamped (default: /tf)"
+    poses = "of odometry, poses, transforms or a path (default: /tf)"
     add("--poses", type=_topic, default=TF_POSES, metavar="TOPIC", help=poses)
-    add("--body-frame", type=frame_name, default="base_link", metavar="NAME", help="of PoseStamped")
+    add("--body-frame", type=frame_name, default="base_link", metavar="NAME", help="of these poses")
     to_map_in = "(default: map, odom or world, the first that there is)"
     add("--map-frame", type=frame_name, default="", metavar="NAME", help=to_map_in)
     clock = "which tells the time of messages (default: header)"

@@ -10,11 +10,11 @@ import numpy as np
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.lines import print_remark
-from triquad_tools.recordings.bag import find_bag
 from triquad_tools.recordings.cloud import points_in_range
 from triquad_tools.recordings.folders.cloud_folder import is_cloud_folder, read_cloud_folder
 from triquad_tools.recordings.folders.depth_folder import is_depth_folder, read_depth_folder
 from triquad_tools.recordings.folders.scan_folder import ScanFolder
+from triquad_tools.recordings.mcap_bag import find_bag
 from triquad_tools.recordings.recording import Place, ReadingOptions, ScanEntry, options_of
 from triquad_tools.recordings.ros_recording import RosRecording
 from triquad_tools.sensors.ray_check import without_repeated
@@ -37,7 +37,7 @@ _FLAGS = {"transforms": "--transform", "deskew": "--no-deskew"}
 
 _OF_BAGS = {
     "topics", "poses", "map_frame", "body_frame", "transforms", "recorder_clock", "stride",
-    "points_in", "ray_origin",
+    "points_in", "ray_origin", "deskew",
 }  # fmt: skip
 _OF_DEPTH = {"trajectory", "quaternion", "intrinsics", "units_per_metre", "stride"}
 _OF_CLOUDS = {"trajectory", "quaternion", "points_in", "columns", "ray_origin", "deskew"}

@@ -2,25 +2,25 @@
 
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
-from rosbags.interfaces import Connection
 from triquad_format.errors import InvalidInputError
 
-from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
-from triquad_tools.recordings.bag import Bag, Message
-from triquad_tools.sensors.motion.frame_tree import STATIC, FrameTree, Track, Transform
+from triquad_tools.recordings.bag import Bag, Channel, Message
+from triquad_tools.sensors.motion.frame_tree import STATIC, FrameTree, Transform
+from triquad_tools.sensors.motion.track import Track
 from triquad_tools.sensors.ray_check import RayCheck
 from triquad_tools.sensors.ros import type_store
-from triquad_tools.sensors.ros.depth_camera import is_depth
+from triquad_tools.sensors.ros.depth_camera import holds_depth
 from triquad_tools.sensors.ros.message_reader import MessageReader
+from triquad_tools.sensors.ros.type_store import PATH, POSES, TRANSFORMS
 from triquad_tools.sensors.sweep import NoScanError
 
-_TRANSFORMS = (type_store.TF, type_store.TF_OF_ROS_1)
-_POSES = (type_store.ODOMETRY, type_store.POSE)
-_SCANS = (type_store.POINT_CLOUD, type_store.IMAGE)
-_USED = (type_store.CAMERA_INFO, *_TRANSFORMS, *_POSES, *_SCANS)
+_SCANS = (*type_store.CLOUDS, *type_store.IMAGES)
+_USED = (*TRANSFORMS, *POSES, *_SCANS)
+_REPORTED = 500  # messages, after which the progress is shown again
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,8 @@ class SeenCloud:
     stamp_ns: int = 0
     first_ns: int = 0  # when its first point was measured
     last_ns: int = 0
+    note: str = ""  # how it was read, for a user
+    file: Path = Path()  # which has it
     problem: NoScanError | None = None  # why no scan can be made of it
 
 
@@ -52,8 +54,8 @@ class RosContent:
     order of their recording, and ``broken`` says by topic what is wrong with its poses.
     """
 
-    def __init__(self, bag: Bag, reader: MessageReader) -> None:
-        """Read all of a bag.
+    def __init__(self, bag: Bag, reader: MessageReader, poses: str | None = None) -> None:
+        """Read all of a bag; where ``poses`` is a topic of transforms, no others that move.
 
         Raises:
             ToolError: it is damaged.
@@ -69,52 +71,87 @@ class RosContent:
         self._colours: set[str] = set()  # topics of images that hold no depth
         self._numbers: Counter[str] = Counter()
         self._reader = reader
-        total = 0
-        for connection in bag.connections():
-            self.kinds[connection.topic] = connection.msgtype
-            self.counts[connection.topic] += connection.msgcount
-            total += connection.msgcount if connection.msgtype in _USED else 0
-        # Cameras first: an image may come before what is known of its camera.
-        messages = bag.messages(
-            _is_camera, lambda one: one.msgtype in _USED and not _is_camera(one)
+        self.spans_ns: dict[str, list[int]] = {}  # when the first and last of a topic was recorded
+        self.foreign: dict[str, str] = {}  # encodings of topics that are not of ROS
+        channels = bag.channels()
+        self._only = next(
+            (x.topic for x in channels if x.topic == poses and x.kind in TRANSFORMS), ""
         )
-        done = 0
+        for channel in channels:
+            self.kinds[channel.topic] = channel.kind
+            self.counts[channel.topic] += channel.count
+            if channel.foreign:
+                self.foreign[channel.topic] = channel.foreign
+        # Cameras first: an image may come before what is known of its camera.
+        cameras = {each.topic for each in channels if _is_camera(each) and each.count}
+        for message in bag.messages(_is_camera) if cameras else ():
+            self._take(message)
+            cameras.discard(message.channel.topic)
+            if not cameras:
+                break
+        self._read(bag, sum(each.count for each in channels if _is_read(each)))
+
+    def _read(self, bag: Bag, total: int) -> None:
+        """Read all but cameras."""
+        done, paths = 0, dict[str, Message]()
         with progress("looking through the recording", total) as report:
-            for done, message in enumerate(messages, start=1):
-                if message.topic not in self._colours:
-                    self._take(message, message.decoded())
-                report(done, f"{done} of {total} messages")
+            for done, message in enumerate(bag.messages(_is_read), start=1):
+                topic = message.channel.topic
+                self.spans_ns.setdefault(topic, [message.recorded_ns] * 2)[1] = message.recorded_ns
+                if message.channel.kind == PATH:
+                    paths[topic] = message  # the newest one has all poses
+                elif topic not in self._colours:
+                    self._take(message)
+                if done % _REPORTED == 0:
+                    report(done, f"{done} of {total} messages")
+            report(done, f"{done} of {total} messages")
+        for path in paths.values():
+            self._take(path)
         self.missing = total - done
 
-    def _take(self, message: Message, decoded: Any) -> None:
-        topic, kind = message.topic, message.kind
+    def _take(self, message: Message) -> None:
+        topic, kind = message.channel.topic, message.channel.kind
         try:
+            decoded = message.decoded()
             if kind == type_store.CAMERA_INFO:
                 self._reader.cameras[topic] = decoded
-            elif kind in (*_TRANSFORMS, *_POSES):
+            elif kind in (*TRANSFORMS, *POSES):
                 static, came_ns = topic.endswith("tf_static"), message.recorded_ns
-                for each in self._reader.transforms(kind, decoded, came_ns, static=static):
-                    self._add(topic, each, is_pose=kind in _POSES)
-            elif kind == type_store.IMAGE and not is_depth(decoded.encoding):
+                if kind in TRANSFORMS and not static and self._only not in ("", topic):
+                    return
+                found = self._reader.transforms(kind, decoded, came_ns, static=static)
+                for each in found:
+                    self._add(topic, each, is_pose=kind in POSES)
+                if kind == PATH and len(self.poses[topic].track) < len(found):
+                    self.broken[topic].append("they have no times of their own")
+            elif kind in type_store.IMAGES and not holds_depth(decoded):
                 self._colours.add(topic)
             else:
                 self._add_cloud(message, decoded)
+        except NoScanError as error:
+            self._leave_out(message, error)
         except AttributeError as error:  # a bag brings its own definitions of types
-            raise ToolError(f"{topic}: messages are not as {kind} is defined: {error}") from error
+            text = f"not as {kind} is defined: {error}"
+            self._leave_out(message, NoScanError("decode", text))
+
+    def _leave_out(self, message: Message, problem: NoScanError) -> None:
+        """Count a message that cannot be read."""
+        topic = message.channel.topic
+        if message.channel.kind in _SCANS:
+            self.clouds.append(SeenCloud(topic, self._numbers[topic], problem=problem))
+            self._numbers[topic] += 1
+        else:
+            self.broken[topic].append(str(problem))
 
     def _add_cloud(self, message: Message, decoded: Any) -> None:
-        topic = message.topic
-        number = self._numbers[topic]
+        topic = message.channel.topic
+        sweep = self._reader.sweep(topic, message.channel.kind, decoded, message.recorded_ns)
+        number, (first_ns, last_ns) = self._numbers[topic], sweep.span_ns
         self._numbers[topic] += 1
-        try:
-            sweep = self._reader.sweep(topic, message.kind, decoded, message.recorded_ns)
-        except NoScanError as error:
-            self.clouds.append(SeenCloud(topic, number, problem=error))
-            return
-        if message.kind != type_store.IMAGE:
+        if message.channel.kind not in type_store.IMAGES:
             self.rays.see(topic, sweep.points)
-        first_ns, last_ns = sweep.span_ns
-        self.clouds.append(SeenCloud(topic, number, sweep.frame, sweep.stamp_ns, first_ns, last_ns))
+        about = sweep.frame, sweep.stamp_ns, first_ns, last_ns, sweep.note, message.channel.file
+        self.clouds.append(SeenCloud(topic, number, *about))
 
     def _add(self, topic: str, transform: Transform, *, is_pose: bool) -> None:
         """Add a transform to all, or a pose to those of its topic."""
@@ -122,7 +159,7 @@ class RosContent:
             if not is_pose:
                 self.frames.add(transform)
                 return
-            position, quaternion = transform.pose.numbers()
+            position, quaternion = transform.numbers()
         except InvalidInputError as error:
             self.broken[topic].append(str(error))
             return
@@ -132,5 +169,9 @@ class RosContent:
         known.track.add(transform.stamp_ns, position, quaternion)
 
 
-def _is_camera(connection: Connection) -> bool:
-    return connection.msgtype == type_store.CAMERA_INFO
+def _is_camera(channel: Channel) -> bool:
+    return channel.kind == type_store.CAMERA_INFO and not channel.foreign
+
+
+def _is_read(channel: Channel) -> bool:
+    return channel.kind in _USED and not channel.foreign

@@ -2,12 +2,12 @@
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-
-import numpy as np
+from dataclasses import replace
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.bag import Bag, Message
+from triquad_tools.recordings.parts import check_places, check_times
+from triquad_tools.recordings.pose_source import TF, PoseSource, choose_poses
 from triquad_tools.recordings.recording import (
     ORIGIN_REMEDIES,
     SENSOR,
@@ -17,15 +17,14 @@ from triquad_tools.recordings.recording import (
     Stream,
 )
 from triquad_tools.recordings.ros_content import RosContent, SeenCloud
-from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES, FrameTree
+from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES
 from triquad_tools.sensors.motion.placing import place
 from triquad_tools.sensors.ros import type_store
+from triquad_tools.sensors.ros.depth_camera import raw_topic
 from triquad_tools.sensors.ros.header import source_of_topic
 from triquad_tools.sensors.ros.message_reader import MessageReader
-from triquad_tools.sensors.sweep import NoScanError, NoTransformError, PosedScan, Sweep, moved
-
-TF = "tf"
-"""Stands for all transforms, whatever their topics."""
+from triquad_tools.sensors.ros.type_store import TRANSFORMS
+from triquad_tools.sensors.sweep import NoScanError, PosedScan
 
 _CLOCKS = (
     "no cloud's stamp lies within the times of the poses: where they are of another clock, "
@@ -49,96 +48,26 @@ _STANDS = (
     "--points-in world has them begin at {body}, or at the frame of --body-frame, and --ray-origin "
     "X,Y,Z where the sensor sits on it; --points-in sensor is for a sensor that does stand there"
 )
-_NO_CLOUDS = "it holds no clouds (PointCloud2) and no depth images (Image): nothing to map"
+_NO_CLOUDS = (
+    "it holds no clouds (PointCloud2, Livox CustomMsg) and no depth images (Image): nothing to map"
+)
 _NO_POSES = (
     "it holds no poses: record /tf with /tf_static, or a topic of odometry or poses, together with "
     "the clouds"
 )
+_PACKETS = {
+    package: f"packets: play it to {driver}, and record the PointCloud2 that this publishes"
+    for driver, packages in {
+        "velodyne_pointcloud": ("velodyne_msgs",),
+        "os_cloud of ouster_ros": ("ouster_ros", "ouster_msgs", "ouster_sensor_msgs"),
+        "the driver of Hesai": ("hesai_ros_driver", "pandar_msgs", "hesai_lidar"),
+        "rslidar_sdk": ("rslidar_msg", "rslidar_msgs"),
+        "laser_geometry": ("sensor_msgs",),
+    }.items()
+    for package in packages
+}
+"""What makes clouds of packets, and of scans of one plane, by the packages of their types."""
 _OF_TIME = ("pose_early", "pose_late")
-
-
-@dataclass(frozen=True)
-class PoseSource:
-    """Poses that may be used, and the frame to map in."""
-
-    name: str  # a topic, or TF
-    frames: FrameTree
-    target: str
-    body: str  # the frame whose poses they are, or one that hangs on it
-    assumed: bool = False  # nothing says that they are its poses
-
-    def moves(self, frame: str) -> bool:
-        """Return whether a frame moves in the one to map in."""
-        return self.frames.moves(self.target, frame)
-
-    def seen(self, scan: PosedScan, sweep: Sweep) -> PosedScan:
-        """Return a scan whose points stand still in the map as the body saw them."""
-        stamps = np.array([sweep.stamp_ns], np.int64)
-        (pose,) = self.frames.poses(self.target, self.body, stamps)
-        points = moved(scan.points, np.linalg.inv(pose) @ scan.world_from_sensor)
-        return PosedScan(points.astype(np.float32), pose)
-
-    def find(self, cloud: SeenCloud) -> NoTransformError | None:
-        """Return why the pose of a cloud is not known; None if it is."""
-        times = np.array([cloud.first_ns, cloud.last_ns], np.int64)
-        try:
-            self.frames.poses(self.target, cloud.frame, times)
-        except NoTransformError as error:
-            return error
-        return None
-
-
-def choose_poses(
-    content: RosContent, clouds: Sequence[SeenCloud], options: ReadingOptions
-) -> PoseSource | None:
-    """Return the source that places the most clouds; None if there is no pose at all.
-
-    Raises:
-        ToolError: the source that was asked for does not exist.
-    """
-    for transform in options.transforms:
-        content.frames.add(transform)
-    frame = clouds[0].frame
-    names = [TF, *content.poses]
-    if options.poses is not None:
-        if options.poses not in names:
-            raise ToolError(
-                f"--poses {options.poses}: there are no such poses, only {', '.join(names)}"
-            )
-        names = [options.poses]
-    sources = [
-        _of_tf(content.frames, frame, options)
-        if name == TF
-        else _of_topic(content, name, frame, options)
-        for name in names
-    ]
-    # Transforms that always hold are no poses.
-    moving = [source for source in sources if source.frames.moves(source.target, source.body)]
-
-    def merit(source: PoseSource) -> tuple[int, bool]:
-        placed = sum(source.find(cloud) is None for cloud in clouds)
-        return placed, source.target in ROOT_NAMES
-
-    return max(moving, key=merit, default=None)
-
-
-def _of_tf(frames: FrameTree, frame: str, options: ReadingOptions) -> PoseSource:
-    """Return all transforms. If they do not reach the sensor, finding a cloud says so."""
-    body = frame
-    if not frames.moves(frames.root(frame), frame):
-        body = options.body_frame or next(iter(frames.moving), frame)
-    return PoseSource(TF, frames, options.map_frame or frames.fixed_frame(body), body)
-
-
-def _of_topic(content: RosContent, topic: str, frame: str, options: ReadingOptions) -> PoseSource:
-    """Return the poses of a topic, in the tree of all transforms but those that say the same."""
-    poses = content.poses[topic]
-    # Where a topic does not name the body, it is what the sensor is fixed to.
-    body = options.body_frame or poses.child or content.frames.root(frame)
-    frames = content.frames.with_track(poses.parent, body, poses.track)
-    target = options.map_frame or frames.fixed_frame(body)
-    assumed = not (options.body_frame or poses.child)
-    return PoseSource(topic, frames, target, body, assumed=assumed)
 
 
 class RosRecording:
@@ -151,14 +80,18 @@ class RosRecording:
             ToolError: it is damaged, or does not hold what ``options`` ask for.
         """
         self._bag = bag
-        self._reader = MessageReader(stride=options.stride, by_arrival=options.recorder_clock)
-        self._content = RosContent(bag, self._reader)
+        self._reader = MessageReader(
+            options.stride, deskew=options.deskew, by_arrival=options.recorder_clock
+        )
+        self._content = RosContent(bag, self._reader, options.poses)
         self._topics = _chosen_topics(self._content, options)
         self._options = options
         self._poses: PoseSource | None = None
         self._placed: list[SeenCloud] = []
         self._left_out: dict[tuple[str, str], list[SeenCloud]] = defaultdict(list)
         self._place_clouds()
+        if self._poses is not None and options.map_frame is None:
+            check_places(self._placed, self._poses)
 
     @property
     def entries(self) -> Sequence[ScanEntry]:
@@ -174,7 +107,11 @@ class RosRecording:
     def remarks(self) -> Sequence[str]:
         """The problems: what is left out and why, and what to do about it, a line each."""
         found = self._content
-        lines = [_MISSING.format(count=found.missing)] if found.missing > 0 else []
+        lines = [*self._bag.remarks]
+        lines += [_MISSING.format(count=found.missing)] if found.missing > 0 else []
+        if found.foreign:
+            others = ", ".join(f"{topic} ({what})" for topic, what in found.foreign.items())
+            lines.append(f"left out, since they are not encoded as messages of ROS: {others}")
         if not found.clouds:
             return [*lines, _NO_CLOUDS]
         lines += [
@@ -183,6 +120,11 @@ class RosRecording:
         ]
         if self._poses is not None and self._poses.assumed:
             lines.append(_ASSUMED.format(topic=self._poses.name, body=self._poses.body))
+        if self._poses is not None:
+            frames, target = self._poses.frames, self._poses.target
+            sensors = dict.fromkeys(cloud.frame for cloud in self._placed)
+            corrected = (frames.corrections(target, frame) for frame in sensors)
+            lines += dict.fromkeys(line for each in corrected for line in each)
         return [*lines, *(self._left_out_line(*key) for key in self._left_out)]
 
     def read(self, indices: Sequence[int]) -> Iterator[PosedScan]:
@@ -194,9 +136,10 @@ class RosRecording:
         wanted = {(self._placed[i].topic, self._placed[i].number) for i in indices}
         topics = {topic for topic, _ in wanted}
         numbers: Counter[str] = Counter()
-        for message in self._bag.messages(lambda connection: connection.topic in topics):
-            key = message.topic, numbers[message.topic]
-            numbers[message.topic] += 1
+        for message in self._bag.messages(lambda channel: channel.topic in topics):
+            topic = message.channel.topic
+            key = topic, numbers[topic]
+            numbers[topic] += 1
             if key in wanted:
                 wanted.discard(key)
                 yield self._read(message)
@@ -208,19 +151,20 @@ class RosRecording:
 
     def _read(self, message: Message) -> PosedScan:
         assert self._poses is not None
-        decoded, came_ns = message.decoded(), message.recorded_ns
+        topic, kind = message.channel.topic, message.channel.kind
         try:
-            sweep = self._reader.sweep(message.topic, message.kind, decoded, came_ns)
+            sweep = self._reader.sweep(topic, kind, message.decoded(), message.recorded_ns)
             scan = place(sweep, self._poses.frames, self._poses.target)
             stands = self._options.points_in == WORLD and not self._poses.moves(sweep.frame)
             return self._poses.seen(scan, sweep) if stands else scan
         except NoScanError as error:
-            raise ToolError(f"{self._bag.path}: a message on {message.topic}: {error}") from error
+            raise ToolError(f"{self._bag.path}: a message on {topic}: {error}") from error
 
     def _place_clouds(self) -> None:
         """Choose the poses, and find out which clouds they place."""
         clouds = [cloud for cloud in self._content.clouds if cloud.topic in self._topics]
         good = [cloud for cloud in clouds if cloud.problem is None]
+        check_times(good)
         if good:
             self._poses = choose_poses(self._content, good, self._options)
         newest_ns: dict[str, int] = {}
@@ -272,23 +216,32 @@ class RosRecording:
             poses = found.poses[topic]
             frames = {f"{poses.parent} > {poses.child or '?'}"}
         frame = ", ".join(sorted(frames))
-        return Stream(topic, found.kinds[topic], found.counts[topic], self._use(topic), frame)
+        use, count = self._use(topic), found.counts[topic]
+        first_ns, last_ns = found.spans_ns.get(topic, (0, 0))
+        if last_ns > first_ns:
+            use += f", {(count - 1) / (last_ns - first_ns) * 1e9:.1f} Hz"
+        return Stream(topic, found.kinds[topic], count, use, frame)
 
     def _use(self, topic: str) -> str:
         """Return what a topic is used for."""
         placed = sum(each.topic == topic for each in self._placed)
         if placed:
-            return f"{placed} scans, source {source_of_topic(topic)}"
+            notes = Counter(each.note for each in self._placed if each.topic == topic)
+            words = [note for note, _ in notes.most_common(2) if note]
+            return ", ".join([f"{placed} scans", f"source {source_of_topic(topic)}", *words])
         chosen = self._poses.name if self._poses else ""
-        match self._content.kinds[topic]:
-            case type_store.TF | type_store.TF_OF_ROS_1:
-                return "the poses" if chosen == TF else "where sensors sit"
-            case type_store.ODOMETRY | type_store.POSE:
-                return "the poses" if chosen == topic else f"other poses: --poses {topic}"
-            case type_store.CAMERA_INFO:
-                return "a camera"
+        kind = self._content.kinds[topic]
+        if kind in TRANSFORMS:
+            return "the poses" if chosen == TF else "where sensors sit"
+        if kind in type_store.POSES:
+            return "the poses" if chosen == topic else f"other poses: --poses {topic}"
+        if kind == type_store.CAMERA_INFO:
+            return "a camera"
+        if topic in self._content.foreign:
+            return f"not read: {self._content.foreign[topic]}, not a message of ROS"
         if not any(cloud.topic == topic for cloud in self._content.clouds):
-            return "not used"
+            is_raw = "Pack" in kind or "Scan" in kind
+            return _PACKETS.get(kind.partition("/")[0], "not used") if is_raw else "not used"
         return "none can be placed" if topic in self._topics else f"other scans: --topics {topic}"
 
 
@@ -309,5 +262,6 @@ def _chosen_topics(found: RosContent, options: ReadingOptions) -> set[str]:
         return set(options.topics)
     # A cloud in a frame that stands still is no scan, but a map made of scans.
     scans = {cloud.topic for cloud in found.clouds if cloud.frame not in ROOT_NAMES} or there
-    clouds = {topic for topic in scans if found.kinds[topic] == type_store.POINT_CLOUD}
-    return clouds or scans
+    clouds = {topic for topic in scans if found.kinds[topic] not in type_store.IMAGES}
+    # Of an image that was recorded twice, as it is and compressed, the first is enough.
+    return clouds or {each for each in scans if raw_topic(each) not in scans - {each}}

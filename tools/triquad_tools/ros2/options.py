@@ -12,10 +12,9 @@ from triquad_tools.ros2.topics import Topic, bridge_key, rmw_key
 from triquad_tools.sensors.ros.depth_camera import camera_topic
 from triquad_tools.sensors.ros.type_store import (
     CAMERA_INFO,
-    IMAGE,
-    ODOMETRY,
-    POINT_CLOUD,
-    POSE,
+    CLOUDS,
+    IMAGES,
+    POSES,
     TF,
 )
 
@@ -42,12 +41,12 @@ class Role(Enum):
 
 
 TYPES: dict[Role, tuple[str, ...]] = {
-    Role.CLOUD: (POINT_CLOUD,),
-    Role.DEPTH: (IMAGE,),
+    Role.CLOUD: CLOUDS,
+    Role.DEPTH: IMAGES,
     Role.CAMERA_INFO: (CAMERA_INFO,),
     Role.TF: (TF,),
     Role.TF_STATIC: (TF,),
-    Role.POSE: (ODOMETRY, POSE),
+    Role.POSE: POSES,
 }
 """The types that messages may have."""
 
@@ -59,6 +58,7 @@ class Feed:
     role: Role
     key: str
     topic_name: str | None  # None: each key of rmw_zenoh names its own
+    type_name: str = ""  # where it is known
 
 
 @dataclass(frozen=True)
@@ -95,18 +95,20 @@ class TopicChoice:
         for role, names in self._names().items():
             for name in names:
                 for type_name in TYPES[role]:
-                    yield Feed(role, rmw_key(self.domain, Topic(name, type_name)), name)
+                    key = rmw_key(self.domain, Topic(name, type_name))
+                    yield Feed(role, key, name, type_name)
                 yield Feed(role, bridge_key(name), name)
         if self.takes_any_cloud:
-            anywhere = Topic(f"{self.prefix}/**", POINT_CLOUD)
-            yield Feed(Role.CLOUD, rmw_key(self.domain, anywhere), None)
+            for type_name in TYPES[Role.CLOUD]:
+                anywhere = Topic(f"{self.prefix}/**", type_name)
+                yield Feed(Role.CLOUD, rmw_key(self.domain, anywhere), None, type_name)
 
     def wants(self, topic: Topic) -> Role | None:
         """Return the role of a topic that was found."""
         for role, names in self._names().items():
             if topic.name in names and topic.type_name in TYPES[role]:
                 return role
-        is_cloud = topic.type_name == POINT_CLOUD and topic.name.startswith(f"{self.prefix}/")
+        is_cloud = topic.type_name in TYPES[Role.CLOUD] and topic.name.startswith(f"{self.prefix}/")
         return Role.CLOUD if is_cloud and self.takes_any_cloud else None
 
     def _names(self) -> dict[Role, tuple[str, ...]]:

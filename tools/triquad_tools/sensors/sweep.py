@@ -16,6 +16,7 @@ class Sweep:
     frame: str  # of the sensor, as frames are named in ROS: no leading slash
     stamp_ns: int  # nanoseconds since 1970
     offsets_s: Doubles | None = None  # [N] seconds after the stamp at which each was measured
+    note: str = ""  # how it was read, for a user
 
     @property
     def span_ns(self) -> tuple[int, int]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.sensors.point_times import TIME_FIELDS
+from triquad_tools.sensors.point_times import time_fields
 
 KITTI_COLUMNS = ("x", "y", "z", "intensity")
 """Those of a ``.bin`` of which nothing else is said."""
@@ -117,7 +117,7 @@ def read_points(path: Path, columns: Sequence[str] = KITTI_COLUMNS) -> FilePoint
         raise ToolError(
             f"{path}: is truncated: it holds {len(points):,} of {rows:,} points; copy it again"
         )
-    time = next((name for name in TIME_FIELDS if name in found), None)
+    time = next(iter(time_fields(found)), None)
     return FilePoints(points, None if time is None else np.asarray(found[time]).ravel())
 
 

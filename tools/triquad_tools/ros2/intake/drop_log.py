@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 
 from triquad_tools.ros2.options import TopicChoice
 from triquad_tools.ros2.topics import Topic
-from triquad_tools.sensors.ros.type_store import IMAGE, POINT_CLOUD
+from triquad_tools.sensors.ros.type_store import CLOUDS, IMAGES
 
 _log = logging.getLogger("triquad_ros2")
 
@@ -33,7 +33,7 @@ REMEDIES = {
 
 AFTER_S = 10.0
 _MOST_LISTED = 20
-_USABLE = (POINT_CLOUD, IMAGE)
+_USABLE = (*CLOUDS, *IMAGES)
 
 
 class DropLog:

@@ -27,9 +27,9 @@ from triquad_tools.ros2.node import Node
 from triquad_tools.ros2.options import TYPES, BridgeOptions, Role
 from triquad_tools.ros2.topics import SequenceGaps
 from triquad_tools.sensors.ray_check import RayCheck
+from triquad_tools.sensors.ros.from_bytes import decode_cdr
 from triquad_tools.sensors.ros.header import source_of_topic
 from triquad_tools.sensors.ros.message_reader import MessageReader
-from triquad_tools.sensors.ros.type_store import decode_cdr
 from triquad_tools.sensors.sweep import NoScanError, PosedScan, Sweep
 
 _log = logging.getLogger("triquad_ros2")
@@ -50,6 +50,7 @@ _OTHERS_UNREAD = QueueLimits(4096, 16_000_000)  # 4 s of transforms at 1 kHz
 _WAITING_BYTES = 512_000_000  # of sweeps that wait for their transforms
 _TICK_S = 0.2
 _SETTING = "which the setting ray_origin_m of its source has to tell the server (docs/server.md)"
+_PATH_POSES = 100  # of a path, whose messages have all of them again and again
 
 
 @dataclass(frozen=True)
@@ -128,12 +129,13 @@ class Intake:
         self._start = Place(frame, np.zeros(3), stamp_ns=0) if frame else None
         self.drops = DropLog()
         self.scans = ScanPublisher(client)
-        self._motion = Motion(from_topic=options.topics.poses is not None)
+        self._motion = Motion(from_topic=options.topics.poses is not None, map_frame=frame)
         self._reader = MessageReader(
             stride=options.depth_stride,
             body_frame=options.body_frame,
             by_arrival=options.clock == "arrival",
             max_points=MAX_POINTS,
+            path_poses=_PATH_POSES,
         )
         self._placement = Placement(
             self._motion, map_frame=frame, max_bytes=_WAITING_BYTES, timeout_s=options.wait_s
@@ -257,7 +259,7 @@ def _decoded(arrival: Arrival) -> tuple[str, Any]:
         NoScanError: it has none of the types of its role.
     """
     payload = arrival.payload.to_bytes()
-    *others, last = TYPES[arrival.role]
+    *others, last = (arrival.type_name,) if arrival.type_name else TYPES[arrival.role]
     for kind in others:
         with suppress(NoScanError):
             return kind, decode_cdr(payload, kind)

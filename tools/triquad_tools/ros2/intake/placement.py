@@ -28,9 +28,9 @@ _CHOICE_S = 1.0
 class Motion:
     """Keeps the transforms that count, within limits: their names come from the network."""
 
-    def __init__(self, *, from_topic: bool) -> None:
+    def __init__(self, *, from_topic: bool, map_frame: str = "") -> None:
         """With ``from_topic``, only a topic of poses gives the motion of the robot's body."""
-        self.frames = FrameTree(_POSES_KEPT)
+        self.frames = FrameTree(_POSES_KEPT, map_frame)
         self.body_parent: str | None = None  # in which frame that topic has the body
         self._from_topic = from_topic
         self._body: str | None = None
@@ -41,7 +41,7 @@ class Motion:
         Raises:
             NoScanError: one of them is of no use; the others were added.
         """
-        if is_body:
+        if is_body and transforms:  # a path may be empty
             self._body, self.body_parent = transforms[0].child, transforms[0].parent
         refusal = None
         for transform in transforms:

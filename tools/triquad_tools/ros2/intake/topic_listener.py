@@ -42,6 +42,7 @@ class Arrival:
     payload: zenoh.ZBytes
     arrived_ns: int  # nanoseconds since 1970, by this machine's clock
     attachment: bytes = b""
+    type_name: str = ""  # where the key or a token tells it
 
     @property
     def nbytes(self) -> int:
@@ -118,6 +119,7 @@ class TopicListener:
         self._closed = False
         self._subscribers: dict[str, Any] = {}  # by key
         self._found: set[Announcement] = set()
+        self._types: dict[str, str] = {}  # of wanted topics that were found
         for feed in self.choice.feeds():
             self._open(feed)
         self._watches = watch_tokens(self.session, self.choice.domain, End.PUBLISHER, self._find)
@@ -154,7 +156,8 @@ class TopicListener:
     def _receive(self, feed: Feed, sample: zenoh.Sample) -> None:
         name = feed.topic_name or rmw_topic_name(str(sample.key_expr))
         attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
-        self.arrived(Arrival(feed.role, name, sample.payload, time.time_ns(), attachment))
+        kind = feed.type_name or self._types.get(name, "")
+        self.arrived(Arrival(feed.role, name, sample.payload, time.time_ns(), attachment, kind))
 
     def _find(self, announcement: Announcement) -> None:
         """Handle a topic that is published."""
@@ -168,6 +171,7 @@ class TopicListener:
             self._found.add(announcement)
         if role is None:
             return
+        self._types[topic.name] = topic.type_name
         _log.info("found %s (%s)", topic.name, topic.type_name)
         if announcement.type_hash == ANY_HASH:
             self._open(Feed(role, bridge_key(topic.name), topic.name))

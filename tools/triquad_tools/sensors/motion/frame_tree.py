@@ -1,118 +1,34 @@
 """The tree of frames that robots report: how frames stand or move in each other over time."""
 
-from array import array
-from bisect import bisect_left
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from triquad_client.pose import Pose, pose_matrices
 from triquad_format.records.arrays import Doubles, Longs
 
+from triquad_tools.sensors.motion.track import MAX_GAP_S, Track
 from triquad_tools.sensors.sweep import NoTransformError
-
-MAX_GAP_S = 2.0
-"""Nothing is interpolated between poses that lie farther apart."""
-
-_WIDTH = 7  # numbers of a pose
-_NEARLY_PARALLEL = 0.9995  # quaternions, of which spherical interpolation would divide by nearly 0
 
 STATIC = None
 """The stamp of a transform that always holds."""
 
+_RIVAL_NS = 10 * 10**9  # after which a parent counts no more, of which nothing was heard since
+_NEARLY_UNIT = 1e-6  # the length of a quaternion that is left as it is
+_MAX_PARENTS = 8  # of a frame, whose names come from the network
+
+_TWO_PUBLISHERS = (
+    "{} from {} jumps to and fro, {} times, by {:.2g} m: two programs publish it; choose the topic "
+    "of one, or other poses, by --poses"
+)
+_CORRECTION = (
+    "{} from {} comes up to {:.1f} s apart: where it moved by no more than drift does, it is taken "
+    "to move evenly between, else to stay as it was until the next"
+)
+
 ROOT_NAMES = ("map", "odom", "world")
 """Frames that stand still, as usual in ROS (REP 105), in order of preference."""
-
-
-class Track:
-    """The poses of a frame in its parent, in the order of their stamps.
-
-    Positions are interpolated on straight lines and rotations on great circles (Shoemake 1985).
-    Nothing is extrapolated.
-    """
-
-    def __init__(self, limit: int | None = None) -> None:
-        """Only the ``limit`` newest poses are kept."""
-        self._limit = limit
-        self._stamps = array("q")
-        self._values = array("d")  # position and unit quaternion of each
-
-    def __len__(self) -> int:
-        return len(self._stamps)
-
-    @property
-    def span_ns(self) -> tuple[int, int]:
-        """The first stamp and the last, of a track that has poses."""
-        return self._stamps[0], self._stamps[-1]
-
-    def add(self, stamp_ns: int, position_m: Doubles, quaternion: Doubles) -> None:
-        """Add a pose, position [3] and unit quaternion [4]; one with the same stamp is replaced."""
-        at = bisect_left(self._stamps, stamp_ns)
-        replaced = at < len(self._stamps) and self._stamps[at] == stamp_ns
-        if not replaced:
-            self._stamps.insert(at, stamp_ns)
-        end = at + 1 if replaced else at
-        self._values[_WIDTH * at : _WIDTH * end] = array("d", [*position_m, *quaternion])
-        if self._limit is not None and len(self._stamps) > self._limit:
-            del self._stamps[0], self._values[:_WIDTH]
-
-    def poses(self, stamps_ns: Longs) -> Doubles:
-        """Return poses [M, 4, 4] at times [M].
-
-        Raises:
-            NoTransformError: a time lies before the first pose, after the last, or in a gap.
-        """
-        self._check_covered(stamps_ns)
-        stamps, values = self._around(int(stamps_ns.min()), int(stamps_ns.max()))
-        after = np.clip(np.searchsorted(stamps, stamps_ns), 1, len(stamps) - 1)
-        if len(stamps) == 1:
-            after = np.zeros_like(after)
-        before = np.maximum(after - 1, 0)
-        self._check_gaps(stamps_ns, stamps[before], stamps[after])
-        span = np.maximum(stamps[after] - stamps[before], 1)
-        share = ((stamps_ns - stamps[before]) / span)[:, None]
-        first, second = values[before], values[after]
-        positions = first[:, :3] + share * (second[:, :3] - first[:, :3])
-        return pose_matrices(positions, _slerp(first[:, 3:], second[:, 3:], share))
-
-    def _around(self, first_ns: int, last_ns: int) -> tuple[Longs, Doubles]:
-        """Return stamps [K] and values [K, 7] of the poses between two times, and around them."""
-        low = max(0, bisect_left(self._stamps, first_ns) - 1)
-        high = bisect_left(self._stamps, last_ns) + 1
-        values = np.array(self._values[_WIDTH * low : _WIDTH * high], np.float64)
-        return np.array(self._stamps[low:high], np.int64), values.reshape(-1, _WIDTH)
-
-    def _check_covered(self, stamps_ns: Longs) -> None:
-        if not self._stamps:
-            raise NoTransformError("no_poses", "there are no poses", late=True)
-        first, last = self.span_ns
-        if stamps_ns.max() > last:
-            late_s = (int(stamps_ns.max()) - last) / 1e9
-            raise NoTransformError("pose_late", f"{late_s:.3g} s after the last pose", late=True)
-        if stamps_ns.min() < first:
-            early_s = (first - int(stamps_ns.min())) / 1e9
-            raise NoTransformError("pose_early", f"{early_s:.3g} s before the first pose")
-
-    @staticmethod
-    def _check_gaps(stamps_ns: Longs, before: Longs, after: Longs) -> None:
-        between = (stamps_ns != before) & (stamps_ns != after)
-        gaps_s = np.where(between, after - before, 0) / 1e9
-        if gaps_s.max() > MAX_GAP_S:
-            raise NoTransformError(
-                "pose_gap", f"between two poses {gaps_s.max():.3g} s apart (at most {MAX_GAP_S:g})"
-            )
-
-
-def _slerp(first: Doubles, second: Doubles, share: Doubles) -> Doubles:
-    """Interpolate between unit quaternions [M, 4], by the shorter way."""
-    cosine = (first * second).sum(axis=1, keepdims=True)
-    second = np.where(cosine < 0, -second, second)
-    cosine = np.abs(cosine)
-    angle = np.arccos(np.minimum(cosine, _NEARLY_PARALLEL))
-    of_first = np.where(cosine < _NEARLY_PARALLEL, np.sin((1 - share) * angle), 1 - share)
-    of_second = np.where(cosine < _NEARLY_PARALLEL, np.sin(share * angle), share)
-    between = of_first * first + of_second * second
-    turned: Doubles = between / np.linalg.norm(between, axis=1, keepdims=True)
-    return turned
 
 
 @dataclass(frozen=True)
@@ -124,36 +40,64 @@ class Transform:
     stamp_ns: int | None  # nanoseconds since 1970, or STATIC
     pose: Pose
 
+    def numbers(self) -> tuple[Sequence[float], Sequence[float]]:
+        """Return the position [3] and the unit quaternion [4].
+
+        Raises:
+            InvalidScanError: its pose is none.
+        """
+        position, turn = self.pose.position_m, self.pose.quaternion_xyzw
+        if (
+            isinstance(position, tuple)  # as transforms come, a thousand a second
+            and isinstance(turn, tuple)
+            and abs(math.hypot(*turn) - 1) < _NEARLY_UNIT
+            and math.isfinite(sum(position))
+        ):
+            return position, turn
+        checked = self.pose.numbers()
+        return checked[0].tolist(), checked[1].tolist()
+
 
 @dataclass
 class _Edge:
-    """The edge from a frame to its parent."""
+    """The edge from a frame to a parent."""
 
     parent: str
     standing: Doubles | None  # [4, 4] where it always holds
     track: Track
+    count: int = 0  # of transforms
+    problem: str | None = None  # "" where its poses were checked and are those of one publisher
+
+    @property
+    def text(self) -> str:
+        """What it is, for a user."""
+        return f"{self.parent} ({self.count} times{', static' * (self.standing is not None)})"
 
 
 class FrameTree:
     """Transforms over time, and the poses of a frame in another.
 
-    As in tf2 a frame has one parent: a transform to another one replaces what was known of it.
+    A frame has one parent. Where transforms name several, ``wanted`` may decide, which is one of
+    them or a frame above one; else a pose that depends on it is refused.
     """
 
-    def __init__(self, limit: int | None = None) -> None:
+    def __init__(self, limit: int | None = None, wanted: str = "") -> None:
         """Only the ``limit`` newest poses of each frame are kept."""
         self._limit = limit
-        self._edges: dict[str, _Edge] = {}
+        self.wanted = wanted
+        self._edges: dict[str, dict[str, _Edge]] = {}  # by child and by parent
 
     @property
     def frames(self) -> list[str]:
         """The names of all frames."""
-        return sorted({*self._edges, *(edge.parent for edge in self._edges.values())})
+        parents = (parent for edges in self._edges.values() for parent in edges)
+        return sorted({*self._edges, *parents})
 
     @property
     def moving(self) -> list[str]:
         """The names of the frames of which it was reported that they move in their parent."""
-        return sorted(name for name, edge in self._edges.items() if edge.standing is None)
+        edges = ((name, self._edge(name)) for name in self._edges)
+        return sorted(name for name, edge in edges if edge and edge.standing is None)
 
     def add(self, transform: Transform) -> None:
         """Add a transform.
@@ -161,28 +105,48 @@ class FrameTree:
         Raises:
             InvalidScanError: its pose is none.
         """
-        if transform.child == transform.parent:
+        parent, child, stamp_ns = transform.parent, transform.child, transform.stamp_ns
+        if child == parent:
             return
-        position, quaternion = transform.pose.numbers()
-        edge = self._edges.get(transform.child)
-        if edge is None or edge.parent != transform.parent:
-            edge = _Edge(transform.parent, None, Track(self._limit))
-            self._edges[transform.child] = edge
-        if transform.stamp_ns is STATIC:
-            edge.standing = pose_matrices(position, quaternion)
-        else:
-            edge.standing = None
-            edge.track.add(transform.stamp_ns, position, quaternion)
+        position, quaternion = transform.numbers()
+        edges = self._edges.setdefault(child, {})
+        edge = edges.get(parent)
+        if edge is None:
+            edge = edges[parent] = _Edge(parent, None, Track(self._limit))
+        edge.count += 1
+        if stamp_ns is STATIC:
+            edge.standing = pose_matrices(np.array(position), np.array(quaternion))
+            return
+        edge.standing = None
+        edge.track.add(stamp_ns, position, quaternion)
+        if self._limit is not None and len(edges) > 1:
+            self._forget_rivals(edges, stamp_ns)
+
+    def _forget_rivals(self, edges: dict[str, _Edge], stamp_ns: int) -> None:
+        """Remove parents that nothing was heard of for a while, and the first of very many."""
+        for rival in list(edges.values()):
+            old = rival.standing is None and rival.track.span_ns[1] < stamp_ns - _RIVAL_NS
+            if old or len(edges) > _MAX_PARENTS:
+                del edges[rival.parent]
 
     def with_track(self, parent: str, child: str, track: Track) -> "FrameTree":
         """Return a tree that differs in where ``child`` is, and else shares what this one knows."""
-        tree = FrameTree(self._limit)
-        tree._edges = {**self._edges, child: _Edge(parent, None, track)}
+        tree = FrameTree(self._limit, self.wanted)
+        tree._edges = {**self._edges, child: {parent: _Edge(parent, None, track)}}
         return tree
+
+    def check(self) -> None:
+        """Find out which poses two programs publish, so that they are refused from now on."""
+        for child, edges in self._edges.items():
+            for edge in edges.values():
+                if edge.problem is None and edge.standing is None:
+                    count, metres = edge.track.jumps()
+                    told = _TWO_PUBLISHERS.format(edge.parent, child, count, metres)
+                    edge.problem = told if count else ""
 
     def newest_ns(self, child: str) -> int | None:
         """Return the stamp of the newest pose of a frame that moves in its parent."""
-        edge = self._edges.get(child)
+        edge = self._edge(child)
         is_moving = edge is not None and edge.standing is None and len(edge.track) > 0
         return edge.track.span_ns[1] if edge is not None and is_moving else None
 
@@ -224,31 +188,88 @@ class FrameTree:
 
     def moves(self, target: str, frame: str) -> bool:
         """Return whether it was ever reported that ``frame`` moves in ``target``."""
-        up, down = self._path(frame), self._path(target)
-        between = {*up} ^ {*down}
-        return any(name in self._edges and self._edges[name].standing is None for name in between)
+        between = {*self._path(frame)} ^ {*self._path(target)}
+        edges = [self._edge(name) for name in between]
+        return any(edge is not None and edge.standing is None for edge in edges)
 
-    def _path(self, frame: str) -> list[str]:
+    def corrections(self, target: str, frame: str) -> list[str]:
+        """Return what was done with rare transforms between two frames, as remarks."""
+        path = self._path(frame)
+        path = path[: path.index(target)] if target in path else []
+        return [
+            _CORRECTION.format(edge.parent, child, edge.track.longest_gap_s)
+            for child, edge, corrects in self._steps(path)
+            if corrects and edge.track.longest_gap_s > MAX_GAP_S
+        ]
+
+    def _path(self, frame: str, below: frozenset[str] = frozenset()) -> list[str]:
         """Return the frame, its parent, and so on up to the root."""
         path = [frame]
-        while (edge := self._edges.get(path[-1])) is not None and edge.parent not in path:
+        while (edge := self._edge(path[-1], below.union(path))) is not None:
+            if edge.parent in path or edge.parent in below:
+                break
             path.append(edge.parent)
         return path
+
+    def _edge(self, child: str, below: frozenset[str] = frozenset()) -> _Edge | None:
+        """Return the edge to the parent of a frame; of several that remain, the one added last."""
+        return next(reversed(self._possible(child, below)), None)
+
+    def _possible(self, child: str, below: frozenset[str] = frozenset()) -> list[_Edge]:
+        """Return the edges to the parents of a frame between which nothing decides."""
+        edges = list(self._edges.get(child, {}).values())
+        if len(edges) < 2:
+            return edges
+        above = {edge.parent: self._path(edge.parent, below | {child}) for edge in edges}
+
+        def moves(edge: _Edge) -> bool:
+            """Where nothing moves, it tells no motion, and is never used."""
+            over = [self._edge(name, below | {child}) for name in above[edge.parent]]
+            return any(e is not None and e.standing is None for e in (edge, *over))
+
+        for fits in (
+            lambda edge: edge.parent == self.wanted,
+            lambda edge: self.wanted in above[edge.parent],
+            moves,
+        ):
+            edges = [edge for edge in edges if fits(edge)] or edges
+        return edges
+
+    def _steps(self, path: list[str]) -> Iterator[tuple[str, _Edge, bool]]:
+        """Yield the edges up a path, and whether each only corrects the motion below it."""
+        below: Track | None = None
+        for child in path:
+            edge = self._edge(child)
+            assert edge is not None
+            corrects = edge.standing is None and below is not None and edge.track.corrects(below)
+            yield child, edge, corrects
+            if edge.standing is None and not corrects:
+                below = edge.track
 
     def _climb(self, path: list[str], stamps_ns: Longs) -> Doubles:
         """Return poses of the first frame of a path in the parent of the last."""
         poses = np.broadcast_to(np.eye(4), (len(stamps_ns), 4, 4))
-        for child in path:
-            edge = self._edges[child]
+        for child, edge, corrects in self._steps(path):
+            self._check_single(child, edge)
             if edge.standing is not None:
                 poses = edge.standing @ poses
                 continue
             try:
-                poses = edge.track.poses(stamps_ns) @ poses
+                poses = edge.track.poses(stamps_ns, corrects=corrects) @ poses
             except NoTransformError as error:
                 text = f"{edge.parent} from {child}: {error}"
                 raise NoTransformError(error.reason, text, late=error.late) from None
         return np.array(poses)
+
+    def _check_single(self, child: str, edge: _Edge) -> None:
+        possible = self._possible(child)
+        if len(possible) > 1 and any(each.standing is None for each in possible):
+            parents = " and ".join(each.text for each in possible)
+            choice = " or ".join(f"--map-frame {each.parent}" for each in possible)
+            text = f"transforms say where {child} is in {parents}: choose by {choice}"
+            raise NoTransformError("two_parents", text)
+        if edge.problem:
+            raise NoTransformError("two_publishers", edge.problem)
 
     def _unconnected(self, target: str, frame: str) -> NoTransformError:
         if frame not in self.frames:

@@ -1,5 +1,8 @@
 """Depth images as ROS has them: ``sensor_msgs/Image`` with its ``CameraInfo``."""
 
+import re
+import struct
+from io import BytesIO
 from typing import Any
 
 import numpy as np
@@ -7,56 +10,110 @@ from numpy.typing import NDArray
 from triquad_client.depth_image import Intrinsics, depth_points
 from triquad_client.errors import InvalidScanError
 
+from triquad_tools.sensors.lens import LensCamera, lens_camera
 from triquad_tools.sensors.ros.header import frame_name, stamp_ns
 from triquad_tools.sensors.sweep import NoScanError, Sweep
 
 _ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+_COMPRESSED_HEADER = struct.Struct("<iff")  # of compressedDepth: format, quantisation A and B
 
 
-def is_depth(encoding: str) -> bool:
-    """Return whether images of this encoding hold depth."""
-    return encoding in _ENCODINGS
+def holds_depth(image: Any) -> bool:
+    """Return whether an ``Image`` or a ``CompressedImage`` holds depth."""
+    return _encoding(image) in _ENCODINGS
+
+
+def _encoding(image: Any) -> str:
+    text = image.format if hasattr(image, "format") else image.encoding
+    return str(text).partition(";")[0].strip()
+
+
+def raw_topic(image_topic: str) -> str:
+    """Return the name of an image's topic without that of the way in which it is compressed."""
+    return re.sub("/(compressedDepth|compressed)$", "", image_topic)
 
 
 def camera_topic(image_topic: str) -> str:
     """Return where the ``CameraInfo`` of an image is published: next to it, as usual in ROS."""
-    return image_topic.rpartition("/")[0] + "/camera_info"
+    return raw_topic(image_topic).rpartition("/")[0] + "/camera_info"
 
 
-def intrinsics_of(info: Any) -> Intrinsics:
-    """Return the camera of a ``CameraInfo``, for the rectified image.
+def camera_of(info: Any, image_topic: str) -> Intrinsics:
+    """Return the camera of a ``CameraInfo`` for the images of a topic.
+
+    Those of a topic such as ``image_rect`` are rectified; others have the distortion of the lens.
 
     Raises:
-        NoScanError: it is not calibrated.
+        NoScanError: it is not calibrated, or its distortion is not understood.
     """
     # ROS 1 writes these names in upper case.
     projection = np.asarray(info.p if hasattr(info, "p") else info.P, np.float64).reshape(3, 4)
     matrix = np.asarray(info.k if hasattr(info, "k") else info.K, np.float64).reshape(3, 3)
-    if projection[0, 0] > 0:
+    values = tuple(map(float, info.d if hasattr(info, "d") else info.D))
+    is_rectified = "rect" in raw_topic(image_topic).rpartition("/")[2]
+    if projection[0, 0] > 0 and (is_rectified or matrix[0, 0] == 0):
         matrix = projection[:, :3]
     try:
-        return Intrinsics.from_matrix(matrix)
+        camera = Intrinsics.from_matrix(matrix)
     except InvalidScanError as error:
         raise NoScanError("intrinsics", f"CameraInfo: {error}; calibrate the camera") from error
+    if is_rectified or not any(values):
+        return camera
+    return lens_camera(camera, info.distortion_model, values, info.height, info.width)
 
 
-def sweep_of_depth(image: Any, info: Any, stride: int = 1) -> Sweep:
-    """Return the sweep of a depth image, in the camera's optical frame.
+def sweep_of_depth(image: Any, info: Any, topic: str = "", stride: int = 1) -> Sweep:
+    """Return the sweep of a depth image, compressed or not, in the camera's optical frame.
 
     Raises:
         NoScanError: it is no depth image, or does not fit to ``info``.
     """
-    if (image.width, image.height) != (info.width, info.height):
-        raise NoScanError(
-            "intrinsics",
-            f"the depth image has {image.width} x {image.height} pixels and its CameraInfo "
-            f"{info.width} x {info.height}: use the CameraInfo of the depth camera",
-        )
+    pixels = _decompressed(image, info) if hasattr(image, "format") else _pixels(image)
+    rows, columns = pixels.shape
+    _check_size(columns, rows, info)
+    camera = camera_of(info, topic)
     try:
-        points = depth_points(_pixels(image), intrinsics_of(info), stride)
+        points = depth_points(pixels, camera, stride)
     except InvalidScanError as error:
         raise NoScanError("depth", str(error)) from error
-    return Sweep(points, frame_name(image.header.frame_id), stamp_ns(image.header))
+    note = f"camera {camera_topic(topic)}"
+    if isinstance(camera, LensCamera):
+        points, note = points[np.isfinite(points).all(axis=1)], f"{note}, {camera.note}"
+    return Sweep(points, frame_name(image.header.frame_id), stamp_ns(image.header), note=note)
+
+
+def _check_size(columns: int, rows: int, info: Any) -> None:
+    if (columns, rows) != (info.width, info.height):
+        raise NoScanError(
+            "intrinsics",
+            f"the depth image has {columns} x {rows} pixels and its CameraInfo "
+            f"{info.width} x {info.height}: use the CameraInfo of the depth camera",
+        )
+
+
+def _decompressed(image: Any, info: Any) -> NDArray[Any]:
+    """Return the pixels [rows, columns] of a PNG, as image_transport compresses depth."""
+    from PIL import Image
+
+    encoding, data = _encoding(image), bytes(image.data)
+    has_header = "compressedDepth" in image.format
+    if encoding not in _ENCODINGS or "rvl" in image.format:
+        raise NoScanError(
+            "encoding",
+            f"the image is {image.format!r}: of compressed ones, depth in PNG is read; record it "
+            "so (parameter format: png), or uncompressed by 'image_transport republish'",
+        )
+    try:
+        with Image.open(BytesIO(data[_COMPRESSED_HEADER.size * has_header :])) as picture:
+            _check_size(picture.width, picture.height, info)  # before it is unpacked
+            pixels = np.asarray(picture).astype(np.uint16)
+        _, a, b = _COMPRESSED_HEADER.unpack_from(data) if has_header else (0, 0.0, 0.0)
+    except (OSError, ValueError, Image.DecompressionBombError, struct.error) as error:
+        raise NoScanError("decode", f"no PNG of depth: {error}") from error
+    if encoding != "32FC1":
+        return pixels
+    with np.errstate(divide="ignore"):  # what is quantised to 0 shows nothing
+        return np.where(pixels == 0, np.nan, a / (pixels - b)).astype(np.float32)
 
 
 def _pixels(image: Any) -> NDArray[Any]:

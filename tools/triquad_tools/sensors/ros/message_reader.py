@@ -1,6 +1,7 @@
 """Messages of ROS, recorded or as they arrive, turned into sweeps and transforms."""
 
 import math
+import sys
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -10,7 +11,14 @@ from triquad_tools.sensors.motion.frame_tree import STATIC, Transform
 from triquad_tools.sensors.ros.depth_camera import camera_topic, sweep_of_depth
 from triquad_tools.sensors.ros.header import frame_name, stamp_ns
 from triquad_tools.sensors.ros.point_cloud import sweep_of_cloud
-from triquad_tools.sensors.ros.type_store import ODOMETRY, POINT_CLOUD, POSE
+from triquad_tools.sensors.ros.type_store import (
+    ODOMETRY,
+    PATH,
+    POINT_CLOUD,
+    POSE,
+    TRANSFORM,
+    TRANSFORMS,
+)
 from triquad_tools.sensors.sweep import NoScanError, Sweep
 
 
@@ -20,8 +28,10 @@ class MessageReader:
 
     stride: int = 1  # every how many rows and columns of a depth image one is taken
     body_frame: str = ""  # whose poses are those that do not say whose they are
+    deskew: bool = True  # take the sensor's motion out of clouds whose points have times
     by_arrival: bool = False  # stamps are when messages came, not those of their headers
     max_points: float = math.inf  # of a scan; what has more is refused
+    path_poses: int = sys.maxsize  # of a path, the newest that are read
     cameras: dict[str, Any] = field(default_factory=dict)  # CameraInfo by its topic
 
     def sweep(self, topic: str, kind: str, message: Any, came_ns: int) -> Sweep:
@@ -30,13 +40,18 @@ class MessageReader:
         Raises:
             NoScanError: it is none, or has too many points, or its camera is not known.
         """
-        if kind == POINT_CLOUD:
+        if isinstance(message, Sweep):
+            sweep = message
+            self._check_count(len(sweep.points))
+        elif kind == POINT_CLOUD:
             self._check_count(message.width * message.height)
             sweep = sweep_of_cloud(message)
         else:
-            stride = self.stride
-            self._check_count(-(-message.width // stride) * -(-message.height // stride))
-            sweep = sweep_of_depth(message, self._camera(camera_topic(topic)), stride)
+            stride, info = self.stride, self._camera(camera_topic(topic))
+            self._check_count(-(-info.width // stride) * -(-info.height // stride))
+            sweep = sweep_of_depth(message, info, topic, stride)
+        if sweep.offsets_s is not None and not self.deskew:
+            sweep = replace(sweep, offsets_s=None, note="point times are not used")
         return replace(sweep, stamp_ns=came_ns) if self.by_arrival else sweep
 
     def transforms(
@@ -52,17 +67,20 @@ class MessageReader:
         return [replace(each, stamp_ns=came_ns) for each in found] if self.by_arrival else found
 
     def _transforms(self, kind: str, message: Any) -> list[Transform]:
+        if kind in TRANSFORMS:
+            return list(message)
+        if kind == TRANSFORM:
+            moved = message.transform
+            return [_transform(message, message.child_frame_id, moved.translation, moved.rotation)]
+        if kind == PATH:
+            body = self.body_frame
+            found = [_posed(each, body, each.pose) for each in message.poses[-self.path_poses :]]
+            frame = frame_name(message.header.frame_id)
+            return [replace(each, parent=each.parent or frame) for each in found]
         if kind == POSE:
-            where = message.pose
-            return [_transform(message.header, self.body_frame, where.position, where.orientation)]
-        if kind == ODOMETRY:
-            where, child = message.pose.pose, message.child_frame_id or self.body_frame
-            return [_transform(message.header, child, where.position, where.orientation)]
-        moved = [(each, each.transform) for each in message.transforms]
-        return [
-            _transform(each.header, each.child_frame_id, by.translation, by.rotation)
-            for each, by in moved
-        ]
+            return [_posed(message, self.body_frame, message.pose)]
+        child = message.child_frame_id if kind == ODOMETRY else ""
+        return [_posed(message, child or self.body_frame, message.pose.pose)]
 
     def _camera(self, topic: str) -> Any:
         if topic not in self.cameras:
@@ -83,11 +101,15 @@ class MessageReader:
             )
 
 
-def _transform(header: Any, child: str, position: Any, rotation: Any) -> Transform:
+def _posed(message: Any, child: str, pose: Any) -> Transform:
+    return _transform(message, child, pose.position, pose.orientation)
+
+
+def _transform(message: Any, child: str, position: Any, rotation: Any) -> Transform:
     quaternion = rotation.x, rotation.y, rotation.z, rotation.w
     return Transform(
-        parent=frame_name(header.frame_id),
+        parent=frame_name(message.header.frame_id),
         child=frame_name(child),
-        stamp_ns=stamp_ns(header),
+        stamp_ns=stamp_ns(message.header),
         pose=Pose((position.x, position.y, position.z), quaternion),
     )

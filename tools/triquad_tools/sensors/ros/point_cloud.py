@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Floats
 
-from triquad_tools.sensors.point_times import TIME_FIELDS, offsets_s
+from triquad_tools.sensors.point_times import offsets_s, time_fields
 from triquad_tools.sensors.ros.header import frame_name, stamp_ns
 from triquad_tools.sensors.sweep import NoScanError, Sweep
 
@@ -24,14 +24,16 @@ def sweep_of_cloud(message: Any) -> Sweep:
     _check_layout(message)
     points = _points(message, fields)
     stamp = stamp_ns(message.header)
-    name = next((name for name in TIME_FIELDS if name in fields), None)
-    times = None if name is None else _column(message, fields[name]).reshape(-1)
-    if not np.isfinite(points).all():
-        finite = np.isfinite(points).all(axis=1)
-        points = points[finite]
-        times = None if times is None else times[finite]
-    offsets = None if times is None else offsets_s(times, stamp)
-    return Sweep(points, frame_name(message.header.frame_id), stamp, offsets)
+    finite = np.isfinite(points)
+    kept = slice(None) if finite.all() else finite.all(axis=1)
+    offsets, note = None, "no point times: motion is not taken out"
+    for name in time_fields(fields):
+        times = _column(message, fields[name]).reshape(-1)
+        offsets = offsets_s(times[kept], stamp, name)
+        if offsets is not None:
+            note = f"point times: {name}, {np.ptp(offsets):.1g} s"
+            break
+    return Sweep(points[kept], frame_name(message.header.frame_id), stamp, offsets, note)
 
 
 def _points(message: Any, fields: dict[str, Any]) -> Floats:
