@@ -12,7 +12,7 @@ from triquad_tools.recordings.recording import ReadingOptions
     [
         ("a.zip", "unzip"),
         ("a.tar.gz", "tar -xf"),
-        ("a.mcap.zstd", "unzstd"),
+        ("a.pcd.zst", "unzstd"),
         ("A.bag.GZ", "gunzip"),
     ],
 )

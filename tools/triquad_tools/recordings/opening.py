@@ -52,9 +52,6 @@ def open_recording(path: Path, options: ReadingOptions) -> Recording:
     """
     if not path.exists():
         raise ToolError(f"{path}: no such file or folder")
-    ends = (command for end, command in _UNPACK.items() if path.name.lower().endswith(end))
-    if path.is_file() and (command := next(ends, None)):
-        raise ToolError(f"{path}: is packed: unpack it with '{command} {path}' first")
     bag = find_bag(path)
     if bag is not None:
         _refuse_others(f"{path} is a bag", _OF_BAGS, options)
@@ -65,6 +62,9 @@ def open_recording(path: Path, options: ReadingOptions) -> Recording:
     if is_cloud_folder(path):
         _refuse_others(f"{path} is a folder of clouds", _OF_CLOUDS, options)
         return read_cloud_folder(path, options)
+    ends = (command for end, command in _UNPACK.items() if path.name.lower().endswith(end))
+    if path.is_file() and (command := next(ends, None)):
+        raise ToolError(f"{path}: is packed: unpack it with '{command} {path}' first")
     raise ToolError(
         f"{path}: no recording that is understood: give a bag of ROS, an MCAP file, or a folder as "
         "docs/tools.md describes them"
@@ -81,7 +81,7 @@ def _refuse_others(what: str, meaningful: set[str], options: ReadingOptions) -> 
 
 @dataclass(frozen=True)
 class Selection:
-    """Some scans of a recording, without points that are too near, or more than are taken."""
+    """Some scans of a recording, without points that are too near."""
 
     recording: Recording
     indices: Sequence[int]
