@@ -54,7 +54,8 @@ def test_rays_that_begin_off_their_frame_are_told(
     with bridging(endpoint) as bridged, robot(endpoint) as r2:
         stand(r2, 0, 1)
         r2.cloud(0.1, np.concatenate([servers.sphere(), 2 * servers.sphere()]))
-        bridged.wait_for(lambda: "which the setting ray_origin_m of its source has" in caplog.text)
+        bridged.wait_for(lambda: bridged.taken == 1)
+    assert "which the setting ray_origin_m of its source has" in caplog.text
     assert "/points: 50% of the points lie behind others" in caplog.text
 
 
