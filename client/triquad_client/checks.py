@@ -35,7 +35,7 @@ _MAX_CELLS = 100_000_000  # of a grid
 
 
 def query_points(points: ArrayLike) -> Doubles:
-    """Return points [N, 3] as float64, finite, at most ``MAX_POSITION_M`` from the map's origin."""
+    """Return points [N, 3] as float64, finite, at most ``MAX_POSITION_M`` from 0 0 0."""
     array = _points(points, np.float64, InvalidInputError)
     # All at once, as point by point takes ten times as long.
     if not np.isfinite(array).all():
@@ -44,8 +44,8 @@ def query_points(points: ArrayLike) -> Doubles:
     if np.abs(array).max(initial=0.0) > MAX_POSITION_M:
         index = int((np.abs(array) > MAX_POSITION_M).any(axis=1).argmax())
         raise InvalidInputError(
-            f"point {index} is {array[index]}, more than {MAX_POSITION_M:g} m from the map's "
-            "origin; are these metres of the map frame?"
+            f"point {index} is {array[index]}, more than {MAX_POSITION_M:g} m from 0 0 0; "
+            "are these metres of the map frame?"
         )
     return array
 
@@ -158,7 +158,7 @@ def finite_box(bounds: Bounds) -> tuple[Doubles, Doubles]:
     if not (minimum < maximum).all():
         raise InvalidInputError(
             f"bounds = {bounds!r} hold nothing: each side needs a length, within "
-            f"{MAX_POSITION_M:g} m from the map's origin"
+            f"{MAX_POSITION_M:g} m from 0 0 0"
         )
     return minimum, maximum
 

@@ -136,6 +136,8 @@ def test_a_server_answers_where_its_scans_were(places: Places, tmp_path: Path) -
             assert_same_mesh(watch.mesh(), other.mesh(), FAR)
             again = far.watch_mesh(box(FAR), known=watch.known_tiles())
             assert_same_mesh(again.mesh(), other.mesh(), FAR)
+            again.catch_up()
+            assert all(again.tiles[index] is tile for index, tile in watch.tiles.items())
         copy = far.sync(box(FAR, -9.0, 9.0), tmp_path / "copy.triquad")
         assert_same(answers(copy, FAR), want)
 
@@ -162,6 +164,9 @@ def test_a_map_is_made_far_away(tmp_path: Path) -> None:
         client.settle(servers.WAIT_S)
         for origin_m in (client.origin_m, local.origin_m, client.status().origin_m):
             np.testing.assert_array_equal(origin_m, FAR)
+        fit = client.status().fit
+        assert fit is not None
+        assert np.abs(fit.worst - near_by).max() < 10.0
         ends = near_by + servers.sphere(200)
         assert (client.query_distance(ends).status == Status.SURFACE).all()
         assert np.median(np.abs(client.query_distance(ends).distance_m)) < 0.02

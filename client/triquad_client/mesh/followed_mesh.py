@@ -57,6 +57,7 @@ class KnownTiles:
     level: int
     tile_side_m: float
     tiles: Mapping[TileIndex, MeshTile] = field(default_factory=dict)
+    origin: Doubles = field(default_factory=lambda: np.zeros(3))  # [3] map frame: of tile 0 0 0
 
 
 @dataclass(frozen=True)
@@ -122,9 +123,8 @@ class FollowedMesh:
             for index, tile in known.tiles.items()
             if (tile.origin <= maximum).all() and (tile.origin + side_m >= minimum).all()
         }
-        zeros = (tile.origin - side_m * np.array(index) for index, tile in tiles.items())
-        origin = next(zeros, empty.origin)
-        return replace(empty, server=known.server, tile_side_m=side_m, origin=origin, tiles=tiles)
+        server, origin = known.server, known.origin
+        return replace(empty, server=server, tile_side_m=side_m, origin=origin, tiles=tiles)
 
     @property
     def complete(self) -> bool:
@@ -230,9 +230,7 @@ class FollowedMesh:
     def known_tiles(self) -> KnownTiles:
         """Return the tiles to go on with."""
         tiles = {index: tile for index, tile in self.tiles.items() if index not in self.stale}
-        return KnownTiles(
-            server=self.server, level=self.level, tile_side_m=self.tile_side_m, tiles=tiles
-        )
+        return KnownTiles(self.server, self.level, self.tile_side_m, tiles, self.origin)
 
 
 class DecodedTile(NamedTuple):
