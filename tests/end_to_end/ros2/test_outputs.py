@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from support import servers
 from support.ros.ros_bridge import bridging
-from support.ros.ros_messages import RosMessages
 from support.ros.ros_robot import robot, shifted
+from support.ros_messages import RosMessages
 from triquad_client import Client, MeshWatch, Status
 from triquad_server.settings import MeshSettings
 from triquad_tools.commands import ros2

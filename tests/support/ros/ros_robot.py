@@ -12,7 +12,7 @@ import numpy as np
 import zenoh
 import zenoh.ext
 from numpy.typing import NDArray
-from support.ros.ros_messages import (
+from support.ros_messages import (
     CAMERA_INFO,
     CLOUD,
     COMPRESSED_IMAGE,

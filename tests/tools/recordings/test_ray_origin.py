@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.recordings.bags import Recorded, messages_for, write_bag
-from support.ros.ros_messages import CLOUD, TF
+from support.ros_messages import CLOUD, TF
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.opening import Selection, open_recording, open_selected
 from triquad_tools.recordings.recording import ReadingOptions, add_recording

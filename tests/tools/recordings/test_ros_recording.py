@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.recordings.bags import KINDS, BagKind, Recorded, drive, messages_for, write_bag
-from support.ros.ros_messages import (
+from support.ros_messages import (
     CAMERA_INFO,
     CLOUD,
     IMAGE,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from support import servers
 from support.ros.ros_bridge import bridging
-from support.ros.ros_messages import CAMERA_INFO, CLOUD, IMAGE, ODOMETRY, TF, RosMessages
 from support.ros.ros_robot import robot, shifted
+from support.ros_messages import CAMERA_INFO, CLOUD, IMAGE, ODOMETRY, TF, RosMessages
 
 MESSAGES = RosMessages()
 

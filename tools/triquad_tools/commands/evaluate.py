@@ -16,6 +16,7 @@ from triquad_tools.evaluation.metrics import MeshScores, ScoreSettings, score_me
 from triquad_tools.mapfiles.meshfile import read_mesh
 from triquad_tools.recordings.cloud import merged, world_points
 from triquad_tools.recordings.folders.cloud_folder import read_cloud_folder
+from triquad_tools.recordings.recording import ReadingOptions
 
 _COMMAND = "triquad-eval"
 
@@ -42,7 +43,8 @@ def _evaluate(options: argparse.Namespace) -> int:
 def _reference(path: Path, voxel_m: float, range_min_m: float) -> Doubles:
     """Return the points ``[N, 3]`` of a cloud, or of all scans of a folder in the world frame."""
     if path.is_dir():
-        folder = read_cloud_folder(path)
+        # Points are what counts, from wherever they were seen.
+        folder = read_cloud_folder(path, ReadingOptions(ray_origin=(0.0, 0.0, 0.0)))
         clouds = (world_points(scan, range_min_m) for scan in folder.read(range(len(folder))))
         points = merged(clouds, voxel_m)
     else:
