@@ -12,8 +12,12 @@ _log = logging.getLogger(__name__)
 
 Arguments = ParamSpec("Arguments")
 
-NICENESS = 5
-"""The niceness of all work but queries, for which somebody waits."""
+NICENESS = 2
+"""The niceness of all work but queries, for which somebody waits.
+
+It makes the map give way to other programs as well: beside two busy ones on two cores, of 195 scans
+in 30 s 84 are taken in, with 5 it were 61 and with 0 109. Amid a stream a query takes 5.0 ms, with
+5 4.6 and with 0 5.7."""
 
 
 @dataclass(frozen=True)
