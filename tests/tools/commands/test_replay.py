@@ -91,7 +91,8 @@ def test_what_a_recording_holds_is_told_without_a_server(tmp_path, capsys):
     assert "4 scans in 0.3 s, 10.0 a second" in output
     assert f"triquad-map {bag} bag.triquad" in output
     assert main([str(bag), "--list", "--transform", "a b 0 0 0 0 0 0 1", "--poses", "tf"]) == 0
-    assert "to map it with the same options: triquad-map" in capsys.readouterr().out
+    same = f"to map it: triquad-map {bag} bag.triquad --transform 'a b 0 0 0 0 0 0 1' --poses tf"
+    assert same in capsys.readouterr().out
     blind = write_bag(tmp_path / "blind", "mcap", [m for m in messages if m.topic != "/tf"])
     assert main([str(blind), "--list"]) == 1
     output = capsys.readouterr().out

@@ -206,3 +206,13 @@ def test_real_scans_agree_in_the_world_frame() -> None:
     first, second = map(world_points, folder.read([4, 5]))
     distances = cKDTree(first).query(second[::20])[0]
     assert np.median(distances) < 0.1
+
+
+def test_poses_of_the_official_layout_are_found(tmp_path: Path) -> None:
+    folder = tmp_path / "sequences" / "07"
+    folder.mkdir(parents=True)
+    np.ones((5, 4), np.float32).tofile(folder / "000000.bin")
+    (tmp_path / "poses").mkdir()
+    (tmp_path / "poses" / "07.txt").write_text("1 0 0 7 0 1 0 8 0 0 1 9\n")
+    (scan,) = read_cloud_folder(folder).read([0])
+    assert scan.world_from_sensor[:3, 3].tolist() == [7, 8, 9]

@@ -264,9 +264,12 @@ def test_missing_poses_and_transforms_are_named_with_the_remedy(tmp_path: Path) 
     loose = opened(tmp_path / "b", without(a_drive(pose_kind="odometry"), "/tf_static"))
     assert not loose.entries
     assert "no transform names the frame 'lidar' (known: base_link, odom)" in only_remark(loose)
-    assert "with --transform, or that the poses are its own with --body-frame lidar" in (
-        only_remark(loose)
-    )
+    assert "with --transform 'base_link lidar X Y Z QX QY QZ QW'" in only_remark(loose)
+    assert "with --transform 'base_link lidar X Y Z QX QY QZ QW'" in only_remark(unmounted)
+    with pytest.raises(
+        ToolError, match=r"--body-frame roof: nothing names it; known are base_link, lidar"
+    ):
+        open_recording(tmp_path / "b" / "bag", ReadingOptions(body_frame="roof"))
 
 
 def test_a_transform_may_be_given(tmp_path: Path) -> None:

@@ -1,9 +1,12 @@
 """``triquad-replay``: publish a recording to a map server, or tell what it holds."""
 
 import argparse
+import shlex
+import sys
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 
 from triquad_client import Client, FlushReport, connect
 
@@ -23,7 +26,9 @@ DueTimes = Callable[[Sequence[int]], list[float]]
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool: 0 done, 1 scans were lost or refused or the server failed, 2 bad input."""
-    options = _parser().parse_args(argv)
+    arguments = sys.argv[1:] if argv is None else list(argv)
+    options = _parser().parse_args(arguments)
+    options.arguments = [argument for argument in arguments if argument != "--list"]
     work = _list if options.list else _replay
     interrupted = "interrupted; scans that were sent are in the map"
     return run(_COMMAND, partial(work, options), interrupted=interrupted)
@@ -45,8 +50,10 @@ def _list(options: argparse.Namespace) -> int:
     seconds = length_s(entries)
     rate = f", {(len(entries) - 1) / seconds:.1f} a second" if seconds > 0 else ""
     print_line(f"{len(entries):,} scans in {seconds:.1f} s{rate}")
-    same = " with the same options" if options_of(options).given else ""
-    print_line(f"to map it{same}: triquad-map {path} {path.resolve().stem}.triquad")
+    words = options.arguments
+    at = next(at for at, word in enumerate(words) if Path(word) == path) + 1
+    words = [*words[:at], f"{path.resolve().stem}.triquad", *words[at:]]
+    print_line(f"to map it: triquad-map {shlex.join(words)}")
     return OK
 
 

@@ -51,8 +51,7 @@ def draw_mesh(title: str, mesh: Mesh, path: Path) -> None:
         wide_m, turn_deg = np.ptp(axes.get_xlim()), math.degrees(math.atan2(view[2, 1], view[2, 0]))
         seen = (
             f"parallel projection, {wide_m:.3g} m wide, looking down and to {turn_deg:.0f}° from "
-            "+x; faces seen from behind (ceilings), and what lies far away from all else, are left "
-            "out"
+            "+x; without faces seen from behind (ceilings) and what lies far away"
         )
         axes.set_xlabel(f"{seen}\n{note}", ha="left", x=0.01)
         scale = ScalarMappable(Normalize(heights.low_m, heights.high_m), HEIGHTS)

@@ -57,6 +57,7 @@ def choose_poses(
     """
     for transform in options.transforms:
         content.frames.add(transform)
+    _check_body(content, {cloud.frame for cloud in clouds}, options)
     content.frames.wanted = options.map_frame or ""
     frame = clouds[0].frame
     names = [TF, *content.poses]
@@ -88,8 +89,23 @@ def _of_tf(frames: FrameTree, frame: str, options: ReadingOptions) -> PoseSource
     """Return all transforms. If they do not reach the sensor, finding a cloud says so."""
     body = frame
     if not frames.moves(frames.root(frame), frame):
-        body = options.body_frame or next(iter(frames.moving), frame)
+        body = options.body_frame or frames.lowest_moving or frame
     return PoseSource(TF, frames, options.map_frame or frames.fixed_frame(body), body)
+
+
+def _check_body(content: RosContent, sensors: set[str], options: ReadingOptions) -> None:
+    """Refuse a frame for the body that nothing names.
+
+    Raises:
+        ToolError: there is none of this name.
+    """
+    bodies = {poses.child for poses in content.poses.values()}
+    known = {*sensors, *bodies, *content.frames.frames} - {""}
+    if options.body_frame is not None and options.body_frame not in known:
+        raise ToolError(
+            f"--body-frame {options.body_frame}: nothing names it; known are "
+            f"{', '.join(sorted(known)) or 'none'}"
+        )
 
 
 def _of_topic(content: RosContent, topic: str, frame: str, options: ReadingOptions) -> PoseSource:

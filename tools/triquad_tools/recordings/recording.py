@@ -24,7 +24,7 @@ Place = tuple[float, float, float]
 
 ORIGIN_REMEDIES = (
     "--ray-origin X,Y,Z says where the sensor sits in it (metres; 0,0,0 if that is right); of "
-    "clouds that were merged, map those of each sensor; points in the frame of the map need "
+    "clouds that were merged, map those of each sensor; points in a frame that stands still need "
     "--points-in world"
 )
 """What to do where rays begin elsewhere than at the frame of their points."""
@@ -147,6 +147,11 @@ def _add_folder(add: _Add) -> None:
 
 def transform(text: str) -> Transform:
     """Return a transform such as ``base_link lidar 0 0 1.5 0 0 0 1``: position and quaternion."""
+    if len(text.split()) != 9:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}: put all 9 words in quotes, 'PARENT CHILD X Y Z QX QY QZ QW', such as "
+            "'base_link lidar 0 0 1.5 0 0 0 1'"
+        )
     try:
         parent, child, *numbers = text.split()
         x, y, z, *quaternion = map(float, numbers)

@@ -31,8 +31,8 @@ _CLOCKS = (
     "--recorder-clock goes by when each message was recorded"
 )
 _NO_TRANSFORM = (
-    "record /tf and /tf_static, or say where the sensor sits with --transform, or that the poses "
-    "are its own with --body-frame {frame}"
+    "record /tf and /tf_static, or say where the sensor sits with --transform '{body} {root} X Y Z "
+    "QX QY QZ QW' (0 0 0 0 0 0 1 where the poses are its own)"
 )
 _ASSUMED = (
     "{topic}: taken as poses of {body}, since its messages do not say whose they are; if they are "
@@ -204,7 +204,9 @@ class RosRecording:
         of_topic = sum(cloud.topic == topic for cloud in self._content.clouds)
         line = f"{topic}: {len(clouds)} of {of_topic} are left out: {clouds[0].problem}"
         if reason == "no_transform":
-            return f"{line}; {_NO_TRANSFORM.format(frame=clouds[0].frame)}"
+            body = self._poses.body if self._poses else "BODY"
+            root = self._content.frames.root(clouds[0].frame)
+            return f"{line}; {_NO_TRANSFORM.format(body=body, root=root)}"
         if reason in _OF_TIME and not any(placed.topic == topic for placed in self._placed):
             return f"{line}; {_CLOCKS}"
         return line

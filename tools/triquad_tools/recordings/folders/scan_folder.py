@@ -188,6 +188,10 @@ def _choose(
         if files := in_order(path.glob("*.txt")):
             return read_pose_files(files), []
     found = [path for name in TRAJECTORY_NAMES for path in sorted(folder.glob(name))]
+    # The official layout of KITTI: sequences/00 and poses/00.txt.
+    sequence = folder.resolve()
+    of_kitti = sequence.parent.parent / "poses" / f"{sequence.name}.txt"
+    found += [of_kitti] if of_kitti.is_file() else []
     if found:
         others = ", ".join(path.name for path in found[1:])
         remark = f"poses are those of {found[0].name}, not of {others}: --trajectory FILE chooses"

@@ -162,6 +162,11 @@ class FrameTree:
         """Remove the transforms of a frame."""
         self._edges.pop(child, None)
 
+    @property
+    def lowest_moving(self) -> str | None:
+        """The frame that moves in its parent and has the most frames above; None: none moves."""
+        return max(self.moving, key=lambda frame: len(self._path(frame)), default=None)
+
     def root(self, frame: str) -> str:
         """Return the topmost ancestor of ``frame``; itself if it has no parent."""
         return self._path(frame)[-1]
