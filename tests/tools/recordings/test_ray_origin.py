@@ -108,6 +108,26 @@ def test_folders_of_clouds_are_checked_as_well(tmp_path: Path) -> None:
     assert_right(selected(tmp_path, "--ray-origin", "0.4,0,1.7"))
 
 
+def test_poses_the_other_way_round_and_millimetres_are_told(tmp_path: Path) -> None:
+    folders = {"inverse": 1.0, "millimetres": 1000.0}
+    for name, units in folders.items():
+        (tmp_path / name).mkdir()
+        rows = []
+        for number in range(len(STAMPS)):
+            points = units * (seen_from(base(number)) - UP)
+            cloud = np.pad(points, ((0, 0), (0, 1))).astype(np.float32)
+            cloud.tofile(tmp_path / name / f"{number:06d}.bin")
+            pose = base(number)
+            pose[:3, 3] += pose[:3, :3] @ UP
+            rows.append(np.linalg.inv(pose) if name == "inverse" else pose)
+        text = "\n".join(" ".join(map(str, pose[:3].ravel())) for pose in rows)
+        (tmp_path / name / "poses.txt").write_text(text)
+    with pytest.raises(ToolError, match="the poses seem to be sensor_from_world"):
+        open_recording(tmp_path / "inverse", ReadingOptions())
+    with pytest.raises(ToolError, match="write them in metres"):
+        open_recording(tmp_path / "millimetres", ReadingOptions())
+
+
 def test_few_points_lie_behind_others_from_the_sensor_alone() -> None:
     points = seen_from(base(3))
     assert hidden_share(points - UP) == 0

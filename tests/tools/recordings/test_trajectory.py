@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.recordings.trajectories import drive, matrices, write_log, write_tum
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.folders.scan_folder import in_order, stamps_of_names
+from triquad_tools.recordings.folders.file_names import in_order, stamps_of_names
 from triquad_tools.recordings.folders.trajectory import read_trajectory
 from triquad_tools.sensors.sweep import NoTransformError
 
@@ -210,6 +210,21 @@ def test_times_are_read_of_names(names, stamps):
     assert read[0] == stamps[0]
 
 
+def test_dates_with_fractions_are_times_across_minutes_and_months():
+    names = ["30-11-2023_23-59-59.75.ply", "2023-12-01T00:00:00.250.ply", "a_20231201_000001.5.ply"]
+    quarters = [6805555199, 6805555201, 6805555206]
+    for name, at in zip(names, quarters, strict=True):
+        assert stamps_of_names([Path(name)]) == [at * 25 * 10**7]
+    assert stamps_of_names([Path("12-30-58.000000.ply")]) is None
+
+
+def test_fractions_without_leading_zeros_are_nanoseconds():
+    names = [Path("1700000000.5000.ply"), Path("1700000000.100005000.ply")]
+    assert stamps_of_names(names) == [17 * 10**17 + 5000, 17 * 10**17 + 100005000]
+    decimals = [Path("1700000000.05.ply"), Path("1700000000.1.ply")]
+    assert stamps_of_names(decimals) == [17 * 10**17 + 5 * 10**7, 17 * 10**17 + 10**8]
+
+
 @pytest.mark.parametrize(
     "name",
     ["000012.ply", "12.ply", "0000000012.ply", "cloud.ply", "20240131_120000.ply", "1.2.3.ply"]
@@ -224,3 +239,12 @@ def test_counts_and_dates_are_no_times(name):
 def test_files_are_ordered_by_their_numbers(numbers):
     paths = [Path(f"scan{number}.ply") for number in numbers]
     assert in_order(paths) == [Path(f"scan{number}.ply") for number in sorted(numbers)]
+
+
+def test_images_of_colmap_are_refused(tmp_path):
+    path = tmp_path / "images.txt"
+    path.write_text(
+        "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n1 1 0 0 0 1 2 3 1 a\n\n"
+    )
+    with pytest.raises(ToolError, match="COLMAP have poses camera_from_world"):
+        read_trajectory(path)

@@ -194,8 +194,12 @@ class RosRecording:
             if way == WORLD:
                 return self._poses.find(replace(cloud, frame=body))
             return NoScanError("map_frame", _STANDS.format(frame=cloud.frame, body=body))
+        if self._options.ray_origin is not None:
+            return None
+        if (far := self._content.rays.are_too_far(cloud.topic)) is not None:
+            return NoScanError("units", far)
         problem = self._content.rays.begin_elsewhere(cloud.topic)
-        if problem is None or self._options.ray_origin is not None:
+        if problem is None:
             return None
         return NoScanError("ray_origin", f"{problem}: {ORIGIN_REMEDIES}")
 

@@ -23,6 +23,9 @@ _WRONG = 0.07
 From the sensor it is 0.3 % in streets and halls and up to 5 % amid trees; from the base of a car
 on the ground 8 to 23 %, from the origin of a map 7 to 21 % (recorded and simulated drives)."""
 
+_FAR_M = 500.0
+"""Half of the points of no scan are farther away than this: they are in millimetres."""
+
 _NEAREST_M = 0.3  # nearer points are the robot's own
 _REPEATED = 16  # equal points of a scan that are no measurements
 
@@ -62,12 +65,23 @@ class RayCheck:
     def __init__(self) -> None:
         self._seen: Counter[str] = Counter()
         self._shares: dict[str, list[float]] = defaultdict(list)
+        self._ranges_m: dict[str, list[float]] = defaultdict(list)
 
     def see(self, stream: str, points: NDArray[np.floating]) -> None:
         """Take notice of the points [N, 3] of a scan, in the frame in which its rays begin."""
         self._seen[stream] += 1
         if self._seen[stream].bit_count() == 1:  # the first, the second, fourth, eighth, ...
             self._shares[stream].append(hidden_share(without_repeated(points)))
+            ranges = np.linalg.norm(points, axis=1)
+            finite = np.append(ranges[np.isfinite(ranges)], 0.0)
+            self._ranges_m[stream].append(float(np.median(finite)))
+
+    def are_too_far(self, stream: str) -> str | None:
+        """Return why the points of a stream cannot be metres; None: they may."""
+        range_m = statistics.median(self._ranges_m[stream] or [0.0])
+        if range_m <= _FAR_M:
+            return None
+        return f"half of the points are farther than {range_m:.0f} m: write them in metres"
 
     def begin_elsewhere(self, stream: str) -> str | None:
         """Return why rays of a stream cannot begin at the frame of its points; None: they may."""

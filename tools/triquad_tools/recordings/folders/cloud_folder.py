@@ -1,6 +1,6 @@
 """Folders of clouds, a file each, with a trajectory next to them."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -9,6 +9,8 @@ import numpy as np
 from triquad_format.records.arrays import Floats
 
 from triquad_tools.console.command import ToolError
+from triquad_tools.recordings.folders.file_names import in_order, stamps_of_names
+from triquad_tools.recordings.folders.frame_checks import check_frame, check_poses, check_rays
 from triquad_tools.recordings.folders.point_file import (
     KITTI_COLUMNS,
     POINT_SUFFIXES,
@@ -20,13 +22,10 @@ from triquad_tools.recordings.folders.scan_folder import (
     PlacedFile,
     ScanFolder,
     check_all,
-    in_order,
     place_files,
-    stamps_of_names,
 )
 from triquad_tools.recordings.folders.trajectory import Trajectory
 from triquad_tools.recordings.recording import (
-    ORIGIN_REMEDIES,
     SENSOR,
     WORLD,
     ReadingOptions,
@@ -35,11 +34,9 @@ from triquad_tools.recordings.recording import (
 from triquad_tools.recordings.text_lines import parse_rigid, parse_stamps, read_lines
 from triquad_tools.sensors.motion.placing import place
 from triquad_tools.sensors.point_times import offsets_s
-from triquad_tools.sensors.ray_check import RayCheck
 from triquad_tools.sensors.sweep import NoTransformError, PosedScan, Sweep, moved
 
 _TRIED = 4  # clouds, to determine the frame of all
-_CLEARLY = 2.0  # times nearer to where the sensor was than to the origin, or the other way round
 
 _DEEPER = "velodyne_points/data"  # where KITTI's raw recordings have theirs
 _KITTI, _KITTI_360 = "calib.txt", "calib_cam_to_velo.txt"
@@ -72,10 +69,10 @@ def read_cloud_folder(folder: Path, options: ReadingOptions | None = None) -> Sc
         files = _of_lidar([folder, above, poses.path.parent], files)
     tried = [files[len(files) * (2 * step + 1) // (2 * _TRIED)] for step in range(_TRIED)]
     if options.points_in is None:
-        _check_frame(tried, columns)
+        check_frame(tried, columns)
     read_file = partial(_read_scan, poses, options)
-    if options.ray_origin is None:
-        _check_rays(first.parent, map(read_file, tried))
+    if options.ray_origin is None and options.points_in != SENSOR:
+        check_rays(first.parent, map(read_file, tried))
     names = dict.fromkeys(path.parent.name for path in paths)
     clouds = ", ".join(f"{name}/*{first.suffix}" for name in names)
     kind = first.suffix[1:].upper() + " clouds"
@@ -83,7 +80,10 @@ def read_cloud_folder(folder: Path, options: ReadingOptions | None = None) -> Sc
         Stream(clouds, kind, len(files), "scans", options.points_in or SENSOR),
         Stream(poses.path.name, poses.kind, len(poses.poses), "poses of the sensor"),
     )
-    return ScanFolder(files, read_file, streams, placed.remarks)
+    read = ScanFolder(files, read_file, streams, placed.remarks)
+    if options.points_in is None:
+        check_poses(read)
+    return read
 
 
 def _read_scan(trajectory: Trajectory, options: ReadingOptions, file: PlacedFile) -> PosedScan:
@@ -138,44 +138,6 @@ def _cloud_paths(folder: Path) -> list[Path]:
             f"{paths[0].parent}: holds {' and '.join(suffixes)}: leave only one of them"
         )
     return paths
-
-
-def _check_frame(tried: Sequence[PlacedFile], columns: Sequence[str]) -> None:
-    """Check that points lie around their sensor, not around where it was in the world.
-
-    Raises:
-        ToolError: a few clouds from all over the recording lie around where it was.
-    """
-    if all(_lies_around_its_place(file, columns) for file in tried):
-        raise ToolError(
-            f"{tried[0].path.parent}: the points seem to be in the world frame: in "
-            f"{tried[0].path.name} they lie around where the sensor was, not around the origin; "
-            "use --points-in world, or --points-in sensor if this is wrong"
-        )
-
-
-def _check_rays(folder: Path, scans: Iterable[PosedScan]) -> None:
-    """Check that rays begin at the frame of the points.
-
-    Raises:
-        ToolError: they begin elsewhere.
-    """
-    rays = RayCheck()
-    for scan in scans:
-        rays.see(str(folder), scan.points)
-    problem = rays.begin_elsewhere(str(folder))
-    if problem is not None:
-        raise ToolError(f"{folder}: {problem}: {ORIGIN_REMEDIES}")
-
-
-def _lies_around_its_place(file: PlacedFile, columns: Sequence[str]) -> bool:
-    points = read_points(file.path, columns).points
-    points = points[np.isfinite(points).all(axis=1)]
-    if len(points) == 0:
-        return False
-    from_origin = np.median(np.linalg.norm(points, axis=1))
-    from_place = np.median(np.linalg.norm(points - file.world_from_sensor[:3, 3], axis=1))
-    return bool(from_place * _CLEARLY < from_origin)
 
 
 def read_times(folders: Sequence[Path], scans: int) -> list[int] | None:

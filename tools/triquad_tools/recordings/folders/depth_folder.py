@@ -11,11 +11,11 @@ from triquad_client.depth_image import Intrinsics, depth_points
 from triquad_client.errors import NO_NUMBER, InvalidScanError
 
 from triquad_tools.console.command import ToolError
+from triquad_tools.recordings.folders.file_names import in_order
 from triquad_tools.recordings.folders.scan_folder import (
     PlacedFile,
     ScanFolder,
     check_all,
-    in_order,
     place_files,
 )
 from triquad_tools.recordings.recording import ReadingOptions, Stream

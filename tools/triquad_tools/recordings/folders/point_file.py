@@ -62,8 +62,8 @@ def check_columns(paths: Sequence[Path]) -> None:
     sizes = sizes[(sizes != 0) & np.isfinite(sizes)]
     if not len(sizes) or np.mean(sizes > _FARTHEST_M) > _AT_LEAST:
         raise ToolError(
-            f"{some[0]}: its numbers are no metres, read as float32: say what they "
-            "are with --columns, or write them so"
+            f"{some[0]}: its numbers are no metres, read as float32: are they float64, or whole "
+            "numbers? Write them as float32"
         )
     share = {count: _explained(flats, count) for count in (4, *_OTHER_COLUMNS)}
     best = max(_OTHER_COLUMNS, key=lambda count: share[count])

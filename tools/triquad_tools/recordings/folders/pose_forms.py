@@ -140,8 +140,17 @@ def order_of(form: Form, quaternions: Doubles, lines: Sequence[Line]) -> str:
 
 
 def _form_of_header(line: Line, count: int) -> Form | None:
-    """Return the form that a line names, if it names all that a pose needs."""
+    """Return the form that a line names, if it names all that a pose needs.
+
+    Raises:
+        ToolError: it is that of COLMAP's images, whose poses are the other way round.
+    """
     text = line.text.lstrip("#%/ ").lower()
+    if "image_id" in text and "camera_id" in text:
+        raise ToolError(
+            f"{line.place}: images of COLMAP have poses camera_from_world, of a scale of its own: "
+            "write t x y z qx qy qz qw of the camera in the world, metres"
+        )
     separator = next((each for each in ",;\t" if each in text), None)
     names = re.sub(r"\s*[\[(]\s*([^\])]*)[\])]", r"_\1", text).split(separator)
     roles: list[str] = []

@@ -1,8 +1,7 @@
 """Folders with a file for each scan, and the poses that belong to the files."""
 
-import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, TypeVar
@@ -12,6 +11,7 @@ from triquad_format.records.arrays import Doubles
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
+from triquad_tools.recordings.folders.file_names import in_order, stamps_of_names
 from triquad_tools.recordings.folders.point_file import read_header
 from triquad_tools.recordings.folders.trajectory import (
     DEFAULT_PERIOD_NS,
@@ -22,7 +22,6 @@ from triquad_tools.recordings.folders.trajectory import (
     read_viewpoints,
 )
 from triquad_tools.recordings.recording import DEFAULT_SOURCE, ReadingOptions, ScanEntry, Stream
-from triquad_tools.recordings.text_lines import NS_OF_DIGITS
 from triquad_tools.sensors.sweep import NoTransformError, PosedScan
 
 _Read = TypeVar("_Read")
@@ -36,11 +35,6 @@ _WHY = {
     "pose_late": "after the last pose",
     "pose_gap": "between poses that lie too far apart",
 }
-_NUMBERS = re.compile(r"(\d+)")
-_WHOLE = re.compile(r"(?:.*\D)?([1-9]\d+)")
-_DECIMAL = re.compile(r"(?:.*[^\d.])?(\d{1,10})\.(\d{1,9})")
-_PAIR = re.compile(r"(?:.*\D)?([1-9]\d{9})[_-](\d{1,9})")
-_PLACES = (3, 6, 9)  # decimal places of milliseconds, microseconds and nanoseconds
 
 
 class PlacedFile(NamedTuple):
@@ -247,45 +241,3 @@ def _no_common_time(stamps_ns: Sequence[int], trajectory: Trajectory, folder: Pa
         f"{trajectory.path} goes from {start:.3f} to {end:.3f} s, with gaps of at most 2 s; write "
         "both with the times of one clock"
     )
-
-
-def in_order(paths: Iterable[Path]) -> list[Path]:
-    """Return paths in the order of the numbers in their names: 2 before 10, padded or not.
-
-    Hidden files are left out: macOS adds one to each that it copies.
-    """
-
-    def key(path: Path) -> list[tuple[int, str]]:
-        parts = _NUMBERS.split(path.name)
-        return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
-
-    return sorted((path for path in paths if not path.name.startswith(".")), key=key)
-
-
-def stamps_of_names(paths: Sequence[Path]) -> list[int] | None:
-    """Return nanoseconds that the names of all files say; None where any of them says none.
-
-    A time is the last number of a name: ``1700000000.25``, ``1700000000250000000`` or
-    ``1700000000_250000000``, seconds and a fraction of them in whole units. Small whole numbers
-    are counts, not times, and so are those that begin with 0.
-    """
-    stems = [path.stem.removesuffix(".pcd") for path in paths]  # nuScenes: .pcd.bin
-    pairs = [_PAIR.fullmatch(stem) for stem in stems]
-    longest = max((len(pair[2]) for pair in pairs if pair), default=0)
-    unit_ns = next(10 ** (9 - places) for places in _PLACES if places >= longest)
-    stamps: list[int] = []
-    for stem, pair in zip(stems, pairs, strict=True):
-        stamp = _stamp_of(stem) if pair is None else int(pair[1]) * 10**9 + int(pair[2]) * unit_ns
-        if stamp is None:
-            return None
-        stamps.append(stamp)
-    return stamps
-
-
-def _stamp_of(stem: str) -> int | None:
-    decimal = _DECIMAL.fullmatch(stem)
-    if decimal is not None:
-        return int(decimal[1]) * 10**9 + int(decimal[2].ljust(9, "0"))
-    whole = _WHOLE.fullmatch(stem)
-    unit_ns = None if whole is None else NS_OF_DIGITS.get(len(whole[1]))
-    return None if whole is None or unit_ns is None else int(whole[1]) * unit_ns

@@ -14,6 +14,7 @@ from triquad_tools.sensors.lens import LensCamera, lens_camera
 from triquad_tools.sensors.ros.header import frame_name, stamp_ns
 from triquad_tools.sensors.sweep import NoScanError, Sweep
 
+_FAR_M = 500.0  # half of the pixels of no depth camera are farther
 _ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 _COMPRESSED_HEADER = struct.Struct("<iff")  # of compressedDepth: format, quantisation A and B
 
@@ -76,6 +77,12 @@ def sweep_of_depth(image: Any, info: Any, topic: str = "", stride: int = 1) -> S
         points = depth_points(pixels, camera, stride)
     except InvalidScanError as error:
         raise NoScanError("depth", str(error)) from error
+    if len(points) and np.nanmedian(points[:, 2]) > _FAR_M:
+        raise NoScanError(
+            "units",
+            f"half of the depths are more than {_FAR_M:.0f} m: 32FC1 is in metres, 16UC1 in "
+            "millimetres (REP 118)",
+        )
     note = f"camera {camera_topic(topic)}"
     if isinstance(camera, LensCamera):
         points, note = points[np.isfinite(points).all(axis=1)], f"{note}, {camera.note}"
