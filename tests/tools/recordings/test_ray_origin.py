@@ -40,7 +40,7 @@ def in_frame(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
     return (points @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)
 
 
-def recorded(frame: str) -> Iterator[Recorded]:
+def recorded(frame: str, name: str = "") -> Iterator[Recorded]:
     """A drive whose clouds are in the frame of the lidar, of the base or of the map."""
     lidar = np.eye(4)
     lidar[:3, 3] = UP
@@ -48,7 +48,7 @@ def recorded(frame: str) -> Iterator[Recorded]:
     for number, stamp in enumerate(STAMPS):
         pose = base(number)
         moved = {"lidar": np.linalg.inv(lidar), "base_link": np.eye(4), "camera_init": pose}[frame]
-        cloud = ROS2.cloud(in_frame(seen_from(pose), moved), stamp, frame)
+        cloud = ROS2.cloud(in_frame(seen_from(pose), moved), stamp, name or frame)
         yield Recorded("/tf", TF, stamp, ROS2.tf(stamp, ("camera_init", "base_link", pose)))
         yield Recorded("/points", CLOUD, stamp + 1, cloud)
 
@@ -95,6 +95,17 @@ def test_clouds_in_the_frame_of_the_map_need_a_body_that_saw_them(tmp_path: Path
     assert_right(selected(bag, "--points-in", "world", "--body-frame", "lidar"))
     stands = selected(bag, "--points-in", "sensor", "--ray-origin", "0,0,0")
     assert all(np.array_equal(scan.world_from_sensor, np.eye(4)) for scan in stands.scans())
+
+
+def test_clouds_in_a_frame_of_the_map_that_nothing_names_can_be_taken_as_such(
+    tmp_path: Path,
+) -> None:
+    bag = write_bag(tmp_path / "bag", "mcap", recorded("camera_init", "world"))
+    (remark,) = open_recording(bag, ReadingOptions()).remarks
+    assert "if its points are in the map already, use --points-in world" in remark
+    assert_right(selected(bag, "--points-in", "world", "--ray-origin", "0.4,0,1.7"))
+    with pytest.raises(ToolError, match="give one of the recordings in it, bag"):
+        open_recording(tmp_path, ReadingOptions())
 
 
 def test_folders_of_clouds_are_checked_as_well(tmp_path: Path) -> None:

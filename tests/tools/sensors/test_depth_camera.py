@@ -39,6 +39,15 @@ def test_rows_may_be_padded() -> None:
     assert (sweep_of_depth(message, INFO).points[:, 2] == 1.0).all()
 
 
+def test_units_may_be_others_and_millimetres_are_told_from_metres() -> None:
+    whole = ROS.image(np.full((4, 6), 8000, np.uint16), "16UC1", 7)
+    assert np.allclose(sweep_of_depth(whole, INFO, units_per_metre=4000).points[:, 2], 2)
+    floating = ROS.image(np.full((4, 6), 2000.0, np.float32), "32FC1", 7)
+    assert np.allclose(sweep_of_depth(floating, INFO, units_per_metre=1000).points[:, 2], 2)
+    with pytest.raises(NoScanError, match=r"half of the depths are more than 500 m.*REP 118"):
+        sweep_of_depth(floating, INFO)
+
+
 def compressed(pixels: np.ndarray, form: str, header: bytes) -> Any:
     return ROS.compressed_depth(pixels, 7, form, header)
 

@@ -30,6 +30,8 @@ _UNPACK = {
 Recording = RosRecording | ScanFolder
 """A recording that was checked as a whole, so that its errors are known."""
 
+_MOST_NAMED = 10  # recordings in a folder
+
 _ORIGIN = 0.0, 0.0, 0.0
 
 _FLAGS = {"transforms": "--transform", "deskew": "--no-deskew"}
@@ -37,7 +39,7 @@ _FLAGS = {"transforms": "--transform", "deskew": "--no-deskew"}
 
 _OF_BAGS = {
     "topics", "poses", "map_frame", "body_frame", "transforms", "recorder_clock", "stride",
-    "points_in", "ray_origin", "deskew",
+    "points_in", "ray_origin", "deskew", "units_per_metre",
 }  # fmt: skip
 _OF_DEPTH = {"trajectory", "quaternion", "intrinsics", "units_per_metre", "stride"}
 _OF_CLOUDS = {"trajectory", "quaternion", "points_in", "columns", "ray_origin", "deskew"}
@@ -65,10 +67,17 @@ def open_recording(path: Path, options: ReadingOptions) -> Recording:
     ends = (command for end, command in _UNPACK.items() if path.name.lower().endswith(end))
     if path.is_file() and (command := next(ends, None)):
         raise ToolError(f"{path}: is packed: unpack it with '{command} {path}' first")
-    raise ToolError(
-        f"{path}: no recording that is understood: give a bag of ROS, an MCAP file, or a folder as "
-        "docs/tools.md describes them"
+    within = sorted(each.name for each in path.glob("*") if each.is_dir() and _is_recording(each))
+    there = (
+        f"one of the recordings in it, {', '.join(within[:_MOST_NAMED])}"
+        if within
+        else ("a bag of ROS, an MCAP file, or a folder as docs/tools.md describes them")
     )
+    raise ToolError(f"{path}: no recording that is understood: give {there}")
+
+
+def _is_recording(path: Path) -> bool:
+    return find_bag(path) is not None or is_depth_folder(path) or is_cloud_folder(path)
 
 
 def _refuse_others(what: str, meaningful: set[str], options: ReadingOptions) -> None:

@@ -4,11 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from triquad_client.pose import Pose
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.recording import ReadingOptions
 from triquad_tools.recordings.ros_content import RosContent, SeenCloud
-from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES, FrameTree
+from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES, STATIC, FrameTree, Transform
 from triquad_tools.sensors.ros.type_store import TRANSFORMS
 from triquad_tools.sensors.sweep import NoTransformError, PosedScan, Sweep, moved
 
@@ -29,6 +30,12 @@ class PoseSource:
     def moves(self, frame: str) -> bool:
         """Return whether a frame moves in the one to map in."""
         return self.frames.moves(self.target, frame)
+
+    def know(self, frames: set[str]) -> None:
+        """Take frames of which no transform tells anything as that to map in."""
+        for frame in frames.difference(self.frames.frames):
+            here = Pose((0, 0, 0), (0, 0, 0, 1))
+            self.frames.add(Transform(self.target, frame, STATIC, here))
 
     def seen(self, scan: PosedScan, sweep: Sweep) -> PosedScan:
         """Return a scan whose points stand still in the map as the body saw them."""

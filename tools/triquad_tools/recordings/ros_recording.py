@@ -81,7 +81,10 @@ class RosRecording:
         """
         self._bag = bag
         self._reader = MessageReader(
-            options.stride, deskew=options.deskew, by_arrival=options.recorder_clock
+            units_per_metre=options.units_per_metre,
+            stride=options.stride,
+            deskew=options.deskew,
+            by_arrival=options.recorder_clock,
         )
         self._content = RosContent(bag, self._reader, options.poses)
         self._topics = _chosen_topics(self._content, options)
@@ -167,6 +170,8 @@ class RosRecording:
         check_times(good)
         if good:
             self._poses = choose_poses(self._content, good, self._options)
+        if self._poses is not None and self._options.points_in == WORLD:
+            self._poses.know({cloud.frame for cloud in good})
         newest_ns: dict[str, int] = {}
         for cloud in clouds:
             problem = self._problem(cloud, newest_ns)
@@ -207,6 +212,8 @@ class RosRecording:
         clouds = self._left_out[topic, reason]
         of_topic = sum(cloud.topic == topic for cloud in self._content.clouds)
         line = f"{topic}: {len(clouds)} of {of_topic} are left out: {clouds[0].problem}"
+        if reason == "no_transform" and clouds[0].frame in ROOT_NAMES:
+            return f"{line}; if its points are in the map already, use --points-in world"
         if reason == "no_transform":
             body = self._poses.body if self._poses else "BODY"
             root = self._content.frames.root(clouds[0].frame)

@@ -63,7 +63,9 @@ def camera_of(info: Any, image_topic: str) -> Intrinsics:
     return lens_camera(camera, info.distortion_model, values, info.height, info.width)
 
 
-def sweep_of_depth(image: Any, info: Any, topic: str = "", stride: int = 1) -> Sweep:
+def sweep_of_depth(
+    image: Any, info: Any, topic: str = "", stride: int = 1, units_per_metre: float | None = None
+) -> Sweep:
     """Return the sweep of a depth image, compressed or not, in the camera's optical frame.
 
     Raises:
@@ -77,11 +79,13 @@ def sweep_of_depth(image: Any, info: Any, topic: str = "", stride: int = 1) -> S
         points = depth_points(pixels, camera, stride)
     except InvalidScanError as error:
         raise NoScanError("depth", str(error)) from error
+    if units_per_metre is not None:
+        points *= (1000.0 if pixels.dtype.kind == "u" else 1.0) / units_per_metre
     if len(points) and np.nanmedian(points[:, 2]) > _FAR_M:
         raise NoScanError(
             "units",
             f"half of the depths are more than {_FAR_M:.0f} m: 32FC1 is in metres, 16UC1 in "
-            "millimetres (REP 118)",
+            "millimetres (REP 118), unless --units-per-metre of a recording says otherwise",
         )
     note = f"camera {camera_topic(topic)}"
     if isinstance(camera, LensCamera):

@@ -26,6 +26,7 @@ from triquad_tools.sensors.sweep import NoScanError, Sweep
 class MessageReader:
     """Reads decoded messages; remembers the cameras, which depth images need."""
 
+    units_per_metre: float | None = None  # of depth images; else as REP 118 has them
     stride: int = 1  # every how many rows and columns of a depth image one is taken
     body_frame: str = ""  # whose poses are those that do not say whose they are
     deskew: bool = True  # take the sensor's motion out of clouds whose points have times
@@ -49,7 +50,7 @@ class MessageReader:
         else:
             stride, info = self.stride, self._camera(camera_topic(topic))
             self._check_count(-(-info.width // stride) * -(-info.height // stride))
-            sweep = sweep_of_depth(message, info, topic, stride)
+            sweep = sweep_of_depth(message, info, topic, stride, self.units_per_metre)
         if sweep.offsets_s is not None and not self.deskew:
             sweep = replace(sweep, offsets_s=None, note="point times are not used")
         return replace(sweep, stamp_ns=came_ns) if self.by_arrival else sweep
