@@ -1,6 +1,7 @@
 """The mesh followed in an event loop: as by the blocking watch, cancelled and closed meanwhile."""
 
 import asyncio
+import contextlib
 import queue
 import threading
 from collections.abc import Iterator
@@ -100,7 +101,7 @@ def test_a_cancelled_wait_leaves_the_watch_in_order_until_the_client_is_closed(
             for _ in range(steps):
                 await asyncio.sleep(0)
             waiting.cancel()
-            with pytest.raises(asyncio.CancelledError):
+            with contextlib.suppress(asyncio.CancelledError):  # unless the reply was there already
                 await waiting
         await watch.catch_up(servers.WAIT_S)
         await fresh.catch_up(servers.WAIT_S)
