@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from triquad_format.records.arrays import Doubles, Floats, Longs
 from triquad_format.records.pose import is_rigid, rotation_error
+from triquad_format.wire.places import moved_pose
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.voxel_index import empty_keys, enter
 
@@ -256,8 +257,7 @@ def usable_rays(
     low, high = (np.array(corner) - begin for corner in source.robot_box_m or _NOWHERE)
     if begin.any():
         points = (points - begin).astype(np.float32)
-        pose = pose.copy()
-        pose[:3, 3] += pose[:3, :3] @ begin
+        pose = moved_pose(pose, pose[:3, :3] @ begin)
     limits = _Limits(
         settings.range_min_m,
         settings.range_max_m,

@@ -253,7 +253,7 @@ def test_a_bridge_that_starts_late_learns_the_static_transforms(
 
 
 @pytest.mark.parametrize("topic", ["/camera/depth", "/camera/depth/compressedDepth"])
-def test_depth_images_are_mapped_with_the_camera_beside_them(endpoint: str, topic: str) -> None:
+def test_depth_images_are_mapped_with_the_camera_next_to_them(endpoint: str, topic: str) -> None:
     matrix = np.array([[100.0, 0, 80], [0, 100, 60], [0, 0, 1]])
     forward = shifted(*AT)
     forward[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]  # the optical axis is the map's x

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from triquad_format.wire.places import moved_pose
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.lines import print_remark
@@ -71,7 +72,7 @@ def open_recording(path: Path, options: ReadingOptions) -> Recording:
     there = (
         f"one of the recordings in it, {', '.join(within[:_MOST_NAMED])}"
         if within
-        else ("a bag of ROS, an MCAP file, or a folder as docs/tools.md describes them")
+        else "a bag of ROS, an MCAP file, or a folder as docs/tools.md describes them"
     )
     raise ToolError(f"{path}: no recording that is understood: give {there}")
 
@@ -115,7 +116,7 @@ class Selection:
             if any(self.ray_origin):
                 begin = np.array(self.ray_origin)
                 points = (points - begin).astype(np.float32)
-                pose = pose @ np.block([[np.eye(3), begin[:, None]], [0, 0, 0, 1]])
+                pose = moved_pose(pose, pose[:3, :3] @ begin)
             yield PosedScan(points_in_range(points, self.range_min_m), pose)
 
 

@@ -15,7 +15,7 @@ _BIN_RAD = np.radians(0.25)
 """The side of the cells of direction that are compared: about one ray of lidars."""
 
 _BEHIND = 1.5
-"""A point lies behind another in its direction if it is so many times as far."""
+"""A point lies behind another in its direction if it is this many times as far."""
 
 _WRONG = 0.07
 """The share of points behind others from which on rays begin elsewhere.

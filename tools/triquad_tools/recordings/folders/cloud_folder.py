@@ -25,12 +25,7 @@ from triquad_tools.recordings.folders.scan_folder import (
     place_files,
 )
 from triquad_tools.recordings.folders.trajectory import Trajectory
-from triquad_tools.recordings.recording import (
-    SENSOR,
-    WORLD,
-    ReadingOptions,
-    Stream,
-)
+from triquad_tools.recordings.recording import SENSOR, WORLD, ReadingOptions, Stream
 from triquad_tools.recordings.text_lines import parse_rigid, parse_stamps, read_lines
 from triquad_tools.sensors.motion.placing import place
 from triquad_tools.sensors.point_times import offsets_s

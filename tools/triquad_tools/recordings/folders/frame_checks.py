@@ -66,7 +66,7 @@ def check_poses(folder: ScanFolder) -> None:
     Raises:
         ToolError: points of scans near each other agree clearly better by the inverse poses.
     """
-    pairs = list(_pairs([file.world_from_sensor for file in folder.files]))
+    pairs = list(_pairs(np.array([file.world_from_sensor for file in folder.files])))
     apart_m = np.array([_apart_m(*folder.read(pair)) for pair in pairs]).reshape(-1, 2)
     as_said_m, inverse_m = np.median(apart_m, axis=0) if len(apart_m) else (0.0, 0.0)
     if as_said_m > _WRONG_M and as_said_m > _CLEARLY * inverse_m:
@@ -77,17 +77,16 @@ def check_poses(folder: ScanFolder) -> None:
         )
 
 
-def _pairs(poses: Sequence[Doubles]) -> Iterable[tuple[int, int]]:
-    """Yield a few pairs of scans that were taken near each other, but not at the same place."""
-    extent_m = np.linalg.norm(np.ptp([pose[:3, 3] for pose in poses], axis=0))
-    apart_m = min(_APART_M, 0.4 * float(extent_m))
+def _pairs(poses: Doubles) -> Iterable[tuple[int, int]]:
+    """Yield a few pairs of scans, of ``poses`` [N, 4, 4]: near each other, not at one place."""
+    extent_m = float(np.linalg.norm(np.ptp(poses[:, :3, 3], axis=0)))
+    apart_m = min(_APART_M, 0.4 * extent_m)
     for first in np.linspace(0, len(poses) - 1, 6).astype(int).tolist()[:-1]:
-        for second in range(first + 1, len(poses)):
-            between = np.linalg.inv(poses[first]) @ poses[second]
-            turn = np.arccos(np.clip((np.trace(between[:3, :3]) - 1) / 2, -1, 1))
-            if np.linalg.norm(between[:3, 3]) > apart_m or turn > _APART_RAD:
-                yield first, second
-                break
+        between = np.linalg.inv(poses[first]) @ poses[first + 1 :]
+        turns = np.arccos(np.clip((np.trace(between[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1))
+        apart = (np.linalg.norm(between[:, :3, 3], axis=1) > apart_m) | (turns > _APART_RAD)
+        if apart.any():
+            yield first, first + 1 + int(apart.argmax())
 
 
 def _apart_m(first: PosedScan, second: PosedScan) -> tuple[float, float]:

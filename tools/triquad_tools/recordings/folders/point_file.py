@@ -77,7 +77,7 @@ def check_columns(paths: Sequence[Path]) -> None:
 
 
 def _explained(flats: Sequence[NDArray[np.float32]], count: int) -> float:
-    """Return the share of the variance of numbers that is explained by which column they are of."""
+    """Return which share of the variance of numbers is between their columns."""
     tables = [flat[: len(flat) // count * count].reshape(-1, count) for flat in flats]
     values = np.arcsinh(np.nan_to_num(np.concatenate(tables), posinf=0.0, neginf=0.0))
     both = (values, np.abs(values))

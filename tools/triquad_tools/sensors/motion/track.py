@@ -58,7 +58,7 @@ class Track:
         return float(np.diff(np.array(self._stamps, np.int64)).max(initial=0)) / 1e9
 
     def corrects(self, below: "Track") -> bool:
-        """Return whether it is rare beside the motion below it, and moves no more than that."""
+        """Return whether it is rarer than the motion below it, and moves no more than that."""
         is_rare = self.rate_hz * _RARER <= below.rate_hz
         return is_rare and self._length_m <= below._length_m + 1.0
 
