@@ -18,7 +18,6 @@ from triquad_server.engine.memory import memory_on
 from triquad_server.intake.rays import usable_rays
 from triquad_server.mapping.region_evidence import RegionEvidence
 from triquad_server.mapping.region_setup import RegionSetup
-from triquad_server.mapping.replay.normals import SurfaceNormals
 from triquad_server.process.threads import Teams
 from triquad_server.settings import Settings
 from triquad_server.settings.loading import load_settings
@@ -82,7 +81,6 @@ class Believed:
             sums=GradientSums(),
             team=Teams().mapping,
         )
-        self._normals = SurfaceNormals(settings.field.leaf_m, self._setup.team)
         live = LiveEvidence(1 << settings.field.depth)
         self._region = RegionEvidence(live, self._setup, np.zeros(3), 0)
 
@@ -91,7 +89,7 @@ class Believed:
         points = scan.points.astype(np.float32)
         rays = usable_rays(points, scan.world_from_sensor, self.settings.scan)
         seen = self._region.scan_seen(rays, 0)
-        self._region.believe(seen, self._normals.add(rays.ends, rays.origin))
+        self._region.believe(seen)
 
     def is_surface(self, centres: Doubles) -> Bools:
         """Return whether voxels with ``centres`` [N, 3] are taken to be surface."""

@@ -13,6 +13,7 @@ from triquad_map.evidence.carving import Reach, mark_crossed
 from triquad_map.evidence.company import have_company
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.evidence.growth import EvidenceSize, NewEnds, new_blocks, new_ends
+from triquad_map.evidence.normals import fit_normals, normals_of, outdated
 from triquad_map.evidence.observations import Observations
 from triquad_map.evidence.observed import Sighting
 from triquad_map.evidence.ray_surfels import ray_surfels
@@ -95,9 +96,25 @@ class LiveEvidence:
         """Return whether there is surface in the voxels of ``rows`` [N]."""
         return have_surface(rows, self._seen, self._observations.arrays)
 
-    def set_normals(self, rows: Ints, normals: Doubles) -> None:
-        """Keep the unit ``normals`` [N, 3] of surfaces that were marked; NaN where unknown."""
-        self._observations.set_normals(rows, normals)
+    def normals(self, ends: Doubles, rows: Ints, split: Split = in_one) -> Doubles:
+        """Return the normals [N, 3] of the surfaces on which the newest scan ended.
+
+        Args:
+            ends: [N, 3] of its rays, voxels.
+            rows: [N] of their voxels, as :meth:`record_ends` gave them.
+            split: where several threads find planes.
+
+        Returns:
+            Unit vectors of either sign; NaN where no plane is known.
+        """
+        observed = self._observations.arrays
+        changed = outdated(rows, observed)
+
+        def work(first: int, last: int) -> None:
+            fit_normals(changed[first:last], self._seen, observed)
+
+        split(len(changed), work)
+        return normals_of(ends, rows, observed)
 
     def first_seen_since(self, scan: int, rows: Ints) -> Bools:
         """Return which rays [N] ended on a surface that was first seen in ``scan`` or later.

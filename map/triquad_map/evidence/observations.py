@@ -17,7 +17,6 @@ from triquad_format.records.region import (
     used_blocks,
 )
 
-from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.team import Split
 from triquad_map.compiled.voxel_index import SHIFT, with_room
 from triquad_map.evidence.field_discs import set_discs
@@ -70,14 +69,6 @@ _RECORD = ("hits", "earlier_misses", "earlier_misses")
 """The fields of a voxel's record that files keep; passes are none but those that would have hit."""
 
 
-@kernel()
-def _set_normals(rows: Ints, normals: Doubles, observed: Observed) -> None:
-    for i, row in enumerate(rows):
-        if row != 0 and not np.isnan(normals[i, 0]):
-            for axis in range(3):
-                observed.voxels[row].normal[axis] = normals[i, axis]
-
-
 class Observations:
     """The observations of the blocks of some evidence, by their rows."""
 
@@ -122,10 +113,6 @@ class Observations:
         )
         self._grow()
         return done, blocks
-
-    def set_normals(self, rows: Ints, normals: Doubles) -> None:
-        """Keep the ``normals`` [N, 3] of the surface in ``rows`` [N]; NaN: as they were."""
-        _set_normals(rows, normals, self.arrays)
 
     def set_discs(self, voxels: Longs, surfels: Surfels, seen: SeenVoxels) -> None:
         """Take the middles and normals of ``voxels`` [N, 3] from their ``surfels``.

@@ -4,8 +4,7 @@ import numpy as np
 from triquad_format.records.arrays import Bytes, Doubles, Floats, Longs
 
 from triquad_map.compiled.kernel import inner_kernel, kernel
-from triquad_map.compiled.planes import MOMENTS, add_points, plane_normal
-from triquad_map.evidence.observed import Observed, row_of
+from triquad_map.evidence.observed import Observed, ObservedVoxel, is_flat, row_of
 from triquad_map.evidence.seen_voxels import SeenVoxels
 from triquad_map.surface import SurfelKind, Surfels, nothing_shown
 
@@ -26,55 +25,18 @@ def ray_surfels(
 
 
 @inner_kernel()
-def _normal_around(
-    voxel: Longs, since: int, seen: SeenVoxels, observed: Observed, normal: Doubles
-) -> bool:
-    """Return the normal of the ends in a voxel and those around it; False where they are not flat.
-
-    Only those count that rays first ended in since ``since``, too: a floor does not, on which
-    something was put.
-    """
-    moments = np.zeros(MOMENTS)
-    for i in range(-1, 2):
-        for j in range(-1, 2):
-            for k in range(-1, 2):
-                near = row_of(seen, observed, voxel[0] + i, voxel[1] + j, voxel[2] + k)
-                other = observed.voxels[near]
-                if near == 0 or other.ends == 0 or other.first_scan < since:
-                    continue
-                at = (i + other.mean[0], j + other.mean[1], k + other.mean[2])
-                add_points(moments, at, other.ends)
-    return bool(plane_normal(moments, normal))
-
-
-@inner_kernel()
-def _set_normal(
-    voxel: Longs,
-    row: int,
-    since: int,
-    seen: SeenVoxels,
-    observed: Observed,
-    normal: Doubles,
-) -> bool:
-    """Set the normal of the surface in a voxel, to the sensor; False: it is the way there."""
-    towards = observed.voxels[row].towards
-    is_known = False
+def _set_normal(voxel: ObservedVoxel, normal: Doubles) -> None:
+    """Set the normal of the surface in a voxel, to the sensor; if none is known, the way there."""
+    towards = voxel.towards
+    length = max(np.sqrt(_product(towards, towards)), 1e-6)
+    sign = -1.0 if _product(voxel.normal, towards) < 0 else 1.0
     for axis in range(3):
-        normal[axis] = observed.voxels[row].normal[axis]
-        is_known = is_known or normal[axis] != 0
-    if not is_known and not _normal_around(voxel, since, seen, observed, normal):
-        length = max(np.sqrt(_product(towards, towards)), 1e-6)
-        for axis in range(3):
-            normal[axis] = towards[axis] / length
-        return False
-    if _product(normal, towards) < 0:
-        for axis in range(3):
-            normal[axis] = -normal[axis]
-    return True
+        is_known = is_flat(voxel)
+        normal[axis] = sign * voxel.normal[axis] if is_known else towards[axis] / length
 
 
 @inner_kernel()
-def _product(one: Floats | Doubles, other: Floats) -> float:
+def _product(one: Floats, other: Floats) -> float:
     """Return the scalar product of two vectors [3]."""
     product: float = one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
     return product
@@ -97,6 +59,6 @@ def _fill(
         here = observed.voxels[row]
         if row == 0 or here.ends == 0 or here.first_scan < since or here.hit_scan < hit_since:
             continue
-        is_flat = _set_normal(voxels[i], row, since, seen, observed, normal)
-        kinds[i] = _RAY_DISC if is_flat else _RAY_POINT
+        _set_normal(here, normal)
+        kinds[i] = _RAY_DISC if is_flat(here) else _RAY_POINT
         offsets[i], normals[i] = here.mean - np.float32(0.5), normal

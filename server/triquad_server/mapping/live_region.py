@@ -86,23 +86,20 @@ class LiveRegion:
         self.is_changed = True
         return self.evidence.scan_seen(rays, stamp_s)
 
-    def believe(self, seen: SeenScan, normals: Doubles) -> None:
-        """Let surface come and go by what a scan has shown, and grow the field where it is new.
-
-        ``normals`` [N, 3] are those of the surface at the rays' ends, NaN where unknown.
-        """
+    def believe(self, seen: SeenScan) -> None:
+        """Let surface come and go by what a scan has shown, and grow the field where it is new."""
         # A leaf of the trees is the shadow of a voxel: where surface was before, nothing grows.
-        new = self.evidence.believe(seen, normals)
+        new = self.evidence.believe(seen)
         self.field.grow(new)
         self.training.surface_appeared(new)
 
-    def scan_taken(self, rays: ScanRays, normals: Doubles, seen: SeenScan) -> None:
+    def scan_taken(self, rays: ScanRays, seen: SeenScan) -> None:
         """Keep the rays of a scan for training, after :meth:`believe`."""
         is_new = self.evidence.first_seen_within(LEARNT_SCANS, seen.rows)
         # A return that is not believed, a drop of rain or the first of far things, teaches nothing.
         ends_elsewhere = seen.rows == 0
         used = ends_elsewhere | self.evidence.live.is_surface(seen.rows)
-        self.training.scan_taken(rays, normals, used, is_new & used)
+        self.training.scan_taken(rays, seen.normals, used, is_new & used)
 
     def take_step(self) -> tuple[Loss, int]:
         """Take one optimiser step; return loss and samples. On a GPU, reading the loss waits."""

@@ -18,7 +18,6 @@ from triquad_server.mapping.live_regions import LiveRegions
 from triquad_server.mapping.map_snapshot import MapChanges, MapSnapshot
 from triquad_server.mapping.progress import MapFigures
 from triquad_server.mapping.region_setup import RegionSetup
-from triquad_server.mapping.replay.normals import SurfaceNormals
 from triquad_server.process.threads import Teams
 from triquad_server.settings import ANY_SOURCE, Settings
 
@@ -53,7 +52,6 @@ class Mapper:
             sums=GradientSums(),
             team=self._teams.mapping,
         )
-        self._normals = SurfaceNormals(self._setup.field.leaf_m, self._teams.mapping)
         self.regions = LiveRegions(self._setup, settings.memory.max_bytes)
         self._number = record.epoch if record else 0
         self._epoch: Epoch | None = None
@@ -69,8 +67,6 @@ class Mapper:
         self._loss: Loss | None = progress.loss or None
         if record is not None:
             self.regions.restore(record.regions)
-            for region in self.regions:
-                self._normals.restore(region.training.rays.ends + region.centre)
             self.regions.share_out()
 
     @property
@@ -185,16 +181,13 @@ class Mapper:
             raise ScanRefusedError("internal", text) from error
 
     def _take_in(self, rays: ScanRays, regions: list[LiveRegion], stamp_s: int) -> None:
-        """Have regions take in a scan; normals are computed while they record what it shows."""
-        seen, normals = self._teams.mapping.both(
-            lambda: [region.scan_seen(rays, stamp_s) for region in regions],
-            lambda: self._normals.add(rays.ends, rays.origin),
-        )
+        """Have regions take in a scan."""
+        seen = [region.scan_seen(rays, stamp_s) for region in regions]
         for region, shown in zip(regions, seen, strict=True):
-            region.believe(shown, normals)
+            region.believe(shown)
         self.regions.share_out()  # by the voxels that have surface so far
         for region, shown in zip(regions, seen, strict=True):
-            region.scan_taken(rays, normals, shown)
+            region.scan_taken(rays, shown)
 
     def train(self) -> None:
         """Take one optimiser step where most is to be learnt; do nothing once all is settled."""
@@ -237,7 +230,6 @@ class Mapper:
         self.regions.forget(minimum, maximum)
         if not self.regions:
             self.scans_taken, self.samples_trained, self._loss = 0, 0, None
-        self._normals.forget(minimum, maximum)
         self._structure_changed = True
 
     def changes_since(self, epoch: int | None) -> MapChanges:

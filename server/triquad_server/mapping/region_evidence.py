@@ -36,6 +36,7 @@ class SeenScan(NamedTuple):
     """What a scan has shown."""
 
     rows: Ints  # [N] of the voxel in which each ray ended; 0 outside the region
+    normals: Doubles  # [N, 3] of the surface where they ended, of either sign; NaN where unknown
     passed: Ints  # [P] of voxels that they may have crossed
 
 
@@ -94,6 +95,7 @@ class RegionEvidence:
         ends, origin = self.voxels(rays.ends), self.voxels(rays.origin[None])[0]
         leaf_m = self._setup.field.leaf_m
         rows = self.live.record_ends(ends, Sighting(origin, leaf_m, stamp_s, self._scans))
+        normals = self.live.normals(ends, rows, self._setup.team.split)
         clear = math.inf if self._setup.change.static else _CLEAR_SHORT
         reach = Reach(_CARVE_SHORT, clear, self._scans)
         thinned = ends[thin(ends, 1.0, empty_keys(len(ends)))]
@@ -106,14 +108,10 @@ class RegionEvidence:
         self.live.carve(origin, open_ends, Reach(0.0))
         if rays.robot is not None:
             self.live.mark_free(self.voxels(rays.robot.voxel_centres(leaf_m)))
-        return SeenScan(rows, passed)
+        return SeenScan(rows, normals, passed)
 
-    def believe(self, seen: SeenScan, normals: Doubles) -> Longs:
-        """Let surface come and go, after :meth:`scan_seen`; return the new voxels [M, 3].
-
-        ``normals`` [N, 3] are those of the surface at the rays' ends, NaN where unknown.
-        """
-        self.live.set_normals(seen.rows, normals)
+    def believe(self, seen: SeenScan) -> Longs:
+        """Let surface come and go, after :meth:`scan_seen`; return the new voxels [M, 3]."""
         changes = self.live.believe(seen.rows, seen.passed, Belief())
         if len(changes.removed):
             self._removed.append(changes.removed)

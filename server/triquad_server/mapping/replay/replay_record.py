@@ -12,9 +12,10 @@ from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.replay_rays import SLOPE_SCALE, STEPS, ReplayRays
 from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.team import Team
+from triquad_map.evidence.live_evidence import LiveEvidence
+from triquad_map.evidence.observed import Sighting
 
 from triquad_server.mapping.replay.held_out import end_in_steps, is_held_out
-from triquad_server.mapping.replay.normals import SurfaceNormals
 from triquad_server.mapping.replay.ray_table import LEAST_SLOPE, VALUE, RayTable
 
 _MOST_RAYS = 6_000_000  # this many fit into the parts of a single cube
@@ -119,7 +120,10 @@ def recorded_rays(table: RayTable, settings: FieldSettings) -> tuple[ReplayRays,
 def restored_rays(rays: ReplayRays, settings: FieldSettings, team: Team) -> RayTable:
     """Return the rays of a record; their slopes follow from normals of the ends around, if any."""
     ends = rays.ends_m(settings)
-    normals = SurfaceNormals(settings.leaf_m, team, max_cells=len(ends)).add(ends, np.zeros(3))
+    voxels = settings.leaf_coordinates(ends)
+    evidence = LiveEvidence(1 << settings.depth)
+    places = evidence.record_ends(voxels, Sighting(np.zeros(3), settings.leaf_m, 0, 1))
+    normals = evidence.normals(voxels, places, team.split)
     ways = ends - rays.origins[rays.origin_of]
     cosines = (ways * normals).sum(axis=1) / np.maximum(np.linalg.norm(ways, axis=1), 1e-9)
     slopes = np.maximum(np.abs(cosines), LEAST_SLOPE)
