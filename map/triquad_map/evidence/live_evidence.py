@@ -13,7 +13,7 @@ from triquad_map.evidence.carving import Reach, mark_crossed
 from triquad_map.evidence.company import have_company
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.evidence.growth import EvidenceSize, NewEnds, new_blocks, new_ends
-from triquad_map.evidence.normals import fit_normals, normals_of, outdated
+from triquad_map.evidence.normals import fit_normals, normals_at, outdated
 from triquad_map.evidence.observations import Observations
 from triquad_map.evidence.observed import Sighting
 from triquad_map.evidence.ray_surfels import ray_surfels
@@ -114,7 +114,7 @@ class LiveEvidence:
             fit_normals(changed[first:last], self._seen, observed)
 
         split(len(changed), work)
-        return normals_of(ends, rows, observed)
+        return normals_at(ends, rows, observed)
 
     def first_seen_since(self, scan: int, rows: Ints) -> Bools:
         """Return which rays [N] ended on a surface that was first seen in ``scan`` or later.

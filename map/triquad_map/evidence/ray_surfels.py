@@ -4,7 +4,8 @@ import numpy as np
 from triquad_format.records.arrays import Bytes, Doubles, Floats, Longs
 
 from triquad_map.compiled.kernel import inner_kernel, kernel
-from triquad_map.evidence.observed import Observed, ObservedVoxel, is_flat, row_of
+from triquad_map.evidence.normals import find_normal
+from triquad_map.evidence.observed import Observed, is_flat, row_of
 from triquad_map.evidence.seen_voxels import SeenVoxels
 from triquad_map.surface import SurfelKind, Surfels, nothing_shown
 
@@ -25,18 +26,26 @@ def ray_surfels(
 
 
 @inner_kernel()
-def _set_normal(voxel: ObservedVoxel, normal: Doubles) -> None:
-    """Set the normal of the surface in a voxel, to the sensor; if none is known, the way there."""
+def _set_normal(row: int, seen: SeenVoxels, observed: Observed, normal: Doubles) -> bool:
+    """Set the normal of the surface in a voxel, to the sensor; False: it is the way there."""
+    voxel = observed.voxels[row]
     towards = voxel.towards
-    length = max(np.sqrt(_product(towards, towards)), 1e-6)
-    sign = -1.0 if _product(voxel.normal, towards) < 0 else 1.0
     for axis in range(3):
-        is_known = is_flat(voxel)
-        normal[axis] = sign * voxel.normal[axis] if is_known else towards[axis] / length
+        normal[axis] = voxel.normal[axis]
+    # Others may have ended around since its own was looked for.
+    if not is_flat(voxel) and not find_normal(row, 1, seen, observed, normal):
+        length = max(np.sqrt(_product(towards, towards)), 1e-6)
+        for axis in range(3):
+            normal[axis] = towards[axis] / length
+        return False
+    if _product(normal, towards) < 0:
+        for axis in range(3):
+            normal[axis] = -normal[axis]
+    return True
 
 
 @inner_kernel()
-def _product(one: Floats, other: Floats) -> float:
+def _product(one: Floats | Doubles, other: Floats) -> float:
     """Return the scalar product of two vectors [3]."""
     product: float = one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
     return product
@@ -59,6 +68,6 @@ def _fill(
         here = observed.voxels[row]
         if row == 0 or here.ends == 0 or here.first_scan < since or here.hit_scan < hit_since:
             continue
-        _set_normal(here, normal)
-        kinds[i] = _RAY_DISC if is_flat(here) else _RAY_POINT
+        is_disc = _set_normal(row, seen, observed, normal)
+        kinds[i] = _RAY_DISC if is_disc else _RAY_POINT
         offsets[i], normals[i] = here.mean - np.float32(0.5), normal
