@@ -91,19 +91,18 @@ def test_the_field_takes_over_once_it_has_learnt_the_surface():
     assert surfels.kinds[0] == SurfelKind.NONE
 
 
-def seen_by_rays(ends, normal=None):
-    """Evidence of one scan from above, and what its rays show of some voxels."""
+def seen_by_rays(ends):
+    """Evidence of one scan from above."""
     evidence = LiveEvidence(SIDE)
-    sighting = Sighting(np.array([32.0, 32, 60]), 0.2, stamp_s=1, scan=1)
-    rows = see(evidence, ends, sighting)
-    normals = np.full(ends.shape, np.nan if normal is None else normal)
-    evidence.set_normals(rows, normals)
+    see(evidence, ends, Sighting(np.array([32.0, 32, 60]), 0.2, stamp_s=1, scan=1))
     return evidence
 
 
 def test_rays_show_a_disc_that_faces_the_sensor():
-    ends = np.array([[30.3, 30.4, 30.1], [30.5, 30.6, 30.3]])
-    evidence = seen_by_rays(ends, (0.0, 0, -1))
+    ends = np.array([[30.3, 30.4, 30.2], [30.5, 30.6, 30.2]])
+    around = ends[0] + np.stack([*np.meshgrid([-1, 0, 1], [-1, 0, 1]), np.zeros((3, 3))], -1)
+    around = np.delete(around.reshape(-1, 3), 4, axis=0)
+    evidence = seen_by_rays(np.concatenate([ends, around]))
     shown = evidence.ray_surfels(np.array([[30, 30, 30], [9, 9, 9]]), since=1)
     assert shown.kinds.tolist() == [SurfelKind.RAY_DISC, SurfelKind.NONE]
     assert evidence.ray_surfels(np.array([[30, 30, 30]]), since=2).kinds[0] == SurfelKind.NONE
@@ -111,7 +110,7 @@ def test_rays_show_a_disc_that_faces_the_sensor():
     np.testing.assert_allclose(shown.normals[0], (0, 0, 1))
 
 
-def test_where_no_normal_is_known_the_ends_around_may_lie_on_a_plane():
+def test_the_ends_around_lie_on_a_plane_or_do_not():
     rng = np.random.default_rng(4)
     slope = np.array([0.6, 0, 0.8])
     ends = rng.uniform(28, 34, (400, 3))

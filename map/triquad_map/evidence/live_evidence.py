@@ -64,8 +64,13 @@ class LiveEvidence:
         self._surface = None
         self._mark("surface", voxels)
 
-    def record_ends(self, voxels: Doubles, sighting: Sighting) -> Ints:
+    def record_ends(self, voxels: Doubles, sighting: Sighting, split: Split = in_one) -> Ints:
         """Record that rays ended at ``voxels`` [N, 3], and from where and when.
+
+        Args:
+            voxels: the ends of all rays of a scan.
+            sighting: the scan.
+            split: over which normals are found.
 
         Returns:
             The row of what is recorded of each ray's voxel; 0 outside the region.
@@ -82,6 +87,7 @@ class LiveEvidence:
         company = self._observations.arrays.voxels["company"]
         alone = np.flatnonzero(~company[rows] & (rows > 0))
         company[rows[alone[have_company(voxels - sighting.origin, alone)]]] = True
+        self._find_normals(rows, sighting.unlearnt_since, split)
         return rows
 
     def believe(self, hit: Ints, passed: Ints, belief: Belief) -> Changes:
@@ -96,25 +102,12 @@ class LiveEvidence:
         """Return whether there is surface in the voxels of ``rows`` [N]."""
         return have_surface(rows, self._seen, self._observations.arrays)
 
-    def normals(self, ends: Doubles, rows: Ints, split: Split = in_one) -> Doubles:
-        """Return the normals [N, 3] of the surfaces on which the newest scan ended.
+    def normals(self, ends: Doubles, rows: Ints) -> Doubles:
+        """Return unit normals [N, 3], of either sign, of the surfaces at ``ends`` [N, 3], voxels.
 
-        Args:
-            ends: [N, 3] of its rays, voxels.
-            rows: [N] of their voxels, as :meth:`record_ends` gave them.
-            split: where several threads find planes.
-
-        Returns:
-            Unit vectors of either sign; NaN where no plane is known.
+        ``rows`` [N] are those that :meth:`record_ends` gave for them. NaN: no plane is known there.
         """
-        observed = self._observations.arrays
-        changed = outdated(rows, observed)
-
-        def work(first: int, last: int) -> None:
-            fit_normals(changed[first:last], self._seen, observed)
-
-        split(len(changed), work)
-        return normals_at(ends, rows, observed)
+        return normals_at(ends, rows, self._observations.arrays)
 
     def first_seen_since(self, scan: int, rows: Ints) -> Bools:
         """Return which rays [N] ended on a surface that was first seen in ``scan`` or later.
@@ -228,6 +221,16 @@ class LiveEvidence:
             done, self._blocks.count = mark(voxels, done, self._seen, mask, self._blocks.count)
             if done < len(voxels):
                 self._make_room(more=True)
+
+    def _find_normals(self, rows: Ints, since: int, split: Split) -> None:
+        """Find the normals of surfaces on which the newest scan ended, in voxels by their rows."""
+        observed = self._observations.arrays
+        changed = outdated(rows, observed)
+
+        def work(first: int, last: int) -> None:
+            fit_normals(changed[first:last], since, self._seen, observed)
+
+        split(len(changed), work)
 
     def _make_room(self, more: bool = False) -> None:
         """Make room for as many blocks as the index has room for, or for ``more``."""

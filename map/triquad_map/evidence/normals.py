@@ -12,41 +12,51 @@ from triquad_map.compiled.planes import MOMENTS, add_points, plane_normal
 from triquad_map.evidence.observed import Observed, is_flat, rows_around, voxel_of
 from triquad_map.evidence.seen_voxels import SeenVoxels
 
-_REACHES = (1, 2, 4)
+_REACHES = (1.25, 2.25, 4.25)
 """How many voxels away ends count for a plane; farther ones only where the nearer ones have none.
-With 1 and 3, a street at 16 beams is seen to 1.36 cm before any training, not 1.27."""
+Without the last, a street at 16 beams is seen to 1.5 cm before any training, not 1.3."""
+
+NEAREST = _REACHES[0]
 
 _ON_PLANE = 0.25
 """The height of a point over a plane above which it does not lie on it, in voxels."""
 
 
 @inner_kernel()
-def find_normal(row: int, reach: int, seen: SeenVoxels, observed: Observed, found: Doubles) -> bool:
+def find_normal(
+    row: int, reach: float, since: int, seen: SeenVoxels, observed: Observed, found: Doubles
+) -> bool:
     """Find the unit normal [3] of the ends within ``reach`` voxels of a row's; False: none.
 
     They count as if all of a voxel lay in their middle, which leaves out most of their noise.
+    Where a voxel was first hit in scan ``since`` or later, only ends in others of that kind do: not
+    those on the floor, on which something was put.
     """
     moments = np.zeros(MOMENTS)
+    here = observed.voxels[row].mean
+    first = min(since, observed.voxels[row].first_scan)
     x, y, z = voxel_of(row, seen, observed)
-    for near in rows_around(row, reach, seen, observed):
+    for near in rows_around(row, int(reach), seen, observed):
         other = observed.voxels[near]
-        if other.ends > 0:
+        if other.ends > 0 and other.first_scan >= first:
             i, j, k = voxel_of(np.int64(near), seen, observed)
             mean = other.mean
             at = (i - x + mean[0], j - y + mean[1], k - z + mean[2])
-            add_points(moments, at, other.ends)
+            square = (at[0] - here[0]) ** 2 + (at[1] - here[1]) ** 2 + (at[2] - here[2]) ** 2
+            if square <= reach * reach:
+                add_points(moments, at, other.ends)
     return bool(plane_normal(moments, found))
 
 
 @kernel()
-def fit_normals(rows: Ints, seen: SeenVoxels, observed: Observed) -> None:
-    """Find the normals of the surface in voxels, by their ``rows`` [N]."""
+def fit_normals(rows: Ints, since: int, seen: SeenVoxels, observed: Observed) -> None:
+    """Find the normals of the surface in voxels, by their ``rows`` [N]; see :func:`find_normal`."""
     normal = np.zeros(3)
     for row in rows:
         is_known = False
         for reach in _REACHES:
             if not is_known:
-                is_known = find_normal(np.int64(row), reach, seen, observed, normal)
+                is_known = find_normal(np.int64(row), reach, since, seen, observed, normal)
         for axis in range(3):
             observed.voxels[row].normal[axis] = normal[axis] if is_known else 0.0
 

@@ -164,6 +164,7 @@ class Sighting(NamedTuple):
     leaf_m: float
     stamp_s: int  # seconds since 1970
     scan: int  # its number, from 1 on; that of the next is greater
+    unlearnt_since: int = 0  # the first scan of whose surface the field has not learnt all
 
 
 @kernel(inline="always")

@@ -4,7 +4,7 @@ import numpy as np
 from triquad_format.records.arrays import Bytes, Doubles, Floats, Longs
 
 from triquad_map.compiled.kernel import inner_kernel, kernel
-from triquad_map.evidence.normals import find_normal
+from triquad_map.evidence.normals import NEAREST, find_normal
 from triquad_map.evidence.observed import Observed, is_flat, row_of
 from triquad_map.evidence.seen_voxels import SeenVoxels
 from triquad_map.surface import SurfelKind, Surfels, nothing_shown
@@ -26,14 +26,16 @@ def ray_surfels(
 
 
 @inner_kernel()
-def _set_normal(row: int, seen: SeenVoxels, observed: Observed, normal: Doubles) -> bool:
+def _set_normal(
+    row: int, since: int, seen: SeenVoxels, observed: Observed, normal: Doubles
+) -> bool:
     """Set the normal of the surface in a voxel, to the sensor; False: it is the way there."""
     voxel = observed.voxels[row]
     towards = voxel.towards
     for axis in range(3):
         normal[axis] = voxel.normal[axis]
     # Others may have ended around since its own was looked for.
-    if not is_flat(voxel) and not find_normal(row, 1, seen, observed, normal):
+    if not is_flat(voxel) and not find_normal(row, NEAREST, since, seen, observed, normal):
         length = max(np.sqrt(_product(towards, towards)), 1e-6)
         for axis in range(3):
             normal[axis] = towards[axis] / length
@@ -68,6 +70,6 @@ def _fill(
         here = observed.voxels[row]
         if row == 0 or here.ends == 0 or here.first_scan < since or here.hit_scan < hit_since:
             continue
-        is_disc = _set_normal(row, seen, observed, normal)
+        is_disc = _set_normal(row, since, seen, observed, normal)
         kinds[i] = _RAY_DISC if is_disc else _RAY_POINT
         offsets[i], normals[i] = here.mean - np.float32(0.5), normal

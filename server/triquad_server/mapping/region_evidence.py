@@ -94,8 +94,8 @@ class RegionEvidence:
         self._scans += 1
         ends, origin = self.voxels(rays.ends), self.voxels(rays.origin[None])[0]
         leaf_m = self._setup.field.leaf_m
-        rows = self.live.record_ends(ends, Sighting(origin, leaf_m, stamp_s, self._scans))
-        normals = self.live.normals(ends, rows, self._setup.team.split)
+        sighting = Sighting(origin, leaf_m, stamp_s, self._scans, self._unlearnt_since)
+        rows = self.live.record_ends(ends, sighting, self._setup.team.split)
         clear = math.inf if self._setup.change.static else _CLEAR_SHORT
         reach = Reach(_CARVE_SHORT, clear, self._scans)
         thinned = ends[thin(ends, 1.0, empty_keys(len(ends)))]
@@ -108,7 +108,7 @@ class RegionEvidence:
         self.live.carve(origin, open_ends, Reach(0.0))
         if rays.robot is not None:
             self.live.mark_free(self.voxels(rays.robot.voxel_centres(leaf_m)))
-        return SeenScan(rows, normals, passed)
+        return SeenScan(rows, self.live.normals(ends, rows), passed)
 
     def believe(self, seen: SeenScan) -> Longs:
         """Let surface come and go, after :meth:`scan_seen`; return the new voxels [M, 3]."""

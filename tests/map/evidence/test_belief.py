@@ -26,14 +26,12 @@ class Watched:
         self.evidence = LiveEvidence(SIDE)
         self.scans = 0
 
-    def scan(self, ends: Doubles, normal: Doubles | None = None, sensor: Doubles = SENSOR) -> int:
+    def scan(self, ends: Doubles, sensor: Doubles = SENSOR) -> int:
         """Take in rays that end at ``ends`` [N, 3]; returns how many voxels were taken back."""
         self.scans += 1
         sighting = Sighting(sensor, 0.2, self.scans, scan=self.scans)
         rows = self.evidence.record_ends(ends, sighting)
         passed = self.evidence.carve(sensor, ends, Reach(0.5, 2.5, self.scans))
-        if normal is not None:
-            self.evidence.set_normals(rows, np.tile(normal, (len(ends), 1)))
         return len(self.evidence.believe(rows, passed, Belief()).removed)
 
     def believed(self, voxels: Doubles) -> float:
@@ -59,9 +57,9 @@ def rng() -> np.random.Generator:
 
 def test_one_scan_with_a_wrong_pose_takes_no_wall_away(rng: np.random.Generator) -> None:
     for scans in (2, 10):
-        watched, facing = Watched(), np.array([1.0, 0, 0])
+        watched = Watched()
         for _ in range(scans):
-            watched.scan(panel(rng, WALL_X), facing)
+            watched.scan(panel(rng, WALL_X))
         before = watched.believed(panel(rng, WALL_X, half=7.0))
         assert before > 0.95
         watched.scan(behind(panel(rng, WALL_X), 120.0))
@@ -72,19 +70,19 @@ def test_one_scan_with_a_wrong_pose_takes_no_wall_away(rng: np.random.Generator)
 
 
 def test_a_wall_that_rays_reach_stays_for_ever(rng: np.random.Generator) -> None:
-    watched, facing = Watched(), np.array([1.0, 0, 0])
+    watched = Watched()
     for _ in range(100):
-        assert watched.scan(panel(rng, WALL_X + rng.normal(0, 0.05)), facing) == 0
+        assert watched.scan(panel(rng, WALL_X + rng.normal(0, 0.05))) == 0
 
 
 def test_a_wall_that_rays_pass_goes_and_comes_back_each_time(
     rng: np.random.Generator,
 ) -> None:
-    watched, facing = Watched(), np.array([1.0, 0, 0])
+    watched = Watched()
     wall = panel(rng, WALL_X, half=7.0)
     for _ in range(3):
         for _ in range(10):
-            watched.scan(panel(rng, WALL_X), facing)
+            watched.scan(panel(rng, WALL_X))
         assert watched.believed(wall) == 1.0
         for _ in range(10):
             watched.scan(behind(panel(rng, WALL_X), 120.0))
@@ -112,7 +110,7 @@ def test_surface_is_new_for_some_scans_and_again_where_it_comes_back(
 
 
 def test_ground_is_not_taken_back_by_rays_that_graze_it(rng: np.random.Generator) -> None:
-    watched, up = Watched(), np.array([0.0, 0, 1.0])
+    watched = Watched()
     ground_z, first = SENSOR[2] - 8.3, None
     for _ in range(60):
         x = SENSOR[0] + rng.uniform(10, 200, 4000)
@@ -120,7 +118,7 @@ def test_ground_is_not_taken_back_by_rays_that_graze_it(rng: np.random.Generator
         z = ground_z + rng.normal(0, 0.05, 4000)
         ends = np.stack([x, y, z], 1)
         first = ends if first is None else first
-        watched.scan(ends, up)
+        watched.scan(ends)
     assert first is not None
     assert watched.believed(first) > 0.998
 
@@ -216,7 +214,7 @@ def test_what_is_beside_a_far_thing_that_went_goes_with_it() -> None:
         rng, watched = np.random.default_rng(drive), Watched()
         high, low = np.array([1.5]), np.array([-3.0, -1.5, 0.0])
         back = lattice(rng, 180.5, np.concatenate([low, high]))
-        watched.scan(back, np.array([1.0, 0, 0]))
+        watched.scan(back)
         assert watched.believed(back) == 1.0
         for _ in range(10):
             watched.scan(behind(lattice(rng, 180.5, low), 240.0))
@@ -268,7 +266,7 @@ def test_drops_of_rain_are_no_surface(rng: np.random.Generator) -> None:
 
 def test_the_ground_does_not_hold_what_stood_on_it(rng: np.random.Generator) -> None:
     """A low box goes; the ground before it and where it stood is met by every scan."""
-    watched, up = Watched(), np.array([0.0, 0, 1.0])
+    watched = Watched()
     ground_z, front_x = SENSOR[2] - 8.9, 60.5
 
     def ground(last_x: float) -> Doubles:
@@ -283,5 +281,5 @@ def test_the_ground_does_not_hold_what_stood_on_it(rng: np.random.Generator) -> 
         watched.scan(np.concatenate([ground(front_x), front(400)]))
     assert watched.believed(front(400)) > 0.99
     for _ in range(10):
-        watched.scan(ground(90.0), up)
+        watched.scan(ground(90.0))
     assert watched.believed(front(400)) < 0.02

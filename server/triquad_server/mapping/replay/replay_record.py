@@ -122,8 +122,9 @@ def restored_rays(rays: ReplayRays, settings: FieldSettings, team: Team) -> RayT
     ends = rays.ends_m(settings)
     voxels = settings.leaf_coordinates(ends)
     evidence = LiveEvidence(1 << settings.depth)
-    places = evidence.record_ends(voxels, Sighting(np.zeros(3), settings.leaf_m, 0, 1))
-    normals = evidence.normals(voxels, places, team.split)
+    sighting = Sighting(np.zeros(3), settings.leaf_m, stamp_s=0, scan=1)
+    places = evidence.record_ends(voxels, sighting, team.split)
+    normals = evidence.normals(voxels, places)
     ways = ends - rays.origins[rays.origin_of]
     cosines = (ways * normals).sum(axis=1) / np.maximum(np.linalg.norm(ways, axis=1), 1e-9)
     slopes = np.maximum(np.abs(cosines), LEAST_SLOPE)
