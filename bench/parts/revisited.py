@@ -13,8 +13,7 @@ from triquad_format.records.status import Status
 from triquad_map.view import MapView
 from triquad_server.intake.rays import usable_rays
 from triquad_server.settings import Settings
-from triquad_tools.console.command import ToolError
-from triquad_tools.console.lines import print_remark
+from triquad_tools.console.command import ToolError, print_remark
 from triquad_tools.console.progress import progress
 from triquad_tools.recordings.cloud import points_in_range
 from triquad_tools.recordings.folders.cloud_folder import read_cloud_folder

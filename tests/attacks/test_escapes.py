@@ -13,7 +13,7 @@ from support.maps.map_records import random_record
 from triquad_format.errors import MapFileError
 from triquad_format.wire import codec, keys
 from triquad_tools.commands import inspect, pack, replay, top
-from triquad_tools.console.lines import print_line
+from triquad_tools.console.command import print_line
 
 EVIL = "\x1b]0;owned\x07\x1b[2J\r\x9b31mtext\u202egnp.exe\u2066\nvalid: nothing to see\x00\ud800"
 SENT = EVIL.replace("\ud800", "")  # what can be encoded
@@ -100,7 +100,7 @@ def test_words_of_a_server(harmless: Callable[[Main, list[str]], str]) -> None:
 
 
 def test_letters_that_a_terminal_does_not_know_are_escapes() -> None:
-    code = "from triquad_tools.console.lines import print_line; print_line('屋 \\ud800')"
+    code = "from triquad_tools.console.command import print_line; print_line('屋 \\ud800')"
     environment = {"PYTHONIOENCODING": "ascii"}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, env=environment)
     assert done.stdout == b"\\u5c4b \\ud800\n"

@@ -3,7 +3,7 @@
 import pytest
 import zenoh
 from triquad_tools.ros2.intake.drop_log import LOG_PERIOD_S, DropLog
-from triquad_tools.ros2.intake.topic_listener import Arrival, MessageQueue, QueueLimits
+from triquad_tools.ros2.intake.topic_listener import Arrival, Limits, MessageQueue
 from triquad_tools.ros2.options import Role
 
 
@@ -44,7 +44,7 @@ def taken(messages: MessageQueue) -> list[str]:
 
 def test_the_newest_messages_wait_within_limits() -> None:
     dropped: list[str] = []
-    limits = QueueLimits(3, 10_000), QueueLimits(2, 5_000)
+    limits = Limits(3, 10_000), Limits(2, 5_000)
     messages = MessageQueue(*limits, lambda message: dropped.append(message.topic_name))
     for name in "abcd":
         messages.put(arrival(name))
@@ -59,7 +59,7 @@ def test_the_newest_messages_wait_within_limits() -> None:
 
 def test_transforms_go_before_scans_and_push_out_none() -> None:
     dropped: list[str] = []
-    limits = QueueLimits(3, 10_000), QueueLimits(2, 5_000)
+    limits = Limits(3, 10_000), Limits(2, 5_000)
     messages = MessageQueue(*limits, lambda message: dropped.append(message.topic_name))
     messages.put(arrival("cloud", size=8_000))
     for name in ("tf1", "tf2", "tf3"):

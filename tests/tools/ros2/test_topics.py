@@ -5,7 +5,7 @@ import pytest
 from support.ros_messages import RosMessages
 from triquad_tools.commands.ros2 import bridge_options, parser
 from triquad_tools.ros2.options import Role, TopicChoice
-from triquad_tools.ros2.output.mesh_publisher import Action, marker_message
+from triquad_tools.ros2.output.mesh_publisher import ADD, marker_message
 from triquad_tools.ros2.topics import (
     ATTACHMENT,
     NODE_NAME,
@@ -104,7 +104,7 @@ def test_options_choose_topics_with_and_without_slashes() -> None:
 @pytest.mark.parametrize("triangles", [0, 1, 5])
 def test_markers_are_read_by_others_as_they_were_meant(frame: str, triangles: int) -> None:
     corners = np.random.default_rng(1).normal(size=(3 * triangles, 3))
-    payload = marker_message(frame, 7, Action.ADD, corners)
+    payload = marker_message(frame, 7, ADD, corners)
     types = RosMessages().types
     marker = types.deserialize_cdr(payload, "visualization_msgs/msg/Marker")
     assert (marker.header.frame_id, marker.id, marker.action) == (frame, 7, 0)

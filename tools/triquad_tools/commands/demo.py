@@ -12,8 +12,7 @@ from pathlib import Path
 from triquad_server import serve
 
 from triquad_tools.console.arguments import command_parser, count, port, seed
-from triquad_tools.console.command import FAILED, OK, ToolError, complain, run
-from triquad_tools.console.lines import print_line, print_remark
+from triquad_tools.console.command import FAILED, OK, ToolError, print_line, print_remark, run
 from triquad_tools.console.report import json_text, print_rows
 from triquad_tools.demo.steps import MAP, DemoResults, broken_promises, demonstrate, table_rows
 from triquad_tools.simulation.street import street_drive
@@ -58,18 +57,13 @@ def _report(out: Path, results: DemoResults) -> int:
     (out / "results.json").write_text(json_text(results) + "\n", encoding="utf-8")
     print_rows(f"Street {results.seed}, {results.intake.scans} scans", table_rows(results))
     print_line(f"In {out}: map.triquad, street.glb, street.ply, street.png, results.json")
-    print_line(
-        f"To look at the map in a browser: {_beside_python('triquad-view')} {out / 'map.triquad'}"
-    )
+    # With its folder, if that is not on the path.
+    view = shutil.which("triquad-view") or Path(sys.executable).parent / "triquad-view"
+    print_line(f"To look at the map in a browser: {view} {out / 'map.triquad'}")
     broken = broken_promises(results)
     for line in broken:
-        complain(_COMMAND, line, FAILED)
+        print_remark(f"{_COMMAND}: {line}")
     return FAILED if broken else OK
-
-
-def _beside_python(command: str) -> str:
-    """Return a command as it has to be typed: with its folder, if that is not on the path."""
-    return command if shutil.which(command) else str(Path(sys.executable).parent / command)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -9,8 +9,7 @@ import numpy as np
 from triquad_format.records.arrays import Doubles
 
 from triquad_tools.console.arguments import command_parser, not_negative, positive
-from triquad_tools.console.command import OK, ToolError, run
-from triquad_tools.console.lines import print_line
+from triquad_tools.console.command import OK, ToolError, print_line, run
 from triquad_tools.console.report import Row, centimetres, json_text, percent, print_rows
 from triquad_tools.evaluation.metrics import MeshScores, ScoreSettings, score_mesh
 from triquad_tools.mapfiles.meshfile import read_mesh

@@ -10,8 +10,7 @@ from triquad_format.mapfile.metadata import utc_time
 from triquad_format.mapfile.reader import MapFile, read_map_file
 
 from triquad_tools.console.arguments import DEFAULT_MAP, add_config, command_parser, picture
-from triquad_tools.console.command import FAILED, OK, ToolError, complain, refuse, run
-from triquad_tools.console.lines import print_line
+from triquad_tools.console.command import FAILED, OK, ToolError, complain, print_line, refuse, run
 from triquad_tools.console.progress import progress
 from triquad_tools.console.report import json_text
 from triquad_tools.mapfiles.diff import compare, difference, print_diff
@@ -53,33 +52,23 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _check_usage(options: argparse.Namespace) -> None:
-    """Refuse what does not go together."""
-    given = len(options.files)
-    problems = {
+def _inspect(options: argparse.Namespace) -> int:
+    given, servers = len(options.files), [one for one in options.files if is_endpoint(str(one))]
+    is_special, of_server = options.log or options.diff, options.map or options.config
+    problems = {  # what does not go together
         "--log and --diff exclude each other": options.log and options.diff,
         f"--diff compares two map files: {given} given": options.diff and given != 2,
         f"only --diff takes more than one file: {given} given": not options.diff and given > 1,
-        "--at is for one map, not for --log or --diff": (
-            options.at and (options.log or options.diff)
-        ),
-        "--map and --config are of a server, and none is given": (
-            (options.map or options.config)
-            and not any(is_endpoint(str(path)) for path in options.files)
-        ),
+        "--at is for one map, not for --log or --diff": options.at and is_special,
+        "--map and --config are of a server, and none is given": of_server and not servers,
         "--plot is for map files, not for --log": options.log and options.plot,
     }
     refuse(problems)
-
-
-def _inspect(options: argparse.Namespace) -> int:
-    _check_usage(options)
     work = _log if options.log else _diff if options.diff else _show
     return work(options)
 
 
 def _show(options: argparse.Namespace) -> int:
-    """Print one map."""
     name, file = _read(options, str(options.files[0]))
     summary = summarise(file)
     if options.plot:
@@ -94,7 +83,6 @@ def _show(options: argparse.Namespace) -> int:
 
 
 def _log(options: argparse.Namespace) -> int:
-    """Print the checkpoints of a folder."""
     path = options.files[0]
     if path.is_file():
         raise ToolError(f"{path} is a file: --log lists the checkpoints in a folder")
@@ -103,14 +91,13 @@ def _log(options: argparse.Namespace) -> int:
         print_line(json_text(log))
     else:
         print_log(log)
-    if log.damaged:
-        message = f"{log.damaged} of {len(log.checkpoints)} do not open"
+    if damaged := sum(one.problem is not None for one in log.checkpoints):
+        message = f"{damaged} of {len(log.checkpoints)} do not open"
         return complain(_COMMAND, message, FAILED)
     return OK
 
 
 def _diff(options: argparse.Namespace) -> int:
-    """Compare two map files."""
     from triquad_client import OfflineMap  # slow to import
 
     (name_a, a), (name_b, b) = (_read(options, str(path)) for path in options.files)

@@ -7,8 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from triquad_tools.console.arguments import command_parser, positive, whole
-from triquad_tools.console.command import OK, run
-from triquad_tools.console.lines import print_line
+from triquad_tools.console.command import OK, print_line, run
 from triquad_tools.console.report import print_columns
 from triquad_tools.credentials.key_folder import LISTENING, KeyFolder
 from triquad_tools.credentials.roles import Holder, Role
@@ -80,7 +79,6 @@ def _list(options: argparse.Namespace) -> int:
 
 
 def _day(expires: datetime) -> str:
-    """Return the day, and whether it has passed."""
     return f"{expires:%Y-%m-%d}{' EXPIRED' if expires < datetime.now(timezone.utc) else ''}"
 
 

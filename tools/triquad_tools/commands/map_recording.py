@@ -14,8 +14,7 @@ from triquad_server.settings.loading import PRESETS, load_settings
 from triquad_server.warm_up import warm_up
 
 from triquad_tools.console.arguments import command_parser
-from triquad_tools.console.command import OK, ToolError, run
-from triquad_tools.console.lines import print_line, print_remark
+from triquad_tools.console.command import OK, ToolError, print_line, print_remark, run
 from triquad_tools.console.progress import progress
 from triquad_tools.mapping.mapping_run import MAP_NAME, MappingRun, mapping_key, read_unfinished
 from triquad_tools.mapping.output import SUFFIXES, check_target, why, write_output
@@ -54,11 +53,9 @@ def _map(options: argparse.Namespace) -> int:
         mapping.take(selection)
         _check_result(mapper, mapping, selection)
         mapping.settle()  # which saves the map, should the output not be written
-        record = mapper.changes_since(None).record
+        record, cell_m = mapper.changes_since(None).record, settings.mesh.cell_m
         try:
-            written = write_output(
-                record, output, cell_m=settings.mesh.cell_m, training=options.training
-            )
+            written = write_output(record, output, cell_m=cell_m, training=options.training)
         except OSError as error:
             raise StoreError(
                 f"{output} cannot be written: {why(error)}; the map is in {part}: the same "
@@ -70,11 +67,6 @@ def _map(options: argparse.Namespace) -> int:
 
 
 def _check_result(mapper: Mapper, mapping: MappingRun, selection: Selection) -> None:
-    """Report refused scans.
-
-    Raises:
-        ToolError: all were.
-    """
     refused = sum(mapping.refusals.values())
     if refused:
         reasons = ", ".join(f"{reason}: {n}" for reason, n in mapping.refusals.items())

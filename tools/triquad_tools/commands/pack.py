@@ -15,8 +15,7 @@ from triquad_format.records.region import VertexTable
 from triquad_format.wire.limits import MAX_FILL_M
 
 from triquad_tools.console.arguments import command_parser, within
-from triquad_tools.console.command import FAILED, OK, ToolError, refuse, run
-from triquad_tools.console.lines import print_line, print_remark
+from triquad_tools.console.command import FAILED, OK, ToolError, complain, print_line, refuse, run
 from triquad_tools.mapfiles.crop import without_training
 from triquad_tools.mapfiles.quantise import quantise
 from triquad_tools.mapfiles.recovered_map import Loss, RecoveredMap, recover
@@ -111,25 +110,21 @@ def _pack(options: argparse.Namespace) -> int:
 
 
 def _check_usage(options: argparse.Namespace) -> None:
-    """Refuse options that do not go together."""
-    suffix = options.output.suffix
+    given, suffix = options.input, options.output.suffix
+    is_map = suffix == MAP_SUFFIX
+    marked = ", ".join(_MARKED)
     problems = {
-        f"{options.input} is a server: give its store, or what client.download_map saved": (
-            is_endpoint(str(options.input))
+        f"{given} is a server: give its store, or what client.download_map saved": (
+            is_endpoint(str(given))
         ),
-        f"--max-error is of map files: {suffix} has none": (
-            options.max_error and suffix != MAP_SUFFIX
-        ),
-        "--cell is of meshes: a map file has none": options.cell and suffix == MAP_SUFFIX,
-        f"--fill is of meshes that can mark it, {', '.join(_MARKED)}": (
-            options.fill and suffix not in _MARKED
-        ),
+        f"--max-error is of map files: {suffix} has none": options.max_error and not is_map,
+        "--cell is of meshes: a map file has none": options.cell and is_map,
+        f"--fill is of meshes that can mark it, {marked}": options.fill and suffix not in _MARKED,
     }
     refuse(problems)
 
 
 def _check_target(source: Path, target: Path, force: bool) -> None:
-    """Refuse a target that must not be written."""
     folder = target.parent
     named_so = checkpoint_file(target) is not None
     if named_so and folder.is_dir() and checkpoint_files(folder):
@@ -146,7 +141,10 @@ def _pack_map(options: argparse.Namespace, path: Path) -> int:
     told = ""
     if options.max_error is not None:
         source, told = _quantised(source, options.max_error)
-    size = write_map_file(source, options.output, feature_dtype=_dtype(source))
+    # What keeps all float features as they are.
+    dtypes = {table.features.dtype.str for table in _tables(source) if len(table.codes)}
+    dtype = "<f4" if "<f4" in dtypes else "<f2"
+    size = write_map_file(source, options.output, feature_dtype=dtype)
     checkpoint = read_checkpoint(path)
     before = path.stat().st_size + (checkpoint.manifest.stored_bytes if checkpoint else 0)
     print_line(f"{options.output}: {size:,} bytes, {size / before:.0%} of {before:,}{told}")
@@ -156,7 +154,7 @@ def _pack_map(options: argparse.Namespace, path: Path) -> int:
 def _quantised(source: SourceMap, max_error_m: float) -> tuple[SourceMap, str]:
     """Return a map with features as integers, and lines that say how far distances moved."""
     if any(table.scale is not None for table in _tables(source)):
-        print_remark(f"{_COMMAND}: features are integers already: both errors add up")
+        complain(_COMMAND, "features are integers already: both errors add up", OK)
     packed = quantise(source.record, max_error_m)
     change = packed.change
     most, largest = (f"{1e3 * one:.2f} mm" for one in (change.quantile_m, change.largest_m))
@@ -164,12 +162,6 @@ def _quantised(source: SourceMap, max_error_m: float) -> tuple[SourceMap, str]:
         f"\n  99 % of distances near surface moved by less than {most}, the most by {largest}\n"
         "  without training state: it does not fit rounded features"
     )
-
-
-def _dtype(source: SourceMap) -> str:
-    """Return what keeps all float features as they are."""
-    found = {table.features.dtype.str for table in _tables(source) if len(table.codes)}
-    return "<f4" if "<f4" in found else "<f2"
 
 
 def _tables(source: SourceMap) -> list[VertexTable]:
@@ -191,7 +183,6 @@ def _box(corners: list[float] | None) -> Box | None:
 
 
 def _source(options: argparse.Namespace, path: Path, box: Box | None) -> tuple[SourceMap, bool]:
-    """Return the map, and whether nothing of it is lost."""
     if not options.recover:
         return read_source(path, box), True
     recovery = recover(path)
@@ -201,9 +192,8 @@ def _source(options: argparse.Namespace, path: Path, box: Box | None) -> tuple[S
 
 
 def _print_recovery(recovery: RecoveredMap) -> None:
-    """Print a line for each loss, and how much was saved."""
     for loss in recovery.losses:
-        print_line(f"lost: {_what(loss)}{_where(loss)}")
+        print_line(f"lost: {_what(loss)}")
     if recovery.parts_listed is None:
         saved = f"saved {recovery.parts_intact} parts"
         print_line(f"{saved}; the list of parts is lost: there may have been more")
@@ -217,16 +207,13 @@ def _print_recovery(recovery: RecoveredMap) -> None:
 
 def _what(loss: Loss) -> str:
     region = "region {} {} {}".format(*loss.key.region)
-    return {
+    if loss.key.topic == TRAINING:
+        return f"training state of {region}: it answers, but learns anew"
+    bounds = zip("xyz", loss.minimum.tolist(), loss.maximum.tolist(), strict=True)
+    where = ", ".join(f"{axis} {low:.1f} to {high:.1f} m" for axis, low, high in bounds)
+    what = {
         REGION: f"{region}, all of it",
         VERTICES: f"vertices of plane {_PLANES[loss.key.plane]} of {region}: now UNKNOWN",
         EVIDENCE: f"evidence of {region}: now UNKNOWN",
-        TRAINING: f"training state of {region}: it answers, but learns anew",
     }[loss.key.topic]
-
-
-def _where(loss: Loss) -> str:
-    if loss.key.topic == TRAINING:
-        return ""
-    bounds = zip("xyz", loss.minimum.tolist(), loss.maximum.tolist(), strict=True)
-    return ", " + ", ".join(f"{axis} {low:.1f} to {high:.1f} m" for axis, low, high in bounds)
+    return f"{what}, {where}"

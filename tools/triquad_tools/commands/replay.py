@@ -8,13 +8,12 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-from triquad_client import Client, FlushReport, connect
+from triquad_client import FlushReport
 
-from triquad_tools.console.arguments import DEFAULT_MAP, add_server, command_parser, positive
-from triquad_tools.console.command import FAILED, OK, run
-from triquad_tools.console.lines import print_line
+from triquad_tools.console.arguments import add_server, command_parser, connect_to, positive
+from triquad_tools.console.command import FAILED, OK, print_line, run
 from triquad_tools.console.report import print_columns
-from triquad_tools.recordings.opening import Selection, length_s, open_recording, open_selected
+from triquad_tools.recordings.opening import length_s, open_recording, open_selected
 from triquad_tools.recordings.publishing import FLUSH_TIMEOUT_S, publish_all, wait_until_settled
 from triquad_tools.recordings.recording import ScanEntry, add_recording, options_of
 
@@ -35,7 +34,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _list(options: argparse.Namespace) -> int:
-    """Print all streams, what is wrong, and how to map it."""
     path = options.recording
     recording = open_recording(path, options_of(options))
     titles = ("stream", "type", "count", "frame", "use")
@@ -59,10 +57,14 @@ def _list(options: argparse.Namespace) -> int:
 
 def _replay(options: argparse.Namespace) -> int:
     selection = open_selected(options)
-    with connect(options.connect, options.map or DEFAULT_MAP, config=options.config) as client:
+    with connect_to(options) as client:
         before = client.status().scans_dropped
         started_s = time.monotonic()
-        published = _publish(client, selection, options.source, options.rate)
+        entries = selection.entries
+        due_s = options.rate([entry.stamp_ns for entry in entries]) if options.rate else ()
+        sent_as = [ScanEntry(entry.stamp_ns, options.source or entry.source) for entry in entries]
+        scans = zip(sent_as, selection.scans(), strict=True)
+        published = publish_all(client, scans, len(entries), due_s)
         flush = client.flush(FLUSH_TIMEOUT_S)
         seconds = time.monotonic() - started_s
         after = client.status().scans_dropped
@@ -76,17 +78,6 @@ def _replay(options: argparse.Namespace) -> int:
             trained = f"{status.samples_trained / 1e6:.1f} M samples trained"
             print_line(f"settled: epoch {status.epoch}, {trained}")
     return OK if flush.lost == flush.refused == 0 else FAILED
-
-
-def _publish(
-    client: Client, selection: Selection, source: str | None, due_times: DueTimes | None
-) -> int:
-    """Send all chosen scans, each when it is due; return how many had points, and were sent."""
-    entries = selection.entries
-    due_s = due_times([entry.stamp_ns for entry in entries]) if due_times else ()
-    sent_as = [ScanEntry(entry.stamp_ns, source or entry.source) for entry in entries]
-    scans = zip(sent_as, selection.scans(), strict=True)
-    return publish_all(client, scans, len(entries), due_s)
 
 
 def _summary(published: int, skipped: int, flush: FlushReport, refusals: dict[str, int]) -> str:

@@ -12,18 +12,18 @@ from contextlib import ExitStack, closing
 from dataclasses import fields
 from functools import partial
 
-from triquad_client import Client, ConnectError, UnknownMapError, connect
+from triquad_client import Client, ConnectError, UnknownMapError
+from triquad_format.printable import printable
 
 from triquad_tools.console.arguments import (
-    DEFAULT_MAP,
     add_server,
     command_parser,
+    connect_to,
     count,
     whole,
     within,
 )
 from triquad_tools.console.command import FAILED, OK, ToolError, run
-from triquad_tools.console.lines import start_log
 from triquad_tools.ros2.bridge import bridging, open_session
 from triquad_tools.ros2.options import (
     MAX_GRID_CELLS,
@@ -34,7 +34,7 @@ from triquad_tools.ros2.options import (
     full_name,
 )
 from triquad_tools.ros2.server_process import ServerProcess
-from triquad_tools.sensors.ros.header import frame_name
+from triquad_tools.sensors.ros.type_store import frame_name
 
 _COMMAND = "triquad-ros2"
 _RETRY_S = 0.5  # while the server starts
@@ -44,9 +44,24 @@ _TOPIC = re.compile(r"(/?[A-Za-z_][A-Za-z0-9_]*)+")
 _log = logging.getLogger("triquad_ros2")
 
 
+def _start_log() -> None:
+    handler = logging.StreamHandler()
+    handler.setFormatter(_Lines("%(asctime)s %(levelname)s ros2: %(message)s"))
+    logging.basicConfig(level=logging.INFO, handlers=[handler])
+
+
+class _Lines(logging.Formatter):
+    """Lines in which names from the network cannot look like other lines."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802
+        """Return the line of a message."""
+        record.message = printable(record.message)
+        return super().formatMessage(record)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool: 0 stopped, 1 the server failed, 2 wrong usage; with --serve, as the server."""
-    start_log("ros2")
+    _start_log()
     return run(_COMMAND, partial(_run, parser().parse_args(argv)))
 
 
@@ -97,7 +112,7 @@ def _connected(options: argparse.Namespace, server: ServerProcess | None) -> Cli
     tell_s = time.monotonic() + _TELL_S
     while server is None or server.exit_code is None:
         try:
-            return connect(options.connect, options.map or DEFAULT_MAP, config=options.config)
+            return connect_to(options)
         except (ConnectError, UnknownMapError) as error:
             if server is None:
                 raise

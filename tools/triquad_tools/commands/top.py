@@ -15,21 +15,20 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
-from triquad_client import Client, ServerMetrics, ServerStatus, connect
+from triquad_client import Client, ServerMetrics, ServerStatus
 from triquad_format.errors import TriquadError
 from triquad_format.mapfile.metadata import utc_time
 from triquad_format.printable import printable
 
 from triquad_tools.console.amounts import count, duration, milliseconds, rate, size, within
 from triquad_tools.console.arguments import (
-    DEFAULT_MAP,
     add_server,
     command_parser,
+    connect_to,
     positive,
     server_name,
 )
-from triquad_tools.console.command import FAILED, OK, complain, run
-from triquad_tools.console.lines import print_line
+from triquad_tools.console.command import FAILED, OK, complain, print_line, run
 from triquad_tools.console.report import json_text
 
 _COMMAND = "triquad-top"
@@ -88,11 +87,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _top(options: argparse.Namespace) -> int:
-    name, server = options.map or DEFAULT_MAP, server_name(options)
+    server = server_name(options)
     can_draw = sys.stdout.isatty() and os.environ.get("TERM") != "dumb"
-    title = f"map {name} at {server}"
-    reached = connect(options.connect, name, timeout_s=_TIMEOUT_S, config=options.config)
-    with reached as client:
+    with connect_to(options, timeout_s=_TIMEOUT_S) as client:
+        name = client.map_name
+        title = f"map {name} at {server}"
         samples = _samples(client, options.interval)
         if options.once or not (options.json or can_draw):
             samples = itertools.islice(samples, 1, 2)
@@ -194,11 +193,9 @@ def _times(sample: Sample, name: str) -> Iterator[str]:
 
 
 def _plain(title: str, sample: Sample) -> str:
-    """Return the whole page as text without colours."""
     has_width = sys.stdout.isatty() or "COLUMNS" in os.environ
-    console = Console(
-        width=None if has_width else _PLAIN_WIDTH, file=io.StringIO(), color_system=None
-    )
+    width = None if has_width else _PLAIN_WIDTH
+    console = Console(width=width, file=io.StringIO(), color_system=None)
     with console.capture() as captured:
         console.print(page(title, sample))
     return "\n".join(line.rstrip() for line in captured.get().splitlines())

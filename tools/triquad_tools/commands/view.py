@@ -7,17 +7,14 @@ from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
 
-import triquad_client
-
 from triquad_tools.console.arguments import (
-    DEFAULT_MAP,
     add_server,
     command_parser,
+    connect_to,
     port,
     server_name,
 )
-from triquad_tools.console.command import OK, complain, refuse, run
-from triquad_tools.console.lines import print_line
+from triquad_tools.console.command import OK, complain, print_line, refuse, run
 from triquad_tools.console.progress import progress
 from triquad_tools.viewer.sources import History, LiveSource, MapSource, StoredMap, moment
 from triquad_tools.viewer.viewer import DEFAULT_PORT, Viewer
@@ -32,25 +29,20 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _view(options: argparse.Namespace) -> int:
     server = options.connect or options.map or options.config
-    refuse(
-        {"--connect, --map and --config are for a server, not for a file": options.file and server}
-    )
-    with (
-        _shown(options) as shown,
-        closing(
-            Viewer(shown, options.host, options.port, allowed_hosts=options.allow_host)
-        ) as viewer,
-    ):
-        print_line(f"open {viewer.url} in a browser; Ctrl-C ends it")
-        threading.Event().wait()
+    problem = "--connect, --map and --config are for a server, not for a file"
+    refuse({problem: options.file and server})
+    with _shown(options) as shown:
+        viewer = Viewer(shown, options.host, options.port, allowed_hosts=options.allow_host)
+        with closing(viewer):
+            print_line(f"open {viewer.url} in a browser; Ctrl-C ends it")
+            threading.Event().wait()
     return OK
 
 
 @contextmanager
 def _shown(options: argparse.Namespace) -> Iterator[MapSource | History]:
     if options.file is None:
-        name = options.map or DEFAULT_MAP
-        with triquad_client.connect(options.connect, name, config=options.config) as client:
+        with connect_to(options) as client:
             yield LiveSource(client, server_name(options))
     elif options.file.is_dir():
         yield _store(options.file)
@@ -79,8 +71,7 @@ def _name(shown: StoredMap) -> str:
 
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser(
-        _COMMAND,
-        description="Show a map in the browser: of a server, as it grows, or of a file.",
+        _COMMAND, description="Show a map in the browser: of a server, as it grows, or of a file."
     )
     add = parser.add_argument
     file = "a map file, or a store with its history, to be shown without a server"

@@ -4,9 +4,13 @@ import argparse
 import math
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import triquad_format
 from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
+
+if TYPE_CHECKING:
+    from triquad_client import Client
 
 DEFAULT_MAP = "default"
 
@@ -59,17 +63,10 @@ def whole(least: int, most: int | None, text: str) -> int:
     return int(text)
 
 
-not_negative = partial(within, 0.0, None)
-"""Returns a finite number of at least 0."""
-
-count = partial(whole, 1, None)
-"""Returns a whole number of at least 1."""
-
-seed = partial(whole, 0, None)
-"""Returns a whole number of at least 0."""
-
-port = partial(whole, 0, 65_535)
-"""Returns a port to listen on; 0: any that is free."""
+not_negative = partial(within, 0.0, None)  # returns a finite number of at least 0
+count = partial(whole, 1, None)  # returns a whole number of at least 1
+seed = partial(whole, 0, None)  # returns a whole number of at least 0
+port = partial(whole, 0, 65_535)  # returns a port to listen on; 0: any that is free
 
 
 def add_server(parser: argparse.ArgumentParser) -> None:
@@ -85,6 +82,14 @@ def add_config(parser: argparse.ArgumentParser) -> None:
     """Add the option for the credentials of a server."""
     file = "Zenoh configuration (JSON5) to connect with, such as one of triquad-keys"
     parser.add_argument("--config", type=Path, metavar="FILE", help=file)
+
+
+def connect_to(options: argparse.Namespace, **more: Any) -> "Client":
+    """Return a client of the map and the server that the arguments name."""
+    import triquad_client  # slow to import
+
+    name = options.map or DEFAULT_MAP
+    return triquad_client.connect(options.connect, name, config=options.config, **more)
 
 
 def server_name(options: argparse.Namespace) -> str:

@@ -1,4 +1,4 @@
-"""The end of every command: an exit status, and one line for what went wrong or interrupted it."""
+"""What commands print and how they end: a status, and one line for what went wrong."""
 
 import os
 import signal
@@ -6,18 +6,14 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from typing import TextIO
 
 from triquad_format.errors import FormatError, NoCompiledCodeError, TriquadError
+from triquad_format.printable import printable_lines
 
-from triquad_tools.console.lines import print_remark
-
-INTERRUPTED = 130
-"""The exit status of shells: 128 and the number of SIGINT."""
-
+INTERRUPTED = 130  # the exit status of shells: 128 and the number of SIGINT
 OK, FAILED, BAD_INPUT = 0, 1, 2
-NOBODY_READS = 141
-"""The status of shells: 128 and the number of SIGPIPE."""
-
+NOBODY_READS = 141  # the status of shells: 128 and the number of SIGPIPE
 _kept: list[KeyboardInterrupt] = []
 """The interrupts, with their frames: what a compiler has half done may not be cleaned up."""
 
@@ -55,8 +51,30 @@ def interruptible() -> Iterator[None]:
             signal.signal(each, handler)
 
 
+def print_line(text: str = "") -> None:
+    """Print to standard output; what would steer a terminal is shown as what it is."""
+    _write(sys.stdout, text)
+
+
+def print_remark(text: str) -> None:
+    """Print to standard error, as :func:`print_line`."""
+    _write(sys.stderr, text)
+
+
+def _write(stream: TextIO, text: str) -> None:
+    line = printable_lines(text) + "\n"
+    encoding = stream.encoding or "utf-8"
+    # Where the terminal does not know a letter, an escape is better than no line.
+    stream.write(line.encode(encoding, "backslashreplace").decode(encoding))
+    stream.flush()
+
+
 class ToolError(TriquadError):
-    """An error of the tools, or of their use: it names the file, the place and the value."""
+    """An error of the tools, or of their use: it names the file, the place and the value.
+
+    Functions of the tools do not list it among what they raise, nor the errors of files, formats
+    and servers, unless a caller expects it: :func:`run` ends the command with its text.
+    """
 
 
 def run(

@@ -10,20 +10,15 @@ from rich.markup import escape
 from rich.progress import Progress, TextColumn
 from triquad_format.printable import printable
 
-from triquad_tools.console.lines import print_remark
+from triquad_tools.console.command import print_remark
 
-Report = Callable[[float, str], None]
-"""Takes how much is done, in the units of the total, and a remark."""
-
+Report = Callable[[float, str], None]  # takes how much is done, in units of the total, and a remark
 _LINE_PERIOD_S = 10.0
 
 
 @contextmanager
 def progress(title: str, total: float | None = None) -> Iterator[Report]:
-    """Show the progress of a step on standard error, and how long it will take.
-
-    Without a total it shows that it goes on.
-    """
+    """Show the progress of a step on standard error, and how long it will take."""
     in_lines, started_s = not sys.stderr.isatty(), time.monotonic()
     columns = *Progress.get_default_columns(), TextColumn("{task.fields[note]}", markup=False)
     bars = Progress(*columns, console=Console(stderr=True), disable=in_lines)

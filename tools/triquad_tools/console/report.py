@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 from triquad_format.printable import printable
 
-from triquad_tools.console.lines import print_line
+from triquad_tools.console.command import print_line
 
 _GAP = 2  # spaces before each column
 _PIPE_WIDTH = 10_000  # characters: nothing is broken where a program reads
@@ -92,10 +92,7 @@ def _print(table: Table) -> None:
 
 
 def json_text(value: object, indent: int | None = 2) -> str:
-    """Return records, lists, arrays and numbers as JSON; what is not finite becomes null.
-
-    Without an ``indent`` it is one line.
-    """
+    """Return records, lists, arrays and numbers as JSON; what is not finite becomes null."""
     return json.dumps(_plain(value), indent=indent)
 
 

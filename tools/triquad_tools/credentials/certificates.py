@@ -11,9 +11,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")
-"""Names of the machine itself, which every server certificate holds."""
-
+LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")  # which every server certificate holds
 _AUTHORITY_DAYS = 3650
 _CLIENT = ExtendedKeyUsageOID.CLIENT_AUTH
 _CLOCK_SKEW = datetime.timedelta(hours=1)  # that a robot's clock may be behind the authority's

@@ -20,7 +20,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 from triquad_format.mapfile.files import replacing
 from triquad_format.wire.access_control import Grant, access_control
@@ -37,8 +36,7 @@ from triquad_tools.credentials.roles import (
     server_grants,
 )
 
-LISTENING = (SERVER, ROUTER)
-"""The roles that listen; each has a file of its own, whose name no client can have."""
+LISTENING = (SERVER, ROUTER)  # roles that listen: no client can have the names of their files
 
 _WARNING = """\
 // Written by triquad-keys, which writes it again with each change: what is changed here is lost.
@@ -58,12 +56,7 @@ class KeyFolder:
     """
 
     def __init__(self, path: Path) -> None:
-        """Open a folder.
-
-        Raises:
-            ToolError: it is no folder of keys, or damaged.
-            OSError: it cannot be read.
-        """
+        """Open a folder."""
         self.path = path
         try:
             read = json.loads(self._register.read_bytes())
@@ -71,9 +64,9 @@ class KeyFolder:
             self.holders: dict[str, Holder] = {}
             self.expires: dict[str, datetime] = {}
             for role in read["roles"]:
-                name, expires = role["name"], role.pop("expires")
-                self.holders[name] = _holder(**role)
-                self.expires[name] = datetime.fromisoformat(expires)
+                self.expires[role["name"]] = datetime.fromisoformat(role.pop("expires"))
+                role |= {"role": Role(role["role"]), "sources": tuple(role["sources"])}
+                self.holders[role["name"]] = Holder(**role)
         except FileNotFoundError as error:
             raise ToolError(f"{path} holds no keys: triquad-keys init {path}") from error
         except (ValueError, KeyError, TypeError) as error:
@@ -238,10 +231,6 @@ class KeyFolder:
 
     def _file(self, name: str) -> Path:
         return self.path / f"{name}.json5"
-
-
-def _holder(*, role: str, sources: list[str], **others: Any) -> Holder:
-    return Holder(role=Role(role), sources=tuple(sources), **others)
 
 
 def _store(path: Path, name: str, certificate: Certificate) -> None:

@@ -8,22 +8,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
+from triquad_format.wire import access_control as access
 from triquad_format.wire import keys
-from triquad_format.wire.access_control import (
-    Grant,
-    Rule,
-    Subject,
-    Verb,
-    administer,
-    everything,
-    publish,
-    serve,
-    view,
-)
 
 SERVER = "server"
-ROUTER = "router"
-"""Common names of the certificates of those who listen."""
+ROUTER = "router"  # common names of the certificates of those who listen
 
 
 class Role(Enum):
@@ -55,38 +44,39 @@ class Holder:
         return f"{self.role.value}:{self.name}:{self.issue}"
 
 
-def server_grants(holders: Sequence[Holder]) -> tuple[Grant, ...]:
+def server_grants(holders: Sequence[Holder]) -> tuple[access.Grant, ...]:
     """Return what a server or a router lets others do; all who are none of these do nothing."""
     domains = sorted({h.ros2_domain for h in holders if h.ros2_domain is not None})
     topics = tuple(_take_part(domain) for domain in domains)
     return (
-        Grant(_known_as(SERVER), (*serve(keys.EVERY_MAP), *topics)),
+        access.Grant(_known_as(SERVER), (*access.serve(keys.EVERY_MAP), *topics)),
         # Who comes through a router was identified there, and beyond it may be servers, too.
-        Grant(_known_as(ROUTER), everything()),
-        *(Grant(_known_as(holder.common_name), _allowed(holder)) for holder in holders),
+        access.Grant(_known_as(ROUTER), access.everything()),
+        *(access.Grant(_known_as(holder.common_name), _allowed(holder)) for holder in holders),
     )
 
 
-def client_grants() -> tuple[Grant, ...]:
+def client_grants() -> tuple[access.Grant, ...]:
     """Return what a client lets others do: servers and routers all, and nobody else anything."""
-    return tuple(Grant(_known_as(name), everything()) for name in (SERVER, ROUTER))
+    return tuple(access.Grant(_known_as(name), access.everything()) for name in (SERVER, ROUTER))
 
 
-def _allowed(holder: Holder) -> tuple[Rule, ...]:
-    rules = view(keys.EVERY_MAP)
+def _allowed(holder: Holder) -> tuple[access.Rule, ...]:
+    rules = access.view(keys.EVERY_MAP)
     if holder.role is Role.ADMIN:
-        rules += administer(keys.EVERY_MAP)
+        rules += access.administer(keys.EVERY_MAP)
     if holder.sources:
-        rules += publish(keys.EVERY_MAP, holder.sources)
+        rules += access.publish(keys.EVERY_MAP, holder.sources)
     if holder.ros2_domain is not None:
         rules += (_take_part(holder.ros2_domain),)
     return rules
 
 
-def _take_part(domain: int) -> Rule:
+def _take_part(domain: int) -> access.Rule:
     """Return rights to a ROS 2 domain, by rmw_zenoh: topics, their history, the graph of nodes."""
-    return Rule(Verb.ALL, (f"{domain}/**", f"{domain}/**/@adv/**", f"@ros2_lv/{domain}/**"))
+    keys_of_domain = f"{domain}/**", f"{domain}/**/@adv/**", f"@ros2_lv/{domain}/**"
+    return access.Rule(access.Verb.ALL, keys_of_domain)
 
 
-def _known_as(common_name: str) -> Subject:
-    return Subject(common_name, cert_common_names=(common_name,))
+def _known_as(common_name: str) -> access.Subject:
+    return access.Subject(common_name, cert_common_names=(common_name,))

@@ -49,10 +49,7 @@ class Probe:
     def __init__(
         self, endpoint: str, map_name: str, points: Doubles, question: str = "sdf"
     ) -> None:
-        """Start to ask at points [N, 3], some 20 times a second.
-
-        ``question`` is ``"sdf"``, ``"gradient"``, ``"distance"`` or ``"ground"``.
-        """
+        """Start to ask at points [N, 3], some 20 times a second."""
         processes = multiprocessing.get_context("spawn")  # a fork would share the parent's session
         self._connection, theirs = processes.Pipe()
         arguments = (theirs, endpoint, map_name, points, question)

@@ -72,28 +72,17 @@ def table_rows(results: DemoResults) -> list[Row]:
     """Return the results as lines of a table."""
     intake, queries, fit = results.intake, results.queries, results.fit
     end = "until nothing was left to learn" if intake.settled else "cut off; still learning"
+    taken_per_s = intake.taken / max(intake.seconds, 1e-9)
+    samples_m, learning_s = intake.samples_trained / 1e6, intake.learning_s
+    trained = f"{samples_m / max(learning_s, 1e-9):.2f} M samples/s"
+    asked = f"median of {queries.queries:,} while training; 99 %: {queries.latency_p99_ms:.1f} ms, "
+    asked += f"longest {queries.latency_max_ms:.1f} ms, {queries.errors} errors"
+    parameters = f"{results.parameters / 1e6:.2f} M parameters"
     rows = [
-        Row(
-            "scans taken in",
-            f"{intake.taken / max(intake.seconds, 1e-9):.1f} /s",
-            f"{intake.taken} of {intake.scans}",
-        ),
-        Row(
-            "training",
-            f"{intake.samples_trained / 1e6 / max(intake.learning_s, 1e-9):.2f} M samples/s",
-            f"{intake.samples_trained / 1e6:.1f} M in {intake.learning_s:.0f} s, {end}",
-        ),
-        Row(
-            f"query of {queries.points:,} points",
-            f"{queries.latency_p50_ms:.1f} ms",
-            f"median of {queries.queries:,} while training; 99 %: {queries.latency_p99_ms:.1f} ms, "
-            f"longest {queries.latency_max_ms:.1f} ms, {queries.errors} errors",
-        ),
-        Row(
-            "map file",
-            f"{results.map_bytes / 1e6:.2f} MB",
-            f"{results.parameters / 1e6:.2f} M parameters",
-        ),
+        Row("scans taken in", f"{taken_per_s:.1f} /s", f"{intake.taken} of {intake.scans}"),
+        Row("training", trained, f"{samples_m:.1f} M in {learning_s:.0f} s, {end}"),
+        Row(f"query of {queries.points:,} points", f"{queries.latency_p50_ms:.1f} ms", asked),
+        Row("map file", f"{results.map_bytes / 1e6:.2f} MB", parameters),
         Row("mesh", f"{results.faces:,}", "faces"),
     ]
     if fit is not None:
@@ -141,7 +130,6 @@ def demonstrate(client: Client, endpoint: str, drive: SimulatedDrive, out: Path)
 
 
 def _learnt(client: Client, scans: Sequence[SimulatedScan]) -> Intake:
-    """Stream the scans and wait until they are learnt."""
     started = time.monotonic()
     published = ((ScanEntry(time.time_ns(), DEFAULT_SOURCE), scan) for scan in scans)
     publish_all(client, published, len(scans))

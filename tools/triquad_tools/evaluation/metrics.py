@@ -75,7 +75,6 @@ def score_mesh(
 
 
 def _samples(mesh: Mesh, reference: Doubles, settings: ScoreSettings) -> Doubles:
-    """Return thinned samples of the mesh where it is scored."""
     import trimesh.sample  # slow to import
 
     surface = mesh.to_trimesh()
@@ -94,14 +93,12 @@ def _samples(mesh: Mesh, reference: Doubles, settings: ScoreSettings) -> Doubles
 def _nearest(points: Doubles, places: Doubles, limit_m: float) -> Doubles:
     """Return the distances [N] of places [N, 3] to the nearest point; infinite beyond a limit."""
     tree = cKDTree(points, balanced_tree=False, compact_nodes=False)  # much faster to build
-    found: Doubles = tree.query(places, distance_upper_bound=limit_m, workers=-1)[0]
-    return found
+    return np.asarray(tree.query(places, distance_upper_bound=limit_m, workers=-1)[0])
 
 
 def _scores(
     distances: Doubles, samples: Doubles, truth: Doubles, settings: ScoreSettings
 ) -> MeshScores:
-    """Return scores of samples [N, 3] of a mesh by their distances [N] from the truth [M, 3]."""
     cut_m = settings.completion_cut_m
     missing_m = np.minimum(_nearest(samples, truth, cut_m), cut_m)
     kept = distances[distances < settings.accuracy_cut_m]

@@ -8,17 +8,9 @@ from triquad_format.records import morton
 from triquad_format.records.arrays import Bytes
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
 from triquad_format.records.leaf_box import LeafBox, check_box, leaf_box, whole_region
-from triquad_format.records.region import (
-    AXES,
-    Evidence,
-    MapRecord,
-    Region,
-    VertexTable,
-    masked,
-)
+from triquad_format.records.region import AXES, Evidence, MapRecord, VertexTable, masked
 
-_REACH_VOXELS = 0.5
-"""A point is near a surface where one was seen this far away."""
+_REACH_VOXELS = 0.5  # a point is near a surface where one was seen this far away
 
 
 def crop_record(record: MapRecord, minimum: ArrayLike, maximum: ArrayLike) -> MapRecord:
@@ -40,7 +32,10 @@ def crop_record(record: MapRecord, minimum: ArrayLike, maximum: ArrayLike) -> Ma
     for region in record.regions:
         box = leaf_box(record.settings, region.index, low=low, high=high)
         if box.meets(whole_region(record.settings)):
-            regions.append(_crop_region(record.settings, region, box))
+            tables = tuple(_crop_table(record.settings, table, box) for table in region.tables)
+            evidence = masked(region.evidence, status_voxels(region.evidence, box))
+            cropped = dataclasses.replace(region, tables=tables, evidence=evidence, training=None)
+            regions.append(cropped)
     return dataclasses.replace(record, regions=tuple(regions))
 
 
@@ -48,12 +43,6 @@ def without_training(record: MapRecord) -> MapRecord:
     """Return the map without the state that training needs: it answers as before."""
     regions = tuple(dataclasses.replace(region, training=None) for region in record.regions)
     return dataclasses.replace(record, regions=regions)
-
-
-def _crop_region(settings: FieldSettings, region: Region, box: LeafBox) -> Region:
-    tables = tuple(_crop_table(settings, table, box) for table in region.tables)
-    evidence = masked(region.evidence, status_voxels(region.evidence, box))
-    return dataclasses.replace(region, tables=tables, evidence=evidence, training=None)
 
 
 def _crop_table(settings: FieldSettings, table: VertexTable, box: LeafBox) -> VertexTable:

@@ -9,21 +9,15 @@ from numpy.typing import NDArray
 from triquad_format.records.arrays import Bytes, Doubles, Floats
 from triquad_format.records.status import Status
 
-from triquad_tools.console.lines import print_line
+from triquad_tools.console.command import print_line
 from triquad_tools.console.report import print_columns
 
 if TYPE_CHECKING:  # slow to import
     from triquad_client import OfflineMap
 
-NEAR_ENOUGH_M = 1e-4
-"""A point this near to the zero of the field is on the surface."""
-
-STILL_M = 1e-3
-"""The least movement that counts: several times the error of a surface point."""
-
-NOISE_M = 0.02
-"""Two maps that learnt the same differ by less, but for single points."""
-
+NEAR_ENOUGH_M = 1e-4  # a point this near to the zero of the field is on the surface
+STILL_M = 1e-3  # the least movement that counts: several times the error of a surface point
+NOISE_M = 0.02  # two maps that learnt the same differ by less, but for single points
 _TOUCHING_LEAVES = 2  # along each axis, as far as points of one object may be apart
 _STEPS = 8
 _LEAST_SLOPE = 0.1  # a flatter field says nothing of where its zero is
@@ -152,20 +146,19 @@ def print_diff(change: Change) -> None:
     if not change.differs:
         print_line(f"  no difference at {change.points_a:,} surface points")
         return
-    titles = ("points A", "in B", "appeared %", "newly seen %", "vanished %", "no longer known %",
-              "moved %", "moved cm", "95 % cm")  # fmt: skip
-    row = (
-        f"{change.points_a:,}",
-        f"{change.points_b:,}",
-        _share(change.appeared, change.points_b),
-        _share(change.newly_seen, change.points_b),
-        _share(change.vanished, change.points_a),
-        _share(change.no_longer_known, change.points_a),
-        _share(change.moved, change.points_a),
-        _centimetres(change.moved_median_m),
-        _centimetres(change.moved_p95_m),
-    )
-    print_columns(titles, [row])
+    of_a, of_b = change.points_a, change.points_b
+    columns = {
+        "points A": f"{of_a:,}",
+        "in B": f"{of_b:,}",
+        "appeared %": _share(change.appeared, of_b),
+        "newly seen %": _share(change.newly_seen, of_b),
+        "vanished %": _share(change.vanished, of_a),
+        "no longer known %": _share(change.no_longer_known, of_a),
+        "moved %": _share(change.moved, of_a),
+        "moved cm": _centimetres(change.moved_median_m),
+        "95 % cm": _centimetres(change.moved_p95_m),
+    }
+    print_columns(list(columns), [list(columns.values())])
 
 
 def _sighting(of: "OfflineMap", by: "OfflineMap") -> Sighting:

@@ -11,27 +11,14 @@ from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from triquad_format.errors import (
-    DamagedMapFileError,
-    FormatError,
-    MapFileError,
-    TooLargeMapFileError,
-    UnsupportedMapFileError,
-)
+from triquad_format import errors
 from triquad_format.mapfile.container import chunk_messages, decompress
 from triquad_format.mapfile.files import FileBytes
 from triquad_format.mapfile.index import CheckpointIndex, is_checkpoint
 from triquad_format.mapfile.manifest import Entry, Manifest, manifest_in, total_limit
 from triquad_format.mapfile.metadata import MAX_MAP_BYTES, MapFacts, unpack_facts
+from triquad_format.mapfile.parts import part
 from triquad_format.mapfile.parts.body import unpack_body
-from triquad_format.mapfile.parts.part import (
-    MANIFEST,
-    MAP,
-    REGION,
-    REGION_TOPICS,
-    TRAINING,
-    PartKey,
-)
 
 _LEAST_BUDGET, _BUDGET_RATIO = 2**24, 8
 """Bytes of all places whose contents are tried: a constant, and a multiple of the file's size."""
@@ -50,14 +37,14 @@ class IntactParts:
     """The parts of the field and of training that are intact, and what is known of the others."""
 
     facts: MapFacts
-    payloads: Mapping[PartKey, bytes]
+    payloads: Mapping[part.PartKey, bytes]
     manifest: Manifest | None = None  # None: it is lost
 
     @property
-    def listed(self) -> frozenset[PartKey]:
+    def listed(self) -> frozenset[part.PartKey]:
         """The parts of regions that there were, as far as the manifest says."""
         entries = () if self.manifest is None else self.manifest.entries
-        return frozenset(entry.key for entry in entries if entry.key.topic in REGION_TOPICS)
+        return frozenset(entry.key for entry in entries if entry.key.topic in part.REGION_TOPICS)
 
 
 def intact_parts(path: Path) -> IntactParts:
@@ -78,29 +65,29 @@ def intact_parts(path: Path) -> IntactParts:
         by_digest = {hashlib.sha256(payload).digest(): payload for payload in payloads}
         return _listed_parts(manifest, lambda entry: by_digest.get(entry.sha256))
     for payload in payloads:
-        if _part_topic(payload) == MAP:
-            facts = unpack_facts(unpack_body(MAP, payload))
+        if _part_topic(payload) == part.MAP:
+            facts = unpack_facts(unpack_body(part.MAP, payload))
             keyed = ((_own_key(payload), payload) for payload in payloads)
             return IntactParts(facts, {key: data for key, data in keyed if key is not None})
-    raise MapFileError("nothing can be saved: neither its first part nor its last is intact")
+    raise errors.MapFileError("nothing can be saved: neither its first part nor its last is intact")
 
 
 def _manifest(payloads: list[bytes]) -> Manifest | None:
     for payload in payloads:
-        if _part_topic(payload) == MANIFEST:
+        if _part_topic(payload) == part.MANIFEST:
             try:
                 # A file that was cut lists parts for which it has no room: any size will do.
-                return manifest_in(unpack_body(MANIFEST, payload), MAX_MAP_BYTES)
-            except UnsupportedMapFileError:
+                return manifest_in(unpack_body(part.MANIFEST, payload), MAX_MAP_BYTES)
+            except errors.UnsupportedMapFileError:
                 raise
-            except FormatError:
+            except errors.FormatError:
                 continue
     return None
 
 
 def _checkpoint_parts(index: CheckpointIndex) -> IntactParts:
     def intact(entry: Entry) -> bytes | None:
-        with suppress(DamagedMapFileError, OSError):
+        with suppress(errors.DamagedMapFileError, OSError):
             return index.payload(entry)
         return None
 
@@ -109,49 +96,43 @@ def _checkpoint_parts(index: CheckpointIndex) -> IntactParts:
 
 def _listed_parts(manifest: Manifest, payload_of: Callable[[Entry], bytes | None]) -> IntactParts:
     """Return the parts of regions that a manifest lists, of those that have a payload."""
-    entries = [entry for entry in manifest.entries if entry.key.topic in REGION_TOPICS]
+    entries = [entry for entry in manifest.entries if entry.key.topic in part.REGION_TOPICS]
     tried = ((entry.key, payload_of(entry)) for entry in entries)
     found = {key: payload for key, payload in tried if payload is not None}
     return IntactParts(manifest.facts, found, manifest)
 
 
-def _own_key(payload: bytes) -> PartKey | None:
-    """Return the key that a part of a region names itself."""
+def _own_key(payload: bytes) -> part.PartKey | None:
     topic = _part_topic(payload)
-    if topic not in REGION_TOPICS:
+    if topic not in part.REGION_TOPICS:
         return None
-    with suppress(FormatError):
+    with suppress(errors.FormatError):
         body = unpack_body(topic, payload)
-        if topic in (REGION, TRAINING):
-            return PartKey(topic, body.index())
-        return PartKey(topic, body.index(), plane=body.count("plane"), cell=body.count("cell"))
+        if topic in (part.REGION, part.TRAINING):
+            return part.PartKey(topic, body.index())
+        return part.PartKey(topic, body.index(), plane=body.count("plane"), cell=body.count("cell"))
     return None
 
 
 def _payloads(file: FileBytes) -> Iterator[bytes]:
-    """Yield the payloads in all intact chunks of a file, in their order.
-
-    Raises:
-        TooLargeMapFileError: the file is larger than map files are, or unpacks to more.
-        OSError: it cannot be read.
-    """
     size = file.size
     if size > MAX_MAP_BYTES:
-        raise TooLargeMapFileError(f"it is larger than the limit of {MAX_MAP_BYTES} bytes")
+        raise errors.TooLargeMapFileError(f"it is larger than the limit of {MAX_MAP_BYTES} bytes")
     data = file.read(0, size)
     left = min(MAX_MAP_BYTES, total_limit(size))
     for message in _intact_messages(data):
         try:
             payload = decompress(message)
-        except FormatError:
+        except errors.FormatError:
             continue  # a preview, which is no zstd frame
         if (left := left - len(payload)) < 0:
-            raise TooLargeMapFileError("its intact parts exceed the limit given for its size")
+            raise errors.TooLargeMapFileError(
+                "its intact parts exceed the limit given for its size"
+            )
         yield payload
 
 
 def _intact_messages(data: bytes) -> Iterator[bytes]:
-    """Yield the data of the messages in all intact chunks."""
     budget = _LEAST_BUDGET + _BUDGET_RATIO * len(data)
     at = 0
     while match := _CHUNK.search(data, at):
@@ -162,7 +143,7 @@ def _intact_messages(data: bytes) -> Iterator[bytes]:
         if not fills or end > len(data) or end - start > budget:
             continue
         budget -= end - start
-        with suppress(FormatError):
+        with suppress(errors.FormatError):
             yield from chunk_messages(data[start:end], start)
             at = end
 

@@ -7,7 +7,7 @@ import numpy as np
 from triquad_format.records.arrays import Doubles
 from triquad_map.clusters import clusters
 
-from triquad_tools.console.lines import print_line
+from triquad_tools.console.command import print_line
 from triquad_tools.console.report import print_columns
 from triquad_tools.mapfiles.diff import Comparison, Sighting
 
@@ -63,9 +63,8 @@ def print_objects(changes: Mapping[str, Sequence[Cluster]]) -> None:
 
 def _clusters(sighting: Sighting) -> list[Cluster]:
     points = sighting.points
-    _, numbers = np.unique(
-        clusters(np.floor(points / sighting.leaf_m).astype(np.int64)), return_inverse=True
-    )
+    groups = clusters(np.floor(points / sighting.leaf_m).astype(np.int64))
+    _, numbers = np.unique(groups, return_inverse=True)
     order, sizes = np.argsort(numbers, kind="stable"), np.bincount(numbers)
     found = []
     for rows in np.split(order, np.cumsum(sizes))[:-1]:

@@ -11,7 +11,6 @@ import math
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from triquad_format.errors import FormatError
@@ -59,7 +58,7 @@ def quantise(record: MapRecord, max_error_m: float) -> QuantisedMap:
     change_of, limit = _changes(record, _SEARCH_SEED), _MARGIN * max_error_m
     step, best, error = _FIRST_STEP, None, 0.0
     for _ in range(_EVALUATIONS_MAX):
-        rounded = _with_tables(record, partial(_rounded, step=step))
+        rounded = _rounded(record, step)
         error = change_of(rounded).quantile_m
         if error <= limit:
             best = rounded
@@ -71,9 +70,7 @@ def quantise(record: MapRecord, max_error_m: float) -> QuantisedMap:
             f"integers change distances by {error * 1e3:.3f} mm, more than "
             f"{max_error_m * 1e3:.3f} mm; allow a larger error"
         )
-    regions = tuple(dataclasses.replace(region, training=None) for region in best.regions)
-    packed = dataclasses.replace(best, regions=regions)
-    return QuantisedMap(packed, field_change(record, packed, _MEASURE_SEED))
+    return QuantisedMap(best, field_change(record, best, _MEASURE_SEED))
 
 
 def field_change(before: MapRecord, after: MapRecord, seed: int) -> FieldChange:
@@ -115,15 +112,17 @@ def _distances(record: MapRecord, points: Doubles) -> Floats:
         return view.query(points).sdf
 
 
-def _with_tables(record: MapRecord, change: Callable[[VertexTable], VertexTable]) -> MapRecord:
-    regions = tuple(
-        dataclasses.replace(region, tables=tuple(map(change, region.tables)))
+def _rounded(record: MapRecord, step: float) -> MapRecord:
+    regions = (
+        dataclasses.replace(
+            region, tables=tuple(_integers(table, step) for table in region.tables), training=None
+        )
         for region in record.regions
     )
-    return dataclasses.replace(record, regions=regions)
+    return dataclasses.replace(record, regions=tuple(regions))
 
 
-def _rounded(table: VertexTable, step: float) -> VertexTable:
+def _integers(table: VertexTable, step: float) -> VertexTable:
     """Return the nearest integers; the scale grows where the largest feature needs it."""
     vectors = table.vectors()
     least = float(np.abs(vectors).max(initial=0.0)) / MAX_INTEGER * (1 + 1e-6)

@@ -5,28 +5,17 @@ themselves.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from triquad_format.errors import FormatError, MapFileError
 from triquad_format.mapfile.files import named
-from triquad_format.mapfile.parts.part import (
-    CELL_LEAVES,
-    FIELD_TOPICS,
-    REGION,
-    REGION_TOPICS,
-    TRAINING,
-    TRAINING_TOPICS,
-    VERTICES,
-    PartKey,
-    extent,
-    vertex_reach,
-)
+from triquad_format.mapfile.parts import part
 from triquad_format.mapfile.parts.region_parts import RegionParts
 from triquad_format.records import morton
-from triquad_format.records.arrays import Doubles, Longs
+from triquad_format.records.arrays import Doubles
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.leaf_box import LeafBox
 from triquad_format.records.record_check import check_record
@@ -49,7 +38,7 @@ class Loss:
     stands for all of a region's training state.
     """
 
-    key: PartKey
+    key: part.PartKey
     minimum: Doubles  # [3] metres, map frame
     maximum: Doubles  # [3]
 
@@ -91,33 +80,31 @@ def recover(path: Path) -> RecoveredMap:
 def _recovered(found: IntactParts) -> RecoveredMap:
     settings = found.facts.settings
     regions: list[Region] = []
-    lost: set[PartKey] = set()
+    lost: set[part.PartKey] = set()
     all_missing = found.listed - found.payloads.keys()
     for index in dict.fromkeys(key.region for key in (*found.payloads, *sorted(all_missing))):
         payloads = {key: data for key, data in found.payloads.items() if key.region == index}
         missing = {key for key in all_missing if key.region == index}
         region = _region(index, settings, payloads, missing=missing)
         if region is None:
-            lost.add(PartKey(REGION, index))
+            lost.add(part.PartKey(part.REGION, index))
             continue
         if found.manifest is None:
             missing |= _missing_squares(settings, region, payloads)
-        lost |= {key for key in missing if key.topic in FIELD_TOPICS}
-        had_training = any(key.topic in TRAINING_TOPICS for key in (*payloads, *missing))
+        lost |= {key for key in missing if key.topic in part.FIELD_TOPICS}
+        had_training = any(key.topic in part.TRAINING_TOPICS for key in (*payloads, *missing))
         if had_training and region.training is None:
-            lost.add(PartKey(TRAINING, index))
+            lost.add(part.PartKey(part.TRAINING, index))
         regions.append(region)
-    losses = tuple(
-        loss_of(key, settings) for key in sorted(lost, key=lambda key: (key.region, key))
-    )
-    regions = _masked_where_lost(settings, regions, losses)
+    regions = _masked_where_lost(settings, regions, lost)
     record = found.facts.record(tuple(regions))
+    losses = [
+        Loss(key, *(record.origin + _status_box(key, settings)))
+        for key in sorted(lost, key=lambda key: (key.region, key))
+    ]
     return RecoveredMap(
         record,
-        tuple(
-            Loss(loss.key, record.origin + loss.minimum, record.origin + loss.maximum)
-            for loss in losses
-        ),
+        tuple(losses),
         parts_intact=len(found.payloads),
         parts_listed=None if found.manifest is None else len(found.listed),
         stamp_ns=0 if found.manifest is None else found.manifest.stamp_ns,
@@ -127,14 +114,13 @@ def _recovered(found: IntactParts) -> RecoveredMap:
 def _region(
     index: RegionIndex,
     settings: FieldSettings,
-    payloads: Mapping[PartKey, bytes],
+    payloads: Mapping[part.PartKey, bytes],
     *,
-    missing: set[PartKey],
+    missing: set[part.PartKey],
 ) -> Region | None:
-    """Return the region of these parts, with its training state where that is complete."""
-    choices = [REGION_TOPICS, FIELD_TOPICS]
-    if any(key.topic in (VERTICES, *TRAINING_TOPICS) for key in missing):
-        choices = [FIELD_TOPICS]
+    choices = [part.REGION_TOPICS, part.FIELD_TOPICS]
+    if any(key.topic in (part.VERTICES, *part.TRAINING_TOPICS) for key in missing):
+        choices = [part.FIELD_TOPICS]
     for topics in choices:
         parts = RegionParts(index, settings)
         try:
@@ -150,8 +136,8 @@ def _region(
 
 
 def _missing_squares(
-    settings: FieldSettings, region: Region, payloads: Mapping[PartKey, bytes]
-) -> set[PartKey]:
+    settings: FieldSettings, region: Region, payloads: Mapping[part.PartKey, bytes]
+) -> set[part.PartKey]:
     """Return squares that had vertices: every node with a seen surface has its four corners."""
     if settings.encoding == "fourier":
         return set()
@@ -161,51 +147,46 @@ def _missing_squares(
         shift = settings.depth - table.level
         nodes = np.unique(voxels[:, list(AXES[table.plane])] >> shift, axis=0)
         for corner in np.ndindex(2, 2):
-            squares = _squares_at((nodes + corner) << shift)
+            leaves = (nodes + corner) << shift
+            squares = np.unique(morton.encode(leaves // part.CELL_LEAVES)).tolist()
             needed |= {
-                PartKey(VERTICES, region.index, plane=table.plane, cell=cell) for cell in squares
+                part.PartKey(part.VERTICES, region.index, plane=table.plane, cell=cell)
+                for cell in squares
             }
     return needed - payloads.keys()
 
 
-def _squares_at(leaves: Longs) -> set[int]:
-    """Return codes of the squares that contain places [N, 2], in leaf coordinates."""
-    return set(np.unique(morton.encode(leaves // CELL_LEAVES)).tolist())
-
-
 def _masked_where_lost(
-    settings: FieldSettings, regions: list[Region], losses: Sequence[Loss]
+    settings: FieldSettings, regions: list[Region], lost: set[part.PartKey]
 ) -> list[Region]:
     """Return the regions without evidence where vertices are lost, their own or a neighbour's."""
-    vertices = [loss for loss in losses if loss.key.topic == VERTICES]
-    low = np.array([loss.minimum for loss in vertices]).reshape(-1, 3)
-    high = np.array([loss.maximum for loss in vertices]).reshape(-1, 3)
+    vertices = [key for key in lost if key.topic == part.VERTICES]
+    boxes = np.array([_status_box(key, settings) for key in vertices]).reshape(-1, 2, 3)
     masked_regions = []
     for region in regions:
         evidence, centre = region.evidence, settings.region_centre(region.index)
         reach_m = settings.region_side_m / 2
-        near = ((low <= centre + reach_m) & (high >= centre - reach_m)).all(axis=1)
-        for number in np.flatnonzero(near).tolist():
-            corners = effect_box(vertices[number].key, settings)
+        below, above = boxes[:, 0] <= centre + reach_m, boxes[:, 1] >= centre - reach_m
+        for number in np.flatnonzero((below & above).all(axis=1)).tolist():
+            corners = _effect_box(vertices[number], settings)
             box = LeafBox(*settings.leaf_coordinates(corners - centre))
             evidence = masked(evidence, ~status_voxels(evidence, box))
         masked_regions.append(dataclasses.replace(region, evidence=evidence))
     return masked_regions
 
 
-def loss_of(key: PartKey, settings: FieldSettings) -> Loss:
-    """Return the loss of a part; its box, from the origin, has all whose status may change."""
-    low, high = effect_box(key, settings)
+def _status_box(key: part.PartKey, settings: FieldSettings) -> Doubles:
+    """Return corners [2, 3], from the origin, of the box of all whose status a loss may change."""
     reach_m = STATUS_REACH_LEAVES * settings.leaf_m
-    return Loss(key, low - reach_m, high + reach_m)
+    return _effect_box(key, settings) + [[-reach_m], [reach_m]]
 
 
-def effect_box(key: PartKey, settings: FieldSettings) -> Doubles:
+def _effect_box(key: part.PartKey, settings: FieldSettings) -> Doubles:
     """Return corners [2, 3], from the origin, of the box in which a part has an effect itself."""
-    box = extent(settings, key)
-    if key.topic == VERTICES:
+    box = part.extent(settings, key)
+    if key.topic == part.VERTICES:
         # A vertex has an effect as far as the side of its level's nodes; those at the upper border
         # of a square belong to the next.
-        box.low[list(AXES[key.plane])] -= vertex_reach(settings)
+        box.low[list(AXES[key.plane])] -= part.vertex_reach(settings)
     corner = settings.region_corner(key.region)
     return corner + np.stack([box.low, box.high]) * settings.leaf_m

@@ -9,11 +9,7 @@ from datetime import datetime
 from pathlib import Path
 
 from triquad_format.errors import MapFileError
-from triquad_format.mapfile.checkpoint_folder import (
-    CheckpointFile,
-    checkpoint_files,
-    map_folder,
-)
+from triquad_format.mapfile.checkpoint_folder import CheckpointFile, checkpoint_files, map_folder
 from triquad_format.mapfile.reader import open_manifest, read_map_file
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.region import MapRecord
@@ -23,9 +19,7 @@ from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
 from triquad_tools.mapfiles.crop import crop_record
 
-Box = Doubles
-"""Opposite corners ``[2, 3]`` of a box, metres, map frame; the lower one first."""
-
+Box = Doubles  # opposite corners [2, 3] of a box, metres, map frame; the lower one first
 _ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws|unixsock-stream)/")
 
 
@@ -100,8 +94,6 @@ def read_source(path: Path, box: Box | None) -> SourceMap:
 
     Raises:
         NothingLeftError: no region lies in the box.
-        FormatError: the box is empty, or the file cannot be read.
-        OSError: it cannot be read.
     """
     if box is None:
         file = read_map_file(path)
@@ -131,33 +123,35 @@ def checkpoint_at(folder: Path, when: str) -> CheckpointFile:
         OSError: the folder or a file cannot be read.
     """
     files = checkpoint_files(folder)
-    found = [file for file in files if _is_by(file, when)]
+    is_epoch = when.isascii() and when.isdigit() and len(when) < 20
+    if is_epoch:
+        found = [file for file in files if file.epoch <= int(when)]
+    else:
+        limit_s = _seconds(when)
+        # Times are shown in whole seconds: what is shown must find its checkpoint.
+        found = [file for file in files if 0 < _stamp_ns(file) // 10**9 <= limit_s]
     epochs = f"epochs {files[-1].epoch} to {files[0].epoch}" if files else "nothing"
     if not found:
         raise MapFileError(f"{folder} holds no checkpoint of {when} or before, but {epochs}")
-    if _is_epoch(when) and int(when) > files[0].epoch:
+    if is_epoch and int(when) > files[0].epoch:
         raise MapFileError(
             f"{folder} holds {epochs}, not {when}; a time is written as 2026-01-31T12:00:00Z"
         )
     return max(found)
 
 
-def _is_epoch(when: str) -> bool:
-    return when.isascii() and when.isdigit() and len(when) < 20
-
-
-def _is_by(file: CheckpointFile, when: str) -> bool:
-    if _is_epoch(when):
-        return file.epoch <= int(when)
+def _seconds(when: str) -> float:
     try:
-        limit_s = datetime.fromisoformat(when.replace("Z", "+00:00")).timestamp()
+        return datetime.fromisoformat(when.replace("Z", "+00:00")).timestamp()
     except ValueError as error:
         raise MapFileError(
             f"{when!r} is neither the number of an epoch nor a time such as 2026-01-31T12:00:00Z"
         ) from error
+
+
+def _stamp_ns(file: CheckpointFile) -> int:
+    """Return when an epoch was written, nanoseconds since 1970; 0 where that is not known."""
     try:
-        manifest = open_manifest(file)
+        return open_manifest(file).stamp_ns
     except MapFileError:
-        return False
-    # Times are shown in whole seconds: what is shown must find its checkpoint.
-    return 0 < manifest.stamp_ns // 10**9 <= limit_s
+        return 0

@@ -5,18 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.checkpoint_folder import (
-    CheckpointFile,
-    PartFiles,
-    checkpoint_files,
-    map_folder,
-    set_aside,
-)
+from triquad_format.mapfile import checkpoint_folder
 from triquad_format.mapfile.files import FileBytes, named
 from triquad_format.mapfile.index import CheckpointIndex, open_index
 from triquad_format.mapfile.metadata import utc_time
 
-from triquad_tools.console.lines import print_line
+from triquad_tools.console.command import print_line
 from triquad_tools.console.report import print_columns
 
 
@@ -42,11 +36,6 @@ class StoreLog:
     checkpoints: tuple[LoggedCheckpoint, ...]
     set_aside: tuple[str, ...] = ()  # names of files that a server found damaged
 
-    @property
-    def damaged(self) -> int:
-        """The number of checkpoints that do not open."""
-        return sum(checkpoint.problem is not None for checkpoint in self.checkpoints)
-
 
 def read_log(store: Path) -> StoreLog:
     """Return the checkpoints of a folder, or of the only map in a server's store.
@@ -57,30 +46,25 @@ def read_log(store: Path) -> StoreLog:
         MapFileError: there are no checkpoints, or those of several maps.
         OSError: the folder cannot be read.
     """
-    folder = map_folder(store)
-    parts_folder = PartFiles(folder).folder
+    folder = checkpoint_folder.map_folder(store)
+    parts_folder = checkpoint_folder.PartFiles(folder).folder
     files = [*folder.iterdir(), *(parts_folder.iterdir() if parts_folder.is_dir() else ())]
     return StoreLog(
         str(folder),
         bytes=sum(path.stat().st_size for path in files if path.is_file()),
-        checkpoints=tuple(_logged(file) for file in checkpoint_files(folder)),
-        set_aside=tuple(path.name for path in set_aside(folder)),
+        checkpoints=tuple(_logged(file) for file in checkpoint_folder.checkpoint_files(folder)),
+        set_aside=tuple(path.name for path in checkpoint_folder.set_aside(folder)),
     )
 
 
 def print_log(log: StoreLog) -> None:
     """Print a table of the checkpoints, and what is wrong with those that do not open."""
     print_line(f"{log.folder}: {len(log.checkpoints)} checkpoints, {log.bytes:,} bytes")
-    rows = [
-        (
-            str(one.epoch),
-            one.time or "-",
-            f"{one.bytes:,}",
-            f"{one.new_bytes:,}",
-            "no" if one.problem else "yes",
-        )
-        for one in log.checkpoints
-    ]
+    rows = []
+    for one in log.checkpoints:
+        opens = "no" if one.problem else "yes"
+        sizes = f"{one.bytes:,}", f"{one.new_bytes:,}"
+        rows.append((f"{one.epoch}", one.time or "-", *sizes, opens))
     print_columns(("epoch", "time", "bytes", "new bytes", "opens"), rows)
     for checkpoint in log.checkpoints:
         if checkpoint.problem is not None:
@@ -91,7 +75,7 @@ def print_log(log: StoreLog) -> None:
         print_line(f"  {name}: set aside as damaged; triquad-pack --recover saves what is intact")
 
 
-def _logged(file: CheckpointFile) -> LoggedCheckpoint:
+def _logged(file: checkpoint_folder.CheckpointFile) -> LoggedCheckpoint:
     try:
         with closing(FileBytes(file.path)) as source, named(str(file.path)):
             index = open_index(source)

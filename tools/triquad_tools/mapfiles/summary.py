@@ -9,9 +9,9 @@ from triquad_format.errors import NoCompiledCodeError
 from triquad_format.mapfile.manifest import Entry
 from triquad_format.mapfile.reader import MapFile
 from triquad_format.records import morton
-from triquad_format.records.arrays import Bytes, Doubles, Floats
+from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
-from triquad_format.records.region import MapProgress, MapRecord, Region
+from triquad_format.records.region import MapProgress, MapRecord, Region, surface_counts
 from triquad_format.records.replay_rays import are_held_out
 from triquad_format.records.seen_space import owned_evidence
 from triquad_map.field_fit import MapFit, PlaceFits, in_cube, map_fit
@@ -69,6 +69,9 @@ def summarise(file: MapFile) -> MapSummary:
     """Return the figures of a map file."""
     record = file.record
     regions = tuple(_summarise_region(record, region) for region in record.regions)
+    by_topic: dict[str, list[Entry]] = {}
+    for entry in file.manifest.entries:
+        by_topic.setdefault(entry.key.topic, []).append(entry)
     return MapSummary(
         bytes=file.size,
         metadata=file.metadata,
@@ -84,7 +87,10 @@ def summarise(file: MapFile) -> MapSummary:
         training=any(region.training is not None for region in record.regions),
         fit=_fit(record),
         regions=regions,
-        parts=_summarise_parts(file),
+        parts={
+            topic: TopicSummary(len(own), sum(e.size for e in own), sum(e.stored for e in own))
+            for topic, own in by_topic.items()
+        },
     )
 
 
@@ -93,21 +99,17 @@ def print_summary(name: str, summary: MapSummary) -> None:
     title = f"{name}: map {summary.map!r}, epoch {summary.epoch}, {summary.bytes:,} bytes"
     print_rows(title, list(_facts(summary)), align="left")
     for region in summary.regions:
-        box = (
-            ""
-            if region.evidence_box_m is None
-            else " in {} to {} m".format(*map(list, region.evidence_box_m))
-        )
+        box = ""
+        if region.evidence_box_m is not None:
+            box = " in {} to {} m".format(*map(list, region.evidence_box_m))
         facts = [
             Row("vertices", f"{region.vertices:,} ({region.precision})"),
             Row("evidence", f"{_evidence(region)}{box}"),
         ]
         title = f"region {region.index} at {list(region.centre_m)} m"
         print_rows(title, facts, align="left")
-    rows = [
-        (topic, f"{p.parts:,}", f"{p.bytes:,}", f"{p.stored_bytes:,}")
-        for topic, p in summary.parts.items()
-    ]
+    parts = summary.parts.items()
+    rows = [(topic, f"{p.parts:,}", f"{p.bytes:,}", f"{p.stored_bytes:,}") for topic, p in parts]
     print_columns(("part", "count", "bytes", "bytes stored"), rows)
 
 
@@ -139,7 +141,12 @@ def _evidence(summary: MapSummary | RegionSummary) -> str:
 
 def _summarise_region(record: MapRecord, region: Region) -> RegionSummary:
     evidence = owned_evidence(record.settings, region)
-    box = _evidence_box(record.settings, region)
+    box = None
+    if len(codes := region.evidence.codes):
+        blocks = morton.decode(codes, 3)
+        ends = np.stack([blocks.min(axis=0), blocks.max(axis=0) + 1])
+        block_m = record.settings.leaf_m * BLOCK_VOXELS
+        box = record.origin + record.settings.region_corner(region.index) + ends * block_m
     voxel_m3 = record.settings.leaf_m**3
     return RegionSummary(
         index=region.index,
@@ -147,30 +154,15 @@ def _summarise_region(record: MapRecord, region: Region) -> RegionSummary:
         parameters=region.parameters,
         precision=", ".join(sorted({table.features.dtype.name for table in region.tables})),
         vertices=sum(len(table.codes) for table in region.tables),
-        evidence_box_m=None if box is None else tuple(map(_rounded, record.origin + box)),
-        surface_m3=_bits(evidence.surface) * voxel_m3,
-        free_m3=_bits(evidence.free & ~evidence.surface) * voxel_m3,
+        evidence_box_m=None if box is None else tuple(map(_rounded, box)),
+        surface_m3=int(surface_counts(evidence.surface).sum()) * voxel_m3,
+        free_m3=int(surface_counts(evidence.free & ~evidence.surface).sum()) * voxel_m3,
     )
-
-
-def _bits(masks: Bytes) -> int:
-    return int(np.unpackbits(masks).sum(dtype=np.int64))
 
 
 def _rounded(place: Doubles) -> tuple[float, ...]:
     """Return coordinates without the noise of their last bits."""
     return tuple(place.round(6).tolist())
-
-
-def _summarise_parts(file: MapFile) -> dict[str, TopicSummary]:
-    """Return the parts by topic."""
-    by_topic: dict[str, list[Entry]] = {}
-    for entry in file.manifest.entries:
-        by_topic.setdefault(entry.key.topic, []).append(entry)
-    return {
-        topic: TopicSummary(len(own), sum(e.size for e in own), sum(e.stored for e in own))
-        for topic, own in by_topic.items()
-    }
 
 
 def _fit(record: MapRecord) -> MapFit | None:
@@ -203,15 +195,3 @@ def _held_out_ends(region: Region, record: MapRecord) -> Floats:
     rays = region.training.rays
     ends = rays.ends_m(record.settings)[are_held_out(rays.ends)].astype(np.float32)
     return ends[in_cube(ends, record.settings)]
-
-
-def _evidence_box(settings: FieldSettings, region: Region) -> Doubles | None:
-    """Return the box [2, 3] around a region's evidence, to whole blocks, from the map's origin.
-
-    ``None`` where there is no evidence.
-    """
-    if not len(region.evidence.codes):
-        return None
-    blocks = morton.decode(region.evidence.codes, 3)
-    ends = np.stack([blocks.min(axis=0), blocks.max(axis=0) + 1])
-    return settings.region_corner(region.index) + ends * (settings.leaf_m * BLOCK_VOXELS)

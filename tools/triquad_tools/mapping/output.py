@@ -11,8 +11,7 @@ from triquad_format.mapfile.metadata import utc_time
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.region import MapRecord
 
-from triquad_tools.console.command import ToolError
-from triquad_tools.console.lines import print_remark
+from triquad_tools.console.command import ToolError, print_remark
 from triquad_tools.console.progress import progress
 from triquad_tools.mapfiles.crop import without_training
 from triquad_tools.mapfiles.meshfile import MESH_SUFFIXES
@@ -77,10 +76,8 @@ def write_map_file(source: SourceMap, path: Path, *, feature_dtype: str = "<f2")
     except ModuleNotFoundError as error:
         if error.name is None or error.name.startswith("triquad"):
             raise
-        print_remark(
-            f"without a preview for MCAP viewers, as {error.name} is missing: "
-            "install triquad[preview]"
-        )
+        told = f"without a preview for MCAP viewers, as {error.name} is missing"
+        print_remark(f"{told}: install triquad[preview]")
     return write_map(
         record, path, feature_dtype=feature_dtype, stamp_ns=stamp_ns, previews=previews
     ).bytes

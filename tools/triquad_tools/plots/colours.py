@@ -11,9 +11,7 @@ from triquad_map.height_scale import HEIGHT_STOPS
 
 UNKNOWN = "#bdbdbd"
 FREE = "#f3f3f3"
-BEHIND = "#d55e00"
-"""The colour of what lies behind a surface."""
-
+BEHIND = "#d55e00"  # what lies behind a surface
 HEIGHTS: Colormap = LinearSegmentedColormap.from_list("heights", HEIGHT_STOPS.tolist())
 MOVEMENT: Colormap = colormaps["plasma_r"]
 DISTANCES = colormaps["viridis"].with_extremes(under=BEHIND)

@@ -69,7 +69,10 @@ def draw_diff(
         _draw_presence(presence, edges, comparison)
         for kind, colour in (("appeared", APPEARED), ("vanished", VANISHED)):
             for cluster in objects[kind]:
-                _draw_box(presence, cluster, colour)
+                x, y, _ = np.array(cluster.low_m) - _BESIDE_M
+                width, depth, _ = cluster.size_m + 2 * _BESIDE_M
+                outline = Rectangle((x, y), width, depth, fill=False, ec=colour, lw=_LINE_PT)
+                presence.add_patch(outline)
         figure.savefig(path)
 
 
@@ -146,12 +149,3 @@ def _draw_cells(
         cells, colours, vmin=0.0, vmax=most, extent=(west, east, south, north), origin="lower",
         interpolation="none",
     )  # fmt: skip
-
-
-def _draw_box(axes: Axes, cluster: Cluster, colour: str) -> None:
-    """Outline a cluster, a little outside of it."""
-    x, y, _ = np.array(cluster.low_m) - _BESIDE_M
-    width, depth, _ = cluster.size_m + 2 * _BESIDE_M
-    axes.add_patch(
-        Rectangle((x, y), width, depth, fill=False, edgecolor=colour, linewidth=_LINE_PT)
-    )

@@ -15,12 +15,8 @@ from triquad_map.height_scale import HeightScale
 from triquad_tools.plots.colours import HEIGHTS
 from triquad_tools.plots.mesh_view import draw_faces, view_along
 
-BACKGROUND = (0.93, 0.94, 0.95)
-"""The sRGB colour of the background."""
-
-TOP, WIDTH, HEIGHT = 90, 1340, 740
-"""Rows above the mesh, which is at the left, and its size, pixels."""
-
+BACKGROUND = (0.93, 0.94, 0.95)  # the sRGB colour of the background
+TOP, WIDTH, HEIGHT = 90, 1340, 740  # rows above the mesh, which is at the left; its size, pixels
 _WIDE, _HIGH = 1600, 900  # pixels of the whole picture
 _BAR = (1362 / _WIDE, 390 / _HIGH, 30 / _WIDE, 360 / _HIGH)  # left, bottom, width, height
 

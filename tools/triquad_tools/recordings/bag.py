@@ -39,8 +39,7 @@ class Channel:
     foreign: str = ""  # the encoding of messages that are not of ROS
 
 
-Wanted = Callable[[Channel], bool]
-"""Tells of a channel whether its messages are wanted."""
+Wanted = Callable[[Channel], bool]  # tells of a channel whether its messages are wanted
 
 
 class Message(NamedTuple):
@@ -65,10 +64,7 @@ class Message(NamedTuple):
 
 @dataclass(frozen=True)
 class Bag:
-    """A bag, which may be cut into several files.
-
-    What reads it raises a ToolError where it cannot be read, or is not whole.
-    """
+    """A bag, which may be cut into several files."""
 
     path: Path
     files: tuple[Path, ...]
@@ -110,9 +106,8 @@ class Bag:
 
 def _channel(reader: AnyReader, known: Connection) -> Channel:
     types = reader.typestore
-    decode = partial(
-        types.deserialize_cdr if reader.is2 else types.deserialize_ros1, typename=known.msgtype
-    )
+    read = types.deserialize_cdr if reader.is2 else types.deserialize_ros1
+    decode = partial(read, typename=known.msgtype)
     file = Path(str(getattr(known.owner, "path", reader.paths[0])))
     return Channel(known.topic, known.msgtype, known.msgcount, file, decode, not reader.is2)
 

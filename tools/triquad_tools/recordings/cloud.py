@@ -12,14 +12,10 @@ _MERGED_POINTS = 2_000_000  # fewer are not worth a merge
 
 
 def points_in_range(points: NDArray[np.floating], range_min_m: float) -> NDArray[np.floating]:
-    """Return the points ``[N, 3]``, sensor frame, that are no nearer than a limit above 0.
-
-    Points without a range are left out as soon as there is a limit.
-    """
+    """Return the points ``[N, 3]``, sensor frame, that are no nearer than a limit above 0."""
     if range_min_m <= 0.0:
         return points
-    kept: NDArray[np.floating] = points[np.linalg.norm(points, axis=1) >= range_min_m]
-    return kept
+    return np.asarray(points[np.linalg.norm(points, axis=1) >= range_min_m])
 
 
 def world_points(scan: PosedScan, range_min_m: float = 0.0) -> Doubles:

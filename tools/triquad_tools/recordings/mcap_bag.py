@@ -4,7 +4,7 @@ import heapq
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -101,8 +101,6 @@ class McapBag(Bag):
 
 
 class _Contents:
-    """What is known of a file while it is read."""
-
     def __init__(self, file: Path) -> None:
         self.file = file
         self.channels: dict[int, Channel] = {}
@@ -125,14 +123,13 @@ def _channel(file: Path, channel: records.Channel, schema: records.Schema | None
         return Channel(channel.topic, name or what, 0, file, bytes, foreign=what)
     kind, is_ros_1 = normalize_msgtype(name), encoding == "ros1"
     text = schema.data.decode(errors="replace") if schema is not None else ""
-    decode = partial(_decode, kind, text, is_ros_1)
+
+    def decode(payload: bytes) -> Any:
+        types = _types(kind, text, is_ros_1)
+        read = types.deserialize_ros1 if is_ros_1 else types.deserialize_cdr
+        return read(payload, kind)
+
     return Channel(channel.topic, kind, 0, file, decode, is_ros_1)
-
-
-def _decode(kind: str, text: str, is_ros_1: bool, payload: bytes) -> Any:
-    types = _types(kind, text, is_ros_1)
-    read = types.deserialize_ros1 if is_ros_1 else types.deserialize_cdr
-    return read(payload, kind)
 
 
 @cache

@@ -3,14 +3,13 @@
 import argparse
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 from triquad_format.wire.places import moved_pose
 
-from triquad_tools.console.command import ToolError
-from triquad_tools.console.lines import print_remark
+from triquad_tools.console.command import ToolError, print_remark
 from triquad_tools.recordings.cloud import points_in_range
 from triquad_tools.recordings.folders.cloud_folder import is_cloud_folder, read_cloud_folder
 from triquad_tools.recordings.folders.depth_folder import is_depth_folder, read_depth_folder
@@ -28,9 +27,7 @@ _UNPACK = {
 }  # fmt: skip
 """The commands that unpack files, by how their names end: the first one counts."""
 
-Recording = RosRecording | ScanFolder
-"""A recording that was checked as a whole, so that its errors are known."""
-
+Recording = RosRecording | ScanFolder  # checked as a whole, so that its errors are known
 _MOST_NAMED = 10  # recordings in a folder
 
 _ORIGIN = 0.0, 0.0, 0.0
@@ -68,23 +65,19 @@ def open_recording(path: Path, options: ReadingOptions) -> Recording:
     ends = (command for end, command in _UNPACK.items() if path.name.lower().endswith(end))
     if path.is_file() and (command := next(ends, None)):
         raise ToolError(f"{path}: is packed: unpack it with '{command} {path}' first")
-    within = sorted(each.name for each in path.glob("*") if each.is_dir() and _is_recording(each))
-    there = (
-        f"one of the recordings in it, {', '.join(within[:_MOST_NAMED])}"
-        if within
-        else "a bag of ROS, an MCAP file, or a folder as docs/tools.md describes them"
-    )
+    kinds = find_bag, is_depth_folder, is_cloud_folder
+    folders = [each for each in path.glob("*") if each.is_dir()]
+    within = sorted(each.name for each in folders if any(is_one(each) for is_one in kinds))
+    there = "a bag of ROS, an MCAP file, or a folder as docs/tools.md describes them"
+    if within:
+        there = f"one of the recordings in it, {', '.join(within[:_MOST_NAMED])}"
     raise ToolError(f"{path}: no recording that is understood: give {there}")
 
 
-def _is_recording(path: Path) -> bool:
-    return find_bag(path) is not None or is_depth_folder(path) or is_cloud_folder(path)
-
-
 def _refuse_others(what: str, meaningful: set[str], options: ReadingOptions) -> None:
-    """Refuse choices that are not for the kind of recording that was found."""
-    for name in options.given:
-        if name not in meaningful:
+    for choice in fields(options):
+        name, is_given = choice.name, getattr(options, choice.name) != choice.default
+        if is_given and name not in meaningful:
             flag = _FLAGS.get(name, f"--{name.replace('_', '-')}")
             raise ToolError(f"{what}, for which {flag} means nothing: leave it out")
 
@@ -112,12 +105,12 @@ class Selection:
         """Yield the scans from number ``start`` on, one after the other."""
         for scan in self.recording.read(self.indices[start:]):
             points = without_repeated(np.asarray(scan.points, np.float32))
-            pose = scan.world_from_sensor
+            seen = PosedScan(points, scan.world_from_sensor)
             if any(self.ray_origin):
-                begin = np.array(self.ray_origin)
-                points = (points - begin).astype(np.float32)
-                pose = moved_pose(pose, pose[:3, :3] @ begin)
-            yield PosedScan(points_in_range(points, self.range_min_m), pose)
+                offset = scan.world_from_sensor[:3, :3] @ self.ray_origin
+                seen = seen.seen_from(moved_pose(scan.world_from_sensor, offset))
+            points = points_in_range(seen.points, self.range_min_m)
+            yield PosedScan(points, seen.world_from_sensor)
 
 
 def open_selected(options: argparse.Namespace) -> Selection:
@@ -150,7 +143,6 @@ def length_s(entries: Sequence[ScanEntry]) -> float:
 
 
 def _chosen(entries: Sequence[ScanEntry], options: argparse.Namespace) -> list[int]:
-    """Return the numbers of scans within the times, every Nth of each sensor."""
     first_ns = min(entry.stamp_ns for entry in entries)
     end_s = float("inf") if options.end is None else options.end
     before: Counter[str] = Counter()  # scans of each sensor

@@ -1,20 +1,24 @@
-"""The recorded poses that place the most clouds."""
+"""The recorded poses that place the most clouds, from file to file of a recording in parts."""
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 from triquad_client.pose import Pose
+from triquad_format.records.arrays import Doubles
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.recording import ReadingOptions
 from triquad_tools.recordings.ros_content import RosContent, SeenCloud
 from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES, STATIC, FrameTree, Transform
 from triquad_tools.sensors.ros.type_store import TRANSFORMS
-from triquad_tools.sensors.sweep import NoTransformError, PosedScan, Sweep, moved
+from triquad_tools.sensors.sweep import NoTransformError, PosedScan, Sweep
 
-TF = "tf"
-"""Stands for all transforms, whatever their topics."""
+_SLACK_M, _SLACK_S = 1.0, 2.0  # between the parts of a recording the robot goes on as it was
+TF = "tf"  # stands for all transforms, whatever their topics
 
 
 @dataclass(frozen=True)
@@ -39,10 +43,12 @@ class PoseSource:
 
     def seen(self, scan: PosedScan, sweep: Sweep) -> PosedScan:
         """Return a scan whose points stand still in the map as the body saw them."""
-        stamps = np.array([sweep.stamp_ns], np.int64)
-        (pose,) = self.frames.poses(self.target, self.body, stamps)
-        points = moved(scan.points, np.linalg.inv(pose) @ scan.world_from_sensor)
-        return PosedScan(points.astype(np.float32), pose)
+        return scan.seen_from(self.pose_of(self.body, sweep.stamp_ns))
+
+    def pose_of(self, frame: str, stamp_ns: int) -> Doubles:
+        """Return the pose [4, 4] of a frame in the one to map in, or raise a NoTransformError."""
+        stamps = np.array([stamp_ns], np.int64)
+        return np.asarray(self.frames.poses(self.target, frame, stamps)[0])
 
     def find(self, cloud: SeenCloud) -> NoTransformError | None:
         """Return why the pose of a cloud is not known; None if it is."""
@@ -70,16 +76,10 @@ def choose_poses(
     names = [TF, *content.poses]
     if options.poses is not None and content.kinds.get(options.poses) not in TRANSFORMS:
         if options.poses not in names:
-            raise ToolError(
-                f"--poses {options.poses}: there are no such poses, only {', '.join(names)}"
-            )
+            known = ", ".join(names)
+            raise ToolError(f"--poses {options.poses}: there are no such poses, only {known}")
         names = [options.poses]
-    sources = [
-        _of_tf(content.frames, frame, options)
-        if name == TF
-        else _of_topic(content, name, frame, options)
-        for name in names
-    ]
+    sources = [_source(content, name, frame, options) for name in names]
     for source in sources:
         source.frames.check()
     # Transforms that always hold are no poses.
@@ -92,20 +92,7 @@ def choose_poses(
     return max(moving, key=merit, default=None)
 
 
-def _of_tf(frames: FrameTree, frame: str, options: ReadingOptions) -> PoseSource:
-    """Return all transforms. If they do not reach the sensor, finding a cloud says so."""
-    body = frame
-    if not frames.moves(frames.root(frame), frame):
-        body = options.body_frame or frames.lowest_moving or frame
-    return PoseSource(TF, frames, options.map_frame or frames.fixed_frame(body), body)
-
-
 def _check_body(content: RosContent, sensors: set[str], options: ReadingOptions) -> None:
-    """Refuse a frame for the body that nothing names.
-
-    Raises:
-        ToolError: there is none of this name.
-    """
     bodies = {poses.child for poses in content.poses.values()}
     known = {*sensors, *bodies, *content.frames.frames} - {""}
     if options.body_frame is not None and options.body_frame not in known:
@@ -115,12 +102,61 @@ def _check_body(content: RosContent, sensors: set[str], options: ReadingOptions)
         )
 
 
-def _of_topic(content: RosContent, topic: str, frame: str, options: ReadingOptions) -> PoseSource:
-    """Return the poses of a topic, in the tree of all transforms but those that say the same."""
-    poses = content.poses[topic]
+def _source(content: RosContent, name: str, frame: str, options: ReadingOptions) -> PoseSource:
+    """Return all transforms, or the poses of a topic in all but those that say the same.
+
+    If they do not reach the sensor, finding a cloud says so.
+    """
+    frames, body = content.frames, options.body_frame
+    if name == TF:
+        if frames.moves(frames.root(frame), frame):
+            body = frame
+        body = body or frames.lowest_moving or frame
+        return PoseSource(TF, frames, options.map_frame or frames.fixed_frame(body), body)
+    poses = content.poses[name]
+    assumed = not (body or poses.child)
     # Where a topic does not name the body, it is what the sensor is fixed to.
-    body = options.body_frame or poses.child or content.frames.root(frame)
-    frames = content.frames.with_track(poses.parent, body, poses.track)
+    body = body or poses.child or frames.root(frame)
+    frames = frames.with_track(poses.parent, body, poses.track)
     target = options.map_frame or frames.fixed_frame(body)
-    assumed = not (options.body_frame or poses.child)
-    return PoseSource(topic, frames, target, body, assumed=assumed)
+    return PoseSource(name, frames, target, body, assumed=assumed)
+
+
+def check_times(clouds: Sequence[SeenCloud]) -> None:
+    """Check that the files of clouds follow each other."""
+    for before, after in _seams(clouds):
+        over_s = (before[-1].stamp_ns - after[0].stamp_ns) / 1e9
+        if over_s > 0:
+            raise ToolError(
+                f"{before[0].file.name} and {after[0].file.name} overlap by {over_s:.1f} s on "
+                f"{after[0].topic}: they are no parts of one recording; map them one by one"
+            )
+
+
+def check_places(clouds: Sequence[SeenCloud], poses: PoseSource) -> None:
+    """Check that the robot goes on from file to file of placed clouds where it was."""
+    for before, after in _seams(clouds):
+        near = *before[-2:], *after[:2]
+        at = len(before[-2:]) - 1  # the step from the one part to the other
+        places = [poses.pose_of(cloud.frame, cloud.stamp_ns)[:3, 3] for cloud in near]
+        steps_m = np.linalg.norm(np.diff(places, axis=0), axis=1)
+        times_s = np.diff([cloud.stamp_ns / 1e9 for cloud in near])
+        speeds_m_s = np.delete(steps_m / np.maximum(times_s, 1e-3), at)
+        goes_on_s = times_s[at] if times_s[at] <= _SLACK_S else 0.0
+        most_m = _SLACK_M + 2 * speeds_m_s.max(initial=0.0) * goes_on_s
+        if steps_m[at] > most_m:
+            raise ToolError(
+                f"{before[0].file.name} and {after[0].file.name}: {times_s[at]:.1f} s lie between "
+                f"them, and the robot is {steps_m[at]:.1f} m elsewhere: they are no parts of one "
+                "recording; map them one by one, or, where their poses are in one map all the "
+                f"same, use --map-frame {poses.target}"
+            )
+
+
+def _seams(clouds: Sequence[SeenCloud]) -> Iterator[tuple[list[SeenCloud], list[SeenCloud]]]:
+    """Yield the clouds of each topic in a file and in the one that follows."""
+    files: dict[tuple[str, Path], list[SeenCloud]] = defaultdict(list)
+    for cloud in clouds:
+        files[cloud.topic, cloud.file].append(cloud)
+    parts = sorted(files.values(), key=lambda part: (part[0].topic, part[0].stamp_ns))
+    return ((a, b) for a, b in pairwise(parts) if a[0].topic == b[0].topic)

@@ -11,24 +11,18 @@ from triquad_client.pose import Pose
 
 from triquad_tools.console.arguments import count, not_negative, positive, within
 from triquad_tools.sensors.motion.frame_tree import STATIC, Transform
-from triquad_tools.sensors.ros.header import frame_name
+from triquad_tools.sensors.ros.type_store import frame_name
+from triquad_tools.sensors.sweep import NoScanError
 
-WORLD, SENSOR = "world", "sensor"
-"""The frames in which points may be."""
+WORLD, SENSOR = "world", "sensor"  # the frames in which points may be
+DEFAULT_SOURCE = "default"  # of recordings that name no sensor: the client's default, too
+Place = tuple[float, float, float]  # metres
 
-DEFAULT_SOURCE = "default"
-"""The source of recordings that name no sensor: the client's default, too."""
-
-Place = tuple[float, float, float]
-"""Metres."""
-
-ORIGIN_REMEDIES = (
+_ORIGIN_REMEDIES = (
     "--ray-origin X,Y,Z says where the sensor sits in it (metres; 0,0,0 if that is right); of "
     "clouds that were merged, map those of each sensor; points in a frame that stands still need "
     "--points-in world"
 )
-"""What to do where rays begin elsewhere than at the frame of their points."""
-
 _FARTHEST_M = 100.0  # that a sensor sits from the frame of its clouds
 
 _Add = Callable[..., argparse.Action]
@@ -73,10 +67,12 @@ class ReadingOptions:
     units_per_metre: float | None = None  # of a pixel; else 5000 for TUM RGB-D, 1000 for others
     stride: int = 1  # take every N-th row and column of depth images
 
-    @property
-    def given(self) -> list[str]:
-        """The names of the choices that differ from the defaults."""
-        return [field.name for field in fields(self) if getattr(self, field.name) != field.default]
+
+def with_remedies(problem: NoScanError | None) -> NoScanError | None:
+    """Return what is wrong with the points of a recording, with what to do about it."""
+    if problem is None or problem.reason != "ray_origin":
+        return problem
+    return NoScanError(problem.reason, f"{problem}: {_ORIGIN_REMEDIES}")
 
 
 def add_recording(parser: argparse.ArgumentParser) -> None:
@@ -147,11 +143,6 @@ def _add_folder(add: _Add) -> None:
 
 def transform(text: str) -> Transform:
     """Return a transform such as ``base_link lidar 0 0 1.5 0 0 0 1``: position and quaternion."""
-    if len(text.split()) != 9:
-        raise argparse.ArgumentTypeError(
-            f"{text!r}: put all 9 words in quotes, 'PARENT CHILD X Y Z QX QY QZ QW', such as "
-            "'base_link lidar 0 0 1.5 0 0 0 1'"
-        )
     try:
         parent, child, *numbers = text.split()
         x, y, z, *quaternion = map(float, numbers)
@@ -159,14 +150,13 @@ def transform(text: str) -> Transform:
         pose.matrix()
     except ValueError as error:
         raise argparse.ArgumentTypeError(
-            f"{text!r}: use 'PARENT CHILD X Y Z QX QY QZ QW', such as "
+            f"{text!r}: put all 9 words in quotes, 'PARENT CHILD X Y Z QX QY QZ QW', such as "
             f"'base_link lidar 0 0 1.5 0 0 0 1' ({error})"
         ) from error
     return Transform(frame_name(parent), frame_name(child), STATIC, pose)
 
 
 def _place(text: str) -> Place:
-    """Return a place such as ``0.9,0,1.8``, metres."""
     try:
         x, y, z = (within(-_FARTHEST_M, _FARTHEST_M, number) for number in text.split(","))
     except (ValueError, argparse.ArgumentTypeError) as error:
@@ -177,12 +167,9 @@ def _place(text: str) -> Place:
 
 
 def _columns(text: str) -> tuple[str, ...]:
-    """Return the names of columns, which may be one letter each."""
     letters = {"i": "intensity", "r": "ring"}
-    names = [
-        letters.get(name.strip(), name.strip())
-        for name in (text.split(",") if "," in text else text)
-    ]
+    words = text.split(",") if "," in text else text
+    names = [letters.get(word.strip(), word.strip()) for word in words]
     if sorted(name for name in names if name in ("x", "y", "z")) != ["x", "y", "z"]:
         raise argparse.ArgumentTypeError(
             f"{text!r}: use x, y and z once each, such as xyzirt or x,y,z,intensity,ring,t; _ is "

@@ -55,11 +55,7 @@ class RosContent:
     """
 
     def __init__(self, bag: Bag, reader: MessageReader, poses: str | None = None) -> None:
-        """Read all of a bag; where ``poses`` is a topic of transforms, no others that move.
-
-        Raises:
-            ToolError: it is damaged.
-        """
+        """Read all of a bag; where ``poses`` is a topic of transforms, no others that move."""
         self.kinds: dict[str, str] = {}
         self.counts: Counter[str] = Counter()
         self.clouds: list[SeenCloud] = []
@@ -74,9 +70,8 @@ class RosContent:
         self.spans_ns: dict[str, list[int]] = {}  # when the first and last of a topic was recorded
         self.foreign: dict[str, str] = {}  # encodings of topics that are not of ROS
         channels = bag.channels()
-        self._only = next(
-            (x.topic for x in channels if x.topic == poses and x.kind in TRANSFORMS), ""
-        )
+        transforms = [each.topic for each in channels if each.kind in TRANSFORMS]
+        self._only = poses if poses in transforms else ""
         for channel in channels:
             self.kinds[channel.topic] = channel.kind
             self.counts[channel.topic] += channel.count
@@ -92,7 +87,6 @@ class RosContent:
         self._read(bag, sum(each.count for each in channels if _is_read(each)))
 
     def _read(self, bag: Bag, total: int) -> None:
-        """Read all but cameras."""
         done, paths = 0, dict[str, Message]()
         with progress("looking through the recording", total) as report:
             for done, message in enumerate(bag.messages(_is_read), start=1):
@@ -135,7 +129,6 @@ class RosContent:
             self._leave_out(message, NoScanError("decode", text))
 
     def _leave_out(self, message: Message, problem: NoScanError) -> None:
-        """Count a message that cannot be read."""
         topic = message.channel.topic
         if message.channel.kind in _SCANS:
             self.clouds.append(SeenCloud(topic, self._numbers[topic], problem=problem))
@@ -154,7 +147,6 @@ class RosContent:
         self.clouds.append(SeenCloud(topic, number, *about))
 
     def _add(self, topic: str, transform: Transform, *, is_pose: bool) -> None:
-        """Add a transform to all, or a pose to those of its topic."""
         try:
             if not is_pose:
                 self.frames.add(transform)

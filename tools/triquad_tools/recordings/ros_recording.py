@@ -6,24 +6,28 @@ from dataclasses import replace
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.bag import Bag, Message
-from triquad_tools.recordings.parts import check_places, check_times
-from triquad_tools.recordings.pose_source import TF, PoseSource, choose_poses
+from triquad_tools.recordings.pose_source import (
+    TF,
+    PoseSource,
+    check_places,
+    check_times,
+    choose_poses,
+)
 from triquad_tools.recordings.recording import (
-    ORIGIN_REMEDIES,
     SENSOR,
     WORLD,
     ReadingOptions,
     ScanEntry,
     Stream,
+    with_remedies,
 )
 from triquad_tools.recordings.ros_content import RosContent, SeenCloud
 from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES
 from triquad_tools.sensors.motion.placing import place
 from triquad_tools.sensors.ros import type_store
 from triquad_tools.sensors.ros.depth_camera import raw_topic
-from triquad_tools.sensors.ros.header import source_of_topic
 from triquad_tools.sensors.ros.message_reader import MessageReader
-from triquad_tools.sensors.ros.type_store import TRANSFORMS
+from triquad_tools.sensors.ros.type_store import TRANSFORMS, source_of_topic
 from triquad_tools.sensors.sweep import NoScanError, PosedScan
 
 _CLOCKS = (
@@ -74,11 +78,7 @@ class RosRecording:
     """A bag or an MCAP file with clouds or depth images, and poses."""
 
     def __init__(self, bag: Bag, options: ReadingOptions) -> None:
-        """Check all of it.
-
-        Raises:
-            ToolError: it is damaged, or does not hold what ``options`` ask for.
-        """
+        """Check all of it."""
         self._bag = bag
         self._reader = MessageReader(
             units_per_metre=options.units_per_metre,
@@ -201,12 +201,7 @@ class RosRecording:
             return NoScanError("map_frame", _STANDS.format(frame=cloud.frame, body=body))
         if self._options.ray_origin is not None:
             return None
-        if (far := self._content.rays.are_too_far(cloud.topic)) is not None:
-            return NoScanError("units", far)
-        problem = self._content.rays.begin_elsewhere(cloud.topic)
-        if problem is None:
-            return None
-        return NoScanError("ray_origin", f"{problem}: {ORIGIN_REMEDIES}")
+        return with_remedies(self._content.rays.problem(cloud.topic))
 
     def _left_out_line(self, topic: str, reason: str) -> str:
         clouds = self._left_out[topic, reason]
@@ -236,7 +231,6 @@ class RosRecording:
         return Stream(topic, found.kinds[topic], count, use, frame)
 
     def _use(self, topic: str) -> str:
-        """Return what a topic is used for."""
         placed = sum(each.topic == topic for each in self._placed)
         if placed:
             notes = Counter(each.note for each in self._placed if each.topic == topic)
@@ -259,11 +253,7 @@ class RosRecording:
 
 
 def _chosen_topics(found: RosContent, options: ReadingOptions) -> set[str]:
-    """Return the topics to map: those asked for, else all clouds, or if none, all depth images.
-
-    Raises:
-        ToolError: a topic that was asked for has nothing to map.
-    """
+    """Return the topics to map: those asked for, else all clouds, or if none, all depth images."""
     there = {cloud.topic for cloud in found.clouds}
     for topic in options.topics:
         if topic not in there:

@@ -1,6 +1,5 @@
 """Text files of numbers, line by line: errors name their place."""
 
-import math
 from collections.abc import Sequence
 from decimal import Decimal
 from pathlib import Path
@@ -36,12 +35,8 @@ class Line(NamedTuple):
 
 def all_lines(path: Path) -> list[Line]:
     """Return the lines of a file that are not blank, without the mark of its encoding."""
-    lines = path.read_text("utf-8-sig", errors="replace").splitlines()
-    return [
-        Line(f"{path}:{number}", line.strip())
-        for number, line in enumerate(lines, start=1)
-        if line.strip()
-    ]
+    lines = enumerate(path.read_text("utf-8-sig", errors="replace").splitlines(), start=1)
+    return [Line(f"{path}:{number}", line.strip()) for number, line in lines if line.strip()]
 
 
 def read_lines(path: Path) -> list[Line]:
@@ -55,19 +50,6 @@ def parse_number(place: str, word: str) -> float:
         return float(word)
     except ValueError:
         raise ToolError(f"{place}: {word!r} is not a number") from None
-
-
-def parse_numbers(place: str, words: Sequence[str]) -> list[float]:
-    """Return the finite numbers that the words are.
-
-    Raises:
-        ToolError: a word is none.
-    """
-    numbers = [parse_number(place, word) for word in words]
-    for word, number in zip(words, numbers, strict=True):
-        if not math.isfinite(number):
-            raise ToolError(f"{place}: {word!r} is not finite")
-    return numbers
 
 
 def unit_ns(line: Line, word: str) -> int:
@@ -113,30 +95,20 @@ def parse_stamps(lines: Sequence[Line]) -> list[int]:
         word = line.words[0]
         stamps.append(parse_time(line, word, unit))
         if stamps[-1] < stamps[-2]:
-            raise ToolError(
-                f"{line.place}: {word} is before the line above: sort the lines by time"
-            )
+            told = "is before the line above: sort the lines by time"
+            raise ToolError(f"{line.place}: {word} {told}")
     return stamps[1:]
 
 
-def parse_rigid(place: str, words: Sequence[str]) -> Doubles:
-    """Return the pose ``[4, 4]`` of 12 numbers, row-major 3 x 4, its rotation made orthonormal.
-
-    Raises:
-        ToolError: they are no rotation and translation.
-    """
-    if len(words) != 12:
-        raise ToolError(f"{place}: {len(words)} numbers where a pose has 12")
-    return rigid(place, parse_numbers(place, words))
-
-
 def rigid(place: str, numbers: Sequence[float] | Doubles) -> Doubles:
-    """Return the pose ``[4, 4]`` of 12 or 16 numbers, as :func:`parse_rigid`."""
+    """Return the pose ``[4, 4]`` of 12 or 16 numbers, row by row, its rotation made orthonormal."""
+    if len(numbers) not in (12, 16):
+        raise ToolError(f"{place}: {len(numbers)} numbers where a pose has 12 or 16")
     pose = np.eye(4)
     pose.reshape(-1)[: len(numbers)] = numbers
     if pose[3].tolist() != [0, 0, 0, 1]:
         raise ToolError(f"{place}: {pose[3].tolist()} where a pose ends with 0 0 0 1")
-    if not is_rotation(pose):
+    if not (is_rotation(pose) and np.isfinite(pose).all()):
         raise ToolError(
             f"{place}: not a rotation: off orthonormal by {rotation_error(pose):.3g}, "
             f"determinant {np.linalg.det(pose[:3, :3]):.3g}"

@@ -40,10 +40,7 @@ _SETTINGS = {
 
 @contextmanager
 def bridging(session: zenoh.Session, client: Client, options: BridgeOptions) -> Iterator[Intake]:
-    """Take part in ROS 2 for a map server while the context is open, which counts what it takes in.
-
-    ``session`` reaches the nodes of ROS, ``client`` the server.
-    """
+    """Take part in ROS 2 for a map server while the context is open; yield what takes scans in."""
     topics = options.topics
     below = f" below {topics.prefix}" if topics.prefix else ""
     _log.info("listening in domain %d%s", topics.domain, below)

@@ -7,17 +7,7 @@ from typing import Any
 
 import zenoh
 
-from triquad_tools.ros2.topics import (
-    Announcement,
-    Delivery,
-    End,
-    bridge_token,
-    bridge_tokens,
-    read_token,
-    rmw_prefix,
-    rmw_token,
-    rmw_tokens,
-)
+from triquad_tools.ros2 import topics
 
 _log = logging.getLogger("triquad_ros2")
 
@@ -33,13 +23,13 @@ class Node:
         self._tokens: list[Any] = []
         self._declare(self._prefix("NN"))
 
-    def announce(self, what: Announcement, delivery: Delivery) -> None:
+    def announce(self, what: topics.Announcement, delivery: topics.Delivery) -> None:
         """Announce it to nodes of rmw_zenoh."""
-        self._declare(rmw_token(self._prefix(what.end.value), what, delivery))
+        self._declare(topics.rmw_token(self._prefix(what.end.value), what, delivery))
 
-    def announce_to_bridges(self, what: Announcement, delivery: Delivery) -> None:
+    def announce_to_bridges(self, what: topics.Announcement, delivery: topics.Delivery) -> None:
         """Announce it to zenoh-bridge-ros2dds."""
-        self._declare(bridge_token(self._session_id, what, delivery))
+        self._declare(topics.bridge_token(self._session_id, what, delivery))
 
     def close(self) -> None:
         """Withdraw all announcements."""
@@ -47,14 +37,17 @@ class Node:
             token.undeclare()
 
     def _prefix(self, kind: str) -> str:
-        return rmw_prefix(self._domain, self._session_id, next(self._numbers), kind)
+        return topics.rmw_prefix(self._domain, self._session_id, next(self._numbers), kind)
 
     def _declare(self, token: str) -> None:
         self._tokens.append(self._session.liveliness().declare_token(token))
 
 
 def watch_tokens(
-    session: zenoh.Session, domain: int, end: End, appeared: Callable[[Announcement], None]
+    session: zenoh.Session,
+    domain: int,
+    end: topics.End,
+    appeared: Callable[[topics.Announcement], None],
 ) -> list[Any]:
     """Report all others that have one end of a topic, existing ones first.
 
@@ -67,7 +60,7 @@ def watch_tokens(
         token = str(sample.key_expr)
         if sample.kind != zenoh.SampleKind.PUT or own_chunk in token:
             return
-        announcement = read_token(token)
+        announcement = topics.read_token(token)
         try:
             if announcement is not None:
                 appeared(announcement)
@@ -76,5 +69,5 @@ def watch_tokens(
 
     return [
         session.liveliness().declare_subscriber(key, receive, history=True)
-        for key in (rmw_tokens(domain, end), bridge_tokens(end))
+        for key in (topics.rmw_tokens(domain, end), topics.bridge_tokens(end))
     ]

@@ -9,18 +9,10 @@ from triquad_client import Bounds
 from triquad_format.records.arrays import Doubles
 
 from triquad_tools.ros2.topics import Topic, bridge_key, rmw_key
+from triquad_tools.sensors.ros import type_store as types
 from triquad_tools.sensors.ros.depth_camera import camera_topic
-from triquad_tools.sensors.ros.type_store import (
-    CAMERA_INFO,
-    CLOUDS,
-    IMAGES,
-    POSES,
-    TF,
-)
 
-TF_POSES = "tf"
-"""Stands for transforms in place of a topic of poses."""
-
+TF_POSES = "tf"  # stands for transforms in place of a topic of poses
 MAX_GRID_CELLS = 250_000
 
 
@@ -41,12 +33,12 @@ class Role(Enum):
 
 
 TYPES: dict[Role, tuple[str, ...]] = {
-    Role.CLOUD: CLOUDS,
-    Role.DEPTH: IMAGES,
-    Role.CAMERA_INFO: (CAMERA_INFO,),
-    Role.TF: (TF,),
-    Role.TF_STATIC: (TF,),
-    Role.POSE: POSES,
+    Role.CLOUD: types.CLOUDS,
+    Role.DEPTH: types.IMAGES,
+    Role.CAMERA_INFO: (types.CAMERA_INFO,),
+    Role.TF: (types.TF,),
+    Role.TF_STATIC: (types.TF,),
+    Role.POSE: types.POSES,
 }
 """The types that messages may have."""
 
@@ -112,7 +104,6 @@ class TopicChoice:
         return Role.CLOUD if is_cloud and self.takes_any_cloud else None
 
     def _names(self) -> dict[Role, tuple[str, ...]]:
-        """Return the topics whose names are known."""
         infos = tuple(camera_topic(name) for name in self.depth)
         names = {
             Role.CLOUD: self.clouds,

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -47,7 +48,9 @@ class ServerProcess:
             command += ["--config", str(file)]
         # A service manager may watch this process; it is the server that reports its state.
         environment = {key: value for key, value in os.environ.items() if key != "WATCHDOG_PID"}
-        self._process = subprocess.Popen(command, env=environment, preexec_fn=_end_with_parent)
+        # The system stops the server if the bridge is killed: it would occupy the port.
+        end_with_parent = partial(ctypes.CDLL(None).prctl, _PR_SET_PDEATHSIG, signal.SIGTERM)
+        self._process = subprocess.Popen(command, env=environment, preexec_fn=end_with_parent)
 
     def __enter__(self) -> "ServerProcess":
         return self
@@ -68,11 +71,6 @@ class ServerProcess:
         """Return once it has ended, or after some time."""
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(timeout_s)
-
-
-def _end_with_parent() -> None:
-    """Let the system stop the server if the bridge is killed: it would occupy the port."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def _parsed(arguments: Sequence[str]) -> argparse.Namespace:

@@ -14,9 +14,7 @@ from triquad_tools.sensors.ros.type_store import type_store
 NODE_NAME = "triquad"
 
 ANY_HASH = "*"
-NO_HASH = "TypeHashNotSupported"
-"""The text that ROS 2 Humble, which knows no hashes of types, writes in their place."""
-
+NO_HASH = "TypeHashNotSupported"  # of ROS 2 Humble, which knows no hashes of types
 ATTACHMENT = struct.Struct("<qqB16s")
 """The attachment: number, time, length of the identity, identity of the publisher."""
 

@@ -11,21 +11,17 @@ from collections import Counter, defaultdict
 import numpy as np
 from numpy.typing import NDArray
 
-_BIN_RAD = np.radians(0.25)
-"""The side of the cells of direction that are compared: about one ray of lidars."""
+from triquad_tools.sensors.sweep import NoScanError
 
-_BEHIND = 1.5
-"""A point lies behind another in its direction if it is this many times as far."""
-
+_BIN_RAD = np.radians(0.25)  # side of the cells of direction that are compared: one ray of lidars
+_BEHIND = 1.5  # a point lies behind another in its direction if it is this many times as far
 _WRONG = 0.07
 """The share of points behind others from which on rays begin elsewhere.
 
 From the sensor it is 0.3 % in streets and halls and up to 5 % amid trees; from the base of a car
 on the ground 8 to 23 %, from the origin of a map 7 to 21 % (recorded and simulated drives)."""
 
-_FAR_M = 500.0
-"""Half of the points of no scan are farther away than this: they are in millimetres."""
-
+_FAR_M = 500.0  # half of the points of no scan are farther away than this: they are in millimetres
 _NEAREST_M = 0.3  # nearer points are the robot's own
 _REPEATED = 16  # equal points of a scan that are no measurements
 
@@ -76,12 +72,14 @@ class RayCheck:
             finite = np.append(ranges[np.isfinite(ranges)], 0.0)
             self._ranges_m[stream].append(float(np.median(finite)))
 
-    def are_too_far(self, stream: str) -> str | None:
-        """Return why the points of a stream cannot be metres; None: they may."""
+    def problem(self, stream: str) -> NoScanError | None:
+        """Return why points of a stream cannot be metres seen from 0, 0, 0; None: they may."""
         range_m = statistics.median(self._ranges_m[stream] or [0.0])
-        if range_m <= _FAR_M:
-            return None
-        return f"half of the points are farther than {range_m:.0f} m: write them in metres"
+        if range_m > _FAR_M:
+            told = f"half of the points are farther than {range_m:.0f} m: write them in metres"
+            return NoScanError("units", told)
+        elsewhere = self.begin_elsewhere(stream)
+        return None if elsewhere is None else NoScanError("ray_origin", elsewhere)
 
     def begin_elsewhere(self, stream: str) -> str | None:
         """Return why rays of a stream cannot begin at the frame of its points; None: they may."""

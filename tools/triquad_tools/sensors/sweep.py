@@ -38,11 +38,15 @@ class PosedScan:
     points: NDArray[np.floating]  # [N, 3] metres, sensor frame
     world_from_sensor: Doubles  # [4, 4]
 
+    def seen_from(self, pose: Doubles) -> "PosedScan":
+        """Return the same points in the world, as a sensor at another pose [4, 4] has them."""
+        points = moved(self.points, np.linalg.inv(pose) @ self.world_from_sensor)
+        return PosedScan(points.astype(np.float32), pose)
+
 
 def moved(points: NDArray[np.floating], pose: NDArray[np.floating]) -> Doubles:
     """Move points [N, 3] by a pose [4, 4], in double precision: they may be far from the origin."""
-    result: Doubles = points.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
-    return result
+    return np.asarray(points.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3])
 
 
 class NoScanError(TriquadError):

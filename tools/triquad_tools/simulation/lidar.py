@@ -103,10 +103,7 @@ class SimulatedDrive:
         return self.sensor.scan(self.scene, self.poses[index], rng)
 
     def true_hits(self, voxel_m: float = 0.02) -> Doubles:
-        """Return what the sensor could have seen: exact surface points ``[N, 3]``, world frame.
-
-        The noise-free hits of all scans, one per voxel of side ``voxel_m``.
-        """
+        """Return what the sensor could have seen: exact surface points ``[N, 3]``, world frame."""
         return merged((scan.true_hits for scan in self), voxel_m)
 
 
@@ -141,10 +138,5 @@ def _positions(travelled: Doubles, length_m: float) -> Doubles:
     lane = _LANE_M + _WEAVE_M * np.sin(travelled * 0.17)
     x = np.minimum(along, length_m) + lane * np.sin(angle)
     y = -lane * np.cos(angle)
-    return np.column_stack(
-        [
-            np.where(back, length_m - x, x),
-            np.where(back, -y, y),
-            np.full(len(travelled), _SENSOR_HEIGHT_M),
-        ]
-    )
+    height = np.full(len(travelled), _SENSOR_HEIGHT_M)
+    return np.column_stack([np.where(back, length_m - x, x), np.where(back, -y, y), height])

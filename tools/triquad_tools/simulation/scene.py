@@ -38,11 +38,11 @@ class Scene:
 
     def sdf(self, points: Doubles) -> Doubles:
         """Return signed distances ``[N]`` in metres at points ``[N, 3]`` of the world."""
-        return self._nearest(points)[0]
+        return _nearest(self._table, _rows(points))[0]
 
     def gradient(self, points: Doubles) -> Doubles:
         """Return unit gradients ``[N, 3]`` of the signed distance at world points ``[N, 3]``."""
-        return self._nearest(points)[1]
+        return _nearest(self._table, _rows(points))[1]
 
     def is_exact(self, points: Doubles) -> Bools:
         """Return whether the signed distance is exact, ``[N]``, at points ``[N, 3]`` of the world.
@@ -50,13 +50,13 @@ class Scene:
         No part of the surface is nearer than the distance says; it is exact where the closest
         point that it gives really lies on the surface.
         """
-        distances, gradients = self._nearest(points)
+        distances, gradients = _nearest(self._table, _rows(points))
         closest = points - distances[:, None] * gradients
         return (distances >= 0.0) | (np.abs(self.sdf(closest)) < _ON_SURFACE_M)
 
     def is_inside_house(self, points: Doubles, margin_m: float = 0.5) -> Bools:
         """Return whether points ``[N, 3]`` lie over ``margin_m`` deep in a house: never seen."""
-        return self._houses.sdf(points) < -margin_m
+        return Scene(self.houses, self.bounds).sdf(points) < -margin_m
 
     def cast(self, origin: Doubles, directions: Doubles, range_max_m: float) -> Doubles:
         """Return ranges ``[N]``, metres, at which rays first hit a solid; infinite if none.
@@ -78,14 +78,6 @@ class Scene:
     @cached_property
     def _table(self) -> Doubles:
         return solid_table(self.solids)
-
-    @cached_property
-    def _houses(self) -> "Scene":
-        return Scene(self.houses, self.bounds)
-
-    def _nearest(self, points: Doubles) -> tuple[Doubles, Doubles]:
-        """Return distances [N] to the nearest solids, and their gradients [N, 3]."""
-        return _nearest(self._table, _rows(points))
 
 
 def _rows(points: Doubles) -> Doubles:

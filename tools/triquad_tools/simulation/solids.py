@@ -30,12 +30,6 @@ class Solid:
     size: tuple[float, float, float, float]  # metres; the meaning depends on the kind
     bound_m: float  # radius of the bounding sphere
 
-    @property
-    def row(self) -> tuple[float, ...]:
-        """The solid as a row of the table that the kernels read."""
-        turn = (math.cos(self.yaw), math.sin(self.yaw))
-        return (float(self.kind), *self.centre, *turn, *self.size, self.bound_m)
-
 
 def half_space(height_m: float) -> Solid:
     """Return all that lies below ``z = height_m``."""
@@ -74,7 +68,11 @@ def gable(centre: Vector, half: Vector, eave: float, yaw: float = 0.0) -> Solid:
 
 def solid_table(solids: tuple[Solid, ...]) -> Doubles:
     """Return the table ``[S, 11]`` of solids that the kernels read."""
-    return np.array([solid.row for solid in solids], np.float64).reshape(-1, _COLUMNS)
+    rows = [
+        (one.kind, *one.centre, math.cos(one.yaw), math.sin(one.yaw), *one.size, one.bound_m)
+        for one in solids
+    ]
+    return np.array(rows, np.float64).reshape(-1, _COLUMNS)
 
 
 @inner_kernel()

@@ -25,7 +25,9 @@ def street(seed: int, length_m: float = 100.0) -> Scene:
     parts: list[Solid] = [half_space(0.0)]
     houses: list[Solid] = []
     for side in (-1.0, 1.0):
-        parts.append(_pavement(side, length_m))
+        middle = (0.5 * length_m, side * (ROAD_HALF_WIDTH_M + 0.5 * _PAVEMENT_M), 0.0)
+        half_x = 0.5 * length_m + _MARGIN_M
+        parts.append(_standing(middle, half_x, 0.5 * _PAVEMENT_M, _KERB_M))
         of_side = _houses(rng, side, length_m)
         houses += of_side
         parts += of_side
@@ -42,16 +44,9 @@ def street_drive(seed: int, scans: int, step_m: float = 1.0) -> SimulatedDrive:
 
 
 def _standing(foot: Vector, half_x: float, half_y: float, height: float, yaw: float = 0.0) -> Solid:
-    """Return a box that stands at ``foot`` and is buried below it."""
     half_z = 0.5 * (height + _BURIED_M)
     centre = (foot[0], foot[1], foot[2] + height - half_z)
     return box(centre, (half_x, half_y, half_z), yaw)
-
-
-def _pavement(side: float, length_m: float) -> Solid:
-    foot = (0.5 * length_m, side * (ROAD_HALF_WIDTH_M + 0.5 * _PAVEMENT_M), 0.0)
-    half_x = 0.5 * length_m + _MARGIN_M
-    return _standing(foot, half_x, 0.5 * _PAVEMENT_M, _KERB_M)
 
 
 def _houses(rng: np.random.Generator, side: float, length_m: float) -> list[Solid]:
@@ -75,14 +70,11 @@ def _flat_house(
     height = rng.uniform(5.0, 10.0)
     yaw = rng.normal(0.0, 0.015)
     ledge_z, over = height - rng.uniform(0.4, 0.8), rng.uniform(0.25, 0.5)
+    wide = half_x + over, half_y + over
     attic = (foot[0] + rng.uniform(-1.0, 1.0), foot[1], height + 0.2)
     return [
         _standing(foot, half_x, half_y, height, yaw),
-        box(
-            (foot[0], foot[1], ledge_z),
-            (half_x + over, half_y + over, rng.uniform(0.12, 0.25)),
-            yaw,
-        ),
+        box((foot[0], foot[1], ledge_z), (*wide, rng.uniform(0.12, 0.25)), yaw),
         box(attic, (0.45 * half_x, 0.5 * half_y, rng.uniform(1.0, 1.6)), yaw),
     ]
 
@@ -151,14 +143,10 @@ def _car(rng: np.random.Generator, x: float, y: float) -> list[Solid]:
         return (x + cos * along - sin * across, y + sin * along + cos * across, z)
 
     cabin_half_z = 0.5 * (top - 0.5)
+    cabin = cabin_half, half_y - 0.1, cabin_half_z
     parts = [
         box(at(0.0, 0.0, body_z), (half_x, half_y, body_half), yaw, 0.12),
-        box(
-            at(cabin_x, 0.0, top - cabin_half_z),
-            (cabin_half, half_y - 0.1, cabin_half_z),
-            yaw,
-            0.22,
-        ),
+        box(at(cabin_x, 0.0, top - cabin_half_z), cabin, yaw, 0.22),
     ]
     for along in (-0.62 * half_x, 0.62 * half_x):
         for across in (0.12 - half_y, half_y - 0.12):

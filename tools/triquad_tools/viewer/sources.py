@@ -15,11 +15,7 @@ from triquad_client.mesh.followed_mesh import MeshTile, TileIndex
 from triquad_client.mesh.mesh_watch import MeshWatch
 from triquad_client.offline.map_mesh import TILE_CELLS
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.checkpoint_folder import (
-    CheckpointFile,
-    checkpoint_files,
-    map_folder,
-)
+from triquad_format.mapfile.checkpoint_folder import CheckpointFile, checkpoint_files, map_folder
 from triquad_format.mapfile.metadata import utc_time
 from triquad_format.mapfile.reader import open_manifest
 from triquad_format.wire.limits import LEVELS
@@ -32,9 +28,7 @@ _MAX_TILES = 500  # that are kept of an open map: some 50 to 200 MB
 _WAIT_S = 0.1  # how long one refresh makes tiles
 
 _MAX_OPEN = 4  # maps that stay in memory beyond those that pages show
-
-COARSEST = LEVELS - 1
-"""Level of detail of the tiles of which a whole map is shown."""
+COARSEST = LEVELS - 1  # level of detail of the tiles of which a whole map is shown
 
 
 @dataclass(frozen=True)
@@ -56,15 +50,10 @@ class TileSizes:
 class LiveSource:
     """The map of a server; the caller closes the client."""
 
-    grows = True
-    """More of it may become known while it is shown."""
+    grows = True  # more of it may become known while it is shown
 
     def __init__(self, client: Client, endpoint: str) -> None:
-        """Ask the server for the lengths of its mesh.
-
-        Raises:
-            TriquadError: it does not answer.
-        """
+        """Ask the server for the lengths of its mesh."""
         self.client = self.queries = client
         self.title = f"{client.map_name} at {endpoint}"
         with client.watch_mesh(_POINT) as watch:
@@ -81,20 +70,12 @@ class LiveSource:
 
 
 class StoredMap:
-    """A map file in memory, with mesh tiles that are made once wanted; for several threads.
-
-    It is closed once it is garbage.
-    """
+    """A map file in memory, with mesh tiles that are made once wanted; for several threads."""
 
     grows = False
 
     def __init__(self, path: Path, place: str) -> None:
-        """Read it; ``place`` shows people where the map is from.
-
-        Raises:
-            MapFileError: it is no map file, is damaged, or needs a newer reader.
-            OSError: it cannot be read.
-        """
+        """Read it; ``place`` shows people where the map is from."""
         self.path = path
         self.queries = open_map(path)
         self.title = f"{self.queries.name} in {place}"
@@ -102,8 +83,7 @@ class StoredMap:
         self.sizes = TileSizes(cell_m, TILE_CELLS * cell_m)
         cells_m = map(self.sizes.cell_of, range(COARSEST + 1))
         self._tiles = [self.queries.mesh_tiles(cell_m) for cell_m in cells_m]  # by level
-        self.tile = lru_cache(_MAX_TILES)(self._made)
-        """The tile of a level and an index, one of :meth:`indices`."""
+        self.tile = lru_cache(_MAX_TILES)(self._made)  # of a level, and one of :meth:`indices`
 
     def follow(
         self, level: int, bounds: Bounds | None = None, before: object = None
@@ -179,12 +159,7 @@ class History:
     """The checkpoints of one map in a store, to which a server may add; for several threads."""
 
     def __init__(self, store: Path) -> None:
-        """Find the folder.
-
-        Raises:
-            MapFileError: there are no checkpoints, or those of several maps.
-            OSError: the folder cannot be read.
-        """
+        """Find the folder."""
         self.folder = map_folder(store)
         self._damaged: dict[CheckpointFile, str] = {}  # as far as is known, and why
         self._opening = threading.Lock()  # one at a time: it takes all cores
@@ -228,10 +203,8 @@ class History:
         while files := self.files():
             with suppress(DamagedError):
                 return self.opened(files[-1])
-        raise ToolError(
-            f"{self.folder}: no checkpoint can be shown; triquad-pack --recover saves what is "
-            "intact"
-        )
+        told = "no checkpoint can be shown; triquad-pack --recover saves what is intact"
+        raise ToolError(f"{self.folder}: {told}")
 
 
 @lru_cache

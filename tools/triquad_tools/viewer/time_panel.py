@@ -52,7 +52,6 @@ class TimePanel(Layer):
             self._say(told)
 
     def _slide_to(self, number: int) -> None:
-        """Choose the checkpoint of this number, counted from 1."""
         chosen = max(min(number, len(self._files)), 1)
         self._slider.value = chosen  # type: ignore[misc] # viser has a setter that mypy overlooks
         self.wake()

@@ -48,7 +48,6 @@ class TrailLayer(Layer):
         self._shown = wanted
 
     def _marks_of(self, source: ScanSource, colour: str) -> list[viser.SceneNodeHandle]:
-        """Return the trail of a source, and points of its newest scan."""
         marks: list[viser.SceneNodeHandle] = []
         lines = [line for line in source.lines() if len(line) > 1] if self._trails.value else []
         if lines:
@@ -64,7 +63,6 @@ class TrailLayer(Layer):
 
 
 def _state(status: ServerStatus) -> tuple[str, str]:
-    """Return what the panel says of the server."""
     dropped, lost = sum(status.scans_dropped.values()), sum(status.scans_lost.values())
     left = "settled" if status.settled else f"{status.samples_left / 1e6:.1f} M samples left"
     scans = f"{status.scans_taken:,} scans taken, {status.scans_waiting} waiting"
@@ -72,7 +70,6 @@ def _state(status: ServerStatus) -> tuple[str, str]:
 
 
 def _line(name: str, source: ScanSource) -> str:
-    """Return what the panel says of a source."""
     if source.newest is None:
         return f"{name}: {source.scans:,} scans"
     x, y, z = source.newest.position_m

@@ -28,10 +28,7 @@ _OF_ONE_WHO_LEFT = ("Queued a .* on a closed connection", "Attempted to remove a
 
 
 def open_page(client: viser.ClientHandle, shown: MapSource | History) -> ExitStack:
-    """Build the page of one browser; return what ends it.
-
-    Of a history, each browser chooses its own moment.
-    """
+    """Build the page of one browser; return what ends it."""
     _prepare(client)
     title, page, parts = client.gui.add_html(""), Page(client), ExitStack()
     try:
@@ -74,20 +71,12 @@ class Viewer:
     """Serves a page that shows a map, to several browsers, until it is closed."""
 
     def __init__(
-        self,
-        shown: MapSource | History,
-        host: str,
-        port: int,
-        *,
-        allowed_hosts: Sequence[str] = (),
+        self, shown: MapSource | History, host: str, port: int, *, allowed_hosts: Sequence[str] = ()
     ) -> None:
         """Serve at an address of this machine, at ``port`` or the next one that is free.
 
         Pages of other servers cannot use it, but for those of ``allowed_hosts``: names under which
         this machine is reached beyond its host name and its addresses.
-
-        Raises:
-            ToolError: it is no such address.
         """
         _check_address(host)
         self._shown = shown

@@ -9,27 +9,21 @@ import numpy as np
 from triquad_format.records.arrays import Floats
 
 from triquad_tools.console.command import ToolError
+from triquad_tools.recordings.folders import point_file
 from triquad_tools.recordings.folders.file_names import in_order, stamps_of_names
 from triquad_tools.recordings.folders.frame_checks import check_frame, check_poses, check_rays
-from triquad_tools.recordings.folders.point_file import (
-    KITTI_COLUMNS,
-    POINT_SUFFIXES,
-    check_columns,
-    check_points,
-    read_points,
-)
 from triquad_tools.recordings.folders.scan_folder import (
     PlacedFile,
     ScanFolder,
-    check_all,
+    checked,
     place_files,
 )
 from triquad_tools.recordings.folders.trajectory import Trajectory
 from triquad_tools.recordings.recording import SENSOR, WORLD, ReadingOptions, Stream
-from triquad_tools.recordings.text_lines import parse_rigid, parse_stamps, read_lines
+from triquad_tools.recordings.text_lines import parse_number, parse_stamps, read_lines, rigid
 from triquad_tools.sensors.motion.placing import place
 from triquad_tools.sensors.point_times import offsets_s
-from triquad_tools.sensors.sweep import NoTransformError, PosedScan, Sweep, moved
+from triquad_tools.sensors.sweep import NoTransformError, PosedScan, Sweep
 
 _TRIED = 4  # clouds, to determine the frame of all
 
@@ -54,10 +48,10 @@ def read_cloud_folder(folder: Path, options: ReadingOptions | None = None) -> Sc
     paths = _cloud_paths(folder)
     first, above = paths[0], paths[0].parent.parent
     if first.suffix.lower() == ".bin" and options.columns is None:
-        check_columns(paths)
+        point_file.check_columns(paths)
     placed = place_files(folder, options, paths, read_times([folder, above], len(paths)))
-    columns = options.columns or KITTI_COLUMNS
-    if not sum(check_all(paths, partial(check_points, columns=columns))):
+    columns = options.columns or point_file.KITTI_COLUMNS
+    if not sum(checked(paths, partial(point_file.check_points, columns=columns))):
         raise ToolError(f"{first.parent}: none of the {len(paths)} files holds any points")
     poses, files = placed.trajectory, placed.files
     if first.suffix.lower() == ".bin" and poses.frames is None:
@@ -82,13 +76,11 @@ def read_cloud_folder(folder: Path, options: ReadingOptions | None = None) -> Sc
 
 
 def _read_scan(trajectory: Trajectory, options: ReadingOptions, file: PlacedFile) -> PosedScan:
-    """Return the finite points of a cloud, in the frame of the sensor."""
-    points, times = read_points(file.path, options.columns or KITTI_COLUMNS)
+    points, times = point_file.read_points(file.path, options.columns or point_file.KITTI_COLUMNS)
     finite = np.isfinite(points).all(axis=1)
     points = points[finite]
     if options.points_in == WORLD:
-        inner = moved(points, np.linalg.inv(file.world_from_sensor))
-        return PosedScan(inner.astype(np.float32), file.world_from_sensor)
+        return PosedScan(points, np.eye(4)).seen_from(file.world_from_sensor)
     single: Floats = points.astype(np.float32)
     if times is not None and trajectory.frames is not None and options.deskew:
         offsets = offsets_s(times[finite], file.stamp_ns)
@@ -100,11 +92,12 @@ def _read_scan(trajectory: Trajectory, options: ReadingOptions, file: PlacedFile
 
 
 def _folders_of_clouds(folder: Path) -> dict[Path, list[Path]]:
-    """Return the files of points in a folder and in those in it."""
     folders = [folder, *sorted(path for path in folder.iterdir() if path.is_dir())]
     folders += [folder / _DEEPER] if (folder / _DEEPER).is_dir() else []
     found = {
-        each: in_order(path for path in each.iterdir() if path.suffix.lower() in POINT_SUFFIXES)
+        each: in_order(
+            path for path in each.iterdir() if path.suffix.lower() in point_file.POINT_SUFFIXES
+        )
         for each in folders
     }
     return {each: paths for each, paths in found.items() if paths}
@@ -115,7 +108,8 @@ def _cloud_paths(folder: Path) -> list[Path]:
         raise ToolError(f"{folder}: no such folder")
     found = _folders_of_clouds(folder)
     if not found:
-        raise ToolError(f"{folder}: holds no {', '.join(POINT_SUFFIXES)}, nor does a folder in it")
+        kinds = ", ".join(point_file.POINT_SUFFIXES)
+        raise ToolError(f"{folder}: holds no {kinds}, nor does a folder in it")
     parts = list(found.values())
     spans = [(min(stamps), max(stamps)) for stamps in map(stamps_of_names, parts) if stamps]
     ordered = sorted(zip(spans, parts, strict=False))
@@ -129,9 +123,8 @@ def _cloud_paths(folder: Path) -> list[Path]:
     paths = [path for part in ([part for _, part in ordered] or parts) for path in part]
     suffixes = sorted({path.suffix for path in paths})
     if len(suffixes) > 1:
-        raise ToolError(
-            f"{paths[0].parent}: holds {' and '.join(suffixes)}: leave only one of them"
-        )
+        kinds = " and ".join(suffixes)
+        raise ToolError(f"{paths[0].parent}: holds {kinds}: leave only one of them")
     return paths
 
 
@@ -165,7 +158,7 @@ def _of_lidar(folders: Sequence[Path], files: Sequence[PlacedFile]) -> list[Plac
     for line in read_lines(path):
         name, _, numbers = line.text.rpartition(":")
         if is_360 or name.strip() == "Tr":
-            given = parse_rigid(line.place, numbers.split())
+            given = rigid(line.place, [parse_number(line.place, word) for word in numbers.split()])
             inverse = np.linalg.inv(given)
             # KITTI's world lies as the first camera does; that of KITTI-360 has z up.
             world, of_lidar = (np.eye(4), inverse) if is_360 else (inverse, given)

@@ -15,11 +15,11 @@ from triquad_tools.recordings.folders.file_names import in_order
 from triquad_tools.recordings.folders.scan_folder import (
     PlacedFile,
     ScanFolder,
-    check_all,
+    checked,
     place_files,
 )
 from triquad_tools.recordings.recording import ReadingOptions, Stream
-from triquad_tools.recordings.text_lines import parse_numbers, parse_stamps, read_lines
+from triquad_tools.recordings.text_lines import parse_number, parse_stamps, read_lines
 from triquad_tools.sensors.sweep import PosedScan
 
 INTRINSICS_NAMES = ("camera_intrinsic.json", "intrinsic.json", "camera_primesense.json")
@@ -107,7 +107,7 @@ def check_fits(camera: Camera, shape: tuple[int, ...], path: Path) -> None:
 def _read_matrix(path: Path) -> Camera:
     """Return the camera of a file with a matrix of 3 x 3 or 4 x 4 numbers, row by row."""
     lines = read_lines(path)
-    numbers = [number for line in lines for number in parse_numbers(line.place, line.words)]
+    numbers = [parse_number(line.place, word) for line in lines for word in line.words]
     size = {9: 3, 16: 4}.get(len(numbers))
     if size is None:
         raise ToolError(f"{path}: {len(numbers)} numbers, where a camera matrix has 9 or 16")
@@ -172,7 +172,7 @@ def read_depth_folder(folder: Path, options: ReadingOptions) -> ScanFolder:
     images = _images(folder)
     camera = choose_camera(folder, options.intrinsics)
     placed = place_files(folder, options, images.paths, images.stamps_ns)
-    for path, pixels in zip(images.paths, check_all(images.paths, read_depth), strict=True):
+    for path, pixels in zip(images.paths, checked(images.paths, read_depth), strict=True):
         check_fits(camera, pixels.shape, path)
     units = options.units_per_metre or camera.units_per_metre or images.units_per_metre
     use = f"scans: {units:g} units a metre, camera of {camera.origin}"
@@ -220,7 +220,6 @@ def _read_scan(camera: Camera, units: float, stride: int, file: PlacedFile) -> P
 
 
 def _images(folder: Path) -> _Images:
-    """Return the images that TUM lists with their times, or that lie where others have them."""
     if not (folder / _LIST_NAME).is_file():
         found = ((in_order(folder.glob(pattern)), units) for pattern, units in _LAYOUTS)
         images, units = next(filter(lambda each: each[0], found))

@@ -47,11 +47,9 @@ def stamps_of_names(paths: Sequence[Path]) -> list[int] | None:
     stamps: list[int] = []
     is_padded = _are_padded([found[2] for stem in stems if (found := _DECIMAL.fullmatch(stem))])
     for stem, pair in zip(stems, pairs, strict=True):
-        stamp = (
-            _stamp_of(stem, is_padded=is_padded)
-            if pair is None
-            else int(pair[1]) * 10**9 + int(pair[2]) * unit_ns
-        )
+        stamp = _stamp_of(stem, is_padded=is_padded)
+        if pair is not None:
+            stamp = int(pair[1]) * 10**9 + int(pair[2]) * unit_ns
         if stamp is None:
             return None
         stamps.append(stamp)

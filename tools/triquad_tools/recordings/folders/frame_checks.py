@@ -10,7 +10,7 @@ from triquad_format.records.arrays import Doubles
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.folders.point_file import read_points
 from triquad_tools.recordings.folders.scan_folder import PlacedFile, ScanFolder
-from triquad_tools.recordings.recording import ORIGIN_REMEDIES
+from triquad_tools.recordings.recording import with_remedies
 from triquad_tools.sensors.ray_check import RayCheck
 from triquad_tools.sensors.sweep import PosedScan, moved
 
@@ -43,11 +43,8 @@ def check_rays(folder: Path, scans: Iterable[PosedScan]) -> None:
     rays = RayCheck()
     for scan in scans:
         rays.see(str(folder), scan.points)
-    if (far := rays.are_too_far(str(folder))) is not None:
-        raise ToolError(f"{folder}: {far}")
-    problem = rays.begin_elsewhere(str(folder))
-    if problem is not None:
-        raise ToolError(f"{folder}: {problem}: {ORIGIN_REMEDIES}")
+    if (problem := with_remedies(rays.problem(str(folder)))) is not None:
+        raise ToolError(f"{folder}: {problem}")
 
 
 def _lies_around_its_place(file: PlacedFile, columns: Sequence[str]) -> bool:

@@ -6,7 +6,7 @@ A ``.bin`` has ``float32`` numbers and no header: in KITTI x, y, z and intensity
 import io
 import logging
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,9 +17,7 @@ from triquad_format.records.arrays import Doubles
 from triquad_tools.console.command import ToolError
 from triquad_tools.sensors.point_times import time_fields
 
-KITTI_COLUMNS = ("x", "y", "z", "intensity")
-"""Those of a ``.bin`` of which nothing else is said."""
-
+KITTI_COLUMNS = ("x", "y", "z", "intensity")  # those of a .bin of which nothing else is said
 _OTHER_COLUMNS = {3: "xyz", 5: "xyzir", 6: "xyzirt"}  # as data sets have them
 _FILES, _SAMPLE, _ENOUGH = 4, 240_000, 1_000  # files, and numbers of each and of all, to tell them
 _CLEARLY, _AT_LEAST = 1.1, 0.01  # times more than other numbers of columns explain, and how much
@@ -207,15 +205,9 @@ def _las(path: Path) -> _Table:
 
 
 def _by_name(table: Any) -> Mapping[str, NDArray[Any]]:
-    """Return the columns of a table, which may be a structured array."""
     return table if isinstance(table, dict) else {name: table[name] for name in table.dtype.names}
 
 
-_READERS: dict[str, Callable[[Path], _Table]] = {
-    ".ply": _ply,
-    ".pcd": _pcd,
-    ".las": _las,
-    ".laz": _las,
-}
+_READERS = {".ply": _ply, ".pcd": _pcd, ".las": _las, ".laz": _las}
 
 POINT_SUFFIXES = (*_READERS, ".bin")

@@ -45,9 +45,7 @@ class Form(NamedTuple):
         return table
 
 
-UNIT_TOLERANCE = 1e-2
-"""The allowed error of a quaternion's length: files of three digits have it."""
-
+UNIT_TOLERANCE = 1e-2  # the allowed error of a quaternion's length: files of three digits have it
 _XYZ = "x y z"
 _XYZW, _WXYZ = "qx qy qz qw", "qw qx qy qz"
 _ROWS, _SQUARE = " m" * 12, " m" * 16
@@ -83,7 +81,7 @@ _ENOUGH, _MOST = 200, 0.9  # lines, to determine a form, and how many of them ha
 _LEVEL = 0.1  # at most, of the x and y of a quaternion: a robot that leans by 11 degrees
 
 
-def read_form(path: Path) -> tuple[Form | None, list[Line]]:
+def read_form(path: Path) -> tuple[Form, list[Line]]:
     """Return how the poses of a file are written, and the lines that hold them.
 
     The form is ``None`` where a pose takes several lines, of 3 or 4 numbers.
@@ -105,11 +103,33 @@ def read_form(path: Path) -> tuple[Form | None, list[Line]]:
         raise ToolError(f"{first.place}: {comma} has a comma for its point: write points")
     named = next(filter(None, (_form_of_header(line, count) for line in reversed(header))), None)
     if named is None and count in (3, 4):
-        return None, lines
+        return Form("Open3D log", "m" * 16), _joined(path, lines)
     for line in lines:
         if len(line.words) != count:
             raise ToolError(f"{line.place}: {len(line.words)} numbers where a pose has {count}")
     return named or _form_of_numbers(lines), lines
+
+
+def _joined(path: Path, lines: Sequence[Line]) -> list[Line]:
+    """Return a line for each pose that stands in several.
+
+    A ``.log`` of Open3D has five: three whole numbers and the rows of a matrix; a file of ScanNet
+    or 7-Scenes has the four rows.
+    """
+    count = len(lines[0].words)
+    size = 5 if count == 3 else 4
+    if len(lines) % size:
+        raise ToolError(
+            f"{path}: {len(lines)} lines are not whole poses of Open3D's .log, which take 5 each, "
+            "or of four rows; copy it again"
+        )
+    joined = []
+    for start in range(0, len(lines), size):
+        first, rows = lines[start], lines[start : start + size][-4:]
+        if len(first.words) != count or any(len(row.words) != 4 for row in rows):
+            raise ToolError(f"{first.place}: not 3 numbers and four rows of 4, as in Open3D's .log")
+        joined.append(Line(first.place, " ".join(row.text for row in rows)))
+    return joined
 
 
 def order_of(form: Form, quaternions: Doubles, lines: Sequence[Line]) -> str:
@@ -140,11 +160,7 @@ def order_of(form: Form, quaternions: Doubles, lines: Sequence[Line]) -> str:
 
 
 def _form_of_header(line: Line, count: int) -> Form | None:
-    """Return the form that a line names, if it names all that a pose needs.
-
-    Raises:
-        ToolError: it is that of COLMAP's images, whose poses are the other way round.
-    """
+    """Return the form that a line names, if it names all that a pose needs."""
     text = line.text.lstrip("#%/ ").lower()
     if "image_id" in text and "camera_id" in text:
         raise ToolError(
@@ -188,7 +204,6 @@ def _role(name: str) -> tuple[str, int | None]:
 
 
 def _form_of_numbers(lines: Sequence[Line]) -> Form:
-    """Return the form of lines without a header."""
     count = len(lines[0].words)
     fitting = [form for form in _FORMS if len(form.columns) == count]
     if len(fitting) > 1:

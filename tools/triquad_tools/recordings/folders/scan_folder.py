@@ -74,7 +74,7 @@ class ScanFolder:
         return (self.read_file(self.files[index]) for index in indices)
 
 
-def check_all(paths: Sequence[Path], read: Callable[[Path], _Read]) -> Iterator[_Read]:
+def checked(paths: Sequence[Path], read: Callable[[Path], _Read]) -> Iterator[_Read]:
     """Yield what is read of each file, with progress: a damaged one is named before any is used."""
     with progress("looking through the recording", len(paths)) as report:
         for number, path in enumerate(paths, start=1):
@@ -112,53 +112,48 @@ def place_files(
     if stamps_ns is None and (stamps_ns := stamps_of_names(paths)) is not None:
         stamps_ns, paths = zip(*sorted(zip(stamps_ns, paths, strict=True)), strict=True)
     placed = _placed(paths, stamps_ns, trajectory, remarks)
-    known = [file for file in placed.files if np.isfinite(file.world_from_sensor).all()]
+    known = [file for file in placed if np.isfinite(file.world_from_sensor).all()]
     if not known:
         raise ToolError(f"{trajectory.path}: says no pose for any of {len(paths)} files")
-    if len(known) < len(placed.files):
-        count = len(placed.files) - len(known)
+    if (count := len(placed) - len(known)) > 0:
         told = f"{count} of {len(paths)} files are left out, as {trajectory.path.name} says no pose"
-        placed.remarks.append(f"{told} for them")
-    return placed._replace(files=known)
+        remarks.append(f"{told} for them")
+    return PlacedFiles(known, trajectory, remarks)
 
 
 def _placed(
-    paths: Sequence[Path],
-    stamps: Sequence[int] | None,
-    trajectory: Trajectory,
-    remarks: list[str],
-) -> PlacedFiles:
-    """Return the files that have poses, some of which may not be finite."""
+    paths: Sequence[Path], stamps: Sequence[int] | None, trajectory: Trajectory, remarks: list[str]
+) -> list[PlacedFile]:
+    """Return the files that have poses, some of which may not be finite; add to the remarks."""
     path = trajectory.path
     timed = stamps is not None and trajectory.frames is not None
-    if stamps is not None and timed:
-        placed = _by_time(paths, stamps, trajectory, remarks)
-        if placed.files:
-            return placed
-    pose_of: dict[int | None, Doubles] = dict(
-        zip(trajectory.numbers or (), trajectory.poses, strict=False)
-    )
+    if stamps is not None and timed and (placed := _by_time(paths, stamps, trajectory, remarks)):
+        return placed
+    known = trajectory.numbers or ()
+    pose_of: dict[int | None, Doubles] = dict(zip(known, trajectory.poses, strict=False))
     numbers = [number_of(path) for path in paths]
     shared = {*numbers} & {*pose_of}
     # As many files as poses, of which not all have common numbers, may be counted in two ways.
     if shared and (len(shared) == len(paths) or len(pose_of) != len(paths)):
         when = stamps or [(number or 0) * DEFAULT_PERIOD_NS for number in numbers]
         found = [pose_of.get(number, np.full((4, 4), np.nan)) for number in numbers]
-        files = list(map(PlacedFile, paths, when, found))
-        return PlacedFiles(files, trajectory, remarks)
+        return list(map(PlacedFile, paths, when, found))
     if len(paths) == len(trajectory.poses) and not pose_of:
-        when = trajectory.stamps_ns.tolist()
-        if stamps is not None and not timed:
-            when = list(stamps)
-        poses = zip(paths, when, trajectory.poses, strict=True)
+        when = stamps if stamps is not None and not timed else trajectory.stamps_ns.tolist()
         if timed:
             remarks.append(
                 f"the times of the files, such as {paths[0].name}, are of another clock than those "
                 f"of {path.name}: files and poses, of which there are as many, go in order"
             )
-        return PlacedFiles([PlacedFile(*each) for each in poses], trajectory, remarks)
+        return list(map(PlacedFile, paths, when, trajectory.poses))
     if stamps is not None and timed:
-        raise _no_common_time(stamps, trajectory, paths[0].parent)
+        first, last = (stamp / 1e9 for stamp in (min(stamps), max(stamps)))
+        start, end = (stamp / 1e9 for stamp in trajectory.stamps_ns[[0, -1]].tolist())
+        raise ToolError(
+            f"{paths[0].parent}: no file has a pose: they were taken from {first:.3f} to "
+            f"{last:.3f} s, and {path} goes from {start:.3f} to {end:.3f} s, with gaps of at most "
+            "2 s; write both with the times of one clock"
+        )
     what = "the trajectory has no times" if stamps is not None else "their names hold no times"
     what = "their numbers are not those of the poses" if pose_of else what
     raise ToolError(
@@ -171,7 +166,6 @@ def _placed(
 def _choose(
     folder: Path, paths: Sequence[Path], options: ReadingOptions
 ) -> tuple[Trajectory, list[str]]:
-    """Return the trajectory, and a remark where there are several."""
     given, order = options.trajectory, options.quaternion
     if given is not None:
         path = next((each for each in (given, folder / given) if each.exists()), None)
@@ -217,7 +211,7 @@ def _viewpoints(paths: Sequence[Path]) -> Trajectory | None:
 
 def _by_time(
     paths: Sequence[Path], stamps_ns: Sequence[int], trajectory: Trajectory, remarks: list[str]
-) -> PlacedFiles:
+) -> list[PlacedFile]:
     placed: list[PlacedFile] = []
     left_out: Counter[str] = Counter()
     for stamp, path in sorted(zip(stamps_ns, paths, strict=True)):
@@ -225,19 +219,7 @@ def _by_time(
             placed.append(PlacedFile(path, stamp, trajectory.pose_at(stamp)))
         except NoTransformError as error:
             left_out[error.reason] += 1
-    told = [
-        f"{count} of {len(paths)} files are left out: they were taken {_WHY[reason]} of "
-        f"{trajectory.path.name}"
-        for reason, count in left_out.items()
-    ]
-    return PlacedFiles(placed, trajectory, [*remarks, *told])
-
-
-def _no_common_time(stamps_ns: Sequence[int], trajectory: Trajectory, folder: Path) -> ToolError:
-    first, last = (stamp / 1e9 for stamp in (min(stamps_ns), max(stamps_ns)))
-    start, end = (stamp / 1e9 for stamp in trajectory.stamps_ns[[0, -1]].tolist())
-    return ToolError(
-        f"{folder}: no file has a pose: they were taken from {first:.3f} to {last:.3f} s, and "
-        f"{trajectory.path} goes from {start:.3f} to {end:.3f} s, with gaps of at most 2 s; write "
-        "both with the times of one clock"
-    )
+    for reason, count in left_out.items() if placed else ():
+        told = f"{count} of {len(paths)} files are left out: they were taken {_WHY[reason]} of"
+        remarks.append(f"{told} {trajectory.path.name}")
+    return placed

@@ -1,8 +1,4 @@
-"""Files that say where a sensor was: a pose a line, a pose in several lines, or a file for each.
-
-The form of lines is told by ``pose_forms.py``. A ``.log`` of Open3D has five lines a pose: three
-whole numbers and the rows of a matrix; a file of ScanNet or 7-Scenes has the four rows.
-"""
+"""Files that say where a sensor was: ``pose_forms.py`` tells how, as lines of one pose each."""
 
 import re
 from collections.abc import Sequence
@@ -15,27 +11,13 @@ from triquad_client.pose import Pose, pose_matrices
 from triquad_format.records.arrays import Doubles, Longs
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.recordings.folders.pose_forms import (
-    UNIT_TOLERANCE,
-    Form,
-    order_of,
-    read_form,
-)
+from triquad_tools.recordings.folders.pose_forms import UNIT_TOLERANCE, Form, order_of, read_form
 from triquad_tools.recordings.recording import SENSOR, WORLD
-from triquad_tools.recordings.text_lines import (
-    Line,
-    parse_number,
-    parse_time,
-    read_lines,
-    rigid,
-    unit_ns,
-)
+from triquad_tools.recordings.text_lines import Line, parse_time, read_lines, rigid, unit_ns
 from triquad_tools.sensors.motion.frame_tree import FrameTree, Transform
 from triquad_tools.sensors.sweep import NoTransformError
 
-DEFAULT_PERIOD_NS = 100_000_000
-"""The time between scans of a recording without times."""
-
+DEFAULT_PERIOD_NS = 100_000_000  # the time between scans of a recording without times
 _ROUNDING_NS = 1_000_000  # files write times with as few as three decimals
 
 
@@ -79,20 +61,7 @@ def read_trajectory(path: Path, order: str | None = None) -> Trajectory:
     Raises:
         ToolError: it has no poses, or a line is none.
     """
-    form, lines = read_form(path)
-    if form is None:
-        first, poses = _blocks(path, lines)
-        return _trajectory(path, "Open3D log", first, poses)
-    is_timed = bool({"t", "sec"} & {*form.columns})
-    keys = form.numbers(lines, *(("t", "sec", "nsec") if is_timed else ("n",)))
-    finite = np.isfinite(keys).all(axis=1)
-    without = [lines[index] for index in np.flatnonzero(~finite).tolist()]
-    lines = [lines[index] for index in np.flatnonzero(finite).tolist()]
-    found = _trajectory(path, form.name, lines, _poses(form, lines, order), without)
-    if is_timed:
-        return _timed(found, _stamps(form, lines))
-    numbers = form.numbers(lines, "n").ravel().tolist()
-    return replace(found, numbers=[int(number) for number in numbers] or None)
+    return _trajectory(path, *read_form(path), order)
 
 
 def read_pose_files(paths: Sequence[Path]) -> Trajectory:
@@ -101,22 +70,21 @@ def read_pose_files(paths: Sequence[Path]) -> Trajectory:
     Raises:
         ToolError: a file does not hold 12 or 16 numbers, or all say no pose.
     """
-    lines, poses = [Line(str(path), "") for path in paths], []
+    lines = [Line(str(path), " ".join(line.text for line in read_lines(path))) for path in paths]
+    form = Form("a pose a file", "m" * len(lines[0].words))
     for path, line in zip(paths, lines, strict=True):
-        words = [word for each in read_lines(path) for word in each.words]
-        if len(words) not in (12, 16):
-            raise ToolError(f"{path}: {len(words)} numbers where a pose has 16")
-        poses.append(_matrix(line, [parse_number(line.place, word) for word in words]))
+        if len(line.words) not in (12, 16) or len(line.words) != len(form.columns):
+            raise ToolError(f"{path}: {len(line.words)} numbers where a pose has 16")
     files = paths[0].parent / f"*{''.join(paths[0].suffixes)}"
     numbers = [number_of(path) or 0 for path in paths]
-    return replace(_trajectory(files, "a pose a file", lines, np.array(poses)), numbers=numbers)
+    return replace(_trajectory(files, form, lines), numbers=numbers)
 
 
 def read_viewpoints(paths: Sequence[Path], texts: Sequence[str]) -> Trajectory:
     """Return the poses that PCD files have as ``VIEWPOINT``, in the order of the files."""
     form = Form("VIEWPOINT", ["x", "y", "z", "qw", "qx", "qy", "qz"], has_header=True)
     lines = [Line(str(path), text) for path, text in zip(paths, texts, strict=True)]
-    return _trajectory(paths[0].parent / "*.pcd", form.name, lines, _poses(form, lines, None))
+    return _trajectory(paths[0].parent / "*.pcd", form, lines)
 
 
 def number_of(path: Path) -> int | None:
@@ -126,23 +94,30 @@ def number_of(path: Path) -> int | None:
 
 
 def _trajectory(
-    path: Path, kind: str, lines: Sequence[Line], poses: Doubles, others: Sequence[Line] = ()
+    path: Path, form: Form, lines: Sequence[Line], order: str | None = None
 ) -> Trajectory:
-    """Return poses without times, with a remark on those, and on other lines, that are none."""
-    nowhere = np.isnan(poses[:, 0, 3])
-    unknown = [*others, *(lines[index] for index in np.flatnonzero(nowhere).tolist())]
+    is_timed = bool({"t", "sec"} & {*form.columns})
+    keys = form.numbers(lines, *(("t", "sec", "nsec") if is_timed else ("n",)))
+    is_known = np.asarray(np.isfinite(keys).all(axis=1))
+    known = [line for line, is_one in zip(lines, is_known, strict=True) if is_one]
+    poses = _poses(form, known, order)
+    is_known[is_known] = np.isfinite(poses[:, 0, 3])
     remarks: tuple[str, ...] = ()
-    if len(unknown) == len(lines) + len(others):
-        raise ToolError(f"{unknown[0].place}: no finite pose, nor in any other line")
-    if unknown:
-        told = f"{len(unknown)} of {len(lines) + len(others)} poses are left out, as they are not "
-        remarks = (f"{told}finite or no rotation, the first at {unknown[0].place}",)
+    if not is_known.all():
+        first = lines[int(is_known.argmin())].place
+        if not is_known.any():
+            raise ToolError(f"{first}: no finite pose, nor in any other line")
+        told = f"{(~is_known).sum()} of {len(lines)} poses are left out, as they are not finite"
+        remarks = (f"{told} or no rotation, the first at {first}",)
     stamps = np.arange(len(poses), dtype=np.int64) * DEFAULT_PERIOD_NS
-    return Trajectory(path, kind, poses, stamps, remarks=remarks)
+    found = Trajectory(path, form.name, poses, stamps, remarks=remarks)
+    if is_timed:
+        return _timed(found, _stamps(form, known))
+    numbers = form.numbers(known, "n").astype(np.int64).ravel().tolist()
+    return replace(found, numbers=numbers or None)
 
 
 def _timed(found: Trajectory, stamps: Longs) -> Trajectory:
-    """Return a trajectory with times [n], sorted by them."""
     remarks, frames = list(found.remarks), FrameTree()
     order = np.argsort(stamps, kind="stable")
     poses, ordered = found.poses[order], stamps[order]
@@ -160,15 +135,12 @@ def _timed(found: Trajectory, stamps: Longs) -> Trajectory:
 
 
 def _stamps(form: Form, lines: Sequence[Line]) -> Longs:
-    """Return the times of lines, nanoseconds: a time, or its seconds and nanoseconds."""
     parts = [form.columns.index(name) for name in ("t", "sec", "nsec") if name in form.columns]
     units = [10**9, 1][: len(parts)]
     if len(parts) == 1 and lines:
         units = [form.unit_ns or unit_ns(lines[0], lines[0].words[parts[0]])]
-    stamps = [
-        sum(parse_time(line, line.words[i], unit) for i, unit in zip(parts, units, strict=True))
-        for line in lines
-    ]
+    both = list(zip(parts, units, strict=True))
+    stamps = [sum(parse_time(line, line.words[i], unit) for i, unit in both) for line in lines]
     return np.array(stamps, np.int64)
 
 
@@ -176,7 +148,9 @@ def _poses(form: Form, lines: Sequence[Line], order: str | None) -> Doubles:
     """Return poses [n, 4, 4] of lines, not finite where a line says none."""
     if "m" in form.columns:
         rows = zip(lines, form.numbers(lines, "m"), strict=True)
-        return np.array([_matrix(line, row) for line, row in rows]).reshape(-1, 4, 4)
+        nowhere = np.full((4, 4), np.nan)
+        found = [rigid(line.place, m) if np.isfinite(m).all() else nowhere for line, m in rows]
+        return np.array(found).reshape(-1, 4, 4)
     positions = form.numbers(lines, "x", "y", "z")
     names = [name for name in form.columns if name[0] == "q"]  # in the order of the file
     quaternions = form.numbers(lines, *names)
@@ -195,30 +169,3 @@ def _poses(form: Form, lines: Sequence[Line], order: str | None) -> Doubles:
     units = quaternions[finite] / lengths[finite, None]
     poses[finite] = pose_matrices(positions[finite], units)
     return poses
-
-
-def _matrix(line: Line, numbers: Sequence[float] | Doubles) -> Doubles:
-    """Return the pose of 12 or 16 numbers; not finite where they are not."""
-    if not np.isfinite(numbers).all():
-        return np.full((4, 4), np.nan)
-    return rigid(line.place, numbers)
-
-
-def _blocks(path: Path, lines: Sequence[Line]) -> tuple[list[Line], Doubles]:
-    """Return the first line of each pose, and poses of four rows, before which may stand a line."""
-    size = 5 if len(lines[0].words) == 3 else 4
-    if len(lines) % size:
-        raise ToolError(
-            f"{path}: {len(lines)} lines are not whole poses of Open3D's .log, which take 5 each, "
-            "or of four rows; copy it again"
-        )
-    poses = []
-    for start in range(0, len(lines), size):
-        rows = lines[start : start + size][-4:]
-        if len(lines[start].words) != len(lines[0].words) or any(len(r.words) != 4 for r in rows):
-            raise ToolError(
-                f"{lines[start].place}: not 3 numbers and four rows of 4, as in Open3D's .log"
-            )
-        numbers = [parse_number(row.place, word) for row in rows for word in row.words]
-        poses.append(_matrix(lines[start], numbers))
-    return list(lines[::size]), np.array(poses)

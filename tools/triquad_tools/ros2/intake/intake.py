@@ -17,36 +17,24 @@ from triquad_format.records.arrays import Doubles
 
 from triquad_tools.ros2.intake.drop_log import DropLog, FirstScan
 from triquad_tools.ros2.intake.placement import Motion, Placed, Placement
-from triquad_tools.ros2.intake.topic_listener import (
-    Arrival,
-    MessageQueue,
-    QueueLimits,
-    TopicListener,
-)
+from triquad_tools.ros2.intake.topic_listener import Arrival, Limits, MessageQueue, TopicListener
 from triquad_tools.ros2.node import Node
 from triquad_tools.ros2.options import TYPES, BridgeOptions, Role
 from triquad_tools.ros2.topics import SequenceGaps
 from triquad_tools.sensors.ray_check import RayCheck
 from triquad_tools.sensors.ros.from_bytes import decode_cdr
-from triquad_tools.sensors.ros.header import source_of_topic
 from triquad_tools.sensors.ros.message_reader import MessageReader
+from triquad_tools.sensors.ros.type_store import source_of_topic
 from triquad_tools.sensors.sweep import NoScanError, PosedScan, Sweep
 
 _log = logging.getLogger("triquad_ros2")
-
-MAX_TOPICS = 64
-"""Topics of which scans are made at most."""
-
-RESTART_NS = 10**9
-"""Stamps that go back by more start again; a wrong one silences no sensor for longer."""
-
-MAX_POINTS = 2_500_000
-"""Points of a scan at most: a message of 30 MB, which servers receive with default settings."""
-
+MAX_TOPICS = 64  # topics of which scans are made at most
+RESTART_NS = 10**9  # stamps that go back by more start again: a wrong one silences for no longer
+MAX_POINTS = 2_500_000  # of a scan: a message of 30 MB, which servers receive by default
 _OTHER_BYTES = 1_000_000  # of a message of transforms, and of a cloud without its points
 _SCAN_BYTES = 64 * MAX_POINTS + _OTHER_BYTES  # drivers write up to 64 bytes for each point
-_SCANS_UNREAD = QueueLimits(16, 256_000_000)
-_OTHERS_UNREAD = QueueLimits(4096, 16_000_000)  # 4 s of transforms at 1 kHz
+_SCANS_UNREAD = Limits(16, 256_000_000)
+_OTHERS_UNREAD = Limits(4096, 16_000_000)  # 4 s of transforms at 1 kHz
 _WAITING_BYTES = 512_000_000  # of sweeps that wait for their transforms
 _TICK_S = 0.2
 _SETTING = "which the setting ray_origin_m of its source has to tell the server (docs/server.md)"
@@ -64,8 +52,6 @@ class Place:
 
 @dataclass
 class _Source:
-    """A topic of which scans are made."""
-
     name: str
     read_ns: int  # newest stamp of a sweep that was read, since time went back
     sent_ns: int = 0  # and of one that was published: sweeps wait in between
@@ -177,7 +163,6 @@ class Intake:
         self._thread.join()
 
     def _receive(self, arrival: Arrival) -> None:
-        """Keep a message for the thread that reads it."""
         limit = _OTHER_BYTES
         if arrival.role.brings_scans:
             limit = _SCAN_BYTES
@@ -213,10 +198,9 @@ class Intake:
             step()
         except NoScanError as error:
             self.drops.add(topic_name, error.reason, error)
-        except InvalidScanError as error:
-            self.drops.add(topic_name, "invalid", error)
         except TriquadError as error:
-            self.drops.add(topic_name, "not_sent", error)
+            reason = "invalid" if isinstance(error, InvalidScanError) else "not_sent"
+            self.drops.add(topic_name, reason, error)
         except Exception as error:
             self.drops.add(topic_name, "internal", repr(error))
             _log.debug("a message of %s could not be used", topic_name, exc_info=True)
@@ -231,18 +215,14 @@ class Intake:
         elif role.brings_scans:
             sweep = self._reader.sweep(topic_name, kind, message, came_ns)
             if role is Role.CLOUD:
-                self._check_rays(topic_name, sweep)
+                self._rays.see(topic_name, sweep.points)
+                if (problem := self._rays.begin_elsewhere(topic_name)) is not None:
+                    self.drops.remark(topic_name, f"{problem}, {_SETTING}")
             self._place(topic_name, sweep)
         else:
             static = role is Role.TF_STATIC
             found = self._reader.transforms(kind, message, came_ns, static=static)
             self._motion.add(found, is_body=role is Role.POSE)
-
-    def _check_rays(self, topic_name: str, sweep: Sweep) -> None:
-        """Log that rays of a topic begin elsewhere than at the frame of its clouds."""
-        self._rays.see(topic_name, sweep.points)
-        if (problem := self._rays.begin_elsewhere(topic_name)) is not None:
-            self.drops.remark(topic_name, f"{problem}, {_SETTING}")
 
     def _place(self, topic_name: str, sweep: Sweep) -> None:
         if self.scans.time_went_back(topic_name, sweep.stamp_ns):
@@ -253,11 +233,7 @@ class Intake:
 
 
 def _decoded(arrival: Arrival) -> tuple[str, Any]:
-    """Return a message with its type: the bytes of one type cannot be read as another.
-
-    Raises:
-        NoScanError: it has none of the types of its role.
-    """
+    """Return a message and which type of its role it has, or raise a NoScanError."""
     payload = arrival.payload.to_bytes()
     *others, last = (arrival.type_name,) if arrival.type_name else TYPES[arrival.role]
     for kind in others:

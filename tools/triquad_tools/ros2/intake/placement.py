@@ -13,16 +13,11 @@ from triquad_tools.sensors.motion.placing import place
 from triquad_tools.sensors.sweep import NoScanError, NoTransformError, PosedScan, Sweep
 
 _log = logging.getLogger("triquad_ros2")
-
-RESTART_NS = 10 * 10**9
-"""Transforms that go back by more are of a simulation or a bag that was started again."""
-
+RESTART_NS = 10 * 10**9  # transforms that go back by more are of a bag that was started again
 _POSES_KEPT = 2000  # of each frame; 20 s at 100 Hz
 _MAX_FRAMES = 1000
 _MAX_NAME = 256
-
-_CHOICE_S = 1.0
-"""The time after a sweep could first be placed in which a better map frame may appear."""
+_CHOICE_S = 1.0  # after a sweep could first be placed, for a better map frame to appear
 
 
 class Motion:
@@ -63,7 +58,6 @@ class Motion:
             self._forget_after(child, stamp_ns)
 
     def _forget_after(self, child: str, stamp_ns: int) -> None:
-        """Remove the poses of a frame whose time goes back to a stamp."""
         newest_ns = self.frames.newest_ns(child)
         if newest_ns is not None and newest_ns > stamp_ns + RESTART_NS:
             self.frames.forget(child)
@@ -128,7 +122,6 @@ class Placement:
                 del self._waiting[topic_name]
 
     def _keep_within_limit(self, now_s: float) -> None:
-        """Give up the oldest sweeps where all together are too large."""
         entries = [entry for entries in self._waiting.values() for entry in entries]
         excess = sum(entry.sweep.memory_bytes for entry in entries) - self.max_bytes
         for entry in sorted(entries, key=lambda entry: entry.give_up_s):
@@ -175,17 +168,11 @@ class Placement:
         return scan
 
     def _warn_of_better_frame(self) -> None:
-        """Warn, once, if a better frame to map in appeared too late."""
         better = self.motion.frames.fixed_frame(self.map_frame)
         if better != self.map_frame and not self._warned:
             self._warned = True
-            _log.warning(
-                "%r turned up above %r, in which the map is made: to map in it, use "
-                "--map-frame %s with an empty map",
-                better,
-                self.map_frame,
-                better,
-            )
+            told = "%r turned up above %r, in which the map is made: to map in it, use --map-frame "
+            _log.warning(told + "%s with an empty map", better, self.map_frame, better)
 
     def _best_frame(self, frame: str, now_s: float) -> str:
         """Return the frame to map in, as far as is known by now."""

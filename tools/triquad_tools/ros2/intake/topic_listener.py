@@ -12,23 +12,14 @@ from typing import Any
 import zenoh
 import zenoh.ext
 
+from triquad_tools.ros2 import topics
 from triquad_tools.ros2.node import Node, watch_tokens
 from triquad_tools.ros2.options import Feed, Role, TopicChoice
-from triquad_tools.ros2.topics import (
-    ANY_HASH,
-    Announcement,
-    Delivery,
-    End,
-    Topic,
-    bridge_key,
-    old_bridge_cache,
-    rmw_topic_name,
-)
 
 _log = logging.getLogger("triquad_ros2")
 _MAX_FOUND = 1000  # topics that are remembered, whether they are wanted or not
 _ASK_S = 2.0
-_SUBSCRIPTION = Delivery(reliable=False)  # which suits every publisher
+_SUBSCRIPTION = topics.Delivery(reliable=False)  # which suits every publisher
 # Static transforms are published once: who publishes them keeps them for those that come later.
 _HISTORY = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=100)
 
@@ -51,7 +42,7 @@ class Arrival:
 
 
 @dataclass(frozen=True)
-class QueueLimits:
+class Limits:
     """The most that may wait."""
 
     messages: int
@@ -61,9 +52,7 @@ class QueueLimits:
 class MessageQueue:
     """Scans, and other messages, which go first: transforms must not wait behind large clouds."""
 
-    def __init__(
-        self, scans: QueueLimits, others: QueueLimits, dropped: Callable[[Arrival], None]
-    ) -> None:
+    def __init__(self, scans: Limits, others: Limits, dropped: Callable[[Arrival], None]) -> None:
         """``dropped`` is called with each message that nobody will read."""
         self._limits = {True: scans, False: others}  # by whether they bring scans
         self._waiting: dict[bool, deque[Arrival]] = {True: deque(), False: deque()}
@@ -118,14 +107,16 @@ class TopicListener:
         self._lock = threading.Lock()
         self._closed = False
         self._subscribers: dict[str, Any] = {}  # by key
-        self._found: set[Announcement] = set()
+        self._found: set[topics.Announcement] = set()
         self._types: dict[str, str] = {}  # of wanted topics that were found
         for feed in self.choice.feeds():
             self._open(feed)
-        self._watches = watch_tokens(self.session, self.choice.domain, End.PUBLISHER, self._find)
+        self._watches = watch_tokens(
+            self.session, self.choice.domain, topics.End.PUBLISHER, self._find
+        )
 
     @property
-    def found(self) -> list[Topic]:
+    def found(self) -> list[topics.Topic]:
         """The published topics, wanted or not."""
         with self._lock:
             return list({each.topic for each in self._found})
@@ -140,7 +131,6 @@ class TopicListener:
             subscriber.undeclare()
 
     def _open(self, feed: Feed) -> None:
-        """Subscribe to a feed, unless that is done already."""
         with self._lock:
             if feed.key in self._subscribers or self._closed:
                 return
@@ -154,16 +144,15 @@ class TopicListener:
             )
 
     def _receive(self, feed: Feed, sample: zenoh.Sample) -> None:
-        name = feed.topic_name or rmw_topic_name(str(sample.key_expr))
+        name = feed.topic_name or topics.rmw_topic_name(str(sample.key_expr))
         attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
         kind = feed.type_name or self._types.get(name, "")
         self.arrived(Arrival(feed.role, name, sample.payload, time.time_ns(), attachment, kind))
 
-    def _find(self, announcement: Announcement) -> None:
-        """Handle a topic that is published."""
+    def _find(self, announcement: topics.Announcement) -> None:
         topic = announcement.topic
         role = self.choice.wants(topic)
-        if role is Role.TF_STATIC and announcement.type_hash == ANY_HASH:
+        if role is Role.TF_STATIC and announcement.type_hash == topics.ANY_HASH:
             self._ask_old_bridges(topic.name)
         with self._lock:
             if announcement in self._found or len(self._found) >= _MAX_FOUND:
@@ -173,16 +162,16 @@ class TopicListener:
             return
         self._types[topic.name] = topic.type_name
         _log.info("found %s (%s)", topic.name, topic.type_name)
-        if announcement.type_hash == ANY_HASH:
-            self._open(Feed(role, bridge_key(topic.name), topic.name))
+        if announcement.type_hash == topics.ANY_HASH:
+            self._open(Feed(role, topics.bridge_key(topic.name), topic.name))
         else:
             # Drivers that publish only while there is a subscriber learn it from this.
-            what = Announcement(End.SUBSCRIPTION, topic, announcement.type_hash)
+            what = topics.Announcement(topics.End.SUBSCRIPTION, topic, announcement.type_hash)
             self.node.announce(what, _SUBSCRIPTION)
 
     def _ask_old_bridges(self, topic_name: str) -> None:
         """Fetch what bridges up to 1.5 published before anybody subscribed."""
-        feed = Feed(Role.TF_STATIC, old_bridge_cache(topic_name), topic_name)
+        feed = Feed(Role.TF_STATIC, topics.old_bridge_cache(topic_name), topic_name)
         replies = self.session.get(
             feed.key,
             target=zenoh.QueryTarget.ALL,

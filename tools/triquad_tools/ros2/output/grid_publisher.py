@@ -14,9 +14,7 @@ from triquad_tools.sensors.ros.type_store import CdrWriter
 
 _PERIOD_S = 1.0  # between two slices
 _MAX_SHARE = 4  # the server works on slices for at most one part in four of the time
-
-FREE, OCCUPIED, UNKNOWN = 0, 100, -1
-"""The values of cells, as nav_msgs/OccupancyGrid has them."""
+FREE, OCCUPIED, UNKNOWN = 0, 100, -1  # the values of cells, as nav_msgs/OccupancyGrid has them
 
 
 class GridPublisher:

@@ -1,7 +1,6 @@
 """The mesh as markers of ROS 2: a marker for each tile, and only tiles that changed."""
 
 from dataclasses import dataclass
-from enum import IntEnum
 
 import numpy as np
 from triquad_client import Client, MeshTile, MeshWatch
@@ -19,17 +18,11 @@ _PHASES = np.array([0.0, 1 / 3, 2 / 3])  # of red, green and blue
 
 TileIndex = tuple[int, int, int]
 
-
-class Action(IntEnum):
-    """The action of a marker."""
-
-    ADD = 0  # or replace
-    DELETE = 2
-    DELETE_ALL = 3
+ADD, DELETE, DELETE_ALL = 0, 2, 3  # the actions of markers; the first one replaces, too
 
 
 def marker_message(
-    frame: str, number: int, action: Action = Action.ADD, corners: Doubles = _NO_CORNERS
+    frame: str, number: int, action: int = ADD, corners: Doubles = _NO_CORNERS
 ) -> bytes:
     """Return triangles that are shown, replaced and deleted together, CDR.
 
@@ -78,7 +71,7 @@ class MeshPublisher:
         if self._watch is None:
             self._watch = self.client.watch_mesh(level=self.level)
             # A bridge before this one may have left some.
-            self.publisher.put(marker_message(place.map_frame, 0, Action.DELETE_ALL))
+            self.publisher.put(marker_message(place.map_frame, 0, DELETE_ALL))
         if self.publisher.has_newcomers():
             self._pending.update(dict.fromkeys(self._watch.tiles))
         while self._left_bytes > 0:
@@ -103,6 +96,6 @@ class MeshPublisher:
     def _marker(self, index: TileIndex, tile: MeshTile | None, frame: str) -> bytes:
         number = self._numbers.setdefault(index, len(self._numbers) + 1)
         if tile is None:
-            return marker_message(frame, number, Action.DELETE)
+            return marker_message(frame, number, DELETE)
         vertices = tile.origin + tile.vertices.astype(np.float64)
         return marker_message(frame, number, corners=vertices[tile.faces.ravel()])

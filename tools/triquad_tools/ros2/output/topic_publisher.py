@@ -8,24 +8,12 @@ from dataclasses import dataclass
 
 import zenoh
 
+from triquad_tools.ros2 import topics
 from triquad_tools.ros2.node import Node, watch_tokens
-from triquad_tools.ros2.topics import (
-    ATTACHMENT,
-    NO_HASH,
-    Announcement,
-    Delivery,
-    End,
-    Topic,
-    bridge_key,
-    rmw_key,
-    type_hash,
-)
 
 
 @dataclass(frozen=True)
 class _Key:
-    """One key under which the topic is published."""
-
     publisher: zenoh.Publisher
     identity: bytes | None  # that messages of rmw_zenoh carry
 
@@ -40,21 +28,23 @@ class TopicPublisher:
 
     session: zenoh.Session
     node: Node
-    topic: Topic
+    topic: topics.Topic
     domain: int
-    delivery: Delivery
+    delivery: topics.Delivery
 
     def __post_init__(self) -> None:
-        self._hash = type_hash(self.topic.type_name)
+        self._hash = topics.type_hash(self.topic.type_name)
         self._lock = threading.Lock()
         self._numbers = itertools.count(1)
         self._keys: dict[str, _Key] = {}
         self._came = threading.Event()  # a subscriber did
         self._open_rmw(self._hash)
-        if self._open(bridge_key(self.topic.name), None):
-            what = Announcement(End.PUBLISHER, self.topic, self._hash)
+        if self._open(topics.bridge_key(self.topic.name), None):
+            what = topics.Announcement(topics.End.PUBLISHER, self.topic, self._hash)
             self.node.announce_to_bridges(what, self.delivery)
-        self._watches = watch_tokens(self.session, self.domain, End.SUBSCRIPTION, self._appeared)
+        self._watches = watch_tokens(
+            self.session, self.domain, topics.End.SUBSCRIPTION, self._appeared
+        )
 
     def close(self) -> None:
         """Publish no more."""
@@ -80,25 +70,26 @@ class TopicPublisher:
         number, now_ns = next(self._numbers), time.time_ns()
         for key in self._all_keys():
             if key.is_followed:
-                attachment = key.identity and ATTACHMENT.pack(number, now_ns, 16, key.identity)
+                attachment = key.identity and topics.ATTACHMENT.pack(
+                    number, now_ns, 16, key.identity
+                )
                 key.publisher.put(payload, attachment=attachment)
 
     def _all_keys(self) -> list[_Key]:
         with self._lock:
             return list(self._keys.values())
 
-    def _appeared(self, who: Announcement) -> None:
-        """Handle a new subscriber of any topic."""
+    def _appeared(self, who: topics.Announcement) -> None:
         if who.topic != self.topic:
             return
-        if who.type_hash == NO_HASH:
-            self._open_rmw(NO_HASH)
+        if who.type_hash == topics.NO_HASH:
+            self._open_rmw(topics.NO_HASH)
         self._came.set()
 
     def _open_rmw(self, type_hash: str) -> None:
-        key = rmw_key(self.domain, self.topic, type_hash)
+        key = topics.rmw_key(self.domain, self.topic, type_hash)
         if self._open(key, hashlib.blake2b(key.encode(), digest_size=16).digest()):
-            what = Announcement(End.PUBLISHER, self.topic, type_hash)
+            what = topics.Announcement(topics.End.PUBLISHER, self.topic, type_hash)
             self.node.announce(what, self.delivery)
 
     def _open(self, key: str, identity: bytes | None) -> bool:

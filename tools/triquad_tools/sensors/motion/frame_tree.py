@@ -11,9 +11,7 @@ from triquad_format.records.arrays import Doubles, Longs
 from triquad_tools.sensors.motion.track import MAX_GAP_S, Track
 from triquad_tools.sensors.sweep import NoTransformError
 
-STATIC = None
-"""The stamp of a transform that always holds."""
-
+STATIC = None  # the stamp of a transform that always holds
 _RIVAL_NS = 10 * 10**9  # after which a parent counts no more, of which nothing was heard since
 _NEARLY_UNIT = 1e-6  # the length of a quaternion that is left as it is
 _MAX_PARENTS = 8  # of a frame, whose names come from the network
@@ -27,8 +25,7 @@ _CORRECTION = (
     "to move evenly between, else to stay as it was until the next"
 )
 
-ROOT_NAMES = ("map", "odom", "world")
-"""Frames that stand still, as usual in ROS (REP 105), in order of preference."""
+ROOT_NAMES = ("map", "odom", "world")  # stand still (REP 105), in order of preference
 
 
 @dataclass(frozen=True)
@@ -60,18 +57,11 @@ class Transform:
 
 @dataclass
 class _Edge:
-    """The edge from a frame to a parent."""
-
     parent: str
     standing: Doubles | None  # [4, 4] where it always holds
     track: Track
     count: int = 0  # of transforms
     problem: str | None = None  # "" where its poses were checked and are those of one publisher
-
-    @property
-    def text(self) -> str:
-        """What it is, for a user."""
-        return f"{self.parent} ({self.count} times{', static' * (self.standing is not None)})"
 
 
 class FrameTree:
@@ -119,12 +109,8 @@ class FrameTree:
             return
         edge.standing = None
         edge.track.add(stamp_ns, position, quaternion)
-        if self._limit is not None and len(edges) > 1:
-            self._forget_rivals(edges, stamp_ns)
-
-    def _forget_rivals(self, edges: dict[str, _Edge], stamp_ns: int) -> None:
-        """Remove parents that nothing was heard of for a while, and the first of very many."""
-        for rival in list(edges.values()):
+        # Parents go that nothing was heard of for a while, and the first of very many.
+        for rival in list(edges.values()) if self._limit is not None and len(edges) > 1 else ():
             old = rival.standing is None and rival.track.span_ns[1] < stamp_ns - _RIVAL_NS
             if old or len(edges) > _MAX_PARENTS:
                 del edges[rival.parent]
@@ -188,8 +174,7 @@ class FrameTree:
             raise self._unconnected(target, frame)
         shared_from_frame = self._climb(up[: up.index(shared)], stamps_ns)
         shared_from_target = self._climb(down[: down.index(shared)], stamps_ns)
-        target_from_frame: Doubles = np.linalg.inv(shared_from_target) @ shared_from_frame
-        return target_from_frame
+        return np.asarray(np.linalg.inv(shared_from_target) @ shared_from_frame)
 
     def moves(self, target: str, frame: str) -> bool:
         """Return whether it was ever reported that ``frame`` moves in ``target``."""
@@ -269,7 +254,10 @@ class FrameTree:
     def _check_single(self, child: str, edge: _Edge) -> None:
         possible = self._possible(child)
         if len(possible) > 1 and any(each.standing is None for each in possible):
-            parents = " and ".join(each.text for each in possible)
+            parents = " and ".join(
+                f"{each.parent} ({each.count} times{', static' * (each.standing is not None)})"
+                for each in possible
+            )
             choice = " or ".join(f"--map-frame {each.parent}" for each in possible)
             text = f"transforms say where {child} is in {parents}: choose by {choice}"
             raise NoTransformError("two_parents", text)

@@ -1,8 +1,7 @@
 """Sweeps placed in the map, each point where it was when it was measured."""
 
 import numpy as np
-from numpy.typing import NDArray
-from triquad_format.records.arrays import Doubles, Floats, Longs
+from triquad_format.records.arrays import Doubles, Longs
 
 from triquad_tools.sensors.motion.frame_tree import FrameTree
 from triquad_tools.sensors.sweep import PosedScan, Sweep
@@ -26,7 +25,9 @@ def place(sweep: Sweep, frames: FrameTree, target: str) -> PosedScan:
     poses = frames.poses(target, sweep.frame, knots_ns)
     middle = int(np.median(knot))
     relative = np.linalg.inv(poses[middle]) @ poses
-    return PosedScan(_moved(sweep.points, relative, knot), poses[middle])
+    of_points = relative[:, :3].astype(np.float32)[knot]
+    turned = np.einsum("nij,nj->ni", of_points[:, :, :3], sweep.points)
+    return PosedScan(turned + of_points[:, :, 3], poses[middle])
 
 
 def _knots(stamp_ns: int, offsets_s: Doubles) -> tuple[Longs, Longs]:
@@ -39,10 +40,3 @@ def _knots(stamp_ns: int, offsets_s: Doubles) -> tuple[Longs, Longs]:
     used[number] = True
     times = np.minimum(stamp_ns + low + np.flatnonzero(used) * step, stamp_ns + high)
     return times, (np.cumsum(used) - 1)[number]
-
-
-def _moved(points: NDArray[np.floating], poses: Doubles, knot: Longs) -> Floats:
-    """Move each point [N, 3] by the pose [M, 4, 4] of its number."""
-    of_points = poses[:, :3].astype(np.float32)[knot]
-    moved: Floats = np.einsum("nij,nj->ni", of_points[:, :, :3], points) + of_points[:, :, 3]
-    return moved

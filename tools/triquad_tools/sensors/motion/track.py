@@ -6,15 +6,12 @@ from bisect import bisect_left
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from triquad_client.pose import pose_matrices
 from triquad_format.records.arrays import Doubles, Longs
 
 from triquad_tools.sensors.sweep import NoTransformError
 
-MAX_GAP_S = 2.0
-"""Nothing is interpolated between poses that lie farther apart, unless they only correct."""
-
+MAX_GAP_S = 2.0  # between poses farther apart nothing is interpolated, unless they only correct
 _WIDTH = 7  # numbers of a pose
 _NEARLY_PARALLEL = 0.9995  # quaternions, of which spherical interpolation would divide by nearly 0
 _RARER = 3.0  # times, at least, is a correction rarer than the poses that it corrects
@@ -109,7 +106,10 @@ class Track:
         """
         stays = corrects and len(self) > 0 and self.rate_hz < 1.0
         self._check_covered(np.minimum(stamps_ns, self.span_ns[1]) if stays else stamps_ns)
-        stamps, values = self._around(int(stamps_ns.min()), int(stamps_ns.max()))
+        low = max(0, bisect_left(self._stamps, int(stamps_ns.min())) - 1)
+        high = bisect_left(self._stamps, int(stamps_ns.max())) + 1
+        stamps = np.array(self._stamps[low:high], np.int64)
+        values = np.array(self._values[_WIDTH * low : _WIDTH * high]).reshape(-1, _WIDTH)
         after = np.clip(np.searchsorted(stamps, stamps_ns), 1, len(stamps) - 1)
         if len(stamps) == 1:
             after = np.zeros_like(after)
@@ -118,19 +118,15 @@ class Track:
         share = np.minimum((stamps_ns - stamps[before]) / span, 1.0)[:, None]
         first, second = values[before], values[after]
         if corrects:
-            jumps = (span > MAX_GAP_S * 1e9) & _far(first, second)
+            cosine = np.abs((first[:, 3:] * second[:, 3:]).sum(axis=1))
+            turned = 2 * np.arccos(np.clip(cosine, 0, 1)) > _CORRECTED_RAD
+            moved = np.linalg.norm(second[:, :3] - first[:, :3], axis=1) > _CORRECTED_M
+            jumps = (span > MAX_GAP_S * 1e9) & (moved | turned)
             share = np.where(jumps[:, None] & (share < 1), 0.0, share)
         else:
             self._check_gaps(stamps_ns, stamps[before], stamps[after])
         positions = first[:, :3] + share * (second[:, :3] - first[:, :3])
         return pose_matrices(positions, _slerp(first[:, 3:], second[:, 3:], share))
-
-    def _around(self, first_ns: int, last_ns: int) -> tuple[Longs, Doubles]:
-        """Return stamps [K] and values [K, 7] of the poses between two times, and around them."""
-        low = max(0, bisect_left(self._stamps, first_ns) - 1)
-        high = bisect_left(self._stamps, last_ns) + 1
-        values = np.array(self._values[_WIDTH * low : _WIDTH * high], np.float64)
-        return np.array(self._stamps[low:high], np.int64), values.reshape(-1, _WIDTH)
 
     def _check_covered(self, stamps_ns: Longs) -> None:
         if not self._stamps:
@@ -148,17 +144,8 @@ class Track:
         between = (stamps_ns != before) & (stamps_ns != after)
         gaps_s = np.where(between, after - before, 0) / 1e9
         if gaps_s.max() > MAX_GAP_S:
-            raise NoTransformError(
-                "pose_gap", f"between two poses {gaps_s.max():.3g} s apart (at most {MAX_GAP_S:g})"
-            )
-
-
-def _far(first: Doubles, second: Doubles) -> NDArray[np.bool_]:
-    """Return whether poses [M, 7] differ by more than what drifts in seconds."""
-    turned = 2 * np.arccos(np.clip(np.abs((first[:, 3:] * second[:, 3:]).sum(axis=1)), 0, 1))
-    moved = np.linalg.norm(second[:, :3] - first[:, :3], axis=1)
-    far: NDArray[np.bool_] = (moved > _CORRECTED_M) | (turned > _CORRECTED_RAD)
-    return far
+            text = f"between two poses {gaps_s.max():.3g} s apart (at most {MAX_GAP_S:g})"
+            raise NoTransformError("pose_gap", text)
 
 
 def _slerp(first: Doubles, second: Doubles, share: Doubles) -> Doubles:
@@ -170,5 +157,4 @@ def _slerp(first: Doubles, second: Doubles, share: Doubles) -> Doubles:
     of_first = np.where(cosine < _NEARLY_PARALLEL, np.sin((1 - share) * angle), 1 - share)
     of_second = np.where(cosine < _NEARLY_PARALLEL, np.sin(share * angle), share)
     between = of_first * first + of_second * second
-    turned: Doubles = between / np.linalg.norm(between, axis=1, keepdims=True)
-    return turned
+    return np.asarray(between / np.linalg.norm(between, axis=1, keepdims=True))

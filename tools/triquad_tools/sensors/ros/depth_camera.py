@@ -11,7 +11,7 @@ from triquad_client.depth_image import Intrinsics, depth_points
 from triquad_client.errors import InvalidScanError
 
 from triquad_tools.sensors.lens import LensCamera, lens_camera
-from triquad_tools.sensors.ros.header import frame_name, stamp_ns
+from triquad_tools.sensors.ros.type_store import frame_name, stamp_ns
 from triquad_tools.sensors.sweep import NoScanError, Sweep
 
 _FAR_M = 500.0  # half of the pixels of no depth camera are farther
@@ -128,12 +128,9 @@ def _decompressed(image: Any, info: Any) -> NDArray[Any]:
 
 
 def _pixels(image: Any) -> NDArray[Any]:
-    """Return a view [rows, columns] of an image."""
     if image.encoding not in _ENCODINGS:
-        raise NoScanError(
-            "encoding",
-            f"the image is {image.encoding}: depth comes as {', '.join(_ENCODINGS)}",
-        )
+        known = ", ".join(_ENCODINGS)
+        raise NoScanError("encoding", f"the image is {image.encoding}: depth comes as {known}")
     dtype = np.dtype((">" if image.is_bigendian else "<") + _ENCODINGS[image.encoding])
     step = image.step or image.width * dtype.itemsize
     if image.width * dtype.itemsize > step or image.height * step > len(image.data):
@@ -143,5 +140,4 @@ def _pixels(image: Any) -> NDArray[Any]:
             f"in rows of {step}, but has {len(image.data)} bytes",
         )
     shape = (image.height, image.width)
-    view: NDArray[Any] = np.ndarray(shape, dtype, image.data, 0, (step, dtype.itemsize))
-    return view
+    return np.asarray(np.ndarray(shape, dtype, image.data, 0, (step, dtype.itemsize)))

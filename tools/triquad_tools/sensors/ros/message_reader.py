@@ -8,17 +8,10 @@ from typing import Any
 from triquad_client.pose import Pose
 
 from triquad_tools.sensors.motion.frame_tree import STATIC, Transform
+from triquad_tools.sensors.ros import type_store as types
 from triquad_tools.sensors.ros.depth_camera import camera_topic, sweep_of_depth
-from triquad_tools.sensors.ros.header import frame_name, stamp_ns
 from triquad_tools.sensors.ros.point_cloud import sweep_of_cloud
-from triquad_tools.sensors.ros.type_store import (
-    ODOMETRY,
-    PATH,
-    POINT_CLOUD,
-    POSE,
-    TRANSFORM,
-    TRANSFORMS,
-)
+from triquad_tools.sensors.ros.type_store import frame_name, stamp_ns
 from triquad_tools.sensors.sweep import NoScanError, Sweep
 
 
@@ -44,7 +37,7 @@ class MessageReader:
         if isinstance(message, Sweep):
             sweep = message
             self._check_count(len(sweep.points))
-        elif kind == POINT_CLOUD:
+        elif kind == types.POINT_CLOUD:
             self._check_count(message.width * message.height)
             sweep = sweep_of_cloud(message)
         else:
@@ -58,29 +51,27 @@ class MessageReader:
     def transforms(
         self, kind: str, message: Any, came_ns: int, *, static: bool = False
     ) -> list[Transform]:
-        """Return the transforms of a message of transforms, ``static`` or not, or of a pose.
-
-        Without ``by_arrival`` they have the times of the headers.
-        """
+        """Return the transforms of a message of transforms, ``static`` or not, or of a pose."""
         found = self._transforms(kind, message)
         if static:
             return [replace(each, stamp_ns=STATIC) for each in found]
         return [replace(each, stamp_ns=came_ns) for each in found] if self.by_arrival else found
 
     def _transforms(self, kind: str, message: Any) -> list[Transform]:
-        if kind in TRANSFORMS:
-            return list(message)
-        if kind == TRANSFORM:
-            moved = message.transform
-            return [_transform(message, message.child_frame_id, moved.translation, moved.rotation)]
-        if kind == PATH:
+        if kind in (*types.TRANSFORMS, types.TRANSFORM):
+            stamped = [message] if kind == types.TRANSFORM else message.transforms
+            return [
+                _transform(s, s.child_frame_id, s.transform.translation, s.transform.rotation)
+                for s in stamped
+            ]
+        if kind == types.PATH:
             body = self.body_frame
             found = [_posed(each, body, each.pose) for each in message.poses[-self.path_poses :]]
             frame = frame_name(message.header.frame_id)
             return [replace(each, parent=each.parent or frame) for each in found]
-        if kind == POSE:
+        if kind == types.POSE:
             return [_posed(message, self.body_frame, message.pose)]
-        child = message.child_frame_id if kind == ODOMETRY else ""
+        child = message.child_frame_id if kind == types.ODOMETRY else ""
         return [_posed(message, child or self.body_frame, message.pose.pose)]
 
     def _camera(self, topic: str) -> Any:
@@ -108,9 +99,6 @@ def _posed(message: Any, child: str, pose: Any) -> Transform:
 
 def _transform(message: Any, child: str, position: Any, rotation: Any) -> Transform:
     quaternion = rotation.x, rotation.y, rotation.z, rotation.w
-    return Transform(
-        parent=frame_name(message.header.frame_id),
-        child=frame_name(child),
-        stamp_ns=stamp_ns(message.header),
-        pose=Pose((position.x, position.y, position.z), quaternion),
-    )
+    pose = Pose((position.x, position.y, position.z), quaternion)
+    parent = frame_name(message.header.frame_id)
+    return Transform(parent, frame_name(child), stamp_ns(message.header), pose)

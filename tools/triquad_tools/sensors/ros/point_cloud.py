@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from triquad_format.records.arrays import Floats
 
 from triquad_tools.sensors.point_times import offsets_s, time_fields
-from triquad_tools.sensors.ros.header import frame_name, stamp_ns
+from triquad_tools.sensors.ros.type_store import frame_name, stamp_ns
 from triquad_tools.sensors.sweep import NoScanError, Sweep
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
@@ -80,8 +80,7 @@ def _column(message: Any, field: Any) -> NDArray[Any]:
     shape = (message.height, message.width)
     if 0 in shape:
         return np.empty(shape, dtype)
-    view: NDArray[Any] = np.ndarray(shape, dtype, message.data, field.offset, strides)
-    return view
+    return np.asarray(np.ndarray(shape, dtype, message.data, field.offset, strides))
 
 
 def _row_step(message: Any) -> int:

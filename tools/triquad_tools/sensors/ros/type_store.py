@@ -1,9 +1,11 @@
-"""Messages of ROS: decoded by the names of their types alone, and written as CDR from arrays.
+"""Messages of ROS: their names, times and types; and written as CDR from arrays.
 
 The library writes messages too, but from objects: large ones take seconds.
 """
 
+import re
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +31,7 @@ TRANSFORMS = (TF, TF_OF_ROS_1)
 MARKER = "visualization_msgs/msg/Marker"
 OCCUPANCY_GRID = "nav_msgs/msg/OccupancyGrid"
 
+_MAX_CHARACTERS = 64  # of the name of a source
 _LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 
 
@@ -36,6 +39,22 @@ _LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 def type_store() -> Typestore:
     """Return the types of ROS 2; those used here are the same in all releases."""
     return get_typestore(Stores.LATEST)
+
+
+def frame_name(name: str) -> str:
+    """Return a frame's name without the leading slash that ROS 1 wrote."""
+    return name.lstrip("/")
+
+
+def stamp_ns(header: Any) -> int:
+    """Return the header's time, nanoseconds since 1970."""
+    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+
+
+def source_of_topic(topic: str) -> str:
+    """Return the source name of a topic's scans: ``/lidar/points`` is ``lidar.points``."""
+    name = re.sub(r"[^A-Za-z0-9_.-]", "_", topic.strip("/").replace("/", "."))
+    return re.sub(r"^[^A-Za-z0-9]+", "", name)[:_MAX_CHARACTERS] or "default"
 
 
 class CdrWriter:

@@ -89,8 +89,6 @@ class OverviewCamera:
 
 
 class _DrawnTile(NamedTuple):
-    """The part of the scene for a tile."""
-
     appearance: Hashable  # if this is another one, the drawing is outdated
     handle: viser.GlbHandle
 
@@ -144,12 +142,9 @@ class MeshLayer(Layer):
         if self.page.source.grows or not self._framed:
             self._camera.follow(points)
             self._framed = self._tiles.loaded
-        by_confidence = self._by.value == _CONFIDENCE
-        colours = (
-            confidence_colours(self.page.source.queries)
-            if by_confidence
-            else height_colours(points[:, 2])
-        )
+        colours = height_colours(points[:, 2])
+        if self._by.value == _CONFIDENCE:
+            colours = confidence_colours(self.page.source.queries)
         self.tell(colours.scale.html)
         for name, tile in wanted.items():
             appearance = (colours.scale.label, colours.scale.low, colours.scale.high, tile.version)

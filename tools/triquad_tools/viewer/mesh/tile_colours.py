@@ -57,10 +57,7 @@ def confidence_colours(queries: MapQueries) -> TileColours:
 
 
 def lit_colours(colours: TileColours, tile: MeshTile) -> Doubles:
-    """Return linear colours [V, 3] for the browser, in the light of a sun and a bright sky.
-
-    They are drawn without lights, which would cost a browser most of all.
-    """
+    """Return linear colours [V, 3] for the browser, in the light of a sun and a bright sky."""
     scale = colours.scale
     places = (np.asarray(colours.values(tile), np.float64) - scale.low) / (scale.high - scale.low)
     up = vertex_normals(tile.vertices.astype(np.float64), tile.faces)

@@ -29,10 +29,8 @@ class NearTiles:
         self.level = level
         self._follower: TileFollower | None = None
         self._roots: set[TileIndex] = set()  # tiles of the coarsest level that are followed
-        self.zero: Doubles = np.zeros(3)
-        """[3] metres, map frame: from where tiles count."""
-        self.ready: set[TileIndex] = set()
-        """The tiles of the coarsest level in which all tiles of this level are loaded."""
+        self.zero: Doubles = np.zeros(3)  # metres, map frame: from where tiles count
+        self.ready: set[TileIndex] = set()  # those of them in which all of this level are loaded
 
     @property
     def loaded(self) -> bool:
@@ -66,7 +64,6 @@ class NearTiles:
             self._follower.close()
 
     def _follow(self, roots: list[TileIndex]) -> None:
-        """Follow the box around some tiles of the coarsest level."""
         low, high = np.min(roots, axis=0), np.max(roots, axis=0)
         steps = np.ndindex(*(high - low + 1))
         around = {(int(low[0] + x), int(low[1] + y), int(low[2] + z)) for x, y, z in steps}

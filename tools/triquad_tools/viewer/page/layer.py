@@ -24,8 +24,7 @@ _LEAST_S = 0.05  # between one refresh and the next, however often it is woken
 
 _PERIOD_S = 0.5
 _LEAST_ASKED_S, _SHARE = 2.0, 0.1  # between the same questions; of the time that goes with them
-Wanted = TypeVar("Wanted", bound=Hashable)
-"""All that an answer depends on, but for the map."""
+Wanted = TypeVar("Wanted", bound=Hashable)  # all that an answer depends on, but for the map
 
 
 class Layer(ABC):
@@ -180,7 +179,6 @@ class Question(Layer, Generic[Wanted]):
         self.tell(answer.html)
 
     def _forget(self) -> None:
-        """Draw nothing."""
         self._answered = None
         self.tell(text_html(self.hint))
         self.draw([])

@@ -34,8 +34,7 @@ class Focus(NamedTuple):
 class Page:
     """The page that its parts draw on; for several threads."""
 
-    source: MapSource
-    """The map, which a part may replace: all others go on with the new one."""
+    source: MapSource  # the map, which a part may replace: all others go on with the new one
 
     def __init__(self, client: viser.ClientHandle) -> None:
         self.client = client

@@ -94,11 +94,7 @@ class Path:
     """A ball that moves from point to point, and what the map answers about it."""
 
     def __init__(self, queries: MapQueries, points: Doubles, radius_m: float) -> None:
-        """Ask about points [N, 3], at least two, metres, map frame.
-
-        Raises:
-            TriquadError: the map does not answer, or not about so long a path.
-        """
+        """Ask about points [N, 3], at least two, metres, map frame."""
         self._points = points
         self._radius_m = radius_m
         self._reach_m = min(max(_LEAST_REACH_M, _REACH_RADII * radius_m), MAX_DISTANCE_M)

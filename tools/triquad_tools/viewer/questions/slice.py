@@ -142,12 +142,8 @@ def _line_distances(max_distance_m: float) -> Doubles:
 def _picture(distance_m: Floats, known: Bools, max_distance_m: float) -> Bytes:
     """Return colours [height, width, 3], the least row first, with lines at round distances.
 
-    Lines end where nothing was seen; those of the surface itself are black.
-
-    Args:
-        distance_m: [rows, columns] at the centres of cells.
-        known: [rows, columns] whether anything was seen there.
-        max_distance_m: where the scale of colours ends.
+    Lines end where nothing was seen, where ``known`` [rows, columns] is false; those of the surface
+    itself are black. The scale of colours ends at ``max_distance_m``.
     """
     rows, columns = known.shape
     figure = Figure((columns * _PIXELS / _DPI, rows * _PIXELS / _DPI), _DPI)
