@@ -24,6 +24,10 @@ def asked(name: str, part: PartT | None, argument: str) -> PartT:
     return part
 
 
+REACH_VOXELS = 0.5
+"""The reach of a surface beyond the voxels in which rays ended, in voxels: it may cut the corner of
+one in which none happened to end. What lies within it of a surface belongs to it."""
+
 NO_LENGTH_M = 1e-6
 """A vector of no more than this length has no direction."""
 

@@ -20,10 +20,7 @@ from triquad_map.compiled.team import MIN_SHARE, Split, in_one
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.field.frozen_field import FieldValues, FrozenField, in_grid
 from triquad_map.surfels.surfel_map import ShownField, SurfelMap
-from triquad_map.view import FieldAnswer
-
-_REACH_VOXELS = 0.5
-"""The reach of a surface beyond the voxels in which rays ended, in voxels."""
+from triquad_map.view import REACH_VOXELS, FieldAnswer
 
 
 class MapRegion(Protocol):
@@ -91,7 +88,7 @@ class FieldView:
             sdf[part] = values.sdf
             if slopes is not None:
                 slopes[part] = values.gradient
-            self._put_status(status[part], points[part], owners, _REACH_VOXELS)
+            self._put_status(status[part], points[part], owners, REACH_VOXELS)
 
         self._for_owners(points, work)
         return FieldAnswer(sdf, status, slopes)
@@ -146,7 +143,7 @@ class FieldView:
         ``SURFACE`` reaches ``reach_m`` beyond the voxels in which rays ended; half a voxel if
         not given.
         """
-        reach = _REACH_VOXELS if reach_m is None else reach_m / self._settings.leaf_m
+        reach = REACH_VOXELS if reach_m is None else reach_m / self._settings.leaf_m
         status = np.empty(len(points), np.uint8)
 
         def work(part: slice, owners: Owners) -> None:

@@ -10,7 +10,7 @@ from triquad_format.records.status import Status
 from triquad_format.wire.limits import MAX_ITERATIONS
 
 from triquad_map.questions.distance import DistanceOptions, distances
-from triquad_map.view import MapView
+from triquad_map.view import REACH_VOXELS, MapView
 
 _COARSE_POINTS = 500
 """The number of points that find the way; all that follows asks for a few millimetres."""
@@ -18,31 +18,16 @@ _COARSE_POINTS = 500
 FINE_POINTS = 2000
 """About the number of points that are used in the end, however many are given."""
 
-_PER_RANGE = 0.1
-"""The share a metre of its range by which a point's distance counts less at first: a wrong guess
-of the rotation moves far points most."""
-
-_REACH_SCALES = 3.0
-"""A distance of more scales than this has hardly any weight: in the end, it is no inlier's."""
-
-_SURE_VOXELS = 5.0
-"""The scale from which points count by the map's confidence: not at all in unknown space. Before,
-those count, too: of a scan that is off by a metre they lie behind walls, and lead back."""
-
-_FINAL_VOXELS = 0.5
-"""Scale of the distances that count in the end; the noise of a lidar and of the map is less."""
-
 _SHRINK = 0.7
 """The scale becomes smaller by this factor with each step. With 0.5, scans that are off by 2 m and
 10 degrees are sometimes drawn to the wrong wall."""
 
-_COARSE_STEP_M, _FINE_STEP_M = 0.01, 0.002
-"""A step that moves the points by less is the last with few points, and the last."""
+_SETTLED_M = 0.002
+"""A step that moves the points by less is the last."""
 
 _LEAST_INLIER_SHARE = 0.5
-_LEAST_INLIERS = 50
-"""The least share of the points on surfaces, of those of which the map knows, and their number, for
-a pose to be found."""
+"""The least share of the points on surfaces, of those of which the map knows, for a pose to be
+found."""
 
 _OBSERVABLE = 0.01
 """A motion under which distances change by less (mean square, by that of the points) is not seen:
@@ -81,9 +66,10 @@ def align(view: MapView, points: Doubles, guess: Doubles, max_distance_m: float)
 
     The squared distances of its points to the nearest seen surface are made small by Gauss-Newton
     steps on distance and gradient. Points count by a Geman-McClure kernel whose scale shrinks with
-    each step from ``max_distance_m`` to half a voxel (graduated non-convexity). Points in unknown
-    space pull at first (a scan that is off by a metre lies behind walls); in the end points count
-    by the map's confidence, and those in unknown space not at all.
+    each step from ``max_distance_m`` to half a voxel (graduated non-convexity). Until then, points
+    in unknown space pull (a scan that is off by a metre lies behind walls), and far points count
+    less: a wrong guess of the rotation moves them most. In the end points count by the map's
+    confidence, and those in unknown space not at all.
 
     Args:
         view: the map.
@@ -123,12 +109,17 @@ class _Normal:
         step: Doubles = -vectors @ ((vectors.T @ self.vector) / values)
         return step
 
+    @property
+    def witnesses(self) -> float:
+        """The number of points with an error of their own that would say as much."""
+        return self.weight / _CORRELATED
+
     def covariance(self) -> Doubles:
         """Return the covariance of translation and rotation [6, 6]."""
         vectors, values = self.seen()
         scaling = np.repeat([1.0, self.arm_m], 3)
         information = (vectors * values) @ vectors.T * np.outer(scaling, scaling)
-        information *= self.weight / (_CORRELATED * max(self.variance, 1e-12))
+        information *= self.witnesses / max(self.variance, 1e-12)
         weak = np.repeat([1 / _UNSEEN_M**2, 1 / _UNSEEN_RAD**2], 3)
         covariance = np.linalg.inv(information + np.diag(weak))
         symmetric: Doubles = (covariance + covariance.T) / 2
@@ -146,20 +137,18 @@ class _Found:
 
 def _descend(view: MapView, fine: Doubles, pose: Doubles, max_distance_m: float) -> _Found:
     points = thinned(fine, _COARSE_POINTS)
-    final = _FINAL_VOXELS * view.voxel_m
+    final = REACH_VOXELS * view.voxel_m
     scale = max(max_distance_m, final)
     for iteration in range(1, MAX_ITERATIONS + 1):
         normal = _normal(view, points, pose, scale, max_distance_m)
         if normal.weight == 0.0:
             return _Found(pose, iteration, False)
         step = normal.step()
-        size = float(np.linalg.norm(step))
         pose = moved(pose, step[:3], step[3:] / normal.arm_m)
-        if scale > final:
-            scale = max(final, _SHRINK * scale)
-        elif points is fine and size < _FINE_STEP_M:
+        if scale == final and np.linalg.norm(step) < _SETTLED_M:
             return _Found(pose, iteration, True)
-        elif size < _COARSE_STEP_M:
+        scale = max(final, _SHRINK * scale)
+        if scale == final:
             points = fine
     return _Found(pose, MAX_ITERATIONS, False)
 
@@ -169,15 +158,15 @@ def _normal(
 ) -> _Normal:
     """Return the normal equations at a pose; their weight is 0 where no point counts."""
     turned = points @ pose[:3, :3].T
-    reach_m = min(max_distance_m, _REACH_SCALES * scale)
-    answer = distances(view, turned + pose[:3, 3], DistanceOptions(reach_m))
+    answer = distances(view, turned + pose[:3, 3], DistanceOptions(max_distance_m))
     distance = answer.distance_m.astype(np.float64)
-    is_final = scale == _FINAL_VOXELS * view.voxel_m
-    spread = 1.0 if is_final else 1.0 + _PER_RANGE * np.linalg.norm(points, axis=1)
-    counts = answer.found.astype(np.float64)
-    if scale <= _SURE_VOXELS * view.voxel_m:
+    if scale == REACH_VOXELS * view.voxel_m:
+        spread = np.ones(len(points))
         counts = answer.confidence.astype(np.float64)  # 0 in unknown space
-    weights = counts / spread / (1.0 + (distance / (scale * spread)) ** 2) ** 2
+    else:
+        spread = 1.0 + np.linalg.norm(points, axis=1) / max_distance_m
+        counts = answer.found / spread
+    weights = counts / (1.0 + (distance / (scale * spread)) ** 2) ** 2
     weight = float(weights.sum())
     share = weights / max(weight, 1e-12)
     arm_m = max(math.sqrt(float(share @ (turned**2).sum(axis=1))), 1e-6)
@@ -195,24 +184,21 @@ def _normal(
 
 def _judged(view: MapView, points: Doubles, found: _Found, max_distance_m: float) -> Alignment:
     """Return the alignment at the pose where the search ended."""
-    final = _FINAL_VOXELS * view.voxel_m
     world = points @ found.pose[:3, :3].T + found.pose[:3, 3]
     answer = distances(view, world, DistanceOptions(max_distance_m))
-    known = answer.status != Status.UNKNOWN
-    inliers = answer.found & known & (np.abs(answer.distance_m) <= _REACH_SCALES * final)
+    inliers = answer.found & (answer.status == Status.SURFACE)
     count = int(inliers.sum())
-    share = count / max(int((answer.found | known).sum()), 1)
+    share = count / max(int((answer.found | (answer.status != Status.UNKNOWN)).sum()), 1)
     squares = answer.distance_m[inliers].astype(np.float64) ** 2
     rms_m = math.sqrt(float(squares.sum()) / max(count, 1))
-    normal = _normal(view, points, found.pose, final, max_distance_m)
-    all_seen = len(normal.seen()[1]) == 6
-    enough = count >= _LEAST_INLIERS and share >= _LEAST_INLIER_SHARE
+    normal = _normal(view, points, found.pose, REACH_VOXELS * view.voxel_m, max_distance_m)
+    holds = len(normal.seen()[1]) == 6 and normal.witnesses > 6
     return Alignment(
         world_from_sensor=found.pose,
         covariance=normal.covariance(),
         inlier_share=share,
         rms_m=rms_m,
-        converged=found.settled and enough and all_seen,
+        converged=found.settled and holds and share >= _LEAST_INLIER_SHARE,
         iterations=found.iterations,
         points=len(points),
         epoch=view.epoch,
