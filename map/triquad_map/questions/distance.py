@@ -12,16 +12,14 @@ from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats
 from triquad_format.records.status import Status
 
 from triquad_map.surface import DISC_RADIUS
-from triquad_map.view import NO_LENGTH_M, MapView, NearestSurface, asked
+from triquad_map.view import NO_LENGTH_M, REACH_VOXELS, MapView, NearestSurface, asked
 
 # Arrays take numbers sooner than they take members of an enumeration.
 _FREE, _SURFACE, _UNKNOWN = int(Status.FREE), int(Status.SURFACE), int(Status.UNKNOWN)
 
-_FIELD_VOXELS = 0.5
-"""The distance up to which the trained field counts alone, in voxels."""
-
-_SURFEL_VOXELS = 1.5
-"""The distance from which on the surfels count alone, in voxels."""
+_SURFEL_VOXELS = 1 + REACH_VOXELS
+"""The distance from which on surfels count alone, in voxels: a voxel and its reach are no wider. Up
+to the reach the trained field does."""
 
 _WIDENED_VOXELS = float(np.sqrt(0.5)) - DISC_RADIUS
 """The way from a disc's rim to where it meets those of the next voxels, at their corners."""
@@ -177,7 +175,7 @@ def _join_field(
     """Take the side of ``rows`` near a surface from the field, and gradually its value."""
     if not len(rows):
         return
-    low, high = _FIELD_VOXELS * view.voxel_m, _SURFEL_VOXELS * view.voxel_m
+    low, high = REACH_VOXELS * view.voxel_m, _SURFEL_VOXELS * view.voxel_m
     field = view.query(points[rows], gradient=True)
     usable = np.isfinite(field.sdf) & (np.abs(field.gradient).max(axis=1) > 0)
     rows = rows[usable]
@@ -218,7 +216,7 @@ def _join_rays(
     close[is_point] = distance[rows[is_point]] - DISC_RADIUS * view.voxel_m
     below = points[rows] - height[:, None] * normal  # the points, moved onto the planes
     ended = view.status(below, reach_m=0.0) == _SURFACE  # else beyond an edge
-    behind = ended & (height < 0) & (height > -_FIELD_VOXELS * view.voxel_m) & (beyond == 0)
+    behind = ended & (height < 0) & (height > -REACH_VOXELS * view.voxel_m) & (beyond == 0)
     side = np.where(behind, -1.0, 1.0)
     share = _surfel_share(view, distance[rows])
     distance[rows] = side * (share * distance[rows] + (1 - share) * close)
@@ -231,7 +229,7 @@ def _join_rays(
 
 def _surfel_share(view: MapView, distance: Doubles) -> Doubles:
     """Return how much the distance to the surfels counts there [N]: from 0 to 1, without a kink."""
-    low, high = _FIELD_VOXELS * view.voxel_m, _SURFEL_VOXELS * view.voxel_m
+    low, high = REACH_VOXELS * view.voxel_m, _SURFEL_VOXELS * view.voxel_m
     share = np.clip((distance - low) / (high - low), 0.0, 1.0)
     return np.asarray(share * share * (3.0 - 2.0 * share), np.float64)
 

@@ -8,20 +8,12 @@ from triquad_format.records.status import Status
 
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.questions.rays import trace
-from triquad_map.questions.segments import STEP_VOXELS
-from triquad_map.view import MapView
-
-_TOLERANCE_VOXELS = 0.5
-"""The most that ground may lie above its point, and that need not be seen above the ground: a
-surface may cut the corner of a voxel in which no ray happened to end."""
+from triquad_map.view import REACH_VOXELS, MapView
 
 _STEEP = 0.5
 """The normal's z of a surface at 60 degrees. What is steeper is a wall, which is not stepped down
 to as if it were a plane; down to as much overhang, the top edge of a wall bears: it leans as the
 field says."""
-
-_LONGEST_REST_M = 0.02
-"""The longest way from where a ray met the surface to the surface."""
 
 _DOWN = np.array([0.0, 0.0, -1.0])
 
@@ -60,7 +52,7 @@ class _Columns:
 def ground(view: MapView, points: Doubles, max_drop_m: float) -> Ground:
     """Return the ground at most ``max_drop_m`` below ``points`` [N, 3], metres, map frame."""
     columns = _columns(view, points, max_drop_m)
-    unseen_m = np.where(columns.hit, _TOLERANCE_VOXELS * view.voxel_m, 0.0)
+    unseen_m = np.where(columns.hit, REACH_VOXELS * view.voxel_m, 0.0)
     to_see_m = np.maximum(columns.depths - unseen_m, 0.0)
     seen_m = _seen_down(view, columns.starts, to_see_m)
     clear = (seen_m >= to_see_m) & ~columns.buried
@@ -83,11 +75,8 @@ def _stand(view: MapView, answer: Ground, rows: Longs, places: Doubles) -> None:
     up = here.gradient[:, 2]
     # Else it is met from behind, or unknown: no ray ended near.
     bears = (up > -_STEEP) & (here.confidence > 0) & _ended_near(view, places)
-    # The rest of the way to the surface, as if that were a plane.
-    rest_m = here.distance_m / np.maximum(up, _STEEP)
-    heights = places[:, 2] - np.clip(rest_m, -_LONGEST_REST_M, _LONGEST_REST_M)
     answer.status[rows[bears]] = Status.SURFACE
-    answer.height_m[rows[bears]] = heights[bears]
+    answer.height_m[rows[bears]] = places[bears, 2]
     answer.normal[rows[bears]] = here.gradient[bears]
     answer.confidence[rows[bears]] = here.confidence[bears]
 
@@ -100,7 +89,7 @@ def _columns(view: MapView, points: Doubles, max_drop_m: float) -> _Columns:
     hit = trace(view, starts, down, ranges=depths)
     buried = hit & (depths <= 0)
     low = np.flatnonzero(buried)
-    lift_m = _TOLERANCE_VOXELS * view.voxel_m
+    lift_m = REACH_VOXELS * view.voxel_m
     starts[low, 2] += lift_m
     again = np.full(len(low), max_drop_m + lift_m)
     hit[low] = trace(view, starts[low], down[low], ranges=again)
@@ -125,7 +114,7 @@ def _seen_down(view: MapView, starts: Doubles, depths: Doubles) -> Doubles:
         going = going[(status != Status.UNKNOWN) & ~_is_new(view, places, status, left_m)]
         seen_m[going] = at[going]
         going = going[at[going] < depths[going]]
-        at[going] = np.minimum(at[going] + STEP_VOXELS * view.voxel_m, depths[going])
+        at[going] = np.minimum(at[going] + REACH_VOXELS * view.voxel_m, depths[going])
     return seen_m
 
 
@@ -147,7 +136,7 @@ def _ended_near(view: MapView, points: Doubles) -> Bools:
 
     Where none did, the field goes on from what lies next to it, as if a hole were covered.
     """
-    near_m = _TOLERANCE_VOXELS * view.voxel_m
+    near_m = REACH_VOXELS * view.voxel_m
     ended = np.zeros(len(points), np.bool_)
     for offset_m in (-near_m, 0.0, near_m):
         ended |= view.status(points + offset_m * _DOWN, reach_m=0.0) == Status.SURFACE

@@ -7,11 +7,12 @@ from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats
 from triquad_format.records.status import Status
 
 from triquad_map.questions.distance import DistanceOptions, distances
-from triquad_map.questions.segments import STEP_VOXELS
-from triquad_map.view import MapView
+from triquad_map.view import REACH_VOXELS, MapView
 
-_HIT_M = 0.005
-_LEAST_STEP_M = 0.02
+_HIT_VOXELS = 0.025
+"""A ray that comes as near to a surface meets it, in voxels; so short is the least step, too. From
+there it is as far as the distance says that fell until then."""
+
 _TOUCH_M = 1e-5
 """A ray that comes as near to unknown space has reached it: its places are no more exact."""
 
@@ -59,20 +60,21 @@ def trace(view: MapView, origins: Doubles, directions: Doubles, ranges: Doubles)
     before = np.zeros(len(origins))  # distance at the last place
     step = np.zeros(len(origins))  # from there
     going = np.arange(len(origins))
-    ask = DistanceOptions(min(_LOOK_AHEAD_M, float(ranges.max(initial=_HIT_M))))
+    hit_m = _HIT_VOXELS * view.voxel_m
+    ask = DistanceOptions(min(_LOOK_AHEAD_M, float(ranges.max(initial=hit_m))))
     while len(going):
         points = origins[going] + at[going, None] * directions[going]
         distance = distances(view, points, ask).distance_m.astype(np.float64)
-        inside = distance <= _HIT_M
-        # Between the last place and this one the distance falls about evenly.
-        share = np.clip(before[going] / np.maximum(before[going] - distance, 1e-9), 0.0, 1.0)
-        reached = np.where(distance < 0, at[going] - (1 - share) * step[going], at[going])
-        hit[going[inside]] = True
-        ranges[going[inside]] = np.clip(reached[inside], 0.0, ranges[going[inside]])
+        met = distance <= hit_m
+        # The distance goes on to fall about as it did from the last place to this one.
+        fall = np.maximum(before[going] - distance, 1e-9)
+        rest = np.minimum(step[going] * distance / fall, REACH_VOXELS * view.voxel_m)
+        hit[going[met]] = True
+        ranges[going[met]] = np.clip((at[going] + rest)[met], 0.0, ranges[going[met]])
         before[going] = distance
-        step[going] = np.maximum(distance, _LEAST_STEP_M)
+        step[going] = np.maximum(distance, hit_m)
         at[going] += step[going]
-        going = going[~inside & (at[going] < ranges[going])]
+        going = going[~met & (at[going] < ranges[going])]
     return hit
 
 
@@ -80,7 +82,7 @@ def _stop_at_unknown(
     view: MapView, origins: Doubles, directions: Doubles, ranges: Doubles, status: Bytes
 ) -> None:
     """Shorten the rays that enter unknown space."""
-    step_m = STEP_VOXELS * view.voxel_m
+    step_m = REACH_VOXELS * view.voxel_m
     at = np.zeros(len(origins))
     going = np.arange(len(origins))
     while len(going):

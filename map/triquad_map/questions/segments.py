@@ -13,10 +13,7 @@ from triquad_map.questions.distance import (
     are_free,
     distances,
 )
-from triquad_map.view import MapView
-
-STEP_VOXELS = 0.5
-"""Between places that are checked, where nothing allows a longer step."""
+from triquad_map.view import REACH_VOXELS, MapView
 
 
 @dataclass(frozen=True)
@@ -66,7 +63,7 @@ def segments(
     lengths = np.linalg.norm(ends - starts, axis=1)
     directions = (ends - starts) / np.maximum(lengths, 1e-12)[:, None]
     reach_m = max(max_distance_m, radius_m + view.voxel_m)
-    step_m = STEP_VOXELS * view.voxel_m
+    step_m = REACH_VOXELS * view.voxel_m
 
     def to_surface(points: Doubles) -> Doubles:
         return distances(view, points, DistanceOptions(reach_m)).distance_m.astype(np.float64)
