@@ -63,10 +63,6 @@ NEAR_M = 10.0
 LEAST_STRENGTH = 0.25
 """The strength of level 1; each further level is twice as strong."""
 
-UNLEARNT_SHARE = 0.5
-"""The share of the confidence where rays ended but the field shows no surface. What stands for it
-is off by half a voxel (median) on a street; a disc of the field by a fiftieth."""
-
 HALF_LIFE_S = 86_400.0
 """While the rest of the map was seen again, confidence in what was not halves in this time."""
 
@@ -182,9 +178,13 @@ def _surfels_of_field(voxels: Longs, field: SampleField, seen: Seen) -> Surfels:
 
 
 def support_confidence(levels: Bytes, kinds: Bytes) -> Floats:
-    """Return the confidence [N] of surfels of a :class:`SurfelKind` at these levels, just seen."""
-    shares = np.where(kinds == SurfelKind.DISC, np.float32(1), np.float32(UNLEARNT_SHARE))
-    return np.asarray(level_confidence()[levels] * shares, np.float32)
+    """Return the confidence [N] of surfels of a :class:`SurfelKind` at these levels, just seen.
+
+    Where the field shows no surface it is no more than that of level 1: what stands for it is off
+    by half a voxel (median) on a street; a disc of the field by a fiftieth.
+    """
+    sure = np.where(kinds == SurfelKind.DISC, levels, np.minimum(levels, 1))
+    return level_confidence()[sure]
 
 
 def level_confidence() -> Floats:

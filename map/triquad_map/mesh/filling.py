@@ -28,11 +28,9 @@ _STEEPNESS = 0.7
 """The least share of the way from a voxel behind a surface to a voxel before it by which the field
 rises."""
 
-_COSINE = 0.9
-"""The least cosine of the angle between the normals of surface in two neighbouring voxels."""
-
 _OFF_PLANE = 0.25
-"""The most that the surface in each of them lies off the other's plane, in voxels."""
+"""The most that the surface in each of two neighbouring voxels lies off the other's plane, in
+voxels."""
 
 _AROUND = np.array([step for step in np.ndindex(3, 3, 3) if step != (1, 1, 1)]) - 1  # [26, 3]
 
@@ -157,10 +155,8 @@ def _distance_like(view: ComposedView, field: SampleField, voxels: Longs) -> _Pa
 def _aligned(one: _Patches, other: _Patches) -> Bools:
     """Return whether patches [N] lie in one plane with ``other`` ones, as far as can be asked."""
     way = other.points - one.points
-    level: Bools = (one.normals * other.normals).sum(axis=1) >= _COSINE
-    for normals in (one.normals, other.normals):
-        level &= np.abs((way * normals).sum(axis=1)) <= _OFF_PLANE
-    return level
+    off = [np.abs((way * patches.normals).sum(axis=1)) for patches in (one, other)]
+    return np.asarray(np.maximum(*off) <= _OFF_PLANE)
 
 
 def on_filled(view: ComposedView, filled: FilledVoxels, points: Doubles, reach_m: float) -> Bools:
