@@ -11,7 +11,9 @@ from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_map.compiled.team import Team
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.mesh.tile_lattice import TileBorder, TileIndex, TileLattice
+from triquad_map.surface import MARGIN_STEP
 from triquad_map.surfels.surfel_map import ShownField, surfel_voxels
+from triquad_map.view import REACH_VOXELS
 
 from triquad_server.epochs.epoch import FrozenRegion
 
@@ -21,13 +23,7 @@ _AROUND = [
 
 _KEY_BITS = 20  # bits of each coordinate of a voxel, or of a group, in its region
 
-_LEFT_SHARE = 0.02
-_LEFT_VOXELS = 4
-"""Something was removed if the surface left this many voxels of a group, and that share of them; if
-fewer, the cause is training, during which some always change."""
-
-_FARTHER = 2
-"""The quarters of a voxel by which what was seen of it must grow to be reported."""
+_FARTHER = REACH_VOXELS / MARGIN_STEP  # the growth of what was seen of a voxel to be reported
 
 
 @dataclass(frozen=True)
@@ -67,8 +63,7 @@ class SurfaceChanges:
     gradient. While a field is trained, single voxels are never at rest; so a group changes where
 
     * a voxel with seen surface is new, or forgotten, or was seen half a voxel farther;
-    * the surface left some voxels (moved by more than half their side);
-    * it moved by more than the tolerance in more than half of the group's voxels, since the group
+    * the surface moved by more than the tolerance in more than half of the group's voxels, since the group
       was last reported: small movements add up.
     """
 
@@ -123,15 +118,12 @@ class SurfaceChanges:
             return np.bincount(voxels.group[chosen], minlength=len(voxels.groups))
 
         size = np.bincount(voxels.group, minlength=len(voxels.groups))
-        left = moved > self._settings.leaf_m / 2
-        many_left = count(left) >= np.maximum(_LEFT_VOXELS, _LEFT_SHARE * size)
         drifted = 2 * count(moved > self._tolerance_m) > size
-        reported = drifted | many_left | (count(is_new) > 0)
+        reported = drifted | (count(is_new) > 0)
         is_reported = reported[voxels.group]
         offsets = np.where(is_reported, now, before)
         margins = np.where(is_reported[:, None], voxels.margins, margins)
-        places = is_new | (left & many_left[voxels.group])
-        keys = np.concatenate([gone, voxels.keys[places]])
+        keys = np.concatenate([gone, voxels.keys[is_new]])
         recorded = _Recorded(
             region.centre,
             region.field,
