@@ -41,10 +41,10 @@ class FairQueue(Generic[ItemT]):
         """Return how many items of a group wait."""
         return sum(map(len, self._groups.get(group, {}).values()))
 
-    def oldest(self) -> Iterator[tuple[ItemT, int]]:
-        """Yield an oldest item of each group, and how many of the group wait."""
-        for group, names in self._groups.items():
-            yield next(iter(names.values()))[0][0], self.count(group)
+    def oldest(self) -> Iterator[ItemT]:
+        """Yield an oldest item of each group."""
+        for names in self._groups.values():
+            yield next(iter(names.values()))[0][0]
 
     def put(self, owner: Owner, item: ItemT, nbytes: int) -> list[ItemT]:
         """Add an item; return those that are removed for it, of which it may be one."""

@@ -23,10 +23,8 @@ MAX_SOURCES_WAITING = 64
 """The number of sources that may each have the full number of scans wait; more share that."""
 
 _BEHIND = 0.25
-"""A source falls behind if more than this share of its limit waits."""
-
-_PRESSED = 0.5
-"""Questions give way to scans once more than this share of a source's limit waits."""
+"""A source falls behind if more than this share of its limit waits: then more of its scans are
+taken, and questions give way to them."""
 
 _GIVE_WAY_S = 0.05
 """Each question waits this many seconds at most: it is late then, but scans that do not fit in the
@@ -130,8 +128,8 @@ class ScanQueue:
     def _is_pressed(self, waited_s: float) -> bool:
         before_s = time.monotonic() - waited_s
         return any(
-            count > _PRESSED * self.limit and waiting.arrived_s <= before_s
-            for waiting, count in self._scans.oldest()
+            self._falls_behind(waiting.scan.source) and waiting.arrived_s <= before_s
+            for waiting in self._scans.oldest()
         )
 
     def _falls_behind(self, source: str) -> bool:

@@ -191,7 +191,7 @@ def test_a_source_is_passed_over_until_it_falls_behind():
 
 def test_questions_give_way_while_a_source_is_about_to_lose_scans(monkeypatch):
     monkeypatch.setattr(scan_queue, "_GIVE_WAY_S", servers.WAIT_S)
-    queue = ScanQueue(limit=8)
+    queue = ScanQueue(limit=16)
     for sequence in range(4):
         queue.put(servers.scan(sequence))
     queue.give_way()  # returns at once
