@@ -180,11 +180,10 @@ def _surfels_of_field(voxels: Longs, field: SampleField, seen: Seen) -> Surfels:
 def support_confidence(levels: Bytes, kinds: Bytes) -> Floats:
     """Return the confidence [N] of surfels of a :class:`SurfelKind` at these levels, just seen.
 
-    Where the field shows no surface it is no more than that of level 1: what stands for it is off
-    by half a voxel (median) on a street; a disc of the field by a fiftieth.
+    Where the field shows no surface it is that of level 0: what stands for it is off by half a
+    voxel (median) on a street; a disc of the field by a fiftieth.
     """
-    sure = np.where(kinds == SurfelKind.DISC, levels, np.minimum(levels, 1))
-    return level_confidence()[sure]
+    return level_confidence()[np.where(kinds == SurfelKind.DISC, levels, 0)]
 
 
 def level_confidence() -> Floats:
