@@ -35,8 +35,8 @@ the map's normals are off by some degrees, which appear as much."""
 
 _CORRELATED = 5.0
 """The number of points that count as one with an error of its own: neighbours share the map's. With
-this the squared errors at real scans are 2 to 4 times what the covariance says, as the poses of their
-maps have errors, too; at simulated ones a third."""
+this the squared errors at real scans are 2 to 4 times what the covariance says, as the poses of
+their maps have errors, too; at simulated ones a third."""
 
 _UNSEEN_M, _UNSEEN_RAD = 100.0, math.pi
 """Standard deviations along what is not seen at all."""

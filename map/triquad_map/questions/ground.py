@@ -11,8 +11,8 @@ from triquad_map.questions.rays import trace
 from triquad_map.view import REACH_VOXELS, MapView
 
 _STEEP = 0.5
-"""The normal's z of a surface at 60 degrees. What is steeper is a wall: what is new there is not in the
-way down. Down to as much overhang, the top edge of a wall bears: it leans as the field says."""
+"""The normal's z of a surface at 60 degrees. What is steeper is a wall: what is new there is not in
+the way down. Down to as much overhang, the top edge of a wall bears: it leans as the field says."""
 
 _DOWN = np.array([0.0, 0.0, -1.0])
 
