@@ -63,8 +63,8 @@ class SurfaceChanges:
     gradient. While a field is trained, single voxels are never at rest; so a group changes where
 
     * a voxel with seen surface is new, or forgotten, or was seen half a voxel farther;
-    * the surface moved by more than the tolerance in more than half of the group's voxels, since the
-      group was last reported: small movements add up.
+    * the surface moved by more than the tolerance in more than half of a group, since it
+      was last reported: small movements add up.
     """
 
     def __init__(
