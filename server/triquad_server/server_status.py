@@ -80,7 +80,8 @@ class Health:
             uptime_s=time.monotonic() - self.started_s,
             last_checkpoint=self.checkpoints.last,
             store_error=self.checkpoints.error,
-            warnings=self.warnings.all(),
+            warnings="\n".join(filter(None, (self.checkpoints.warning, self.warnings.all())))
+            or None,
             samples_left=progress.map.samples_left,
             map_bytes=progress.map.map_bytes,
             map_max_bytes=self.map_max_bytes,

@@ -77,6 +77,7 @@ class CheckpointMetrics(Message):
     failed: Count
     last_duration_s: Duration | None  # None before any was written
     age_s: Duration | None  # since the last one was written, by this server
+    late_s: Duration = 0.0  # for which more is unsaved than there may be: two periods
 
 
 @dataclass(frozen=True)

@@ -56,6 +56,7 @@ gauge     triquad_resident_memory_bytes        metrics.resident_bytes           
 counter   triquad_checkpoints_total            metrics.checkpoints.{outcome:written+failed}         Checkpoints by outcome
 gauge     triquad_checkpoint_duration_seconds  metrics.checkpoints.last_duration_s                  How long writing the last checkpoint took
 gauge     triquad_checkpoint_age_seconds       metrics.checkpoints.age_s                            Time since the last checkpoint of this process was written
+gauge     triquad_checkpoint_late_seconds      metrics.checkpoints.late_s                           For how long more is unsaved than two periods
 gauge     triquad_checkpoint_bytes             status.last_checkpoint.bytes                         Size of the last checkpoint with all its parts
 """  # noqa: E501
 

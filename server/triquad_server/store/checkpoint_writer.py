@@ -13,7 +13,6 @@ from triquad_format.wire.messages import (
     ResetRequest,
 )
 from triquad_format.wire.metrics_messages import CheckpointMetrics
-from triquad_map.compiled.team import lower_priority
 
 from triquad_server.errors import (
     NO_MEMORY,
@@ -24,10 +23,11 @@ from triquad_server.errors import (
 from triquad_server.intake.source_trails import SourceTrails
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
-from triquad_server.process.threads import NICENESS
 from triquad_server.store.store import Store
 
 _log = logging.getLogger(__name__)
+
+_LATE_PERIODS = 2.0  # after so many, what is mapped should be on the disk
 
 _NO_STORE = "the server was started without a store: the map is not kept"
 
@@ -35,7 +35,8 @@ _NO_STORE = "the server was started without a store: the map is not kept"
 class CheckpointWriter:
     """Writes the map to its store, from time to time on a thread of its own.
 
-    A store that fails never stops the mapping.
+    A store that fails never stops the mapping. The thread has the priority of queries, not that of
+    mapping: beside other programs, checkpoints would come ever later.
     """
 
     def __init__(
@@ -51,6 +52,7 @@ class CheckpointWriter:
         self._period_s = period_s
         self._stopping = threading.Event()
         self._metrics = CheckpointMetrics(0, 0, None, None)
+        self._saved_s = time.monotonic()  # when the map was as the newest checkpoint has it
         self._ended_s: float | None = None  # when the last was written, monotonic
         self._timer = threading.Thread(target=self._write_regularly, name="checkpoints")
         self._writing = threading.RLock()  # locked while anything is written
@@ -70,7 +72,27 @@ class CheckpointWriter:
     def metrics(self) -> CheckpointMetrics:
         """Return how many checkpoints were written, and how long the last took."""
         age_s = None if self._ended_s is None else time.monotonic() - self._ended_s
-        return replace(self._metrics, age_s=age_s)
+        return replace(self._metrics, age_s=age_s, late_s=self.late_s)
+
+    @property
+    def late_s(self) -> float:
+        """Return for how long more is unsaved than there may be; 0: no longer than two periods."""
+        if self._store is None or self._period_s == 0:
+            return 0.0
+        return max(0.0, time.monotonic() - self._saved_s - _LATE_PERIODS * self._period_s)
+
+    @property
+    def warning(self) -> str | None:
+        """Return that checkpoints are late, and what helps; ``None``: they are not."""
+        late_s = self.late_s
+        if late_s == 0:
+            return None
+        unsaved_s = late_s + _LATE_PERIODS * self._period_s
+        return (
+            f"checkpoints are late: what was mapped in the last {unsaved_s:.0f} s is on no disk, "
+            f"with store.period_s = {self._period_s:g}; the server needs more of the processor or "
+            "a faster disk, or a longer period"
+        )
 
     def close(self) -> None:
         """Write a last checkpoint, if the map changed since the one before.
@@ -181,9 +203,11 @@ class CheckpointWriter:
         """Do as :meth:`write`; an error is not recorded yet."""
         base, last = store.base_epoch, self.last
         try:
+            asked_s = time.monotonic()
             snapshot = self._mapper.call(lambda mapper: mapper.snapshot_since(base))
             # The base is the last checkpoint, as long as its file and parts are there.
             if not undoes and last is not None and last.epoch == snapshot.epoch.number == base:
+                self._saved_s = asked_s
                 return last
             started = time.monotonic()
             changes = snapshot.changes()
@@ -191,7 +215,10 @@ class CheckpointWriter:
             info = store.write(changes, undoes)
         except MemoryError as error:
             raise StoreError(f"a checkpoint was not written: {NO_MEMORY}") from error
+        if (warning := self.warning) is not None:
+            _log.warning("%s", warning)
         self._record(info, time.monotonic() - started)
+        self._saved_s = asked_s
         return info
 
     def _record(self, info: CheckpointInfo, took_s: float) -> None:
@@ -204,8 +231,9 @@ class CheckpointWriter:
         _log.info("checkpoint %s: epoch %d, %d bytes", info.path, info.epoch, info.bytes)
 
     def _write_regularly(self) -> None:
-        lower_priority(2 * NICENESS)
-        while not self._stopping.wait(self._period_s):
+        due_s = time.monotonic() + self._period_s
+        while not self._stopping.wait(max(0.0, due_s - time.monotonic())):
+            due_s = time.monotonic() + self._period_s  # from the beginning of one to the next
             self._write_if_changed()
 
     def _write_if_changed(self) -> None:

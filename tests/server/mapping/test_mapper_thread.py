@@ -235,3 +235,20 @@ def test_a_checkpoint_for_which_there_is_no_memory_is_refused_and_the_next_is_wr
         assert checkpoints.metrics().failed == 1
         assert checkpoints.answer(CheckpointRequest()) == checkpoints.last
         assert checkpoints.error is None
+
+
+def test_checkpoints_that_are_late_are_told_until_one_is_written(tmp_path: Path) -> None:
+    """While the mapper's thread is kept at something else, the map cannot be saved."""
+    store, let_go = Store(tmp_path, "test", StoreSettings()), Event()
+    with closing(store), running(learning_mapper()) as mapping, ThreadPoolExecutor() as pool:
+        checkpoints = CheckpointWriter(mapping.thread, store, 2.0, None)
+        assert (checkpoints.warning, checkpoints.metrics().late_s) == (None, 0.0)
+        checkpoints.start()
+        with closing(checkpoints):
+            pool.submit(mapping.thread.call, lambda _: let_go.wait(servers.WAIT_S))
+            servers.until(lambda: checkpoints.warning is not None)
+            assert "store.period_s = 2" in (checkpoints.warning or "")
+            assert checkpoints.metrics().late_s > 0
+            let_go.set()
+            servers.until(lambda: checkpoints.warning is None)
+        assert checkpoints.last is not None
