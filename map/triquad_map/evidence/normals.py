@@ -45,7 +45,12 @@ def find_normal(
             square = (at[0] - here[0]) ** 2 + (at[1] - here[1]) ** 2 + (at[2] - here[2]) ** 2
             if square <= reach * reach:
                 add_points(moments, at, other.ends)
-    return bool(plane_normal(moments, found))
+    if not plane_normal(moments, found):
+        return False
+    height = 0.0
+    for axis in range(3):
+        height += (here[axis] - moments[1 + axis] / moments[0]) * found[axis]
+    return bool(abs(height) <= _ON_PLANE)  # not a drop that hangs over the ground
 
 
 @kernel()
