@@ -131,7 +131,7 @@ def _coupling(row: int, other: int, seen: SeenVoxels, observed: Observed) -> flo
 def _own_odds(voxel: ObservedVoxel, belief: Belief) -> float:
     """Return the logarithm of the odds that a voxel has no surface, by its own record."""
     hits = float(voxel.hits)
-    if voxel.company or is_flat(voxel):
+    if voxel.company:
         hits = max(hits, 1.0) + 1.0  # a whole one, even if other rays of its scan passed
     recorded = belief.vacant - belief.stray * hits + _recorded(voxel)
     return float(max(recorded, belief.leaves) + _missed(voxel))
