@@ -43,13 +43,13 @@ _LONGEST_STEP = 0.5
 """The longest of them on each axis, in voxels. Where the field saturates, longer ones miss the
 surface: on a sparsely seen street distances are off by a sixth more."""
 
-_ON_SURFACE = 0.1
+ON_SURFACE = 0.1
 """The most, in voxels, that the field may be off on a surface. Where the steps lead there is none
 if it is more: where it is flat in the free space of a corner, it comes near zero without crossing
 it. And it has learnt the surface in a voxel if it is no more at the mean of the ends there. With
 0.15, the mesh of a room is half a point of F-score worse after 0.3 million samples."""
 
-_FLATTEST = 0.3
+FLATTEST = 0.3
 """A field that is flatter than this, as a slope, was not trained there, and shows no surface. With
 less, more voxels have discs, and distances are off by more at most."""
 
@@ -144,7 +144,7 @@ def fit_surfels(
     off, kinds = field(places).values, surfels.kinds[rows]
     # Next to a surface in the next voxel, noisy rays end on both sides of the border.
     is_noise = (kinds == SurfelKind.NONE) & (off < 0)
-    is_off = (kinds == SurfelKind.POINT) | (np.abs(off) > _ON_SURFACE)
+    is_off = (kinds == SurfelKind.POINT) | (np.abs(off) > ON_SURFACE)
     unlearnt = rows[is_off & ~is_noise]
     surfels.take(unlearnt, shown.chosen(unlearnt))
     return surfels
@@ -160,12 +160,12 @@ def _surfels_of_field(voxels: Longs, field: SampleField, seen: Seen) -> Surfels:
     points: Doubles = middles
     for _ in range(_STEPS):
         sample = field(points)
-        squares = np.maximum((sample.gradients**2).sum(axis=1), _FLATTEST**2)
+        squares = np.maximum((sample.gradients**2).sum(axis=1), FLATTEST**2)
         steps = -(sample.values / squares)[:, None] * sample.gradients
         points = points + np.clip(steps, -_LONGEST_STEP, _LONGEST_STEP)
     at_end = field(points)
     steepness = np.linalg.norm(at_end.gradients, axis=1)
-    on_surface = (np.abs(at_end.values) < _ON_SURFACE) & (steepness > _FLATTEST)
+    on_surface = (np.abs(at_end.values) < ON_SURFACE) & (steepness > FLATTEST)
     there = np.floor(points).astype(np.int64)
     away = np.abs(there - voxels).max(axis=1, initial=0)
     is_shown = on_surface & (away <= 1)

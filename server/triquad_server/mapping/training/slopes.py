@@ -6,6 +6,7 @@ labels, a ray teaches there a field that is too steep; but the direction of its 
 
 import numpy as np
 from triquad_format.records.arrays import Doubles, Floats, Longs
+from triquad_map.surface import FLATTEST, ON_SURFACE
 
 from triquad_server.engine.live_field import LiveField
 from triquad_server.mapping.replay.ray_table import END, LEAST_SLOPE, RayTable
@@ -16,10 +17,6 @@ _EVERY_SAMPLES = 1 << 15  # samples after which the field is queried
 _SHARE = 0.25
 """The share of the samples that are rays without a normal, whose slope follows the field. Without
 any, a street at 16 beams settles at 0.74 cm instead of 0.60."""
-
-_LEARNT_WITHIN, _LEARNT_SLOPE = 0.25, 0.5
-"""The surface of a field that knows it is as near to a ray's end, in leaves, and its gradient
-longer than that."""
 
 
 class Slopes:
@@ -44,8 +41,8 @@ class Slopes:
             return
         ends = np.ascontiguousarray(table.rows[rays, END : END + 3])
         values = self._field.live_view().evaluate(ends, gradient=True)
-        is_learnt = np.abs(values.sdf) < _LEARNT_WITHIN * self._field.settings.leaf_m
-        is_learnt &= np.linalg.norm(values.gradient, axis=1) > _LEARNT_SLOPE
+        is_learnt = np.abs(values.sdf) < ON_SURFACE * self._field.settings.leaf_m
+        is_learnt &= np.linalg.norm(values.gradient, axis=1) > FLATTEST
         rays, gradients = rays[is_learnt], values.gradient[is_learnt]
         self._pool.set_slopes(rays, _slopes(table, rays, gradients))
 
