@@ -32,9 +32,11 @@ from triquad_map.evidence.observed import (
 )
 from triquad_map.evidence.seen_voxels import SeenVoxels
 
-_PRIOR_SPREAD = 0.15
-"""Standard deviation of the ends in a voxel before any is known, in all directions, in voxels. This
-counts as one end."""
+_LEAST_SPREAD = 0.05
+"""Standard deviation of the ends in a voxel in any direction, at least, in voxels."""
+
+_PRIOR_SPREAD, _PRIOR_ENDS = 0.15, 2.0
+"""The same before any end, in all directions, and the number of ends that this counts as."""
 
 
 class Passing(NamedTuple):
@@ -69,8 +71,8 @@ def _crosses(ray: Passing, corner: Voxel, voxel: ObservedVoxel) -> float:
     v = to_x * second[0] + to_y * second[1] + to_z * second[2]
     if u * u + v * v > 1:
         return 0.0
-    share = float(voxel.ends) / (float(voxel.ends) + 1)
-    prior = (1 - share) * _PRIOR_SPREAD**2
+    share = float(voxel.ends) / (float(voxel.ends) + _PRIOR_ENDS)
+    prior = share * _LEAST_SPREAD**2 + (1 - share) * _PRIOR_SPREAD**2
     uu = share * _across(spread, first, first) + prior
     uv = share * _across(spread, first, second)
     vv = share * _across(spread, second, second) + prior
