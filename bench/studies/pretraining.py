@@ -47,6 +47,7 @@ def _learnt_on(street: int, mlp: Sequence[Floats]) -> Sequence[Floats]:
 
 def _begin_with(mlp: Sequence[Floats], field: LiveField) -> None:
     """Begin with an MLP, but without its weights of Fourier features, which know a place."""
+    field.mlp_steps = 0
     for part, values in zip(field.mlp, mlp, strict=True):
         part.values[0] = values
         part.steps[:] = 0

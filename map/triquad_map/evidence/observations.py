@@ -196,6 +196,7 @@ class Observations:
         voxels["lowest"], voxels["highest"] = eighths[:, :3], EIGHTHS - 1 - eighths[:, 3:]
         for name, counts in zip(_RECORD, outcome_counts(outcomes).T, strict=True):
             voxels[name] = counts
+        voxels["company"] = True  # it was believed
         # The margins that a file has count, however few scans its hits stand for.
         is_sure = margins.any(axis=1)
         voxels["scans"] = np.where(is_sure, MOST_SCANS, np.minimum(voxels["hits"], MOST_SCANS))

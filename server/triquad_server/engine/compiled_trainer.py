@@ -285,6 +285,8 @@ class CompiledTrainer:
 
     def _step_mlp(self, sums: list[Mlp], rates: CompiledRates) -> None:
         """Apply Adam to the MLP, by the gradients of each thread."""
+        share = np.float32(self._field.next_mlp_share())
+        of_mlp = rates._replace(mean_scales=share * rates.mean_scales)
         for part, parameter in enumerate(self._field.mlp):
             gradient = np.sum([thread[part] for thread in sums], axis=0).reshape(1, -1)
-            _step_row(0, gradient, _parameter_rows(parameter), rates)
+            _step_row(0, gradient, _parameter_rows(parameter), of_mlp)

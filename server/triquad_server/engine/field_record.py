@@ -62,7 +62,7 @@ def training_state(field: LiveField, budget_samples: int) -> TrainingState:
         table_steps=tuple(steps[chosen] for chosen in rows),
         mlp_means=tuple(array(part.means[0]).copy() for part in mlp),
         mlp_variances=tuple(array(part.variances[0]).copy() for part in mlp),
-        mlp_steps=int(array(field.mlp[0].steps)[0]),
+        mlp_steps=field.mlp_steps,
         sample_points=np.zeros((0, 3), np.float32),
         sample_labels=np.zeros(0, np.float16),
         budget_samples=budget_samples,

@@ -18,12 +18,15 @@ from triquad_format.records.field_settings import FieldSettings
 PRETRAINED = Path(__file__).with_name("pretrained_mlp.npz")
 """The file with the arrays that :func:`initial_mlp` reads; `make pretrained` writes it."""
 
+_STEPS = 1000
+"""The steps that a pretrained MLP counts as having taken; a young one moves more."""
+
 
 class InitialMlp(NamedTuple):
     """The MLP that a region begins with."""
 
     parts: list[Floats]  # weights [in, out] and bias [out] of each layer in turn
-    is_pretrained: bool
+    steps: int  # steps that it counts as having taken
 
 
 def initial_mlp(settings: FieldSettings, generator: np.random.Generator) -> InitialMlp:
@@ -33,19 +36,18 @@ def initial_mlp(settings: FieldSettings, generator: np.random.Generator) -> Init
     """
     random = random_mlp(settings, generator)
     if settings.encoding == "fourier":
-        return InitialMlp(random, is_pretrained=False)
+        return InitialMlp(random, steps=0)
     stored = _read_pretrained()
     shape = (settings.feature_levels, settings.feature_size, settings.hidden)
     if stored["weights1"].shape != shape or stored["feature_std"] != settings.feature_std:
-        return InitialMlp(random, is_pretrained=False)
+        return InitialMlp(random, steps=0)
     names = ("weights1", "bias1", "weights2", "bias2", "weights3", "bias3")
     parts = [stored[name] for name in names]
     of_features = parts[0].reshape(-1, settings.hidden)
     of_fourier = np.zeros_like(random[0][len(of_features) :])
     logits_per_leaf = np.float32(settings.leaf_m / settings.logit_scale_m)
     last = [part * logits_per_leaf for part in parts[-2:]]
-    pretrained = [np.concatenate([of_features, of_fourier]), *parts[1:-2], *last]
-    return InitialMlp(pretrained, is_pretrained=True)
+    return InitialMlp([np.concatenate([of_features, of_fourier]), *parts[1:-2], *last], _STEPS)
 
 
 def random_mlp(settings: FieldSettings, generator: np.random.Generator) -> list[Floats]:

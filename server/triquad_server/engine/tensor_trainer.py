@@ -69,10 +69,12 @@ class TensorTrainer:
 
     def _step_mlp(self, mlp: tuple[Tensor, ...], rates: Rates) -> None:
         first_row = torch.zeros(1, dtype=torch.int64, device=self._tensor_field.device)
+        share = self._field.next_mlp_share()
+        mlp_rates = rates._replace(learning_rate=share * rates.learning_rate)
         for parameter, weight in zip(self._field.mlp, mlp, strict=True):
             assert weight.grad is not None
             tensors = ParameterTensors.of(parameter)
-            step_rows(tensors, first_row, weight.grad[None], rates=rates)
+            step_rows(tensors, first_row, weight.grad[None], rates=mlp_rates)
 
     def _step_features(self, corners: Corners, gradient: Tensor, rates: Rates) -> None:
         features = ParameterTensors.of(self._field.features)

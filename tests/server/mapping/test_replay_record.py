@@ -79,7 +79,7 @@ def test_the_ends_around_tell_the_slopes_again(team: Team) -> None:
     told = again[ON_FLOOR, VALUE] > 0
     assert told.mean() > 0.99  # not where single points stand out
     off = (again[ON_FLOOR, VALUE] - before[ON_FLOOR, VALUE])[told]
-    assert np.quantile(np.abs(off), 0.95) < 0.05
+    assert np.quantile(np.abs(off), 0.95) < 0.07
     assert off.mean() == pytest.approx(0, abs=0.01)
 
 
