@@ -165,12 +165,9 @@ class TrainingSettings(BaseModel):
     learning_rate: Annotated[float, Field(ge=0, le=1)] = 0.01
     """Learning rate of Adam, before it cools."""
 
-    pool_rays: Annotated[int, Field(ge=100, le=1_000_000_000)] = 1_200_000
-    """Rays that are kept for training, over the whole map, spread evenly over its surface; a large
-    map keeps more, by `rays_per_voxel`. The training budget is at most 20 samples for each."""
-
     rays_per_voxel: Annotated[float, Field(ge=0.01, le=10_000)] = 12.0
-    """Rays that a large map keeps for each voxel with surface."""
+    """Rays that are kept for training, for each voxel with surface, spread evenly over them. The
+    training budget is at most 20 samples for each."""
 
     pool_bytes: Annotated[int, Field(ge=10_000, le=2**50)] = 500_000_000
     """Bytes of all rays that are kept; a map too large for that keeps fewer for each voxel."""

@@ -136,7 +136,7 @@ def test_all_regions_keep_as_many_rays_for_each_voxel_and_tell_what_they_discard
 
 def test_training_beyond_what_the_area_may_owe_is_discarded_and_told() -> None:
     scan = world().scans[0]
-    mapper = mapper_of(scan, chosen=settings(pool_rays=100, rays_per_voxel=0.5))
+    mapper = mapper_of(scan, chosen=settings(rays_per_voxel=0.5))
     voxels = sum(region.evidence.live.surface_voxels for region in mapper.regions)
     assert 0.99 * 10 * voxels < mapper.samples_left <= 10 * voxels
     assert mapper.figures().samples_discarded > 0

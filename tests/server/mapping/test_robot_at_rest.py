@@ -12,7 +12,7 @@ from triquad_tools.simulation.solids import Solid, box
 RNG = np.random.default_rng(0)
 HALF = np.array([0.6, 0.9, 0.45])
 FRONT = np.column_stack([np.full(60, 4.4), RNG.uniform(-0.3, 1.3, 60), RNG.uniform(0.3, 0.8, 60)])
-FEW = {"pool_rays": 60_000, "rays_per_voxel": 1}
+FEW = {"rays_per_voxel": 6}
 
 
 def box_at(x: float) -> Solid:

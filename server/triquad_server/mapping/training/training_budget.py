@@ -27,13 +27,12 @@ class FairShare:
     @classmethod
     def of(cls, voxels: int, training: TrainingSettings) -> "FairShare":
         """Return the share in a map of ``voxels`` voxels with surface."""
-        count = max(1, voxels)
-        wanted = max(training.pool_rays / count, training.rays_per_voxel)
-        kept = min(wanted, training.pool_bytes / RAY_BYTES / count)
+        wanted = training.rays_per_voxel
+        kept = min(wanted, training.pool_bytes / RAY_BYTES / max(1, voxels))
         return cls(
             rays=_STEP ** math.floor(math.log(kept, _STEP)),
             samples=_MOST_PER_RAY * wanted,
-            rays_share=min(1.0, kept / training.rays_per_voxel),
+            rays_share=kept / wanted,
         )
 
 
