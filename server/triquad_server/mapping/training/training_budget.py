@@ -13,7 +13,7 @@ _STEP = 1.1
 done seldom."""
 
 _MOST_PER_RAY = 20.0
-"""Samples that may be left, for each ray that a map of this size keeps."""
+"""Samples that may be left, for each ray that the map is to keep."""
 
 
 @dataclass(frozen=True)
