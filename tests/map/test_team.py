@@ -1,6 +1,7 @@
 """Work that is shared among threads is all done, once, whatever happens."""
 
 import threading
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -41,16 +42,20 @@ def test_an_error_of_one_part_is_raised_when_all_have_ended(team):
 
 
 @pytest.mark.parametrize("is_closed", [False, True])
-def test_two_pieces_of_work_have_both_ended_when_they_return(team, is_closed):
+@pytest.mark.parametrize("failing", [0, THREADS - 1, THREADS])
+def test_all_parts_have_ended_when_they_return(team, is_closed, failing):
     if is_closed:
         team.close()
-    assert team.both(lambda: 1, lambda: 2) == (1, 2)
-    with pytest.raises(ZeroDivisionError):
-        team.both(lambda: 1, lambda: 1 // 0)
     ended = []
-    with pytest.raises(ZeroDivisionError):
-        team.both(lambda: 1 // 0, lambda: ended.append(True))
-    assert ended
+
+    def work(part):
+        ended.append(part)
+        if part == failing:
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError) if failing < THREADS else nullcontext():
+        team.each(work)
+    assert sorted(ended) == list(range(THREADS))
 
 
 def test_work_is_done_once_where_no_thread_can_be_started(team, monkeypatch):
@@ -64,20 +69,19 @@ def test_work_is_done_once_where_no_thread_can_be_started(team, monkeypatch):
 
     with monkeypatch.context() as patched:
         patched.setattr(threading.Thread, "start", refuse)
-        both = team.both(lambda: team.split(len(done), work), lambda: "done")
+        team.split(len(done), work)
     assert (done == 1).all()
     team.split(len(done), work)
     team.close()  # what the pool still had waits no more
     assert (done == 2).all()
-    assert both == (None, "done")
 
 
 def test_the_caller_waits_for_no_thread_that_has_other_work(team):
-    threads = max(1, THREADS - 1)
-    busy, go_on = threading.Barrier(threads + 1), threading.Event()
+    busy, go_on = threading.Barrier(THREADS), threading.Event()
 
-    def work():
-        busy.wait()
+    def work(part):
+        if part > 0:  # on a thread of the team
+            busy.wait()
         go_on.wait()
 
     done = np.zeros(10_000, int)
@@ -87,10 +91,8 @@ def test_the_caller_waits_for_no_thread_that_has_other_work(team):
         team.split(len(done), lambda first, last: done.__setitem__(slice(first, last), 1))
         go_on.set()
 
-    others = [threading.Thread(target=team.both, args=(go_on.wait, work)) for _ in range(threads)]
-    for other in others:
-        other.start()
+    other = threading.Thread(target=team.each, args=(work,))
+    other.start()
     split()
-    for other in others:
-        other.join()
+    other.join()
     assert done.all()

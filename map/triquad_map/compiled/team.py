@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
-from typing import Protocol, TypeVar
+from typing import Protocol
 
 _thread = threading.local()
 
@@ -35,9 +35,6 @@ def is_urgent() -> bool:
 
 THREADS = max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1)
 """Threads that share the work: one per core that this process may use."""
-
-MineT = TypeVar("MineT")
-OtherT = TypeVar("OtherT")
 
 MIN_SHARE = 2048
 """Points of a field below which splitting work costs more than it gains."""
@@ -113,14 +110,6 @@ class Team:
             work(0, count)
         else:
             self._run(lambda part: work(*share(count, part, parts)), parts)
-
-    def both(self, mine: Callable[[], MineT], other: Callable[[], OtherT]) -> tuple[MineT, OtherT]:
-        """Return what two pieces of work return, done in parallel: the caller does ``mine``."""
-        my_result: list[MineT] = []
-        others: list[OtherT] = []
-        works = (lambda: my_result.append(mine()), lambda: others.append(other()))
-        self._run(lambda part: works[part](), 2)
-        return my_result[0], others[0]
 
     def _run(self, work: Callable[[int], None], parts: int) -> None:
         with contextlib.ExitStack() as rest:  # nobody goes on with it later, whatever happens

@@ -75,6 +75,14 @@ class LiveEvidence:
         Returns:
             The row of what is recorded of each ray's voxel; 0 outside the region.
         """
+        rows = self.add_ends(voxels, sighting, split)
+        company = self._observations.arrays.voxels["company"]
+        alone = np.flatnonzero(~company[rows] & (rows > 0))
+        company[rows[alone[have_company(voxels - sighting.origin, alone)]]] = True
+        return rows
+
+    def add_ends(self, voxels: Doubles, sighting: Sighting, split: Split = in_one) -> Ints:
+        """Do as :meth:`record_ends` with rays of many scans: none is asked for its company."""
         self._frozen = None
         rows = np.empty(len(voxels), np.int32)
         done = 0
@@ -84,9 +92,6 @@ class LiveEvidence:
             )
             if self._blocks.count == self._blocks.capacity:
                 self._make_room(more=True)
-        company = self._observations.arrays.voxels["company"]
-        alone = np.flatnonzero(~company[rows] & (rows > 0))
-        company[rows[alone[have_company(voxels - sighting.origin, alone)]]] = True
         self._find_normals(rows, sighting.unlearnt_since, split)
         return rows
 

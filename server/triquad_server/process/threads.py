@@ -13,7 +13,7 @@ _log = logging.getLogger(__name__)
 Arguments = ParamSpec("Arguments")
 
 NICENESS = 2
-"""The niceness of all work but queries, for which somebody waits.
+"""The niceness of all work but queries, for which somebody waits, and checkpoints.
 
 It makes the map give way to other programs as well: while two busy ones run on two cores, 84 of 195
 scans in 30 s are taken in, with 5 61, with 0 109. Amid a stream a query takes 5.0 ms, with 5 4.6,

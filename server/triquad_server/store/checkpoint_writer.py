@@ -36,7 +36,7 @@ class CheckpointWriter:
     """Writes the map to its store, from time to time on a thread of its own.
 
     A store that fails never stops the mapping. The thread has the priority of queries, not that of
-    mapping: beside other programs, checkpoints would come ever later.
+    mapping: while other programs are busy, checkpoints would come ever later.
     """
 
     def __init__(

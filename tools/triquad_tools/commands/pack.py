@@ -208,7 +208,7 @@ def _print_recovery(recovery: RecoveredMap) -> None:
 def _what(loss: Loss) -> str:
     region = "region {} {} {}".format(*loss.key.region)
     if loss.key.topic == TRAINING:
-        return f"training state of {region}: it answers, but learns anew"
+        return f"training state of {region}: it answers, but learns from the start"
     bounds = zip("xyz", loss.minimum.tolist(), loss.maximum.tolist(), strict=True)
     where = ", ".join(f"{axis} {low:.1f} to {high:.1f} m" for axis, low, high in bounds)
     what = {

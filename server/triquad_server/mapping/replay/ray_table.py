@@ -59,10 +59,9 @@ class RayTable(NamedTuple):
         return RayTable(self.rows.take(places, axis=0), self.origin_of[places], self.origins)
 
     @property
-    def ends_newest_last(self) -> Floats:
-        """The end points [R, 3] of the rays, without the single samples, by the age of the rays."""
-        order = np.argsort(self.origin_of, kind="stable")[(self.origin_of < 0).sum() :]
-        return np.ascontiguousarray(self.rows[order, END : END + 3])
+    def ends(self) -> Floats:
+        """The end points [R, 3] of the rays, without the single samples."""
+        return self.rows[self.origin_of >= 0, END : END + 3]
 
 
 class Placement(NamedTuple):

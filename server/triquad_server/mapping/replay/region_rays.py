@@ -46,13 +46,8 @@ class RegionRays:
     def judging_ends(self) -> Floats:
         """Return where rays that are held out end [N, 3] in the region's cube, metres from its
         centre."""
-        ends = self.held_out.table.ends_newest_last
+        ends = self.held_out.table.ends
         return ends[in_cube(ends, self._settings)]
-
-    @property
-    def ends(self) -> Floats:
-        """Return where the pool's rays end [N, 3], metres from the region's centre, newest last."""
-        return self.pool.table.ends_newest_last
 
     def keep(self, rays: RayTable) -> Bools:
         """Keep rays [N]; return which of them are held out."""
