@@ -131,25 +131,29 @@ def rows_around(row: int, reach: int, seen: SeenVoxels, observed: Observed) -> I
                 corner = (i << SHIFT, j << SHIFT, k << SHIFT)
                 block = find_block(seen.blocks, corner[0], corner[1], corner[2], seen.side)
                 if block >= 0:
-                    of_block = observed.rows[observed.places[block]]
-                    count = _add_rows(of_block, corner, middle, reach, rows, count)
+                    place = observed.places[block]
+                    count = _add_rows(place, corner, middle, reach, observed, rows, count)
     return rows[:count]
 
 
 @inner_kernel()
 def _add_rows(
-    of_block: Ints, corner: Voxel, middle: Voxel, reach: int, rows: Ints, count: int
+    place: int, corner: Voxel, middle: Voxel, reach: int, observed: Observed, rows: Ints, count: int
 ) -> int:
     """Add the rows of a block that :func:`rows_around` asks for; returns how many there are now."""
     (x, y, z), (low_x, low_y, low_z) = middle, corner
+    first, last = max(z - reach, low_z) & LOW, min(z + reach, low_z + LOW) & LOW
     for i in range(max(x - reach, low_x), min(x + reach, low_x + LOW) + 1):
         for j in range(max(y - reach, low_y), min(y + reach, low_y + LOW) + 1):
-            column = byte_of(i, j) << SHIFT
-            for k in range(max(z - reach, low_z), min(z + reach, low_z + LOW) + 1):
-                row = of_block[column | (k & LOW)]
-                if row != 0:
-                    rows[count] = row
+            byte = byte_of(i, j)
+            bits = int(observed.ended[place, byte]) >> first
+            k = first
+            while bits != 0 and k <= last:
+                if bits & 1:
+                    rows[count] = observed.rows[place, byte << SHIFT | k]
                     count += 1
+                bits >>= 1
+                k += 1
     return count
 
 
