@@ -21,6 +21,7 @@ _FEW = {
     "messages": 300,
     "files": 40,
     "kills": 1,
+    "busy": 1,
     "disk": 4,
     "clock": 2,
     "cuts": 3,

@@ -47,6 +47,10 @@ class CommandQueue:
         with self._lock:
             return self._commands.popleft() if self._commands else None
 
+    def __bool__(self) -> bool:
+        """Whether any command waits."""
+        return bool(self._commands)
+
     def end(self, why: str) -> None:
         """Take no more commands; those that wait fail with :class:`MapperStoppedError`."""
         with self._lock:

@@ -173,7 +173,7 @@ class MapperThread:
             return else_s
         took_scans = self._ingest_scans(max(_SCANS_S, _SCANS_SHARE * else_s))
         ingested_s = time.monotonic()
-        if not self._mapper.settled:
+        if not (self._mapper.settled or self._commands):
             self._train()
         if self._schedule.take_due():
             self._publish()
@@ -226,8 +226,8 @@ class MapperThread:
         while (scan := self._scans.take(sources)) is not None:
             sources.add(scan.source)
             self._ingest(scan)
-            if time.monotonic() > ends_s:
-                break
+            if self._commands or time.monotonic() > ends_s:
+                break  # a command is at most a scan late: checkpoints begin when they are due
         return bool(sources)
 
     def _ingest(self, scan: Scan) -> None:

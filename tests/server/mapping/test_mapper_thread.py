@@ -6,9 +6,10 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Event
+from typing import Any
 
 import pytest
 from support import servers
@@ -17,8 +18,10 @@ from triquad_format.errors import RefusedError
 from triquad_format.wire.messages import CheckpointRequest
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.errors import MapperStoppedError
+from triquad_server.intake.rays import ScanRays
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.mapping import mapper as mapper_module
+from triquad_server.mapping import mapper_thread as mapper_thread_module
 from triquad_server.mapping import publish_schedule
 from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.mapper import Mapper
@@ -201,6 +204,34 @@ def test_pending_commands_fail_when_the_thread_will_not_come_to_them() -> None:
         thread.close()
         with pytest.raises(MapperStoppedError, match="never started"):
             pending.result(servers.WAIT_S)
+
+
+class HeldMapper(Mapper):
+    """Goes on with a scan once it is let."""
+
+    def __init__(self) -> None:
+        super().__init__("test", settings(), "cpu")
+        self.begun, self.goes_on = Event(), Event()
+
+    def ingest(self, *scan: Any, **options: Any) -> ScanRays:
+        self.begun.set()
+        assert self.goes_on.wait(servers.WAIT_S)
+        return super().ingest(*scan, **options)
+
+
+def test_a_command_waits_for_no_more_than_the_scan_that_is_taken_in(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(mapper_thread_module, "_SCANS_S", NEVER_S)
+    with running(held := HeldMapper()) as mapping, ThreadPoolExecutor(1) as pool:
+        for source in ("one", "two", "three"):
+            mapping.scans.put(replace(servers.scan(0), source=source))
+        mapping.thread.wake()
+        assert held.begun.wait(servers.WAIT_S)
+        done = pool.submit(mapping.thread.call, lambda mapper: mapper.scans_taken)
+        servers.until(lambda: bool(mapping.thread._commands))
+        held.goes_on.set()
+        assert done.result(servers.WAIT_S) == 1
 
 
 def test_a_checkpoint_takes_one_epoch_however_fast_the_map_changes(tmp_path: Path) -> None:
