@@ -29,7 +29,7 @@ from triquad_client.checks import Bounds
 from triquad_client.mesh.followed_mesh import FollowedMesh, KnownTiles
 from triquad_client.mesh.mesh_calls import MeshCalls
 from triquad_client.mesh.mesh_watch import MeshWatch
-from triquad_client.net.connection import Connection
+from triquad_client.net.connection import Connection, new_ticket
 from triquad_client.net.opening import open_connection
 from triquad_client.offline.synced_map import SyncedMap
 
@@ -159,15 +159,17 @@ class Client(ScanCalls, MapQueries, MeshCalls, ChangeCalls, DownloadCalls):
         """
         return self._connection.ask(MetricsRequest())
 
-    def checkpoint(self) -> CheckpointInfo:
-        """Have the server write the map to its store now.
+    def checkpoint(self, timeout_s: float = 600.0) -> CheckpointInfo:
+        """Have the server write the map to its store now, and wait until it is there.
 
         Raises:
             RefusedError: ``store``, where it cannot be written.
+            RequestTimeoutError: it was not after ``timeout_s``; the text says for how long the
+                server has been at it, which it will finish.
         """
-        return self._connection.ask(CheckpointRequest())
+        return self._connection.ask_until_done(CheckpointRequest(new_ticket()), timeout_s)
 
-    def reset(self, bounds: Bounds | None = None) -> ResetReply:
+    def reset(self, bounds: Bounds | None = None, timeout_s: float = 600.0) -> ResetReply:
         """Forget what was learnt within ``bounds``.
 
         A server with a store first writes the map as it is to a checkpoint, which stays until
@@ -175,6 +177,7 @@ class Client(ScanCalls, MapQueries, MeshCalls, ChangeCalls, DownloadCalls):
 
         Args:
             bounds: corners of a box, metres, map frame; ``None``: everything is forgotten.
+            timeout_s: how long to wait for that, at most.
 
         Returns:
             ``epoch``: the first without it. ``kept_epoch``: the checkpoint of the map before;
@@ -182,8 +185,10 @@ class Client(ScanCalls, MapQueries, MeshCalls, ChangeCalls, DownloadCalls):
 
         Raises:
             RefusedError: ``store``, where the map as it is cannot be kept: nothing is forgotten.
+            RequestTimeoutError: not done after ``timeout_s``; the server goes on with it.
         """
-        reply = self._connection.ask(ResetRequest(*checks.box(bounds)))
+        request = ResetRequest(*checks.box(bounds), new_ticket())
+        reply = self._connection.ask_until_done(request, timeout_s)
         return reply if reply.undo is None else replace(reply, undo=printable(reply.undo))
 
     def maps(self) -> list[str]:

@@ -1,10 +1,13 @@
 """The files of a service with a real map: downloads, and checkpoints in its store."""
 
+from concurrent.futures import ThreadPoolExecutor
+from threading import Event
+
 import numpy as np
 import pytest
 import triquad_client
 from support import servers
-from triquad_client import RefusedError
+from triquad_client import RefusedError, RequestTimeoutError
 from triquad_format.mapfile.reader import read_map
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import MapChunk, MapChunkRequest, ResetRequest
@@ -31,6 +34,30 @@ def test_a_downloaded_map_is_the_map(client, tmp_path):
     client.download_map(path, training=True)
     assert read_map(path).regions[0].training is not None
     assert [entry.name for entry in tmp_path.iterdir()] == ["map.triquad"]
+
+
+def test_a_checkpoint_may_take_longer_than_a_reply(tmp_path, monkeypatch):
+    begun, let, write = Event(), Event(), Store.write
+
+    def held_write(self, *what):
+        begun.set()
+        assert let.wait(servers.WAIT_S)
+        return write(self, *what)
+
+    with (
+        servers.running_service(store=tmp_path) as endpoint,
+        triquad_client.connect(endpoint, timeout_s=2.0) as client,
+        ThreadPoolExecutor(1) as pool,
+    ):
+        servers.learn(client)
+        monkeypatch.setattr(Store, "write", held_write)
+        with pytest.raises(RequestTimeoutError, match=r"it goes on for \d+ s, and the server will"):
+            client.checkpoint(timeout_s=0.5)
+        assert begun.is_set()
+        patient = pool.submit(client.checkpoint)
+        assert client.status().last_checkpoint is None, "others are answered meanwhile"
+        let.set()
+        assert patient.result(servers.WAIT_S) == client.status().last_checkpoint
 
 
 def test_chunks_of_other_files_or_beyond_the_end_are_refused(client, endpoint, tmp_path):

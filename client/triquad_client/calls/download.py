@@ -9,9 +9,10 @@ from triquad_format.wire.messages import MapChunkRequest, MapInfo, MapInfoReques
 
 from triquad_client import checks
 from triquad_client.errors import DownloadError
-from triquad_client.net.connection import Connection, retried
+from triquad_client.net.connection import Connection, new_ticket, retried
 
 _BLOCK_BYTES = 2**23
+_PACKED_S = 600.0  # the time in which a server packs its map, at most
 
 
 def newest_file(connection: Connection, training: bool = False) -> MapInfo:
@@ -20,7 +21,8 @@ def newest_file(connection: Connection, training: bool = False) -> MapInfo:
     Raises:
         DownloadError: it is larger than this client takes.
     """
-    info, max_bytes = connection.ask(MapInfoRequest(training)), connection.max_download_bytes
+    request = MapInfoRequest(training, new_ticket())
+    info, max_bytes = connection.ask_until_done(request, _PACKED_S), connection.max_download_bytes
     if info.bytes > max_bytes:
         raise DownloadError(
             f"the server announces a map file of {info.bytes} bytes, more than the {max_bytes} "

@@ -1,5 +1,7 @@
 """Requests, and who answers them: a server at the other end of a connection, or a map in memory."""
 
+import secrets
+import time
 import weakref
 from abc import ABC, abstractmethod
 from collections import deque
@@ -16,6 +18,7 @@ from triquad_format.wire.bounds import check_answers
 from triquad_format.wire.codec import Message, Request
 from triquad_format.wire.messages import ErrorReply, RequestOrigin
 
+from triquad_client import checks
 from triquad_client.errors import (
     BadReplyError,
     ClosedError,
@@ -111,6 +114,27 @@ class Connection(Answering):
         while waiting:
             yield self._received(*waiting.popleft())
 
+    def ask_until_done(self, request: Request[ReplyT], timeout_s: float) -> ReplyT:
+        """Return the reply to a request with a ticket, which is repeated while work is under way.
+
+        Raises:
+            RequestTimeoutError: it is not done after ``timeout_s``, or the server does not answer.
+            RefusedError: the server refused.
+        """
+        deadline = checks.deadline(timeout_s)
+        while True:
+            try:
+                return self.ask(request)
+            except RefusedError as error:
+                if error.code != "under_way":
+                    raise
+                told = error.message
+            if time.monotonic() > deadline:
+                raise RequestTimeoutError(
+                    f"{self._key(request)} was not done within {timeout_s:g} s: {told}, and the "
+                    "server will finish it"
+                )
+
     def put(self, key: str, message: Message) -> None:
         """Publish a message; blocks where the network is slower than the publisher.
 
@@ -144,14 +168,13 @@ class Connection(Answering):
         return sorted(filter(keys.is_name, names))
 
     def _send(self, request: Request[Any]) -> Iterable[zenoh.Reply]:
-        timeout_s = self._timeout_s(request)
         try:
             return self._session.get(
                 self._key(request),
                 payload=codec.encode(request),
                 encoding=keys.encoding(type(request)),
-                attachment=codec.encode(RequestOrigin(self._id, timeout_s, self.local)),
-                timeout=timeout_s,
+                attachment=codec.encode(RequestOrigin(self._id, self.timeout_s, self.local)),
+                timeout=self.timeout_s,
                 priority=zenoh.Priority.BACKGROUND if request.background else zenoh.Priority.DATA,
                 congestion_control=zenoh.CongestionControl.BLOCK,
                 consolidation=zenoh.ConsolidationMode.NONE,
@@ -174,7 +197,7 @@ class Connection(Answering):
             payload = b"" if reply.err is None else reply.err.payload.to_bytes()
             if payload == b"Timeout":
                 raise RequestTimeoutError(
-                    f"no reply on {self._key(request)} within {self._timeout_s(request):g} s"
+                    f"no reply on {self._key(request)} within {self.timeout_s:g} s"
                 )
             reason = codec.decode(ErrorReply, payload)
         except WireError as error:
@@ -208,9 +231,6 @@ class Connection(Answering):
     def _key(self, request: Request[Any]) -> str:
         return keys.operation_key(self.map_name, request.operation)
 
-    def _timeout_s(self, request: Request[Any]) -> float:
-        return max(self.timeout_s, request.least_wait_s)
-
     def _broken(self, error: Exception) -> Exception:
         if self.is_closed:
             return closed_error()
@@ -220,6 +240,11 @@ class Connection(Answering):
 def closed_error() -> ClosedError:
     """Return the error for what is asked of a closed client."""
     return ClosedError("the client is closed")
+
+
+def new_ticket() -> int:
+    """Return the ticket of a request for :meth:`Connection.ask_until_done`."""
+    return secrets.randbits(63) or 1
 
 
 def retried(code: str, attempt: Callable[[], ResultT]) -> ResultT:

@@ -63,14 +63,11 @@ class Request(Message, Generic[ReplyT]):
     operation: ClassVar[str]  # of triquad_format.wire.keys
     reply: ClassVar[type[Message]]
     background: ClassVar[bool]
-    least_wait_s: ClassVar[float]  # the least time for which a client waits for the reply
 
-    def __init_subclass__(
-        cls, *, operation: str, background: bool = False, least_wait_s: float = 0.0
-    ) -> None:
+    def __init_subclass__(cls, *, operation: str, background: bool = False) -> None:
         super().__init_subclass__()
         (cls.reply,) = get_args(cls.__dict__["__orig_bases__"][0])
-        cls.operation, cls.background, cls.least_wait_s = operation, background, least_wait_s
+        cls.operation, cls.background = operation, background
 
 
 @dataclass(frozen=True)

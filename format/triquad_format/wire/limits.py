@@ -3,9 +3,6 @@
 MAX_WAIT_S = 60.0
 """The longest time that a request may wait for its answer."""
 
-WRITES_S = 120.0
-"""The least time for which a client waits for what a server writes to its disk, or packs whole."""
-
 MAX_SEQUENCE = 2**48 - 1
 """The largest number of a scan in its session."""
 

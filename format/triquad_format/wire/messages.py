@@ -24,7 +24,7 @@ from triquad_format.wire.bounds import (
     within,
 )
 from triquad_format.wire.codec import ArraySpec, Message, Request, decode
-from triquad_format.wire.limits import MAX_CHUNK_BYTES, MAX_SEQUENCE, WRITES_S
+from triquad_format.wire.limits import MAX_CHUNK_BYTES, MAX_SEQUENCE
 from triquad_format.wire.places import PLACE
 
 MAX_ORIGIN_BYTES = 1024
@@ -53,6 +53,9 @@ FinitePoints = Annotated[NDArray[np.float64], ArraySpec("<f8", (None, 3)), withi
 Origin = Annotated[NDArray[np.float64], ArraySpec("<f8", (3,)), within()]
 Lengths = Annotated[Values, within(0)]
 Name = Annotated[str, text(256)]
+Ticket = Annotated[int, within(0, 2**63 - 1)]
+"""Drawn at random for what takes long: who asks again with the same asks for the same work, and is
+refused as ``under_way`` until it is done; with 0 the reply comes when it is."""
 UpperCorner = Annotated[Point, corner_above("minimum")]
 Digest = Annotated[str, text(64, form="[0-9a-f]{64}")]  # SHA-256
 
@@ -198,8 +201,10 @@ class FlushRequest(Request[FlushReply], operation=keys.FLUSH):
 
 
 @dataclass(frozen=True)
-class CheckpointRequest(Request[CheckpointInfo], operation=keys.CHECKPOINT, least_wait_s=WRITES_S):
+class CheckpointRequest(Request[CheckpointInfo], operation=keys.CHECKPOINT):
     """Write a checkpoint now; answered with :class:`CheckpointInfo` once it is on disk."""
+
+    ticket: Ticket = 0
 
 
 @dataclass(frozen=True)
@@ -212,11 +217,12 @@ class ResetReply(Message):
 
 
 @dataclass(frozen=True)
-class ResetRequest(Request[ResetReply], operation=keys.RESET, least_wait_s=WRITES_S):
+class ResetRequest(Request[ResetReply], operation=keys.RESET):
     """Forget what was learnt within a box of the map frame; infinite sides are allowed."""
 
     minimum: Point
     maximum: UpperCorner
+    ticket: Ticket = 0
 
 
 @dataclass(frozen=True)
@@ -231,12 +237,11 @@ class MapInfo(Message):
 
 
 @dataclass(frozen=True)
-class MapInfoRequest(
-    Request[MapInfo], operation=keys.MAP_INFO, background=True, least_wait_s=WRITES_S
-):
+class MapInfoRequest(Request[MapInfo], operation=keys.MAP_INFO, background=True):
     """Prepare the newest epoch as a map file for download."""
 
     training: bool  # with the state that training needs to go on
+    ticket: Ticket = 0
 
 
 @dataclass(frozen=True)

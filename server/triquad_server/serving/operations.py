@@ -22,6 +22,7 @@ from triquad_map.compiled.team import THREADS, lower_priority
 
 from triquad_server.errors import NO_MEMORY, MapperStoppedError
 from triquad_server.process.threads import NICENESS, submit
+from triquad_server.serving.long_work import LongWork
 from triquad_server.serving.request import OperationCounts, Request, payload_size
 from triquad_server.serving.request_queue import MOST_SENDING, ClientSessions, RequestQueue
 from triquad_server.settings import ServiceSettings
@@ -57,7 +58,8 @@ class Lane(Enum):
     """The lane of the mesh: requests come one after the other, and all cores make their tiles."""
 
     FILES = "files"
-    """The lane of checkpoints and map files, which take seconds, one after the other."""
+    """The lane of checkpoints and map files, which take long, one after the other: its workers
+    wait for what :class:`LongWork` does."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,7 @@ _LANES = {
     Lane.LONG_QUESTIONS: _LaneWorkers(max(2, THREADS), NICENESS, gives_way_s=0.0),
     Lane.ADMINISTRATION: _LaneWorkers(2),
     Lane.MESH: _LaneWorkers(1, NICENESS),
-    Lane.FILES: _LaneWorkers(1, NICENESS),
+    Lane.FILES: _LaneWorkers(2),
 }
 
 _LONG_BYTES = 32_768
@@ -146,6 +148,7 @@ class Operations:
         self._origin = origin
         self._sessions = ClientSessions(session)
         self._refusals = RefusalSender()
+        self._long_work = LongWork(NICENESS)
         self._operations: dict[str, _Operation] = {}  # by key
         self._queryables: list[zenoh.Queryable[Any]] = []
         self._pools: list[ThreadPoolExecutor] = []
@@ -175,6 +178,8 @@ class Operations:
 
         Requests larger than ``max_bytes`` are refused.
         """
+        if lane is Lane.FILES:
+            answer = partial(self._long_work.answer, answer)
         key = keys.operation_key(self._map_name, kind.operation)
         counts = self.counts[kind.operation] = OperationCounts()
         self._operations[key] = _Operation(
@@ -203,6 +208,7 @@ class Operations:
         for queryable in self._queryables:
             queryable.undeclare()
         self.stop()  # requests may have arrived meanwhile
+        self._long_work.close()
         for pool in self._pools:
             pool.shutdown()
         self._refusals.close()

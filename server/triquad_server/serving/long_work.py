@@ -1,0 +1,89 @@
+"""Work that takes seconds, and minutes on a busy machine, such as writing a checkpoint.
+
+A client that waited for its end could not tell it from a server that is stuck. So work goes on in a
+thread of its own, and whoever asks is told after a moment that it does.
+"""
+
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Protocol, TypeVar
+
+from triquad_format.errors import RefusedError
+from triquad_map.compiled.team import lower_priority
+
+_TOLD_AFTER_S = 0.2  # that work is under way; less than any client waits for a reply
+_MOST_PENDING = 64
+_MOST_KEPT = 64  # results that were not fetched: their clients have left
+
+
+class Ticketed(Protocol):
+    """A request for work that takes long."""
+
+    @property
+    def ticket(self) -> int:
+        """What tells the work from other work of its kind; 0: it is asked for once."""
+        ...
+
+
+RequestT = TypeVar("RequestT", bound=Ticketed)
+ResultT = TypeVar("ResultT")
+
+
+@dataclass(frozen=True)
+class _Task:
+    """Some work, and its result once it is done."""
+
+    result: Future[object]
+    begun_s: float = field(default_factory=time.monotonic)
+
+
+class LongWork:
+    """Does one thing after the other."""
+
+    def __init__(self, niceness: int) -> None:
+        """Make the thread, of that ``niceness``, once it is needed."""
+        self._thread = ThreadPoolExecutor(1, "long-work", lower_priority, (niceness,))
+        self._lock = threading.Lock()
+        self._tasks: dict[int, _Task] = {}  # by ticket, the oldest first
+
+    def close(self) -> None:
+        """Finish what has begun; what has not is refused."""
+        self._thread.shutdown(cancel_futures=True)
+
+    def answer(self, work: Callable[[RequestT], ResultT], request: RequestT) -> ResultT:
+        """Return what ``work`` returns for the request, once it is done.
+
+        Raises:
+            RefusedError: ``under_way``: it is not; ``busy``: it will not be done. And as ``work``.
+        """
+        with self._lock:
+            task = self._tasks.get(request.ticket) or self._begin(work, request)
+        try:
+            result = task.result.result(_TOLD_AFTER_S if request.ticket else None)
+        except TimeoutError:
+            if task.result.done():  # the work itself had no time left
+                raise
+            waited_s = time.monotonic() - task.begun_s
+            raise RefusedError("under_way", f"it goes on for {waited_s:.0f} s") from None
+        except CancelledError:
+            raise RefusedError("busy", "the server is stopping") from None
+        return result  # type: ignore[return-value]
+
+    def _begin(self, work: Callable[[RequestT], ResultT], request: RequestT) -> _Task:
+        pending = sum(not task.result.done() for task in self._tasks.values())
+        if pending >= _MOST_PENDING:
+            raise RefusedError("busy", f"{pending} tasks wait already; try later")
+        try:
+            task = _Task(self._thread.submit(partial(work, request)))
+        except RuntimeError as error:  # it has been shut down
+            raise RefusedError("busy", "the server is stopping") from error
+        if request.ticket:
+            self._tasks[request.ticket] = task
+        done = [ticket for ticket, task in self._tasks.items() if task.result.done()]
+        for ticket in done[:-_MOST_KEPT]:
+            del self._tasks[ticket]
+        return task
