@@ -212,7 +212,8 @@ def connect(
             ``robot:7447``, or an endpoint of Zenoh; ``None``: where ``config`` says, and otherwise
             port 7447 of this machine.
         map: name of the map.
-        timeout_s: for connecting and for each request.
+        timeout_s: for connecting and for each request: so long a server is waited for that is not
+            there yet, or still starts; a warning says so.
         config: Zenoh configuration file (JSON5), such as one of triquad-keys with credentials.
         max_download_bytes: the largest map file that is fetched from the server, and the most that
             the mesh of a box may take of memory, whatever the server announces.
@@ -220,7 +221,7 @@ def connect(
             ``"local"``: they are relative to :attr:`Client.origin_m`.
 
     Raises:
-        ConnectError: nothing listens at the endpoint, or it does not let us in.
+        ConnectError: nothing listens at the endpoint, it does not let us in, or it still starts.
         UnknownMapError: no server there has this map.
         InvalidInputError: there cannot be an endpoint or a map of this name.
     """

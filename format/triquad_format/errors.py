@@ -8,6 +8,7 @@ ERROR_CODES = {
     "too_large": "the request exceeds a limit of the server; split it",
     "epoch_gone": "the epoch is not kept, or not known what changed since; ask the newest",
     "chunk_gone": "the map file asked for is no longer kept; ask for its info again",
+    "starting": "the server is not ready yet; the text says what it does",
     "under_way": "the server is at it; ask again with the same ticket",
     "timeout": "the server could not finish in the time that the request allows",
     "busy": "too many requests are waiting, or the server stops or is short of memory",

@@ -19,6 +19,7 @@ from triquad_server.process.service_manager import ServiceManager
 from triquad_server.process.stop import Stop, Stops, wait_for_stop
 from triquad_server.process.threads import Teams
 from triquad_server.service import ServedMap, Service
+from triquad_server.serving.starting import StartingNotice
 from triquad_server.settings import Settings
 from triquad_server.store.restore import ValidCheckpoint
 from triquad_server.store.store import Store
@@ -114,13 +115,20 @@ def _open(options: LaunchOptions, stops: Stops, starting: Report, stack: ExitSta
     settings = options.settings
     network = configuration(options.network, options.map_name, settings)
     monitoring = _open_monitoring(settings, stack)
-    store = _open_store(options, starting, stack)
-    restored = None if store is None else _restored(store, options, starting)
+    session = stack.enter_context(closing(open_session(network)))
+    notice = stack.enter_context(closing(StartingNotice(session, options.map_name)))
+
+    def begins(stage: str) -> None:
+        notice.stage = stage
+        starting(stage)
+
+    store = _open_store(options, begins, stack)
+    restored = None if store is None else _restored(store, options, begins)
     if restored is not None:
         settings = _settings_of(restored, settings)
     teams = stack.enter_context(closing(Teams()))
-    warm_up(settings, options.device, teams, _before_each_step(stops, starting))
-    starting("opening the map")
+    warm_up(settings, options.device, teams, _before_each_step(stops, begins))
+    begins("opening the map")
     mapper = Mapper(
         options.map_name,
         settings,
@@ -128,7 +136,6 @@ def _open(options: LaunchOptions, stops: Stops, starting: Report, stack: ExitSta
         record=restored.record if restored else None,
         teams=teams,
     )
-    session = stack.enter_context(closing(open_session(network)))
     served = ServedMap(
         name=options.map_name,
         mapper=mapper,
@@ -139,6 +146,7 @@ def _open(options: LaunchOptions, stops: Stops, starting: Report, stack: ExitSta
     )
     service = Service(session, served, settings, failed=stops.put)
     stack.enter_context(closing(service))
+    notice.close()
     if monitoring is not None:
         stack.enter_context(monitoring.showing(service.health))
     _log_who_gets_in(network)

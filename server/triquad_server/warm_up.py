@@ -52,7 +52,7 @@ def warm_up(
     ]
     for number, step in enumerate(steps, start=1):
         name = step.__name__.replace("_", " ")
-        report(name)
+        report(f"{name}, step {number} of {len(steps)}")
         compiles = compiles or count_compiled() > before
         if compiles:
             _log.warning(_COMPILING, number, len(steps), name)

@@ -16,7 +16,7 @@ from triquad_format.printable import printable
 from triquad_format.wire import codec, keys
 from triquad_format.wire.bounds import check_answers
 from triquad_format.wire.codec import Message, Request
-from triquad_format.wire.messages import ErrorReply, RequestOrigin
+from triquad_format.wire.messages import ErrorReply, RequestOrigin, StatusRequest
 
 from triquad_client import checks
 from triquad_client.errors import (
@@ -166,6 +166,16 @@ class Connection(Answering):
             raise self._broken(error) from error
         names = {str(reply.ok.key_expr).split("/")[1] for reply in replies if reply.ok}
         return sorted(filter(keys.is_name, names))
+
+    def start_stage(self) -> str | None:
+        """Return what the server of the map does before it is ready; None: there is none such."""
+        try:
+            self.ask(StatusRequest())
+        except RefusedError as error:
+            return error.message if error.code == "starting" else None
+        except (NoReplyError, UnknownMapError, RequestTimeoutError):
+            return None
+        return "it is about to be ready"
 
     def _send(self, request: Request[Any]) -> Iterable[zenoh.Reply]:
         try:

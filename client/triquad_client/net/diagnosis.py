@@ -6,14 +6,14 @@ import socket
 import ssl
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import zenoh
 from triquad_format.wire.endpoints import Locator
 
 _PROTOCOLS = ("tcp", "tls", "udp", "quic", "ws", "serial", "vsock", "unixsock-stream", "unixpipe")
 _LONGEST_S = 1.0  # for each attempt
-_REMEDY = ". Start triquad-server there, or check the endpoint"
+REMEDY = ". Start triquad-server there, or check the endpoint"
 
 _FILES = ("root_ca_certificate", "connect_certificate", "connect_private_key")
 
@@ -30,14 +30,25 @@ _HINTS = {
 """The advice on what to do, by the codes of OpenSSL."""
 
 
-def why_no_link(config: zenoh.Config, timeout_s: float) -> str | None:
+class Obstacle(NamedTuple):
+    """What stands in the way of a link."""
+
+    why: str
+    may_pass: bool = False  # it goes away by itself where a server is just being started
+
+
+def why_no_link(config: zenoh.Config, timeout_s: float) -> Obstacle | None:
     """Return what stands in the way of a link with ``config``, where that can be known."""
-    found = list(_of_files(config))
+    found = [Obstacle(why) for why in _of_files(config)]
+    may_pass = not found
     for endpoint in _endpoints(config):
-        why = _of_endpoint(endpoint, config, max(0.01, min(timeout_s, _LONGEST_S)))
-        if why is not None:
-            found.append(why)
-    return "; ".join(found) or None
+        obstacle = _of_endpoint(endpoint, config, max(0.01, min(timeout_s, _LONGEST_S)))
+        if obstacle is not None:
+            found.append(obstacle)
+    if not found:
+        return None
+    may_pass = may_pass and any(obstacle.may_pass for obstacle in found)
+    return Obstacle("; ".join(obstacle.why for obstacle in found), may_pass)
 
 
 def _endpoints(config: zenoh.Config) -> list[str]:
@@ -61,10 +72,10 @@ def _of_files(config: zenoh.Config) -> Iterator[str]:
             yield f"the configuration names {path} as its {name}: {why}"
 
 
-def _of_endpoint(endpoint: str, config: zenoh.Config, timeout_s: float) -> str | None:
+def _of_endpoint(endpoint: str, config: zenoh.Config, timeout_s: float) -> Obstacle | None:
     protocol, host, port = Locator.of(endpoint)
     if protocol not in _PROTOCOLS:
-        return (
+        return Obstacle(
             f"{protocol.rstrip(':')!r} is no protocol of Zenoh: use tcp/HOST:PORT, or tls/HOST:PORT"
         )
     host = host.removeprefix("[").removesuffix("]")
@@ -73,26 +84,26 @@ def _of_endpoint(endpoint: str, config: zenoh.Config, timeout_s: float) -> str |
     try:
         with socket.create_connection((host, int(port)), timeout_s) as link:
             link.settimeout(timeout_s)
-            return _of_tls(link, host, config) if protocol == "tls" else _of_tcp(link)
+            return Obstacle(_of_tls(link, host, config)) if protocol == "tls" else _of_tcp(link)
     except socket.gaierror:
-        return f"no address is known of the host {host!r}{_REMEDY}"
+        return Obstacle(f"no address is known of the host {host!r}{REMEDY}")
     except ConnectionRefusedError:
-        return f"nothing listens at {host} on port {port}{_REMEDY}"
+        return Obstacle(f"nothing listens at {host} on port {port}", may_pass=True)
     except TimeoutError:
-        return f"{host} does not answer on port {port}{_REMEDY}"
+        return Obstacle(f"{host} does not answer on port {port}", may_pass=True)
     except (OSError, OverflowError, UnicodeError) as error:
         why = error.strerror if isinstance(error, OSError) and error.strerror else error
-        return f"{host}, port {port}: {why}{_REMEDY}"
+        return Obstacle(f"{host}, port {port}: {why}{REMEDY}")
 
 
-def _of_tcp(link: socket.socket) -> str:
+def _of_tcp(link: socket.socket) -> Obstacle:
     """Return why something that listens lets no link by plain TCP come about."""
     if _speaks_tls(link):
-        return (
+        return Obstacle(
             "the server wants an encrypted link and a certificate: connect with the file of a "
             "role, such as config='robot.json5' or --config robot.json5 (docs/security.md)"
         )
-    return "something listens there, but no link came about: it may be no triquad-server"
+    return Obstacle("something listens there, but no link came about", may_pass=True)
 
 
 def _speaks_tls(link: socket.socket) -> bool:

@@ -1,6 +1,8 @@
 """Opening a connection to a server, as a program or a configuration file describes it."""
 
 import json
+import logging
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,9 +17,13 @@ from triquad_format.wire.zenoh_config import QUIET, fill, put
 from triquad_client import checks
 from triquad_client.errors import ConnectError, UnknownMapError
 from triquad_client.net.connection import Connection
-from triquad_client.net.diagnosis import why_no_link
+from triquad_client.net.diagnosis import REMEDY, Obstacle, why_no_link
+
+_log = logging.getLogger("triquad_client")
 
 _HERE = "127.0.0.1"
+_PAUSE_S = 0.1  # between two attempts
+_TOLD_AFTER_S = 3.0  # most servers are ready by then
 
 _OF_CLIENTS: Mapping[str, Any] = {
     "mode": "client",
@@ -48,23 +54,76 @@ def open_connection(
         raise InvalidInputError(str(error)) from error
     except zenoh.ZError as error:
         raise ConnectError(f"cannot connect {where}: {_reason(error)}") from error
-    try:
-        session = zenoh.open(configured)
-    except zenoh.ZError as error:
-        why = why_no_link(configured, timeout_s) or (
-            f"{_reason(error)} Start triquad-server there, or check the endpoint and the "
-            "credentials."
-        )
-        raise ConnectError(f"cannot connect {where}: {why}") from error
+    patience = _Patience(timeout_s)
+    session = _open(configured, where, patience)
     connection = Connection(session, map_name, timeout_s, max_download_bytes=most, local=local)
     try:
-        # Asked for by name first: there may be any number of others.
-        if not connection.maps(map_name):
-            raise UnknownMapError(map_name, connection.maps())
+        _wait_for_map(connection, patience)
     except BaseException:
         connection.close()
         raise
     return connection
+
+
+class _Patience:
+    """How long a server that is just being started is waited for."""
+
+    def __init__(self, timeout_s: float) -> None:
+        self.timeout_s = timeout_s
+        self._began_s = time.monotonic()
+        self._told = ""
+
+    def wait(self, why: str) -> bool:
+        """Wait a moment, and say ``why`` after a while; return False where it was long enough."""
+        waited_s = time.monotonic() - self._began_s
+        if waited_s >= self.timeout_s:
+            return False
+        if waited_s > _TOLD_AFTER_S and why != self._told:
+            self._told = why
+            _log.warning("%s; trying for %g s", why, self.timeout_s)
+        time.sleep(_PAUSE_S)
+        return True
+
+
+def _open(configured: zenoh.Config, where: str, patience: _Patience) -> zenoh.Session:
+    """Open a session, once something listens.
+
+    Raises:
+        ConnectError: nothing does, or it does not let us in.
+    """
+    while True:
+        try:
+            return zenoh.open(configured)
+        except zenoh.ZError as error:
+            obstacle = why_no_link(configured, patience.timeout_s) or Obstacle(
+                f"{_reason(error)} Start triquad-server there, or check the endpoint and the "
+                "credentials."
+            )
+            told, remedy = f"cannot connect {where}: {obstacle.why}", ""
+            if obstacle.may_pass:
+                if patience.wait(told):
+                    continue
+                remedy = REMEDY
+            raise ConnectError(told + remedy) from error
+
+
+def _wait_for_map(connection: Connection, patience: _Patience) -> None:
+    """Return once the server of the map is there and ready.
+
+    Raises:
+        UnknownMapError: there is none.
+        ConnectError: it is still starting.
+    """
+    name = connection.map_name
+    # Asked for by name first: there may be any number of others.
+    while not connection.maps(name):
+        stage, others = connection.start_stage(), connection.maps()
+        if stage is not None:
+            told = f"the server of map {name!r} is starting: {stage}"
+            if not patience.wait(told):
+                raise ConnectError(f"{told}; connect again, or with a longer timeout_s")
+        elif others or not patience.wait(f"no server has a map {name!r} yet"):
+            raise UnknownMapError(name, others)
 
 
 def _configuration(endpoint: str | None, timeout_s: float, file: str | Path | None) -> zenoh.Config:

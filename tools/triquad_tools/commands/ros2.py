@@ -6,7 +6,6 @@ import os
 import re
 import sys
 import threading
-import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import fields
@@ -37,8 +36,6 @@ from triquad_tools.ros2.server_process import ServerProcess
 from triquad_tools.sensors.ros.type_store import frame_name
 
 _COMMAND = "triquad-ros2"
-_RETRY_S = 0.5  # while the server starts
-_TELL_S = 30.0  # after which the log says why it cannot be reached, and again
 _TOPIC = re.compile(r"(/?[A-Za-z_][A-Za-z0-9_]*)+")
 
 _log = logging.getLogger("triquad_ros2")
@@ -109,17 +106,12 @@ def _bridge(
 
 def _connected(options: argparse.Namespace, server: ServerProcess | None) -> Client | None:
     """Return a client of the map server, once it serves; None where one of ours ended before."""
-    tell_s = time.monotonic() + _TELL_S
     while server is None or server.exit_code is None:
         try:
             return connect_to(options)
-        except (ConnectError, UnknownMapError) as error:
+        except (ConnectError, UnknownMapError):
             if server is None:
                 raise
-            if time.monotonic() > tell_s:
-                tell_s = time.monotonic() + _TELL_S
-                _log.warning("waiting for the server: %s", error)
-            server.wait(_RETRY_S)
     return None
 
 
