@@ -18,7 +18,7 @@ from triquad_format.records.field_settings import FieldSettings
 PRETRAINED = Path(__file__).with_name("pretrained_mlp.npz")
 """The file with the arrays that :func:`initial_mlp` reads; `make pretrained` writes it."""
 
-_STEPS = 1000
+_STEPS = 1600
 """The steps that a pretrained MLP counts as having taken; a young one moves more."""
 
 

@@ -103,13 +103,10 @@ class Rates(NamedTuple):
 
 _SOFT_STEPS, _HARDEST = 800, 0.1
 """The steps for which a row of features learns at the full rate (after n times as many, at an n-th
-of it), and the least share of the rate. So learnt values move little where others are trained."""
+of it), and the least share of the rate. So learnt values move little where others are trained. Of
+the MLP, which all places of a region share, it is the square."""
 
 LAST_AGE = int(_SOFT_STEPS / _HARDEST)  # from here on, no rate falls any more
-
-_MLP_SOFT_STEPS, _MLP_HARDEST = 300, 0.02
-"""The same of the MLP, which applies in addition to the above: all places of a region share it.
-With the numbers of rows, 6 % more tiles are sent where a street grows."""
 
 
 class LiveField:
@@ -200,9 +197,9 @@ class LiveField:
         self.features.append(features)
 
     def next_mlp_share(self) -> float:
-        """Count a step of the MLP; return its share of the rates, falling faster than features'."""
+        """Count a step of the MLP; return its share of what features of its age learn at."""
         self.mlp_steps += 1
-        return min(1.0, max(_MLP_HARDEST, _MLP_SOFT_STEPS / self.mlp_steps))
+        return min(1.0, max(_HARDEST, _SOFT_STEPS / self.mlp_steps))
 
     def live_view(self) -> FrozenField:
         """Return the field for its thread alone; from arrays, it is valid until it changes."""

@@ -158,7 +158,7 @@ class TrainingSettings(BaseModel):
     model_config = SECTION
 
     batch: Annotated[int, Field(ge=1, le=10_000_000)] = 16_384
-    """Samples per step, at most: it is one for each 14 vertices of a region, and at least 4096, so
+    """Samples per step, at most: it is one for each 14 vertices of a region, so
     that a street learns alike in one region and across several. While scans stream in, it is half
     of that: of as many samples, more and smaller steps learn sooner."""
 

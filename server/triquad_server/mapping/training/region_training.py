@@ -22,11 +22,10 @@ from triquad_server.mapping.training.slopes import Slopes
 from triquad_server.mapping.training.training_budget import FairShare, TrainingBudget
 
 _VERTICES_PER_SAMPLE = 14
-"""The vertices for each sample of a step: each vertex takes about as many steps in any region."""
+"""The vertices for each sample of a step: each vertex takes about as many steps in any region. With
+4,096 samples at least, a room is learnt to 0.33 cm after 3 million, not 0.29."""
 
-_LEAST_BATCH = 4096
-"""Samples of a step at least: always as many take a fifth more time on a street, and always 8192
-learn a room later."""
+_LEAST_BATCH = 256  # steps of fewer samples take nearly as long
 
 _JUDGED_AFTER_SAMPLES = 8_000_000
 """A field is judged after this many samples, a few seconds, and once it has settled."""
