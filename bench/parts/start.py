@@ -14,6 +14,7 @@ from bench.clients.server_process import server_process
 from bench.figures import Figure
 
 _STARTS = 5
+_LAUNCHES = 50
 _TIMEOUT_S = 300.0
 
 
@@ -22,6 +23,7 @@ def measure_start() -> list[Figure]:
     with tempfile.TemporaryDirectory(prefix="triquad-bench-") as name:
         first = _Start(Path(name))
         later = [_Start(Path(name)) for _ in range(_STARTS)]
+        launched_s = [_launched_s(Path(name)) for _ in range(_LAUNCHES)]
     ready_s = statistics.median(start.ready_s for start in later)
     return [
         Figure("ready at the very first start", first.ready_s, "s", at_most=45),
@@ -29,7 +31,25 @@ def measure_start() -> list[Figure]:
         Figure("resident memory after it", first.resident_mb, "MB"),
         Figure("ready at a later start", ready_s, "s", at_most=2),
         Figure("resident memory after that", later[-1].resident_mb, "MB"),
+        Figure("connected, of 50 clients started with their servers", len(launched_s), ""),
+        Figure("the last of them, after", max(launched_s), "s"),
     ]
+
+
+def _launched_s(folder: Path) -> float:
+    """Return when a client that was started together with its server was connected, seconds.
+
+    Raises:
+        TriquadError: it was not, within the time that clients wait by default.
+    """
+    started = time.monotonic()
+    compiled = {"NUMBA_CACHE_DIR": str(folder / "kernels")}
+    with (
+        server_process(["--device", "cpu"], environment=compiled, ready=False) as server,
+        connect(server.endpoint) as client,
+    ):
+        client.status()
+        return time.monotonic() - started
 
 
 class _Start:

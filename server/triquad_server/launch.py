@@ -116,19 +116,34 @@ def _open(options: LaunchOptions, stops: Stops, starting: Report, stack: ExitSta
     network = configuration(options.network, options.map_name, settings)
     monitoring = _open_monitoring(settings, stack)
     session = stack.enter_context(closing(open_session(network)))
-    notice = stack.enter_context(closing(StartingNotice(session, options.map_name)))
+    with closing(StartingNotice(session, options.map_name)) as notice:
 
-    def begins(stage: str) -> None:
-        notice.stage = stage
-        starting(stage)
+        def begins(stage: str) -> None:
+            notice.stage = stage
+            starting(stage)
 
-    store = _open_store(options, begins, stack)
-    restored = None if store is None else _restored(store, options, begins)
+        served, settings = _restored_map(options, stops, begins, stack)
+        service = Service(session, served, settings, failed=stops.put)
+        stack.enter_context(closing(service))
+    if monitoring is not None:
+        stack.enter_context(monitoring.showing(service.health))
+    _log_who_gets_in(network)
+    _log_ready(options, network, service.epoch)
+    return service
+
+
+def _restored_map(
+    options: LaunchOptions, stops: Stops, starting: Report, stack: ExitStack
+) -> tuple[ServedMap, Settings]:
+    """Return the map as its store has it, or an empty one, and the settings that hold for it."""
+    settings = options.settings
+    store = _open_store(options, starting, stack)
+    restored = None if store is None else _restored(store, options, starting)
     if restored is not None:
         settings = _settings_of(restored, settings)
     teams = stack.enter_context(closing(Teams()))
-    warm_up(settings, options.device, teams, _before_each_step(stops, begins))
-    begins("opening the map")
+    warm_up(settings, options.device, teams, _before_each_step(stops, starting))
+    starting("opening the map")
     mapper = Mapper(
         options.map_name,
         settings,
@@ -144,14 +159,7 @@ def _open(options: LaunchOptions, stops: Stops, starting: Report, stack: ExitSta
         restored=restored.info if restored else None,
         teams=teams,
     )
-    service = Service(session, served, settings, failed=stops.put)
-    stack.enter_context(closing(service))
-    notice.close()
-    if monitoring is not None:
-        stack.enter_context(monitoring.showing(service.health))
-    _log_who_gets_in(network)
-    _log_ready(options, network, service.epoch)
-    return service
+    return served, settings
 
 
 def _open_monitoring(settings: Settings, stack: ExitStack) -> "MonitoringServer | None":

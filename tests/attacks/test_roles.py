@@ -164,7 +164,7 @@ def test_clients_believe_no_server_but_those_they_know(folder: KeyFolder, kind: 
         impostor(folder, endpoint, {**listens, **showing(certificate, "listen")}),
         pytest.raises((ConnectError, UnknownMapError)),
     ):
-        triquad_client.connect(endpoint, config=folder.path / "viewer.json5")
+        triquad_client.connect(endpoint, timeout_s=2.0, config=folder.path / "viewer.json5")
 
 
 def test_clients_do_believe_the_server(folder: KeyFolder) -> None:

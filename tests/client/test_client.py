@@ -57,7 +57,7 @@ def test_a_router_without_maps_is_told_apart() -> None:
         servers.raw_session("router", listen=endpoint),
         pytest.raises(UnknownMapError, match="available: none"),
     ):
-        triquad_client.connect(endpoint)
+        triquad_client.connect(endpoint, timeout_s=0.5)
 
 
 @pytest.mark.parametrize("name", ["a/b", None])

@@ -38,6 +38,8 @@ from triquad_tools.sensors.ros.type_store import frame_name
 _COMMAND = "triquad-ros2"
 _TOPIC = re.compile(r"(/?[A-Za-z_][A-Za-z0-9_]*)+")
 
+_ATTEMPT_S = 2.0  # after which it is checked whether our server still runs
+
 _log = logging.getLogger("triquad_ros2")
 
 
@@ -108,6 +110,8 @@ def _connected(options: argparse.Namespace, server: ServerProcess | None) -> Cli
     """Return a client of the map server, once it serves; None where one of ours ended before."""
     while server is None or server.exit_code is None:
         try:
+            if server is not None:  # it may also end before it is there
+                connect_to(options, timeout_s=_ATTEMPT_S).close()
             return connect_to(options)
         except (ConnectError, UnknownMapError):
             if server is None:
