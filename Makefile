@@ -22,6 +22,14 @@ BIN = $(VENV)/bin
 INSTALLED_DEMO = $(VENV)/.installed-demo
 INSTALLED = $(VENV)/.installed
 
+# What pip says is of interest where it fails.
+PIP_LOG = $(VENV)/pip.log
+define pip_install
+	@echo "installing what '$(1)' needs into $(VENV) ..."
+	@$(BIN)/python -m pip install --no-compile $(PIP_FLAGS) -c constraints.txt -e '.[$(1)]' \
+	  > $(PIP_LOG) 2>&1 || { tail -n 30 $(PIP_LOG); exit 1; }
+endef
+
 .PHONY: bench campaign check clean demo docs kernels pictures pretrained test test-long
 
 demo: $(INSTALLED_DEMO)
@@ -65,11 +73,11 @@ check: $(INSTALLED)
 
 $(INSTALLED_DEMO): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --no-compile $(PIP_FLAGS) -c constraints.txt -e '.[demo]'
+	$(call pip_install,demo)
 	touch $@
 
 $(INSTALLED): $(INSTALLED_DEMO)
-	$(BIN)/python -m pip install --no-compile $(PIP_FLAGS) -c constraints.txt -e '.[dev]'
+	$(call pip_install,dev)
 	touch $@
 
 pretrained: $(INSTALLED)

@@ -21,6 +21,8 @@ from triquad_tools.viewer.viewer import DEFAULT_PORT, Viewer
 
 _COMMAND = "triquad-demo"
 
+_WATCHED_PERIOD_S = 0.3  # between two scans, a metre apart, so that the map is seen to grow
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool: 0 all is as promised, 1 something is not or failed, 2 wrong usage."""
@@ -45,7 +47,8 @@ def _demo(options: argparse.Namespace) -> int:
             print_remark(f"open {viewer.url} in a browser: then the drive begins")
             viewer.wait_for_browser()
         drive = street_drive(options.seed, options.scans)
-        results = demonstrate(client, server.endpoint, drive, out)
+        period_s = _WATCHED_PERIOD_S if options.view else 0.0
+        results = demonstrate(client, server.endpoint, drive, out, period_s)
         status = _report(out, results)
         if options.view:
             print_remark("the page shows what the server has now; Ctrl-C ends both")

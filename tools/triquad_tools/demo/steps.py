@@ -91,8 +91,12 @@ def table_rows(results: DemoResults) -> list[Row]:
     return rows
 
 
-def demonstrate(client: Client, endpoint: str, drive: SimulatedDrive, out: Path) -> DemoResults:
+def demonstrate(
+    client: Client, endpoint: str, drive: SimulatedDrive, out: Path, period_s: float = 0.0
+) -> DemoResults:
     """Have a server learn a drive while another process asks it; leave the map in a folder.
+
+    Scans are sent every ``period_s`` seconds, or as fast as the server takes them.
 
     Raises:
         ToolError, TriquadError, OSError: a step failed.
@@ -106,7 +110,7 @@ def demonstrate(client: Client, endpoint: str, drive: SimulatedDrive, out: Path)
     hits = np.concatenate([scan.true_hits for scan in scans])
     asked = np.random.default_rng(_SEED).choice(hits, _QUERY_POINTS)
     with Probe(endpoint, MAP, asked) as probe:
-        intake = _learnt(client, scans)
+        intake = _learnt(client, scans, period_s)
         queries = probe.finish()
     with progress("fetching the map and its mesh"):
         client.download_map(out / "map.triquad")
@@ -129,10 +133,11 @@ def demonstrate(client: Client, endpoint: str, drive: SimulatedDrive, out: Path)
     )
 
 
-def _learnt(client: Client, scans: Sequence[SimulatedScan]) -> Intake:
+def _learnt(client: Client, scans: Sequence[SimulatedScan], period_s: float) -> Intake:
     started = time.monotonic()
     published = ((ScanEntry(time.time_ns(), DEFAULT_SOURCE), scan) for scan in scans)
-    publish_all(client, published, len(scans))
+    due_s = [number * period_s for number in range(len(scans))] if period_s else ()
+    publish_all(client, published, len(scans), due_s)
     flush = client.flush(FLUSH_TIMEOUT_S)
     taken_in = time.monotonic()
     status = wait_until_settled(client, _SETTLE_LIMIT_S)
