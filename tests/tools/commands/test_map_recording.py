@@ -81,6 +81,17 @@ def test_a_bag_gives_the_map_of_its_folder(tmp_path: Path, settings: str, whole:
     assert [region.training is not None for region in regions] == [False, True]
 
 
+def test_surface_is_continued_only_where_that_is_marked(
+    tmp_path: Path, settings: str, whole: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("map.triquad", "map.stl"):
+        assert main(["recording", str(tmp_path / name), "--fill", "1"]) == 2
+        assert "--fill is of what can mark it, .ply, .glb, .obj, .png" in capsys.readouterr().err
+    record = read_map(whole)
+    told = write_output(record, tmp_path / "map.ply", cell_m=0.2, training=False, fill_m=1.0)
+    assert told.endswith("of them filled")
+
+
 def test_the_name_says_what_is_written(tmp_path: Path, whole: Path) -> None:
     record = read_map(whole)
     for name in ("map.ply", "map.glb"):

@@ -175,6 +175,21 @@ def test_a_picture_of_a_map_has_the_colours_of_its_heights(tmp_path, capsys):
     assert not within[:, [0, -1]].any()
 
 
+def test_faces_that_were_not_seen_are_pale(tmp_path):
+    mesh = ground(8, 4)
+    filled = mesh.vertices[mesh.faces[:, 0], 0] >= 4
+    pictures = []
+    for number, shown_as in enumerate((None, filled)):
+        draw_mesh("", dataclasses.replace(mesh, filled=shown_as), tmp_path / f"{number}.png")
+        pictures.append(read_picture(tmp_path / f"{number}.png"))
+    seen, continued = pictures
+    changed = (seen != continued).any(axis=-1)
+    changed[: TOP + 1] = changed[TOP + HEIGHT :] = False  # what is written there
+    assert 0.4 < changed.sum() / shown(seen).sum() < 0.6
+    pale = 0.4 * seen[changed] + 0.6 * 255 * np.array(BACKGROUND)
+    assert np.quantile(np.abs(continued[changed] - pale), 0.95) < 12
+
+
 def test_a_map_with_next_to_nothing_has_a_picture(tmp_path):
     path, out = tmp_path / "map.triquad", tmp_path / "map.png"
     write_map(exact_map(table(0.1, 1.1)), path, feature_dtype="<f4")

@@ -13,11 +13,11 @@ from triquad_server.process.threads import Teams
 from triquad_server.settings.loading import PRESETS, load_settings
 from triquad_server.warm_up import warm_up
 
-from triquad_tools.console.arguments import command_parser
+from triquad_tools.console.arguments import add_fill, command_parser
 from triquad_tools.console.command import OK, ToolError, print_line, print_remark, run
 from triquad_tools.console.progress import progress
 from triquad_tools.mapping.mapping_run import MAP_NAME, MappingRun, mapping_key, read_unfinished
-from triquad_tools.mapping.output import SUFFIXES, check_target, why, write_output
+from triquad_tools.mapping.output import SUFFIXES, check_fill, check_target, why, write_output
 from triquad_tools.recordings.opening import Selection, open_selected
 from triquad_tools.recordings.recording import add_recording
 
@@ -34,6 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _map(options: argparse.Namespace) -> int:
     output = options.output
     check_target(output, force=options.force)
+    check_fill(output, options.fill)
     settings = load_settings(options.settings, options.set, preset=options.preset)
     check_device(options.device)
     selection = open_selected(options)
@@ -55,7 +56,9 @@ def _map(options: argparse.Namespace) -> int:
         mapping.settle()  # which saves the map, should the output not be written
         record, cell_m = mapper.changes_since(None).record, settings.mesh.cell_m
         try:
-            written = write_output(record, output, cell_m=cell_m, training=options.training)
+            written = write_output(
+                record, output, cell_m=cell_m, training=options.training, fill_m=options.fill
+            )
         except OSError as error:
             raise StoreError(
                 f"{output} cannot be written: {why(error)}; the map is in {part}: the same "
@@ -91,6 +94,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--settings", type=Path, metavar="FILE", help="settings of the map, as of triquad-server")
     one = "one setting, such as field.leaf_m=0.05, repeatable"
     add("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help=one)
+    add_fill(parser)
     add("--device", choices=DEVICES, default="cpu", help="what it trains on (default: cpu)")
     add("--training", action="store_true", help="keep what further training needs in the map file")
     add("--force", action="store_true", help="replace OUT where it exists")

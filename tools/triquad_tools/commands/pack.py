@@ -12,9 +12,8 @@ from triquad_format.mapfile.checkpoint_folder import checkpoint_file, checkpoint
 from triquad_format.mapfile.index import read_checkpoint
 from triquad_format.mapfile.parts.part import EVIDENCE, REGION, TRAINING, VERTICES
 from triquad_format.records.region import VertexTable
-from triquad_format.wire.limits import MAX_FILL_M
 
-from triquad_tools.console.arguments import command_parser, within
+from triquad_tools.console.arguments import add_fill, command_parser, within
 from triquad_tools.console.command import FAILED, OK, ToolError, complain, print_line, refuse, run
 from triquad_tools.mapfiles.crop import without_training
 from triquad_tools.mapfiles.quantise import quantise
@@ -28,11 +27,17 @@ from triquad_tools.mapfiles.source import (
     is_endpoint,
     read_source,
 )
-from triquad_tools.mapping.output import MAP_SUFFIX, SUFFIXES, check_target, export, write_map_file
+from triquad_tools.mapping.output import (
+    MAP_SUFFIX,
+    SUFFIXES,
+    check_fill,
+    check_target,
+    export,
+    write_map_file,
+)
 
 _COMMAND = "triquad-pack"
 _DAMAGE = (DamagedMapFileError, NothingLeftError)
-_MARKED = (".ply", ".glb", ".obj")  # meshes that can show which faces fill holes
 _PLANES = ("XY", "XZ", "YZ")
 _CELL_RANGE_M = (0.01, 10.0)
 _ERROR_RANGE_M = (1e-5, 0.1)
@@ -58,6 +63,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_source(parser.add_argument)
     _add_content(parser.add_argument)
     _add_target(parser.add_argument)
+    add_fill(parser)
     return parser
 
 
@@ -84,9 +90,6 @@ def _add_content(add: _Add) -> None:
 def _add_target(add: _Add) -> None:
     cell = "side of cells of a mesh or a picture (default: half a leaf)"
     add("--cell", type=partial(within, *_CELL_RANGE_M), metavar="M", help=cell)
-    fill = "of a mesh: continue surface into unknown space, where the field does, up to so far "
-    fill += f"from what was seen, at most {MAX_FILL_M:g} m; those faces are marked"
-    add("--fill", type=partial(within, 0.0, MAX_FILL_M), default=0.0, metavar="M", help=fill)
     add("--force", action="store_true", help="replace OUT where it exists")
 
 
@@ -112,16 +115,15 @@ def _pack(options: argparse.Namespace) -> int:
 def _check_usage(options: argparse.Namespace) -> None:
     given, suffix = options.input, options.output.suffix
     is_map = suffix == MAP_SUFFIX
-    marked = ", ".join(_MARKED)
     problems = {
         f"{given} is a server: give its store, or what client.download_map saved": (
             is_endpoint(str(given))
         ),
         f"--max-error is of map files: {suffix} has none": options.max_error and not is_map,
         "--cell is of meshes: a map file has none": options.cell and is_map,
-        f"--fill is of meshes that can mark it, {marked}": options.fill and suffix not in _MARKED,
     }
     refuse(problems)
+    check_fill(options.output, options.fill)
 
 
 def _check_target(source: Path, target: Path, force: bool) -> None:

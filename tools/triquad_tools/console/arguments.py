@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import triquad_format
 from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
+from triquad_format.wire.limits import MAX_FILL_M
 
 if TYPE_CHECKING:
     from triquad_client import Client
@@ -76,6 +77,14 @@ def add_server(parser: argparse.ArgumentParser) -> None:
     name = f"of the server's maps (default: {DEFAULT_MAP})"
     parser.add_argument("--map", metavar="NAME", help=name)
     add_config(parser)
+
+
+def add_fill(parser: argparse.ArgumentParser) -> None:
+    """Add the option to continue surface; see :func:`triquad_tools.mapping.output.check_fill`."""
+    fill = "of a mesh or a picture: continue surface into unknown space, where the field does, up "
+    fill += f"to so far from what was seen, at most {MAX_FILL_M:g} m; those faces are marked"
+    most = partial(within, 0.0, MAX_FILL_M)
+    parser.add_argument("--fill", type=most, default=0.0, metavar="M", help=fill)
 
 
 def add_config(parser: argparse.ArgumentParser) -> None:

@@ -18,6 +18,7 @@ from triquad_tools.mapfiles.meshfile import MESH_SUFFIXES
 from triquad_tools.mapfiles.source import Box, NothingLeftError, SourceMap
 
 MAP_SUFFIX, PICTURE_SUFFIX = ".triquad", ".png"
+_MARKED = (".ply", ".glb", ".obj", PICTURE_SUFFIX)  # they can show which faces were not seen
 SUFFIXES = (MAP_SUFFIX, *MESH_SUFFIXES, PICTURE_SUFFIX)
 
 
@@ -43,17 +44,30 @@ def check_target(path: Path, *, force: bool) -> None:
         raise ToolError(f"{path.parent} is not a folder: make it first")
 
 
-def write_output(record: MapRecord, path: Path, *, cell_m: float, training: bool) -> str:
+def check_fill(path: Path, fill_m: float) -> None:
+    """Refuse to continue surface by ``fill_m`` where nothing could show which that is.
+
+    Raises:
+        ToolError: with what to use.
+    """
+    if fill_m and path.suffix not in _MARKED:
+        raise ToolError(f"--fill is of what can mark it, {', '.join(_MARKED)}: {path} cannot")
+
+
+def write_output(
+    record: MapRecord, path: Path, *, cell_m: float, training: bool, fill_m: float = 0.0
+) -> str:
     """Write a map file, a mesh with cells of side ``cell_m`` or a picture; return what it is.
 
-    A map file has the state that further training needs only with ``training``.
+    A map file has the state that further training needs only with ``training``; the surface of a
+    mesh or a picture is continued by ``fill_m`` into unknown space.
 
     Raises:
         OSError: it cannot be written.
     """
     source = SourceMap(record if training else without_training(record), time.time_ns())
     if path.suffix != MAP_SUFFIX:
-        return export(source, path, cell_m=cell_m)
+        return export(source, path, cell_m=cell_m, fill_m=fill_m)
     size = write_map_file(source, path)
     told = f"{size:,} bytes, {len(record.regions)} regions, epoch {record.epoch}"
     origin = ", origin {:.12g} {:.12g} {:.12g} m".format(*record.origin_m)
