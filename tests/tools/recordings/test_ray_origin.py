@@ -1,11 +1,12 @@
 """Where rays begin: clouds that nobody can have seen from there are told, and can be put right."""
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from support.recordings.bags import Recorded, messages_for, write_bag
 from support.ros_messages import CLOUD, TF
 from triquad_tools.console.command import ToolError
@@ -40,7 +41,9 @@ def in_frame(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
     return (points @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)
 
 
-def recorded(frame: str, name: str = "") -> Iterator[Recorded]:
+def recorded(
+    frame: str, written: Callable[[np.ndarray], np.ndarray] = np.asarray, *, name: str = ""
+) -> Iterator[Recorded]:
     """A drive whose clouds are in the frame of the lidar, of the base or of the map."""
     lidar = np.eye(4)
     lidar[:3, 3] = UP
@@ -49,7 +52,9 @@ def recorded(frame: str, name: str = "") -> Iterator[Recorded]:
         pose = base(number)
         moved = {"lidar": np.linalg.inv(lidar), "base_link": np.eye(4), "camera_init": pose}[frame]
         cloud = ROS2.cloud(in_frame(seen_from(pose), moved), stamp, name or frame)
-        yield Recorded("/tf", TF, stamp, ROS2.tf(stamp, ("camera_init", "base_link", pose)))
+        yield Recorded(
+            "/tf", TF, stamp, ROS2.tf(stamp, ("camera_init", "base_link", written(pose)))
+        )
         yield Recorded("/points", CLOUD, stamp + 1, cloud)
 
 
@@ -100,7 +105,7 @@ def test_clouds_in_the_frame_of_the_map_need_a_body_that_saw_them(tmp_path: Path
 def test_clouds_in_a_frame_of_the_map_that_nothing_names_can_be_taken_as_such(
     tmp_path: Path,
 ) -> None:
-    bag = write_bag(tmp_path / "bag", "mcap", recorded("camera_init", "world"))
+    bag = write_bag(tmp_path / "bag", "mcap", recorded("camera_init", name="world"))
     (remark,) = open_recording(bag, ReadingOptions()).remarks
     assert "if its points are in the map already, use --points-in world" in remark
     assert_right(selected(bag, "--points-in", "world", "--ray-origin", "0.4,0,1.7"))
@@ -119,24 +124,52 @@ def test_folders_of_clouds_are_checked_as_well(tmp_path: Path) -> None:
     assert_right(selected(tmp_path, "--ray-origin", "0.4,0,1.7"))
 
 
-def test_poses_the_other_way_round_and_millimetres_are_told(tmp_path: Path) -> None:
-    folders = {"inverse": 1.0, "millimetres": 1000.0}
-    for name, units in folders.items():
-        (tmp_path / name).mkdir()
-        rows = []
-        for number in range(len(STAMPS)):
-            points = units * (seen_from(base(number)) - UP)
-            cloud = np.pad(points, ((0, 0), (0, 1))).astype(np.float32)
-            cloud.tofile(tmp_path / name / f"{number:06d}.bin")
-            pose = base(number)
-            pose[:3, 3] += pose[:3, :3] @ UP
-            rows.append(np.linalg.inv(pose) if name == "inverse" else pose)
-        text = "\n".join(" ".join(map(str, pose[:3].ravel())) for pose in rows)
-        (tmp_path / name / "poses.txt").write_text(text)
-    with pytest.raises(ToolError, match="the poses seem to be sensor_from_world"):
-        open_recording(tmp_path / "inverse", ReadingOptions())
-    with pytest.raises(ToolError, match="write them in metres"):
-        open_recording(tmp_path / "millimetres", ReadingOptions())
+def words_of(pose: np.ndarray, order: str = "xyzw") -> str:
+    """A pose as a line ``x y z`` and a quaternion."""
+    turn = dict(zip("xyzw", Rotation.from_matrix(pose[:3, :3]).as_quat(), strict=True))
+    return " ".join(map(str, [*pose[:3, 3], *(turn[axis] for axis in order)]))
+
+
+def in_millimetres(pose: np.ndarray) -> np.ndarray:
+    return np.vstack([pose[:3] * [1, 1, 1, 1000], pose[3]])
+
+
+@pytest.mark.parametrize(
+    ("said", "units", "told"),
+    [
+        (words_of, 1.0, ""),
+        (lambda pose: words_of(np.linalg.inv(pose)), 1.0, "the poses seem to be sensor_from_world"),
+        (lambda pose: words_of(pose, "wxyz"), 1.0, "seem to have quaternions w x y z.*ion wxyz"),
+        (lambda pose: words_of(in_millimetres(pose)), 1.0, r"moves 3.* of the poses in metres"),
+        (words_of, 1000.0, "half of the points are farther .* write them in metres"),
+    ],
+)
+def test_what_else_than_metres_from_the_sensor_to_the_world_a_folder_may_hold_is_told(
+    said: Callable[[np.ndarray], str], units: float, told: str, tmp_path: Path
+) -> None:
+    lines = ["# x y z qx qy qz qw"]
+    for number in range(len(STAMPS)):
+        points = units * (seen_from(base(number)) - UP)
+        np.pad(points, ((0, 0), (0, 1))).astype(np.float32).tofile(tmp_path / f"{number:06d}.bin")
+        pose = base(number)
+        pose[:3, 3] += pose[:3, :3] @ UP
+        lines.append(said(pose))
+    (tmp_path / "poses.txt").write_text("\n".join(lines))
+    if told:
+        with pytest.raises(ToolError, match=told):
+            open_recording(tmp_path, ReadingOptions())
+    else:
+        assert len(open_recording(tmp_path, ReadingOptions()).entries) == len(STAMPS)
+
+
+def test_poses_in_millimetres_of_a_bag_are_told(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "bag", "mcap", recorded("lidar", in_millimetres))
+    recording = open_recording(bag, ReadingOptions())
+    assert not recording.entries
+    (remark,) = recording.remarks
+    assert "/points: 9 of 9 are left out: from scan to scan the sensor moves 3" in remark
+    assert "write the positions of the poses in metres" in remark
+    assert len(selected(bag, "--ray-origin", "0,0,0")) == len(STAMPS)
 
 
 def test_few_points_lie_behind_others_from_the_sensor_alone() -> None:

@@ -188,12 +188,16 @@ def test_two_publishers_of_the_same_poses_are_told(same_time: bool) -> None:
     single = tree(*(edge("odom", "base", T0 + n, at_x(n + n % 2 / 10)) for n in range(50)))
     single.check()
     assert len(single.poses("odom", "base", at(T0))) == 1
+    assert single.problems() == []
+    ((child, problem),) = frames.problems()
+    assert child == "base"
     frames.check()
     with pytest.raises(
         NoTransformError, match=r"jumps to and fro, \d+ times, by 0.(15|5) m"
     ) as caught:
         frames.poses("odom", "base", at(T0))
     assert caught.value.reason == "two_publishers"
+    assert problem in str(caught.value)
 
 
 def moving(stamp_ns: int) -> Pose:

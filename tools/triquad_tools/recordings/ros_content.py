@@ -141,8 +141,7 @@ class RosContent:
         sweep = self._reader.sweep(topic, message.channel.kind, decoded, message.recorded_ns)
         number, (first_ns, last_ns) = self._numbers[topic], sweep.span_ns
         self._numbers[topic] += 1
-        if message.channel.kind not in type_store.IMAGES:
-            self.rays.see(topic, sweep.points)
+        self.rays.see(topic, sweep.points, is_depth=message.channel.kind in type_store.IMAGES)
         about = sweep.frame, sweep.stamp_ns, first_ns, last_ns, sweep.note, message.channel.file
         self.clouds.append(SeenCloud(topic, number, *about))
 

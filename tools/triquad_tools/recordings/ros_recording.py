@@ -4,6 +4,8 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.bag import Bag, Message
 from triquad_tools.recordings.pose_source import (
@@ -179,8 +181,29 @@ class RosRecording:
                 newest_ns[cloud.topic] = cloud.stamp_ns
                 self._placed.append(cloud)
             else:
-                left_out = replace(cloud, problem=problem)
-                self._left_out[cloud.topic, problem.reason].append(left_out)
+                self._leave_out(cloud, problem)
+        for topic, frame in dict.fromkeys((each.topic, each.frame) for each in self._placed):
+            self._check_rays(topic, frame)
+
+    def _leave_out(self, cloud: SeenCloud, problem: NoScanError) -> None:
+        self._left_out[cloud.topic, problem.reason].append(replace(cloud, problem=problem))
+
+    def _check_rays(self, topic: str, frame: str) -> None:
+        """Leave out placed clouds whose points and poses cannot be metres seen from their frame."""
+        assert self._poses is not None
+        stands = self._options.points_in == WORLD and not self._poses.moves(frame)
+        if stands or self._options.ray_origin is not None:
+            return
+        clouds = [each for each in self._placed if (each.topic, each.frame) == (topic, frame)]
+        stamps = np.array([cloud.stamp_ns for cloud in clouds])
+        poses = self._poses.frames.poses(self._poses.target, frame, stamps)
+        problem = with_remedies(self._content.rays.problem(topic, poses[:, :3, 3]))
+        if problem is not None:
+            self._placed = [
+                each for each in self._placed if (each.topic, each.frame) != (topic, frame)
+            ]
+            for cloud in clouds:
+                self._leave_out(cloud, problem)
 
     def _problem(self, cloud: SeenCloud, newest_ns: dict[str, int]) -> NoScanError | None:
         if cloud.problem is not None:
@@ -199,9 +222,7 @@ class RosRecording:
             if way == WORLD:
                 return self._poses.find(replace(cloud, frame=body))
             return NoScanError("map_frame", _STANDS.format(frame=cloud.frame, body=body))
-        if self._options.ray_origin is not None:
-            return None
-        return with_remedies(self._content.rays.problem(cloud.topic))
+        return None
 
     def _left_out_line(self, topic: str, reason: str) -> str:
         clouds = self._left_out[topic, reason]

@@ -10,6 +10,8 @@ from collections import Counter, defaultdict
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.records.arrays import Doubles
+from triquad_format.records.plausibility import median_range_m, wrong_units
 
 from triquad_tools.sensors.sweep import NoScanError
 
@@ -21,9 +23,9 @@ _WRONG = 0.07
 From the sensor it is 0.3 % in streets and halls and up to 5 % amid trees; from the base of a car
 on the ground 8 to 23 %, from the origin of a map 7 to 21 % (recorded and simulated drives)."""
 
-_FAR_M = 500.0  # half of the points of no scan are farther away than this: they are in millimetres
 _NEAREST_M = 0.3  # nearer points are the robot's own
 _REPEATED = 16  # equal points of a scan that are no measurements
+_NOWHERE = np.empty((0, 3))
 
 
 def hidden_share(points: NDArray[np.floating]) -> float:
@@ -63,30 +65,30 @@ class RayCheck:
         self._shares: dict[str, list[float]] = defaultdict(list)
         self._ranges_m: dict[str, list[float]] = defaultdict(list)
 
-    def see(self, stream: str, points: NDArray[np.floating]) -> None:
-        """Take notice of the points [N, 3] of a scan, in the frame in which its rays begin."""
+    def see(self, stream: str, points: NDArray[np.floating], *, is_depth: bool = False) -> None:
+        """Take notice of the points [N, 3] of a scan, in the frame in which its rays begin.
+
+        Those of a depth image begin at its camera.
+        """
         self._seen[stream] += 1
         if self._seen[stream].bit_count() == 1:  # the first, the second, fourth, eighth, ...
-            self._shares[stream].append(hidden_share(without_repeated(points)))
-            ranges = np.linalg.norm(points, axis=1)
-            finite = np.append(ranges[np.isfinite(ranges)], 0.0)
-            self._ranges_m[stream].append(float(np.median(finite)))
+            share = 0.0 if is_depth else hidden_share(without_repeated(points))
+            self._shares[stream].append(share)
+            self._ranges_m[stream].append(median_range_m(points))
 
-    def problem(self, stream: str) -> NoScanError | None:
-        """Return why points of a stream cannot be metres seen from 0, 0, 0; None: they may."""
+    def problem(self, stream: str, places: Doubles = _NOWHERE) -> NoScanError | None:
+        """Return why points of a stream cannot be metres seen from 0, 0, 0; None: they may.
+
+        ``places`` [N, 3] are where the sensor was, scan by scan, as far as that is known.
+        """
         range_m = statistics.median(self._ranges_m[stream] or [0.0])
-        if range_m > _FAR_M:
-            told = f"half of the points are farther than {range_m:.0f} m: write them in metres"
+        if (told := wrong_units(range_m, places)) is not None:
             return NoScanError("units", told)
-        elsewhere = self.begin_elsewhere(stream)
-        return None if elsewhere is None else NoScanError("ray_origin", elsewhere)
-
-    def begin_elsewhere(self, stream: str) -> str | None:
-        """Return why rays of a stream cannot begin at the frame of its points; None: they may."""
         share = statistics.median(self._shares[stream] or [0.0])
         if share <= _WRONG:
             return None
-        return (
+        return NoScanError(
+            "ray_origin",
             f"{share:.0%} of the points lie behind others as seen from the origin of their frame, "
-            "so their rays begin elsewhere"
+            "so their rays begin elsewhere",
         )

@@ -25,8 +25,6 @@ from triquad_tools.sensors.motion.placing import place
 from triquad_tools.sensors.point_times import offsets_s
 from triquad_tools.sensors.sweep import NoTransformError, PosedScan, Sweep
 
-_TRIED = 4  # clouds, to determine the frame of all
-
 _DEEPER = "velodyne_points/data"  # where KITTI's raw recordings have theirs
 _KITTI, _KITTI_360 = "calib.txt", "calib_cam_to_velo.txt"
 _DRIVE_M, _ALONG_Z = 5.0, 0.9  # a way that tells the axes, and how much of it is along z
@@ -56,12 +54,8 @@ def read_cloud_folder(folder: Path, options: ReadingOptions | None = None) -> Sc
     poses, files = placed.trajectory, placed.files
     if first.suffix.lower() == ".bin" and poses.frames is None:
         files = _of_lidar([folder, above, poses.path.parent], files)
-    tried = [files[len(files) * (2 * step + 1) // (2 * _TRIED)] for step in range(_TRIED)]
     if options.points_in is None:
-        check_frame(tried, columns)
-    read_file = partial(_read_scan, poses, options)
-    if options.ray_origin is None and options.points_in != SENSOR:
-        check_rays(first.parent, map(read_file, tried))
+        check_frame(files, columns)
     names = dict.fromkeys(path.parent.name for path in paths)
     clouds = ", ".join(f"{name}/*{first.suffix}" for name in names)
     kind = first.suffix[1:].upper() + " clouds"
@@ -69,7 +63,9 @@ def read_cloud_folder(folder: Path, options: ReadingOptions | None = None) -> Sc
         Stream(clouds, kind, len(files), "scans", options.points_in or SENSOR),
         Stream(poses.path.name, poses.kind, len(poses.poses), "poses of the sensor"),
     )
-    read = ScanFolder(files, read_file, streams, placed.remarks)
+    read = ScanFolder(files, partial(_read_scan, poses, options), streams, placed.remarks)
+    if options.ray_origin is None and options.points_in != SENSOR:
+        check_rays(read)
     if options.points_in is None:
         check_poses(read)
     return read

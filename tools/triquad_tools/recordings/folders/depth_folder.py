@@ -12,6 +12,7 @@ from triquad_client.errors import NO_NUMBER, InvalidScanError
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.folders.file_names import in_order
+from triquad_tools.recordings.folders.frame_checks import check_rays
 from triquad_tools.recordings.folders.scan_folder import (
     PlacedFile,
     ScanFolder,
@@ -182,7 +183,9 @@ def read_depth_folder(folder: Path, options: ReadingOptions) -> ScanFolder:
         Stream(poses.path.name, poses.kind, len(poses.poses), "poses of the camera"),
     )
     read_file = partial(_read_scan, camera, units, options.stride)
-    return ScanFolder(placed.files, read_file, streams, placed.remarks)
+    read = ScanFolder(placed.files, read_file, streams, placed.remarks)
+    check_rays(read, is_depth=True)
+    return read
 
 
 def read_depth(path: Path) -> NDArray[np.uint16]:

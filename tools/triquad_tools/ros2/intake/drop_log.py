@@ -60,9 +60,12 @@ class DropLog:
             remedy = f" ({REMEDIES[reason]})" if reason in REMEDIES else ""
             _log.warning("%s: %d dropped, %s: %s%s", topic_name, since, reason, text, remedy)
 
-    def remark(self, topic_name: str, text: str) -> None:
-        """Log something that drops nothing by itself, as often as a drop; a text is one reason."""
-        if self._due(topic_name, text, 1):
+    def remark(self, topic_name: str, text: str, reason: str = "") -> None:
+        """Log something that drops nothing by itself, as often as a drop of one reason.
+
+        A text is a reason of its own, unless one is given.
+        """
+        if self._due(topic_name, reason or text, 1):
             _log.warning("%s: %s", topic_name, text)
 
     def _due(self, topic_name: str, reason: str, count: int) -> int:

@@ -15,7 +15,7 @@ from triquad_client import Client, InvalidScanError
 from triquad_format.errors import TriquadError
 from triquad_format.records.arrays import Doubles
 
-from triquad_tools.ros2.intake.drop_log import DropLog, FirstScan
+from triquad_tools.ros2.intake.drop_log import LOG_PERIOD_S, DropLog, FirstScan
 from triquad_tools.ros2.intake.placement import Motion, Placed, Placement
 from triquad_tools.ros2.intake.topic_listener import Arrival, Limits, MessageQueue, TopicListener
 from triquad_tools.ros2.node import Node
@@ -135,6 +135,7 @@ class Intake:
         self._gaps = SequenceGaps()
         self._gaps_lock = threading.Lock()
         self._first_scan = FirstScan(options.topics, time.monotonic())
+        self._check_s = time.monotonic() + LOG_PERIOD_S  # when the transforms are checked next
         self._stopping = threading.Event()
         self._listener = TopicListener(session, options.topics, node, self._receive)
         self._thread = threading.Thread(target=self._run, name="ros2-intake")
@@ -184,7 +185,12 @@ class Intake:
                 self._guard(arrival.topic_name, partial(self._read, arrival))
             for placed in self._placement.settle(time.monotonic()):
                 self._guard(placed.topic_name, partial(self._publish, placed))
-            self._first_scan.check(self._listener.found, time.monotonic())
+            now_s = time.monotonic()
+            self._first_scan.check(self._listener.found, now_s)
+            if now_s >= self._check_s:
+                self._check_s = now_s + LOG_PERIOD_S
+                for child, problem in self._motion.frames.problems():
+                    self.drops.remark(child, problem, "two_publishers")
 
     def _publish(self, placed: Placed) -> None:
         if isinstance(placed.outcome, NoScanError):
@@ -216,8 +222,9 @@ class Intake:
             sweep = self._reader.sweep(topic_name, kind, message, came_ns)
             if role is Role.CLOUD:
                 self._rays.see(topic_name, sweep.points)
-                if (problem := self._rays.begin_elsewhere(topic_name)) is not None:
-                    self.drops.remark(topic_name, f"{problem}, {_SETTING}")
+                if (problem := self._rays.problem(topic_name)) is not None:
+                    setting = f", {_SETTING}" if problem.reason == "ray_origin" else ""
+                    self.drops.remark(topic_name, f"{problem}{setting}")
             self._place(topic_name, sweep)
         else:
             static = role is Role.TF_STATIC

@@ -126,9 +126,13 @@ class FrameTree:
         for child, edges in self._edges.items():
             for edge in edges.values():
                 if edge.problem is None and edge.standing is None:
-                    count, metres = edge.track.jumps()
-                    told = _TWO_PUBLISHERS.format(edge.parent, child, count, metres)
-                    edge.problem = told if count else ""
+                    edge.problem = _of_two(child, edge)
+
+    def problems(self) -> list[tuple[str, str]]:
+        """Return the frames whose poses two programs publish by now, each with what to do."""
+        found = ((child, self._edge(child)) for child in self.moving)
+        told = ((child, _of_two(child, edge)) for child, edge in found if edge is not None)
+        return [(child, problem) for child, problem in told if problem]
 
     def newest_ns(self, child: str) -> int | None:
         """Return the stamp of the newest pose of a frame that moves in its parent."""
@@ -276,3 +280,9 @@ class FrameTree:
                 "transform connects the two"
             )
         return NoTransformError("no_transform", text, late=True)
+
+
+def _of_two(child: str, edge: _Edge) -> str:
+    """Return which poses two programs publish, if they do."""
+    count, metres = edge.track.jumps()
+    return _TWO_PUBLISHERS.format(edge.parent, child, count, metres) if count else ""

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from triquad_client.pose import pose_matrices
 from triquad_format.records.arrays import Doubles, Longs
+from triquad_format.records.plausibility import JUMP_M, jumps
 
 from triquad_tools.sensors.sweep import NoTransformError
 
@@ -15,8 +16,6 @@ MAX_GAP_S = 2.0  # between poses farther apart nothing is interpolated, unless t
 _WIDTH = 7  # numbers of a pose
 _NEARLY_PARALLEL = 0.9995  # quaternions, of which spherical interpolation would divide by nearly 0
 _RARER = 3.0  # times, at least, is a correction rarer than the poses that it corrects
-_JUMP_M = 0.15  # less than by this, two that publish the same poses may differ
-_JUMPS, _SHARE_OF_JUMPS = 5, 0.05  # as many are of two, rather than a few wrong poses of one
 _CORRECTED_M, _CORRECTED_RAD = 0.3, 0.05  # drift; a correction by more, at a loop, comes at once
 
 
@@ -67,7 +66,7 @@ class Track:
             replaced = stamps[at] == stamp_ns
             if replaced:
                 before = values[_WIDTH * at : _WIDTH * at + 3]
-                self._replaced += math.dist(before, position_m) > _JUMP_M
+                self._replaced += math.dist(before, position_m) > JUMP_M
             else:
                 stamps.insert(at, stamp_ns)
             new = array("d", [*position_m, *quaternion])
@@ -83,17 +82,7 @@ class Track:
     def jumps(self) -> tuple[int, float]:
         """Return how often it jumps to and fro as if two published it, and by how much, metres."""
         places = np.array(self._values).reshape(-1, _WIDTH)[:, :3]
-        times = np.array(self._stamps, np.int64)
-        share = ((times[1:-1] - times[:-2]) / (times[2:] - times[:-2]))[:, None]
-        aside = places[1:-1] - (1 - share) * places[:-2] - share * places[2:]
-        size = np.linalg.norm(aside, axis=1)
-        turns_back = (aside[:-1] * aside[1:]).sum(axis=1) < -0.5 * size[:-1] * size[1:]
-        jumps = np.minimum(size[:-1], size[1:])[turns_back]
-        jumps = jumps[jumps > _JUMP_M]
-        count = len(jumps) + self._replaced
-        if count < max(_JUMPS, _SHARE_OF_JUMPS * (len(self) + self._replaced)):
-            return 0, 0.0
-        return count, float(np.median(jumps)) if len(jumps) else _JUMP_M
+        return jumps(np.array(self._stamps, np.int64), places, self._replaced)
 
     def poses(self, stamps_ns: Longs, *, corrects: bool = False) -> Doubles:
         """Return poses [M, 4, 4] at times [M].
