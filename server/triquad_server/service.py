@@ -195,7 +195,7 @@ class Service:
             failed=failed,
             listeners=MapListeners(
                 scan_taken=(
-                    lambda scan, rays: warnings.add(scan.source, len(scan.points), rays),
+                    lambda scan, rays: warnings.add(scan.source, scan.points, rays),
                     trails.add,
                 ),
                 published=(self._surface.add,),

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+from triquad_format.records.arrays import Doubles, Floats
+from triquad_format.records.plausibility import jumps, median_range_m, wrong_units
 
 from triquad_server.intake.rays import ScanRays
 from triquad_server.intake.scan_queue import ScanQueue
@@ -25,7 +27,6 @@ _TOO_NEAR_SHARE, _TOO_FAR_SHARE = 0.1, 0.5
 _MAX_SOURCES = 256  # sources that are kept; the one heard of longest ago is removed
 _MAX_WARNINGS = 1024  # warnings that are kept, the same way
 _MAX_SHOWN = 50  # warnings for a client at once
-_RANGES = 1000  # of a scan, at most, of which the median is taken
 
 _NEAR_LEAVES, _GOOD_LEAVES = 18.0, 40.0
 """The median ranges that are too near for the leaf, and that suit it: lidars in streets have 28 to
@@ -42,6 +43,8 @@ class _Points:
     sent: int = 0
     dropped: dict[str, int] = field(default_factory=lambda: {"too_near": 0, "too_far": 0})
     ranges_m: list[float] = field(default_factory=list)  # median of each scan, of what is used
+    sent_ranges_m: list[float] = field(default_factory=list)  # the same of all that was sent
+    places: list[Doubles] = field(default_factory=list)  # [3] of the sensor, of each scan
 
 
 @dataclass
@@ -71,20 +74,27 @@ class ScanWarnings:
         # By source and cause, the newest last.
         self._warnings: OrderedDict[tuple[str, str], _Warning] = OrderedDict()
 
-    def add(self, source: str, sent: int, rays: ScanRays) -> None:
-        """Record that a scan of ``sent`` points was taken in; ``rays`` are what of it is used."""
+    def add(self, source: str, sent: Floats, rays: ScanRays) -> None:
+        """Record that a scan was taken in.
+
+        Args:
+            source: the name of the sensor.
+            sent: its points [N, 3], sensor frame.
+            rays: what of it is used.
+        """
         with self._lock:
             points = self._points.setdefault(source, _Points())
             self._points.move_to_end(source)
             if len(self._points) > _MAX_SOURCES:
                 self._points.popitem(last=False)
             points.scans += 1
-            points.sent += sent
+            points.sent += len(sent)
+            points.sent_ranges_m.append(median_range_m(sent))
+            points.places.append(rays.origin)
             for reason in points.dropped:
                 points.dropped[reason] += rays.points_dropped.get(reason, 0)
             if len(rays.ends):
-                some = rays.ends[:: max(1, len(rays.ends) // _RANGES)]
-                points.ranges_m.append(float(np.median(np.linalg.norm(some - rays.origin, axis=1))))
+                points.ranges_m.append(median_range_m(rays.ends - rays.origin))
 
     def check(self) -> None:
         """Log the warnings that are due and were not logged lately."""
@@ -94,6 +104,7 @@ class ScanWarnings:
                 if points.scans >= _SCANS:
                     self._check_ranges(source, points)
                     self._check_leaf(source, points)
+                    self._check_places(source, points)
                     self._points[source] = _Points()
 
     def of(self, source: str) -> str | None:
@@ -182,6 +193,19 @@ class ScanWarnings:
             f"details are lost. For a new map use --preset {preset}, or field.leaf_m = "
             f"{better_m:g}",
         )
+
+    def _check_places(self, source: str, points: _Points) -> None:
+        places = np.array(points.places)
+        if (told := wrong_units(float(np.median(points.sent_ranges_m)), places)) is not None:
+            self._warn(source, "units", told)
+        count, size_m = jumps(np.arange(len(places)), places)
+        if count and told is None:
+            self._warn(
+                source,
+                "jumps",
+                f"its poses jump to and fro by {size_m:.2g} m: two programs publish them, or two "
+                "sensors scans of this name: stop one, or give each a source of its own",
+            )
 
     def _warn(
         self, source: str, cause: str, text: str, *, scans: int = 0, met_s: float | None = None

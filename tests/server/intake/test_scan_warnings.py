@@ -7,7 +7,7 @@ from triquad_format.records.field_settings import FieldSettings
 from triquad_server.intake.rays import usable_rays
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
-from triquad_server.settings import Settings, SourceSettings
+from triquad_server.settings import ScanSettings, Settings, SourceSettings
 from triquad_server.settings.loading import load_settings
 
 SETTINGS = Settings()
@@ -39,7 +39,7 @@ def take_in(
     source = settings.sources.get("cam", SourceSettings())
     scan = settings.scan_of(source)
     for _ in range(scans):
-        warnings.add("cam", len(points), usable_rays(points, np.eye(4), scan, source=source))
+        warnings.add("cam", points, usable_rays(points, np.eye(4), scan, source=source))
 
 
 def test_points_that_range_min_m_takes_are_told_with_the_setting_to_change() -> None:
@@ -60,6 +60,28 @@ def test_most_points_beyond_the_range_are_told() -> None:
     assert text is not None
     assert "range_max_m = 50 drops 60 % of its points" in text
     assert "sources.cam.range_max_m to more" in text
+
+
+@pytest.mark.parametrize(
+    ("range_m", "step_m", "aside_m", "told"),
+    [
+        (8.0, 0.5, 0.0, ""),
+        (8000.0, 0.5, 0.0, "farther than 8000 m: write them in metres"),
+        (8.0, 500.0, 0.0, "the sensor moves 500 m, while half of the points are nearer than 8 m"),
+        (8.0, 0.5, 0.4, "its poses jump to and fro by 0.4 m: two programs publish them"),
+    ],
+)
+def test_what_two_publish_and_what_is_in_millimetres_is_told(
+    range_m: float, step_m: float, aside_m: float, told: str
+) -> None:
+    warnings, points = watch(Settings(scan=ScanSettings(range_max_m=100.0))), cloud((500, range_m))
+    for number in range(10):
+        pose = np.eye(4)
+        pose[:2, 3] = step_m * number, aside_m * (number % 2)
+        warnings.add("cam", points, usable_rays(points, pose, SETTINGS.scan))
+    text = warnings.of("cam") or ""
+    assert told in text
+    assert bool(told) == bool(text)
 
 
 NO_DEPTH = np.zeros((500, 3), np.float32)
@@ -177,7 +199,8 @@ def test_a_warning_whose_cause_is_gone_is_no_longer_told() -> None:
 
 def test_sources_that_are_invented_take_no_memory_without_end() -> None:
     warnings = watch()
-    rays = usable_rays(cloud((10, 8.0)), np.eye(4), SETTINGS.scan)
+    points = cloud((10, 8.0))
+    rays = usable_rays(points, np.eye(4), SETTINGS.scan)
     for number in range(2000):
-        warnings.add(f"s{number}", 10, rays)
+        warnings.add(f"s{number}", points, rays)
     assert len(warnings._points) == 256
