@@ -55,7 +55,9 @@ class Intrinsics:
         return slopes
 
 
-def depth_points(depth: ArrayLike, intrinsics: Intrinsics, stride: int = 1) -> Floats:
+def depth_points(
+    depth: ArrayLike, intrinsics: Intrinsics, stride: int = 1, units_per_metre: float | None = None
+) -> Floats:
     """Return the points [N, 3] that a depth image shows, row by row.
 
     Args:
@@ -64,6 +66,7 @@ def depth_points(depth: ArrayLike, intrinsics: Intrinsics, stride: int = 1) -> F
             or the largest integer shows nothing.
         intrinsics: of the camera.
         stride: every how many rows and columns one is taken.
+        units_per_metre: of the depths, where these are no metres or millimetres.
 
     Returns:
         Metres, in the camera's optical frame: x to the right, y down, z forward.
@@ -72,7 +75,7 @@ def depth_points(depth: ArrayLike, intrinsics: Intrinsics, stride: int = 1) -> F
         InvalidScanError: the image is not one, shows nothing, most of it is negative, or the
             stride is below 1.
     """
-    image = _metres(depth)
+    image = _metres(depth, units_per_metre)
     if isinstance(stride, bool) or not isinstance(stride, int) or stride < 1:
         raise InvalidScanError(f"stride = {stride!r}: use 1 or more")
     image = image[::stride, ::stride]
@@ -90,14 +93,15 @@ def depth_points(depth: ArrayLike, intrinsics: Intrinsics, stride: int = 1) -> F
     return np.stack([x, y, z], axis=1).astype(np.float32)
 
 
-def _metres(depth: ArrayLike) -> NDArray[np.floating]:
+def _metres(depth: ArrayLike, units_per_metre: float | None) -> NDArray[np.floating]:
     image = np.asarray(depth)
     if image.ndim != 2 or image.size == 0:
         raise InvalidScanError(f"depth is {list(image.shape)}, not [rows, columns]")
     if image.dtype.kind == "f":
-        return image
+        return image if units_per_metre is None else image / np.float32(units_per_metre)
     if image.dtype.kind == "u" and image.dtype.itemsize > 1:
-        metres: NDArray[np.floating] = image / np.float32(_MILLIMETRES_PER_M)
+        units = np.float32(units_per_metre or _MILLIMETRES_PER_M)
+        metres: NDArray[np.floating] = image / units
         metres[image == np.iinfo(image.dtype).max] = 0.0
         return metres
     raise InvalidScanError(

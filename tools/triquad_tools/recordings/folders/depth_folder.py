@@ -1,6 +1,7 @@
 """Folders of depth images with the poses of the camera, as data sets lay them out."""
 
 import json
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -39,7 +40,6 @@ _LAYOUTS = (
 )
 """Where images lie in a folder, and how many units of theirs are a metre."""
 
-_NOTHING = np.iinfo(np.uint16).max  # of a pixel without a measurement, in 7-Scenes and 3DMatch
 _GREY_MODES = ("I;16", "I;16B", "I")  # 16 bits, as versions of Pillow name them
 
 
@@ -214,11 +214,9 @@ def read_depth(path: Path) -> NDArray[np.uint16]:
 
 
 def _read_scan(camera: Camera, units: float, stride: int, file: PlacedFile) -> PosedScan:
-    pixels = read_depth(file.path)
-    pixels[pixels == _NOTHING] = 0
     points: NDArray[Any] = np.empty((0, 3), np.float32)
-    if pixels[::stride, ::stride].any():
-        points = depth_points(pixels / np.float32(units), camera.intrinsics, stride)
+    with suppress(InvalidScanError):  # it shows nothing
+        points = depth_points(read_depth(file.path), camera.intrinsics, stride, units)
     return PosedScan(points, file.world_from_sensor)
 
 

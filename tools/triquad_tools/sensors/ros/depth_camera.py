@@ -76,11 +76,9 @@ def sweep_of_depth(
     _check_size(columns, rows, info)
     camera = camera_of(info, topic)
     try:
-        points = depth_points(pixels, camera, stride)
+        points = depth_points(pixels, camera, stride, units_per_metre)
     except InvalidScanError as error:
         raise NoScanError("depth", str(error)) from error
-    if units_per_metre is not None:
-        points *= (1000.0 if pixels.dtype.kind == "u" else 1.0) / units_per_metre
     if len(points) and np.nanmedian(points[:, 2]) > _FAR_M:
         raise NoScanError(
             "units",
