@@ -13,7 +13,7 @@ from triquad_client import FlushReport
 from triquad_tools.console.arguments import add_server, command_parser, connect_to, positive
 from triquad_tools.console.command import FAILED, OK, print_line, run
 from triquad_tools.console.report import print_columns
-from triquad_tools.recordings.opening import length_s, open_recording, open_selected
+from triquad_tools.recordings.opening import entries_of, length_s, open_recording, open_selected
 from triquad_tools.recordings.publishing import FLUSH_TIMEOUT_S, publish_all, wait_until_settled
 from triquad_tools.recordings.recording import ScanEntry, add_recording, options_of
 
@@ -41,10 +41,7 @@ def _list(options: argparse.Namespace) -> int:
     print_columns(titles, rows, words=("type", "frame", "use"))
     for remark in recording.remarks:
         print_line(remark)
-    entries = recording.entries
-    if not entries:
-        print_line(f"{path}: nothing of it can be mapped as it is")
-        return FAILED
+    entries = entries_of(recording, path)
     seconds = length_s(entries)
     rate = f", {(len(entries) - 1) / seconds:.1f} a second" if seconds > 0 else ""
     print_line(f"{len(entries):,} scans in {seconds:.1f} s{rate}")
@@ -100,7 +97,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Publish a recording to a map server. By default the server sets the pace, and "
         "no scan is lost.",
         epilog="Exit status: 0 all scans are in the map (--list: there are some to map), 1 some "
-        "were lost or refused or the server failed, 2 wrong usage or input.",
+        "were lost or refused or the server failed, 2 wrong usage, or nothing can be mapped.",
     )
     add_recording(parser)
     add = parser.add_argument

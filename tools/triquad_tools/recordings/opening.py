@@ -123,9 +123,7 @@ def open_selected(options: argparse.Namespace) -> Selection:
     recording = open_recording(options.recording, reading)
     for remark in recording.remarks:
         print_remark(f"{options.recording}: {remark}")
-    entries = recording.entries
-    if not entries:
-        raise ToolError(f"{options.recording}: nothing of it can be mapped")
+    entries = entries_of(recording, options.recording)
     indices = _chosen(entries, options)
     if not indices:
         raise ToolError(
@@ -134,6 +132,17 @@ def open_selected(options: argparse.Namespace) -> Selection:
         )
     way = repr((options.recording.resolve(), reading, options.range_min))
     return Selection(recording, indices, options.range_min, reading.ray_origin or _ORIGIN, way)
+
+
+def entries_of(recording: Recording, path: Path) -> Sequence[ScanEntry]:
+    """Return the scans of a recording that can be mapped.
+
+    Raises:
+        ToolError: there are none.
+    """
+    if entries := recording.entries:
+        return entries
+    raise ToolError(f"{path}: nothing of it can be mapped as it is")
 
 
 def length_s(entries: Sequence[ScanEntry]) -> float:
