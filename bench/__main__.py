@@ -14,7 +14,7 @@ from pathlib import Path
 from triquad_server.settings import Settings
 from triquad_server.warm_up import warm_up
 from triquad_tools.console.arguments import seed
-from triquad_tools.console.command import ToolError, run
+from triquad_tools.console.command import run
 from triquad_tools.console.progress import progress
 from triquad_tools.console.report import Row, print_rows
 
@@ -38,9 +38,9 @@ _Measure = Callable[[argparse.Namespace], list[Figure]]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the benchmarks: 0 done, whatever the figures; 1 a part failed; 2 wrong usage or input."""
+    """Run the benchmarks: 0 done, whatever the figures; 1 or 2 a part failed, or wrong usage."""
     options = _parser().parse_args(argv)
-    return run("bench", partial(_bench, options), failures=(ToolError, OSError))
+    return run("bench", partial(_bench, options))
 
 
 def _bench(options: argparse.Namespace) -> int:

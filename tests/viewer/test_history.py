@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.files.changing_store import EMPTY, box_at, write_checkpoint
-from triquad_tools.console.command import ToolError
+from triquad_format.errors import DamagedMapFileError
 from triquad_tools.viewer.sources import (
     COARSEST,
     DamagedError,
@@ -111,5 +111,5 @@ def test_a_moment_that_cannot_be_shown_is_none_any_more(tmp_path: Path) -> None:
 
 def test_a_store_of_which_nothing_is_left(tmp_path: Path) -> None:
     flip(write_checkpoint(tmp_path, 1, EMPTY))
-    with pytest.raises(ToolError, match="no checkpoint can be shown"):
+    with pytest.raises(DamagedMapFileError, match="no checkpoint can be shown"):
         History(tmp_path).newest()

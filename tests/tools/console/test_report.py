@@ -1,6 +1,12 @@
 import pytest
+from triquad_format.errors import (
+    DamagedMapFileError,
+    InvalidInputError,
+    MapFileError,
+    TriquadError,
+)
 from triquad_tools.console import report
-from triquad_tools.console.command import run
+from triquad_tools.console.command import ToolError, run
 from triquad_tools.console.report import Row, json_text, print_columns, print_rows
 
 
@@ -41,7 +47,11 @@ def test_json_has_null_for_what_is_not_finite():
     ("raised", "status", "line"),
     [
         (OSError("no such file"), 2, "tool: no such file"),
-        (KeyError("damage"), 1, "tool: 'damage'"),
+        (DamagedMapFileError("damage"), 1, "tool: damage"),
+        (MapFileError("no map file"), 2, "tool: no map file"),
+        (ToolError("usage"), 2, "tool: usage"),
+        (InvalidInputError("argument"), 2, "tool: argument"),
+        (TriquadError("server"), 1, "tool: server"),
         (KeyboardInterrupt(), 130, "tool: interrupted"),
     ],
 )
@@ -49,5 +59,5 @@ def test_what_goes_wrong_is_a_status_and_one_line(capsys, raised, status, line):
     def work():
         raise raised
 
-    assert run("tool", work, failures=(KeyError,)) == status
+    assert run("tool", work) == status
     assert capsys.readouterr().err == f"{line}\n"

@@ -12,7 +12,7 @@ from pathlib import Path
 from triquad_server import serve
 
 from triquad_tools.console.arguments import command_parser, count, port, seed
-from triquad_tools.console.command import FAILED, OK, ToolError, print_line, print_remark, run
+from triquad_tools.console.command import FAILED, OK, print_line, print_remark, run
 from triquad_tools.console.report import json_text, print_rows
 from triquad_tools.demo.steps import MAP, DemoResults, broken_promises, demonstrate, table_rows
 from triquad_tools.simulation.street import street_drive
@@ -28,7 +28,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool: 0 all is as promised, 1 something is not or failed, 2 wrong usage."""
     work = partial(_demo, _parser().parse_args(argv))
     interrupted = "interrupted; the server is stopped"
-    return run(_COMMAND, work, failures=(ToolError, OSError), interrupted=interrupted)
+    return run(_COMMAND, work, interrupted=interrupted)
 
 
 def _demo(options: argparse.Namespace) -> int:

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from triquad_format.errors import DamagedMapFileError
 from triquad_format.mapfile.metadata import utc_time
 from triquad_format.mapfile.reader import MapFile, read_map_file
 
@@ -25,7 +24,7 @@ _COMMAND = "triquad-inspect"
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool: 0 valid, 1 damaged, 2 not readable, or wrong usage."""
     options = _parser().parse_intermixed_args(argv)
-    return run(_COMMAND, partial(_inspect, options), failures=(DamagedMapFileError,))
+    return run(_COMMAND, partial(_inspect, options))
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -28,7 +28,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool: 0 done, 1 nothing could be written, 2 bad input, 130 interrupted."""
     work = partial(_map, _parser().parse_args(argv))
     interrupted = "interrupted; the same command goes on where the map was saved last"
-    return run(_COMMAND, work, failures=(StoreError,), interrupted=interrupted)
+    return run(_COMMAND, work, interrupted=interrupted)
 
 
 def _map(options: argparse.Namespace) -> int:

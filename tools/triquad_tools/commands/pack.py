@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from triquad_format.errors import DamagedMapFileError
 from triquad_format.mapfile.checkpoint_folder import checkpoint_file, checkpoint_files, set_aside
 from triquad_format.mapfile.index import read_checkpoint
 from triquad_format.mapfile.parts.part import EVIDENCE, REGION, TRAINING, VERTICES
@@ -20,7 +19,6 @@ from triquad_tools.mapfiles.quantise import quantise
 from triquad_tools.mapfiles.recovered_map import Loss, RecoveredMap, recover
 from triquad_tools.mapfiles.source import (
     Box,
-    NothingLeftError,
     SourceMap,
     chosen_file,
     cropped,
@@ -37,7 +35,6 @@ from triquad_tools.mapping.output import (
 )
 
 _COMMAND = "triquad-pack"
-_DAMAGE = (DamagedMapFileError, NothingLeftError)
 _PLANES = ("XY", "XZ", "YZ")
 _CELL_RANGE_M = (0.01, 10.0)
 _ERROR_RANGE_M = (1e-5, 0.1)
@@ -49,7 +46,7 @@ _Add = Callable[..., argparse.Action]
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool: 0 done, 1 damage, or nothing lies in the box, 2 otherwise."""
-    return run(_COMMAND, partial(_pack, _parser().parse_args(argv)), failures=_DAMAGE)
+    return run(_COMMAND, partial(_pack, _parser().parse_args(argv)))
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -8,7 +8,13 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TextIO
 
-from triquad_format.errors import FormatError, NoCompiledCodeError, TriquadError
+from triquad_format.errors import (
+    DamagedMapFileError,
+    FormatError,
+    InvalidInputError,
+    NoCompiledCodeError,
+    TriquadError,
+)
 from triquad_format.printable import printable_lines
 
 INTERRUPTED = 130  # the exit status of shells: 128 and the number of SIGINT
@@ -77,19 +83,18 @@ class ToolError(TriquadError):
     """
 
 
-def run(
-    command: str,
-    work: Callable[[], int],
-    *,
-    failures: tuple[type[Exception], ...] = (),
-    interrupted: str = "interrupted",
-) -> int:
+_OF_INPUT = ToolError, FormatError, NoCompiledCodeError, InvalidInputError
+
+
+def run(command: str, work: Callable[[], int], *, interrupted: str = "interrupted") -> int:
     """Return the exit status of ``work``; what it raises becomes a status and one line.
+
+    The same error has the same status in all commands: ``BAD_INPUT`` where usage or input is to
+    blame, ``FAILED`` where a map file is damaged, or a server or a result fails.
 
     Args:
         command: its name, with which the line begins.
         work: all that the command does; returns its exit status.
-        failures: errors that say that something failed; others blame the usage or the input.
         interrupted: what the line says after Ctrl-C.
     """
     try:
@@ -101,15 +106,12 @@ def run(
         # As in `... | head`. Python would complain when it flushes the rest at its end.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return NOBODY_READS
-    except failures as error:
-        return complain(command, error, FAILED)
     except OSError as error:
         return complain(command, _in_words(error), BAD_INPUT)
-    except (ToolError, FormatError, NoCompiledCodeError) as error:
-        return complain(command, error, BAD_INPUT)
     except TriquadError as error:
-        # What the client refuses to send is a ValueError, too; all else is the server's failure.
-        return complain(command, error, BAD_INPUT if isinstance(error, ValueError) else FAILED)
+        is_damage = isinstance(error, DamagedMapFileError)
+        blames_input = isinstance(error, _OF_INPUT) and not is_damage
+        return complain(command, error, BAD_INPUT if blames_input else FAILED)
     except KeyboardInterrupt as interrupt:
         _kept.append(interrupt)
         return complain(command, interrupted, INTERRUPTED)

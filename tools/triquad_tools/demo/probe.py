@@ -13,8 +13,6 @@ from triquad_client import Client, connect
 from triquad_format.errors import TriquadError
 from triquad_format.records.arrays import Doubles
 
-from triquad_tools.console.command import ToolError
-
 _PERIOD_S = 0.05
 _STOP_TIMEOUT_S = 60.0
 
@@ -69,17 +67,17 @@ class Probe:
         """End the queries and return what they met.
 
         Raises:
-            ToolError: the process failed.
+            TriquadError: the process failed.
         """
         try:
             self._connection.send(None)
             if not self._connection.poll(_STOP_TIMEOUT_S):
-                raise ToolError(f"the queries did not end within {_STOP_TIMEOUT_S:g} s")
+                raise TriquadError(f"the queries did not end within {_STOP_TIMEOUT_S:g} s")
             report: ProbeReport = self._connection.recv()
         except (EOFError, ConnectionError):
             self._process.join()
             code = self._process.exitcode
-            raise ToolError(f"the queries ended with exit code {code}") from None
+            raise TriquadError(f"the queries ended with exit code {code}") from None
         return report
 
 

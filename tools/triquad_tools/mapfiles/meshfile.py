@@ -26,7 +26,10 @@ def read_mesh(path: Path) -> Mesh:
 
     if path.suffix not in MESH_SUFFIXES:
         names = ", ".join(MESH_SUFFIXES)
-        raise ToolError(f"{path}: meshes are read from {names}, not {path.suffix!r}")
+        raise ToolError(
+            f"{path}: meshes are read from {names}, not {path.suffix!r}; triquad-pack makes one of "
+            "a map"
+        )
     if not path.is_file():
         raise ToolError(f"{path}: no such file")
     try:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from triquad_format.errors import MapFileError
+from triquad_format.errors import MapFileError, TriquadError
 from triquad_format.mapfile.checkpoint_folder import CheckpointFile, checkpoint_files, map_folder
 from triquad_format.mapfile.reader import open_manifest, read_map_file
 from triquad_format.records.arrays import Doubles
@@ -23,7 +23,7 @@ Box = Doubles  # opposite corners [2, 3] of a box, metres, map frame; the lower 
 _ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws|unixsock-stream)/")
 
 
-class NothingLeftError(ToolError):
+class NothingLeftError(TriquadError):
     """A box in which a map has nothing, or nothing of what is asked for."""
 
 

@@ -14,7 +14,7 @@ from triquad_client.checks import Bounds
 from triquad_client.mesh.followed_mesh import MeshTile, TileIndex
 from triquad_client.mesh.mesh_watch import MeshWatch
 from triquad_client.offline.map_mesh import TILE_CELLS
-from triquad_format.errors import FormatError
+from triquad_format.errors import DamagedMapFileError, FormatError
 from triquad_format.mapfile.checkpoint_folder import CheckpointFile, checkpoint_files, map_folder
 from triquad_format.mapfile.metadata import utc_time
 from triquad_format.mapfile.reader import open_manifest
@@ -198,13 +198,13 @@ class History:
         """Return the map as it was at the newest moment that can be shown.
 
         Raises:
-            ToolError: there is none.
+            DamagedMapFileError: there is none.
         """
         while files := self.files():
             with suppress(DamagedError):
                 return self.opened(files[-1])
         told = "no checkpoint can be shown; triquad-pack --recover saves what is intact"
-        raise ToolError(f"{self.folder}: {told}")
+        raise DamagedMapFileError(f"{self.folder}: {told}")
 
 
 @lru_cache
