@@ -3,7 +3,6 @@
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 from triquad_format.errors import InvalidInputError
 from triquad_format.printable import printable
 from triquad_format.records.arrays import Doubles
@@ -17,6 +16,7 @@ from triquad_format.wire.messages import (
     StatusRequest,
 )
 from triquad_format.wire.metrics_messages import MetricsRequest, ServerMetrics
+from triquad_format.wire.places import known_origin
 from triquad_format.wire.source_messages import SourceReport, SourcesRequest
 
 from triquad_client import checks
@@ -71,8 +71,7 @@ class Client(ScanCalls, MapQueries, MeshCalls, ChangeCalls, DownloadCalls):
 
         The first scan of the map decides: ask once it is taken in. Raises as :meth:`status`.
         """
-        origin = self.status().origin_m
-        return np.zeros(3) if origin is None else origin
+        return known_origin(self.status().origin_m)
 
     def close(self) -> None:
         """End the connection. Scans that were published may still be on their way: flush first."""

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import triquad_format
 import zenoh
+from triquad_format.printable import joined_lines
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import ServerStatus
 from triquad_format.wire.metrics_messages import QueueMetrics, ServerMetrics
@@ -80,8 +81,7 @@ class Health:
             uptime_s=time.monotonic() - self.started_s,
             last_checkpoint=self.checkpoints.last,
             store_error=self.checkpoints.error,
-            warnings="\n".join(filter(None, (self.checkpoints.warning, self.warnings.all())))
-            or None,
+            warnings=joined_lines(self.checkpoints.warning, self.warnings.all()),
             samples_left=progress.map.samples_left,
             map_bytes=progress.map.map_bytes,
             map_max_bytes=self.map_max_bytes,

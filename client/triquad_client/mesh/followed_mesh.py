@@ -16,6 +16,7 @@ from triquad_format.wire.mesh_messages import (
     TileChanges,
     TileChangesRequest,
 )
+from triquad_format.wire.places import known_origin
 from triquad_format.wire.tile_codec import TileSurface, decode_tile, decoded_bytes
 from triquad_map.triangles import Triangles, joined
 
@@ -141,7 +142,7 @@ class FollowedMesh:
         Raises:
             BadReplyError: it contradicts the reply before.
         """
-        origin = np.zeros(3) if reply.origin is None else reply.origin
+        origin = known_origin(reply.origin)
         is_same = reply.server == self.server and bool((origin == self.origin).all())
         if is_same and reply.epoch < self.epoch:
             raise BadReplyError(f"epoch {reply.epoch} comes after epoch {self.epoch}")

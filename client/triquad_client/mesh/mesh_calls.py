@@ -6,6 +6,7 @@ import numpy as np
 from triquad_format.records.arrays import Bools, Ints
 from triquad_format.wire.limits import MAX_FILL_M
 from triquad_format.wire.mesh_messages import MeshReply, MeshRequest, TileListRequest
+from triquad_format.wire.places import known_origin
 from triquad_map.triangles import TileJoin
 
 from triquad_client import checks
@@ -42,7 +43,7 @@ class MeshCalls:
         def fetch() -> Mesh:
             listed = self._connection.ask(request)
             # Joined from where tiles count, which is a corner of one.
-            origin = np.zeros(3) if listed.origin is None else listed.origin
+            origin = known_origin(listed.origin)
             low, high = box[0] - origin, box[1] - origin
             join = TileJoin(listed.tile_side_m, (low, high), marked=fill_m > 0)
             decoder = TileDecoder(self._connection.max_download_bytes)

@@ -27,6 +27,11 @@ def moved_pose(pose: Doubles, by: Doubles) -> Doubles:
     return result
 
 
+def known_origin(origin: Doubles | None) -> Doubles:
+    """Return an origin [3] that a message may leave out: then it is 0 0 0."""
+    return np.zeros(3) if origin is None else origin
+
+
 def asked_from(origin: Doubles, answer: Callable[[Any], MessageT], question: Message) -> MessageT:
     """Return the answer of a map that counts from an ``origin`` [3] of the question's coordinates.
 

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+from triquad_format.printable import joined_lines
 from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.records.plausibility import jumps, median_range_m, wrong_units
 
@@ -124,7 +125,7 @@ class ScanWarnings:
                 for (source, _), warning in self._warnings.items()
                 if wanted(source) and warning.met_s >= since_s
             ]
-        return "\n".join(texts[-_MAX_SHOWN:]) or None
+        return joined_lines(*texts[-_MAX_SHOWN:])
 
     def _check_scans(self) -> None:
         ledger = self._scans.ledger

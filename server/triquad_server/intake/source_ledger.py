@@ -6,6 +6,7 @@ from collections import OrderedDict, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
+from triquad_format.printable import joined_lines
 from triquad_format.wire.limits import MAX_SEQUENCE
 from triquad_format.wire.messages import FlushReply, FlushRequest, Scan
 from triquad_format.wire.metrics_messages import SourceMetrics
@@ -189,8 +190,7 @@ class SourceLedger:
             if self.is_settled(*scan):
                 publish_soon()
             return reply
-        lines = filter(None, (reply.warnings, warnings(request.source)))
-        return replace(reply, warnings="\n".join(lines) or None)
+        return replace(reply, warnings=joined_lines(reply.warnings, warnings(request.source)))
 
     def lost(self) -> dict[str, int]:
         """Return the number of lost scans, by source."""
