@@ -24,6 +24,7 @@ from triquad_map.questions.distance import Unknown, UnknownLike
 from triquad_map.questions.grid import GridShape
 
 from triquad_client.errors import NO_NUMBER, InvalidScanError
+from triquad_client.real_numbers import real_number, real_numbers
 
 Bounds: TypeAlias = tuple[Sequence[float], Sequence[float]]
 """Minimum and maximum corner of a box, metres, map frame; sides may be infinite."""
@@ -81,7 +82,7 @@ def open_directions(vectors: ArrayLike) -> Floats:
 def stamp_ns(stamp_s: float) -> int:
     """Return a stamp in seconds since 1970 as nanoseconds."""
     try:
-        seconds = _number(stamp_s)
+        seconds = real_number(stamp_s)
     except NO_NUMBER:
         seconds = math.nan
     if not 0 <= seconds < 2**63 / 1e9:
@@ -116,7 +117,7 @@ def box(bounds: Bounds | None) -> tuple[Doubles, Doubles]:
     if bounds is None:
         return np.full(3, -np.inf), np.full(3, np.inf)
     try:
-        minimum, maximum = (np.asarray(corner, np.float64) for corner in bounds)
+        minimum, maximum = (real_numbers(corner).astype(np.float64) for corner in bounds)
     except NO_NUMBER as error:
         raise InvalidInputError(f"bounds = {_shown(bounds)}: give (minimum, maximum)") from error
     if minimum.shape != (3,) or maximum.shape != (3,):
@@ -193,7 +194,7 @@ def within(
 ) -> float:
     """Return a number from ``least`` to ``most``."""
     try:
-        number = _number(value)
+        number = real_number(value)
     except NO_NUMBER as error:
         raise InvalidInputError(f"{name} = {_shown(value)} is not a number") from error
     if not least <= number <= most:
@@ -204,7 +205,7 @@ def within(
 def radii(values: ArrayLike, count: int) -> Floats:
     """Return radii [count], from as many or a single one."""
     try:
-        array = np.broadcast_to(np.asarray(values, np.float32), (count,))
+        array = np.broadcast_to(real_numbers(values).astype(np.float32), (count,))
     except NO_NUMBER as error:
         raise InvalidInputError(f"radii_m are not one number or {count}: {error}") from error
     bad = ~((array >= 0) & (array <= MAX_DISTANCE_M))
@@ -257,22 +258,6 @@ def _points(
         one = "; a single one is [[x, y, z]]" if array.shape == (3,) else ""
         raise error(f"{what} are {list(array.shape)}, not [N, 3]{one}")
     return array[:, :3].astype(dtype, copy=False)
-
-
-def real_numbers(values: ArrayLike) -> NDArray[Any]:
-    """Return an array of whole or floating numbers."""
-    array = np.asarray(values)
-    if array.dtype.kind not in "fiu":
-        raise TypeError(f"dtype {array.dtype} is not one of real numbers")
-    return array
-
-
-def _number(value: Any) -> float:
-    """Return ``value`` as a float; an integer that is too large for one is infinite."""
-    try:
-        return float(value)
-    except OverflowError:
-        return math.inf if value > 0 else -math.inf
 
 
 def _shown(value: Any) -> str:

@@ -20,6 +20,7 @@ from triquad_format.wire.places import known_origin
 from triquad_format.wire.source_messages import SourceReport, SourcesRequest
 
 from triquad_client import checks
+from triquad_client.brief_errors import brief, brief_errors
 from triquad_client.calls.changes import ChangeCalls
 from triquad_client.calls.download import DownloadCalls
 from triquad_client.calls.point_queries import pin_newest
@@ -39,6 +40,7 @@ MAX_DOWNLOAD_BYTES = 2**30
 _NO_SOURCES = SourceReport(server="", revision=0, sources={})
 
 
+@brief_errors
 class Client(ScanCalls, MapQueries, MeshCalls, ChangeCalls, DownloadCalls):
     """A connection to one map of a server. Close it, or use it in a ``with`` statement.
 
@@ -195,6 +197,7 @@ class Client(ScanCalls, MapQueries, MeshCalls, ChangeCalls, DownloadCalls):
         return self._connection.maps()
 
 
+@brief
 def connect(
     endpoint: str | None = None,
     map: str = "default",  # noqa: A002 - the word of the command line and of the documentation

@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 from triquad_format.records.arrays import Doubles, Floats
 
 from triquad_client.errors import NO_NUMBER, InvalidScanError
+from triquad_client.real_numbers import real_numbers
 
 _MILLIMETRES_PER_M = 1000.0
 
@@ -25,9 +26,13 @@ class Intrinsics:
 
     def __post_init__(self) -> None:
         values = (self.fx, self.fy, self.cx, self.cy)
-        if not np.isfinite(values).all() or self.fx <= 0 or self.fy <= 0:
+        try:
+            is_one = np.isfinite(real_numbers(values)).all() and self.fx > 0 and self.fy > 0
+        except NO_NUMBER:
+            is_one = False
+        if not is_one:
             raise InvalidScanError(
-                f"intrinsics {values}: fx, fy, cx and cy are finite, the first two above 0"
+                f"intrinsics {values}: fx, fy, cx and cy are finite numbers, the first two above 0"
             )
 
     @classmethod
@@ -38,15 +43,15 @@ class Intrinsics:
             InvalidScanError: it is no such matrix, or has skew.
         """
         try:
-            matrix = np.asarray(camera_matrix, np.float64).reshape(3, 3)
+            matrix = real_numbers(camera_matrix).astype(np.float64).reshape(3, 3)
         except NO_NUMBER as error:
             raise InvalidScanError(f"the camera matrix is not [3, 3]: {error}") from error
         (fx, skew, cx), (zero, fy, cy), last = matrix
-        if skew != 0 or zero != 0 or list(last) != [0, 0, 1]:
-            raise InvalidScanError(
-                f"the camera matrix is {matrix.tolist()}, not [[fx, 0, cx], [0, fy, cy], "
-                "[0, 0, 1]]; rectify the images"
-            )
+        wrong = f"a skew of {skew:g}, not 0; rectify the images" if skew != 0 else ""
+        if zero != 0 or list(last) != [0, 0, 1]:
+            wrong = f"the last row {last.tolist()}, not [0, 0, 1]; is it transposed?"
+        if wrong:
+            raise InvalidScanError(f"the camera matrix {matrix.tolist()} has {wrong}")
         return cls(fx, fy, cx, cy)
 
     def slopes(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Doubles:
@@ -56,7 +61,10 @@ class Intrinsics:
 
 
 def depth_points(
-    depth: ArrayLike, intrinsics: Intrinsics, stride: int = 1, units_per_metre: float | None = None
+    depth: ArrayLike,
+    intrinsics: Intrinsics | ArrayLike,
+    stride: int = 1,
+    units_per_metre: float | None = None,
 ) -> Floats:
     """Return the points [N, 3] that a depth image shows, row by row.
 
@@ -64,7 +72,7 @@ def depth_points(
         depth: [rows, columns] along the optical axis: metres as floating numbers, or millimetres
             as integers without sign (``16UC1``). A pixel that is 0, not finite (REP 117), negative
             or the largest integer shows nothing.
-        intrinsics: of the camera.
+        intrinsics: of the camera; also as a matrix [3, 3]: see :meth:`Intrinsics.from_matrix`.
         stride: every how many rows and columns one is taken.
         units_per_metre: of the depths, where these are no metres or millimetres.
 
@@ -73,9 +81,11 @@ def depth_points(
 
     Raises:
         InvalidScanError: the image is not one, shows nothing, most of it is negative, or the
-            stride is below 1.
+            stride is below 1; or the matrix is not that of a camera.
     """
     image = _metres(depth, units_per_metre)
+    if not isinstance(intrinsics, Intrinsics):
+        intrinsics = Intrinsics.from_matrix(intrinsics)
     if isinstance(stride, bool) or not isinstance(stride, int) or stride < 1:
         raise InvalidScanError(f"stride = {stride!r}: use 1 or more")
     image = image[::stride, ::stride]

@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from triquad_format.records.arrays import Doubles
 
-from triquad_client import checks
 from triquad_client.errors import NO_NUMBER, InvalidScanError
+from triquad_client.real_numbers import real_numbers
 
 
 def empty_returns(cloud: ArrayLike, directions: ArrayLike) -> Doubles:
@@ -37,7 +37,7 @@ def empty_returns(cloud: ArrayLike, directions: ArrayLike) -> Doubles:
 def _organised(name: str, values: ArrayLike) -> Doubles:
     """Return an array [rows, columns, 3] as float64; values that are not finite may be in it."""
     try:
-        array = checks.real_numbers(values).astype(np.float64, copy=False)
+        array = real_numbers(values).astype(np.float64, copy=False)
     except NO_NUMBER as error:
         raise InvalidScanError(f"{name}: not an array of real numbers: {error}") from error
     if array.ndim != 3 or array.shape[2] != 3:

@@ -9,6 +9,7 @@ from triquad_format.records.arrays import Doubles
 from triquad_format.records.pose import RIGID_TOLERANCE, is_rotation, rotation_error
 
 from triquad_client.errors import NO_NUMBER, InvalidScanError
+from triquad_client.real_numbers import real_numbers
 
 _UNIT_TOLERANCE = 1e-2
 """The allowed error of a quaternion's length: files of three digits have it."""
@@ -55,7 +56,7 @@ def rigid_pose(world_from_sensor: PoseLike) -> Doubles:
     if isinstance(world_from_sensor, Pose):
         return world_from_sensor.matrix()
     try:
-        pose = np.asarray(world_from_sensor, np.float64)
+        pose = real_numbers(world_from_sensor).astype(np.float64)
     except NO_NUMBER as error:
         raise InvalidScanError(f"world_from_sensor is not a matrix: {error}") from error
     if pose.shape != (4, 4):
@@ -71,9 +72,8 @@ def rigid_pose(world_from_sensor: PoseLike) -> Doubles:
         raise InvalidScanError(
             f"the last row of world_from_sensor is {pose[3]}, not 0 0 0 1; is it transposed?"
         )
-    exact: Doubles = pose.copy()
-    exact[3] = (0, 0, 0, 1)
-    return exact
+    pose[3] = (0, 0, 0, 1)
+    return pose
 
 
 def pose_matrices(positions: Doubles, quaternions: Doubles) -> Doubles:
@@ -99,7 +99,7 @@ def pose_matrices(positions: Doubles, quaternions: Doubles) -> Doubles:
 
 def _numbers(name: str, values: ArrayLike, count: int) -> Doubles:
     try:
-        array = np.asarray(values, np.float64)
+        array = real_numbers(values).astype(np.float64)
     except NO_NUMBER as error:
         raise InvalidScanError(f"{name} = {values!r} are not {count} numbers: {error}") from error
     if array.shape != (count,):

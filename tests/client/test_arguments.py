@@ -1,5 +1,6 @@
 """What the client refuses to send, by name, and what it takes."""
 
+import traceback
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -7,7 +8,15 @@ import numpy as np
 import pytest
 import triquad_client
 from support import servers
-from triquad_client import Client, InvalidInputError, InvalidScanError, Status
+from triquad_client import (
+    Client,
+    Intrinsics,
+    InvalidInputError,
+    InvalidScanError,
+    Pose,
+    Status,
+    TriquadError,
+)
 
 POSE = np.eye(4)
 CLOUD = np.ones((10, 3), np.float32)
@@ -27,7 +36,7 @@ def client() -> Iterator[Client]:
         (np.zeros(3), r"\[3\], not \[N, 3\]; a single one is \[\[x, y, z\]\]"),
         (np.zeros((3, 500)), r"\[3, 500\], not"),  # transposed
         (np.zeros((2, 3), complex), "complex128"),
-        (np.full((2, 3), "x"), "dtype"),
+        (np.full((2, 3), "1.5"), r"'1.5' \(<U3\) is not a real number"),
         ([[1, 2, 3], [4, 5]], "points are not"),
         (None, "points are not"),
     ],
@@ -162,6 +171,44 @@ def test_a_flush_that_cannot_be_waited_for_is_refused_here(
 ) -> None:
     with pytest.raises(InvalidInputError, match=text):
         client.flush(timeout_s, pending)
+
+
+TEXTS = np.full((3, 3), "1.5")
+OF_CLIENTS: dict[str, Callable[[Client], object]] = {
+    "timeout_s": lambda client: client.flush("1.5"),  # type: ignore[arg-type]
+    "pending": lambda client: client.flush(1.5, "1"),  # type: ignore[arg-type]
+    "stamp_s": lambda client: client.publish_scan(CLOUD, POSE, "1.5"),  # type: ignore[arg-type]
+    "world_from_sensor": lambda client: client.publish_scan(CLOUD, POSE.astype(str)),
+    "position_m": lambda client: client.publish_scan(CLOUD, Pose(["1.5", 0, 0], (0, 0, 0, 1))),
+    "no_return": lambda client: client.publish_scan(CLOUD, POSE, no_return=TEXTS),
+    "camera matrix": lambda client: client.publish_depth(CLOUD, TEXTS, POSE),
+    "intrinsics": lambda _: Intrinsics("1.5", 1, 1, 1),  # type: ignore[arg-type]
+    "points": lambda client: client.query_sdf(TEXTS),
+    "max_distance_m": lambda client: client.query_distance(CLOUD, "1.5"),  # type: ignore[arg-type]
+    "radii_m": lambda client: client.query_spheres(CLOUD, "1.5"),
+    "cell_m": lambda client: client.query_grid(((0, 0, 0), (1, 1, 1)), "1.5"),  # type: ignore[arg-type]
+    "bounds": lambda client: client.mesh((["1.5", "0", "0"], [2, 2, 2])),  # type: ignore[list-item]
+    "max_points": lambda client: client.sources(None, "1"),  # type: ignore[arg-type]
+}
+
+
+@pytest.mark.parametrize("name", OF_CLIENTS)
+def test_numbers_as_text_are_refused_with_their_name_and_value(client: Client, name: str) -> None:
+    with pytest.raises(InvalidInputError, match=f"{name}[^1]*.*'1(.[05])?'"):
+        OF_CLIENTS[name](client)
+
+
+@pytest.mark.parametrize(
+    "fails", [OF_CLIENTS["max_distance_m"], lambda client: client.query_sdf(CLOUD, at_epoch=9**9)]
+)
+def test_an_error_has_no_trace_of_what_is_within(
+    client: Client, fails: Callable[[Client], object]
+) -> None:
+    with pytest.raises(TriquadError) as caught:
+        fails(client)
+    names = [frame.name for frame in traceback.extract_tb(caught.value.__traceback__)]
+    assert names == ["test_an_error_has_no_trace_of_what_is_within", "<lambda>", "call"]
+    assert caught.value.__suppress_context__
 
 
 def test_far_coordinates_keep_their_precision(client: Client) -> None:

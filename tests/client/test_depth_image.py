@@ -72,6 +72,9 @@ def test_a_camera_matrix_gives_the_intrinsics() -> None:
     matrix = [[60, 0, 39.5], [0, 50, 29.5], [0, 0, 1]]
     assert Intrinsics.from_matrix(matrix) == CAMERA
     assert Intrinsics.from_matrix(np.ravel(matrix)) == CAMERA  # as CameraInfo has it
+    for given in (matrix, np.array(matrix)):
+        points = depth_points(wall_depth(), given)
+        np.testing.assert_array_equal(points, depth_points(wall_depth(), CAMERA))
 
 
 @pytest.mark.parametrize(
@@ -98,13 +101,20 @@ def test_what_is_no_depth_image_is_refused(depth: Any, stride: Any, text: str) -
     "values", [(0.0, 1, 1, 1), (1, -1, 1, 1), (1, 1, np.nan, 1), (1, np.inf, 1, 1)]
 )
 def test_what_is_no_camera_is_refused(values: tuple[float, ...]) -> None:
-    with pytest.raises(InvalidScanError, match="intrinsics .*finite, the first two above 0"):
+    with pytest.raises(InvalidScanError, match="intrinsics .*finite numbers, the first two above 0"):
         Intrinsics(*values)
 
 
 @pytest.mark.parametrize(
-    "matrix", [np.eye(4), "K", [[60, 1, 39], [0, 50, 29], [0, 0, 1]], np.zeros((3, 3))]
+    ("matrix", "text"),
+    [
+        (np.eye(4), "size 16"),
+        ("K", "'K' .* is not a real number"),
+        ([[60, 1, 39], [0, 50, 29], [0, 0, 1]], "has a skew of 1, not 0; rectify the images"),
+        (np.zeros((3, 3)), r"the last row \[0.0, 0.0, 0.0\], not \[0, 0, 1\]"),
+        ([[60, 0, 0], [0, 50, 0], [39, 29, 1]], "the last row .* is it transposed?"),
+    ],
 )
-def test_what_is_no_camera_matrix_is_refused(matrix: Any) -> None:
-    with pytest.raises(InvalidScanError, match="camera matrix"):
+def test_what_is_no_camera_matrix_is_refused(matrix: Any, text: str) -> None:
+    with pytest.raises(InvalidScanError, match=f"camera matrix.*{text}"):
         Intrinsics.from_matrix(matrix)

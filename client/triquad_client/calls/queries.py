@@ -1,5 +1,6 @@
 """Questions about the map, which clients, pinned epochs and maps in memory answer alike."""
 
+from triquad_client.brief_errors import brief_errors
 from triquad_client.calls.point_queries import PointQueries
 from triquad_client.calls.way_queries import WayQueries
 from triquad_client.net.connection import Answering
@@ -15,6 +16,7 @@ class MapQueries(PointQueries, WayQueries):
     """
 
 
+@brief_errors
 class PinnedMap(MapQueries):
     """The map as it was in one epoch.
 

@@ -9,10 +9,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from triquad_format.errors import FormatError, InvalidInputError, RefusedError
+from triquad_format.errors import FormatError, RefusedError
 from triquad_format.printable import printable
 from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.wire import keys
+from triquad_format.wire.bounds import MAX_COUNT
 from triquad_format.wire.messages import (
     FlushReply,
     FlushRequest,
@@ -102,7 +103,7 @@ class ScanCalls:
     def publish_depth(
         self,
         depth: ArrayLike,
-        intrinsics: Intrinsics,
+        intrinsics: Intrinsics | ArrayLike,
         world_from_camera: PoseLike,
         stamp_s: float | None = None,
         source: str = "default",
@@ -116,7 +117,8 @@ class ScanCalls:
         Args:
             depth: [rows, columns] along the optical axis: metres as floating numbers, or
                 millimetres as ``uint16``. A pixel that is 0 or not finite shows nothing.
-            intrinsics: of the camera; the image must be rectified.
+            intrinsics: of the camera, or its matrix [3, 3], such as OpenCV's ``K``; the image must
+                be rectified.
             world_from_camera: pose of the camera's optical frame (x to the right, y down, z
                 forward) in the map frame, as in :meth:`publish_scan`.
             stamp_s: as in :meth:`publish_scan`.
@@ -153,9 +155,8 @@ class ScanCalls:
             RefusedError: ``timeout``, where that was not long enough.
         """
         wait_s = checks.within("timeout_s", timeout_s, checks.LONGEST_S, least=0.0)
-        if pending < 0:
-            raise InvalidInputError(f"pending = {pending!r}: use 0 or more")
-        done = self._all_done(list(self._requests(pending)), wait_s)
+        ahead = checks.count("pending", pending, MAX_COUNT)
+        done = self._all_done(list(self._requests(ahead)), wait_s)
         replies = done.values()
         refusals = [
             f"source {source!r}: {reply.last_refusal}"

@@ -16,6 +16,7 @@ from triquad_format.wire.limits import MAX_TILES_ASKED
 from triquad_format.wire.mesh_messages import MeshRequest
 
 from triquad_client import checks
+from triquad_client.brief_errors import brief_errors
 from triquad_client.errors import ClosedError, RequestTimeoutError
 from triquad_client.mesh.followed_mesh import (
     FollowedMesh,
@@ -76,6 +77,7 @@ class WatchedTiles(ABC):
         return self._now().known_tiles()
 
 
+@brief_errors
 class MeshWatch(WatchedTiles):
     """The mesh tiles of a box, kept up to date by :meth:`next`; nothing is asked in between.
 

@@ -21,6 +21,7 @@ from triquad_map.questions.answers import Answers
 from triquad_map.view import MapView
 
 from triquad_client import checks
+from triquad_client.brief_errors import brief, brief_errors
 from triquad_client.calls.queries import MapQueries
 from triquad_client.checks import Bounds
 from triquad_client.errors import ClosedError
@@ -76,6 +77,7 @@ class LocalMap(Answering):
         yield view
 
 
+@brief_errors
 class OfflineMap(MapQueries):
     """A map in memory; several threads may ask it.
 
@@ -179,6 +181,7 @@ class OfflineMap(MapQueries):
         return self._map.view.near_ends(places, REACH_LEAVES * self.leaf_m)
 
 
+@brief
 def open_map(path: str | Path, *, coordinates: str = "map") -> OfflineMap:
     """Return the map in a file, read whole and checked.
 

@@ -19,6 +19,7 @@ from triquad_format.wire.messages import MapInfo
 from triquad_map.stored_map import StoredMap
 
 from triquad_client import checks
+from triquad_client.brief_errors import brief_errors
 from triquad_client.calls.download import RemoteBytes, newest_file
 from triquad_client.calls.queries import MapQueries
 from triquad_client.checks import Bounds
@@ -58,6 +59,7 @@ class _State:
     seen_bytes: int  # see :func:`_seen_bytes`
 
 
+@brief_errors
 class SyncedMap(MapQueries):
     """The part of a map that a box needs, copied to this machine; several threads may ask it.
 
