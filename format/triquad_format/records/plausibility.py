@@ -7,10 +7,9 @@ from triquad_format.records.arrays import Doubles
 
 _FAR_M = 500.0  # half of the points of no scan are farther away than this: they are in millimetres
 _OUTRUN = 3.0
-"""As many times its median range a sensor moves at most from scan to scan. Robots have 0.2, and
-scanners that are set up by hand 2; in millimetres, a robot that moves 3 cm a scan has 4."""
+"""As many times its median range a sensor moves at most from scan to scan, as a median. Robots move
+0.2, and scanners that are set up by hand 2; in millimetres, a robot that moves 3 cm a scan 4."""
 
-_MOST_STEPS = 0.75  # the share of the steps of a way that are shorter than the one that counts
 JUMP_M = 0.15  # less than by this, two that publish the same poses may differ
 _JUMPS, _SHARE_OF_JUMPS = 5, 0.05  # as many are of two, rather than a few wrong poses of one
 _RANGES = 1000  # of a scan, at most, of which the median is taken
@@ -32,7 +31,7 @@ def wrong_units(range_m: float, places: Doubles) -> str | None:
     if range_m > _FAR_M:
         return f"half of the points are farther than {range_m:.0f} m: write them in metres"
     steps_m = np.linalg.norm(np.diff(places, axis=0), axis=1)
-    step_m = float(np.quantile(steps_m, _MOST_STEPS)) if len(steps_m) else 0.0
+    step_m = float(np.median(steps_m)) if len(steps_m) else 0.0
     if not 0 < _OUTRUN * range_m < step_m:
         return None
     return (

@@ -140,7 +140,11 @@ def in_millimetres(pose: np.ndarray) -> np.ndarray:
         (words_of, 1.0, ""),
         (lambda pose: words_of(np.linalg.inv(pose)), 1.0, "the poses seem to be sensor_from_world"),
         (lambda pose: words_of(pose, "wxyz"), 1.0, "seem to have quaternions w x y z.*ion wxyz"),
-        (lambda pose: words_of(in_millimetres(pose)), 1.0, r"moves 3.* of the poses in metres"),
+        (
+            lambda pose: words_of(in_millimetres(pose)),
+            1.0,
+            r"sensor moves 2.* of the poses in metres",
+        ),
         (words_of, 1000.0, "half of the points are farther .* write them in metres"),
     ],
 )
