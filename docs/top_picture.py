@@ -13,9 +13,9 @@ import numpy as np
 import triquad_server
 from rich.console import Console
 from triquad_client import Client
-from triquad_tools.commands.top import Sample, page
 from triquad_tools.simulation.lidar import Lidar, SimulatedScan, drive
 from triquad_tools.simulation.street import street
+from triquad_tools.work.top import Sample, page
 
 PICTURE = Path(__file__).parent / "images" / "top.svg"
 _WIDTH = 100  # characters

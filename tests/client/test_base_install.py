@@ -110,7 +110,7 @@ def test_a_map_file_is_written_with_previews_where_they_can_be_made(map_with_pre
     ("command", "arguments", "message"),
     [
         ("demo", (), "numba is missing: install triquad[demo]"),
-        ("evaluate", (), "scipy is missing: install triquad[tools]"),
+        ("evaluate", ("x.ply", "--reference", "x.ply"), "scipy is missing: install triquad[tools]"),
         ("inspect", ("MAP", "--plot", "map.png"), "numba is missing: pip install 'triquad[fast]'"),
         ("pack", ("MAP", "mesh.ply"), "numba is missing: pip install 'triquad[fast]'"),
     ],

@@ -101,7 +101,7 @@ def test_what_is_no_depth_image_is_refused(depth: Any, stride: Any, text: str) -
     "values", [(0.0, 1, 1, 1), (1, -1, 1, 1), (1, 1, np.nan, 1), (1, np.inf, 1, 1)]
 )
 def test_what_is_no_camera_is_refused(values: tuple[float, ...]) -> None:
-    with pytest.raises(InvalidScanError, match="intrinsics .*finite numbers, the first two above 0"):
+    with pytest.raises(InvalidScanError, match="intrinsics .*finite numbers, the first two"):
         Intrinsics(*values)
 
 

@@ -14,7 +14,7 @@ from triquad_format.wire.metrics_messages import (
     SourceMetrics,
     TimeHistogram,
 )
-from triquad_tools.commands.top import Sample
+from triquad_tools.work.top import Sample
 
 BOUNDS_S = np.array([0.001, 0.01, 0.1, 1.0, 10.0])
 

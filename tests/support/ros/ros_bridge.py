@@ -10,10 +10,10 @@ from support import servers
 from support.ros.ros_robot import Robot, shifted
 from triquad_client import Client, ServerStatus
 from triquad_tools.commands import ros2
-from triquad_tools.commands.ros2 import bridge_options
 from triquad_tools.ros2 import bridge
 from triquad_tools.ros2.bridge import open_session
 from triquad_tools.ros2.intake.intake import Intake
+from triquad_tools.work.ros2 import bridge_options
 
 AT = (20.0, -3.0, 1.0)  # of the robot in the map
 MAST = shifted(z=0.5)  # of the lidar on the robot

@@ -26,8 +26,9 @@ from support.server_records import METRICS, STATUS, later, operation
 from support.terminal import Terminal, terminal
 from triquad_client import Client, ServerMetrics, ServerStatus
 from triquad_format.wire.metrics_messages import QueueMetrics, SourceMetrics
-from triquad_tools.commands.top import Sample, main, page
+from triquad_tools.commands.top import main
 from triquad_tools.console.amounts import count, duration, millimetres, rate, size
+from triquad_tools.work.top import Sample, page
 
 CODE = "import sys; from triquad_tools.commands.entry_points import top; sys.exit(top())"
 CAUSE = "source 'camera': range_min_m = 1.5 drops 12 % of its points: set scan.range_min_m to less"

@@ -8,7 +8,11 @@ from pathlib import Path
 import pytest
 import triquad_format
 
-COMMANDS = ("demo", "evaluate", "inspect", "keys", "pack", "replay", "top")
+COMMANDS = (
+    "demo", "evaluate", "inspect", "keys", "map_recording", "pack", "replay", "ros2", "top", "view"
+)  # fmt: skip
+SLOW = {"matplotlib", "numba", "pydantic", "rich", "scipy", "torch", "trimesh", "viser", "zenoh"}
+"""What no one waits for who asks for help."""
 WAIT_S = 60.0
 
 
@@ -22,6 +26,29 @@ def command(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
 def test_each_command_tells_its_version(name: str) -> None:
     done = command(name, "--version")
     assert (done.returncode, done.stdout) == (0, f"triquad {triquad_format.__version__}\n")
+
+
+HELP = """
+import sys
+from importlib import import_module
+try:
+    import_module(sys.argv[1]).main(["--help"])
+except SystemExit:
+    print("LOADED", *sys.modules)
+"""
+
+
+@pytest.mark.parametrize(
+    "module", ["triquad_server.cli", *(f"triquad_tools.commands.{name}" for name in COMMANDS)]
+)
+def test_help_waits_for_no_library_that_is_slow_to_import(module: str) -> None:
+    line = [sys.executable, "-c", HELP, module]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=WAIT_S)
+    told, loaded, names = done.stdout.partition("LOADED ")
+    assert told.startswith("usage: triquad-")
+    assert loaded
+    assert "argparse" in names.split()
+    assert not SLOW & {*names.split()}
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ def run(code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
 def test_while_libraries_are_imported(name: str, module: str) -> None:
     code = PRESSED_AT_IMPORT.format(module=module)
     code += f"from triquad_tools.commands.entry_points import {name}\nsys.exit({name}())"
-    done = run(code, "--version")
+    done = run(code, "none.triquad", "none.triquad")
     assert (done.returncode, done.stderr) == (130, f"{NAMES[name]}: interrupted\n")
     assert done.stdout == ""
 
@@ -84,7 +84,7 @@ sys.exit(run("triquad-test", swallowing))
 
 
 def test_who_ignores_interrupts_is_not_interrupted() -> None:
-    code = PRESSED_AT_IMPORT.format(module="numpy")
+    code = PRESSED_AT_IMPORT.format(module="triquad_tools.commands.inspect")
     code += "signal.signal(signal.SIGINT, signal.SIG_IGN)\n"  # as shells do in the background
     code += "from triquad_tools.commands.entry_points import inspect\nsys.exit(inspect())"
     done = run(code, "--version")

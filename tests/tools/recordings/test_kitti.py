@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 from support.recordings.kitti_folder import write_folder
 from triquad_tools.console.command import ToolError
+from triquad_tools.recordings.arguments import add_recording
 from triquad_tools.recordings.cloud import world_points
 from triquad_tools.recordings.folders.cloud_folder import read_cloud_folder
 from triquad_tools.recordings.folders.scan_folder import ScanFolder
-from triquad_tools.recordings.recording import ReadingOptions, add_recording, options_of
+from triquad_tools.recordings.recording import ReadingOptions, options_of
 
 DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
 IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0"

@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 from support.recordings.bags import Recorded, messages_for, write_bag
 from support.ros_messages import CLOUD, TF
 from triquad_tools.console.command import ToolError
+from triquad_tools.recordings.arguments import add_recording
 from triquad_tools.recordings.opening import Selection, open_recording, open_selected
-from triquad_tools.recordings.recording import ReadingOptions, add_recording
+from triquad_tools.recordings.recording import ReadingOptions
 from triquad_tools.sensors.ray_check import hidden_share, without_repeated
 
 LOW, HIGH = np.array([-10.0, -5, 0]), np.array([90.0, 5, 6])  # a hall

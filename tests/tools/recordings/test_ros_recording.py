@@ -19,8 +19,9 @@ from support.ros_messages import (
     TRANSFORM,
 )
 from triquad_tools.console.command import ToolError
+from triquad_tools.recordings.arguments import transform
 from triquad_tools.recordings.opening import Recording, open_recording
-from triquad_tools.recordings.recording import ReadingOptions, transform
+from triquad_tools.recordings.recording import ReadingOptions
 
 COUNT = 6
 STAMPS = [1_700_000_000 * 10**9 + i * 10**8 for i in range(COUNT)]

@@ -5,8 +5,9 @@ from pathlib import Path
 import pytest
 from support import servers
 from triquad_tools.commands import ros2
-from triquad_tools.commands.ros2 import bridge_options, parser
+from triquad_tools.commands.ros2 import parser
 from triquad_tools.console.command import BAD_INPUT, FAILED
+from triquad_tools.work.ros2 import bridge_options
 
 
 def test_a_file_stands_for_arguments(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from support.ros_messages import RosMessages
-from triquad_tools.commands.ros2 import bridge_options, parser
+from triquad_tools.commands.ros2 import parser
 from triquad_tools.ros2.options import Role, TopicChoice
 from triquad_tools.ros2.output.mesh_publisher import ADD, marker_message
 from triquad_tools.ros2.topics import (
@@ -22,6 +22,7 @@ from triquad_tools.ros2.topics import (
     rmw_topic_name,
     type_hash,
 )
+from triquad_tools.work.ros2 import bridge_options
 
 STRING = "std_msgs/msg/String"
 HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"

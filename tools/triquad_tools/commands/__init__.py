@@ -1,1 +1,1 @@
-"""The console commands."""
+"""The command lines of the commands, which import nothing slow; their work is in ``work``."""

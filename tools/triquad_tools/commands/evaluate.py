@@ -2,72 +2,22 @@
 
 import argparse
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
-import numpy as np
-from triquad_format.records.arrays import Doubles
-
 from triquad_tools.console.arguments import command_parser, not_negative, positive
-from triquad_tools.console.command import OK, ToolError, print_line, run
-from triquad_tools.console.report import Row, centimetres, json_text, percent, print_rows
-from triquad_tools.evaluation.metrics import MeshScores, ScoreSettings, score_mesh
-from triquad_tools.mapfiles.meshfile import read_mesh
-from triquad_tools.recordings.cloud import merged, world_points
-from triquad_tools.recordings.folders.cloud_folder import read_cloud_folder
-from triquad_tools.recordings.recording import ReadingOptions
+from triquad_tools.console.command import run_work
 
-_COMMAND = "triquad-eval"
+COMMAND = "triquad-eval"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool: 0 done, 2 wrong usage or input that cannot be used."""
-    return run(_COMMAND, partial(_evaluate, _parser().parse_args(argv)))
-
-
-def _evaluate(options: argparse.Namespace) -> int:
-    mesh = read_mesh(options.mesh)
-    if not len(mesh.faces):
-        raise ToolError(f"{options.mesh}: has no faces; a cloud can only be a --reference")
-    settings = ScoreSettings(options.threshold, accuracy_cut_m=2 * options.threshold)
-    reference = _reference(options.reference, settings.voxel_m, options.range_min)
-    scores = score_mesh(mesh, reference, settings)
-    if options.json:
-        print_line(json_text(scores))
-    else:
-        print_rows(str(options.mesh), _rows(scores))
-    return OK
-
-
-def _reference(path: Path, voxel_m: float, range_min_m: float) -> Doubles:
-    """Return the points ``[N, 3]`` of a cloud, or of all scans of a folder in the world frame."""
-    if path.is_dir():
-        # Points are what counts, from wherever they were seen.
-        folder = read_cloud_folder(path, ReadingOptions(ray_origin=(0.0, 0.0, 0.0)))
-        clouds = (world_points(scan, range_min_m) for scan in folder.read(range(len(folder))))
-        points = merged(clouds, voxel_m)
-    else:
-        points = np.asarray(read_mesh(path).vertices, np.float64)
-    if not len(points):
-        raise ToolError(f"{path}: holds no points")
-    return points
-
-
-def _rows(scores: MeshScores) -> list[Row]:
-    return [
-        Row("accuracy", centimetres(scores.accuracy_m), "mean, mesh to truth, outliers left out"),
-        Row("accuracy, median", centimetres(scores.accuracy_median_m)),
-        Row("accuracy ratio", percent(scores.accuracy_ratio), "outliers left out"),
-        Row("completion", centimetres(scores.completion_m), "mean, truth to mesh"),
-        Row("completion ratio", percent(scores.completion_ratio)),
-        Row("F-score", percent(scores.f_score), "of both ratios"),
-        Row("outliers", percent(scores.outlier_ratio), "mesh beyond the accuracy cut"),
-    ]
+    return run_work(COMMAND, "evaluate", _parser().parse_args(argv))
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser(
-        _COMMAND,
+        COMMAND,
         description="Score a mesh against true surface points. docs/tools.md defines the figures.",
         epilog="Exit status: 0 done, 2 wrong usage or input.",
     )

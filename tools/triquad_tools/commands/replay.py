@@ -1,24 +1,14 @@
 """``triquad-replay``: publish a recording to a map server, or tell what it holds."""
 
 import argparse
-import shlex
 import sys
-import time
 from collections.abc import Callable, Sequence
-from functools import partial
-from pathlib import Path
 
-from triquad_client import FlushReport
+from triquad_tools.console.arguments import add_server, command_parser, positive
+from triquad_tools.console.command import run_work
+from triquad_tools.recordings.arguments import add_recording
 
-from triquad_tools.console.arguments import add_server, command_parser, connect_to, positive
-from triquad_tools.console.command import FAILED, OK, print_line, run
-from triquad_tools.console.report import print_columns
-from triquad_tools.recordings.opening import entries_of, length_s, open_recording, open_selected
-from triquad_tools.recordings.publishing import FLUSH_TIMEOUT_S, publish_all, wait_until_settled
-from triquad_tools.recordings.recording import ScanEntry, add_recording, options_of
-
-_COMMAND = "triquad-replay"
-
+COMMAND = "triquad-replay"
 DueTimes = Callable[[Sequence[int]], list[float]]
 """Returns when scans are sent, seconds after the first, by their stamps in nanoseconds."""
 
@@ -28,72 +18,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if argv is None else list(argv)
     options = _parser().parse_args(arguments)
     options.arguments = [argument for argument in arguments if argument != "--list"]
-    work = _list if options.list else _replay
     interrupted = "interrupted; scans that were sent are in the map"
-    return run(_COMMAND, partial(work, options), interrupted=interrupted)
-
-
-def _list(options: argparse.Namespace) -> int:
-    path = options.recording
-    recording = open_recording(path, options_of(options))
-    titles = ("stream", "type", "count", "frame", "use")
-    rows = [(s.name, s.kind, f"{s.count:,}", s.frame, s.use) for s in recording.streams]
-    print_columns(titles, rows, words=("type", "frame", "use"))
-    for remark in recording.remarks:
-        print_line(remark)
-    entries = entries_of(recording, path)
-    seconds = length_s(entries)
-    rate = f", {(len(entries) - 1) / seconds:.1f} a second" if seconds > 0 else ""
-    print_line(f"{len(entries):,} scans in {seconds:.1f} s{rate}")
-    words = options.arguments
-    at = next(at for at, word in enumerate(words) if Path(word) == path) + 1
-    words = [*words[:at], f"{path.resolve().stem}.triquad", *words[at:]]
-    print_line(f"to map it: triquad-map {shlex.join(words)}")
-    return OK
-
-
-def _replay(options: argparse.Namespace) -> int:
-    selection = open_selected(options)
-    with connect_to(options) as client:
-        before = client.status().scans_dropped
-        started_s = time.monotonic()
-        entries = selection.entries
-        due_s = options.rate([entry.stamp_ns for entry in entries]) if options.rate else ()
-        sent_as = [ScanEntry(entry.stamp_ns, options.source or entry.source) for entry in entries]
-        scans = zip(sent_as, selection.scans(), strict=True)
-        published = publish_all(client, scans, len(entries), due_s)
-        flush = client.flush(FLUSH_TIMEOUT_S)
-        seconds = time.monotonic() - started_s
-        after = client.status().scans_dropped
-        refusals = {reason: count - before.get(reason, 0) for reason, count in after.items()}
-        told = _summary(published, len(selection) - published, flush, refusals)
-        print_line(f"{told}, {seconds:.1f} s, {published / max(seconds, 1e-9):.1f} scans/s")
-        if flush.last_refusal:
-            print_line(f"last refusal: {flush.last_refusal}")
-        if options.settle:
-            status = wait_until_settled(client)
-            trained = f"{status.samples_trained / 1e6:.1f} M samples trained"
-            print_line(f"settled: epoch {status.epoch}, {trained}")
-    return OK if flush.lost == flush.refused == 0 else FAILED
-
-
-def _summary(published: int, skipped: int, flush: FlushReport, refusals: dict[str, int]) -> str:
-    """Return what became of the scans; ``refusals`` are the server's counts by reason."""
-    reasons = ", ".join(f"{reason}: {count}" for reason, count in refusals.items() if count > 0)
-    parts = [
-        f"{published} scans published",
-        f"{flush.taken} taken",
-        f"{flush.refused} refused" + (f" ({reasons})" if flush.refused and reasons else ""),
-        f"{flush.lost} lost",
-    ]
-    if skipped:
-        parts.append(f"{skipped} without points not sent")
-    return ", ".join(parts)
+    return run_work(COMMAND, "replay", options, interrupted=interrupted)
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser(
-        _COMMAND,
+        COMMAND,
         description="Publish a recording to a map server. By default the server sets the pace, and "
         "no scan is lost.",
         epilog="Exit status: 0 all scans are in the map (--list: there are some to map), 1 some "

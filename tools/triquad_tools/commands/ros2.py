@@ -1,152 +1,29 @@
 """``triquad-ros2``: maps what a robot with ROS 2 publishes, and publishes the map to it."""
 
 import argparse
-import logging
 import os
 import re
 import sys
-import threading
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack, closing
-from dataclasses import fields
 from functools import partial
 
-from triquad_client import Client, ConnectError, UnknownMapError
-from triquad_format.printable import printable
+from triquad_tools.console.arguments import add_server, command_parser, count, whole, within
+from triquad_tools.console.command import run_work
+from triquad_tools.sensors.ros.type_store import ALL_TF, frame_name
 
-from triquad_tools.console.arguments import (
-    add_server,
-    command_parser,
-    connect_to,
-    count,
-    whole,
-    within,
-)
-from triquad_tools.console.command import FAILED, OK, ToolError, run
-from triquad_tools.ros2.bridge import bridging, open_session
-from triquad_tools.ros2.options import (
-    MAX_GRID_CELLS,
-    TF_POSES,
-    BridgeOptions,
-    SliceShape,
-    TopicChoice,
-    full_name,
-)
-from triquad_tools.ros2.server_process import ServerProcess
-from triquad_tools.sensors.ros.type_store import frame_name
-
-_COMMAND = "triquad-ros2"
+COMMAND = "triquad-ros2"
 _TOPIC = re.compile(r"(/?[A-Za-z_][A-Za-z0-9_]*)+")
-
-_ATTEMPT_S = 2.0  # after which it is checked whether our server still runs
-
-_log = logging.getLogger("triquad_ros2")
-
-
-def _start_log() -> None:
-    handler = logging.StreamHandler()
-    handler.setFormatter(_Lines("%(asctime)s %(levelname)s ros2: %(message)s"))
-    logging.basicConfig(level=logging.INFO, handlers=[handler])
-
-
-class _Lines(logging.Formatter):
-    """Lines in which names from the network cannot look like other lines."""
-
-    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802
-        """Return the line of a message."""
-        record.message = printable(record.message)
-        return super().formatMessage(record)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the tool: 0 stopped, 1 the server failed, 2 wrong usage; with --serve, as the server."""
-    _start_log()
-    return run(_COMMAND, partial(_run, parser().parse_args(argv)))
-
-
-def _run(options: argparse.Namespace) -> int:
-    asked = bridge_options(options)
-    server: ServerProcess | None = None
-    by_signal = FAILED
-    try:
-        with ExitStack() as stack:
-            if options.serve is not None:
-                server = stack.enter_context(ServerProcess(options.serve, asked.topics))
-                options.map = options.map or server.map_name
-                if options.config is None:
-                    options.connect = options.connect or server.endpoint
-                    options.router = options.router or server.endpoint
-            _bridge(options, asked, server)
-    except KeyboardInterrupt:
-        _log.info("stopped")
-        by_signal = OK  # a server that was just starting ends so, too
-    code = OK if server is None else server.exit_code or OK
-    return by_signal if code < OK else code
-
-
-def _bridge(
-    options: argparse.Namespace, asked: BridgeOptions, server: ServerProcess | None
-) -> None:
-    """Bridge until the server ends, or else for ever."""
-    client = _connected(options, server)
-    if client is None:
-        return
-    with (
-        client,
-        closing(open_session(options.router, options.config)) as session,
-        bridging(session, client, asked) as intake,
-    ):
-        try:
-            if server is None:
-                threading.Event().wait()
-            else:
-                server.wait()
-        finally:
-            dropped = ", ".join(f"{reason}: {n}" for reason, n in intake.dropped.items())
-            _log.info("%d scans published, dropped: %s", intake.published, dropped or "none")
-
-
-def _connected(options: argparse.Namespace, server: ServerProcess | None) -> Client | None:
-    """Return a client of the map server, once it serves; None where one of ours ended before."""
-    while server is None or server.exit_code is None:
-        try:
-            if server is not None:  # it may also end before it is there
-                connect_to(options, timeout_s=_ATTEMPT_S).close()
-            return connect_to(options)
-        except (ConnectError, UnknownMapError):
-            if server is None:
-                raise
-    return None
-
-
-def bridge_options(options: argparse.Namespace) -> BridgeOptions:
-    """Return what the arguments ask of the bridge.
-
-    Raises:
-        ToolError: the grid would have too many cells.
-    """
-    grid = SliceShape(options.grid_height_m, options.grid_side_m, options.grid_cell_m)
-    if grid.cells**2 > MAX_GRID_CELLS:
-        raise ToolError(
-            f"a grid of {grid.side_m:g} m has {grid.cells} cells of {grid.cell_m:g} m along each "
-            f"side: use at most {int(MAX_GRID_CELLS**0.5)}"
-        )
-    prefix = full_name("", options.namespace or "").rstrip("/")
-    topics = TopicChoice(
-        options.domain,
-        prefix,
-        clouds=tuple(full_name(prefix, name) for name in options.clouds),
-        depth=tuple(full_name(prefix, name) for name in options.depth),
-        poses=None if options.poses.strip("/") == TF_POSES else full_name(prefix, options.poses),
-    )
-    others = {field.name for field in fields(BridgeOptions)} - {"topics", "grid"}
-    return BridgeOptions(topics, grid, **{name: getattr(options, name) for name in others})
+    return run_work(COMMAND, "ros2", parser().parse_args(argv))
 
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line; ``@FILE`` stands for what a file has, line by line."""
     made = command_parser(
-        _COMMAND,
+        COMMAND,
         description="Map the clouds and depth images of a robot with ROS 2 (rmw_zenoh or "
         "zenoh-bridge-ros2dds), and publish the map's mesh and an occupancy grid to it: "
         "docs/guides/ros2.md. @FILE stands for the arguments in a file, one a line.",
@@ -179,7 +56,7 @@ def _add_topics(add: Callable[..., argparse.Action]) -> None:
         add(f"--{name}", type=_topic, nargs="+", default=[], metavar="TOPIC", help=what)
     add("--depth-stride", type=count, default=2, metavar="N", help="every Nth pixel (default: 2)")
     poses = "of odometry, poses, transforms or a path (default: /tf)"
-    add("--poses", type=_topic, default=TF_POSES, metavar="TOPIC", help=poses)
+    add("--poses", type=_topic, default=ALL_TF, metavar="TOPIC", help=poses)
     add("--body-frame", type=frame_name, default="base_link", metavar="NAME", help="of these poses")
     to_map_in = "(default: map, odom or world, the first that there is)"
     add("--map-frame", type=frame_name, default="", metavar="NAME", help=to_map_in)

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from triquad_client import Client
 
 DEFAULT_MAP = "default"
+PAGE_PORT = 8080  # of the page that shows a map
 
 
 def command_parser(prog: str, description: str, epilog: str = "") -> argparse.ArgumentParser:

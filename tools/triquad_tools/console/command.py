@@ -1,11 +1,14 @@
 """What commands print and how they end: a status, and one line for what went wrong."""
 
+import argparse
+import importlib
 import os
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from typing import TextIO
 
 from triquad_format.errors import (
@@ -115,6 +118,18 @@ def run(command: str, work: Callable[[], int], *, interrupted: str = "interrupte
     except KeyboardInterrupt as interrupt:
         _kept.append(interrupt)
         return complain(command, interrupted, INTERRUPTED)
+
+
+def run_work(
+    command: str, module: str, options: argparse.Namespace, *, interrupted: str = "interrupted"
+) -> int:
+    """Return the exit status of a command whose arguments are right, as :func:`run`.
+
+    Its work is the function ``work`` of a module of ``triquad_tools.work``, which is imported only
+    here: that takes a second, for which nobody waits who asks for help.
+    """
+    work = importlib.import_module(f"triquad_tools.work.{module}").work
+    return run(command, partial(work, options), interrupted=interrupted)
 
 
 def _in_words(error: OSError) -> str:

@@ -7,8 +7,7 @@ import numpy as np
 from triquad_client import Mesh
 
 from triquad_tools.console.command import ToolError
-
-MESH_SUFFIXES = (".ply", ".glb", ".obj", ".stl")
+from triquad_tools.console.suffixes import MESH_SUFFIXES
 
 # glTF has y up; maps have z up.
 _GLTF_FROM_MAP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])

@@ -13,13 +13,11 @@ from triquad_format.records.region import MapRecord
 
 from triquad_tools.console.command import ToolError, print_remark
 from triquad_tools.console.progress import progress
+from triquad_tools.console.suffixes import MAP_SUFFIX, PICTURE_SUFFIX, SUFFIXES
 from triquad_tools.mapfiles.crop import without_training
-from triquad_tools.mapfiles.meshfile import MESH_SUFFIXES
 from triquad_tools.mapfiles.source import Box, NothingLeftError, SourceMap
 
-MAP_SUFFIX, PICTURE_SUFFIX = ".triquad", ".png"
 _MARKED = (".ply", ".glb", ".obj", PICTURE_SUFFIX)  # they can show which faces were not seen
-SUFFIXES = (MAP_SUFFIX, *MESH_SUFFIXES, PICTURE_SUFFIX)
 
 
 def why(error: OSError) -> str:

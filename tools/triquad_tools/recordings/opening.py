@@ -10,12 +10,13 @@ import numpy as np
 from triquad_format.wire.places import moved_pose
 
 from triquad_tools.console.command import ToolError, print_remark
+from triquad_tools.recordings.arguments import Place
 from triquad_tools.recordings.cloud import points_in_range
 from triquad_tools.recordings.folders.cloud_folder import is_cloud_folder, read_cloud_folder
 from triquad_tools.recordings.folders.depth_folder import is_depth_folder, read_depth_folder
 from triquad_tools.recordings.folders.scan_folder import ScanFolder
 from triquad_tools.recordings.mcap_bag import find_bag
-from triquad_tools.recordings.recording import Place, ReadingOptions, ScanEntry, options_of
+from triquad_tools.recordings.recording import ReadingOptions, ScanEntry, options_of
 from triquad_tools.recordings.ros_recording import RosRecording
 from triquad_tools.sensors.ray_check import without_repeated
 from triquad_tools.sensors.sweep import PosedScan

@@ -14,18 +14,17 @@ from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.recording import ReadingOptions
 from triquad_tools.recordings.ros_content import RosContent, SeenCloud
 from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES, STATIC, FrameTree, Transform
-from triquad_tools.sensors.ros.type_store import TRANSFORMS
+from triquad_tools.sensors.ros.type_store import ALL_TF, TRANSFORMS
 from triquad_tools.sensors.sweep import NoTransformError, PosedScan, Sweep
 
 _SLACK_M, _SLACK_S = 1.0, 2.0  # between the parts of a recording the robot goes on as it was
-TF = "tf"  # stands for all transforms, whatever their topics
 
 
 @dataclass(frozen=True)
 class PoseSource:
     """Poses that may be used, and the frame to map in."""
 
-    name: str  # a topic, or TF
+    name: str  # a topic, or ALL_TF
     frames: FrameTree
     target: str
     body: str  # the frame whose poses they are, or one that hangs on it
@@ -73,7 +72,7 @@ def choose_poses(
     _check_body(content, {cloud.frame for cloud in clouds}, options)
     content.frames.wanted = options.map_frame or ""
     frame = clouds[0].frame
-    names = [TF, *content.poses]
+    names = [ALL_TF, *content.poses]
     if options.poses is not None and content.kinds.get(options.poses) not in TRANSFORMS:
         if options.poses not in names:
             known = ", ".join(names)
@@ -108,11 +107,11 @@ def _source(content: RosContent, name: str, frame: str, options: ReadingOptions)
     If they do not reach the sensor, finding a cloud says so.
     """
     frames, body = content.frames, options.body_frame
-    if name == TF:
+    if name == ALL_TF:
         if frames.moves(frames.root(frame), frame):
             body = frame
         body = body or frames.lowest_moving or frame
-        return PoseSource(TF, frames, options.map_frame or frames.fixed_frame(body), body)
+        return PoseSource(ALL_TF, frames, options.map_frame or frames.fixed_frame(body), body)
     poses = content.poses[name]
     assumed = not (body or poses.child)
     # Where a topic does not name the body, it is what the sensor is fixed to.

@@ -7,29 +7,22 @@ from dataclasses import replace
 import numpy as np
 
 from triquad_tools.console.command import ToolError
+from triquad_tools.recordings.arguments import SENSOR, WORLD
 from triquad_tools.recordings.bag import Bag, Message
 from triquad_tools.recordings.pose_source import (
-    TF,
     PoseSource,
     check_places,
     check_times,
     choose_poses,
 )
-from triquad_tools.recordings.recording import (
-    SENSOR,
-    WORLD,
-    ReadingOptions,
-    ScanEntry,
-    Stream,
-    with_remedies,
-)
+from triquad_tools.recordings.recording import ReadingOptions, ScanEntry, Stream, with_remedies
 from triquad_tools.recordings.ros_content import RosContent, SeenCloud
 from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES
 from triquad_tools.sensors.motion.placing import place
 from triquad_tools.sensors.ros import type_store
 from triquad_tools.sensors.ros.depth_camera import raw_topic
 from triquad_tools.sensors.ros.message_reader import MessageReader
-from triquad_tools.sensors.ros.type_store import TRANSFORMS, source_of_topic
+from triquad_tools.sensors.ros.type_store import ALL_TF, TRANSFORMS, source_of_topic
 from triquad_tools.sensors.sweep import NoScanError, PosedScan
 
 _CLOCKS = (
@@ -260,7 +253,7 @@ class RosRecording:
         chosen = self._poses.name if self._poses else ""
         kind = self._content.kinds[topic]
         if kind in TRANSFORMS:
-            return "the poses" if chosen == TF else "where sensors sit"
+            return "the poses" if chosen == ALL_TF else "where sensors sit"
         if kind in type_store.POSES:
             return "the poses" if chosen == topic else f"other poses: --poses {topic}"
         if kind == type_store.CAMERA_INFO:

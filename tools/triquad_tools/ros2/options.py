@@ -12,7 +12,6 @@ from triquad_tools.ros2.topics import Topic, bridge_key, rmw_key
 from triquad_tools.sensors.ros import type_store as types
 from triquad_tools.sensors.ros.depth_camera import camera_topic
 
-TF_POSES = "tf"  # stands for transforms in place of a topic of poses
 MAX_GRID_CELLS = 250_000
 
 

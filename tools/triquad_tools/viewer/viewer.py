@@ -22,7 +22,6 @@ from triquad_tools.viewer.sources import History, LiveSource, MapSource
 from triquad_tools.viewer.time_panel import TimePanel
 from triquad_tools.viewer.trail_layer import TrailLayer
 
-DEFAULT_PORT = 8080
 _OF_ONE_WHO_LEFT = ("Queued a .* on a closed connection", "Attempted to remove an? already removed")
 """Warnings of viser that come when a browser leaves while something is drawn or removed."""
 

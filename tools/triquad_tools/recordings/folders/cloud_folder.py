@@ -9,6 +9,7 @@ import numpy as np
 from triquad_format.records.arrays import Floats
 
 from triquad_tools.console.command import ToolError
+from triquad_tools.recordings.arguments import SENSOR, WORLD
 from triquad_tools.recordings.folders import point_file
 from triquad_tools.recordings.folders.file_names import in_order, stamps_of_names
 from triquad_tools.recordings.folders.frame_checks import check_frame, check_poses, check_rays
@@ -19,7 +20,7 @@ from triquad_tools.recordings.folders.scan_folder import (
     place_files,
 )
 from triquad_tools.recordings.folders.trajectory import Trajectory
-from triquad_tools.recordings.recording import SENSOR, WORLD, ReadingOptions, Stream
+from triquad_tools.recordings.recording import ReadingOptions, Stream
 from triquad_tools.recordings.text_lines import parse_number, parse_stamps, read_lines, rigid
 from triquad_tools.sensors.motion.placing import place
 from triquad_tools.sensors.point_times import offsets_s

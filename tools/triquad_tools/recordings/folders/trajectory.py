@@ -11,8 +11,8 @@ from triquad_client.pose import Pose, pose_matrices
 from triquad_format.records.arrays import Doubles, Longs
 
 from triquad_tools.console.command import ToolError
+from triquad_tools.recordings.arguments import SENSOR, WORLD
 from triquad_tools.recordings.folders.pose_forms import UNIT_TOLERANCE, Form, order_of, read_form
-from triquad_tools.recordings.recording import SENSOR, WORLD
 from triquad_tools.recordings.text_lines import Line, parse_time, read_lines, rigid, unit_ns
 from triquad_tools.sensors.motion.frame_tree import FrameTree, Transform
 from triquad_tools.sensors.sweep import NoTransformError

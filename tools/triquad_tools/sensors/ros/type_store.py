@@ -19,6 +19,7 @@ IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 IMAGES = (IMAGE, COMPRESSED_IMAGE)
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+ALL_TF = "tf"  # stands for them in place of a topic of poses, whatever their topics
 TF = "tf2_msgs/msg/TFMessage"
 TF_OF_ROS_1 = "tf/msg/tfMessage"
 ODOMETRY = "nav_msgs/msg/Odometry"
