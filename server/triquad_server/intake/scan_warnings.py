@@ -103,9 +103,10 @@ class ScanWarnings:
             self._check_scans()
             for source, points in self._points.items():
                 if points.scans >= _SCANS:
-                    self._check_ranges(source, points)
-                    self._check_leaf(source, points)
-                    self._check_places(source, points)
+                    if not self._check_units(source, points):
+                        self._check_ranges(source, points)
+                        self._check_leaf(source, points)
+                        self._check_places(source, points)
                     self._points[source] = _Points()
 
     def of(self, source: str) -> str | None:
@@ -195,12 +196,16 @@ class ScanWarnings:
             f"{better_m:g}",
         )
 
-    def _check_places(self, source: str, points: _Points) -> None:
-        places = np.array(points.places)
-        if (told := wrong_units(float(np.median(points.sent_ranges_m)), places)) is not None:
+    def _check_units(self, source: str, points: _Points) -> bool:
+        """Return whether points or poses are not in metres, where all else would mislead."""
+        range_m = float(np.median(points.sent_ranges_m))
+        if (told := wrong_units(range_m, np.array(points.places))) is not None:
             self._warn(source, "units", told)
-        count, size_m = jumps(np.arange(len(places)), places)
-        if count and told is None:
+        return told is not None
+
+    def _check_places(self, source: str, points: _Points) -> None:
+        count, size_m = jumps(np.arange(len(points.places)), np.array(points.places))
+        if count:
             self._warn(
                 source,
                 "jumps",

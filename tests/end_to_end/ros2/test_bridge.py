@@ -11,7 +11,7 @@ from support.ros.ros_robot import T0, robot, shifted, stamp
 from support.ros_messages import CLOUD, PATH, POSE_WITH_COVARIANCE, TRANSFORM
 from triquad_client import Client, Status
 from triquad_server.settings import SourceSettings
-from triquad_tools.ros2.intake import drop_log
+from triquad_tools.ros2.intake import drop_log, intake
 
 
 @pytest.fixture(scope="module")
@@ -121,6 +121,16 @@ def test_clouds_that_are_no_scans_are_refused_with_the_reason(
         assert bridged.bridge.dropped == dict.fromkeys(reasons, 1)
         del no_names
     assert "the cloud has no field z" in caplog.text
+
+
+def test_two_that_publish_one_transform_are_told(
+    endpoint: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(intake, "LOG_PERIOD_S", 0.1)
+    with bridging(endpoint) as bridged, robot(endpoint) as r2:
+        for number in range(60):
+            r2.tf(0.1 * number, ("odom", "base_link", shifted(x=0.1 * number + number % 2)))
+        bridged.wait_for(lambda: "odom from base_link jumps to and fro" in caplog.text)
 
 
 def test_only_chosen_topics_are_mapped_and_others_are_named(
