@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 from triquad_format.records.arrays import Doubles, Floats
 
 from triquad_client.errors import NO_NUMBER, InvalidScanError
-from triquad_client.real_numbers import real_numbers
+from triquad_client.real_numbers import real_number, real_numbers
 
 _MILLIMETRES_PER_M = 1000.0
 
@@ -81,9 +81,10 @@ def depth_points(
 
     Raises:
         InvalidScanError: the image is not one, shows nothing, most of it is negative, or the
-            stride is below 1; or the matrix is not that of a camera.
+            stride is below 1, or the units are none above 0; or the matrix is not that of a camera.
     """
-    image = _metres(depth, units_per_metre)
+    units = None if units_per_metre is None else _units(units_per_metre)
+    image = _metres(depth, units)
     if not isinstance(intrinsics, Intrinsics):
         intrinsics = Intrinsics.from_matrix(intrinsics)
     if isinstance(stride, bool) or not isinstance(stride, int) or stride < 1:
@@ -101,6 +102,16 @@ def depth_points(
     z = image[rows, columns]
     x, y = intrinsics.slopes(rows * stride, columns * stride) * z
     return np.stack([x, y, z], axis=1).astype(np.float32)
+
+
+def _units(units_per_metre: float) -> float:
+    try:
+        units = real_number(units_per_metre)
+    except NO_NUMBER:
+        units = 0.0
+    if not 0 < units < np.inf:
+        raise InvalidScanError(f"units_per_metre = {units_per_metre!r}: use a number above 0")
+    return units
 
 
 def _metres(depth: ArrayLike, units_per_metre: float | None) -> NDArray[np.floating]:

@@ -97,6 +97,13 @@ def test_what_is_no_depth_image_is_refused(depth: Any, stride: Any, text: str) -
         depth_points(depth, CAMERA, stride)
 
 
+@pytest.mark.parametrize("units", ["1000", 0, -1.0, np.inf, np.nan])
+def test_units_that_are_none_are_refused(units: Any) -> None:
+    with pytest.raises(InvalidScanError, match=f"units_per_metre = {units!r}: use a number above"):
+        depth_points(wall_depth(), CAMERA, units_per_metre=units)
+    assert len(depth_points(wall_depth(), CAMERA, units_per_metre=2)) == np.prod(SHAPE)
+
+
 @pytest.mark.parametrize(
     "values", [(0.0, 1, 1, 1), (1, -1, 1, 1), (1, 1, np.nan, 1), (1, np.inf, 1, 1)]
 )
