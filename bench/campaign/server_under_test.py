@@ -16,7 +16,7 @@ from bench.campaign.turn import BrokenError, Turn
 _SPACING_M = 9.0  # between places on the x axis, each with a sphere of its own
 _MAX_GROWTH_BYTES = 200 * 2**20
 WITHIN_S = 30.0  # an honest request is answered, also where much else goes on
-_SETTINGS = servers.SMALL_TOML + "max_regions = 40\n[store]\nkeep = 4\n"
+_SETTINGS = servers.SMALL_FILE.read_text() + "max_regions = 40\n[store]\nkeep = 4\n"
 _INTERNAL = ("Traceback", "internal error")
 
 

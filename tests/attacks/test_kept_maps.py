@@ -11,6 +11,7 @@ import pytest
 import triquad_client
 import triquad_server
 from support import servers
+from support.files.file_damage import rot
 from triquad_client import Client, RefusedError
 from triquad_format.mapfile.checkpoint_folder import checkpoint_files
 from triquad_format.mapfile.index import Checkpoint
@@ -24,9 +25,7 @@ PROBES = servers.sphere(200)
 
 @contextmanager
 def served(folder: Path, *more: str) -> Iterator[tuple[servers.ServerProcess, Client]]:
-    settings = folder / "server.toml"
-    settings.write_text(servers.SMALL_TOML)
-    arguments = ["--settings", settings, "--store", folder / "store", *more]
+    arguments = ["--settings", servers.SMALL_FILE, "--store", folder / "store", *more]
     with (
         servers.server_process(arguments) as server,
         triquad_client.connect(server.endpoint) as client,
@@ -113,14 +112,6 @@ def test_nothing_is_reset_where_the_map_cannot_be_kept_and_mapping_goes_on_while
             servers.learn(client, scans=1)
             client.checkpoint()
         assert reply.kept_epoch in {file.epoch for file in checkpoint_files(folder)}
-
-
-def rot(path: Path) -> None:
-    """Flip a bit in the middle of a file, whose time stays: as a disk does it."""
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 1
-    with path.open("r+b") as file:
-        file.write(data)
 
 
 def test_a_part_that_rots_is_written_again(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import triquad_client
 from support import servers
-from support.requests import tile_changes
+from support.poses import shifted
 from support.servers import RawPeer, ServerProcess
 from triquad_format.wire import codec, keys
 
@@ -31,9 +31,8 @@ def test_spheres_all_around_fill_the_map_and_no_more(server: ServerProcess) -> N
         for number in range(SPHERES):
             directions = rng.normal(size=(POINTS, 3))
             directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-            pose = np.eye(4)
-            pose[0, 3] = 20.0 * number
-            client.publish_scan((RADIUS_M * directions).astype(np.float32), pose, source="liar")
+            points = (RADIUS_M * directions).astype(np.float32)
+            client.publish_scan(points, shifted(20.0 * number), source="liar")
             report = client.flush(servers.WAIT_S)
         grown = server.resident_bytes - before
         print(f"grown by {grown / 1e6:.0f} MB")
@@ -50,7 +49,7 @@ def test_spheres_all_around_fill_the_map_and_no_more(server: ServerProcess) -> N
 
 
 def test_junk_in_a_request_for_tiles_is_refused(server: ServerProcess) -> None:
-    body = codec.encode(tile_changes())
+    body = codec.encode(servers.tile_changes())
     assert body[0] == 0xDE or body[0] & 0xF0 == 0x80
     junk = b"\xa1j\xc6" + (12_000_000).to_bytes(4, "big") + bytes(12_000_000)
     fields = body[0] & 0x0F

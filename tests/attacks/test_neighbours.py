@@ -35,9 +35,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def server(store: Path) -> Iterator[servers.ServerProcess]:
     """A server process that has learnt a sphere."""
-    (store / "settings.toml").write_text(servers.SMALL_TOML)
-    arguments = ["--settings", store / "settings.toml", "--store", store]
-    with servers.server_process(arguments) as server:
+    with servers.server_process(["--settings", servers.SMALL_FILE, "--store", store]) as server:
         with triquad_client.connect(server.endpoint) as client:
             servers.learn(client)
         yield server

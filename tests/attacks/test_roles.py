@@ -17,7 +17,7 @@ from support.attackers.role_matrix import OTHERS, OWN, achieved, expected
 from support.ros.ros_bridge import MAST, bridging, stand
 from support.ros.ros_robot import RmwZenoh, Robot
 from support.ros_messages import RosMessages
-from support.servers import SMALL_TOML, WAIT_S, server_process, sphere
+from support.servers import SMALL_FILE, WAIT_S, server_process, sphere
 from triquad_client.errors import ConnectError, NoReplyError, UnknownMapError
 from triquad_format.wire import keys
 from triquad_tools.commands import inspect, top
@@ -84,14 +84,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> KeyFolder:
 def network(folder: KeyFolder) -> Iterator[Network]:
     server = folder.path / "server.json5"
     endpoints = {path: free_tls_endpoint() for path in PATHS}
-    settings = folder.path / "settings.toml"
-    settings.write_text(SMALL_TOML)
     router = zenoh.Config.from_file(str(server))
     router.insert_json5("listen/endpoints", json.dumps([endpoints["router"]]))
     own = showing(folder.certificate(ROUTER), "connect", "listen")
     for name, value in own.items():
         router.insert_json5(name.replace("__", "/"), json.dumps(value))
-    arguments = ["--config", server, "--settings", settings, "--connect", endpoints["router"]]
+    arguments = ["--config", server, "--settings", SMALL_FILE, "--connect", endpoints["router"]]
     with (
         zenoh.open(router),
         server_process(arguments, endpoints["server"]),

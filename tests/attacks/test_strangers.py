@@ -12,7 +12,7 @@ from support.attackers.beyond import from_beyond
 from support.operations import OPERATIONS
 from support.servers import (
     MAP,
-    SMALL_TOML,
+    SMALL_FILE,
     WAIT_S,
     ServerProcess,
     free_endpoint,
@@ -37,9 +37,8 @@ TOKENS = 4000
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcess]:
     """A server on all addresses of this machine, that has mapped a sphere and stored it."""
     folder = tmp_path_factory.mktemp("strangers")
-    (folder / "small.toml").write_text(SMALL_TOML)
     endpoint = free_endpoint().replace("127.0.0.1", "0.0.0.0")
-    arguments = ["--settings", folder / "small.toml", "--store", folder / "store"]
+    arguments = ["--settings", SMALL_FILE, "--store", folder / "store"]
     with server_process(arguments, endpoint) as running:
         with connected(running) as client:
             learn(client)

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 import triquad_client
 from support import servers
+from support.files.file_damage import rot
+from support.poses import shifted
 from triquad_client import (
     Client,
     ClosedError,
@@ -40,9 +42,7 @@ def client() -> Iterator[Client]:
 
 def learn(client: Client, x_m: float, radius_m: float = 4.0) -> None:
     """Have the server learn a room, and settle."""
-    pose = np.eye(4)
-    pose[0, 3] = x_m
-    client.publish_scan(servers.sphere(radius_m=radius_m), pose)
+    client.publish_scan(servers.sphere(radius_m=radius_m), shifted(x_m))
     client.flush(servers.WAIT_S)
     client.settle(servers.WAIT_S)
 
@@ -103,14 +103,12 @@ def test_a_damaged_copy_is_mended_and_a_foreign_file_replaced(
 ) -> None:
     path = tmp_path / "copy.triquad"
     parts = client.sync(WHOLE, path).report.parts
-    data = bytearray(path.read_bytes())
-    data[len(data) // 3] ^= 0xFF
-    path.write_bytes(data)
+    rot(path)
     mended = client.sync(WHOLE, path)
     assert mended.report.parts_received >= 1
     assert mended.report.parts_kept + mended.report.parts_received == parts
     assert_same_answers(mended, client)
-    for content in (b"", b"something else", bytes(data[:-50])):
+    for content in (b"", b"something else", path.read_bytes()[:-50]):
         path.write_bytes(content)
         assert client.sync(WHOLE, path).report.parts_received == parts
         assert triquad_client.open_map(path).epoch == client.status().epoch

@@ -25,14 +25,6 @@ def client(endpoint: str) -> Iterator[Client]:
 
 
 @pytest.fixture
-def settings(tmp_path: Path) -> Path:
-    """A file with the settings of small maps."""
-    path = tmp_path / "server.toml"
-    path.write_text(servers.SMALL_TOML)
-    return path
-
-
-@pytest.fixture
-def arguments(tmp_path: Path, settings: Path) -> list[str]:
-    """Arguments of a server process with these settings, and a store in ``tmp_path / "store"``."""
-    return ["--settings", str(settings), "--store", str(tmp_path / "store")]
+def arguments(tmp_path: Path) -> list[str]:
+    """Arguments of a server process of small maps, with a store in ``tmp_path / "store"``."""
+    return ["--settings", str(servers.SMALL_FILE), "--store", str(tmp_path / "store")]

@@ -11,10 +11,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support import servers
 from support.operations import OPERATIONS
-from support.requests import tile_changes
 from triquad_format.wire import codec, keys
+from triquad_format.wire.limits import MAX_SEQUENCE
 from triquad_format.wire.mesh_messages import MeshRequest, TileListRequest
-from triquad_format.wire.messages import ResetRequest, SdfRequest, StatusRequest
+from triquad_format.wire.messages import FlushRequest, ResetRequest, SdfRequest, StatusRequest
 from triquad_format.wire.query_messages import (
     ChangesRequest,
     DistanceRequest,
@@ -22,6 +22,7 @@ from triquad_format.wire.query_messages import (
     RaysRequest,
     SegmentsRequest,
 )
+from triquad_format.wire.source_messages import SourcesRequest
 
 ORIGIN = np.zeros(3)
 ONE_POINT = np.zeros((1, 3), np.float32)
@@ -41,6 +42,12 @@ def rays(count, range_m):
 
 def ground(count, drop_m, z=0.0):
     return GroundRequest(ORIGIN, np.full((count, 3), z, np.float32), drop_m, 0)
+
+
+def flush(**changes):
+    """A question about a scan that never came."""
+    good = {"source": "lidar", "session": 7, "sequence": 0, "waited_s": 0.0}
+    return FlushRequest(**(good | changes))
 
 
 def tiles(*xs):
@@ -112,6 +119,8 @@ def test_scans_that_cannot_be_read_are_counted_by_reason(peer, client, payload, 
         ({"world_from_sensor": np.zeros((4, 4))}, "pose_not_rigid"),
         ({"world_from_sensor": np.eye(4) + np.eye(4, k=3) * 1e9}, "outside_world"),
         ({"stamp_ns": -5}, "time_backwards"),
+        ({"no_return": np.float32([[0, 0, 1], [0, 0, 0]])}, "bad_no_return"),
+        ({"no_return": np.float32([[0, -np.inf, 0]])}, "bad_no_return"),
     ],
 )
 def test_scans_that_cannot_be_used_are_refused_with_the_cause(peer, client, changes, reason):
@@ -183,12 +192,22 @@ def test_random_scans_are_dropped_or_taken_but_never_do_harm(peer, client):
         (keys.MESH, MeshRequest(tiles(), 0), "bad_request"),
         (keys.MESH, MeshRequest(tiles(*range(65)), 0), "bad_request"),
         (keys.MESH, MeshRequest(tiles(0), 0, fill_m=1.0), "bad_request"),
-        (keys.TILE_CHANGES, tile_changes(minimum=np.full(3, np.nan)), "bad_request"),
-        (keys.TILE_CHANGES, tile_changes(level=7), "bad_request"),
+        (keys.TILE_CHANGES, servers.tile_changes(minimum=np.full(3, np.nan)), "bad_request"),
+        (keys.TILE_CHANGES, servers.tile_changes(level=7), "bad_request"),
         (keys.TILE_LIST, TileListRequest(ORIGIN + 1, ORIGIN, 0), "bad_request"),
         (keys.TILE_LIST, TileListRequest(ORIGIN * np.nan, ORIGIN, 0), "bad_request"),
         (keys.RESET, ResetRequest(ORIGIN, ORIGIN * np.nan), "bad_request"),
         (keys.RESET, ResetRequest(ORIGIN, ORIGIN - 1), "bad_request"),
+        (keys.FLUSH, flush(sequence=-1), "bad_request"),
+        (keys.FLUSH, flush(sequence=MAX_SEQUENCE + 1), "bad_request"),
+        (keys.FLUSH, flush(sequence=2**63 - 1), "bad_request"),
+        (keys.FLUSH, flush(source=""), "bad_request"),
+        (keys.FLUSH, flush(source="a/b"), "bad_request"),
+        (keys.FLUSH, flush(source="a" * 65), "bad_request"),
+        (keys.FLUSH, flush(waited_s=np.nan), "bad_request"),
+        (keys.FLUSH, flush(waited_s=-1.0), "bad_request"),
+        (keys.SOURCES, SourcesRequest("", 0, -1), "bad_request"),
+        (keys.SOURCES, SourcesRequest("", 0, 10_001), "bad_request"),
         (keys.CHANGES, ChangesRequest(-1, "", ORIGIN, ORIGIN), "bad_request"),
         (keys.CHANGES, ChangesRequest(2**62, "", ORIGIN, ORIGIN), "epoch_gone"),
         (keys.CHANGES, ChangesRequest(0, "x" * 10_000, ORIGIN, ORIGIN), "epoch_gone"),
@@ -216,11 +235,13 @@ def test_a_request_for_another_map_gets_no_reply(asked):
     assert stranger.ask(keys.STATUS, codec.encode(StatusRequest())) is None
 
 
-def test_what_is_far_is_empty(client):
-    assert len(client.mesh(((6.4e6, -6.4e6, 0), (6.5e6, -6.3e6, 9))).faces) == 0
-    result = client.query_sdf([[1e9, 0, 0], [-1e9, 1e9, 1e9]], gradient=True)
+def test_what_is_far_is_empty_and_so_is_a_new_map(client):
+    for bounds in (None, ((6.4e6, -6.4e6, 0), (6.5e6, -6.3e6, 9))):
+        assert len(client.mesh(bounds).faces) == 0
+    result = client.query_sdf([[0, 0, 0], [1e9, 0, 0], [-1e9, 1e9, 1e9]], gradient=True)
     assert (result.status == triquad_client.Status.UNKNOWN).all()
     assert np.isnan(result.sdf).all()
+    assert np.isnan(result.gradient).all()
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))

@@ -16,6 +16,7 @@ from support import servers
 from support.files.checkpoint_folder import write_record
 from support.maps import small_world
 from support.maps.exact_maps import exact_map, table
+from support.poses import shifted
 from triquad_client import ChangeKind, Client, Mesh, OfflineMap, Status, open_map
 from triquad_client.calls.queries import MapQueries
 from triquad_format.mapfile.writer import write_map
@@ -34,9 +35,7 @@ EVERYWHERE = (-np.full(3, np.inf), np.full(3, np.inf))
 
 
 def pose(at: Doubles, x: float = 0.0) -> Doubles:
-    result = np.eye(4)
-    result[:3, 3] = at + [x, 0, 0]
-    return result
+    return shifted(*(at + [x, 0, 0]))
 
 
 def box(at: Doubles, low: float = -5.0, high: float = 5.0) -> tuple[list[float], list[float]]:

@@ -14,12 +14,6 @@ from triquad_format.wire.messages import MapChunk, MapChunkRequest, ResetRequest
 from triquad_server.store.store import Store
 
 
-def assert_same_map(before, after):
-    assert after.epoch >= before.epoch
-    assert np.array_equal(after.status, before.status)
-    assert np.allclose(after.sdf, before.sdf, rtol=0, atol=2e-3)  # features in half precision
-
-
 def test_a_downloaded_map_is_the_map(client, tmp_path):
     servers.learn(client)
     client.settle(servers.WAIT_S)
@@ -103,7 +97,7 @@ def test_a_checkpoint_writes_what_changed_and_the_next_server_has_all(tmp_path):
         before = client.query_sdf(probes)
     with servers.service_and_client(store=tmp_path) as client:
         assert client.status().last_checkpoint.epoch == part.epoch == before.epoch
-        assert_same_map(before, client.query_sdf(probes))
+        servers.assert_same_map(before, client.query_sdf(probes))
 
 
 def test_a_reset_while_the_last_checkpoint_is_written_is_not_acknowledged(tmp_path, monkeypatch):

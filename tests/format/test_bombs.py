@@ -13,7 +13,7 @@ from support.files.mapfile_edit import (
     Edit,
     edited,
     file_bytes,
-    in_level,
+    first_level,
     read_bytes,
     rewritten,
     set_array,
@@ -28,10 +28,6 @@ from triquad_format.records.region import MapRecord
 
 RECORD = with_rays(with_support(random_record(12)))
 DATA = file_bytes(RECORD)
-
-
-def first_level(edit: Edit) -> Edit:
-    return in_level(0, edit)
 
 
 def many_entries(manifest: Manifest) -> Manifest:

@@ -8,6 +8,7 @@ import msgpack
 import pytest
 import zstandard
 from support.files.checkpoint_folder import write_record
+from support.files.file_damage import flipped
 from support.maps.map_records import random_record
 from triquad_format.errors import DamagedMapFileError, MapFileError, UnsupportedMapFileError
 from triquad_format.mapfile.checkpoint_folder import (
@@ -112,40 +113,26 @@ def test_by_time_damaged_and_unstamped_files_are_passed_over(folder: Path) -> No
 def test_map_folder(folder: Path) -> None:
     assert map_folder(folder) == folder
     assert map_folder(folder.parent) == folder
+    for empty in (folder / "deeper", folder.parent / "second"):
+        empty.mkdir()
     with pytest.raises(MapFileError, match="maps in it: none"):
-        map_folder(make(folder / "deeper"))
-
-
-def test_a_store_of_several_maps(folder: Path) -> None:
-    second = make(folder.parent / "second")
+        map_folder(folder / "deeper")
     assert map_folder(folder.parent) == folder
-    write_checkpoint(second, 1)
+    write_checkpoint(folder.parent / "second", 1)
     with pytest.raises(MapFileError, match="maps in it: default, second"):
         map_folder(folder.parent)
-
-
-def make(folder: Path) -> Path:
-    folder.mkdir()
-    return folder
 
 
 # What a checkpoint's file may hold
 
 
-@pytest.mark.parametrize("cut", [0, 10, 30, 60, 500, -1])
-def test_a_checkpoint_that_is_cut_is_refused(folder: Path, cut: int) -> None:
-    path = folder / checkpoint_name(8)
-    path.write_bytes(path.read_bytes()[:cut])
-    with pytest.raises(MapFileError, match=path.name):
-        open_manifest(CheckpointFile(8, path))
-
-
-def test_every_byte_of_a_checkpoint_is_checked(folder: Path) -> None:
+def test_a_checkpoint_that_is_cut_or_damaged_is_refused(folder: Path) -> None:
     path = folder / checkpoint_name(8)
     data = path.read_bytes()
-    for at in range(0, len(data), 7):
-        path.write_bytes(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :])
-        with pytest.raises(MapFileError):
+    cut = [data[:end] for end in (0, 10, 30, 60, 500, -1)]
+    for harmed in (*cut, *(flipped(data, at) for at in range(0, len(data), 7))):
+        path.write_bytes(harmed)
+        with pytest.raises(MapFileError, match=path.name):
             open_manifest(CheckpointFile(8, path))
 
 

@@ -6,7 +6,15 @@ import msgpack
 import numpy as np
 from support.files.checkpoint_folder import write_record
 from support.files.mapfile_edit import file_bytes, parts_of, read_bytes, stored
-from support.maps.map_records import SMALL, assert_same, evidence_of, random_record, with_support
+from support.maps.map_records import (
+    SMALL,
+    assert_same,
+    evidence_of,
+    random_record,
+    with_evidence,
+    with_region,
+    with_support,
+)
 from triquad_format.mapfile.parts.part import EVIDENCE
 from triquad_format.mapfile.reader import read_map
 from triquad_format.records.region import seen_voxels
@@ -19,6 +27,9 @@ CUBES = dataclasses.replace(SMALL, depth=9)
 RECORD = with_support(random_record(21, settings=CUBES, indices=((0, 0, 0), (1, 0, 0)), points=500))
 
 
+RANDOM = random_record(3, training=False)
+
+
 def told_of(evidence):
     """Level, outcome and time of each surface voxel; blocks without surface have no time."""
     counts = np.unpackbits(evidence.surface, axis=1).sum(axis=1, dtype=np.int64)
@@ -27,12 +38,6 @@ def told_of(evidence):
     times = np.repeat(evidence.seen_s, counts)
     rows = np.column_stack([voxels, evidence.levels, evidence.outcomes, times])
     return set(map(tuple, rows.tolist()))
-
-
-def record_of(evidence):
-    record = random_record(3, training=False)
-    region = dataclasses.replace(record.regions[0], evidence=evidence)
-    return dataclasses.replace(record, regions=(region,))
 
 
 def test_literal_bytes():
@@ -44,7 +49,7 @@ def test_literal_bytes():
     evidence = dataclasses.replace(
         evidence_of(np.arange(3), surface, surface), levels=levels, seen_s=seen_s
     )
-    data = file_bytes(record_of(evidence))
+    data = file_bytes(with_region(RANDOM, evidence=evidence))
     (part,) = (part for part in parts_of(data) if part.topic == EVIDENCE)
     body = msgpack.unpackb(part.payload)
     assert body["levels"] == {"dtype": "|u1", "shape": [3, 1], "data": b"\x0c\x06\x08"}
@@ -61,7 +66,7 @@ def test_literal_bytes_of_outcomes():
         evidence_of(np.arange(1), surface, surface), outcomes=outcome_codes(counts)
     )
     assert evidence.outcomes.tolist() == [[0, 0, 0], [0, 7, 5], [1, 0, 0]]
-    data = file_bytes(record_of(evidence))
+    data = file_bytes(with_region(RANDOM, evidence=evidence))
     (part,) = (part for part in parts_of(data) if part.topic == EVIDENCE)
     planes = b"\x00\x04\x00\x02\x00\x00\x00\x02\x02\x02"
     stored = {"dtype": "|u1", "shape": [10, 1], "data": planes}
@@ -81,13 +86,9 @@ def test_a_crop_keeps_the_levels_of_what_it_keeps():
 
 
 def test_a_checkpoint_writes_the_cubes_whose_levels_changed(tmp_path):
-    first, second = RECORD.regions
-    levels = first.evidence.levels.copy()
+    levels = RECORD.regions[0].evidence.levels.copy()
     levels[0] ^= 1
-    changed = dataclasses.replace(
-        first, evidence=dataclasses.replace(first.evidence, levels=levels)
-    )
-    following = dataclasses.replace(RECORD, epoch=8, regions=(changed, second))
+    following = with_evidence(dataclasses.replace(RECORD, epoch=8), levels=levels)
     known = {}
     write_record(tmp_path, RECORD, known=known)
     path = write_record(tmp_path, following, known=known)

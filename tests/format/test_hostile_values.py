@@ -12,7 +12,7 @@ from support.files.mapfile_edit import (
     assert_refused,
     edited,
     file_bytes,
-    in_level,
+    first_level,
     parts_of,
     read_bytes,
     rewritten,
@@ -39,10 +39,6 @@ from triquad_format.mapfile.parts.part import (
 RECORD = with_rays(with_support(random_record(12)))
 DATA = file_bytes(RECORD)
 POINT = np.array([[1.0, 1.0, 1.0]])
-
-
-def first_level(edit: Edit) -> Edit:
-    return in_level(0, edit)
 
 
 def nan_features(body: dict[str, Any]) -> None:

@@ -8,7 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.maps.map_records import SMALL, assert_same, random_record, with_integers
+from support.maps.map_records import (
+    SMALL,
+    assert_same,
+    random_record,
+    with_evidence,
+    with_integers,
+    with_region,
+)
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
@@ -19,10 +26,8 @@ from triquad_format.records.region import MAX_INTEGER, MapProgress, MapRecord
 
 def with_table(record: MapRecord, **changes: Any) -> MapRecord:
     """The record with changes to the first table of its first region."""
-    region = record.regions[0]
-    table = dataclasses.replace(region.tables[0], **changes)
-    region = dataclasses.replace(region, tables=(table, *region.tables[1:]))
-    return dataclasses.replace(record, regions=(region, *record.regions[1:]))
+    first, *others = record.regions[0].tables
+    return with_region(record, tables=(dataclasses.replace(first, **changes), *others))
 
 
 INVALID: dict[str, Callable[[MapRecord], MapRecord]] = {
@@ -59,13 +64,6 @@ INVALID_EVIDENCE = {
         "outcomes: a code exceeds",
     ),
 }
-
-
-def with_evidence(record: MapRecord, **changes: Any) -> MapRecord:
-    """The record with changes to the evidence of its only region."""
-    region = record.regions[0]
-    region = dataclasses.replace(region, evidence=dataclasses.replace(region.evidence, **changes))
-    return dataclasses.replace(record, regions=(region,))
 
 
 @pytest.mark.parametrize("case", INVALID_EVIDENCE)

@@ -2,18 +2,25 @@
 
 import dataclasses
 import io
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
+from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from support.files.mapfile_edit import file_bytes
-from support.maps.map_records import SMALL, evidence_of, random_record, surface_evidence
-from support.maps.other_field import OtherField
+from support.maps.map_records import (
+    SMALL,
+    evidence_of,
+    random_record,
+    surface_evidence,
+    with_region,
+)
 from support.maps.small_world import settings, settled_mapper, world
 from trimesh import Trimesh
 from trimesh.sample import sample_surface
@@ -22,6 +29,8 @@ from triquad_format.mapfile.writer import write_map
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import BLOCK_BYTES, Evidence, MapRecord
+from triquad_map.composition.recorded_view import RecordedView
+from triquad_map.field.frozen_field import in_grid
 from triquad_map.height_scale import HeightScale
 from triquad_map.preview import CELL_LEAVES, FACES_MIN, coarse_mesh, previews_of
 
@@ -32,6 +41,17 @@ GROUND_M = 1.3
 def ground(points: Doubles) -> Doubles:
     """Signed distance to a level ground."""
     return points[:, 2] - GROUND_M
+
+
+class OtherField(RecordedView):
+    """Meshes of it show the surface of ``sdf`` where rays of the record ended."""
+
+    def __init__(self, record: MapRecord, sdf: Callable[[Doubles], Doubles]) -> None:
+        super().__init__(record)
+        self._sdf = sdf
+
+    def distances_in_grid(self, axes: Doubles, points: Longs) -> NDArray[np.float32]:
+        return self._sdf(in_grid(axes, points)).astype(np.float32)
 
 
 def seen_ground(record: MapRecord) -> MapRecord:
@@ -113,8 +133,7 @@ def test_colours_tell_the_height() -> None:
     record = random_record(65, settings=SETTINGS, points=50)
     x, y = np.random.default_rng(0).uniform(-20, 20, (2, 100_000))
     seen = surface_evidence(np.stack([x, y, GROUND_M + 0.1 * x], axis=1), SETTINGS)
-    region = dataclasses.replace(record.regions[0], evidence=seen)
-    record = dataclasses.replace(record, regions=(region,))
+    record = with_region(record, evidence=seen)
     ((_, scene),) = scenes(file_bytes(record, preview=True, view=OtherField(record, slope)))
     vertices, _ = mesh_of(scene)
     shown = scene.entities[0].triangles[0].colors
@@ -141,8 +160,7 @@ def test_the_field_of_the_map_is_shown_where_no_other_is_given() -> None:
     record = random_record(42, points=400, training=False)
     full = np.full((8**3, BLOCK_BYTES), 255, np.uint8)
     seen = evidence_of(np.arange(8**3), full, full)
-    everywhere = dataclasses.replace(record.regions[0], evidence=seen)
-    record = dataclasses.replace(record, regions=(everywhere,))
+    record = with_region(record, evidence=seen)
     ((_, scene),) = scenes(file_bytes(record, preview=True))
     vertices, faces = mesh_of(scene)
     assert len(faces)
@@ -159,9 +177,8 @@ def test_nothing_seen_is_an_empty_mesh() -> None:
 def mesh_of_seen(seen, sdf):
     """The coarse mesh of a field where points [N, 3] of its surface have been seen."""
     record = random_record(1, settings=SETTINGS, points=10)
-    region = dataclasses.replace(record.regions[0], evidence=surface_evidence(seen, SETTINGS))
-    view = OtherField(dataclasses.replace(record, regions=(region,)), sdf)
-    return coarse_mesh(region, SETTINGS, view)
+    record = with_region(record, evidence=surface_evidence(seen, SETTINGS))
+    return coarse_mesh(record.regions[0], SETTINGS, OtherField(record, sdf))
 
 
 def surface(mesh):

@@ -8,6 +8,7 @@ from typing import cast
 
 import zenoh
 from support import servers
+from support.clock import Clock
 from support.maps.small_world import settings
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.intake.scan_queue import ScanQueue
@@ -22,15 +23,6 @@ from triquad_server.settings import ServiceSettings, Settings
 from triquad_server.store.checkpoint_writer import CheckpointWriter
 
 COMPUTED_S = 0.5
-
-
-class Clock:
-    """Seconds that pass when the test says so."""
-
-    now_s = 0.0
-
-    def __call__(self) -> float:
-        return self.now_s
 
 
 @contextmanager
@@ -107,18 +99,3 @@ def test_a_thread_that_computes_for_long_is_healthy_until_that_is_absurd() -> No
         assert health.mapping_problem(stuck_s=STUCK_S / 2 - COMPUTED_S / 2) is not None
         clock.now_s += ENDLESS_S
         assert health.mapping_problem(stuck_s=2 * ENDLESS_S) is not None
-
-
-def test_a_thread_that_comes_to_no_end_is_a_problem_until_it_does() -> None:
-    clock = Clock()
-    with running(Mapper("test", settings(), "cpu"), clock) as (thread, health):
-        with at_work(thread):
-            clock.now_s += STUCK_S - 1
-            assert health.mapping_problem() is None
-            clock.now_s += 2
-            problem = health.mapping_problem()
-            told = f"mapping makes no progress: it is at commands since {STUCK_S + 1:.0f} s"
-            assert problem == told
-            assert health.problem() == problem
-        thread.call(lambda mapper: mapper.settled)
-        assert health.problem() is None

@@ -13,15 +13,16 @@ import numpy as np
 import triquad_client
 import zenoh
 from numpy.typing import NDArray
-from triquad_format.records.field_settings import FieldSettings
 from triquad_format.wire import codec, keys
 from triquad_format.wire.codec import Message
+from triquad_format.wire.mesh_messages import TileChangesRequest
 from triquad_format.wire.messages import ErrorReply, FlushReply, FlushRequest, Scan
 from triquad_format.wire.zenoh_config import QUIET, put
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.network import NetworkOptions, configuration, open_session
 from triquad_server.service import ServedMap, Service
-from triquad_server.settings import Settings, TrainingSettings
+from triquad_server.settings import Settings
+from triquad_server.settings.loading import load_settings
 from triquad_server.store.restore import ValidCheckpoint
 from triquad_server.store.store import Store
 from triquad_server.warm_up import warm_up
@@ -31,13 +32,8 @@ from bench.clients.server_process import server_process as process_of
 
 MAP = "default"
 WAIT_S = 120.0  # for what takes milliseconds unless something is broken
-SMALL = Settings(
-    field=FieldSettings(depth=7),
-    training=TrainingSettings(batch=2048, samples_per_ray=10.0, pool_bytes=480_000),
-)
-SMALL_TOML = (
-    "[field]\ndepth = 7\n[training]\nbatch = 2048\nsamples_per_ray = 10.0\npool_bytes = 480000\n"
-)
+SMALL_FILE = Path(__file__).with_name("small.toml")
+SMALL = load_settings(SMALL_FILE)
 RADIUS_M = 4.0
 
 
@@ -53,6 +49,12 @@ def learn(client: triquad_client.Client, scans: int = 2) -> triquad_client.Flush
     for _ in range(scans):
         client.publish_scan(sphere(), np.eye(4))
     return client.flush(WAIT_S)
+
+
+def assert_same_map(before: triquad_client.SdfResult, after: triquad_client.SdfResult) -> None:
+    assert after.epoch >= before.epoch
+    assert np.array_equal(after.status, before.status)
+    assert np.allclose(after.sdf, before.sdf, rtol=0, atol=2e-3)  # features in half precision
 
 
 def until(
@@ -206,6 +208,13 @@ class RawPeer:
 def scan(sequence: int = 0, **changes: object) -> Scan:
     """A good scan, but for ``changes``."""
     good = Scan(sphere(500), np.eye(4), 1_000 + sequence, "lidar", 7, sequence)
+    return replace(good, **changes)  # type: ignore[arg-type]
+
+
+def tile_changes(**changes: object) -> TileChangesRequest:
+    """A good request for all of a map's mesh, but for ``changes``."""
+    everywhere = np.full(3, -np.inf), np.full(3, np.inf)
+    good = TileChangesRequest(*everywhere, level=0, server="", since=0)
     return replace(good, **changes)  # type: ignore[arg-type]
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.files.changing_store import EMPTY, box_at, write_checkpoint
+from support.files.file_damage import rot
 from triquad_format.errors import DamagedMapFileError
 from triquad_tools.viewer.sources import (
     COARSEST,
@@ -74,18 +75,11 @@ def test_checkpoints_come_and_go(tmp_path: Path) -> None:
     assert history.damaged() == []
 
 
-def flip(path: Path) -> None:
-    """Damage a part, which only reading all of the file shows."""
-    data = bytearray(path.read_bytes())
-    data[len(data) // 3] ^= 0x10
-    path.write_bytes(data)
-
-
 def cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-1000])
 
 
-@pytest.mark.parametrize("damage", [flip, cut])
+@pytest.mark.parametrize("damage", [rot, cut])
 def test_damaged_checkpoints_are_named_and_left_out(
     tmp_path: Path, damage: Callable[[Path], None]
 ) -> None:
@@ -100,7 +94,7 @@ def test_damaged_checkpoints_are_named_and_left_out(
 
 def test_a_moment_that_cannot_be_shown_is_none_any_more(tmp_path: Path) -> None:
     write_checkpoint(tmp_path, 1, EMPTY)
-    flip(write_checkpoint(tmp_path, 2, EMPTY))
+    rot(write_checkpoint(tmp_path, 2, EMPTY))
     write_checkpoint(tmp_path, 3, EMPTY)
     history = History(tmp_path)
     assert history.newest().queries.epoch == 3
@@ -110,6 +104,6 @@ def test_a_moment_that_cannot_be_shown_is_none_any_more(tmp_path: Path) -> None:
 
 
 def test_a_store_of_which_nothing_is_left(tmp_path: Path) -> None:
-    flip(write_checkpoint(tmp_path, 1, EMPTY))
+    rot(write_checkpoint(tmp_path, 1, EMPTY))
     with pytest.raises(DamagedMapFileError, match="no checkpoint can be shown"):
         History(tmp_path).newest()

@@ -14,6 +14,7 @@ import pytest
 from matplotlib.colors import to_rgb
 from playwright.sync_api import Locator, Page, expect
 from support import servers
+from support.poses import shifted
 from support.servers import WAIT_S, learn, running_service, sphere
 from triquad_client import Client, Status, connect
 from triquad_format.records.arrays import Bytes
@@ -239,10 +240,8 @@ def test_a_path_is_laid_checked_and_blocked_as_the_map_goes_on(mapped: Looked) -
     expect(page.get_by_role("row", name="free all along")).to_contain_text("with radius 0.1 m")
     assert share_of(page, BEHIND, tolerance=40) < 1e-5
 
-    pose = np.eye(4)
-    pose[:3, 3] = points[1]
-    for _ in range(3):
-        client.publish_scan(sphere(30_000, radius_m=1.7), pose)  # a ball around the second point
+    for _ in range(3):  # a ball around the second point
+        client.publish_scan(sphere(30_000, radius_m=1.7), shifted(*points[1]))
     assert client.flush(WAIT_S).refused == 0
     expect(page.get_by_role("row", name="blocked")).to_be_visible(timeout=TIMEOUT_MS)
 

@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from support.maps.exact_maps import SETTINGS, Height, exact_map, flat
+from support.maps.map_records import with_evidence, with_region
 from support.maps.small_world import settled_epoch, world
 from triquad_client import InvalidInputError, Mesh, OfflineMap
 from triquad_format.records import morton
@@ -22,18 +23,13 @@ EDGE = 10  # voxels along x
 FIELD_MAX_M = 32.0
 
 
-def changed(record: MapRecord, **parts: object) -> MapRecord:
-    region = dataclasses.replace(record.regions[0], **parts)  # type: ignore[arg-type]
-    return dataclasses.replace(record, regions=(region,))
-
-
 def ground(height: Height) -> MapRecord:
     """An exact map whose field has a gradient on the surface, too."""
     record = exact_map(height)
     mlp = record.regions[0].mlp
     above = np.array([1.0, -1.0], np.float32) * FIELD_MAX_M  # where the activation has no kink
     biases = (above, mlp.biases[1], -above[:1])
-    return changed(record, mlp=dataclasses.replace(mlp, biases=biases))
+    return with_region(record, mlp=dataclasses.replace(mlp, biases=biases))
 
 
 def with_hole(record: MapRecord, *, free: bool = False) -> MapRecord:
@@ -52,8 +48,8 @@ def with_hole(record: MapRecord, *, free: bool = False) -> MapRecord:
         np.unpackbits(bits, bitorder="little").astype(bool) for bits in (evidence.surface, surface)
     )
     kept = after[before]
-    without = dataclasses.replace(
-        evidence,
+    return with_evidence(
+        record,
         surface=surface,
         free=open_air,
         levels=evidence.levels[kept],
@@ -61,7 +57,6 @@ def with_hole(record: MapRecord, *, free: bool = False) -> MapRecord:
         outcomes=evidence.outcomes[kept],
         margins=evidence.margins[kept],
     )
-    return changed(record, evidence=without)
 
 
 def mesh_of(record: MapRecord, **options: object) -> Mesh:
@@ -151,7 +146,7 @@ def with_edge(quarters: int) -> MapRecord:
     outermost = seen_voxels(evidence, evidence.surface)[:, 0] == HALF + EDGE - 1
     margins = np.zeros((len(outermost), 6), np.uint8)
     margins[outermost, 3] = quarters
-    return changed(GROUND, evidence=dataclasses.replace(evidence, margins=margins))
+    return with_region(GROUND, evidence=dataclasses.replace(evidence, margins=margins))
 
 
 @pytest.mark.parametrize("quarters", [0, 1, 2, 3])

@@ -1,13 +1,12 @@
 """Meshes of map files, without a server."""
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 from support.maps.exact_maps import SEEN_M, exact_map, flat, table
-from support.maps.map_records import with_support
+from support.maps.map_records import with_region, with_support
 from triquad_client import InvalidInputError, Mesh, OfflineMap, open_map
 from triquad_client.offline import map_mesh
 from triquad_format.mapfile.writer import write_map
@@ -69,8 +68,7 @@ def test_surface_is_where_the_mesh_has_faces() -> None:
 
 def test_far_regions_are_meshed_as_near_ones() -> None:
     def faces_at(index: int) -> int:
-        region = dataclasses.replace(RECORD.regions[0], index=(index, 0, 0))
-        return len(mesh_of(dataclasses.replace(RECORD, regions=(region,)), cell_m=0.2).faces)
+        return len(mesh_of(with_region(RECORD, index=(index, 0, 0)), cell_m=0.2).faces)
 
     assert faces_at(2**31 - 1) == faces_at(0) > 10_000
 

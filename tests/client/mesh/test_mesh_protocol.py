@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import triquad_client
 from support import servers
-from support.requests import tile_changes
 from support.watched_ball import SETTINGS, learn
 from triquad_client import Client
 from triquad_format.wire import codec, keys
@@ -46,7 +45,7 @@ def test_the_protocol_by_hand(client: Client, endpoint: str) -> None:
     with servers.raw_session(connect=endpoint) as session:
         peer = servers.RawPeer(session)
         known: dict[tuple[int, int, int], bytes] = {}
-        while not (told := by_hand(peer, tile_changes())).is_newest:
+        while not (told := by_hand(peer, servers.tile_changes())).is_newest:
             time.sleep(0.1)
         for (x, y, z), changed in zip(told.tiles.tolist(), told.changed.tolist(), strict=True):
             request = MeshRequest(np.array([[x, y, z]], np.int32), 0)
@@ -62,8 +61,8 @@ def test_the_protocol_by_hand(client: Client, endpoint: str) -> None:
             for index, tile in watch.tiles.items():
                 np.testing.assert_array_equal(surfaces[index].positions(0.1), tile.vertices)
                 np.testing.assert_array_equal(surfaces[index].faces, tile.faces)
-        later = by_hand(peer, tile_changes(server=told.server, since=told.revision))
+        later = by_hand(peer, servers.tile_changes(server=told.server, since=told.revision))
         assert (later.is_newest, len(later.tiles)) == (True, 0)
-        strange = by_hand(peer, tile_changes(server="another", since=10**6))
+        strange = by_hand(peer, servers.tile_changes(server="another", since=10**6))
         assert strange.server == told.server
         assert {tuple(tile) for tile in strange.tiles.tolist()} == watch.tiles.keys()

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial import cKDTree
 from support import servers
+from support.poses import shifted
 from triquad_server.settings import Settings, TrainingSettings
 from triquad_tools.mapfiles.meshfile import read_mesh
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
@@ -25,8 +26,7 @@ SETTINGS = Settings(training=TrainingSettings(batch=4096, samples_per_ray=8.0))
 SCENE = street(1)  # of triquad-demo, which the guides begin with
 DRIVE = SimulatedDrive(SCENE, Lidar(columns=360), drive(SCENE, 20, 1.5), seed=1)
 RADIUS_M = 0.4  # of what the planners move
-TRUE_POSE = np.eye(4)
-TRUE_POSE[:3, 3] = 12.0, -1.6, 1.8
+TRUE_POSE = shifted(12.0, -1.6, 1.8)
 
 Run = Callable[..., str]
 

@@ -38,8 +38,10 @@ def threads() -> set[threading.Thread]:
     return {thread for thread in threading.enumerate() if not thread.name.startswith("Dummy")}
 
 
-def test_a_map_is_learnt_asked_and_found_again(tmp_path, settings):
-    with triquad_server.serve(store=tmp_path / "store", settings=settings, map="lab") as server:
+def test_a_map_is_learnt_asked_and_found_again(tmp_path):
+    with triquad_server.serve(
+        store=tmp_path / "store", settings=servers.SMALL_FILE, map="lab"
+    ) as server:
         with server.client() as client:
             assert client.map_name == "lab"
             servers.learn(client)
@@ -48,7 +50,9 @@ def test_a_map_is_learnt_asked_and_found_again(tmp_path, settings):
             assert other.status().map_name == "lab"
     with triquad_server.serve(store=str(tmp_path / "store"), settings=servers.SMALL) as server:
         assert server.client().status().regions == 0  # another map
-    with triquad_server.serve(store=tmp_path / "store", settings=settings, map="lab") as server:
+    with triquad_server.serve(
+        store=tmp_path / "store", settings=servers.SMALL_FILE, map="lab"
+    ) as server:
         after = server.client().query_distance(servers.sphere(50, 3.0))
     assert np.array_equal(after.found, before.found)
     assert np.median(np.abs(after.distance_m - 1.0)) < 0.2
@@ -223,9 +227,9 @@ def read_until(process: "subprocess.Popen[str]", text: str) -> None:
     raise AssertionError(f"the program ended without {text!r}")
 
 
-def test_ctrl_c_loses_nothing_that_was_acknowledged(tmp_path, settings):
+def test_ctrl_c_loses_nothing_that_was_acknowledged(tmp_path):
     store = tmp_path / "store"
-    with program(_LEARN_WITHOUT_END, store, settings) as process:
+    with program(_LEARN_WITHOUT_END, store, servers.SMALL_FILE) as process:
         read_until(process, "acknowledged 4")
         process.send_signal(signal.SIGINT)
         read_until(process, "stopping")
@@ -239,9 +243,9 @@ def test_ctrl_c_loses_nothing_that_was_acknowledged(tmp_path, settings):
         assert statuses(store, 10.0 * scans) == {Status.SURFACE}
 
 
-def test_a_program_that_ends_without_closing_ends_well(tmp_path, settings):
+def test_a_program_that_ends_without_closing_ends_well(tmp_path):
     store = tmp_path / "store"
-    with program(_FORGET, store, settings) as process:
+    with program(_FORGET, store, servers.SMALL_FILE) as process:
         out, errors = process.communicate(timeout=servers.WAIT_S)
     assert process.returncode == 0, errors
     assert errors == ""

@@ -75,9 +75,9 @@ def test_the_same_as_text() -> None:
     assert FOREIGN in lines
 
 
-def test_a_server_logs_in_json_from_its_start_to_its_end(settings, monkeypatch) -> None:
+def test_a_server_logs_in_json_from_its_start_to_its_end(monkeypatch) -> None:
     monkeypatch.setenv("TRIQUAD_LOG_FORMAT", "json")
-    arguments = ["--settings", settings, "--log-level", "debug", "--map", "lab"]
+    arguments = ["--settings", servers.SMALL_FILE, "--log-level", "debug", "--map", "lab"]
     with servers.server_process(arguments) as server:
         with triquad_client.connect(server.endpoint, "lab") as client:
             assert client.maps() == ["lab"]

@@ -33,16 +33,10 @@ def learn(endpoint):
         return client.query_sdf(PROBES, gradient=True)
 
 
-def assert_same_map(before, after):
-    assert after.epoch >= before.epoch
-    assert np.array_equal(after.status, before.status)
-    assert np.allclose(after.sdf, before.sdf, rtol=0, atol=2e-3)  # features in half precision
-
-
 def assert_kept(store, before):
     """A server that goes on from a store answers as one did before."""
     with servers.service_and_client(store=store) as client:
-        assert_same_map(before, client.query_sdf(PROBES, gradient=True))
+        servers.assert_same_map(before, client.query_sdf(PROBES, gradient=True))
 
 
 def test_sigterm_keeps_the_map_and_the_next_server_gives_the_same_answers(store, arguments):
@@ -60,7 +54,7 @@ def test_sigterm_keeps_the_map_and_the_next_server_gives_the_same_answers(store,
     with servers.server_process(arguments) as server:
         assert f"restoring epoch {before.epoch} from {newest}" in server.log
         with triquad_client.connect(server.endpoint) as client:
-            assert_same_map(before, client.query_sdf(PROBES, gradient=True))
+            servers.assert_same_map(before, client.query_sdf(PROBES, gradient=True))
             epoch = client.status().epoch
         server.process.send_signal(signal.SIGINT)
         server.process.send_signal(signal.SIGTERM)
@@ -126,12 +120,15 @@ def test_where_memory_runs_out_it_ends_and_the_last_checkpoint_counts(store, arg
 def test_each_cause_for_which_it_cannot_start_has_its_exit_code(store, arguments, code, text):
     folder = store / servers.MAP
     folder.mkdir(parents=True)
-    (folder / "epoch-000000007.triquad").write_bytes(b"not a map")
+    damaged = folder / "epoch-000000007.triquad"
+    damaged.write_bytes(b"not a map")
     arguments = [word.replace("STORE", str(store)) for word in arguments]
     with servers.server_process(arguments, ready=False) as server:
         assert server.wait() == code
     assert text in server.log
     assert "ready" not in server.log
+    assert damaged.exists()
+
     assert "Traceback" not in server.log
 
 

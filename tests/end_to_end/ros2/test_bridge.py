@@ -6,8 +6,9 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from support import servers
+from support.poses import shifted
 from support.ros.ros_bridge import AT, MAST, Bridged, bridging, stand
-from support.ros.ros_robot import T0, robot, shifted, stamp
+from support.ros.ros_robot import T0, robot, stamp
 from support.ros_messages import CLOUD, PATH, POSE_WITH_COVARIANCE, TRANSFORM
 from triquad_client import Client, Status
 from triquad_server.settings import SourceSettings

@@ -20,8 +20,7 @@ from triquad_format.wire.messages import StatusRequest
 @contextmanager
 def one_command(folder: Path, listen: str, *arguments: str) -> Iterator[servers.ServerProcess]:
     """``triquad-ros2 --serve``, once it listens to nodes."""
-    (folder / "server.toml").write_text(servers.SMALL_TOML)
-    files = ["--settings", folder / "server.toml", "--store", folder / "maps"]
+    files = ["--settings", servers.SMALL_FILE, "--store", folder / "maps"]
     program = ["-m", "triquad_tools.commands.ros2", *arguments, "--serve"]
     serving = servers.server_process(["--map", "yard", *files], listen, False, program=program)
     with serving as both:

@@ -1,10 +1,10 @@
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.clock import Clock
 from support.servers import WAIT_S
 from triquad_format.errors import RefusedError
 from triquad_format.records.field_settings import FieldSettings
@@ -12,14 +12,6 @@ from triquad_map.compiled.team import in_one
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.settings import ServiceSettings
-
-
-@dataclass
-class Clock:
-    now: float = 0.0
-
-    def __call__(self):
-        return self.now
 
 
 def epoch(number):
@@ -70,7 +62,7 @@ def test_who_asks_for_an_epoch_by_number_has_the_others_let_go(by_view):
     epochs = history(kept=4, pinned=1, clock=clock)
     for number in range(2, 5):
         epochs.add(epoch(number))
-    clock.now += 10 * ServiceSettings().publish_period_s + 1
+    clock.now_s += 10 * ServiceSettings().publish_period_s + 1
     if by_view:
         with epochs.view(2):
             pass
@@ -135,7 +127,7 @@ def test_once_no_epoch_follows_only_the_newest_and_those_asked_for_stay():
     epochs.remove_expired()
     assert [kept.number for kept in epochs.kept().epochs] == [2, 3, 4, 5]
     epochs.get(3)
-    clock.now += 10 * ServiceSettings().publish_period_s + 1
+    clock.now_s += 10 * ServiceSettings().publish_period_s + 1
     epochs.remove_expired()
     assert [kept.number for kept in epochs.kept().epochs] == [3, 5]
 
@@ -152,28 +144,28 @@ def test_whatever_is_asked_when_an_epoch_goes_only_where_it_may(kept, pinned, de
     pin_s = 10.0
     clock = Clock()
     epochs = history(kept, pinned, pin_s, clock)
-    newest, published = 1, clock.now
+    newest, published = 1, clock.now_s
     alone = 1  # the newest when it last was for long
     asked: dict[int, float] = {}  # in the order of asking
     for deed in deeds:
         if deed == "publish":
             newest += 1
-            published = clock.now
+            published = clock.now_s
             epochs.add(epoch(newest))
         elif deed[0] == "wait":
-            clock.now += deed[1]
-            if clock.now - published > 10 * ServiceSettings().publish_period_s:
+            clock.now_s += deed[1]
+            if clock.now_s - published > 10 * ServiceSettings().publish_period_s:
                 alone = newest
         else:
             number = max(1, newest - deed[1])
             if is_gone(epochs, number):
                 assert number <= newest - kept or number < alone
-                expired = clock.now - asked.get(number, -1e9) > pin_s
-                alive = [other for other, at in asked.items() if clock.now - at <= pin_s]
+                expired = clock.now_s - asked.get(number, -1e9) > pin_s
+                alive = [other for other, at in asked.items() if clock.now_s - at <= pin_s]
                 assert expired or len(alive) > pinned
             else:
                 asked.pop(number, None)
-                asked[number] = clock.now
+                asked[number] = clock.now_s
         assert epochs.get(0) is epochs.newest
         assert epochs.newest.number == newest
 

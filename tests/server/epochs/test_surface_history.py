@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support.poses import shifted
 from support.servers import sphere
 from triquad_format.errors import RefusedError
 from triquad_format.records.seen_space import surface_voxels
@@ -26,9 +27,7 @@ def voxels_of(epoch):
 
 
 def see(mapper, x=0.0, radius_m=2.0, count=60):
-    pose = np.eye(4)
-    pose[:3, 3] = x, 0.3, -0.7
-    mapper.ingest(sphere(count, radius_m), pose)
+    mapper.ingest(sphere(count, radius_m), shifted(x, 0.3, -0.7))
 
 
 def told(history, since, until):

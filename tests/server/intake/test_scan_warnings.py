@@ -3,6 +3,7 @@ import logging
 import numpy as np
 import pytest
 from support import servers
+from support.clock import Clock
 from triquad_format.records.field_settings import FieldSettings
 from triquad_server.intake.rays import usable_rays
 from triquad_server.intake.scan_queue import ScanQueue
@@ -11,16 +12,6 @@ from triquad_server.settings import ScanSettings, Settings, SourceSettings
 from triquad_server.settings.loading import load_settings
 
 SETTINGS = Settings()
-
-
-class Clock:
-    """Seconds, as the test says."""
-
-    def __init__(self) -> None:
-        self.now_s = 1000.0
-
-    def __call__(self) -> float:
-        return self.now_s
 
 
 def cloud(*parts: tuple[int, float]) -> np.ndarray:

@@ -3,6 +3,7 @@ import tracemalloc
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
+from support.poses import shifted
 from triquad_format.wire.messages import Scan
 from triquad_format.wire.source_messages import SourcesRequest
 from triquad_server.intake.rays import ScanRays
@@ -12,8 +13,7 @@ LEAF_M = 0.2
 
 
 def add(trails, position, source="lidar"):
-    pose = np.eye(4)
-    pose[:3, 3] = position
+    pose = shifted(*position)
     scan = Scan(np.zeros((0, 3), np.float32), pose, 1, source, 7, 0)
     trails.add(scan, ScanRays(pose[:3, 3], pose[None, :3, 3] + (3.0, 0, 0), {}))
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from support.files.mapfile_edit import file_bytes, read_bytes
 from support.maps.small_world import WALLED, WALLED_BOUNDS, settings, settle
+from support.poses import shifted
 from triquad_client import Mesh
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.region import Region
@@ -39,8 +40,7 @@ class Watched:
         """Take in some scans of the place with what is ``there`` besides, and publish."""
         scene = Scene((*WALLED, *there), WALLED_BOUNDS)
         for _ in range(count):
-            pose = np.eye(4)
-            pose[:3, 3] = (0.5 * np.sin(0.7 * self.scans), 0.3 * np.cos(self.scans), 1.4)
+            pose = shifted(0.5 * np.sin(0.7 * self.scans), 0.3 * np.cos(self.scans), 1.4)
             made = Lidar(columns=1024).scan(scene, pose, np.random.default_rng(self.scans))
             self.mapper.ingest(made.points, pose, stamp_s=self.scans)
             self.scans += 1
@@ -145,8 +145,7 @@ def test_a_settled_map_that_is_seen_again_in_part_unlearns_what_was_removed() ->
     faced = watched.mapper.publish()
     scene = Scene(WALLED, WALLED_BOUNDS)
     for number in range(20):
-        pose = np.eye(4)
-        pose[:3, 3] = (0.0, 0.05 * number, 1.4)
+        pose = shifted(0.0, 0.05 * number, 1.4)
         made = Lidar(columns=1024).scan(scene, pose, np.random.default_rng(number))
         ahead = np.abs(np.arctan2(made.points[:, 1], made.points[:, 0])) < 0.25
         watched.mapper.ingest(made.points[ahead], pose, stamp_s=100 + number)

@@ -5,6 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 from support.maps.small_world import WALLED, WALLED_BOUNDS, settings, settle
+from support.poses import shifted
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.region import MapRecord
 from triquad_format.records.status import Status
@@ -32,9 +33,7 @@ CHOSEN = settings(samples_per_ray=6.0)
 
 
 def pose_of(number: int) -> Doubles:
-    pose = np.eye(4)
-    pose[:3, 3] = (0.1 * number - 1.0, 0.1, 1.4)
-    return pose
+    return shifted(0.1 * number - 1.0, 0.1, 1.4)
 
 
 @cache

@@ -1,6 +1,7 @@
 """Rays that met nothing, and the box of the robot, over the regions of a map."""
 
 import numpy as np
+from support.poses import shifted
 from triquad_format.records.status import Status
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
@@ -14,9 +15,7 @@ def test_rays_without_a_return_make_no_region_but_are_recorded_where_there_is_on
     nothing = np.empty((0, 3), np.float32)
     mapper.ingest(nothing, np.eye(4), no_return=along)
     assert mapper.publish().regions == 1
-    there = np.eye(4)
-    there[0, 3] = pitch
-    mapper.ingest(np.array([[0, 3, 0]], np.float32), there)  # now there is a region
+    mapper.ingest(np.array([[0, 3, 0]], np.float32), shifted(pitch))  # now there is a region
     mapper.ingest(nothing, np.eye(4), no_return=along)
     epoch = mapper.publish()
     assert epoch.regions == 2
@@ -53,10 +52,8 @@ def test_the_robot_is_free_in_all_regions_of_the_map_that_it_reaches_into() -> N
     )
     nothing, up = np.empty((0, 3), np.float32), np.array([[0, 0, 1]], np.float32)
     mapper = Mapper("test", chosen, "cpu")
-    behind, here = np.eye(4), np.eye(4)
-    behind[0, 3] = -9.6
-    mapper.ingest(nothing, behind, no_return=up)
-    mapper.ingest(nothing, here, source="truck", no_return=up)
+    mapper.ingest(nothing, shifted(-9.6), no_return=up)
+    mapper.ingest(nothing, np.eye(4), source="truck", no_return=up)
     epoch = mapper.publish()
     along = np.array([[0.5, 0.5, 0], [-8.0, 0.5, 0], [-13.0, 0.5, 0], [1.5, 0.5, 0]])
     expected = [Status.FREE, Status.FREE, Status.FREE, Status.UNKNOWN]

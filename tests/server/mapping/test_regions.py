@@ -11,6 +11,7 @@ from support.maps.small_world import (
     take_in,
     world,
 )
+from support.poses import shifted
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.status import Status
 from triquad_server.errors import ScanRefusedError
@@ -27,8 +28,8 @@ def test_regions_meet_without_hole_or_step() -> None:
     )
     border = chosen.field.region_pitch_m / 2
     drive_through = world(5)
-    moved = np.eye(4)
-    moved[0, 3] = border - np.mean([scan.world_from_sensor[0, 3] for scan in drive_through.scans])
+    middle = np.mean([scan.world_from_sensor[0, 3] for scan in drive_through.scans])
+    moved = shifted(border - middle)
     mapper = Mapper("test", chosen, "cpu")
     for scan in drive_through.scans:
         mapper.ingest(scan.points, moved @ scan.world_from_sensor)
@@ -58,11 +59,9 @@ def test_a_street_across_a_corner_of_regions_is_nearly_as_right_as_in_the_middle
 
 def surface_error_at(place: np.ndarray, chosen: Settings, drive_through: World) -> float:
     """The error of a settled map of a drive that begins at ``place`` [3]."""
-    shift = np.eye(4)
-    shift[:3, 3] = place
     mapper = Mapper("test", chosen, "cpu")
     for scan in drive_through.scans:
-        mapper.ingest(scan.points, shift @ scan.world_from_sensor)
+        mapper.ingest(scan.points, shifted(*place) @ scan.world_from_sensor)
     settle(mapper)
     return surface_error(mapper.publish(), drive_through, offset=place)
 
@@ -73,8 +72,7 @@ def test_a_region_that_was_just_entered_is_trained_like_one_that_is_owed_much() 
     mapper = mapper_of(*drive_through.scans, chosen=chosen)
     for _ in range(40):
         mapper.train()
-    far = np.eye(4)
-    far[0, 3] = 2 * chosen.field.region_pitch_m
+    far = shifted(2 * chosen.field.region_pitch_m)
     first = drive_through.scans[0]
     mapper.ingest(first.points, far @ first.world_from_sensor)
     for _ in range(40):
@@ -90,9 +88,7 @@ def test_free_space_is_seen_in_all_regions_that_rays_pass() -> None:
     mapper = Mapper("test", chosen, "cpu")
     across = np.mgrid[-2:2:0.1, -2:2:0.1].reshape(2, -1).T
     wall = np.column_stack([np.full(len(across), 12.0), across]).astype(np.float32)
-    pose = np.eye(4)
-    pose[0, 3] = half - 8.0
-    mapper.ingest(wall, pose)
+    mapper.ingest(wall, shifted(half - 8.0))
     along = np.linspace(half - 7.5, half + 3.5, 200)
     points = np.column_stack([along, np.full(200, 0.05), np.full(200, 0.05)])
     answer = mapper.publish().query(points)

@@ -2,6 +2,7 @@
 
 import numpy as np
 from support.maps.small_world import WALLED, WALLED_BOUNDS, settle
+from support.poses import shifted
 from triquad_format.records.arrays import Doubles
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
@@ -29,8 +30,7 @@ class Resting:
 
     def scan(self, *there: Solid) -> int:
         """Take in a scan; return how many samples were trained on, of 80,000 for which is time."""
-        pose = np.eye(4)
-        pose[:3, 3] = (0.3, 0.2, 1.4)
+        pose = shifted(0.3, 0.2, 1.4)
         scene = Scene((*WALLED, *there), WALLED_BOUNDS)
         made = Lidar(columns=512).scan(scene, pose, np.random.default_rng(self.scans))
         before, self.scans = self.mapper.samples_trained, self.scans + 1

@@ -1,13 +1,12 @@
 """Parts are kept once, and as long as a checkpoint names them."""
 
 import dataclasses
-import errno
 import logging
-import os
 from contextlib import closing
 from pathlib import Path
 
 import pytest
+from support.files.file_damage import rot
 from support.files.growing_store import (
     ROW,
     changes,
@@ -16,7 +15,6 @@ from support.files.growing_store import (
     part_of,
     parts_of,
     paths,
-    rot,
 )
 from support.maps.map_records import assert_same, random_record
 from triquad_format.errors import DamagedMapFileError, MapFileError
@@ -74,14 +72,6 @@ def test_a_restarted_store_goes_on_from_the_newest(store, tmp_path):
         assert_same(read_map(info.path), fourth)
 
 
-def test_regions_that_were_reset_are_gone(store):
-    first = grown(1, 1)
-    store.write(changes(first))
-    second = dataclasses.replace(first, epoch=2, regions=first.regions[:3])
-    store.write(changes(second, only=()))
-    assert_same(read_map(paths(store)[2]), second)
-
-
 def test_a_backup_is_restored_and_gone_on_from(store):
     first = grown(1, 7)
     write_map(first, store.folder / "epoch-000000007.triquad")
@@ -135,19 +125,6 @@ def test_a_checkpoint_that_is_deleted_while_it_is_read_is_not_called_damaged(
     assert "recover" not in str(caught.value)
 
 
-def test_a_damaged_part_is_written_again_for_all_that_need_it(store):
-    records = drive(store, 1)
-    part = part_of(paths(store)[2], ROW[0])
-    rot(part)
-    with pytest.raises(DamagedMapFileError, match=f"parts/{part.name}"):
-        read_map(paths(store)[2])
-    assert store.forget_base(part.name)
-    assert store.base_epoch is None
-    store.write(changes(records[2]))
-    for epoch in (1, 2):
-        assert_same(read_map(paths(store)[epoch]), records[epoch])
-
-
 def test_a_part_that_nothing_new_needs_is_no_reason_to_write(store):
     first = grown(1, 1)
     store.write(changes(first))
@@ -191,25 +168,6 @@ def test_what_was_set_aside_can_still_be_recovered(store):
     assert saved.record.epoch == 3
     kept = [region for region in records[3].regions if region.index != ROW[3]]
     assert_same(saved.record, dataclasses.replace(records[3], regions=tuple(kept)))
-
-
-def test_on_a_full_disk_nothing_is_lost_and_nothing_is_left(store, monkeypatch):
-    records = drive(store, 1)
-    before = sorted(store.folder.rglob("*"))
-
-    def full(path, data):
-        path.touch()
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(StoreError, match="000000003.*No space left on device.*parts"):
-        store.write(changes(grown(3, 3)))
-    monkeypatch.undo()
-    assert sorted(store.folder.rglob("*")) == before
-    assert store.base_epoch == 2
-    for epoch, record in records.items():
-        assert_same(read_map(paths(store)[epoch]), record)
-    store.write(changes(grown(3, 3)))
 
 
 def test_what_could_not_be_read_again_is_not_written(store, monkeypatch):

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from support.attackers.hostile_server import Body, packed
+from support.files.file_damage import flipped
 from triquad_client import Client
 from triquad_format.wire import keys
 from triquad_format.wire.tile_codec import TileSurface, encode_tile
@@ -141,10 +142,7 @@ def _adds(field: str, more: Any) -> Callable[[Body], object]:
 
 def _rots(body: Body) -> None:
     """A bit is flipped in each kilobyte."""
-    data = bytearray(body["data"])
-    for place in range(0, len(data), 1000):
-        data[place] ^= 0x10
-    body["data"] = bytes(data)
+    body["data"] = flipped(body["data"], *range(0, len(body["data"]), 1000))
 
 
 def _has_faces(faces: list[list[int]]) -> Callable[[Body], object]:

@@ -1,6 +1,8 @@
 """Map files damaged at a chosen place."""
 
+import os
 from dataclasses import dataclass
+from pathlib import Path
 
 from support.files.mapfile_edit import manifest_of, metadata_of
 
@@ -37,6 +39,13 @@ def flipped(data: bytes, *places: int) -> bytes:
     for place in places:
         corrupt[place] ^= 0x10
     return bytes(corrupt)
+
+
+def rot(path: Path) -> None:
+    """Damage a file as a disk does: nothing but its bytes tells."""
+    before = path.stat()
+    path.write_bytes(flipped(path.read_bytes(), before.st_size // 2))
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
 
 
 def zeroed(data: bytes, first: int, last: int) -> bytes:

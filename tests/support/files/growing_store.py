@@ -1,7 +1,6 @@
 """Stores of a map of several regions, of which some change from checkpoint to checkpoint."""
 
 import dataclasses
-import os
 from functools import cache, partial
 
 from support.maps.map_records import random_record
@@ -65,12 +64,3 @@ def part_of(path, index, topic="/triquad/evidence"):
     entries = read_map_file(path).manifest.entries
     chosen = next(e for e in entries if e.key.region == index and e.key.topic == topic)
     return PartFiles(path.parent).folder / chosen.name
-
-
-def rot(path):
-    """Damage a file as a disk does: nothing but its bytes tells."""
-    before = path.stat()
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 0x10
-    path.write_bytes(data)
-    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))

@@ -7,7 +7,6 @@ import struct
 import tempfile
 import zlib
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgpack
@@ -21,11 +20,9 @@ from triquad_format.errors import DamagedMapFileError, MapFileError
 from triquad_format.mapfile.files import check_range
 from triquad_format.mapfile.index import MapIndex
 from triquad_format.mapfile.manifest import Manifest, pack_manifest
-from triquad_format.mapfile.metadata import MapFacts
-from triquad_format.mapfile.parts.pack import pack_record
 from triquad_format.mapfile.parts.part import MANIFEST
 from triquad_format.mapfile.reader import read_map
-from triquad_format.mapfile.writer import MapFileInfo, write_map, write_parts
+from triquad_format.mapfile.writer import write_map
 from triquad_format.records.region import MapRecord
 from triquad_format.wire.codec import pack_array, unpack_array
 from triquad_map.preview import previews_of
@@ -221,11 +218,6 @@ def all_of(*edits: Edit) -> Edit:
     return lambda body: [edit(body) for edit in edits]
 
 
-def in_level(number: int, edit: Edit) -> Edit:
-    """Edit the rows of one level of a part."""
-    return lambda body: edit(body["levels"][number])
-
-
-def write_record(path: Path, record: MapRecord, **options: Any) -> MapFileInfo:
-    """A file of all parts of a record; options are those of ``write_parts``."""
-    return write_parts(path, MapFacts.of(record), pack_record(record, "<f2", {}), **options)
+def first_level(edit: Edit) -> Edit:
+    """Edit the rows of the first level of a part."""
+    return lambda body: edit(body["levels"][0])

@@ -5,15 +5,12 @@ from contextlib import closing
 from multiprocessing.connection import Connection
 from pathlib import Path
 
+from support.files.growing_store import ROW, changes
 from support.maps.map_records import random_record
-from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.region import MapRecord, Region
-from triquad_server.mapping.map_snapshot import MapChanges
-from triquad_server.mapping.mapper import Mapper
-from triquad_server.settings import Settings, StoreSettings
+from triquad_server.settings import StoreSettings
 from triquad_server.store.store import Store
 
-ROW: tuple[RegionIndex, ...] = tuple((x, 0, 0) for x in range(6))
 KEPT = 6
 
 
@@ -44,16 +41,10 @@ def write_for_ever(root: Path, acknowledged: Connection) -> None:
     with closing(Store(root, "lab", StoreSettings(keep=KEPT))) as store:
         restored = store.newest()
         epoch = restored.record.epoch if restored else 0
-        asked = Mapper("lab", Settings(field=record_at(0).settings), "cpu").publish()
         acknowledged.send(epoch)
         while True:
             epoch += 1
             base = store.base_epoch
-            record = record_at(epoch)
-            regions = tuple(
-                region
-                for i, region in enumerate(record.regions)
-                if base is None or changed_last(epoch, i) > base
-            )
-            store.write(MapChanges(dataclasses.replace(record, regions=regions), ROW, asked))
+            only = [r for i, r in enumerate(ROW) if base is None or changed_last(epoch, i) > base]
+            store.write(changes(record_at(epoch), only))
             acknowledged.send(epoch)

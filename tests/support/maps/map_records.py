@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -159,6 +160,18 @@ def _training(
         sample_labels=_floats(rng, samples).astype(np.float16),
         budget_samples=int(rng.randint(0, 10**6, dtype=np.int64)),
     )
+
+
+def with_region(record: MapRecord, **parts: Any) -> MapRecord:
+    """The record whose first region has some other ``parts``."""
+    first, *others = record.regions
+    return dataclasses.replace(record, regions=(dataclasses.replace(first, **parts), *others))
+
+
+def with_evidence(record: MapRecord, **parts: Any) -> MapRecord:
+    """The record in whose first region something else is known."""
+    evidence = dataclasses.replace(record.regions[0].evidence, **parts)
+    return with_region(record, evidence=evidence)
 
 
 def with_integers(record: MapRecord, limit: int = 100, seed: int = 0) -> MapRecord:

@@ -1,10 +1,9 @@
 """Tiles of the mesh of a ground that is moved, and what a cache has made of them."""
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 from support.maps.exact_maps import SETTINGS, exact_map
+from support.maps.map_records import with_region
 from triquad_format.wire.tile_codec import TileSurface, decode_tile
 from triquad_map.mesh.tile_lattice import TileIndex
 from triquad_server.epochs.epoch import Epoch
@@ -61,7 +60,5 @@ def bump(where: float, height_m: float) -> Epoch:
 
 def ground(height: object, **parts: object) -> Epoch:
     """A ground of that height, of whose region some ``parts`` are others."""
-    record = exact_map(height, epoch=next(_EPOCHS))  # type: ignore[arg-type]
-    region = replace(record.regions[0], **parts)  # type: ignore[arg-type]
-    record = replace(record, regions=(region,))
+    record = with_region(exact_map(height, epoch=next(_EPOCHS)), **parts)  # type: ignore[arg-type]
     return Mapper("test", Settings(field=SETTINGS, mesh=MESH), "cpu", record).publish()

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import triquad_client
 from support import servers
-from support.ros.ros_robot import Robot, shifted
+from support.poses import shifted
+from support.ros.ros_robot import Robot
 from triquad_client import Client, ServerStatus
 from triquad_tools.commands import ros2
 from triquad_tools.ros2 import bridge

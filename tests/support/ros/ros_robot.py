@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Protocol
 
-import numpy as np
 import zenoh
 import zenoh.ext
 from numpy.typing import NDArray
@@ -177,13 +176,6 @@ class Robot:
 
 def stamp(second: float) -> int:
     return T0 + round(second * SECOND)
-
-
-def shifted(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Array:
-    """A pose [4, 4] without rotation."""
-    pose = np.eye(4)
-    pose[:3, 3] = x, y, z
-    return pose
 
 
 @contextmanager

@@ -3,6 +3,7 @@ import json
 import numpy as np
 import pytest
 import triquad_client
+from support.poses import shifted
 from support.recordings.kitti_folder import write_folder
 from triquad_tools.commands import evaluate
 
@@ -41,8 +42,7 @@ def test_a_plate_scores_its_distance_from_a_cloud(tmp_path, capsys, suffix):
 
 def test_a_plate_scores_its_distance_from_the_scans_of_a_folder(tmp_path, capsys):
     mesh = _plate(tmp_path / "plate.ply", (10, 14), (0, 2), 0.02)
-    pose = np.eye(4)
-    pose[0, 3] = 10.0
+    pose = shifted(10.0)
     bumper = np.array([[0.1, 0.1, 1.0]])
     scan = np.vstack([_grid(), bumper]).astype(np.float32)
     write_folder(tmp_path / "scans", [scan, scan], np.stack([pose, pose]), [0, 1])

@@ -25,15 +25,9 @@ POSES = np.tile(np.eye(4), (COUNT, 1, 1))
 POSES[:, 0, 3] = 0.05 * np.arange(COUNT)
 STAMPS = [10**18 + i * 10**8 for i in range(COUNT)]
 SPHERE = servers.sphere(2000)
+SETTINGS = str(servers.SMALL_FILE)
 # Long enough to be interrupted while it trains.
 LONG = ("--set", "training.samples_per_ray=150", "--set", "training.batch=2048")
-
-
-@pytest.fixture(scope="module")
-def settings(tmp_path_factory: pytest.TempPathFactory) -> str:
-    path = tmp_path_factory.mktemp("settings") / "small.toml"
-    path.write_text(servers.SMALL_TOML)
-    return str(path)
 
 
 def scans() -> list[np.ndarray]:
@@ -49,10 +43,10 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 @pytest.fixture(scope="module")
-def whole(recording: str, settings: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def whole(recording: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The map of the recording, made without an interruption, with its training state."""
     path = tmp_path_factory.mktemp("whole") / "whole.triquad"
-    assert main([recording, str(path), "--settings", settings, "--training"]) == 0
+    assert main([recording, str(path), "--settings", SETTINGS, "--training"]) == 0
     assert not path.with_name("whole.triquad.part").exists()
     return path
 
@@ -70,10 +64,10 @@ def assert_no_scan_is_lost(path: Path, whole: Path) -> None:
     assert np.array_equal(ours.surface, theirs.surface)
 
 
-def test_a_bag_gives_the_map_of_its_folder(tmp_path: Path, settings: str, whole: Path) -> None:
+def test_a_bag_gives_the_map_of_its_folder(tmp_path: Path, whole: Path) -> None:
     messages = drive(messages_for("mcap"), scans(), POSES, STAMPS, np.eye(4))
     bag, output = write_bag(tmp_path / "bag", "mcap", messages), tmp_path / "bag.triquad"
-    assert main([str(bag), str(output), "--settings", settings]) == 0
+    assert main([str(bag), str(output), "--settings", SETTINGS]) == 0
     assert abs(error_of(output) - error_of(whole)) < 0.02
     assert_no_scan_is_lost(output, whole)
     # Training state is kept on request alone.
@@ -130,10 +124,10 @@ def mapping(*arguments: object, until: str) -> Iterator[tuple[subprocess.Popen[s
 
 
 def test_after_ctrl_c_the_same_command_goes_on(
-    tmp_path: Path, recording: str, settings: str, whole: Path, capsys
+    tmp_path: Path, recording: str, whole: Path, capsys
 ) -> None:
     output = tmp_path / "map.triquad"
-    arguments = [recording, str(output), "--settings", settings]
+    arguments = [recording, str(output), "--settings", SETTINGS]
     with mapping(*arguments, *LONG, until="training") as (process, said):
         process.send_signal(signal.SIGINT)
         assert process.wait(servers.WAIT_S) == 130
@@ -151,10 +145,10 @@ def test_after_ctrl_c_the_same_command_goes_on(
 
 
 def test_after_a_kill_the_same_command_makes_the_map(
-    tmp_path: Path, recording: str, settings: str, whole: Path
+    tmp_path: Path, recording: str, whole: Path
 ) -> None:
     output = tmp_path / "map.triquad"
-    arguments = [recording, str(output), "--settings", settings]
+    arguments = [recording, str(output), "--settings", SETTINGS]
     with mapping(*arguments, until="mapping") as (process, _):
         process.kill()
         process.wait()
@@ -165,10 +159,10 @@ def test_after_a_kill_the_same_command_makes_the_map(
 
 @pytest.mark.long
 def test_however_often_it_is_interrupted_no_scan_is_lost(
-    tmp_path: Path, recording: str, settings: str, whole: Path
+    tmp_path: Path, recording: str, whole: Path
 ) -> None:
     output = tmp_path / "map.triquad"
-    arguments = [recording, str(output), "--settings", settings]
+    arguments = [recording, str(output), "--settings", SETTINGS]
     for moment in ("preparing", "mapping", "mapping", "training", "training"):
         with mapping(*arguments, until=moment) as (process, _):
             process.send_signal(signal.SIGINT)
@@ -180,35 +174,33 @@ def test_however_often_it_is_interrupted_no_scan_is_lost(
 
 @pytest.mark.parametrize("name", ["map.triquad.part", "map.triquad.part/mine.txt"])
 def test_what_somebody_else_put_beside_the_output_stays(
-    tmp_path: Path, recording: str, settings: str, capsys, name: str
+    tmp_path: Path, recording: str, capsys, name: str
 ) -> None:
     mine = tmp_path / name
     mine.parent.mkdir(exist_ok=True)
     mine.write_text("precious")
-    assert main([recording, str(tmp_path / "map.triquad"), "--settings", settings]) == 2
+    assert main([recording, str(tmp_path / "map.triquad"), "--settings", SETTINGS]) == 2
     assert "holds something else; move it away" in capsys.readouterr().err
     assert mine.read_text() == "precious"
 
 
 def test_a_recording_of_which_nothing_can_be_used_is_told(
-    tmp_path: Path, recording: str, settings: str, capsys
+    tmp_path: Path, recording: str, capsys
 ) -> None:
-    near = ("--set", "scan.range_min_m=30", "--settings", settings)
+    near = ("--set", "scan.range_min_m=30", "--settings", SETTINGS)
     assert main([recording, str(tmp_path / "map.triquad"), *near]) == 2
     words = "nothing was mapped: 8 of 8 scans could not be used (empty: 8); the last: scan 7"
     assert words in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
-def test_poses_that_go_on_in_another_frame_are_refused(
-    tmp_path: Path, settings: str, capsys
-) -> None:
+def test_poses_that_go_on_in_another_frame_are_refused(tmp_path: Path, capsys) -> None:
     """As where a first GPS fix comes late. A single pose that is wrong is left out and told."""
     for lost, status in ((1, 0), (3, 2)):
         poses, output = POSES.copy(), tmp_path / f"{lost}.triquad"
         poses[3 : 3 + lost, :3, 3] += (450_000.0, 5_400_000.0, 400.0)
         write_folder(tmp_path / f"{lost}", scans(), poses, STAMPS)
-        assert main([str(tmp_path / f"{lost}"), str(output), "--settings", settings]) == status
+        assert main([str(tmp_path / f"{lost}"), str(output), "--settings", SETTINGS]) == status
         assert output.exists() == (status == 0)
         told = capsys.readouterr().err
         assert "from the map's origin 0 0 0, which the first scan" in told
@@ -234,9 +226,9 @@ def test_input_that_cannot_be_used_is_refused(tmp_path: Path, recording: str, ca
     assert exists.read_bytes() == b"x"
 
 
-def test_a_preset_lies_below_the_settings(tmp_path: Path, recording: str, settings: str) -> None:
+def test_a_preset_lies_below_the_settings(tmp_path: Path, recording: str) -> None:
     output = tmp_path / "map.triquad"
     command = [recording, str(output), "--every", str(COUNT), "--preset", "long-range"]
-    assert main([*command, "--settings", settings]) == 0
+    assert main([*command, "--settings", SETTINGS]) == 0
     field = read_map(output).settings
     assert (field.leaf_m, field.depth) == (0.4, 7)

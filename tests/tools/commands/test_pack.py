@@ -95,9 +95,9 @@ def test_tool_reads_only_what_the_box_needs(tmp_path, capsys):
     assert_same(read_map(out), crop_record(record, [-60] * 3, [-40] * 3))
     summary = make_reader(io.BytesIO(source.read_bytes())).get_summary()
     far = summary.chunk_indexes[-2]  # of the last evidence, in the opposite corner
-    data = bytearray(source.read_bytes())
-    data[far.chunk_start_offset + far.chunk_length // 2] ^= 1
-    source.write_bytes(data)
+    middle = far.chunk_start_offset + far.chunk_length // 2
+    source.write_bytes(flipped(source.read_bytes(), middle))
+
     assert main([str(source), str(out), *box, "--force"]) == 0
     assert main([str(source), str(out), "--force"]) == 1
     assert "damaged" in capsys.readouterr().err

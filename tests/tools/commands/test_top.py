@@ -11,7 +11,6 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass, replace
-from pathlib import Path
 from random import Random
 from typing import Any
 
@@ -244,10 +243,8 @@ def lines_of(endpoint: str) -> Iterator[Iterator[dict[str, Any]]]:
         assert (process.returncode, errors) == (130, "triquad-top: interrupted\n")
 
 
-def test_a_server_that_is_killed_and_started_again_is_noticed(tmp_path: Path) -> None:
-    settings = tmp_path / "small.toml"
-    settings.write_text(servers.SMALL_TOML)
-    arguments = ["--settings", settings]
+def test_a_server_that_is_killed_and_started_again_is_noticed() -> None:
+    arguments = ["--settings", servers.SMALL_FILE]
     with (
         servers.server_process(arguments) as server,
         triquad_client.connect(server.endpoint) as client,

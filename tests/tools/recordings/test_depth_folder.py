@@ -1,17 +1,15 @@
+"""Folders of depth images, of a room that a camera sees exactly."""
+
 import json
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
-from support.recordings import depth_images
-from support.recordings.depth_images import (
-    CAMERA,
-    HALF_ROOM_M,
-    room_depth,
-    write_depth,
-    write_intrinsics,
-)
+from numpy.typing import NDArray
+from PIL import Image
+from support.files.file_damage import flipped
 from support.recordings.trajectories import drive, matrices, write_log, write_tum
 from triquad_client.depth_image import Intrinsics
 from triquad_client.pose import Pose
@@ -28,6 +26,47 @@ STAMPS = [START_NS + STEP_NS * number for number in range(COUNT)]
 POSES = drive(COUNT, step_m=0.1, turn_rad=0.2, start=(0.3, -0.2, 0.1))
 
 
+CAMERA = Intrinsics(60.0, 62.0, 31.5, 23.5)
+WIDTH, HEIGHT = 64, 48
+HALF_ROOM_M = 2.0
+
+
+def room_depth(world_from_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Depths [HEIGHT, WIDTH] of the walls of a cube around the origin, metres."""
+    columns, rows = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+    rays = np.stack(
+        [(columns - CAMERA.cx) / CAMERA.fx, (rows - CAMERA.cy) / CAMERA.fy, np.ones(rows.shape)],
+        axis=-1,
+    )
+    directions = rays @ world_from_camera[:3, :3].T
+    with np.errstate(divide="ignore"):
+        reach = (np.sign(directions) * HALF_ROOM_M - world_from_camera[:3, 3]) / directions
+    depth: NDArray[np.float64] = reach.min(axis=-1)
+    return depth
+
+
+def write_depth(path: Path, depth: NDArray[np.float64], units_per_metre: float) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.round(depth * units_per_metre).astype(np.uint16)).save(path)
+    return path
+
+
+def write_intrinsics(path: Path, camera: Intrinsics = CAMERA, width: int = WIDTH) -> Path:
+    matrix = [camera.fx, 0, 0, 0, camera.fy, 0, camera.cx, camera.cy, 1]
+    said = {"width": width, "height": HEIGHT, "intrinsic_matrix": matrix}
+    path.write_text(json.dumps(said))
+    return path
+
+
+def write_list(folder: Path, stamps_ns: Sequence[int]) -> list[Path]:
+    """``depth.txt`` of TUM RGB-D; returns the paths of the images that it names."""
+    names = [f"depth/{stamp // 10**9}.{stamp % 10**9 // 1000:06d}.png" for stamp in stamps_ns]
+    lines = ["# depth maps", "# timestamp filename"]
+    lines += [f"{name[6:-4]} {name}" for name in names]
+    (folder / "depth.txt").write_text("\n".join(lines) + "\n")
+    return [folder / name for name in names]
+
+
 def read_depth_folder(folder: Path, **options) -> ScanFolder:
     return depth_folder.read_depth_folder(folder, ReadingOptions(**options))
 
@@ -36,7 +75,7 @@ def _tum(folder: Path, units: float = 5000.0) -> Path:
     folder.mkdir(exist_ok=True)
     write_tum(folder / "groundtruth.txt", STAMPS, POSES)
     write_intrinsics(folder / "camera_intrinsic.json")
-    paths = depth_images.write_list(folder, STAMPS)
+    paths = write_list(folder, STAMPS)
     for path, pose in zip(paths, matrices(POSES), strict=True):
         write_depth(path, room_depth(pose), units)
     return folder
@@ -189,9 +228,8 @@ def test_an_image_that_shows_nothing_is_a_scan_without_points(tmp_path):
 def test_a_damaged_image_is_told_before_the_first_scan(tmp_path):
     path = sorted((_open3d(tmp_path) / "depth").iterdir())[3]
     whole = path.read_bytes()
-    damaged = bytearray(whole)
-    damaged[len(whole) // 2] ^= 0xFF
-    for content in (whole[: len(whole) // 2], whole[:20], b"", bytes(damaged)):
+    middle = len(whole) // 2
+    for content in (whole[:middle], whole[:20], b"", flipped(whole, middle)):
         path.write_bytes(content)
         with pytest.raises(ToolError, match=f"{re.escape(path.name)}: cannot be read as PNG"):
             read_depth_folder(tmp_path)
@@ -199,8 +237,6 @@ def test_a_damaged_image_is_told_before_the_first_scan(tmp_path):
 
 @pytest.mark.parametrize("mode", ["L", "RGB"])
 def test_images_of_colour_or_8_bits_are_refused(tmp_path, mode):
-    from PIL import Image
-
     path = next((_open3d(tmp_path) / "depth").iterdir())
     Image.new(mode, (64, 48)).save(path)
     with pytest.raises(ToolError, match=f"{path.name}: is an image of mode {mode}: depth takes 16"):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import zstandard
 from mcap.writer import CompressionType, IndexType, Writer
+from support.files.file_damage import flipped
 from support.recordings.bags import Recorded, drive, messages_for
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.opening import open_recording
@@ -93,9 +94,9 @@ def test_what_was_cut_off_is_read_up_to_there_and_told(tmp_path: Path) -> None:
 
 def test_damaged_chunks_and_messages_are_left_out_and_counted(tmp_path: Path) -> None:
     path = written(tmp_path / "drive.mcap", compression=CompressionType.NONE)
-    data = bytearray(path.read_bytes())
-    data[data.index(SCANS[9].tobytes()) + 5] ^= 255  # its checksum is wrong then
-    path.write_bytes(data)
+    data = path.read_bytes()
+    path.write_bytes(flipped(data, data.index(SCANS[9].tobytes()) + 5))  # its checksum is wrong
+
     recording = open_recording(path, ReadingOptions())
     assert COUNT // 2 < len(recording.entries) < COUNT
     assert any("1 of its chunks are damaged; what is whole" in line for line in recording.remarks)

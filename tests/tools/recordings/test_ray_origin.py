@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.poses import shifted
 from support.recordings.bags import Recorded, messages_for, write_bag
 from support.ros_messages import CLOUD, TF
 from triquad_tools.console.command import ToolError
@@ -46,8 +47,7 @@ def recorded(
     frame: str, written: Callable[[np.ndarray], np.ndarray] = np.asarray, *, name: str = ""
 ) -> Iterator[Recorded]:
     """A drive whose clouds are in the frame of the lidar, of the base or of the map."""
-    lidar = np.eye(4)
-    lidar[:3, 3] = UP
+    lidar = shifted(*UP)
     yield Recorded("/tf_static", TF, STAMPS[0] - 1, ROS2.tf(0, ("base_link", "lidar", lidar)))
     for number, stamp in enumerate(STAMPS):
         pose = base(number)

@@ -5,8 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from support import servers
+from support.poses import shifted
 from support.ros.ros_bridge import bridging
-from support.ros.ros_robot import robot, shifted
+from support.ros.ros_robot import robot
 from support.ros_messages import CAMERA_INFO, CLOUD, IMAGE, ODOMETRY, TF, RosMessages
 
 MESSAGES = RosMessages()
