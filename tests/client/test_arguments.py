@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import triquad_client
 from support import servers
 from triquad_client import (
     Client,
@@ -209,13 +208,3 @@ def test_an_error_has_no_trace_of_what_is_within(
     names = [frame.name for frame in traceback.extract_tb(caught.value.__traceback__)]
     assert names == ["test_an_error_has_no_trace_of_what_is_within", "<lambda>", "call"]
     assert caught.value.__suppress_context__
-
-
-def test_far_coordinates_keep_their_precision(client: Client) -> None:
-    """Offsets travel in single precision from an origin in double precision."""
-    far = np.array([[50_000.0, 0, 0]]) + servers.sphere(20)
-    pose = np.eye(4)
-    pose[0, 3] = 50_000.0
-    client.publish_scan(servers.sphere(), pose, source="far")
-    client.flush(servers.WAIT_S)
-    assert (client.query_sdf(far).status == triquad_client.Status.SURFACE).all()

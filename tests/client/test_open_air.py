@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import triquad_client
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 from support import servers
 from triquad_client import Client, InvalidScanError, Status
 from triquad_server.settings import Settings
@@ -95,7 +96,9 @@ def test_points_beyond_the_range_and_none_show_the_space_up_to_it() -> None:
 
 def test_the_robot_is_free_and_no_surface() -> None:
     box = ((-1.0, -0.6, -0.4), (2.0, 0.6, 0.4))
-    turned = np.array([[0, -1, 0, 4.05], [1, 0, 0, 1.05], [0, 0, 1, 0.05], [0, 0, 0, 1]])
+    turned = np.eye(4)
+    turned[:3, :3] = Rotation.from_euler("xyz", [0.2, -0.3, 0.9]).as_matrix()
+    turned[:3, 3] = 4.05, 1.05, 0.05
     settings = open_settings(roof={"robot_box_m": box, "range_min_m": 0.0})
     with servers.service_and_client(settings) as client:
         hood = [[1.8, 0.3, 0.2], [1.9, -0.3, 0.1]]

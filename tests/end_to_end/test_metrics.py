@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import triquad_client
 from support import servers
-from triquad_client import RefusedError, ServerMetrics
+from triquad_client import ServerMetrics
 
 
 def figures(client: triquad_client.Client, done) -> ServerMetrics:
@@ -34,15 +34,6 @@ def test_every_answer_is_counted_and_timed(client):
     assert now.answer_time_s("query/sdf", 0.5, since=now) is None
     assert now.answer_time_s("query/nothing", 0.5) is None
     assert now.operations["query/metrics"].answered > 0
-
-
-def test_refusals_are_counted_by_operation(client):
-    with pytest.raises(RefusedError):
-        client.query_sdf([[0, 0, 0]], at_epoch=10**6)
-    now = figures(client, lambda m: m.operations["query/sdf"].refused)
-    assert now.operations["query/sdf"].refused == {"epoch_gone": 1}
-    assert now.operations["query/sdf"].answered == 0
-    assert client.status().requests_refused == {"epoch_gone": 1}
 
 
 def test_scans_are_counted_by_source(client):

@@ -15,14 +15,6 @@ POSE = np.eye(4)
 PROBES = np.concatenate([servers.sphere(50, radius) for radius in (2.0, 3.9, 4.0, 4.1)])
 
 
-def test_an_empty_map_answers_that_it_knows_nothing(client):
-    result = client.query_sdf(PROBES, gradient=True)
-    assert np.isnan(result.sdf).all()
-    assert np.isnan(result.gradient).all()
-    assert (result.status == Status.UNKNOWN).all()
-    assert len(client.mesh().faces) == 0
-
-
 def test_what_was_flushed_shows_in_the_next_answer(client):
     before = client.query_sdf(PROBES).epoch
     report = servers.learn(client)
@@ -153,20 +145,6 @@ def test_holes_of_a_mesh_are_filled_where_that_is_asked_for(client):
     assert np.abs(centres[mesh.filled, 0]).min() < 0.1
     assert (client.query_sdf(centres[mesh.filled]).status != Status.FREE).all()
     assert client.mesh(((50, 50, 50), (60, 60, 60)), fill_m=0.6).filled.shape == (0,)
-
-
-def test_reset_forgets_a_box_or_everything(client):
-    servers.learn(client)
-    epoch = client.reset(((0, -10, -10), (10, 10, 10))).epoch
-    points = servers.sphere(400)
-    result = client.query_sdf(points)
-    assert result.epoch >= epoch
-    assert (result.status[points[:, 0] > 0.2] == Status.UNKNOWN).all()
-    assert (result.status[points[:, 0] < -0.2] == Status.SURFACE).all()
-    epoch = client.reset().epoch
-    assert client.status().regions == 0
-    assert client.query_sdf(points).epoch >= epoch
-    assert servers.learn(client, 1).taken == 3
 
 
 def test_the_status_is_published(endpoint):

@@ -10,6 +10,7 @@ import io
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,7 @@ from mcap.writer import Writer
 from support.files.file_damage import chunks, flipped, zeroed
 from support.files.mapfile_edit import file_bytes, read_bytes, rewritten, stored, stored_record
 from support.maps.map_records import assert_same, random_record
+from triquad_client import open_map
 from triquad_format.errors import (
     DamagedMapFileError,
     MapFileError,
@@ -103,20 +105,23 @@ def test_a_damaged_part_is_refused_when_it_is_read(number: int) -> None:
             stored_record(mutant)
 
 
-def test_messages_name_file_fault_and_remedy(tmp_path: Path) -> None:
+@pytest.mark.parametrize("read", [read_map, open_map])
+def test_messages_name_file_fault_and_remedy(
+    tmp_path: Path, read: Callable[[Path], object]
+) -> None:
     path = tmp_path / "broken.triquad"
     path.write_bytes(DATA[:-100])
     with pytest.raises(DamagedMapFileError, match=r"broken.triquad .*incomplete.*older"):
-        read_map(path)
+        read(path)
     path.write_bytes(b"")
     with pytest.raises(DamagedMapFileError, match="incomplete: 0 bytes"):
-        read_map(path)
+        read(path)
     for other in (b"PK\x03\x04 a zip file", b"\x89PNG\r\n\x1a\n" * 10):
         path.write_bytes(other)
         with pytest.raises(MapFileError, match="not a map file"):
-            read_map(path)
+            read(path)
     with pytest.raises(FileNotFoundError):
-        read_map(tmp_path / "none.triquad")
+        read(tmp_path / "none.triquad")
 
 
 @pytest.mark.parametrize("names", [[], ["other"], ["triquad", "triquad"]])

@@ -12,7 +12,6 @@ from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.region import BLOCK_BYTES, MapRecord
 from triquad_map.composition.recorded_view import RecordedView
 from triquad_map.surfels.surfel_search import no_surfels
-from triquad_map.view import NotAskedError
 
 TWO = ((0, 0, 0), (1, 0, 0))
 APART = ((0, 0, 0), (1, 0, 0), (1, 1, 0), (-4, 2, 1))
@@ -121,14 +120,3 @@ def test_confidence_fades_with_the_age_since_anything_was_seen_anywhere() -> Non
     same = (aged.distance == fresh.distance) & aged.found
     assert same.sum() > 10
     np.testing.assert_allclose(aged.confidence[same], fresh.confidence[same] / 2, rtol=1e-5)
-
-
-def test_gradients_are_told_on_request_and_leave_the_values_alone() -> None:
-    record = random_record(6, indices=TWO)
-    points = across_the_border(record, 100, 1.5 * record.settings.region_side_m)
-    plain = RecordedView(record).query(points)
-    with pytest.raises(NotAskedError):
-        _ = plain.gradient
-    both = RecordedView(record).query(points, gradient=True)
-    np.testing.assert_array_equal(plain.sdf, both.sdf)
-    np.testing.assert_array_equal(np.isnan(both.gradient).all(axis=1), np.isnan(plain.sdf))

@@ -13,22 +13,6 @@ def filled(queue, owner, items, nbytes=1):
     return [removed for item in items for removed in queue.put(owner, item, nbytes)]
 
 
-def test_owners_take_turns_however_much_one_of_them_sends():
-    queue = queue_of()
-    filled(queue, A, "abcde")
-    filled(queue, B, "XY")
-    assert queue.clear() == list("aXbYcde")
-    assert (len(queue), queue.nbytes) == (0, 0)
-
-
-def test_names_of_one_group_share_its_turn():
-    queue = queue_of()
-    for name in "123":
-        filled(queue, Owner("group", name), [f"{name}-", f"{name}+"])
-    filled(queue, A, "abcd")
-    assert queue.clear() == ["1-", "a", "2-", "b", "3-", "c", "1+", "d", "2+", "3+"]
-
-
 def test_an_owner_who_asks_again_and_again_does_not_come_first():
     queue = queue_of()
     filled(queue, A, "ab")
@@ -48,23 +32,7 @@ def test_who_has_most_or_too_many_loses_the_newest_or_the_oldest(newest_go, left
     assert len(queue) == 0
 
 
-def test_where_bytes_are_too_many_who_has_most_of_them_loses():
-    queue = queue_of()
-    filled(queue, A, "abcde", nbytes=1)
-    assert filled(queue, B, "XY", nbytes=600) == ["Y"]
-    assert queue.nbytes == 605
-
-
 def test_a_single_item_may_be_larger_than_the_limit():
     queue = queue_of(limit_bytes=10)
     assert filled(queue, A, "a", nbytes=50) == []
     assert filled(queue, B, "X") == ["a"]
-
-
-def test_many_invented_names_lose_to_one_owner():
-    queue = queue_of(limit=4)
-    filled(queue, A, "a")
-    for number in range(50):
-        filled(queue, Owner("", str(number)), [number])
-    assert len(filled(queue, A, "b")) == 1
-    assert {"a", "b"} <= set(queue.clear())

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from support.maps.small_world import (
-    mapper_of,
     settings,
     settle,
     settled,
@@ -89,13 +88,3 @@ def test_a_place_left_behind_is_not_forgotten() -> None:
     settle(mapper)
     assert mapper.rays_kept <= 75_000
     assert surface_error(mapper.publish(), here) < before + 0.006
-
-
-@pytest.mark.parametrize("encoding", ["features", "fourier"])
-def test_the_parts_of_the_field_can_be_switched(encoding: str) -> None:
-    chosen = settings(samples_per_ray=3.0)
-    field = type(chosen.field)(depth=8, encoding=encoding)
-    scan = world().scans[0]
-    mapper = mapper_of(scan, chosen=type(chosen)(field=field, training=chosen.training))
-    settle(mapper)
-    assert np.isfinite(mapper.publish().query(scan.true_hits[::100], gradient=True).sdf).all()

@@ -18,7 +18,6 @@ from support.maps.small_world import (
 from triquad_format.records.replay_rays import no_rays
 from triquad_format.records.status import Status
 from triquad_map.field_fit import in_cube
-from triquad_server.errors import ScanRefusedError
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.replay.kept_rays import RAY_BYTES
 from triquad_server.mapping.replay.ray_table import END
@@ -40,24 +39,6 @@ def test_it_settles_and_then_changes_no_more(mapped: Mapper) -> None:
     assert mapped.publish() is first
 
 
-def test_an_epoch_does_not_change_while_training_goes_on() -> None:
-    first, *others = world().scans
-    mapper = mapper_of(first)
-    mapper.train()
-    epoch = mapper.publish()
-    points = first.true_hits[::20]
-    before = epoch.query(points, gradient=False)
-    for scan in others:
-        take_in(mapper, scan)
-        mapper.train()
-    after = epoch.query(points, gradient=False)
-    np.testing.assert_array_equal(after.sdf, before.sdf)
-    np.testing.assert_array_equal(after.status, before.status)
-    later = mapper.publish()
-    assert later.number > epoch.number
-    assert later.vertices > epoch.vertices
-
-
 def test_epochs_share_what_did_not_change_between_them() -> None:
     mapper = mapper_of(world().scans[0])
     mapper.train()
@@ -68,15 +49,6 @@ def test_epochs_share_what_did_not_change_between_them() -> None:
     assert len(before.frozen_regions) > 1
     assert new.evidence is old.evidence
     assert new.engine.tree is old.engine.tree
-
-
-def test_a_refused_scan_changes_nothing() -> None:
-    mapper = Mapper("test", settings(), "cpu")
-    epoch = mapper.publish()
-    with pytest.raises(ScanRefusedError):
-        mapper.ingest(np.zeros((5, 3), np.float32), np.eye(4) * 2)
-    assert mapper.publish() is epoch
-    assert mapper.settled
 
 
 def test_a_record_restores_the_map_and_its_training(mapped: Mapper) -> None:

@@ -127,14 +127,6 @@ def test_who_knows_everything_is_told_nothing() -> None:
     assert cache.changed(0, *EVERYWHERE, cache.revision(0)) == {}
 
 
-def test_only_tiles_of_the_box_are_told_of() -> None:
-    cache = TileCache(MESH, TEAM)
-    cache.refresh(ground(flat(0.3)))
-    told = cache.changed(0, np.array([0.2, 0.2, -9]), np.array([5.0, 5, 9]), 0)
-    assert told
-    assert all(x >= 0 and y >= 0 for x, y, _ in told)
-
-
 def test_tiles_whose_bytes_went_are_made_again_and_stay_the_same() -> None:
     cache = TileCache(MeshSettings(tile_cells=16, cache_bytes=2000), TEAM)
     epoch = ground(flat(0.3))

@@ -3,7 +3,6 @@
 import subprocess
 import sys
 from importlib import import_module
-from pathlib import Path
 
 import pytest
 import triquad_format
@@ -67,15 +66,6 @@ def test_wrong_usage_ends_with_code_2(name: str, arguments: tuple[str, ...]) -> 
     with pytest.raises(SystemExit) as caught:
         import_module(f"triquad_tools.commands.{name}").main(arguments)
     assert caught.value.code == 2
-
-
-def test_a_file_that_is_not_there_is_named_without_numbers(tmp_path: Path) -> None:
-    missing = tmp_path / "missing.triquad"
-    done = command("inspect", missing)
-    assert done.returncode == 2
-    assert f"{missing}: no such f" in done.stderr
-    assert "Errno" not in done.stderr
-    assert len(done.stderr.splitlines()) == 1
 
 
 def test_nobody_who_reads_the_output_is_no_error() -> None:

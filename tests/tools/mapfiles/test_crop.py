@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 from support.maps.map_records import assert_same, random_record
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.reader import read_map
-from triquad_format.mapfile.writer import write_map
 from triquad_map.composition.recorded_view import RecordedView
 from triquad_tools.mapfiles.crop import crop_record, without_training
 
@@ -41,14 +39,6 @@ def test_a_crop_answers_in_the_box_as_before(low, high):
     np.testing.assert_array_equal(before.sdf, after.sdf)
     np.testing.assert_array_equal(before.status, after.status)
     np.testing.assert_array_equal(before.gradient, after.gradient)
-
-
-def test_a_crop_can_be_written(tmp_path):
-    record = random_record(4, indices=CUBE, points=100)
-    cropped = crop_record(record, [-1, -1, -1], [1, 1, 1])
-    write_map(cropped, tmp_path / "map.triquad")
-    assert_same(read_map(tmp_path / "map.triquad"), cropped)
-    assert [region.training for region in cropped.regions] == [None] * len(cropped.regions)
 
 
 def test_a_crop_drops_regions_that_the_box_does_not_meet():

@@ -21,13 +21,6 @@ def test_ply_round_trip_keeps_the_precision(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read.faces, TETRAHEDRON.faces)
 
 
-def test_glb_round_trip_has_z_up_again(tmp_path: Path) -> None:
-    TETRAHEDRON.save(tmp_path / "a.glb")
-    read = read_mesh(tmp_path / "a.glb")
-    np.testing.assert_allclose(read.vertices, TETRAHEDRON.vertices, atol=1e-6)
-    np.testing.assert_array_equal(read.faces, TETRAHEDRON.faces)
-
-
 @pytest.mark.parametrize("name", ["a.gltf", "a", "a.pkl"])
 def test_other_formats_are_refused(tmp_path: Path, name: str) -> None:
     with pytest.raises(ToolError, match=r"\.ply, \.glb, \.obj, \.stl"):

@@ -67,12 +67,6 @@ def test_the_error_is_from_the_map_that_was_packed(street, fine):
     assert field_change(street, again.record, OTHER_SEED).quantile_m <= 0.005
 
 
-def test_integers_survive_the_file(coarse, tmp_path):
-    packed = coarse.record
-    (tmp_path / "map.triquad").write_bytes(file_bytes(packed))
-    assert_same(read_map(tmp_path / "map.triquad"), packed)
-
-
 def test_a_map_without_evidence():
     nothing_seen = crop_record(random_record(1), [7.9, 7.9, 7.9], [7.95, 7.95, 7.95])
     assert quantise(nothing_seen, 0.001).change.largest_m == 0

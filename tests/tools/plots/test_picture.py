@@ -1,5 +1,7 @@
 """Pictures of meshes, read back."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -178,7 +180,7 @@ def test_faces_that_were_not_seen_are_pale(tmp_path):
     filled = mesh.vertices[mesh.faces[:, 0], 0] >= 4
     pictures = []
     for number, shown_as in enumerate((None, filled)):
-        draw_mesh("", dataclasses.replace(mesh, filled=shown_as), tmp_path / f"{number}.png")
+        draw_mesh("", replace(mesh, filled=shown_as), tmp_path / f"{number}.png")
         pictures.append(read_picture(tmp_path / f"{number}.png"))
     seen, continued = pictures
     changed = (seen != continued).any(axis=-1)

@@ -85,12 +85,6 @@ def test_every_format_is_read(tmp_path, suffix):
         np.testing.assert_allclose(scan.points, cloud, atol=6e-4)
 
 
-def test_hidden_files_are_no_clouds(tmp_path):
-    _timed(tmp_path)
-    (tmp_path / "clouds" / f"._{_name(STAMPS[0])}.ply").write_bytes(b"of macOS")
-    assert len(read_cloud_folder(tmp_path).entries) == COUNT
-
-
 def test_clouds_without_a_pose_are_left_out_and_counted(tmp_path):
     stamps = [STAMPS[0] - 10**9, STAMPS[1], STAMPS[2], STAMPS[-1] + 10**9, STAMPS[-1] + 2 * 10**9]
     recording = read_cloud_folder(_timed(tmp_path, stamps))

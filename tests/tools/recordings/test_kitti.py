@@ -107,20 +107,6 @@ def test_calibration_turns_rotations_too(tmp_path: Path) -> None:
     np.testing.assert_allclose(pose[:3, 3], [0.5, 0.5, 0.0], atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("line", "words"),
-    [
-        ("1 0 0", "poses.txt:2: 3 numbers"),
-        (IDENTITY.replace("1", "one", 1), "poses.txt:2: 'one' is not a number"),
-        ("1.01" + IDENTITY[1:], "poses.txt:2: not a rotation: off orthonormal by 0.0201"),
-        ("-1" + IDENTITY[1:], "poses.txt:2: not a rotation: .*determinant -1"),
-    ],
-)
-def test_bad_pose_is_refused_with_its_place(tmp_path: Path, line: str, words: str) -> None:
-    with pytest.raises(ToolError, match=words):
-        read_cloud_folder(_folder(tmp_path, f"{IDENTITY}\n{line}\n", 2))
-
-
 @pytest.mark.parametrize("names", ["xyz", "xyzi", "xyzir", "xyzirt", "t,x,y,z,i"])
 @pytest.mark.parametrize("shuffled", [False, True])
 def test_columns_are_told_or_given(tmp_path: Path, names: str, *, shuffled: bool) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.recordings.trajectories import drive, matrices, write_log, write_tum
+from support.recordings.trajectories import drive, matrices, write_tum
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.folders.file_names import in_order, stamps_of_names
 from triquad_tools.recordings.folders.trajectory import read_trajectory
@@ -12,6 +12,7 @@ from triquad_tools.sensors.sweep import NoTransformError
 
 START_NS = 1_700_000_000_000_000_000
 LINE = "1 0 0 0 0 0 0 1"
+ROW = "1 0 0 0 0 1 0 0 0 0 1 0"  # of KITTI
 
 
 def test_tum_comes_back_and_is_interpolated(tmp_path):
@@ -32,16 +33,6 @@ def test_a_time_that_was_rounded_finds_the_pose_at_the_end(tmp_path):
     np.testing.assert_array_equal(read.pose_at(START_NS - 500_000), read.poses[0])
     with pytest.raises(NoTransformError, match="before the first pose"):
         read.pose_at(START_NS - 2_000_000)
-
-
-def test_open3d_and_kitti_come_without_times(tmp_path):
-    poses = drive(4)
-    log = read_trajectory(write_log(tmp_path / "trajectory.log", poses))
-    np.testing.assert_allclose(log.poses, matrices(poses), atol=1e-7)
-    assert log.frames is None
-    rows = matrices(poses)[:, :3].reshape(4, 12)
-    np.savetxt(tmp_path / "poses.txt", rows)
-    np.testing.assert_allclose(read_trajectory(tmp_path / "poses.txt").poses, matrices(poses))
 
 
 EUROC = "p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []"
@@ -123,6 +114,10 @@ def test_lines_of_data_sets_are_read(tmp_path, header, form, separator):
         ("0 0 1\n1 0 0 0\n0 1 0\n0 0 1 0\n0 0 0 1\n", ":1: not 3 numbers and four rows of 4"),
         ("0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 1 1\n", ":1: .* where a pose ends with 0 0 0 1"),
         ("0 0 1\n1 0 0 0\n0 2 0 0\n0 0 1 0\n0 0 0 1\n", ":1: not a rotation"),
+        (f"{ROW}\n1 0 0\n", ":2: 3 numbers"),
+        (f"{ROW}\none{ROW[1:]}\n", ":2: 'one' is not a number"),
+        (f"{ROW}\n1.01{ROW[1:]}\n", ":2: not a rotation: off orthonormal by 0.0201"),
+        (f"{ROW}\n-1{ROW[1:]}\n", ":2: not a rotation: .*determinant -1"),
     ],
 )
 def test_what_is_no_trajectory_is_refused_with_its_place(tmp_path, text, words):
