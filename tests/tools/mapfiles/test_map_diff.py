@@ -1,17 +1,25 @@
+"""What differs between two maps, and what vanished and appeared; of exact maps and of streets."""
+
+import dataclasses
 import json
 import math
+from functools import cache
 
 import numpy as np
 import pytest
 from support.maps.exact_maps import exact_map, flat, table
 from support.maps.map_records import random_record
-from support.maps.small_world import settings, settled_epoch, settled_mapper, world
+from support.maps.small_world import settings, settle, settled_epoch, settled_mapper, world
 from triquad_client import OfflineMap
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.status import Status
+from triquad_server.mapping.mapper import Mapper
 from triquad_tools.commands.inspect import main
 from triquad_tools.mapfiles.diff import compare, difference
-from triquad_tools.mapfiles.object_changes import object_changes
+from triquad_tools.mapfiles.object_changes import LEAST_POINTS, object_changes
+from triquad_tools.simulation.lidar import Lidar, drive
+from triquad_tools.simulation.solids import box
+from triquad_tools.simulation.street import street
 
 GROUND = exact_map(flat(0.1))
 RAISED = exact_map(table(0.1, 0.15))  # by 5 cm, in a square of 4 m
@@ -83,37 +91,119 @@ def test_the_same_scans_give_maps_that_differ_by_their_noise_alone():
         assert count < 0.002 * total.points_a
 
 
+# What vanished and appeared, in maps made from simulated scans of a street
+
+LIDAR = Lidar(columns=360, range_max_m=12.0)  # small maps are compared quickly
+VANISHES = (4.0, 1.5)
+APPEARS = (9.0, 1.8)
+MOVES = (12.0, 0.8)
+MOVED = (13.5, 0.8)
+
+
+@cache
+def mapped(seed, *places):
+    """A map of a drive of 15 m along a street with boxes of 1.2 m, 2 m high, on its road."""
+    scene = street(3)
+    boxes = tuple(box((x, y, 0.0), (0.6, 0.6, 2.0)) for x, y in places)
+    scene = dataclasses.replace(scene, solids=scene.solids + boxes)
+    mapper = Mapper("street", settings(samples_per_ray=8.0), "cpu")
+    rng = np.random.default_rng(seed)
+    for pose in drive(scene, 12, 1.4):
+        scan = LIDAR.scan(scene, pose, rng)
+        mapper.ingest(scan.points, scan.world_from_sensor)
+    settle(mapper)
+    return mapper.publish().record()
+
+
+def before():
+    return mapped(1, VANISHES, MOVES)
+
+
+def after():
+    return mapped(2, APPEARS, MOVED)
+
+
+@pytest.fixture(scope="module")
+def found():
+    return object_changes(compared(before(), after()))
+
+
+def test_what_vanished_and_what_appeared_is_told_apart(found):
+    """What moved did both."""
+    for clusters, places in (
+        (found["vanished"], (VANISHES, MOVES)),
+        (found["appeared"], (APPEARS, MOVED)),
+    ):
+        by_x = sorted(cluster.middle_m[:2].tolist() for cluster in clusters)
+        np.testing.assert_allclose(by_x, places, atol=0.35)
+        for cluster in clusters:
+            np.testing.assert_allclose(cluster.size_m[:2], 1.2, atol=0.4)
+            assert 1.7 <= cluster.high_m[2] <= 2.3
+            assert cluster.points > 100
+
+
+def test_where_a_box_stood_the_road_is_newly_seen_and_under_it_no_longer_known(found):
+    def has_road_at(clusters, place):
+        return any(
+            np.linalg.norm(cluster.middle_m[:2] - place) < 0.5 and abs(cluster.middle_m[2]) < 0.1
+            for cluster in clusters
+        )
+
+    assert has_road_at(found["newly_seen"], MOVES)
+    assert has_road_at(found["no_longer_known"], APPEARS)
+    assert not has_road_at(found["vanished"] + found["appeared"], MOVES)
+
+
+def test_another_drive_with_other_noise_shows_no_objects():
+    found = object_changes(compared(before(), mapped(3, VANISHES, MOVES)))
+    assert found["vanished"] == found["appeared"] == []
+
+
+def test_where_only_one_map_has_been_nothing_appeared_or_vanished():
+    nowhere = dataclasses.replace(before(), regions=())
+    found = object_changes(compared(before(), nowhere))
+    assert found["vanished"] == found["appeared"] == found["newly_seen"] == []
+    assert max(cluster.points for cluster in found["no_longer_known"]) > 10_000
+    assert all(cluster.points >= LEAST_POINTS for cluster in found["no_longer_known"])
+
+
 # The command
 
 
 @pytest.fixture
 def files(tmp_path):
     paths = [tmp_path / name for name in ("a.triquad", "b.triquad")]
-    for path, record in zip(paths, (GROUND, TABLE), strict=True):
-        write_map(record, path, feature_dtype="<f4")
+    for path, record in zip(paths, (before(), after()), strict=True):
+        write_map(record, path)
     return [str(path) for path in paths]
 
 
-def test_table(files, capsys):
+def points_of(record):
+    """How many points of surface are compared, as the command writes it."""
+    return f"{difference(compared(record, record)).points_a:,}"
+
+
+def test_the_table_lists_what_differs(files, capsys):
     assert main([*files, "--diff"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[:2] == [
-        f"{letter}  {path}: map 'ground', epoch 1" for letter, path in zip("AB", files, strict=True)
-    ]
+    for letter, path, record, line in zip("AB", files, (before(), after()), lines, strict=False):
+        assert line == f"{letter}  {path}: map 'street', epoch {record.epoch}"
     assert lines[2].split()[:2] == ["points", "A"]
-    assert lines[3].split()[0] == "10,000"
+    assert lines[3].split()[0] == points_of(before())
     assert lines[4].split()[0] == "what"
-    assert {line.split()[0] for line in lines[5:]} >= {"appeared"}
+    kinds = [line.split()[0] for line in lines[5:9]]
+    assert kinds == ["vanished", "vanished", "appeared", "appeared"]
 
 
-def test_json(files, capsys):
+def test_programs_get_all(files, capsys):
     assert main([*files, "--diff", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert found["total"]["points_a"] == POINTS
     assert found["total"]["appeared"] > 0
-    assert found["objects"]["appeared"][0].keys() == {"low_m", "high_m", "points"}
+    objects = found["objects"]
+    assert objects["vanished"][0].keys() == {"low_m", "high_m", "points"}
+    assert objects.keys() == {"vanished", "appeared", "newly_seen", "no_longer_known", "moved"}
 
 
 def test_nothing_to_tell(files, capsys):
     assert main([files[0], files[0], "--diff"]) == 0
-    assert "no difference at 10,000 surface points" in capsys.readouterr().out
+    assert f"no difference at {points_of(before())} surface points" in capsys.readouterr().out
