@@ -1,6 +1,11 @@
-import errno
+"""What cannot be opened as a recording, or written as a map, is told with the remedy."""
 
+import errno
+from pathlib import Path
+
+import numpy as np
 import pytest
+from support.recordings.bags import BagKind, drive, messages_for, write_bag
 from triquad_tools.console.command import ToolError
 from triquad_tools.mapping.output import why
 from triquad_tools.recordings.opening import open_recording
@@ -25,3 +30,16 @@ def test_what_is_packed_is_refused_with_the_command_that_unpacks_it(tmp_path, na
 def test_a_full_disk_is_called_that():
     assert why(OSError(errno.ENOSPC, "No space left")).startswith("the disk is full (")
     assert why(PermissionError(errno.EACCES, "denied")) == "[Errno 13] denied"
+
+
+@pytest.mark.parametrize("kind", ["sqlite3", "ros1"])
+def test_a_damaged_bag_is_refused_with_the_remedy(tmp_path: Path, kind: BagKind) -> None:
+    scans, poses = [np.ones((30, 3), np.float32)] * 6, np.tile(np.eye(4), (6, 1, 1))
+    stamps = [10**18 + i * 10**8 for i in range(6)]
+    messages = drive(messages_for(kind), scans, poses, stamps, np.eye(4))
+    path = write_bag(tmp_path / "bag", kind, messages)
+    file = path if path.is_file() else next(f for f in path.iterdir() if f.suffix != ".yaml")
+    file.write_bytes(file.read_bytes()[:-2000])
+    with pytest.raises(ToolError, match="saves what is left") as caught:
+        list(open_recording(path, ReadingOptions()).read(range(6)))
+    assert "\n" not in str(caught.value)
