@@ -1,5 +1,6 @@
 """Bridges to ROS 2 in this process, over a server of the test, and what tests wait for."""
 
+import itertools
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -49,6 +50,17 @@ class Bridged:
         """Return once something holds."""
         bridge = self.bridge
         servers.until(holds, lambda: (bridge.published, bridge.dropped, self.client.status()))
+
+    def send_until(self, send: Callable[[int], None], holds: Callable[[], bool]) -> None:
+        """Send with ever higher numbers until something holds: what is first may not be heard."""
+        numbers = itertools.count(1)
+
+        def holds_now() -> bool:
+            if not holds():
+                send(next(numbers))
+            return holds()
+
+        self.wait_for(holds_now)
 
     def settle(self) -> None:
         self.wait_for(lambda: self.client.status().settled)
