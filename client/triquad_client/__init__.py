@@ -10,7 +10,7 @@ with triquad.connect("tcp/127.0.0.1:7447") as client:
 
 from triquad_format import __version__
 from triquad_format.errors import InvalidInputError, MapFileError, RefusedError, TriquadError
-from triquad_format.records.status import Status
+from triquad_format.records.status import Status, Statuses
 from triquad_format.wire.messages import CheckpointInfo, FieldFit, MapInfo, ResetReply, ServerStatus
 from triquad_format.wire.metrics_messages import (
     CheckpointMetrics,
@@ -120,6 +120,7 @@ __all__ = [
     "SourceReport",
     "Spheres",
     "Status",
+    "Statuses",
     "SyncReport",
     "SyncedMap",
     "TimeHistogram",

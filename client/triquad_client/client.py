@@ -56,6 +56,10 @@ class Client(ScanCalls, MapQueries, MeshCalls, ChangeCalls, DownloadCalls):
         super().__init__(connection)
         self._server = connection
 
+    def __repr__(self) -> str:
+        state = ", closed" if self._connection.is_closed else ""
+        return f"Client(map {self.map_name!r} {self._connection.where}{state})"
+
     def __enter__(self) -> "Client":
         return self
 

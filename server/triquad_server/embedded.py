@@ -111,6 +111,10 @@ class Server:
             self._ask_to_stop()
             raise
 
+    def __repr__(self) -> str:
+        state = ", stopped" if self._run.has_ended else ""
+        return f"Server(map {self.map_name!r} at {self.endpoint}{state})"
+
     def __enter__(self) -> "Server":
         return self
 

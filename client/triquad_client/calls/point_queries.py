@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from triquad_format.wire.limits import MAX_QUERY_POINTS, MAX_SEARCHES
 from triquad_format.wire.messages import SdfRequest
 from triquad_format.wire.query_messages import DistanceRequest, GridRequest, SpheresRequest
+from triquad_map.questions.answer import Answer
 from triquad_map.questions.distance import Distances, Unknown, UnknownLike, with_unknown
 from triquad_map.questions.grid import Grid
 from triquad_map.questions.spheres import Spheres
@@ -21,8 +22,8 @@ from triquad_client.checks import Bounds
 from triquad_client.net.connection import NEWEST, Answering, retried
 
 
-@dataclass(frozen=True)
-class SdfResult(FieldAnswer):
+@dataclass(frozen=True, repr=False)
+class SdfResult(Answer, FieldAnswer):
     """The field and the status of N points, all of it from one epoch."""
 
     epoch: int

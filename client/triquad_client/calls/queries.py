@@ -29,3 +29,6 @@ class PinnedMap(MapQueries):
         self._server = server
         self._epoch = epoch
         self.epoch = epoch
+
+    def __repr__(self) -> str:
+        return f"PinnedMap(epoch {self.epoch})"

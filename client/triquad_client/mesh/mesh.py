@@ -20,11 +20,16 @@ _Y_UP = np.array([(1, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0, 0, 0, 1.0)])
 """The map's axes, of which z points upwards, as those of a glTF scene."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Mesh(Triangles):
     """Triangles of the map frame."""
 
     epoch: int = 0  # number of the published state of the map that it shows; 0: of none
+
+    def __repr__(self) -> str:
+        filled = 0 if self.filled is None else int(self.filled.sum())
+        told = f"{len(self.vertices)} vertices, {len(self.faces)} faces"
+        return f"Mesh({told}{f', {filled} of them filled' if filled else ''}; epoch {self.epoch})"
 
     @classmethod
     def of(cls, triangles: Triangles, epoch: int) -> "Mesh":

@@ -104,6 +104,9 @@ class MeshWatch(WatchedTiles):
         self._closed = threading.Event()
         self._asking: list[zenoh.CancellationToken] = []
 
+    def __repr__(self) -> str:
+        return f"MeshWatch({len(self.tiles)} tiles{'' if self.complete else ', more to come'})"
+
     def __enter__(self) -> "MeshWatch":
         return self
 

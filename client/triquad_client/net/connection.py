@@ -69,6 +69,7 @@ class Connection(Answering):
         *,
         max_download_bytes: int,
         local: bool = False,
+        where: str = "",
     ) -> None:
         self._session = session
         self._id = str(session.info.zid())
@@ -76,6 +77,7 @@ class Connection(Answering):
         # come back into an interpreter that is no longer there.
         self._close = weakref.finalize(self, session.close)
         self.map_name = map_name
+        self.where = where  # of the server, in words
         self.timeout_s = timeout_s
         self.max_download_bytes = max_download_bytes  # of a map file, or the mesh of a box
         self.local = local  # places count from the map's origin

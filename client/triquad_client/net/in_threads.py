@@ -103,6 +103,9 @@ class InThreads:
         self._blocking = blocking
         self._threads = threads
 
+    def __repr__(self) -> str:
+        return f"Async{self._blocking!r}"
+
 
 def awaited(
     method: Callable[Concatenate[Any, ArgumentsP], ResultT],

@@ -56,7 +56,9 @@ def open_connection(
         raise ConnectError(f"cannot connect {where}: {_reason(error)}") from error
     patience = _Patience(timeout_s)
     session = _open(configured, where, patience)
-    connection = Connection(session, map_name, timeout_s, max_download_bytes=most, local=local)
+    connection = Connection(
+        session, map_name, timeout_s, max_download_bytes=most, local=local, where=where
+    )
     try:
         _wait_for_map(connection, patience)
     except BaseException:

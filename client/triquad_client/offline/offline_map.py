@@ -104,6 +104,10 @@ class OfflineMap(MapQueries):
         self.stamp_ns = stamp_ns
         """The time when its epoch was written, nanoseconds since 1970; 0: the file does not say."""
 
+    def __repr__(self) -> str:
+        regions = len(self._seen.regions)
+        return f"OfflineMap({self.name!r}, {regions} regions; epoch {self.epoch})"
+
     def __enter__(self) -> "OfflineMap":
         return self
 

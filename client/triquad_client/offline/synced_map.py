@@ -75,6 +75,9 @@ class SyncedMap(MapQueries):
         self._updating = threading.Lock()
         self._state: _State | None = None
 
+    def __repr__(self) -> str:
+        return f"SyncedMap({self._path}, {self.age_s:.1f} s old; epoch {self.epoch})"
+
     @property
     def epoch(self) -> int:
         """The server's epoch, a published state of its map, that the copy was made from."""

@@ -42,7 +42,7 @@ _UNSEEN_M, _UNSEEN_RAD = 100.0, math.pi
 """Standard deviations along what is not seen at all."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Alignment:
     """The pose where a scan fits best near a guess, in one epoch of the map.
 
@@ -60,6 +60,11 @@ class Alignment:
     iterations: int
     points: int  # that were used, of those given
     epoch: int
+
+    def __repr__(self) -> str:
+        found = "converged" if self.converged else "not converged"
+        fits = f"{self.inlier_share:.0%} on surfaces, rms {self.rms_m:.3g} m"
+        return f"Alignment({found}, {self.points} points: {fits}; epoch {self.epoch})"
 
 
 def align(view: MapView, points: Doubles, guess: Doubles, max_distance_m: float) -> Alignment:

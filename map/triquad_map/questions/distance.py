@@ -11,6 +11,7 @@ from triquad_format.errors import TriquadError
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats
 from triquad_format.records.status import Status
 
+from triquad_map.questions.answer import Answer
 from triquad_map.surface import DISC_RADIUS
 from triquad_map.view import NO_LENGTH_M, REACH_VOXELS, MapView, NearestSurface, asked
 
@@ -79,8 +80,8 @@ class DistanceOptions:
     unknown_distance: bool = False
 
 
-@dataclass(frozen=True)
-class Distances:
+@dataclass(frozen=True, repr=False)
+class Distances(Answer):
     """Distances from N points to the nearest seen surface, metres, map frame, of one epoch.
 
     What was not asked for raises :class:`NotAskedError`.

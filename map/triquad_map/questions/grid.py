@@ -1,12 +1,18 @@
 """Dense grids of distance and status: costmaps and slices."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+from triquad_format.errors import InvalidInputError
 from triquad_format.records.arrays import Bytes, Doubles, Floats
+from triquad_format.records.status import Status, Statuses
 
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.view import MapView
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True)
@@ -29,7 +35,7 @@ class GridShape:
         return np.asarray(self.corner + (cells + 0.5) * self.cell_m, np.float64)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Grid:
     """A map at the middles of a grid's cells, of one epoch."""
 
@@ -37,6 +43,41 @@ class Grid:
     distance_m: Floats  # [x, y, z] to the nearest surface, at most max_distance_m
     status: Bytes  # [x, y, z] Status
     epoch: int
+
+    def __post_init__(self) -> None:
+        """Let statuses be told by their names."""
+        object.__setattr__(self, "status", Statuses.of(self.status))
+
+    def __repr__(self) -> str:
+        cells = " x ".join(map(str, self.shape.counts))
+        told = Statuses.of(self.status).counted()
+        return f"Grid({cells} cells of {self.shape.cell_m:g} m: {told}; epoch {self.epoch})"
+
+    def plot(self, layer: int = 0, axes: "Axes | None" = None) -> "Axes":
+        """Draw a level layer of the grid, as distances in metres; unknown cells stay empty.
+
+        Args:
+            layer: which one, the lowest is 0.
+            axes: where to draw; ``None``: axes of a new figure.
+
+        Raises:
+            InvalidInputError: matplotlib is not installed.
+            IndexError: the grid has no such layer.
+        """
+        try:
+            from matplotlib import pyplot
+        except ModuleNotFoundError as error:
+            raise InvalidInputError("plot() needs matplotlib: pip install matplotlib") from error
+        drawn = pyplot.subplots()[1] if axes is None else axes
+        (x, y, z), cell_m = self.shape.corner, self.shape.cell_m
+        sides = np.array(self.shape.counts[:2]) * cell_m
+        known = np.where(self.status == Status.UNKNOWN, np.nan, self.distance_m)[:, :, layer]
+        extent = (x, x + sides[0], y, y + sides[1])
+        image = drawn.imshow(known.T, origin="lower", extent=extent, cmap="viridis")
+        drawn.figure.colorbar(image, ax=drawn, label="distance to surface, m")
+        height_m = z + (layer % self.shape.counts[2] + 0.5) * cell_m
+        drawn.set(xlabel="x, m", ylabel="y, m", title=f"z = {height_m:g} m, epoch {self.epoch}")
+        return drawn
 
 
 def grid(view: MapView, shape: GridShape, max_distance_m: float) -> Grid:

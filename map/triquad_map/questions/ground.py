@@ -6,6 +6,7 @@ import numpy as np
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Longs
 from triquad_format.records.status import Status
 
+from triquad_map.questions.answer import Answer
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.questions.rays import trace
 from triquad_map.view import REACH_VOXELS, MapView
@@ -17,8 +18,8 @@ the way down. Down to as much overhang, the top edge of a wall bears: it leans a
 _DOWN = np.array([0.0, 0.0, -1.0])
 
 
-@dataclass(frozen=True)
-class Ground:
+@dataclass(frozen=True, repr=False)
+class Ground(Answer):
     """The ground below N points, metres, map frame, of one epoch.
 
     ``SURFACE``: the first surface below the point, which is its ground. ``FREE``: none as far down

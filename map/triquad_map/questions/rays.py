@@ -1,11 +1,13 @@
 """The ranges of rays: a simulated lidar, or what a localiser expects to see."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats
 from triquad_format.records.status import Status
 
+from triquad_map.questions.answer import Answer
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.view import REACH_VOXELS, MapView
 
@@ -20,14 +22,15 @@ _LOOK_AHEAD_M = 3.0
 """The distance of a search for surface: farther costs more than shorter steps."""
 
 
-@dataclass(frozen=True)
-class RayRanges:
+@dataclass(frozen=True, repr=False)
+class RayRanges(Answer):
     """The ranges of N rays, metres, of one epoch.
 
     ``SURFACE``: to a seen surface. ``UNKNOWN``: to where unknown space begins. ``FREE``: to the
     largest range, through space that was seen to be free (or, where asked for, unknown).
     """
 
+    _things: ClassVar[str] = "rays"
     range_m: Floats  # [N]
     status: Bytes  # [N] Status
     epoch: int

@@ -2,10 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from triquad_format.records.arrays import Bools, Doubles, Floats
 
+from triquad_map.questions.answer import Answer
 from triquad_map.questions.distance import (
     DistanceOptions,
     Unknown,
@@ -16,14 +18,15 @@ from triquad_map.questions.distance import (
 from triquad_map.view import REACH_VOXELS, MapView
 
 
-@dataclass(frozen=True)
-class Segments:
+@dataclass(frozen=True, repr=False)
+class Segments(Answer):
     """The contacts of a ball on N segments, metres, of one epoch.
 
     Places are distances along the segment from its start. ``clearance_m`` is that of the ball's
     centre, up to where it first touches a surface; it is right within half a step of half a voxel.
     """
 
+    _things: ClassVar[str] = "segments"
     length_m: Floats  # [N]
     blocked: Bools  # [N] the ball touches a seen surface
     contact_m: Floats  # [N] where it first does; the length where it does not
@@ -41,6 +44,9 @@ class Segments:
             ValueError: ``unknown`` is no :class:`Unknown`.
         """
         return are_free("segment", self.blocked, self.meets_unknown, unknown)
+
+    def _told(self) -> str:
+        return f"{self.blocked.sum()} blocked, {self.meets_unknown.sum()} meet unknown space"
 
 
 @dataclass(frozen=True)

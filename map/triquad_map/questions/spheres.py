@@ -1,11 +1,13 @@
 """The status of spheres: a robot's body, made of spheres."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from triquad_format.records.arrays import Bools, Bytes, Doubles
 from triquad_format.records.status import Status
 
+from triquad_map.questions.answer import Answer
 from triquad_map.questions.distance import (
     DistanceOptions,
     Unknown,
@@ -16,14 +18,15 @@ from triquad_map.questions.distance import (
 from triquad_map.view import MapView
 
 
-@dataclass(frozen=True)
-class Spheres:
+@dataclass(frozen=True, repr=False)
+class Spheres(Answer):
     """The content of N spheres, of one epoch.
 
     ``SURFACE``: a seen surface reaches into the sphere, or it lies behind one. ``UNKNOWN``: none
     does, but unknown space. ``FREE``: all of it was seen to be free.
     """
 
+    _things: ClassVar[str] = "spheres"
     status: Bytes  # [N] Status
     epoch: int
 

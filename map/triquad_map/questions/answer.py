@@ -1,0 +1,76 @@
+"""The behaviour that all answers about many things share."""
+
+import dataclasses
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+
+import numpy as np
+from triquad_format.errors import InvalidInputError
+from triquad_format.records.arrays import Bools, Ints, Longs
+from triquad_format.records.status import Status, Statuses
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+AnswerT = TypeVar("AnswerT", bound="Answer")
+_AXES = "xyz"
+
+
+class Answer:
+    """An answer about N things: a dataclass whose arrays [N, ...] have a row for each.
+
+    ``len(answer)`` is N, and ``answer[i]``, with a number, a slice, numbers or a mask, is the
+    answer about these alone.
+    """
+
+    _things: ClassVar[str] = "points"
+    epoch: int
+
+    def __post_init__(self) -> None:
+        """Let statuses be told by their names."""
+        if (status := getattr(self, "status", None)) is not None:
+            object.__setattr__(self, "status", Statuses.of(status))
+
+    def __len__(self) -> int:
+        return next(map(len, self._arrays().values()))
+
+    def __getitem__(self: AnswerT, which: int | slice | Ints | Longs | Bools) -> AnswerT:
+        rows = np.atleast_1d(np.arange(len(self))[which])
+        parts = {name: array[rows] for name, array in self._arrays().items()}
+        return dataclasses.replace(self, **parts)  # type: ignore[type-var]
+
+    def __repr__(self) -> str:
+        told = f"{len(self)} {self._things}"
+        if len(self):
+            told += f": {self._told()}"
+        return f"{type(self).__name__}({told}; epoch {self.epoch})"
+
+    def to_pandas(self) -> "pd.DataFrame":
+        """Return a table with a row for each thing, and three columns for each vector.
+
+        Raises:
+            InvalidInputError: pandas is not installed.
+        """
+        try:
+            import pandas as pd
+        except ModuleNotFoundError as error:
+            raise InvalidInputError("to_pandas() needs pandas: pip install pandas") from error
+        columns: dict[str, Any] = {}
+        for field, array in self._arrays().items():
+            name = field.removeprefix("_")
+            if isinstance(array, Statuses):
+                columns[name] = pd.Categorical.from_codes(array, [one.name for one in Status])
+            elif array.ndim == 1:
+                columns[name] = array
+            else:
+                columns |= {f"{name}_{axis}": array[:, i] for i, axis in enumerate(_AXES)}
+        return pd.DataFrame(columns)
+
+    def _told(self) -> str:
+        """Return how many things are of which kind."""
+        status: Statuses = self.status  # type: ignore[attr-defined]
+        return status.counted()
+
+    def _arrays(self) -> dict[str, np.ndarray]:
+        """Return the arrays by the names of their fields; what was not asked for has none."""
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}  # type: ignore[arg-type]
+        return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
