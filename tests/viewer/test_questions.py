@@ -1,6 +1,7 @@
 """What slices, borders of unknown space and paths say, against the map that they are of."""
 
 from collections.abc import Iterator
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.maps.exact_maps import SEEN_M, exact_map, flat
 from triquad_client import OfflineMap, Status
-from triquad_tools.viewer.page.page import Focus
+from triquad_tools.viewer.page.page import Focus, surface_along
 from triquad_tools.viewer.questions.cell_box import CellBox
 from triquad_tools.viewer.questions.clicks import Path
 from triquad_tools.viewer.questions.slice import Slice
@@ -42,6 +43,23 @@ def test_a_slice_is_asked_and_drawn_where_it_is(ground: OfflineMap, axis: int) -
     expected = np.array(box.corner)
     expected[axis] = 0.9
     np.testing.assert_allclose(corner, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(("beyond_m", "is_met"), [(-0.5, True), (0.15, True), (1.0, False)])
+def test_a_click_snaps_to_surface_within_a_voxel(
+    ground: OfflineMap, beyond_m: float, is_met: bool
+) -> None:
+    page = SimpleNamespace(
+        source=SimpleNamespace(queries=ground, sizes=SimpleNamespace(cell_m=0.5 * ground.leaf_m)),
+        focus=FOCUS,
+        eye=np.array([0.0, 0, 5]),
+    )
+    origin = np.array([SEEN_M + beyond_m, 0.03, 1.5])
+    met = surface_along(page, origin, np.array([0.0, 0, -2]))  # type: ignore[arg-type]
+    assert (met is not None) == is_met
+    if met is not None:
+        assert abs(met[2] - GROUND_M) < 0.05
+        assert np.linalg.norm(met[:2] - origin[:2]) <= ground.leaf_m + 1e-6
 
 
 @given(st.integers(0, 2**32 - 1))

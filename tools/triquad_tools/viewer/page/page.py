@@ -2,6 +2,7 @@
 
 import math
 import threading
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -85,6 +86,8 @@ class Page:
 def surface_along(page: Page, origin: Doubles, towards: Doubles) -> Doubles | None:
     """Return the first surface [3], metres, map frame, whose front a ray meets; else ``None``.
 
+    A ray through a hole as small as a voxel meets what is around it.
+
     Args:
         page: whose map is shown.
         origin: [3] metres, map frame.
@@ -96,6 +99,23 @@ def surface_along(page: Page, origin: Doubles, towards: Doubles) -> Doubles | No
     direction, queries = towards / np.linalg.norm(towards), page.source.queries
     away_m = float(np.linalg.norm(page.focus.middle - page.eye))
     start = origin + max(away_m - _BEFORE_M, 0.0) * direction
+    cell_m = page.source.sizes.cell_m
+    places = (start, *(start + side_m for side_m in sides(direction, (cell_m, 2 * cell_m))))
+    return next((met for at in places if (met := front(queries, at, direction)) is not None), None)
+
+
+def sides(direction: Doubles, lengths: Sequence[float]) -> Iterator[Doubles]:
+    """Yield eight vectors [3] around a unit vector, at right angles to it, for each length."""
+    across = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
+    across /= np.linalg.norm(across)
+    for length in lengths:
+        for turn in np.arange(8) * (math.pi / 4):
+            up = np.cross(direction, across)
+            yield length * (math.cos(turn) * across + math.sin(turn) * up)
+
+
+def front(queries: MapQueries, start: Doubles, direction: Doubles) -> Doubles | None:
+    """Return the first surface [3] whose front a ray from ``start`` [3] meets; else ``None``."""
     for _ in range(_BACKS):
         met = _first_surface(queries, start, direction)
         if met is None:
