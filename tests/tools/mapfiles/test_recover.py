@@ -184,6 +184,19 @@ def test_truncated_files(recovered: Recover, share: float) -> None:
     assert_answers(recovery)
 
 
+def test_what_is_left_of_a_file_is_a_map_of_a_part_of_the_world(recovered: Recover) -> None:
+    record = dataclasses.replace(without_training(RECORD), regions=RECORD.regions[:1])
+    data = file_bytes(record)
+    whole = RecordedView(record).status(places()) != Status.UNKNOWN
+    shares = []
+    for left in (0.5, 0.75, 0.9):
+        kept = recovered(data[: int(left * len(data))]).record
+        answer = RecordedView(kept).status(places()) != Status.UNKNOWN
+        assert not (answer & ~whole).any()
+        shares.append(float(answer.sum() / whole.sum()))
+    assert 0.1 < shares[0] < shares[1] < shares[2] < 1
+
+
 def test_a_file_cut_within_its_index_loses_nothing(recovered: Recover) -> None:
     end = chunks(DATA)[-1].end
     for cut in (end, end + 10, len(DATA) - 1):

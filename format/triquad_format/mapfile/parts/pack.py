@@ -38,6 +38,7 @@ from triquad_format.mapfile.parts.part import (
     split_integers,
     square_shift,
 )
+from triquad_format.records import morton
 from triquad_format.records.arrays import Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.region import (
@@ -96,18 +97,32 @@ def pack_record(
 
 
 def pack_region(region: Region, settings: FieldSettings, feature_dtype: str) -> Iterator[Part]:
-    """Yield the parts of a checked region, in the order of the file.
+    """Yield the parts of a checked region, in the order of the file: place by place.
 
+    What is left of a file that was cut off is then a map of a part of the world.
     ``feature_dtype``, one of ``FLOATS``, is for features that are not integers.
 
     Raises:
         FormatError: features do not fit ``feature_dtype``; the text names the region.
     """
     yield _pack_head(region)
-    yield from _pack_vertices(region, settings, feature_dtype)
-    yield from _pack_evidence(region)
+    vertices = {part.key: part for part in _pack_vertices(region, settings, feature_dtype)}
+    for evidence in _pack_evidence(region):
+        for key in _squares_of(evidence.key):
+            if key in vertices:
+                yield vertices.pop(key)
+        yield evidence
+    yield from vertices.values()
     if region.training is not None:
         yield from _pack_training(region, region.training, settings)
+
+
+def _squares_of(cube: PartKey) -> Iterator[PartKey]:
+    """Yield the keys of the vertices that the evidence in a cube needs, but for its border."""
+    corner = morton.decode(np.array([cube.cell]), 3)
+    for plane, axes in enumerate(AXES):
+        (square,) = morton.encode(corner[:, list(axes)])
+        yield PartKey(VERTICES, cube.region, plane, int(square))
 
 
 def _region_part(key: PartKey, fields: Mapping[str, object]) -> Part:
