@@ -195,7 +195,9 @@ class Service:
             failed=failed,
             listeners=MapListeners(
                 scan_taken=(
-                    lambda scan, rays: warnings.add(scan.source, scan.points, rays),
+                    lambda scan, rays: warnings.add(
+                        scan.source, scan.points, rays, stamp_ns=scan.stamp_ns
+                    ),
                     trails.add,
                 ),
                 published=(self._surface.add,),

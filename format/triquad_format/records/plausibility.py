@@ -13,11 +13,12 @@ _OUTRUN = 3.0
 JUMP_M = 0.15  # less than by this, two that publish the same poses may differ
 _JUMPS, _SHARE_OF_JUMPS = 5, 0.05  # as many are of two, rather than a few wrong poses of one
 _RANGES = 1000  # of a scan, at most, of which the median is taken
+_ZERO = np.zeros(3)
 
 
-def median_range_m(points: NDArray[np.floating]) -> float:
-    """Return how far half of the points [N, 3] are from 0, 0, 0; 0 where none is finite."""
-    ranges = np.linalg.norm(points[:: max(1, len(points) // _RANGES)], axis=1)
+def median_range_m(points: NDArray[np.floating], origin: Doubles = _ZERO) -> float:
+    """Return how far half of the points [N, 3] are from an origin [3]; 0 where none is finite."""
+    ranges = np.linalg.norm(points[:: max(1, len(points) // _RANGES)] - origin, axis=1)
     return float(np.median(np.append(ranges[np.isfinite(ranges)], 0.0)))
 
 
@@ -35,7 +36,7 @@ def wrong_units(range_m: float, places: Doubles) -> str | None:
     if not 0 < _OUTRUN * range_m < step_m:
         return None
     return (
-        f"from scan to scan the sensor moves {step_m:.3g} m, while half of the points are nearer "
+        f"from scan to scan the sensor moves {step_m:.0f} m, while half of the points are nearer "
         f"than {range_m:.2g} m: write the positions of the poses in metres, as those of points"
     )
 

@@ -45,7 +45,7 @@ class _Points:
     dropped: dict[str, int] = field(default_factory=lambda: {"too_near": 0, "too_far": 0})
     ranges_m: list[float] = field(default_factory=list)  # median of each scan, of what is used
     sent_ranges_m: list[float] = field(default_factory=list)  # the same of all that was sent
-    places: list[Doubles] = field(default_factory=list)  # [3] of the sensor, of each scan
+    places: list[tuple[int, Doubles]] = field(default_factory=list)  # stamp and place of each scan
 
 
 @dataclass
@@ -75,13 +75,14 @@ class ScanWarnings:
         # By source and cause, the newest last.
         self._warnings: OrderedDict[tuple[str, str], _Warning] = OrderedDict()
 
-    def add(self, source: str, sent: Floats, rays: ScanRays) -> None:
+    def add(self, source: str, sent: Floats, rays: ScanRays, *, stamp_ns: int) -> None:
         """Record that a scan was taken in.
 
         Args:
             source: the name of the sensor.
             sent: its points [N, 3], sensor frame.
             rays: what of it is used.
+            stamp_ns: when it was taken.
         """
         with self._lock:
             points = self._points.setdefault(source, _Points())
@@ -91,11 +92,11 @@ class ScanWarnings:
             points.scans += 1
             points.sent += len(sent)
             points.sent_ranges_m.append(median_range_m(sent))
-            points.places.append(rays.origin)
+            points.places.append((stamp_ns, rays.origin))
             for reason in points.dropped:
                 points.dropped[reason] += rays.points_dropped.get(reason, 0)
             if len(rays.ends):
-                points.ranges_m.append(median_range_m(rays.ends - rays.origin))
+                points.ranges_m.append(median_range_m(rays.ends, rays.origin))
 
     def check(self) -> None:
         """Log the warnings that are due and were not logged lately."""
@@ -199,12 +200,16 @@ class ScanWarnings:
     def _check_units(self, source: str, points: _Points) -> bool:
         """Return whether points or poses are not in metres, where all else would mislead."""
         range_m = float(np.median(points.sent_ranges_m))
-        if (told := wrong_units(range_m, np.array(points.places))) is not None:
+        if (
+            told := wrong_units(range_m, np.array([place for _, place in points.places]))
+        ) is not None:
             self._warn(source, "units", told)
         return told is not None
 
     def _check_places(self, source: str, points: _Points) -> None:
-        count, size_m = jumps(np.arange(len(points.places)), np.array(points.places))
+        stamps, places = zip(*sorted(points.places, key=lambda one: one[0]), strict=True)
+        times = np.array(stamps) + np.arange(len(stamps))  # ns: equal ones follow each other
+        count, size_m = jumps(times, np.array(places))
         if count:
             self._warn(
                 source,
