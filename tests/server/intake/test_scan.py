@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from triquad_server.errors import ScanRefusedError
-from triquad_server.intake.rays import usable_rays
+from triquad_server.intake.rays import RobotBox, usable_rays
 from triquad_server.settings import ScanSettings, SourceSettings
 
 SETTINGS = ScanSettings()
@@ -125,3 +125,21 @@ def test_points_on_the_robot_are_told_from_near_ones() -> None:
     rays = usable_rays(scan, pose(), SETTINGS, source=source)
     np.testing.assert_allclose(rays.ends, [[3.1, 0, 0]], atol=1e-6)
     assert rays.points_dropped == {"on_robot": 3, "too_near": 1, "no_range": 1}
+
+
+def test_the_voxels_of_a_turned_robot_are_those_whose_centres_it_holds() -> None:
+    turn = pose()
+    turn[:3, :3] = Rotation.from_euler("xyz", [0.2, -0.3, 0.9]).as_matrix()
+    turn[:3, 3] = 812.3, -41.7, 3.9
+    low, high = np.array([-1.0, -0.5, -0.4]), np.array([0.7, 0.6, 0.2])
+    centres = RobotBox(low, high, turn).voxel_centres(0.1)
+    every = np.stack(np.meshgrid(*[np.arange(-25, 25)] * 3), -1).reshape(-1, 3)
+    every = (np.floor(turn[:3, 3] / 0.1) + every + 0.5) * 0.1
+    in_box = (every - turn[:3, 3]) @ turn[:3, :3]
+    held = every[((in_box >= low) & (in_box <= high)).all(axis=1)]
+    assert len(held) > 500
+
+    def voxels(places: np.ndarray) -> set[tuple[int, ...]]:
+        return {tuple(voxel) for voxel in np.floor(places / 0.1).astype(int).tolist()}
+
+    assert voxels(centres) == voxels(held)
