@@ -99,3 +99,18 @@ def test_a_thread_that_computes_for_long_is_healthy_until_that_is_absurd() -> No
         assert health.mapping_problem(stuck_s=STUCK_S / 2 - COMPUTED_S / 2) is not None
         clock.now_s += ENDLESS_S
         assert health.mapping_problem(stuck_s=2 * ENDLESS_S) is not None
+
+
+def test_a_thread_that_comes_to_no_end_is_a_problem_until_it_does() -> None:
+    clock = Clock()
+    with running(Mapper("test", settings(), "cpu"), clock) as (thread, health):
+        with at_work(thread):
+            clock.now_s += STUCK_S - 1
+            assert health.mapping_problem() is None
+            clock.now_s += 2
+            problem = health.mapping_problem()
+            told = f"mapping makes no progress: it is at commands since {STUCK_S + 1:.0f} s"
+            assert problem == told
+            assert health.problem() == problem
+        thread.call(lambda mapper: mapper.settled)
+        assert health.problem() is None
