@@ -4,8 +4,6 @@ from support.maps.small_world import settings, world
 from triquad_server.epochs.epoch import buffers_of
 from triquad_server.mapping.mapper import Mapper
 
-RNG = np.random.default_rng(0)
-
 
 def total(part: object) -> int:
     return sum(buffers_of(part).values())
