@@ -6,6 +6,7 @@
 # make pretrained   train the MLP that regions begin with, on simulated streets: 10 minutes
 # make bench     how fast and how good triquad is on this machine; PART=core: one part of it
 # make campaign  try for 5 minutes to break a server and its files; CAMPAIGN_MINUTES=60: for an hour
+# make wheel     build the wheel, and try it in an environment of its own
 # make demo      set up a virtual environment and map a street, end to end
 VENV ?= .venv
 PYTHON ?= python3
@@ -30,7 +31,7 @@ define pip_install
 	  > $(PIP_LOG) 2>&1 || { tail -n 30 $(PIP_LOG); exit 1; }
 endef
 
-.PHONY: bench campaign check clean demo docs kernels pictures pretrained test test-long
+.PHONY: bench campaign check clean demo docs kernels pictures pretrained test test-long wheel
 
 demo: $(INSTALLED_DEMO)
 	$(BIN)/triquad-demo --out demo-out
@@ -79,6 +80,15 @@ $(INSTALLED_DEMO): pyproject.toml constraints.txt
 $(INSTALLED): $(INSTALLED_DEMO)
 	$(call pip_install,dev)
 	touch $@
+
+# What is in the wheel, and nothing of this folder, maps a few scans in an environment of its own.
+wheel:
+	rm -rf dist
+	$(PYTHON) -m venv dist/try
+	dist/try/bin/python -m pip wheel -q --no-deps $(PIP_FLAGS) -w dist .
+	dist/try/bin/python -m pip install -q --no-compile $(PIP_FLAGS) -c constraints.txt "$$(ls dist/*.whl)[demo]"
+	cd dist && try/bin/triquad-demo --scans 5 --out demo-out
+	rm -rf dist/try dist/demo-out
 
 pretrained: $(INSTALLED)
 	$(BIN)/python -m bench.studies.pretraining

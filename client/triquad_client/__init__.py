@@ -135,3 +135,8 @@ __all__ = [
     "empty_returns",
     "open_map",
 ]
+
+
+def __dir__() -> list[str]:
+    """Return what is public."""
+    return __all__
