@@ -204,6 +204,12 @@ def test_the_border_of_unknown_space_is_drawn_and_goes(mapped: Looked) -> None:
     wait_until(page, lambda: share_where(page, is_pink) <= before + 0.001, "nothing is pink")
 
 
+def test_the_view_tells_its_scale_and_direction(mapped: Looked) -> None:
+    page, _ = mapped
+    expect(page.get_by_text("m in the middle")).to_be_visible(timeout=TIMEOUT_MS)
+    expect(page.get_by_text("x, looking to")).to_be_visible()
+
+
 def test_a_click_asks_the_map(mapped: Looked) -> None:
     page, client = mapped
     control(page, "Raised by (m)").fill("0.75")

@@ -14,6 +14,7 @@ from triquad_tools.viewer.questions.cell_box import CellBox
 from triquad_tools.viewer.questions.clicks import Path
 from triquad_tools.viewer.questions.slice import Slice
 from triquad_tools.viewer.questions.unknown_space import ask_boundary, border_faces
+from triquad_tools.viewer.view_panel import round_length, turned_back
 
 GROUND_M = 0.1  # in the middle of a voxel
 FOCUS = Focus(np.array([0.3, -0.4, 1.2]), 16.0)
@@ -60,6 +61,25 @@ def test_a_click_snaps_to_surface_within_a_voxel(
     if met is not None:
         assert abs(met[2] - GROUND_M) < 0.05
         assert np.linalg.norm(met[:2] - origin[:2]) <= ground.leaf_m + 1e-6
+
+
+@given(st.floats(1e-3, 1e6))
+def test_a_scale_is_a_round_length_that_fits(most_m: float) -> None:
+    length_m = round_length(most_m)
+    assert 0.39 * most_m < length_m <= most_m
+    assert f"{length_m:.3e}"[:5] in ("1.000", "2.000", "5.000")
+
+
+@pytest.mark.parametrize("back", [(3.0, -4, 12), (0, 0, 5), (0, 0, -5), (-1, 0, 0)])
+def test_a_view_from_a_side_keeps_its_distance(back: tuple[float, float, float]) -> None:
+    for level in (True, False):
+        turned = turned_back(np.array(back), level=level)
+        assert np.linalg.norm(turned) == pytest.approx(np.linalg.norm(back))
+        rise_deg = np.degrees(np.arcsin(turned[2] / np.linalg.norm(turned)))
+        assert 3 < rise_deg < 8 if level else rise_deg > 89.9
+        if back[0]:
+            across = turned[0] * back[1] - turned[1] * back[0]
+            assert across == pytest.approx(0.0, abs=1e-9), "it is not turned round"
 
 
 @given(st.integers(0, 2**32 - 1))

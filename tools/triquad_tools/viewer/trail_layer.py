@@ -4,6 +4,7 @@ import numpy as np
 import viser
 from matplotlib.colors import to_rgb
 from triquad_client import Client, ScanSource, ServerStatus, SourceReport
+from triquad_format.records.arrays import Doubles
 
 from triquad_tools.viewer.page.layer import Layer
 from triquad_tools.viewer.page.legends import problem_html, text_html
@@ -25,9 +26,11 @@ class TrailLayer(Layer):
         self._client = client
         self._report: SourceReport | None = None
         self._shown: tuple[object, ...] = ()
+        self._robot: Doubles | None = None  # where the robot was seen last, [3] metres, map frame
         with self.folder:
             self._trails = page.gui.add_checkbox("Trail", True)
             self._scans = page.gui.add_checkbox("Newest scan", True)
+            self._follows = page.gui.add_checkbox("Follow the robot", False)
             self.add_text()
         self.start(self._trails, self._scans)
 
@@ -38,6 +41,7 @@ class TrailLayer(Layer):
         problems = (problem_html(text or "") for text in (status.store_error, status.warnings))
         lines = (*_state(status), *(_line(name, source) for name, source in report.sources.items()))
         self.tell(text_html("\n".join(lines)) + "".join(problems))
+        self._follow(report)
         wanted = (report.server, report.revision, self._trails.value, self._scans.value)
         if wanted == self._shown:
             return
@@ -46,6 +50,18 @@ class TrailLayer(Layer):
             marks += self._marks_of(source, _COLOURS[number % len(_COLOURS)])
         self.draw(marks)
         self._shown = wanted
+
+    def _follow(self, report: SourceReport) -> None:
+        """Move the camera as the robot did since: the source whose newest scan is the newest."""
+        scans = [source.newest for source in report.sources.values() if source.newest is not None]
+        if not scans:
+            return
+        before, self._robot = self._robot, max(scans, key=lambda scan: scan.stamp_ns).position_m
+        if before is not None and self._follows.value and (before != self._robot).any():
+            eye, middle = self.page.eye, self.page.focus.middle
+            with self.page.client.atomic():
+                self.page.client.camera.position = self.page.in_scene(eye + self._robot - before)
+                self.page.client.camera.look_at = self.page.in_scene(middle + self._robot - before)
 
     def _marks_of(self, source: ScanSource, colour: str) -> list[viser.SceneNodeHandle]:
         marks: list[viser.SceneNodeHandle] = []

@@ -21,6 +21,7 @@ from triquad_tools.viewer.questions.unknown_space import UnknownSpace
 from triquad_tools.viewer.sources import History, LiveSource, MapSource
 from triquad_tools.viewer.time_panel import TimePanel
 from triquad_tools.viewer.trail_layer import TrailLayer
+from triquad_tools.viewer.view_panel import ViewPanel
 
 _OF_ONE_WHO_LEFT = ("Queued a .* on a closed connection", "Attempted to remove an? already removed")
 """Warnings of viser that come when a browser leaves while something is drawn or removed."""
@@ -35,7 +36,10 @@ def open_page(client: viser.ClientHandle, shown: MapSource | History) -> ExitSta
         title.content = text_html(source.title)
         if isinstance(shown, History):
             parts.callback(TimePanel(page, shown).close)
-        for part in (MeshLayer, SliceQuestion, UnknownSpace, Clicks):
+        mesh = MeshLayer(page)
+        parts.callback(mesh.close)
+        parts.callback(ViewPanel(page, mesh).close)
+        for part in (SliceQuestion, UnknownSpace, Clicks):
             parts.callback(part(page).close)
         if isinstance(source, LiveSource):
             parts.callback(TrailLayer(page, source.client).close)

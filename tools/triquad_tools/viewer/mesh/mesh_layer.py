@@ -83,6 +83,11 @@ class OverviewCamera:
                 camera.position = eye
                 camera.look_at = target
 
+    def release(self) -> None:
+        """Follow again, whoever moved the camera."""
+        self._taken = False
+        self._eyes.append(np.array(self._page.client.camera.position))
+
     def _moved(self, camera: viser.CameraHandle) -> None:
         away_m = np.linalg.norm(np.array(self._eyes) - camera.position, axis=1)
         self._taken |= bool(away_m.min() > _SAME * (1.0 + np.linalg.norm(camera.position)))
@@ -117,6 +122,12 @@ class MeshLayer(Layer):
         for handle in (*self._replaced, *(drawn.handle for drawn in self._shown.values())):
             handle.remove()
         self._tiles.close()
+
+    def show_all(self) -> None:
+        """Look at all that was seen."""
+        self._camera.release()
+        self._framed = False
+        self.wake()
 
     def refresh(self) -> None:
         """Draw what came since the last round, and remove what it replaces."""

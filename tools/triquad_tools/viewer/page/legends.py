@@ -51,6 +51,22 @@ def lines_html(*lines: tuple[str, str]) -> str:
     )
 
 
+def scale_html(length_m: float, pixels: float) -> str:
+    """Return a bar of so many pixels, which is as long as ``length_m`` in the middle of a scene."""
+    bar = f"width: {pixels:.0f}px; height: 0.4em; border: 2px solid; border-top: 0"
+    return f'<div style="{_TEXT}"><div style="{bar}"></div>{length_m:g} m in the middle</div>'
+
+
+def compass_html(turn_deg: float) -> str:
+    """Return an arrow along the map's x axis, on a screen that shows ``turn_deg`` as up.
+
+    The angle is counted from the x axis towards the y axis.
+    """
+    arrow = f"display: inline-block; transform: rotate({turn_deg - 90.0:.0f}deg)"
+    told = f"x, looking to {turn_deg:.0f}° from it"
+    return f'<div style="{_TEXT}"><span style="{arrow}">⟶</span> {told}</div>'
+
+
 def text_html(text: str) -> str:
     """Return a text, line by line; nothing where it is empty."""
     shown = f'<div style="{_TEXT}; white-space: pre-line">{_shown(text)}</div>'
