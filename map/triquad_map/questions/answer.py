@@ -53,7 +53,9 @@ class Answer:
         try:
             import pandas as pd
         except ModuleNotFoundError as error:
-            raise InvalidInputError("to_pandas() needs pandas: pip install pandas") from error
+            raise InvalidInputError(
+                "to_pandas() needs pandas: install triquad[notebook]"
+            ) from error
         columns: dict[str, Any] = {}
         for field, array in self._arrays().items():
             name = field.removeprefix("_")

@@ -22,7 +22,18 @@ DISTRIBUTIONS = {
     "pydantic_core": "pydantic",
     "prometheus_client": "prometheus-client",
 }
-EVERY_EXTRA = ("fast", "gpu", "keys", "mesh", "preview", "ros", "server", "tools", "viewer")
+EVERY_EXTRA = (
+    "fast",
+    "gpu",
+    "keys",
+    "mesh",
+    "notebook",
+    "preview",
+    "ros",
+    "server",
+    "tools",
+    "viewer",
+)
 
 
 def declared(*extras: str) -> set[str]:
@@ -56,7 +67,7 @@ def imported(folder: str) -> set[str]:
     [
         ("format", ()),
         ("client", ("mesh",)),
-        ("map", ("fast", "preview")),
+        ("map", ("fast", "notebook", "preview")),
         ("server", ("fast", "gpu", "preview", "server")),
         ("tools", EVERY_EXTRA),
         ("tools/triquad_tools/credentials", ("keys",)),

@@ -76,7 +76,7 @@ def test_a_bag_gives_the_map_of_its_folder(tmp_path: Path, whole: Path) -> None:
 
 
 def test_surface_is_continued_only_where_that_is_marked(
-    tmp_path: Path, settings: str, whole: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, whole: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name in ("map.triquad", "map.stl"):
         assert main(["recording", str(tmp_path / name), "--fill", "1"]) == 2

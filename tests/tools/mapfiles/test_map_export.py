@@ -89,7 +89,7 @@ def test_refusals(map_file, tmp_path, capsys):
 
     refused("'0.001' is not a number in range: use 0.01 to 10", "mesh.ply", "--cell", "0.001")
     refused(".triquad, .ply, .glb, .obj, .stl, .png", "mesh.gltf")
-    refused("--fill is of meshes that can mark it, .ply, .glb, .obj", "a.stl", "--fill", "1")
+    refused("--fill is of what can mark it, .ply, .glb, .obj, .png", "a.stl", "--fill", "1")
     refused("'6' is not a number in range: use 0 to 5", "mesh.ply", "--fill", "6")
     refused("of map files", "mesh.ply", "--max-error", "0.002")
     refused("nowhere is not a folder", "nowhere/mesh.ply")
