@@ -19,7 +19,7 @@ PARTS = (
     Part("messages", "messages", messages.run, goal=200_000, per_turn=10_000),
     Part("files", "files", files.run, goal=50_000, per_turn=2_500),
     Part("kills", "kills", kills.run, goal=200, per_turn=10),
-    Part("busy", "kills beside busy processes", busy.run, goal=50, per_turn=5),
+    Part("busy", "kills on a busy machine", busy.run, goal=50, per_turn=5),
     Part("disk", "writes on a full disk", disk.run, goal=2_000, per_turn=100),
     Part("clock", "jumps of the clock", clock.run, 400, per_turn=20, missing=clock.missing),
     Part("cuts", "cut connections", cuts.run, goal=1_000, per_turn=50),

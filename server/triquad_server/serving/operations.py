@@ -75,7 +75,7 @@ class _LaneWorkers:
 
 
 _LANES = {
-    Lane.QUESTIONS: _LaneWorkers(max(2, THREADS), gives_way_s=0.5),
+    Lane.QUESTIONS: _LaneWorkers(max(2, THREADS), gives_way_s=1.0),
     Lane.LONG_QUESTIONS: _LaneWorkers(max(2, THREADS), NICENESS, gives_way_s=0.0),
     Lane.ADMINISTRATION: _LaneWorkers(2),
     Lane.MESH: _LaneWorkers(1, NICENESS),
