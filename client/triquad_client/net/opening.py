@@ -119,12 +119,14 @@ def _wait_for_map(connection: Connection, patience: _Patience) -> None:
     name = connection.map_name
     # Asked for by name first: there may be any number of others.
     while not connection.maps(name):
-        stage, others = connection.start_stage(), connection.maps()
+        stage = connection.start_stage()
         if stage is not None:
             told = f"the server of map {name!r} is starting: {stage}"
             if not patience.wait(told):
                 raise ConnectError(f"{told}; connect again, or with a longer timeout_s")
-        elif others or not patience.wait(f"no server has a map {name!r} yet"):
+        elif (others := connection.maps()) or not patience.wait(
+            f"no server has a map {name!r} yet"
+        ):
             raise UnknownMapError(name, others)
 
 

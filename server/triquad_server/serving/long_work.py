@@ -1,7 +1,7 @@
 """Work that takes seconds, and minutes on a busy machine, such as writing a checkpoint.
 
 A client that waited for its end could not tell it from a server that is stuck. So work goes on in a
-thread of its own, and whoever asks is told after a moment that it does.
+thread of its own, and a client that asks is told after a moment that it does.
 """
 
 import threading

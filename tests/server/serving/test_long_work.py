@@ -1,4 +1,4 @@
-"""Work that takes long: whoever asks again with the same ticket asks for the same work."""
+"""Work that takes long: to ask again with the same ticket is to ask for the same work."""
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor

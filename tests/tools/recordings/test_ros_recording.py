@@ -221,10 +221,10 @@ def test_two_that_publish_one_transform_are_named_and_one_can_be_chosen(tmp_path
     """Of another parent, or of the same one and told apart by the topic alone."""
     for parent, choice in (("map", {"map_frame": "odom"}), ("odom", {"poses": "/tf"})):
 
-        def beside(stamp: int, body: np.ndarray, parent: str = parent) -> Any:
+        def other(stamp: int, body: np.ndarray, parent: str = parent) -> Any:
             return ROS2.tf(stamp + 9, (parent, "base_link", shifted(y=0.4) @ body))
 
-        both = opened(tmp_path / parent, [*a_drive(), *each("/other/tf", TF, beside)])
+        both = opened(tmp_path / parent, [*a_drive(), *each("/other/tf", TF, other)])
         assert not both.entries
         assert "choose" in only_remark(both)
         assert "6 times" in only_remark(both) or "jumps to and fro, 9 times" in only_remark(both)

@@ -84,7 +84,7 @@ class OverviewCamera:
                 camera.look_at = target
 
     def release(self) -> None:
-        """Follow again, whoever moved the camera."""
+        """Follow again, even if a person moved the camera."""
         self._taken = False
         self._eyes.append(np.array(self._page.client.camera.position))
 

@@ -52,7 +52,7 @@ def lines_html(*lines: tuple[str, str]) -> str:
 
 
 def scale_html(length_m: float, pixels: float) -> str:
-    """Return a bar of so many pixels, which is as long as ``length_m`` in the middle of a scene."""
+    """Return a bar of some ``pixels``, as long as ``length_m`` in the middle of a scene."""
     bar = f"width: {pixels:.0f}px; height: 0.4em; border: 2px solid; border-top: 0"
     return f'<div style="{_TEXT}"><div style="{bar}"></div>{length_m:g} m in the middle</div>'
 
