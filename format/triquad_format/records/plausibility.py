@@ -51,7 +51,11 @@ def jumps(times: NDArray[np.integer], places: Doubles, replaced: int = 0) -> tup
     """
     share = ((times[1:-1] - times[:-2]) / (times[2:] - times[:-2]))[:, None]
     aside = places[1:-1] - (1 - share) * places[:-2] - share * places[2:]
-    size = np.linalg.norm(aside, axis=1)
+    # Times that are those of arrival move places along the way, but not off it.
+    way, to = places[2:] - places[:-2], places[1:-1] - places[:-2]
+    along = (way * to).sum(axis=1) / np.maximum((way * way).sum(axis=1), 1e-30)
+    off_way = np.linalg.norm(to - along.clip(0, 1)[:, None] * way, axis=1) > JUMP_M
+    size = np.where(off_way, np.linalg.norm(aside, axis=1), 0.0)
     turns_back = (aside[:-1] * aside[1:]).sum(axis=1) < -0.5 * size[:-1] * size[1:]
     found = np.minimum(size[:-1], size[1:])[turns_back]
     found = found[found > JUMP_M]
