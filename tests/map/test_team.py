@@ -28,6 +28,20 @@ def test_each_place_is_worked_on_once(team, count):
     assert (done == 2).all()
 
 
+@pytest.mark.parametrize("is_closed", [False, True])
+@pytest.mark.parametrize("count", [0, 1, 10_000])
+def test_work_along_is_done_once_and_the_callers_own_by_the_caller(team, count, is_closed):
+    if is_closed:
+        team.close()
+    done = np.zeros(count, int)
+
+    def work(first, last):
+        done[first:last] += 1
+
+    assert team.along(threading.get_ident, count, work, 300) == threading.get_ident()
+    assert (done == 1).all()
+
+
 def test_an_error_of_one_part_is_raised_when_all_have_ended(team):
     ended = []
 

@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 _thread = threading.local()
 
@@ -39,6 +39,8 @@ THREADS = max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity"
 MIN_SHARE = 2048
 """Points of a field below which splitting work costs more than it gains."""
 
+
+Result = TypeVar("Result")
 
 Work = Callable[[int, int], None]
 """Does the part ``range(first, last)`` of some work."""
@@ -110,6 +112,23 @@ class Team:
             work(0, count)
         else:
             self._run(lambda part: work(*share(count, part, parts)), parts)
+
+    def along(self, own: Callable[[], Result], count: int, work: Work, least: int) -> Result:
+        """Run ``own`` on the caller's thread and ``work`` over ``range(count)`` on the others.
+
+        The caller joins these when its own is done; ``least`` is how many a part has at least.
+        """
+        results: list[Result] = []
+        parts = max(1, count // least)
+
+        def do(part: int) -> None:
+            if part == 0:
+                results.append(own())
+            else:
+                work(*share(count, part - 1, parts))
+
+        self._run(do, 1 + parts)
+        return results[0]
 
     def _run(self, work: Callable[[int], None], parts: int) -> None:
         with contextlib.ExitStack() as rest:  # nobody goes on with it later, whatever happens

@@ -13,7 +13,7 @@ from triquad_map.evidence.carving import Reach, mark_crossed
 from triquad_map.evidence.company import have_company
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.evidence.growth import EvidenceSize, NewEnds, new_blocks, new_ends
-from triquad_map.evidence.normals import fit_normals, normals_at, outdated
+from triquad_map.evidence.normals import NormalSearch, normals_at
 from triquad_map.evidence.observations import Observations
 from triquad_map.evidence.observed import Sighting
 from triquad_map.evidence.ray_surfels import ray_surfels
@@ -64,24 +64,23 @@ class LiveEvidence:
         self._surface = None
         self._mark("surface", voxels)
 
-    def record_ends(self, voxels: Doubles, sighting: Sighting, split: Split = in_one) -> Ints:
+    def record_ends(self, voxels: Doubles, sighting: Sighting) -> Ints:
         """Record that rays ended at ``voxels`` [N, 3], and from where and when.
 
         Args:
             voxels: the ends of all rays of a scan.
             sighting: the scan.
-            split: over which normals are found.
 
         Returns:
             The row of what is recorded of each ray's voxel; 0 outside the region.
         """
-        rows = self.add_ends(voxels, sighting, split)
+        rows = self.add_ends(voxels, sighting)
         company = self._observations.arrays.voxels["company"]
         alone = np.flatnonzero(~company[rows] & (rows > 0))
         company[rows[alone[have_company(voxels - sighting.origin, alone)]]] = True
         return rows
 
-    def add_ends(self, voxels: Doubles, sighting: Sighting, split: Split = in_one) -> Ints:
+    def add_ends(self, voxels: Doubles, sighting: Sighting) -> Ints:
         """Do as :meth:`record_ends` with rays of many scans: none is asked for its company."""
         self._frozen = None
         rows = np.empty(len(voxels), np.int32)
@@ -92,8 +91,12 @@ class LiveEvidence:
             )
             if self._blocks.count == self._blocks.capacity:
                 self._make_room(more=True)
-        self._find_normals(rows, sighting.unlearnt_since, split)
         return rows
+
+    def outdated_normals(self, rows: Ints, since: int) -> NormalSearch:
+        """Return the search for normals of the surfaces on which the newest scan ended, by rows."""
+        seen = self._seen._replace(blocks=self._blocks.freeze())
+        return NormalSearch(rows, since, seen, self._observations.arrays)
 
     def believe(self, hit: Ints, passed: Ints, belief: Belief) -> Changes:
         """Let surface come and go where rays of a scan ended and passed, by rows."""
@@ -226,16 +229,6 @@ class LiveEvidence:
             done, self._blocks.count = mark(voxels, done, self._seen, mask, self._blocks.count)
             if done < len(voxels):
                 self._make_room(more=True)
-
-    def _find_normals(self, rows: Ints, since: int, split: Split) -> None:
-        """Find the normals of surfaces on which the newest scan ended, in voxels by their rows."""
-        observed = self._observations.arrays
-        changed = outdated(rows, observed)
-
-        def work(first: int, last: int) -> None:
-            fit_normals(changed[first:last], since, self._seen, observed)
-
-        split(len(changed), work)
 
     def _make_room(self, more: bool = False) -> None:
         """Make room for as many blocks as the index has room for, or for ``more``."""

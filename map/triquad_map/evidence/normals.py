@@ -5,7 +5,7 @@ scans do. So the plane of a voxel is found again whenever twice as many scans ha
 """
 
 import numpy as np
-from triquad_format.records.arrays import Doubles, Ints
+from triquad_format.records.arrays import Doubles, Floats, Ints
 
 from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.planes import MOMENTS, add_points, plane_normal
@@ -54,16 +54,43 @@ def find_normal(
 
 
 @kernel()
-def fit_normals(rows: Ints, since: int, seen: SeenVoxels, observed: Observed) -> None:
-    """Find the normals of the surface in voxels, by their ``rows`` [N]; see :func:`find_normal`."""
+def fit_normals(
+    rows: Ints, since: int, seen: SeenVoxels, observed: Observed, normals: Floats
+) -> None:
+    """Find the normals [N, 3] of the surface in the voxels of ``rows`` [N]; 0: not known.
+
+    See :func:`find_normal`.
+    """
     normal = np.zeros(3)
-    for row in rows:
+    for i, row in enumerate(rows):
         is_known = False
         for reach in _REACHES:
             if not is_known:
                 is_known = find_normal(np.int64(row), reach, since, seen, observed, normal)
         for axis in range(3):
-            observed.voxels[row].normal[axis] = normal[axis] if is_known else 0.0
+            normals[i, axis] = normal[axis] if is_known else 0.0
+
+
+class NormalSearch:
+    """The search for normals that a scan has outdated, in the evidence as its ends left it.
+
+    Rays may carve meanwhile: they add blocks, in which nothing ended, and move no end.
+    """
+
+    def __init__(self, rows: Ints, since: int, seen: SeenVoxels, observed: Observed) -> None:
+        """Find which are outdated, of the voxels in ``rows`` [N]; blocks of ``seen`` are frozen."""
+        self.rows = outdated(rows, observed)
+        self._normals = np.zeros((len(self.rows), 3), np.float32)
+        self._since, self._seen, self._observed = since, seen, observed
+
+    def find(self, first: int, last: int) -> None:
+        """Find those of ``rows[first:last]``."""
+        part = slice(first, last)
+        fit_normals(self.rows[part], self._since, self._seen, self._observed, self._normals[part])
+
+    def finish(self) -> None:
+        """Record what was found."""
+        self._observed.voxels["normal"][self.rows] = self._normals
 
 
 @kernel()

@@ -27,6 +27,8 @@ what it ends on."""
 
 _FAR_THINNED_AT, _OPEN_THINNED_AT = 0.5, 0.25  # shares of the rays' length
 
+_NORMALS = 500  # that a thread finds at least: half a millisecond
+
 _SURFELS_REFITTED = 8_000
 """The number of surfels that are fitted again with each epoch while the field is trained: some
 10 ms."""
@@ -95,20 +97,28 @@ class RegionEvidence:
         ends, origin = self.voxels(rays.ends), self.voxels(rays.origin[None])[0]
         leaf_m = self._setup.field.leaf_m
         sighting = Sighting(origin, leaf_m, stamp_s, self._scans, self._unlearnt_since)
-        rows = self.live.record_ends(ends, sighting, self._setup.team.split)
+        rows = self.live.record_ends(ends, sighting)
+        normals = self.live.outdated_normals(rows, self._unlearnt_since)
+        passed = self._setup.team.along(
+            lambda: self._carved(rays, origin, ends), len(normals.rows), normals.find, _NORMALS
+        )
+        normals.finish()
+        return SeenScan(rows, self.live.normals(ends, rows), passed)
+
+    def _carved(self, rays: ScanRays, origin: Doubles, ends: Doubles) -> Ints:
+        """Record what the rays crossed; return the rows that they may have."""
         clear = math.inf if self._setup.change.static else _CLEAR_SHORT
         reach = Reach(_CARVE_SHORT, clear, self._scans)
         thinned = ends[thin(ends, 1.0, empty_keys(len(ends)))]
         far_ends = self._thinned(origin, self.voxels(rays.far_ends), _FAR_THINNED_AT)
         passed = self.live.carve(origin, thinned, reach)
         passed_farther = self.live.carve(origin, far_ends, reach._replace(free=0.0))
-        passed = np.concatenate([passed, passed_farther])
         # Glass and black paint return nothing: these rays contradict no surface.
         open_ends = self._thinned(origin, self.voxels(rays.open_ends), _OPEN_THINNED_AT)
         self.live.carve(origin, open_ends, Reach(0.0))
         if rays.robot is not None:
-            self.live.mark_free(self.voxels(rays.robot.voxel_centres(leaf_m)))
-        return SeenScan(rows, self.live.normals(ends, rows), passed)
+            self.live.mark_free(self.voxels(rays.robot.voxel_centres(self._setup.field.leaf_m)))
+        return np.concatenate([passed, passed_farther])
 
     def believe(self, seen: SeenScan) -> Longs:
         """Let surface come and go, after :meth:`scan_seen`; return the new voxels [M, 3]."""

@@ -31,7 +31,10 @@ class Watched:
         self.scans += 1
         sighting = Sighting(sensor, 0.2, self.scans, scan=self.scans)
         rows = self.evidence.record_ends(ends, sighting)
+        search = self.evidence.outdated_normals(rows, sighting.unlearnt_since)
+        search.find(0, len(search.rows))
         passed = self.evidence.carve(sensor, ends, Reach(0.5, 2.5, self.scans))
+        search.finish()
         return len(self.evidence.believe(rows, passed, Belief()).removed)
 
     def believed(self, voxels: Doubles) -> float:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.maps.seen_scans import see
+from support.maps.seen_scans import end, see
 from triquad_format.records.arrays import Bools, Doubles
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import Evidence, seen_voxels
@@ -164,7 +164,7 @@ def test_what_was_taken_back_is_forgotten() -> None:
     wide, narrow = Wall((11.0, 30.0), (16.8, 34.0)), Wall((11.0, 30.0), (16.2, 34.0))
 
     def scan(number: int, ends: Doubles) -> None:
-        rows = evidence.record_ends(ends, Sighting(sensor, 0.2, number, scan=number))
+        rows = end(evidence, ends, Sighting(sensor, 0.2, number, scan=number))
         passed = evidence.carve(sensor, ends, Reach(0.5, 2.5, number))
         evidence.believe(rows, passed, Belief())
 

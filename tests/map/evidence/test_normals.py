@@ -1,7 +1,9 @@
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.maps.seen_scans import end
 from triquad_format.records.arrays import Doubles
+from triquad_map.evidence.carving import Reach
 from triquad_map.evidence.live_evidence import LiveEvidence
 from triquad_map.evidence.observed import Sighting
 
@@ -20,7 +22,7 @@ def plane(rng: np.random.Generator, normal: Doubles, count: int, half: float = 1
 
 def normals(evidence: LiveEvidence, ends: Doubles, scan: int = 1) -> Doubles:
     """Have a scan end at ``ends`` [N, 3], and return the normals there."""
-    return evidence.normals(ends, evidence.record_ends(ends, Sighting(SENSOR, 0.2, 1, scan)))
+    return evidence.normals(ends, end(evidence, ends, Sighting(SENSOR, 0.2, 1, scan)))
 
 
 def off_degrees(found: Doubles, normal: Doubles) -> Doubles:
@@ -61,3 +63,25 @@ def test_what_lies_over_a_plane_does_not_have_its_normal() -> None:
     ground, thing = plane(rng, up, 4000), MIDDLE + [[0.4, 0.4, 0.9]]
     found = normals(evidence, np.concatenate([ground, thing]))
     assert np.isnan(found[-1]).all()
+
+
+def test_rays_that_carve_meanwhile_change_no_normal() -> None:
+    """They add blocks to the index in which the ends around a voxel are found."""
+    found = []
+    for carves_first in (False, True):
+        rng, evidence = np.random.default_rng(4), LiveEvidence(SIDE)
+        for number in range(1, 4):
+            ends = plane(rng, np.array([0.0, 0.6, 0.8]), 2000)
+            rows = evidence.record_ends(ends, Sighting(SENSOR, 0.2, 1, number))
+            search = evidence.outdated_normals(rows, since=0)
+            blocks = evidence.size.blocks
+            if carves_first:
+                evidence.carve(SENSOR, ends, Reach(0.5, 2.5, number))
+                assert evidence.size.blocks > blocks or number > 1
+            search.find(0, len(search.rows))
+            if not carves_first:
+                evidence.carve(SENSOR, ends, Reach(0.5, 2.5, number))
+            search.finish()
+            found.append(evidence.normals(ends, rows))
+    np.testing.assert_array_equal(found[:3], found[3:])
+    assert not np.isnan(found[-1]).all()

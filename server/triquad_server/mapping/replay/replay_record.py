@@ -123,7 +123,10 @@ def restored_rays(rays: ReplayRays, settings: FieldSettings, team: Team) -> RayT
     voxels = settings.leaf_coordinates(ends)
     evidence = LiveEvidence(1 << settings.depth)
     sighting = Sighting(np.zeros(3), settings.leaf_m, stamp_s=0, scan=1)
-    places = evidence.add_ends(voxels, sighting, team.split)
+    places = evidence.add_ends(voxels, sighting)
+    search = evidence.outdated_normals(places, sighting.unlearnt_since)
+    team.split(len(search.rows), search.find)
+    search.finish()
     normals = evidence.normals(voxels, places)
     ways = ends - rays.origins[rays.origin_of]
     cosines = (ways * normals).sum(axis=1) / np.maximum(np.linalg.norm(ways, axis=1), 1e-9)
