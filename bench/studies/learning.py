@@ -6,7 +6,9 @@ that are not tuned on are only to be scored.
 """
 
 import argparse
+import statistics
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -21,6 +23,7 @@ from triquad_format.records.arrays import Doubles
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.training.slopes import Slopes
+from triquad_server.process.resources import resident_bytes
 from triquad_server.settings.loading import load_settings
 from triquad_tools.console.report import Row, print_rows
 from triquad_tools.evaluation.metrics import ScoreSettings
@@ -51,6 +54,7 @@ class Place:
     within_m: float  # nearer than this counts as right
     voxel_m: float  # between the points that are compared
     is_tuned_on: bool = False
+    settings: tuple[str, ...] = ()  # over those of the preset
 
 
 def _street(number: int, lidar: Lidar, scans: int, step_m: float) -> SimulatedDrive:
@@ -68,6 +72,9 @@ PLACES = {
     "street, 16 beams": Place("street", partial(_street, 11, _SPARSE, 30, 1.8), 0.1, 0.05),
     "street, noisy": Place("street", partial(_street, 12, _NOISY, 80, 0.6), 0.1, 0.05),
     "room by lidar": Place("indoor", partial(room_by_lidar, 8, 60), 0.02, 0.01),
+    "street, fine": Place(
+        "street", partial(_street, 2, _PLAIN, 50, 1.0), 0.02, 0.02, settings=("field.leaf_m=0.05",)
+    ),
     "tabletop": Place("tabletop", partial(tabletop_by_camera, 6, 60), 0.01, 0.0025),
 }
 
@@ -98,12 +105,28 @@ class _Learner:
     def __init__(self, place: Place) -> None:
         self._place, self._driven = place, driven(place.make(), place.voxel_m)
         self.scans = self._driven.scans
-        self.mapper = Mapper("bench", load_settings(preset=place.preset), "cpu")
-        for scan in self.scans:
-            self.mapper.ingest(scan.points, scan.world_from_sensor)
+        self._bytes_before = resident_bytes()
+        self.most_bytes = 0  # that it took: after scans, and before and after publishing
+        settings = load_settings(None, place.settings, preset=place.preset)
+        self.mapper = Mapper("bench", settings, "cpu")
         self._random = np.random.default_rng(0)
         self._samples = 0
-        self.figures: list[Figure] = []
+        self.figures = [
+            Figure(
+                "a scan, processor", 1e3 * statistics.median(map(self._take_in, self.scans)), "ms"
+            )
+        ]
+
+    def _take_in(self, scan: PosedScan) -> float:
+        """Take in a scan; return the processor's seconds."""
+        began_s = time.process_time()
+        self.mapper.ingest(scan.points, scan.world_from_sensor)
+        taken_s = time.process_time() - began_s
+        self._weigh()
+        return taken_s
+
+    def _weigh(self) -> None:
+        self.most_bytes = max(self.most_bytes, resident_bytes() - self._bytes_before)
 
     def learn(self, samples: float = np.inf) -> None:
         """Train until so many samples were trained on, or nothing is left to learn."""
@@ -113,6 +136,7 @@ class _Learner:
             if self.mapper.samples_trained >= published + _EPOCH_SAMPLES:
                 published = self.mapper.samples_trained
                 self.mapper.publish()
+                self._weigh()
 
     def stream(self, scans: Sequence[PosedScan]) -> None:
         """Take in more scans, with time to train between them, then learn all."""
@@ -161,6 +185,7 @@ def measure_learning(place: Place) -> list[Figure]:
         learner.score(f"{samples / 1e6:g} M")
     learner.learn()
     learner.score("settled")
+    learner.figures.append(Figure("memory, at most", learner.most_bytes / 1e6, "MB"))
     learner.stream(learner.scans[-1:] * _RESTING)
     learner.score("rested")
     learner.stream(learner.scans[: len(learner.scans) // _AGAIN])
