@@ -14,6 +14,7 @@ from triquad_map.triangles import Triangles
 from triquad_client.mesh.mesh_files import GlbMesh, glb_bytes, ply_bytes
 
 if TYPE_CHECKING:
+    import open3d
     import trimesh
 
 _Y_UP = np.array([(1, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0, 0, 0, 1.0)])
@@ -76,6 +77,20 @@ class Mesh(Triangles):
         except ImportError as error:
             raise InvalidInputError("trimesh is missing: pip install 'triquad[mesh]'") from error
         return trimesh.Trimesh(self.vertices.copy(), self.faces.copy(), process=False)
+
+    def to_open3d(self) -> "open3d.geometry.TriangleMesh":
+        """Return a copy for the library Open3D, with normals of its vertices.
+
+        Raises:
+            InvalidInputError: Open3D is not installed.
+        """
+        try:
+            import open3d
+        except ImportError as error:
+            raise InvalidInputError("Open3D is missing: pip install open3d") from error
+        vectors = open3d.utility
+        corners, faces = vectors.Vector3dVector(self.vertices), vectors.Vector3iVector(self.faces)
+        return open3d.geometry.TriangleMesh(corners, faces).compute_vertex_normals()
 
 
 def compacted(vertices: Doubles, faces: NDArray[np.integer]) -> Mesh:

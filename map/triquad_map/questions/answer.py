@@ -53,9 +53,8 @@ class Answer:
         try:
             import pandas as pd
         except ModuleNotFoundError as error:
-            raise InvalidInputError(
-                "to_pandas() needs pandas: install triquad[notebook]"
-            ) from error
+            told = "pandas is missing: pip install 'triquad[notebook]'"
+            raise InvalidInputError(told) from error
         columns: dict[str, Any] = {}
         for field, array in self._arrays().items():
             name = field.removeprefix("_")

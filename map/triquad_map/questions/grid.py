@@ -67,7 +67,8 @@ class Grid:
         try:
             from matplotlib import pyplot
         except ModuleNotFoundError as error:
-            raise InvalidInputError("plot() needs matplotlib: install triquad[notebook]") from error
+            told = "matplotlib is missing: pip install 'triquad[notebook]'"
+            raise InvalidInputError(told) from error
         drawn = pyplot.subplots()[1] if axes is None else axes
         (x, y, z), cell_m = self.shape.corner, self.shape.cell_m
         sides = np.array(self.shape.counts[:2]) * cell_m
