@@ -87,7 +87,8 @@ class Mesh(Triangles):
         try:
             import open3d
         except ImportError as error:
-            raise InvalidInputError("Open3D is missing: pip install open3d") from error
+            told = f"open3d is missing ({error}): pip install 'triquad[open3d]'"
+            raise InvalidInputError(told) from error
         vectors = open3d.utility
         corners, faces = vectors.Vector3dVector(self.vertices), vectors.Vector3iVector(self.faces)
         return open3d.geometry.TriangleMesh(corners, faces).compute_vertex_normals()

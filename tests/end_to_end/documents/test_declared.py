@@ -28,6 +28,7 @@ EVERY_EXTRA = (
     "keys",
     "mesh",
     "notebook",
+    "open3d",
     "preview",
     "ros",
     "server",
@@ -66,7 +67,7 @@ def imported(folder: str) -> set[str]:
     ("folder", "extras"),
     [
         ("format", ()),
-        ("client", ("mesh",)),
+        ("client", ("mesh", "open3d")),
         ("map", ("fast", "notebook", "preview")),
         ("server", ("fast", "gpu", "preview", "server")),
         ("tools", EVERY_EXTRA),
