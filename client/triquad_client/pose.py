@@ -6,7 +6,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 from triquad_format.records.arrays import Doubles
-from triquad_format.records.pose import RIGID_TOLERANCE, is_rotation, rotation_error
+from triquad_format.records.pose import RIGID_TOLERANCE, is_rotation, pose_matrices, rotation_error
 
 from triquad_client.errors import NO_NUMBER, InvalidScanError
 from triquad_client.real_numbers import real_numbers
@@ -74,27 +74,6 @@ def rigid_pose(world_from_sensor: PoseLike) -> Doubles:
         )
     pose[3] = (0, 0, 0, 1)
     return pose
-
-
-def pose_matrices(positions: Doubles, quaternions: Doubles) -> Doubles:
-    """Return poses [..., 4, 4] of positions [..., 3] and unit quaternions [..., 4] x, y, z, w.
-
-    Diebel 2006, "Representing attitude", section 5.6.
-    """
-    x, y, z, w = np.moveaxis(quaternions, -1, 0)
-    poses = np.zeros((*x.shape, 4, 4))
-    poses[..., 0, 0] = 1 - 2 * (y * y + z * z)
-    poses[..., 0, 1] = 2 * (x * y - z * w)
-    poses[..., 0, 2] = 2 * (x * z + y * w)
-    poses[..., 1, 0] = 2 * (x * y + z * w)
-    poses[..., 1, 1] = 1 - 2 * (x * x + z * z)
-    poses[..., 1, 2] = 2 * (y * z - x * w)
-    poses[..., 2, 0] = 2 * (x * z - y * w)
-    poses[..., 2, 1] = 2 * (y * z + x * w)
-    poses[..., 2, 2] = 1 - 2 * (x * x + y * y)
-    poses[..., :3, 3] = positions
-    poses[..., 3, 3] = 1.0
-    return poses
 
 
 def _numbers(name: str, values: ArrayLike, count: int) -> Doubles:

@@ -151,6 +151,8 @@ def _restored_map(
         record=restored.record if restored else None,
         teams=teams,
     )
+    if store is not None:
+        store.log_scans(settings.field.leaf_m)
     served = ServedMap(
         name=options.map_name,
         mapper=mapper,

@@ -186,7 +186,8 @@ class Service:
         self._parts.callback(self.session.liveliness().declare_token(alive).undeclare)
 
     def _open_mapper(self, failed: Callable[[Stop], None]) -> MapperThread:
-        warnings, trails = self._warnings, self._trails
+        warnings, trails, store = self._warnings, self._trails, self._served.store
+        log = None if store is None else store.scans
         mapper = MapperThread(
             self._served.mapper,
             self._scans,
@@ -199,6 +200,7 @@ class Service:
                         scan.source, scan.points, rays, stamp_ns=scan.stamp_ns
                     ),
                     trails.add,
+                    *(() if log is None else (log.add,)),
                 ),
                 published=(self._surface.add,),
             ),

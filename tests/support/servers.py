@@ -89,6 +89,8 @@ def running_service(
     restored: ValidCheckpoint | None = opened.newest() if opened else None
     mapper = Mapper(map_name, settings, "cpu", restored.record if restored else None)
     info = restored.info if restored else None
+    if opened:
+        opened.log_scans(settings.field.leaf_m)
     session = open_session(network)
     try:
         with closing(Service(session, ServedMap(map_name, mapper, "cpu", opened, info), settings)):

@@ -39,3 +39,42 @@ def orthonormal(pose: Doubles) -> Doubles:
     left, _, right = np.linalg.svd(exact[:3, :3])
     exact[:3, :3] = left @ right
     return exact
+
+
+def pose_matrices(positions: Doubles, quaternions: Doubles) -> Doubles:
+    """Return poses [..., 4, 4] of positions [..., 3] and unit quaternions [..., 4] x, y, z, w.
+
+    Diebel 2006, "Representing attitude", section 5.6.
+    """
+    x, y, z, w = np.moveaxis(quaternions, -1, 0)
+    poses = np.zeros((*x.shape, 4, 4))
+    poses[..., 0, 0] = 1 - 2 * (y * y + z * z)
+    poses[..., 0, 1] = 2 * (x * y - z * w)
+    poses[..., 0, 2] = 2 * (x * z + y * w)
+    poses[..., 1, 0] = 2 * (x * y + z * w)
+    poses[..., 1, 1] = 1 - 2 * (x * x + z * z)
+    poses[..., 1, 2] = 2 * (y * z - x * w)
+    poses[..., 2, 0] = 2 * (x * z - y * w)
+    poses[..., 2, 1] = 2 * (y * z + x * w)
+    poses[..., 2, 2] = 1 - 2 * (x * x + y * y)
+    poses[..., :3, 3] = positions
+    poses[..., 3, 3] = 1.0
+    return poses
+
+
+def quaternion_of(rotation: Doubles) -> Doubles:
+    """Return the unit quaternion [4] x, y, z, w of a rotation [3, 3].
+
+    Bar-Itzhack 2000, "New method for extracting the quaternion from a rotation matrix".
+    """
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation.tolist()
+    products = np.array(
+        [
+            [xx - yy - zz, 0, 0, 0],
+            [yx + xy, yy - xx - zz, 0, 0],
+            [zx + xz, zy + yz, zz - xx - yy, 0],
+            [zy - yz, xz - zx, yx - xy, xx + yy + zz],
+        ]
+    )
+    vectors = np.linalg.eigh(products).eigenvectors  # which reads the lower triangle alone
+    return np.asarray(vectors[:, -1], np.float64)

@@ -4,8 +4,10 @@ import logging
 import threading
 import time
 from dataclasses import replace
+from functools import partial
 
 from triquad_format.errors import RefusedError
+from triquad_format.scan_log.segment import SegmentWriter
 from triquad_format.wire.messages import (
     CheckpointInfo,
     CheckpointRequest,
@@ -21,6 +23,7 @@ from triquad_server.errors import (
     StoreError,
 )
 from triquad_server.intake.source_trails import SourceTrails
+from triquad_server.mapping.map_snapshot import MapSnapshot
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.store.store import Store
@@ -83,10 +86,11 @@ class CheckpointWriter:
 
     @property
     def warning(self) -> str | None:
-        """Return that checkpoints are late, and what helps; ``None``: they are not."""
+        """Return that checkpoints are late, and what helps, or why scans are not kept."""
         late_s = self.late_s
         if late_s == 0:
-            return None
+            scans = None if self._store is None else self._store.scans
+            return None if scans is None else scans.error
         unsaved_s = late_s + _LATE_PERIODS * self._period_s
         return (
             f"checkpoints are late: what was mapped in the last {unsaved_s:.0f} s is on no disk, "
@@ -138,6 +142,9 @@ class CheckpointWriter:
 
         def forget(mapper: Mapper) -> int:
             mapper.reset(request.minimum, request.maximum)
+            if self._store is not None and self._store.scans is not None:
+                corners = request.minimum + mapper.origin, request.maximum + mapper.origin
+                self._store.scans.add_reset(*corners)
             trails.forget(request.minimum, request.maximum)
             return mapper.publish().number
 
@@ -204,7 +211,9 @@ class CheckpointWriter:
         base, last = store.base_epoch, self.last
         try:
             asked_s = time.monotonic()
-            snapshot = self._mapper.call(lambda mapper: mapper.snapshot_since(base))
+            snapshot, scans = self._mapper.call(partial(_snapshot, store, base))
+            if store.scans is not None:
+                store.scans.keep(scans, snapshot.epoch.number)
             # The base is the last checkpoint, as long as its file and parts are there.
             if not undoes and last is not None and last.epoch == snapshot.epoch.number == base:
                 self._saved_s = asked_s
@@ -244,3 +253,11 @@ class CheckpointWriter:
         except Exception:
             self.error = "an internal error of the server; its log has the details"
             _log.exception("a checkpoint met an internal error")
+
+
+def _snapshot(
+    store: Store, base: int | None, mapper: Mapper
+) -> tuple[MapSnapshot, SegmentWriter | None]:
+    """Return what a checkpoint needs since ``base``, and the scans that the log kept since then."""
+    scans = None if store.scans is None else store.scans.cut()
+    return mapper.snapshot_since(base), scans

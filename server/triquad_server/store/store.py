@@ -40,6 +40,7 @@ from triquad_server.store.restore import (
     newest_valid,
     valid_checkpoint,
 )
+from triquad_server.store.scan_log import ScanLog
 
 _log = logging.getLogger(__name__)
 
@@ -69,6 +70,7 @@ class Store:
         self._newest: _Newest | None = None
         self._restored: Restored | None = None  # the last time that the map was restored
         self._settings = settings
+        self.scans: ScanLog | None = None  # that the map takes in, from :meth:`log_scans` on
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             self._lock = StoreLock(self.folder)
@@ -79,8 +81,17 @@ class Store:
             ) from error
         delete_unneeded(self.folder, self._settings)
 
+    def log_scans(self, leaf_m: float) -> None:
+        """Keep scans, too, from the newest checkpoint on; ``leaf_m`` is the side of a voxel."""
+        if self._settings.log_max_bytes > 0:
+            epoch = 0 if self._newest is None else self._newest.info.epoch
+            most = self._settings.log_max_bytes
+            self.scans = ScanLog(self.folder, most, leaf_m, epoch, self._restored)
+
     def close(self) -> None:
         """Release the folder."""
+        if self.scans is not None:
+            self.scans.close()
         self._lock.close()
 
     @property

@@ -103,7 +103,9 @@ class MappingRun:
                 try:
                     stamp_s = entry.stamp_ns // 1_000_000_000
                     pose, source = scan.world_from_sensor, entry.source
-                    rays = self.mapper.ingest(scan.points, pose, stamp_s, source=source)
+                    rays = self.mapper.ingest(
+                        scan.points, pose, stamp_s, source=source, no_return=scan.no_return
+                    )
                     self._warnings.add(source, scan.points, rays, stamp_ns=entry.stamp_ns)
                     self._warnings.check()
                     self._outside = False

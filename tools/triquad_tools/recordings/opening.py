@@ -3,7 +3,7 @@
 import argparse
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,11 @@ from triquad_tools.recordings.folders.scan_folder import ScanFolder
 from triquad_tools.recordings.mcap_bag import find_bag
 from triquad_tools.recordings.recording import ReadingOptions, ScanEntry, options_of
 from triquad_tools.recordings.ros_recording import RosRecording
+from triquad_tools.recordings.scan_log import (
+    ScanLogRecording,
+    find_scan_log,
+    read_scan_log,
+)
 from triquad_tools.sensors.ray_check import without_repeated
 from triquad_tools.sensors.sweep import PosedScan
 
@@ -28,7 +33,9 @@ _UNPACK = {
 }  # fmt: skip
 """The commands that unpack files, by how their names end: the first one counts."""
 
-Recording = RosRecording | ScanFolder  # checked as a whole, so that its errors are known
+Recording = (
+    RosRecording | ScanFolder | ScanLogRecording
+)  # checked as a whole, so that its errors are known
 _MOST_NAMED = 10  # recordings in a folder
 
 _ORIGIN = 0.0, 0.0, 0.0
@@ -53,6 +60,9 @@ def open_recording(path: Path, options: ReadingOptions) -> Recording:
     """
     if not path.exists():
         raise ToolError(f"{path}: no such file or folder")
+    if (log := find_scan_log(path)) is not None:
+        _refuse_others(f"{path} has the scans of a map", set(), options)
+        return read_scan_log(log)
     bag = find_bag(path)
     if bag is not None:
         _refuse_others(f"{path} is a bag", _OF_BAGS, options)
@@ -106,12 +116,11 @@ class Selection:
         """Yield the scans from number ``start`` on, one after the other."""
         for scan in self.recording.read(self.indices[start:]):
             points = without_repeated(np.asarray(scan.points, np.float32))
-            seen = PosedScan(points, scan.world_from_sensor)
+            seen = PosedScan(points, scan.world_from_sensor, no_return=scan.no_return)
             if any(self.ray_origin):
                 offset = scan.world_from_sensor[:3, :3] @ self.ray_origin
                 seen = seen.seen_from(moved_pose(scan.world_from_sensor, offset))
-            points = points_in_range(seen.points, self.range_min_m)
-            yield PosedScan(points, seen.world_from_sensor)
+            yield replace(seen, points=points_in_range(seen.points, self.range_min_m))
 
 
 def open_selected(options: argparse.Namespace) -> Selection:

@@ -35,7 +35,9 @@ def publish_all(
                 time.sleep(max(0.0, started_s + due_s[done - 1] - time.monotonic()))
             if len(scan.points):
                 pose, stamp_s = scan.world_from_sensor, entry.stamp_ns / 1e9
-                client.publish_scan(scan.points, pose, stamp_s, source=entry.source)
+                client.publish_scan(
+                    scan.points, pose, stamp_s, source=entry.source, no_return=scan.no_return
+                )
                 published += 1
                 # Not after every scan, for the server publishes an epoch before it answers.
                 if not due_s and published % _PENDING == 0:

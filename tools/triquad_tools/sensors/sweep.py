@@ -1,6 +1,6 @@
 """One sweep of a sensor, before and after its pose is known, and errors in such data."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,11 +37,13 @@ class PosedScan:
 
     points: NDArray[np.floating]  # [N, 3] metres, sensor frame
     world_from_sensor: Doubles  # [4, 4]
+    # [M, 3] directions of rays that met nothing
+    no_return: NDArray[np.floating] | None = field(default=None, kw_only=True)
 
     def seen_from(self, pose: Doubles) -> "PosedScan":
         """Return the same points in the world, as a sensor at another pose [4, 4] has them."""
         points = moved(self.points, np.linalg.inv(pose) @ self.world_from_sensor)
-        return PosedScan(points.astype(np.float32), pose)
+        return replace(self, points=points.astype(np.float32), world_from_sensor=pose)
 
 
 def moved(points: NDArray[np.floating], pose: NDArray[np.floating]) -> Doubles:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Protocol
 
@@ -25,7 +25,7 @@ class SimulatedScan(PosedScan):
     """The sensor's measurements: returns with range noise, and the truth behind each."""
 
     true_hits: Doubles  # [N, 3] metres, world frame, exactly on the surface
-    no_return: Floats  # [M, 3] unit vectors, sensor frame, of the rays that met nothing
+    no_return: Floats = field(kw_only=True)  # [M, 3] unit vectors of rays that met nothing
 
 
 @dataclass(frozen=True)

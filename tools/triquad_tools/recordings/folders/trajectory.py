@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from triquad_client.pose import Pose, pose_matrices
+from triquad_client.pose import Pose
 from triquad_format.records.arrays import Doubles, Longs
+from triquad_format.records.pose import pose_matrices
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.arguments import SENSOR, WORLD

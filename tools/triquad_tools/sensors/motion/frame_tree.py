@@ -5,8 +5,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from triquad_client.pose import Pose, pose_matrices
+from triquad_client.pose import Pose
 from triquad_format.records.arrays import Doubles, Longs
+from triquad_format.records.pose import pose_matrices
 
 from triquad_tools.sensors.motion.track import MAX_GAP_S, Track
 from triquad_tools.sensors.sweep import NoTransformError

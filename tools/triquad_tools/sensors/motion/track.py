@@ -6,9 +6,9 @@ from bisect import bisect_left
 from collections.abc import Sequence
 
 import numpy as np
-from triquad_client.pose import pose_matrices
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.plausibility import JUMP_M, jumps
+from triquad_format.records.pose import pose_matrices
 
 from triquad_tools.sensors.sweep import NoTransformError
 

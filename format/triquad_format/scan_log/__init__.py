@@ -1,0 +1,1 @@
+"""The scans that a map was learnt from, in MCAP files that ROS 2 and its tools play."""

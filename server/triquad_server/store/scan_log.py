@@ -1,0 +1,177 @@
+"""Keeps the scans that a map is learnt from, with its checkpoints, so that it can be learnt again.
+
+Not all: of each source, one wherever it has moved on or turned, and now and then while it rests.
+"""
+
+import logging
+import math
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from triquad_format.mapfile.files import sync_folder
+from triquad_format.mapfile.index import Restored
+from triquad_format.records.arrays import Doubles
+from triquad_format.scan_log.log_folder import LOG_NAME, segment_name, segments
+from triquad_format.scan_log.segment import LoggedReset, LoggedScan, SegmentWriter
+from triquad_format.wire.messages import Scan
+
+from triquad_server.intake.rays import ScanRays
+
+_log = logging.getLogger(__name__)
+
+_APART_VOXELS, _APART_DEG, _APART_S = 2.5, 10.0, 2.0
+"""How far a source has moved, turned, or rested until its next scan is kept."""
+
+_BEYOND = 1.01  # times the range of a source: where points beyond it are put
+
+_UNFINISHED = ".unfinished-{}.mcap"
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """The last scan of a source that was kept."""
+
+    stamp_ns: int
+    world_from_sensor: Doubles  # [4, 4] from the map's origin
+
+
+class ScanLog:
+    """The log of one map. The mapper's thread adds and cuts; who writes checkpoints keeps."""
+
+    def __init__(
+        self, folder: Path, max_bytes: int, leaf_m: float, epoch: int, restored: Restored | None
+    ) -> None:
+        """Go on with the log in the map's folder, which is made where it is not there.
+
+        Args:
+            folder: of the map's checkpoints.
+            max_bytes: that the files may have together.
+            leaf_m: side of the map's voxels.
+            epoch: of the checkpoint from which the map goes on; 0: it begins. What the map took in
+                later than that it has lost, and so does the log.
+            restored: when the map went back to an older checkpoint, the last time.
+        """
+        self.folder = folder / LOG_NAME
+        self.error: str | None = None
+        self._max_bytes = max_bytes
+        self._apart_m = _APART_VOXELS * leaf_m
+        self._kept: dict[str, _Kept] = {}
+        self._writer: SegmentWriter | None = None
+        self._opened = 0  # files
+        with self._telling("cannot be opened"):
+            self.folder.mkdir(exist_ok=True)
+            for segment in segments(self.folder):
+                if segment.epoch > epoch:
+                    segment.path.unlink()
+            for path in self.folder.glob(_UNFINISHED.format("*")):
+                path.unlink()
+        self._newest = self._newest_until(epoch)
+        if restored is not None and restored.as_epoch == epoch > self._newest:
+            # An empty file marks that scans since the older checkpoint are in the map no more.
+            self._newest = self._newest_until(restored.epoch)
+            self.keep(self._open(), epoch)
+            self._writer = None
+
+    def add(self, scan: Scan, rays: ScanRays) -> None:
+        """Keep a scan that was taken in, if its source has moved on since the last that was kept.
+
+        Both count from the map's origin.
+        """
+        if not self._is_apart(scan):
+            return
+        rotation, position = scan.world_from_sensor[:3, :3], scan.world_from_sensor[:3, 3]
+        beyond = position + _BEYOND * (rays.far_ends - position)
+        points = (np.concatenate([rays.ends, beyond]) - position) @ rotation
+        pose = scan.world_from_sensor.copy()
+        pose[:3, 3] += rays.map_origin
+        no_return = (rays.open_ends - rays.origin) @ rotation
+        lengths = np.linalg.norm(no_return, axis=1, keepdims=True)
+        logged = LoggedScan(
+            scan.source,
+            scan.stamp_ns,
+            pose,
+            points.astype(np.float32),
+            (no_return / np.maximum(lengths, 1e-9)).astype(np.float32),
+        )
+        with self._telling("cannot be written"):
+            self._open().add(logged)
+            self._kept[scan.source] = _Kept(scan.stamp_ns, scan.world_from_sensor)
+
+    def add_reset(self, minimum: Doubles, maximum: Doubles) -> None:
+        """Keep that the map forgot what lies between two corners [3] of the user's coordinates."""
+        self._kept.clear()
+        with self._telling("cannot be written"):
+            self._open().add_reset(LoggedReset(minimum, maximum), time.time_ns())
+
+    def cut(self) -> SegmentWriter | None:
+        """Return the file with what was added since the last time; ``None``: nothing was."""
+        written, self._writer = self._writer, None
+        return written
+
+    def keep(self, written: SegmentWriter | None, epoch: int) -> None:
+        """Make a file durable that ends with ``epoch``; the oldest go that there is no room for."""
+        if written is None:
+            return
+        with self._telling("cannot be written"):
+            written.finish()
+            with written.path.open("rb") as stream:
+                os.fsync(stream.fileno())
+            os.replace(written.path, self.folder / segment_name(self._newest, epoch))
+            sync_folder(self.folder)
+            self._newest = epoch
+        self._make_room()
+
+    def close(self) -> None:
+        """Give up what was added since the last time, for the map has it in no checkpoint."""
+        if (written := self.cut()) is not None:
+            written.close()
+            written.path.unlink(missing_ok=True)
+
+    def _is_apart(self, scan: Scan) -> bool:
+        kept, pose = self._kept.get(scan.source), scan.world_from_sensor
+        if kept is None or scan.stamp_ns - kept.stamp_ns >= _APART_S * 1e9:
+            return True
+        moved = np.linalg.inv(kept.world_from_sensor) @ pose
+        turned = math.degrees(math.acos(min(1.0, max(-1.0, (np.trace(moved[:3, :3]) - 1) / 2))))
+        return float(np.linalg.norm(moved[:3, 3])) >= self._apart_m or turned >= _APART_DEG
+
+    def _open(self) -> SegmentWriter:
+        if self._writer is None:
+            self._opened += 1
+            self._writer = SegmentWriter(self.folder / _UNFINISHED.format(self._opened))
+        return self._writer
+
+    def _newest_until(self, epoch: int) -> int:
+        """Return the epoch of the newest file that ends with ``epoch`` at the latest."""
+        with suppress(OSError):
+            ends = [segment.epoch for segment in segments(self.folder)]
+            return max((end for end in ends if end <= epoch), default=0)
+        return 0
+
+    def _make_room(self) -> None:
+        """Delete the oldest files while all take more than they may."""
+        with self._telling("cannot be thinned"):
+            files = [(one.path, one.path.stat().st_size) for one in segments(self.folder)]
+            total = sum(size for _, size in files)
+            for path, size in files[:-1]:
+                if total <= self._max_bytes:
+                    return
+                path.unlink()
+                total -= size
+
+    @contextmanager
+    def _telling(self, what: str) -> Iterator[None]:
+        """Do something to the files; where that fails, mapping goes on, and the error is told."""
+        try:
+            yield
+            self.error = None
+        except OSError as error:
+            self.close()
+            if self.error is None:
+                _log.error("the scan log in %s %s: %s", self.folder, what, error)
+            self.error = f"the scan log {what}: {error}"
