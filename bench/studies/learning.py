@@ -105,28 +105,23 @@ class _Learner:
     def __init__(self, place: Place) -> None:
         self._place, self._driven = place, driven(place.make(), place.voxel_m)
         self.scans = self._driven.scans
-        self._bytes_before = resident_bytes()
-        self.most_bytes = 0  # that it took: after scans, and before and after publishing
+        before = resident_bytes()
         settings = load_settings(None, place.settings, preset=place.preset)
         self.mapper = Mapper("bench", settings, "cpu")
         self._random = np.random.default_rng(0)
         self._samples = 0
+        scan_s = statistics.median(map(self._take_in, self.scans))
+        self.mapper.publish()
         self.figures = [
-            Figure(
-                "a scan, processor", 1e3 * statistics.median(map(self._take_in, self.scans)), "ms"
-            )
+            Figure("a scan, processor", 1e3 * scan_s, "ms"),
+            Figure("memory with all scans", (resident_bytes() - before) / 1e6, "MB"),
         ]
 
     def _take_in(self, scan: PosedScan) -> float:
         """Take in a scan; return the processor's seconds."""
         began_s = time.process_time()
         self.mapper.ingest(scan.points, scan.world_from_sensor)
-        taken_s = time.process_time() - began_s
-        self._weigh()
-        return taken_s
-
-    def _weigh(self) -> None:
-        self.most_bytes = max(self.most_bytes, resident_bytes() - self._bytes_before)
+        return time.process_time() - began_s
 
     def learn(self, samples: float = np.inf) -> None:
         """Train until so many samples were trained on, or nothing is left to learn."""
@@ -136,7 +131,6 @@ class _Learner:
             if self.mapper.samples_trained >= published + _EPOCH_SAMPLES:
                 published = self.mapper.samples_trained
                 self.mapper.publish()
-                self._weigh()
 
     def stream(self, scans: Sequence[PosedScan]) -> None:
         """Take in more scans, with time to train between them, then learn all."""
@@ -185,7 +179,6 @@ def measure_learning(place: Place) -> list[Figure]:
         learner.score(f"{samples / 1e6:g} M")
     learner.learn()
     learner.score("settled")
-    learner.figures.append(Figure("memory, at most", learner.most_bytes / 1e6, "MB"))
     learner.stream(learner.scans[-1:] * _RESTING)
     learner.score("rested")
     learner.stream(learner.scans[: len(learner.scans) // _AGAIN])
