@@ -45,7 +45,9 @@ def test_a_checkpoint_may_take_longer_than_a_reply(tmp_path, monkeypatch):
     ):
         servers.learn(client)
         monkeypatch.setattr(Store, "write", held_write)
-        with pytest.raises(RequestTimeoutError, match=r"it goes on for \d+ s, and the server will"):
+        with pytest.raises(
+            RequestTimeoutError, match=r"has been at it for \d+ s, and will finish it"
+        ):
             client.checkpoint(timeout_s=0.5)
         assert begun.is_set()
         patient = pool.submit(client.checkpoint)

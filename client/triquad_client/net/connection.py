@@ -133,8 +133,8 @@ class Connection(Answering):
                 told = error.message
             if time.monotonic() > deadline:
                 raise RequestTimeoutError(
-                    f"{self._key(request)} was not done within {timeout_s:g} s: {told}, and the "
-                    "server will finish it"
+                    f"{self._key(request)} was not done within {timeout_s:g} s: {told}, and will "
+                    "finish it"
                 )
 
     def put(self, key: str, message: Message) -> None:

@@ -68,7 +68,9 @@ class LongWork:
             if task.result.done():  # the work itself had no time left
                 raise
             waited_s = time.monotonic() - task.begun_s
-            raise RefusedError("under_way", f"it goes on for {waited_s:.0f} s") from None
+            raise RefusedError(
+                "under_way", f"the server has been at it for {waited_s:.0f} s"
+            ) from None
         except CancelledError:
             raise RefusedError("busy", "the server is stopping") from None
         return result  # type: ignore[return-value]
