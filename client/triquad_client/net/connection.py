@@ -222,12 +222,12 @@ class Connection(Answering):
         """Return the error for a request that got no reply at all."""
         if self.is_closed:
             return closed_error()
-        info = self._session.info
+        available = self.maps()
+        info = self._session.info  # last: where a server is killed, its map may go before the link
         if not (info.routers_zid() or info.peers_zid()):
             return ConnectError(
                 "the link to the server is down; it is set up again once the server is back"
             )
-        available = self.maps()
         if self.map_name not in available:
             return UnknownMapError(self.map_name, available)
         why = (
