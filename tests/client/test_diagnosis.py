@@ -45,9 +45,10 @@ def reason(endpoint: str | None, config: Path | None = None) -> str:
     [
         ("nonsense.invalid", "no address is known of the host 'nonsense.invalid'"),
         (servers.free_endpoint(), "nothing listens at 127.0.0.1"),
-        ("http://127.0.0.1:7447", "'http' is no protocol of Zenoh: use tcp/HOST:PORT"),
+        ("http://127.0.0.1:7447", "'http:' is no protocol of Zenoh: use tcp/HOST:PORT"),
+        ("tcp://127.0.0.1:7447", "'tcp:' is no protocol of Zenoh: use tcp/HOST:PORT"),
     ],
-    ids=["host", "port", "protocol"],
+    ids=["host", "port", "protocol", "url"],
 )
 def test_why_there_is_no_link_is_told(endpoint: str, why: str) -> None:
     assert why in reason(endpoint)

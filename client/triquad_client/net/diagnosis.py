@@ -76,7 +76,7 @@ def _of_endpoint(endpoint: str, config: zenoh.Config, timeout_s: float) -> Obsta
     protocol, host, port = Locator.of(endpoint)
     if protocol not in _PROTOCOLS:
         return Obstacle(
-            f"{protocol.rstrip(':')!r} is no protocol of Zenoh: use tcp/HOST:PORT, or tls/HOST:PORT"
+            f"{protocol!r} is no protocol of Zenoh: use tcp/HOST:PORT, or tls/HOST:PORT"
         )
     host = host.removeprefix("[").removesuffix("]")
     if protocol not in ("tcp", "tls") or not host or not (port.isascii() and port.isdigit()):
