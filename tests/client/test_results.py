@@ -51,8 +51,9 @@ def test_a_part_of_a_result_is_the_result_of_that_part(offline: OfflineMap) -> N
         assert np.allclose(found.surface_point, expected.surface_point, rtol=0, atol=1e-5)
         assert np.array_equal(found.status, expected.status)
     assert [len(one) for one in whole] == [1] * 5
-    with pytest.raises(IndexError):
-        whole[5]
+    for outside in (5, np.zeros((2, 2), int), np.argwhere(whole.distance_m > 0), None):
+        with pytest.raises(IndexError):
+            whole[outside]
     with pytest.raises(triquad_client.NotAskedError):
         _ = whole[0].unknown_point
 

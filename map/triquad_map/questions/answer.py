@@ -35,6 +35,8 @@ class Answer:
 
     def __getitem__(self: AnswerT, which: int | slice | Ints | Longs | Bools) -> AnswerT:
         rows = np.atleast_1d(np.arange(len(self))[which])
+        if rows.ndim > 1:
+            raise IndexError(f"an index of {rows.ndim} dimensions: use a number, a slice or [N]")
         parts = {name: array[rows] for name, array in self._arrays().items()}
         return dataclasses.replace(self, **parts)  # type: ignore[type-var]
 
