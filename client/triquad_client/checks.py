@@ -4,7 +4,6 @@ What cannot be is refused with :class:`InvalidInputError`, of scans with :class:
 """
 
 import math
-import operator
 import reprlib
 import time
 from collections.abc import Sequence
@@ -20,11 +19,10 @@ from triquad_format.wire.limits import (
     MAX_POSITION_M,
     MIN_LENGTH_M,
 )
-from triquad_map.questions.distance import Unknown, UnknownLike
 from triquad_map.questions.grid import GridShape
 
 from triquad_client.errors import NO_NUMBER, InvalidScanError
-from triquad_client.real_numbers import real_number, real_numbers
+from triquad_client.real_numbers import real_number, real_numbers, whole_number
 
 Bounds: TypeAlias = tuple[Sequence[float], Sequence[float]]
 """Minimum and maximum corner of a box, metres, map frame; sides may be infinite."""
@@ -100,9 +98,7 @@ def chosen_epoch(at_epoch: int | None, name: str = "at_epoch") -> int:
     if at_epoch is None:
         return 0
     try:
-        if isinstance(at_epoch, bool):
-            raise TypeError("a truth value")
-        number = operator.index(at_epoch)
+        number = whole_number(at_epoch)
     except TypeError as error:
         raise InvalidInputError(
             f"{name} = {_shown(at_epoch)} is not the number of an epoch"
@@ -136,9 +132,13 @@ def flag(name: str, value: bool) -> bool:
 
 def count(name: str, value: int, most: int, *, least: int = 0) -> int:
     """Return ``value`` where it is a number of things, from ``least`` to ``most``."""
-    if type(value) is not int or not least <= value <= most:
+    try:
+        number = whole_number(value)
+    except TypeError as error:
+        raise InvalidInputError(f"{name} = {_shown(value)} is not a whole number") from error
+    if not least <= number <= most:
         raise InvalidInputError(f"{name} = {_shown(value)}: use {least} to {most}")
-    return value
+    return number
 
 
 def are_local(coordinates: str) -> bool:
@@ -178,15 +178,6 @@ def grid_shape(bounds: Bounds, cell_m: float) -> GridShape:
         )
     corner = np.where(high > low, low, low - side_m / 2)
     return GridShape(corner, side_m, (int(counts[0]), int(counts[1]), int(counts[2])))
-
-
-def unknown_policy(unknown: UnknownLike) -> Unknown:
-    """Return how unknown space is to count."""
-    try:
-        return Unknown(unknown)
-    except ValueError as error:
-        ways = ", ".join(repr(way.value) for way in Unknown)
-        raise InvalidInputError(f"unknown = {unknown!r}: use one of {ways}") from error
 
 
 def within(

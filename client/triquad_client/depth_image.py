@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 from triquad_format.records.arrays import Doubles, Floats
 
 from triquad_client.errors import NO_NUMBER, InvalidScanError
-from triquad_client.real_numbers import real_number, real_numbers
+from triquad_client.real_numbers import real_number, real_numbers, whole_number
 
 _MILLIMETRES_PER_M = 1000.0
 
@@ -87,9 +87,8 @@ def depth_points(
     image = _metres(depth, units)
     if not isinstance(intrinsics, Intrinsics):
         intrinsics = Intrinsics.from_matrix(intrinsics)
-    if isinstance(stride, bool) or not isinstance(stride, int) or stride < 1:
-        raise InvalidScanError(f"stride = {stride!r}: use 1 or more")
-    image = image[::stride, ::stride]
+    step = _stride(stride)
+    image = image[::step, ::step]
     finite = np.isfinite(image)
     rows, columns = np.nonzero(finite & (image > 0))
     if np.count_nonzero(finite & (image < 0)) > len(rows):
@@ -100,8 +99,18 @@ def depth_points(
     if len(rows) == 0:
         raise InvalidScanError("the depth image shows nothing: each pixel is 0 or not finite")
     z = image[rows, columns]
-    x, y = intrinsics.slopes(rows * stride, columns * stride) * z
+    x, y = intrinsics.slopes(rows * step, columns * step) * z
     return np.stack([x, y, z], axis=1).astype(np.float32)
+
+
+def _stride(stride: int) -> int:
+    try:
+        step = whole_number(stride)
+    except TypeError:
+        step = 0
+    if step < 1:
+        raise InvalidScanError(f"stride = {stride!r}: use a whole number, 1 or more")
+    return step
 
 
 def _units(units_per_metre: float) -> float:
@@ -115,7 +124,10 @@ def _units(units_per_metre: float) -> float:
 
 
 def _metres(depth: ArrayLike, units_per_metre: float | None) -> NDArray[np.floating]:
-    image = np.asarray(depth)
+    try:
+        image = real_numbers(depth)
+    except NO_NUMBER as error:
+        raise InvalidScanError(f"depth is not an image of real numbers: {error}") from error
     if image.ndim != 2 or image.size == 0:
         raise InvalidScanError(f"depth is {list(image.shape)}, not [rows, columns]")
     if image.dtype.kind == "f":

@@ -2,8 +2,9 @@
 
 from triquad_format.errors import InvalidInputError, TriquadError
 
-NO_NUMBER = (TypeError, ValueError, OverflowError)
-"""The errors of conversions to numbers: Python's integers may be larger than any float."""
+NO_NUMBER = (TypeError, ValueError, OverflowError, RuntimeError)
+"""The errors of conversions to numbers: Python's integers may be larger than any float, and torch
+gives no array of a tensor that requires a gradient."""
 
 _MAPS_NAMED = 20
 _NO_MAPS = "none (is this a router without a triquad server?)"

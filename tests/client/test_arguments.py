@@ -17,6 +17,14 @@ from triquad_client import (
     TriquadError,
 )
 
+
+class OfAGraph:
+    """What gives no array of itself, as torch does of a tensor that requires a gradient."""
+
+    def __array__(self, *_: Any, **__: Any) -> np.ndarray:
+        raise RuntimeError("Use tensor.detach().numpy() instead.")
+
+
 POSE = np.eye(4)
 CLOUD = np.ones((10, 3), np.float32)
 
@@ -37,6 +45,8 @@ def client() -> Iterator[Client]:
         (np.zeros((2, 3), complex), "complex128"),
         (np.full((2, 3), "1.5"), r"'1.5' \(<U3\) is not a real number"),
         ([[1, 2, 3], [4, 5]], "points are not"),
+        (np.ma.masked_greater(np.arange(6.0).reshape(2, 3), 4), "values are masked: fill them"),
+        (OfAGraph(), r"points are not .* Use tensor.detach\(\).numpy\(\) instead"),
         (None, "points are not"),
     ],
 )
@@ -71,6 +81,28 @@ def test_what_is_neither_true_nor_false_is_refused_here(
 ) -> None:
     with pytest.raises(InvalidInputError, match=f"{name}: use True or False"):
         question(client)
+
+
+@pytest.mark.parametrize(
+    ("question", "text"),
+    [
+        (lambda client: client.query_distance(CLOUD, True), "max_distance_m = True is not a n"),
+        (lambda client: client.flush(True), "timeout_s = True is not a number"),
+        (lambda client: client.sources(max_points=True), "max_points = True is not a whole n"),
+        (lambda client: client.sources(max_points=1.0), "max_points = 1.0 is not a whole number"),
+        (lambda client: client.query_distance(CLOUD, unknown="no"), "unknown = 'no': use one of"),
+        (lambda client: client.query_spheres(CLOUD, 0.1).free("no"), "unknown = 'no': use one of"),
+    ],
+)
+def test_values_of_another_kind_are_refused_here(
+    client: Client, question: Callable[[Client], object], text: str
+) -> None:
+    with pytest.raises(InvalidInputError, match=text):
+        question(client)
+
+
+def test_whole_numbers_of_numpy_are_taken(client: Client) -> None:
+    assert list(client.sources(max_points=np.int64(5)).sources) == list(client.sources().sources)
 
 
 def test_truth_values_of_numpy_are_taken(client: Client) -> None:

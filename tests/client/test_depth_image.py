@@ -54,6 +54,7 @@ def test_what_shows_nothing_is_left_out_and_a_stride_thins() -> None:
     depth = wall_depth()
     depth[0, 0], depth[2, 2], depth[1, 1] = np.nan, np.inf, 0
     assert len(depth_points(depth, CAMERA)) == depth.size - 3
+    assert len(depth_points(depth, CAMERA, np.int64(2))) == depth.size // 4 - 2  # type: ignore[arg-type]
     rep_117 = depth.copy()
     rep_117[1, 2:4] = -np.inf, -0.5
     assert len(depth_points(rep_117, CAMERA)) == depth.size - 5
@@ -87,8 +88,11 @@ def test_a_camera_matrix_gives_the_intrinsics() -> None:
         (np.full(SHAPE, -2.0), 1, "depth -2 m is negative"),
         (np.ones(SHAPE, np.uint8), 1, "depth is uint8: use floating metres, or millimetres"),
         (np.ones(SHAPE, int), 1, "depth is int64"),
-        ("depth", 1, r"depth is \[\]"),
-        (np.ones(SHAPE), 0, "stride = 0: use 1 or more"),
+        ("depth", 1, "depth is not an image of real numbers: 'depth'"),
+        ([[1.0, 2.0], [3.0]], 1, "depth is not an image of real numbers: setting an array"),
+        (np.ma.masked_equal(wall_depth(), 4.0), 1, "depth is .* some values are masked"),
+        (np.ones((4, 4, 1)), 1, r"depth is \[4, 4, 1\]"),
+        (np.ones(SHAPE), 0, "stride = 0: use a whole number"),
         (np.ones(SHAPE), 1.5, "stride = 1.5"),
     ],
 )

@@ -77,7 +77,7 @@ class PointQueries(Asking):
         Raises:
             UnknownSpaceError: ``unknown`` is ``"error"`` and unknown space is nearer somewhere.
         """
-        checked, policy = checks.query_points(points), checks.unknown_policy(unknown)
+        checked, policy = checks.query_points(points), Unknown(unknown)
         with_point = checks.flag("surface_point", surface_point)
         with_distance = checks.flag("unknown_distance", unknown_distance)
         with_distance = with_distance or policy is not Unknown.FREE

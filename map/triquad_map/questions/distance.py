@@ -3,11 +3,11 @@
 import dataclasses
 from dataclasses import dataclass
 from enum import Enum
-from typing import Literal, TypeAlias
+from typing import Literal, NoReturn, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.errors import TriquadError
+from triquad_format.errors import InvalidInputError, TriquadError
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats
 from triquad_format.records.status import Status
 
@@ -47,6 +47,12 @@ class Unknown(str, Enum):
     OBSTACLE = "obstacle"
     FREE = "free"
     ERROR = "error"  # to meet it raises UnknownSpaceError
+
+    @classmethod
+    def _missing_(cls, value: object) -> NoReturn:
+        """Refuse what is no such way, by name."""
+        ways = ", ".join(repr(way.value) for way in cls)
+        raise InvalidInputError(f"unknown = {value!r}: use one of {ways}")
 
 
 UnknownLike: TypeAlias = Unknown | Literal["obstacle", "free", "error"]
