@@ -127,11 +127,16 @@ def _read_file(file: Path) -> dict[str, Any]:
 
 def _read_environment() -> dict[str, Any]:
     tables: dict[str, Any] = {}
+    schemas = setting_schemas()
+    joined = {f"{section}_{key}": (section, key) for section in schemas for key in schemas[section]}
     for variable in sorted(os.environ):
         names = variable.removeprefix(_PREFIX).lower().split(_DELIMITER)
         is_setting = len(names) > 1 or names[0] in Settings.model_fields
         if variable.startswith(_PREFIX) and is_setting:
             _put(tables, names, os.environ[variable])
+        elif variable.startswith(_PREFIX) and names[0] in joined:
+            right = _PREFIX + _DELIMITER.join(joined[names[0]]).upper()
+            raise SettingsError(f"environment: {variable} is no setting: did you mean {right}?")
     return tables
 
 
@@ -201,13 +206,14 @@ def _problem(details: ErrorDetails) -> str:
 
 
 def _unknown(location: tuple[int | str, ...]) -> str:
-    """That a setting or a section is unknown, with the name that is nearest to it."""
+    """That a setting or a section is unknown, with the name that is near to it, if any is."""
     schemas = setting_schemas()
     if len(location) > 2:
         schemas[f"sources.{location[1]}"] = schemas.pop(SOURCE_SECTION)
     names = [f"{section}.{key}" for section, table in schemas.items() for key in table]
     if len(location) < 2:
-        names = [section.partition(".")[0] for section in schemas]
+        names += [section.partition(".")[0] for section in schemas]
     name = ".".join(map(str, location))
-    nearest = difflib.get_close_matches(name, names, n=1, cutoff=0)[0]
-    return f"unknown setting {name}: did you mean {nearest}?"
+    nearest = difflib.get_close_matches(name.lower(), names, n=1)
+    remedy = f"did you mean {nearest[0]}?" if nearest else "triquad-server --print-settings has all"
+    return f"unknown setting {name}: {remedy}"

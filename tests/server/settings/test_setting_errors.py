@@ -15,6 +15,7 @@ from triquad_server.settings.loading import load_settings
         ("TRIQUAD_STORE", ["store = 0.5", "[store]"]),
         ("TRIQUAD_SOURCES__ROOF__RANGE_MX_M", ["did you mean sources.roof.range_max_m?"]),
         ("TRIQUAD_SOURCES", ["sources = 0.5", "[sources.NAME]"]),
+        ("TRIQUAD_SCAN_RANGE_MIN_M", ["RANGE_MIN_M is no setting", "TRIQUAD_SCAN__RANGE_MIN_M?"]),
     ],
 )
 def test_errors_name_the_environment(
@@ -105,6 +106,9 @@ def test_errors_name_the_command_line(assignments: str, words: list[str]) -> Non
         ("[sources.roof]\nrobot_box = 3\n", ["did you mean sources.roof.robot_box_m?"]),
         ("[sources.roof]\nrobot_box_m = 3\n", ["robot_box_m = 3: write two corners, [[x, y, z]"]),
         ("[sources.a]\nrobot_box_m = [[0, 0, 0], [1, 1, 99]]\n", ["99", "or equal to 20"]),
+        ("range_min_m = 1\n", ["unknown setting range_min_m: did you mean scan.range_min_m?"]),
+        ("[SCAN]\nrange_min_m = 1\n", ["unknown setting SCAN: did you mean scan?"]),
+        ("[nix]\na = 1\n", ["unknown setting nix: triquad-server --print-settings has all"]),
         ("[field\n", ["settings.toml"]),
         (f"[field]\nleaf_m = 1{'0' * 400}\n", ["leaf_m", "number"]),
         (f"[field]\ndepth = 1{'0' * 5000}\n", ["settings.toml"]),
