@@ -73,7 +73,9 @@ def test_tool_refuses(map_file, tmp_path, capsys):
     refused(2, "--force", map_file, out)
     assert out.read_bytes() == b"precious"
     refused(1, "box", map_file, out, "--force", "--crop", *["900", "0", "0", "901", "1", "1"])
-    refused(2, "box", map_file, out, "--force", "--crop", *["1", "0", "0", "0", "1", "1"])
+    for name in ("out.triquad", "out.ply", "out.png"):
+        reversed_box = ["--crop", "1", "0", "0", "0", "1", "1"]
+        refused(2, "--crop holds nothing", map_file, tmp_path / name, "--force", *reversed_box)
     refused(2, "no such file", tmp_path / "none", out, "--force")
     broken = tmp_path / "broken"
     broken.write_bytes(before[:-50])

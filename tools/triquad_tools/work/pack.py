@@ -120,7 +120,12 @@ def _export(options: argparse.Namespace, path: Path) -> int:
 
 
 def _box(corners: list[float] | None) -> Box | None:
-    return None if corners is None else np.reshape(np.array(corners), (2, 3))
+    if corners is None:
+        return None
+    box = np.reshape(np.array(corners), (2, 3))
+    if not (box[0] < box[1]).all():
+        raise ToolError("the box of --crop holds nothing: XMIN YMIN ZMIN lie below XMAX YMAX ZMAX")
+    return box
 
 
 def _source(options: argparse.Namespace, path: Path, box: Box | None) -> tuple[SourceMap, bool]:
