@@ -3,9 +3,12 @@
 import subprocess
 import sys
 from importlib import import_module
+from pathlib import Path
 
 import pytest
 import triquad_format
+from support.files.golden import FOLDER
+from triquad_format.mapfile.reader import read_map
 
 COMMANDS = (
     "demo", "evaluate", "inspect", "keys", "map_recording", "pack", "replay", "ros2", "top", "view"
@@ -66,6 +69,15 @@ def test_wrong_usage_ends_with_code_2(name: str, arguments: tuple[str, ...]) -> 
     with pytest.raises(SystemExit) as caught:
         import_module(f"triquad_tools.commands.{name}").main(arguments)
     assert caught.value.code == 2
+
+
+def test_closed_streams_are_no_error(tmp_path: Path) -> None:
+    entry = "from triquad_tools.commands.entry_points import pack; raise SystemExit(pack())"
+    out = tmp_path / "out.triquad"
+    line = [sys.executable, "-c", entry, str(FOLDER / "map_v1.triquad"), str(out)]
+    done = subprocess.run(["sh", "-c", '"$@" >&- 2>&-', "sh", *line], timeout=WAIT_S)
+    assert done.returncode == 0
+    assert read_map(out).regions
 
 
 def test_nobody_who_reads_the_output_is_no_error() -> None:

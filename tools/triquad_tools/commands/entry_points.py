@@ -4,6 +4,7 @@ import importlib
 import importlib.util
 import os
 import signal
+import sys
 from functools import partial
 
 from triquad_tools.console.command import BAD_INPUT, INTERRUPTED, complain
@@ -11,6 +12,10 @@ from triquad_tools.console.command import BAD_INPUT, INTERRUPTED, complain
 
 def _run(command: str, module: str, *, extra: str = "tools", needs: tuple[str, ...] = ()) -> int:
     """Run the ``main`` of a command; ``needs`` are libraries that its processes import later."""
+    # Closed, as by >&- in a shell. What is opened next would pass for it, an output file too.
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115 - as long as the process
     _leave_on_interrupt(command)
     try:
         for name in needs:
