@@ -48,7 +48,7 @@ class LongWork:
         """Make the thread, of that ``niceness``, once it is needed."""
         self._thread = ThreadPoolExecutor(1, "long-work", lower_priority, (niceness,))
         self._lock = threading.Lock()
-        self._tasks: dict[int, _Task] = {}  # by ticket, the oldest first
+        self._tasks: dict[tuple[type, int], _Task] = {}  # by kind and ticket, the oldest first
 
     def close(self) -> None:
         """Finish what has begun; what has not is refused."""
@@ -61,7 +61,7 @@ class LongWork:
             RefusedError: ``under_way``: it is not; ``busy``: it will not be done. And as ``work``.
         """
         with self._lock:
-            task = self._tasks.get(request.ticket) or self._begin(work, request)
+            task = self._tasks.get((type(request), request.ticket)) or self._begin(work, request)
         try:
             result = task.result.result(_TOLD_AFTER_S if request.ticket else None)
         except TimeoutError:
@@ -84,8 +84,8 @@ class LongWork:
         except RuntimeError as error:  # it has been shut down
             raise RefusedError("busy", "the server is stopping") from error
         if request.ticket:
-            self._tasks[request.ticket] = task
-        done = [ticket for ticket, task in self._tasks.items() if task.result.done()]
-        for ticket in done[:-_MOST_KEPT]:
-            del self._tasks[ticket]
+            self._tasks[type(request), request.ticket] = task
+        done = [key for key, task in self._tasks.items() if task.result.done()]
+        for key in done[:-_MOST_KEPT]:
+            del self._tasks[key]
         return task

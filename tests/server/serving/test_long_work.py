@@ -18,6 +18,11 @@ class Asked:
     ticket: int
 
 
+@dataclass(frozen=True)
+class AskedOtherwise(Asked):
+    pass
+
+
 @dataclass
 class Held:
     """Work that begins, and ends once it is let."""
@@ -53,6 +58,14 @@ def test_who_asks_again_gets_the_result_of_the_first_time(work: LongWork) -> Non
     held.let.set()
     assert [work.answer(held, Asked(ticket)) for ticket in (0, 6, 5, 5)] == [0, -6, -5, -5]
     assert held.done == [5, 6, 0], "each was done once, in their order"
+
+
+def test_a_ticket_of_other_work_is_another(work: LongWork) -> None:
+    held = Held()
+    held.let.set()
+    assert work.answer(held, Asked(5)) == -5
+    assert work.answer(lambda request: "reset", AskedOtherwise(5)) == "reset"
+    assert work.answer(held, Asked(5)) == -5
 
 
 def test_what_went_wrong_is_told_to_who_asks_again(work: LongWork) -> None:
