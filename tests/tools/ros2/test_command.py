@@ -29,10 +29,10 @@ def test_the_domain_is_that_of_the_environment(monkeypatch: pytest.MonkeyPatch) 
     ("arguments", "reason"),
     [
         (["--clouds", "/a b"], "'/a b' is not the name of a topic"),
-        (["--domain", "233"], "'233' is not a whole number: use 0 to 232"),
+        (["--domain", "233"], "'233' is not a whole number in range: use 0 to 232"),
         (["--wait-s", "soon"], "'soon' is not a number"),
         (["--grid-cell-m", "0.001"], "'0.001' is not a number in range: use 0.01 to 10"),
-        (["--mesh-bytes-per-s", "5"], "'5' is not a whole number: use 1000 to"),
+        (["--mesh-bytes-per-s", "5"], "'5' is not a whole number in range: use 1000 to"),
     ],
 )
 def test_wrong_options_are_refused_with_the_value(

@@ -61,7 +61,9 @@ def whole(least: int, most: int | None, text: str) -> int:
     digits = text.isascii() and text.isdigit()
     if not digits or int(text) < least or (most is not None and int(text) > most):
         values = f"{least}, {least + 1}, ..." if most is None else f"{least} to {most}"
-        raise argparse.ArgumentTypeError(f"{text!r:.40} is not a whole number: use {values}")
+        raise argparse.ArgumentTypeError(
+            f"{text!r:.40} is not a whole number in range: use {values}"
+        )
     return int(text)
 
 
