@@ -4,12 +4,16 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
+from support.files.changing_store import box_at, write_checkpoint
 from support.maps.exact_maps import exact_map, flat
 from support.servers import SMALL, learn, running_service
 from triquad_client import connect
+from triquad_client.mesh.followed_mesh import MeshTile
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.arrays import Doubles
-from triquad_tools.viewer.mesh.tile_colours import before_tone_mapping
+from triquad_tools.viewer.mesh.mesh_layer import cut_tile, joined_tiles
+from triquad_tools.viewer.mesh.tile_colours import before_tone_mapping, height_colours
 from triquad_tools.viewer.mesh.tiles_in_view import NearTiles, TilesInView
 from triquad_tools.viewer.sources import COARSEST, LiveSource, MapSource, StoredMap
 
@@ -61,6 +65,42 @@ def assert_detail_near(source: MapSource, place: Doubles) -> None:
         for tile in shown.values():
             assert np.abs(tile.origin + tile.vertices - place).max() < 20.0
     tiles.close()
+
+
+def test_a_mesh_is_cut_and_joined(tmp_path: Path) -> None:
+    path = write_checkpoint(tmp_path, 7, box_at(3.0, 3.0))
+    source = StoredMap(path, "here")
+    follower = source.follow(0)
+    while not follower.complete:
+        follower.next(0.0)
+    tiles, side_m = list(follower.tiles.values()), source.sizes.tile_side_m
+    whole = source.queries.mesh(cell_m=source.sizes.cell_m)
+    mesh = joined_tiles(tiles, side_m)
+    assert mesh.epoch == 7
+    assert len(mesh.vertices) == pytest.approx(len(whole.vertices), rel=1e-3), "without seams"
+    assert mesh.vertices[:, 2].max() > 1.4
+    cut = joined_tiles([cut_tile(tile, 0.8) for tile in tiles], side_m)
+    assert 0.1 < cut.vertices[:, 2].max() <= 0.8
+    below = (whole.vertices[whole.faces][..., 2] <= 0.8).all(axis=1)
+    assert len(cut.faces) == pytest.approx(below.sum(), rel=1e-3)
+    assert not len(joined_tiles([], side_m).faces)
+
+
+def test_what_lies_near_a_flat_ground_has_most_of_the_colours() -> None:
+    rng = np.random.default_rng(0)
+    walls = rng.uniform(0.0, 8.0, 3000)
+    street = np.concatenate([rng.normal(0.0, 0.02, 3000), walls])
+    even, stretched = height_colours(walls), height_colours(street)
+    assert "4" in even.scale.html
+    for colours, least in (even, 0.0), (stretched, 2.0 * 1.5 / 8.5):
+        scale, tile = colours.scale, MeshTile(
+            (0, 0, 0), 1, "", 0, np.zeros(3), np.float32([[0, 0, 0], [0, 0, 1.5], [0, 0, 8]]),
+            np.int32([[0, 1, 2]]),
+        )  # fmt: skip
+        places = (colours.values(tile) - scale.low) / (scale.high - scale.low)
+        assert (np.diff(places) > 0).all()
+        assert places[1] - places[0] > least, "a car is not as the road"
+        np.testing.assert_allclose(scale.told(colours.values(tile)), [0, 1.5, 8], atol=1e-5)
 
 
 def test_the_browser_shows_the_colours_of_the_legend() -> None:

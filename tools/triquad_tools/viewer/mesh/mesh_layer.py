@@ -2,20 +2,23 @@
 
 import math
 from collections import deque
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import viser
+from triquad_client import Mesh
 from triquad_client.mesh.followed_mesh import MeshTile
 from triquad_client.mesh.mesh_files import GlbMesh, glb_bytes
 from triquad_format.records.arrays import Doubles
+from triquad_map.triangles import Triangles, joined
 
 from triquad_tools.plots.mesh_view import view_axes
 from triquad_tools.viewer.mesh.tile_colours import (
-    TileColours,
     confidence_colours,
     height_colours,
+    height_range,
     lit_colours,
 )
 from triquad_tools.viewer.mesh.tiles_in_view import TileName, TilesInView
@@ -35,6 +38,7 @@ _EYES = 64  # places where it was put last: what a browser reports is not as old
 _PERIOD_S = 0.5
 _HEIGHT, _CONFIDENCE = "height", "confidence"
 _PIXELS = 4  # of a cell
+_CUT_M = 0.1  # steps of the slider
 _ENOUGH = 200  # vertices of a tile, to know where it is
 
 
@@ -95,7 +99,8 @@ class OverviewCamera:
 
 class _DrawnTile(NamedTuple):
     appearance: Hashable  # if this is another one, the drawing is outdated
-    handle: viser.GlbHandle
+    tile: MeshTile  # as it was cut
+    handles: Sequence[viser.GlbHandle]  # one, or none where nothing is left of it
 
 
 class MeshLayer(Layer):
@@ -104,29 +109,37 @@ class MeshLayer(Layer):
     def __init__(self, page: Page) -> None:
         super().__init__(page, "Mesh", _PERIOD_S)
         self._camera = OverviewCamera(page)
-        self._framed = False
+        self._framed = 0.0  # aspect of the page when all was framed
         self._tiles = TilesInView(page.source)
         self._replacing = False  # tiles of the map that was shown before are drawn
         self._shown: dict[TileName, _DrawnTile] = {}
         self._replaced: list[viser.GlbHandle] = []  # they go a round later: nothing flickers
+        gui = page.gui
         with self.folder:
-            self._by = page.gui.add_dropdown("Colour", (_HEIGHT, _CONFIDENCE))
+            self._on = gui.add_checkbox("Show mesh", True)
+            self._by = gui.add_dropdown("Colour", (_HEIGHT, _CONFIDENCE))
             self.add_text()
-            self._pixels = page.gui.add_slider("Pixels per cell", 1, 20, 1, _PIXELS)
+            self._top = gui.add_slider("Cut above (m)", 0.0, 0.5, _CUT_M, 0.5)
+            self._pixels = gui.add_slider("Pixels per cell", 1, 20, 1, _PIXELS)
+            save = gui.add_button("Save mesh (GLB)")
+        save.on_click(self._save)
         page.client.camera.on_update(self.wake)
-        self.start(self._by, self._pixels)
+        self.start(self._on, self._by, self._top, self._pixels)
 
     def close(self) -> None:
         """Draw no more; remove what was drawn and the folder."""
         super().close()
-        for handle in (*self._replaced, *(drawn.handle for drawn in self._shown.values())):
+        for handle in (
+            *self._replaced,
+            *(each for one in self._shown.values() for each in one.handles),
+        ):
             handle.remove()
         self._tiles.close()
 
     def show_all(self) -> None:
         """Look at all that was seen."""
         self._camera.release()
-        self._framed = False
+        self._framed = 0.0
         self.wake()
 
     def refresh(self) -> None:
@@ -146,32 +159,70 @@ class MeshLayer(Layer):
             self.wake()
         if not self._replacing:
             self._draw(wanted)
+            self.page.drawn = self._tiles.source
 
     def _draw(self, wanted: Mapping[TileName, MeshTile]) -> None:
         """Draw these tiles alone; those that they replace go a round later."""
         points = _some_vertices(self._tiles.roots.values())
-        if self.page.source.grows or not self._framed:
+        aspect = self.page.client.camera.aspect  # another one once the panel has its place
+        if self.page.source.grows or aspect != self._framed:
             self._camera.follow(points)
-            self._framed = self._tiles.loaded
-        colours = height_colours(points[:, 2])
+            self._framed = aspect if self._tiles.loaded else 0.0
+        top_m = self._cut_at(*height_range(points[:, 2]))
+        colours = height_colours(points[points[:, 2] <= top_m, 2])
         if self._by.value == _CONFIDENCE:
             colours = confidence_colours(self.page.source.queries)
         self.tell(colours.scale.html)
-        for name, tile in wanted.items():
-            appearance = (colours.scale.label, colours.scale.low, colours.scale.high, tile.version)
+        shown = wanted if self._on.value else {}
+        for name, tile in shown.items():
+            scale = colours.scale
+            appearance = (scale.label, scale.low, scale.high, top_m, tile.version)
             drawn = self._shown.get(name)
             if drawn is None or drawn.appearance != appearance:
-                self._shown[name] = _DrawnTile(appearance, self._add(tile, colours))
-                self._replaced += [drawn.handle] if drawn else []
-        for name in self._shown.keys() - wanted.keys():
-            self._replaced.append(self._shown.pop(name).handle)
+                cut = cut_tile(tile, top_m)
+                handles = [self._add(cut, lit_colours(colours, tile))] if len(cut.faces) else []
+                self._shown[name] = _DrawnTile(appearance, cut, handles)
+                self._replaced += drawn.handles if drawn else []
+        for name in self._shown.keys() - shown.keys():
+            self._replaced += self._shown.pop(name).handles
 
-    def _add(self, tile: MeshTile, colours: TileColours) -> viser.GlbHandle:
-        mesh = GlbMesh("tile", tile.vertices, tile.faces, lit_colours(colours, tile))
+    def _cut_at(self, least_m: float, most_m: float) -> float:
+        """Return above which height nothing is drawn; at the slider's end there is none."""
+        slider, top_m = self._top, self._top.value
+        top_m = most_m if top_m >= slider.max else min(max(top_m, least_m), most_m)
+        slider.min, slider.max = least_m, most_m
+        slider.value = top_m  # type: ignore[misc]  # mypy takes it for read-only
+        self.page.top_m = top_m if top_m < most_m else math.inf
+        return self.page.top_m
+
+    def _add(self, tile: MeshTile, colours: Doubles) -> viser.GlbHandle:
         return self.page.scene.add_glb(
-            self.node("tile"), glb_bytes([mesh]), position=self.page.in_scene(tile.origin),
-            cast_shadow=False, receive_shadow=False,
+            self.node("tile"), glb_bytes([GlbMesh("tile", tile.vertices, tile.faces, colours)]),
+            position=self.page.in_scene(tile.origin), cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
+
+    def _save(self, _: object) -> None:
+        """Send the mesh to the browser as it is drawn, in the map frame."""
+        tiles = [drawn.tile for drawn in list(self._shown.values())]
+        mesh = joined_tiles(tiles, self.page.source.sizes.tile_side_m)
+        self.page.client.send_file_download(
+            "triquad-mesh.glb", mesh.file_bytes(".glb"), save_immediately=True
+        )
+
+
+def cut_tile(tile: MeshTile, top_m: float) -> MeshTile:
+    """Return a tile without the faces that reach above a height; all of its vertices stay."""
+    below = tile.origin[2] + tile.vertices[:, 2] <= top_m
+    return replace(tile, faces=tile.faces[below[tile.faces].all(axis=1)])
+
+
+def joined_tiles(tiles: Sequence[MeshTile], tile_side_m: float) -> Mesh:
+    """Return tiles as one mesh; the side is that of tiles of level 0, metres."""
+    zero = tiles[0].origin if tiles else np.zeros(3)
+    parts = (Triangles(tile.origin - zero + tile.vertices, tile.faces) for tile in tiles)
+    everywhere = np.full(3, -np.inf), np.full(3, np.inf)
+    epoch = max((tile.version for tile in tiles), default=0)
+    return Mesh.of(joined(parts, tile_side_m, everywhere).moved(zero), epoch)
 
 
 def _some_vertices(tiles: Iterable[MeshTile]) -> Doubles:

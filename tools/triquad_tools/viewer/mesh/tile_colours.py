@@ -17,7 +17,11 @@ from triquad_tools.viewer.page.legends import ColourScale
 
 _TOWARDS_SUN = np.array([-0.50, -0.58, 0.64]) / np.linalg.norm([-0.50, -0.58, 0.64])
 _SUN, _SKY = 0.55, 0.5
-_STEP_M = 0.5  # of the ends of the scale: it stays the same as the map grows a little
+_STEEPER = 2.5  # are slopes in that light than they are: else a kerb on flat ground is not seen
+# Of the ends of the scale: it stays the same as the map grows a little.
+_STEP_M, _FINE_STEP_M, _FINE_M = 0.5, 0.1, 2.0  # the fine step: of a scale that is as short
+_MANY = 0.25  # share of heights within the same half metre
+_EVEN_M = 1.0  # about that, the scale is nearly even; farther away it goes by factors
 _NEAR_M = 1.0  # around a vertex, where its surface is searched for
 
 # The browser's tone mapping, ACES Filmic as three.js has it, which viser cannot be asked to leave
@@ -37,15 +41,41 @@ class TileColours:
     values: Callable[[MeshTile], NDArray[np.floating]]  # [V] places of the vertices on the scale
 
 
-def height_colours(heights_m: NDArray[np.floating]) -> TileColours:
-    """Colour by height in the map frame, on a scale for nearly all heights [N], to half a metre."""
+def height_range(heights_m: NDArray[np.floating]) -> tuple[float, float]:
+    """Return round ends, metres, of nearly all heights [N]."""
     around = HeightScale.around(heights_m)
-    low_m = math.floor(around.low_m / _STEP_M) * _STEP_M
-    high_m = math.ceil(around.high_m / _STEP_M) * _STEP_M
+    step_m = _FINE_STEP_M if around.high_m - around.low_m < _FINE_M else _STEP_M
+    low_m = math.floor(around.low_m / step_m) * step_m
+    return round(low_m, 1), round(math.ceil(around.high_m / step_m) * step_m, 1)
+
+
+def height_colours(heights_m: NDArray[np.floating]) -> TileColours:
+    """Colour by height in the map frame, on a scale for nearly all heights [N].
+
+    Where many lie about one, as on a street with its houses, heights near that have most of the
+    colours: on an even scale a car would look like the road.
+    """
+    ground_m, ends_m = _flat_ground(heights_m), np.array(height_range(heights_m))
+
+    def place(heights_m: NDArray[np.floating]) -> NDArray[np.floating]:
+        return heights_m if ground_m is None else np.arcsinh((heights_m - ground_m) / _EVEN_M)
+
+    def height(places: Doubles) -> Doubles:
+        return places if ground_m is None else ground_m + _EVEN_M * np.sinh(places)
+
+    low, high = place(ends_m).tolist()
     return TileColours(
-        ColourScale("height, m", HEIGHTS, low_m, high_m, open_below=True, open_above=True),
-        values=lambda tile: tile.origin[2] + tile.vertices[:, 2],
+        ColourScale("height, m", HEIGHTS, low, high, True, True, told=height),
+        values=lambda tile: place(tile.origin[2] + tile.vertices[:, 2]),
     )
+
+
+def _flat_ground(heights_m: NDArray[np.floating]) -> float | None:
+    """Return the height, to half a metre, about which many of heights [N], metres, lie, if any."""
+    steps, counts = np.unique(np.round(heights_m / _STEP_M), return_counts=True)
+    if not len(steps) or counts.max() < _MANY * len(heights_m):
+        return None
+    return float(_STEP_M * steps[counts.argmax()])
 
 
 def confidence_colours(queries: MapQueries) -> TileColours:
@@ -60,7 +90,8 @@ def lit_colours(colours: TileColours, tile: MeshTile) -> Doubles:
     """Return linear colours [V, 3] for the browser, in the light of a sun and a bright sky."""
     scale = colours.scale
     places = (np.asarray(colours.values(tile), np.float64) - scale.low) / (scale.high - scale.low)
-    up = vertex_normals(tile.vertices.astype(np.float64), tile.faces)
+    up = vertex_normals(tile.vertices.astype(np.float64), tile.faces) * [_STEEPER, _STEEPER, 1.0]
+    up /= np.maximum(np.linalg.norm(up, axis=1, keepdims=True), 1e-30)
     light = _SUN * np.maximum(up @ _TOWARDS_SUN, 0.0) + _SKY * (0.75 + 0.25 * up[:, 2])
     return before_tone_mapping(scale.colours(places)[:, :3] ** GAMMA * light[:, None])
 

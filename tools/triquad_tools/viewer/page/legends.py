@@ -3,13 +3,14 @@
 Texts from the network are shown as they are.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from html import escape
 
 import numpy as np
 from matplotlib.colors import Colormap, to_hex
 from triquad_format.printable import printable_lines
+from triquad_format.records.arrays import Doubles
 
 _TICKS = 5
 _TEXT = "padding: 0.2em 1em; font-size: 0.8em; line-height: 1.4; overflow-wrap: anywhere"
@@ -25,19 +26,21 @@ class ColourScale:
     high: float
     open_below: bool = False  # there may be values below
     open_above: bool = False
+    told: Callable[[Doubles], Doubles] = lambda values: values  # what labels say of them
 
     @property
     def html(self) -> str:
         """The scale for the panel, with labels at equal steps."""
         stops = ", ".join(to_hex(colour) for colour in self.colours(np.linspace(0.0, 1.0, 17)))
-        texts = [f"{value:.3g}" for value in np.linspace(self.low, self.high, _TICKS)]
+        ticks = self.told(np.linspace(self.low, self.high, _TICKS))
+        texts = [f"{round(tick, 2):.3g}" for tick in ticks]
         texts[0] = f"≤ {texts[0]}" if self.open_below else texts[0]
         texts[-1] = f"≥ {texts[-1]}" if self.open_above else texts[-1]
-        ticks = "".join(f"<span>{text}</span>" for text in texts)
+        labels = "".join(f"<span>{text}</span>" for text in texts)
         return (
             f'<div style="padding: 0.2em 1em; font-size: 0.8em"><div>{self.label}</div>'
             f'<div style="height: 0.8em; background: linear-gradient(to right, {stops})"></div>'
-            f'<div style="display: flex; justify-content: space-between">{ticks}</div></div>'
+            f'<div style="display: flex; justify-content: space-between">{labels}</div></div>'
         )
 
 
@@ -46,7 +49,7 @@ def lines_html(*lines: tuple[str, str]) -> str:
     return "".join(
         f'<div style="padding: 0 1.3em; font-size: 0.8em"><span style="display: inline-block; '
         "width: 2.5em; vertical-align: middle; margin-right: 0.6em; "
-        f'border-top: 3px solid {colour}"></span>{text}</div>'
+        f'border-top: 3px solid {colour}; outline: 1px solid #8886"></span>{text}</div>'
         for colour, text in lines
     )
 

@@ -36,6 +36,8 @@ class Page:
     """The page that its parts draw on; for several threads."""
 
     source: MapSource  # the map, which a part may replace: all others go on with the new one
+    drawn: MapSource | None = None  # the map whose mesh is in the scene
+    top_m = math.inf  # map frame: what lies above is not drawn, and no click meets it
 
     def __init__(self, client: viser.ClientHandle) -> None:
         self.client = client
@@ -86,7 +88,8 @@ class Page:
 def surface_along(page: Page, origin: Doubles, towards: Doubles) -> Doubles | None:
     """Return the first surface [3], metres, map frame, whose front a ray meets; else ``None``.
 
-    A ray through a hole as small as a voxel meets what is around it.
+    What lies above the page's top does not count. A ray through a hole as small as a voxel meets
+    what is around it.
 
     Args:
         page: whose map is shown.
@@ -98,10 +101,13 @@ def surface_along(page: Page, origin: Doubles, towards: Doubles) -> Doubles | No
     """
     direction, queries = towards / np.linalg.norm(towards), page.source.queries
     away_m = float(np.linalg.norm(page.focus.middle - page.eye))
-    start = origin + max(away_m - _BEFORE_M, 0.0) * direction
+    top_m, start = page.top_m, origin + max(away_m - _BEFORE_M, 0.0) * direction
+    if start[2] > top_m and direction[2] < 0:
+        start = start + (top_m - start[2]) / direction[2] * direction
     cell_m = page.source.sizes.cell_m
     places = (start, *(start + side_m for side_m in sides(direction, (cell_m, 2 * cell_m))))
-    return next((met for at in places if (met := front(queries, at, direction)) is not None), None)
+    found = (front(queries, at, direction) for at in places)
+    return next((met for met in found if met is not None and met[2] <= top_m), None)
 
 
 def sides(direction: Doubles, lengths: Sequence[float]) -> Iterator[Doubles]:
