@@ -12,6 +12,7 @@ from triquad_client import OfflineMap, Status
 from triquad_tools.viewer.page.page import Focus, surface_along
 from triquad_tools.viewer.questions.cell_box import CellBox
 from triquad_tools.viewer.questions.clicks import Path
+from triquad_tools.viewer.questions.measure import Measure
 from triquad_tools.viewer.questions.slice import Slice
 from triquad_tools.viewer.questions.unknown_space import ask_boundary, border_faces
 from triquad_tools.viewer.view_panel import round_length, turned_back
@@ -54,13 +55,24 @@ def test_a_click_snaps_to_surface_within_a_voxel(
         source=SimpleNamespace(queries=ground, sizes=SimpleNamespace(cell_m=0.5 * ground.leaf_m)),
         focus=FOCUS,
         eye=np.array([0.0, 0, 5]),
+        top_m=1.0,
     )
     origin = np.array([SEEN_M + beyond_m, 0.03, 1.5])
     met = surface_along(page, origin, np.array([0.0, 0, -2]))  # type: ignore[arg-type]
     assert (met is not None) == is_met
+    page.top_m = GROUND_M - 0.05
+    cut = surface_along(page, origin, np.array([0.0, 0, -2]))  # type: ignore[arg-type]
+    assert cut is None, "what is not drawn is not met"
     if met is not None:
         assert abs(met[2] - GROUND_M) < 0.05
         assert np.linalg.norm(met[:2] - origin[:2]) <= ground.leaf_m + 1e-6
+
+
+def test_a_length_has_a_level_and_an_upright_part() -> None:
+    start = np.array([450_000.0, -2.0, 1.0])
+    html = Measure(start, start + [3.0, 4.0, -12.0]).html()
+    for told in ("13.000 m", "5.000 m", "-12.000 m"):
+        assert told in html
 
 
 @given(st.floats(1e-3, 1e6))

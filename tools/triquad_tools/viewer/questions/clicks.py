@@ -16,6 +16,7 @@ from triquad_tools.plots.colours import BEHIND, UNKNOWN
 from triquad_tools.viewer.page.layer import Answer, Layer, Question
 from triquad_tools.viewer.page.legends import lines_html, table_html, text_html
 from triquad_tools.viewer.page.page import Page, surface_along
+from triquad_tools.viewer.questions.measure import Measure
 
 _POINT_REACH_M = 10.0  # how far around a point surfaces are searched for
 
@@ -30,10 +31,12 @@ _LEGEND = lines_html(
     (UNKNOWN, "it is in unknown space, or was before"),
     (BEHIND, "it touches a surface, or did before"),
 )
-_ASKS, _LAYS, _NOTHING = "asks the map", "adds to the path", "does nothing"
+_ASKS, _MEASURES, _LAYS = "asks the map", "measures a length", "adds to the path"
+_NOTHING = "does nothing"
 _RAISED_M, _RADIUS_M = 0.5, 0.3
 _LEAST_LEG_M = 0.01  # a second click at the same place adds nothing
 _HINT = "Click at a surface."
+_OTHER_END = "Click at the other end."
 _SKY = "No surface there: sky, or nothing was seen in that direction."
 
 
@@ -155,6 +158,7 @@ class Clicked:
     points: tuple[Point, ...]
     radius_m: float
     sky: bool  # whether the newest click met no surface
+    measured: bool  # from one to the next, without a robot
 
 
 class Clicks(Question[Clicked]):
@@ -164,18 +168,20 @@ class Clicks(Question[Clicked]):
         super().__init__(page, "Clicks")
         self._events: deque[viser.SceneClickEvent] = deque()
         self._points: tuple[Point, ...] = ()
-        self._sky = False
+        self._sky = self._measured = False
         self.hint = _HINT
         gui = page.gui
         with self.folder:
-            self._use = gui.add_dropdown("A click", (_ASKS, _LAYS, _NOTHING))
+            self._use = gui.add_dropdown("A click", (_ASKS, _MEASURES, _LAYS, _NOTHING))
             self._raised = gui.add_number("Raised by (m)", _RAISED_M, min=0.0, max=100.0, step=0.05)
             self._radius = gui.add_number("Radius (m)", _RADIUS_M, min=0.0, max=50.0, step=0.05)
             self._undo = gui.add_button("Undo last point")
             self._clear = gui.add_button("Clear path")
+            self._save = gui.add_button("Save path (CSV)")
             self.add_text(text_html(_HINT))
         self._undo.on_click(lambda _: self._keep(self._points[:-1]))
         self._clear.on_click(lambda _: self._keep(()))
+        self._save.on_click(lambda _: self._send())
         page.scene.on_click()(self._clicked)
         self.start(self._use, self._radius)
 
@@ -186,19 +192,25 @@ class Clicks(Question[Clicked]):
 
     def wanted(self) -> Clicked | None:
         """Find what was clicked at, and return it with all before, if there is anything."""
+        is_path = len(self._points) > 1 and not self._measured
         for control in (self._radius, self._undo, self._clear):
-            control.visible = self._use.value == _LAYS or len(self._points) > 1
+            control.visible = self._use.value == _LAYS or is_path
+        self._save.visible = is_path
         while self._events:
             self._find(self._events.popleft())
         self.hint = _SKY if self._sky else _HINT
-        clicked = Clicked(self._points, float(self._radius.value), self._sky)
+        radius_m = float(self._radius.value)
+        clicked = Clicked(self._points, radius_m, self._sky, self._measured)
         return clicked if self._points else None
 
     def ask(self, wanted: Clicked) -> Answer:
         """Ask at the newest point, and about the path if there are several."""
         queries, point = self.page.source.queries, wanted.points[-1]
-        told = text_html(_SKY) if wanted.sky else ""
+        told = text_html(_SKY if wanted.sky else _OTHER_END if wanted.measured else "")
         found = queries.query_distance(point.place[None], _POINT_REACH_M)
+        if wanted.measured and len(wanted.points) > 1:
+            measure = Measure(wanted.points[0].place, point.place)
+            return Answer(measure.html(), found.epoch, measure.marks(self))
         if len(wanted.points) == 1:
             html, marks = told + point.html(found), point.marks(self, found)
             return Answer(html, found.epoch, marks)
@@ -206,6 +218,14 @@ class Clicks(Question[Clicked]):
         path = Path(queries, places, wanted.radius_m)
         html = told + path.html() + point.html(found)
         return Answer(html, found.epoch, path.marks(self) + point.marks(self, found))
+
+    def _send(self) -> None:
+        """Send the points of the path to the browser, as they were clicked at and raised."""
+        rows = (f"{x:.4f},{y:.4f},{z:.4f}" for x, y, z in (each.place for each in self._points))
+        text = "\n".join(["x_m,y_m,z_m", *rows, ""])
+        self.page.client.send_file_download(
+            "triquad-path.csv", text.encode(), save_immediately=True
+        )
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         if self._use.value != _NOTHING:
@@ -220,11 +240,15 @@ class Clicks(Question[Clicked]):
         origin = self.page.in_map(np.array(event.ray_origin))
         surface = surface_along(self.page, origin, np.array(event.ray_direction))
         self._sky = surface is None
-        before = self._points if self._use.value == _LAYS else ()
+        use, was_measured = self._use.value, self._measured
+        self._measured = use == _MEASURES
+        goes_on = use == _LAYS and not was_measured or self._measured and len(self._points) == 1
+        before = self._points if goes_on else ()
         if surface is None:
             self._points = before
             return
-        point = Point(tuple(surface.tolist()), float(self._raised.value))
+        raised_m = 0.0 if self._measured else float(self._raised.value)
+        point = Point(tuple(surface.tolist()), raised_m)
         if not before or np.linalg.norm(point.place - before[-1].place) > _LEAST_LEG_M:
             before += (point,)
         self._points = before

@@ -79,7 +79,7 @@ class SliceQuestion(Question[Slice]):
             self._on = gui.add_checkbox("Show slice", False)
             self._kind = gui.add_dropdown("Slice", tuple(_AXES), visible=False)
             self._at = gui.add_slider("At (m)", -_REACH_M, _REACH_M, _STEP_M, 0.0, visible=False)
-            self._here = gui.add_button("Through the middle of the view", visible=False)
+            self._here = gui.add_button("Through the middle", visible=False)
             self._most = gui.add_number(
                 "Up to (m)", _MAX_DISTANCE_M, min=0.2, max=50.0, step=0.1, visible=False
             )
