@@ -35,6 +35,14 @@ def test_a_store_is_shown_as_it_was(
         page.keyboard.press("End")
         expect(page.get_by_text("epoch 5, 2026-01-31T17:00:00Z 4 of 4")).to_be_visible()
         wait_until_drawn(page)
+        page.get_by_role("button", name="Play").click()
+        for number in range(1, 5):
+            expect(page.get_by_text(f"{number} of 4")).to_be_visible()
+        expect(page.get_by_role("button", name="Play")).to_be_visible()
+        page.get_by_role("button", name="Play").click()
+        expect(page.get_by_text("1 of 4")).to_be_visible()
+        page.get_by_role("button", name="Pause").click()
+        expect(page.get_by_role("button", name="Play")).to_be_visible()
 
 
 def _differs(page: Page, before: np.ndarray) -> int:
