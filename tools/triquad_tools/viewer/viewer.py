@@ -6,6 +6,7 @@ import threading
 import warnings
 from collections.abc import Sequence
 from contextlib import ExitStack, redirect_stdout
+from typing import Literal
 
 import viser
 from triquad_format.errors import TriquadError
@@ -23,6 +24,7 @@ from triquad_tools.viewer.time_panel import TimePanel
 from triquad_tools.viewer.trail_layer import TrailLayer
 from triquad_tools.viewer.view_panel import ViewPanel
 
+_UPRIGHT, _NARROW = 1.0, 1.5  # width to height: how many pixels a screen has says nothing
 _OF_ONE_WHO_LEFT = ("Queued a .* on a closed connection", "Attempted to remove an? already removed")
 """Warnings of viser that come when a browser leaves while something is drawn or removed."""
 
@@ -34,15 +36,16 @@ def open_page(client: viser.ClientHandle, shown: MapSource | History) -> ExitSta
     try:
         page.source = source = shown.newest() if isinstance(shown, History) else shown
         title.content = text_html(source.title)
-        if isinstance(shown, History):
-            parts.callback(TimePanel(page, shown).close)
-        mesh = MeshLayer(page)
-        parts.callback(mesh.close)
-        parts.callback(ViewPanel(page, mesh).close)
-        for part in (SliceQuestion, UnknownSpace, Clicks):
-            parts.callback(part(page).close)
-        if isinstance(source, LiveSource):
-            parts.callback(TrailLayer(page, source.client).close)
+        with _controls(client):
+            if isinstance(shown, History):
+                parts.callback(TimePanel(page, shown).close)
+            mesh = MeshLayer(page)
+            parts.callback(mesh.close)
+            parts.callback(ViewPanel(page, mesh).close)
+            for part in (SliceQuestion, UnknownSpace, Clicks):
+                parts.callback(part(page).close)
+            if isinstance(source, LiveSource):
+                parts.callback(TrailLayer(page, source.client).close)
     except TriquadError as error:
         page.failed("page", str(error))
     except Exception:
@@ -51,9 +54,16 @@ def open_page(client: viser.ClientHandle, shown: MapSource | History) -> ExitSta
     return parts
 
 
+def _controls(client: viser.ClientHandle) -> viser.GuiFolderHandle:
+    """Return where controls are; on a page as a phone has it, a folder that is shut at first."""
+    upright = client.camera.aspect < _UPRIGHT
+    return client.gui.add_folder("Controls" if upright else None, expand_by_default=not upright)
+
+
 def _prepare(client: viser.ClientHandle) -> None:
     """Make a page plain: the map alone, z upwards."""
-    client.gui.configure_theme(show_logo=False, show_share_button=False)
+    width: Literal["small", "medium"] = "small" if client.camera.aspect < _NARROW else "medium"
+    client.gui.configure_theme(control_width=width, show_logo=False, show_share_button=False)
     client.gui.main_panel.dock_right()
     client.gui.set_panel_label("triquad")
     client.scene.set_up_direction("+z")
