@@ -161,3 +161,18 @@ def test_what_shrinks_to_a_thousandth_is_read(tmp_path: Path) -> None:
     path = tmp_path / "map.triquad"
     write_map(record, path, feature_dtype="<f4")
     assert_same(read_map(path), record)
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir], ids=["a pipe", "a folder"])
+def test_what_is_no_file_is_not_replaced(tmp_path: Path, make: Callable[[Path], None]) -> None:
+    """As root, a device such as /dev/null would be gone."""
+    there, link = tmp_path / "there.triquad", tmp_path / "link.triquad"
+    make(there)
+    link.symlink_to(there)
+    before = there.stat()
+    for path in (there, link):
+        with pytest.raises(OSError, match=path.name):
+            write_map(random_record(18), path)
+    assert (there.stat().st_ino, there.stat().st_mode) == (before.st_ino, before.st_mode)
+    assert link.is_symlink()
+    assert len(list(tmp_path.iterdir())) == 2

@@ -1,6 +1,7 @@
 """Files on a disk: read from any place, written whole and durably or not at all."""
 
 import contextlib
+import errno
 import io
 import os
 import secrets
@@ -95,8 +96,11 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     """Yield a stream whose bytes replace the file at ``path``, durably, where nothing is raised.
 
     Raises:
-        OSError: the file cannot be written; it is named, and the one that was there stays.
+        OSError: the file cannot be written, or what is there is none, such as a device; it is
+            named, and what was there stays.
     """
+    if path.exists() and not path.is_file():
+        raise FileExistsError(errno.EEXIST, "it is no file, and is not replaced", str(path))
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
         with naming(path):
