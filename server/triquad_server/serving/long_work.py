@@ -4,6 +4,7 @@ A client that waited for its end could not tell it from a server that is stuck. 
 thread of its own, and a client that asks is told after a moment that it does.
 """
 
+import dataclasses
 import threading
 import time
 from collections.abc import Callable
@@ -61,7 +62,10 @@ class LongWork:
             RefusedError: ``under_way``: it is not; ``busy``: it will not be done. And as ``work``.
         """
         with self._lock:
-            task = self._tasks.get((type(request), request.ticket)) or self._begin(work, request)
+            task = self._tasks.get((type(request), request.ticket)) or self._waiting(request)
+            task = task or self._begin(work, request)
+            if request.ticket:
+                self._tasks[type(request), request.ticket] = task
         try:
             result = task.result.result(_TOLD_AFTER_S if request.ticket else None)
         except TimeoutError:
@@ -75,16 +79,27 @@ class LongWork:
             raise RefusedError("busy", "the server is stopping") from None
         return result  # type: ignore[return-value]
 
+    def _waiting(self, request: Ticketed) -> _Task | None:
+        """Return work that has not begun, and that answers the request as well.
+
+        That is a request that says nothing but its ticket, such as to write a checkpoint: else a
+        client that gives up and asks again, time after time, would keep all others waiting.
+        """
+        if len(dataclasses.fields(request)) > 1:  # type: ignore[arg-type]
+            return None
+        for (kind, _), task in self._tasks.items():
+            if kind is type(request) and not (task.result.running() or task.result.done()):
+                return task
+        return None
+
     def _begin(self, work: Callable[[RequestT], ResultT], request: RequestT) -> _Task:
-        pending = sum(not task.result.done() for task in self._tasks.values())
+        pending = len({task for task in self._tasks.values() if not task.result.done()})
         if pending >= _MOST_PENDING:
             raise RefusedError("busy", f"{pending} tasks wait already; try later")
         try:
             task = _Task(self._thread.submit(partial(work, request)))
         except RuntimeError as error:  # it has been shut down
             raise RefusedError("busy", "the server is stopping") from error
-        if request.ticket:
-            self._tasks[type(request), request.ticket] = task
         done = [key for key, task in self._tasks.items() if task.result.done()]
         for key in done[:-_MOST_KEPT]:
             del self._tasks[key]

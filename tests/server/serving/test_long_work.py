@@ -16,6 +16,12 @@ from triquad_server.serving.long_work import _MOST_PENDING, LongWork
 @dataclass(frozen=True)
 class Asked:
     ticket: int
+    place: str = ""
+
+
+@dataclass(frozen=True)
+class AskedForAll:
+    ticket: int
 
 
 @dataclass(frozen=True)
@@ -31,7 +37,7 @@ class Held:
     let: Event = field(default_factory=Event)
     done: list[int] = field(default_factory=list)
 
-    def __call__(self, request: Asked) -> int:
+    def __call__(self, request: Asked | AskedForAll) -> int:
         self.begun.set()
         assert self.let.wait(servers.WAIT_S)
         self.done.append(request.ticket)
@@ -66,6 +72,22 @@ def test_a_ticket_of_other_work_is_another(work: LongWork) -> None:
     assert work.answer(held, Asked(5)) == -5
     assert work.answer(lambda request: "reset", AskedOtherwise(5)) == "reset"
     assert work.answer(held, Asked(5)) == -5
+
+
+def test_what_has_not_begun_answers_all_who_ask_for_no_place(work: LongWork) -> None:
+    """As a client does that gives up, and asks with another ticket."""
+    first, held = Held(), Held()
+    assert refused(work, first, 5) == "under_way"
+    for ticket in (6, 7, 8):
+        with pytest.raises(RefusedError, match="been at it"):
+            work.answer(held, AskedForAll(ticket))
+    first.let.set()
+    assert held.begun.wait(servers.WAIT_S)
+    with pytest.raises(RefusedError, match="been at it"):
+        work.answer(held, AskedForAll(9))  # too late for the one that has begun
+    held.let.set()
+    assert [work.answer(held, AskedForAll(ticket)) for ticket in (9, 8, 7, 6)] == [-9, -6, -6, -6]
+    assert held.done == [6, 9]
 
 
 def test_what_went_wrong_is_told_to_who_asks_again(work: LongWork) -> None:
