@@ -15,6 +15,9 @@ def real_numbers(values: ArrayLike) -> NDArray[Any]:
     """Return an array of whole or floating numbers, or raise one of :data:`NO_NUMBER`."""
     if np.ma.is_masked(values):
         raise TypeError("some values are masked: fill them with NaN, or leave them out")
+    columns = list(getattr(values, "columns", ()))  # of a table of pandas or polars
+    if columns[:3] != ["x", "y", "z"] and any(isinstance(column, str) for column in columns):
+        raise TypeError(f"a table with columns {columns}: give table[['x', 'y', 'z']]")
     array = np.asarray(values)
     if array.dtype.kind not in "fiu":
         example = repr(array.item(0))[:40] if array.size else "nothing"

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from support import servers
 from triquad_client import (
@@ -46,6 +47,10 @@ def client() -> Iterator[Client]:
         (np.full((2, 3), "1.5"), r"'1.5' \(<U3\) is not a real number"),
         ([[1, 2, 3], [4, 5]], "points are not"),
         (np.ma.masked_greater(np.arange(6.0).reshape(2, 3), 4), "values are masked: fill them"),
+        (
+            pd.DataFrame(np.ones((2, 3)), columns=["z", "x", "y"]),
+            r"give table\[\['x', 'y', 'z'\]\]",
+        ),
         (OfAGraph(), r"points are not .* Use tensor.detach\(\).numpy\(\) instead"),
         (None, "points are not"),
     ],
@@ -53,6 +58,14 @@ def client() -> Iterator[Client]:
 def test_points_that_are_no_scan_are_refused_here(client: Client, points: Any, text: str) -> None:
     with pytest.raises(InvalidScanError, match=text):
         client.publish_scan(points, POSE)
+
+
+def test_tables_are_taken_by_the_names_of_their_columns(client: Client) -> None:
+    table = pd.DataFrame(servers.sphere(50), columns=["x", "y", "z"])
+    for good in (table, pd.DataFrame(servers.sphere(50))):
+        assert len(client.query_sdf(good)) == 50
+    with pytest.raises(InvalidInputError, match="a table with columns"):
+        client.query_sdf(table[["y", "x", "z"]])
 
 
 def test_columns_after_the_third_are_left_out(client: Client) -> None:
