@@ -2,7 +2,7 @@
 # make test-long   campaigns, deep fuzzing, every page of the browser, whole demonstrations: 45 minutes
 # make check     the checks alone: style, types, which package may import which
 # make docs      write the tables of docs/settings.md and docs/numbers.md from the code
-# make pictures  make the pictures of the documentation anew; those of the viewer need Chromium
+# make pictures  make the pictures of the documentation again; those of the viewer need Chromium
 # make pretrained   train the MLP that regions begin with, on simulated streets: 10 minutes
 # make bench     how fast and how good triquad is on this machine; PART=core: one part of it
 # make campaign  try for 5 minutes to break a server and its files; CAMPAIGN_MINUTES=60: for an hour

@@ -1,6 +1,9 @@
 """A map made again of the scans that its server kept."""
 
+from contextlib import closing
+
 import numpy as np
+import pytest
 import triquad_client
 from scipy.spatial import cKDTree
 from support import servers
@@ -8,7 +11,8 @@ from support.maps.small_world import world
 from triquad_client import OfflineMap
 from triquad_format.mapfile.checkpoint_folder import checkpoint_files, map_folder
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.settings import Settings
+from triquad_server.settings import Settings, StoreSettings
+from triquad_server.store.store import Store
 from triquad_tools.recordings.opening import open_recording
 from triquad_tools.recordings.recording import ReadingOptions
 from triquad_tools.recordings.ros_recording import RosRecording
@@ -68,6 +72,21 @@ def test_the_map_comes_from_the_kept_scans_again_and_at_another_leaf(tmp_path):
             assert near(expected, found) > 0.995 or leaf_m != 0.2
             assert len(found) < 0.5 * len(expected) or leaf_m == 0.2
             assert not ((found > EMPTY[0] + 0.4) & (found < EMPTY[1] - 0.4)).all(1).any()
+
+
+@pytest.mark.parametrize("log_max_bytes", [0, 10**9])
+def test_what_was_reset_is_there_again_where_the_map_went_back(tmp_path, log_max_bytes):
+    with servers.service_and_client(settings(0.2), tmp_path) as client:
+        scan, pose = next(poses(world(6).scans))
+        client.publish_scan(scan.points, pose, 1e9, source="roof")
+        client.flush()
+        kept = client.reset().kept_epoch
+    with closing(Store(tmp_path, servers.MAP, StoreSettings(log_max_bytes=log_max_bytes))) as store:
+        store.restore(kept)
+        store.newest()
+        store.log_scans(0.2)
+    (again,) = open_recording(tmp_path, ReadingOptions()).read([0])
+    assert len(again.points) > 1000
 
 
 def test_other_tools_read_the_kept_scans_as_a_bag(tmp_path):

@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 from triquad_format.errors import FormatError
-from triquad_format.mapfile.checkpoint_folder import map_folder
+from triquad_format.mapfile.checkpoint_folder import checkpoint_files, map_folder
+from triquad_format.mapfile.index import read_checkpoint
 from triquad_format.records.arrays import Floats
 from triquad_format.scan_log.log_folder import LOG_NAME, Segment, history, segments
 from triquad_format.scan_log.segment import LoggedReset, LoggedScan, read_segment
@@ -79,7 +80,7 @@ def read_scan_log(folder: Path) -> ScanLogRecording:
     Raises:
         ToolError: a file cannot be read; it is named.
     """
-    files = history(segments(folder))
+    files = history(_of_map(folder))
     entries: list[ScanEntry] = []
     counts: list[int] = []
     resets: list[PlacedReset] = []
@@ -102,7 +103,26 @@ def read_scan_log(folder: Path) -> ScanLogRecording:
     if files and files[0].after:
         told = f"scans before epoch {files[0].after} are not kept any more: see store.log_max_bytes"
         remarks.append(told)
+    if resets:
+        remarks.append(f"what was reset, {len(resets)} times, is left out")
     return ScanLogRecording(files, entries, counts, resets, streams, remarks)
+
+
+def _of_map(folder: Path) -> list[Segment]:
+    """Return the files of a log without those of scans that the newest checkpoint went back from.
+
+    A server that keeps scans marks them; one that keeps none may have gone back, too.
+    """
+    found = segments(folder)
+    with suppress(FormatError, OSError, IndexError):
+        newest = checkpoint_files(folder.parent)[0]
+        checkpoint = read_checkpoint(newest.path)
+        restored = None if checkpoint is None else checkpoint.restored
+        found = [segment for segment in found if segment.epoch <= newest.epoch]
+        if restored is not None:
+            left = range(restored.epoch + 1, restored.as_epoch)
+            found = [segment for segment in found if segment.epoch not in left]
+    return found
 
 
 def _read(segment: Segment) -> Iterator[LoggedScan | LoggedReset]:
