@@ -174,6 +174,7 @@ def test_the_history_leaves_out_what_the_map_went_back_from(tmp_path) -> None:
 def test_a_history_ends_even_where_names_go_in_circles() -> None:
     found = [Segment(5, 9, Path("a")), Segment(9, 5, Path("b")), Segment(11, 11, Path("c"))]
     assert len(history(found)) <= 3
+    assert history(found[:2]) == found[:2]
 
 
 def test_a_folder_that_is_not_there_has_no_files(tmp_path) -> None:

@@ -9,6 +9,7 @@ corner of a box, six little-endian float64. ``docs/scan-log.md`` has all of it.
 
 import io
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
@@ -61,13 +62,16 @@ class LoggedReset:
 class SegmentWriter:
     """Writes a file as scans come; it is whole once :meth:`finish` was called."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, after_loss: bool = False) -> None:
         """Begin a file, in place of what is there.
+
+        ``after_loss``: scans or resets before it could not be written.
 
         Raises:
             OSError: it cannot be written.
         """
         self.path = path
+        self.after_loss = after_loss
         self._stream: IO[bytes] = path.open("wb")
         self._mcap = Writer(self._stream, _CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._mcap.start(profile="ros2", library="triquad")
@@ -108,9 +112,12 @@ class SegmentWriter:
         self._mcap.finish()  # type: ignore[no-untyped-call]
         self._stream.close()
 
-    def close(self) -> None:
-        """Give the file up, whole or not."""
-        self._stream.close()
+    def discard(self) -> None:
+        """Give the file up, and delete it as far as that is possible."""
+        with suppress(OSError):  # what was not written yet finds the disk as full as before
+            self._stream.close()
+        with suppress(OSError):
+            self.path.unlink(missing_ok=True)
 
     def _put(self, topic: str, kind: str, stamp_ns: int, data: bytes) -> None:
         if topic not in self._channels:

@@ -7,8 +7,8 @@ import logging
 import math
 import os
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +16,7 @@ import numpy as np
 from triquad_format.mapfile.files import sync_folder
 from triquad_format.mapfile.index import Restored
 from triquad_format.records.arrays import Doubles
-from triquad_format.scan_log.log_folder import LOG_NAME, segment_name, segments
+from triquad_format.scan_log.log_folder import LOG_NAME, of_map, segment_name, segments
 from triquad_format.scan_log.segment import LoggedReset, LoggedScan, SegmentWriter
 from triquad_format.wire.messages import Scan
 
@@ -63,19 +63,22 @@ class ScanLog:
         self._kept: dict[str, _Kept] = {}
         self._writer: SegmentWriter | None = None
         self._opened = 0  # files
+        self._lost = False  # what was added could not be written; of the mapper's thread
+        self._newest: int | None = 0  # epoch with which the newest file ends; None: it was lost
         with self._telling("cannot be opened"):
             self.folder.mkdir(exist_ok=True)
-            for segment in segments(self.folder):
-                if segment.epoch > epoch:
-                    segment.path.unlink()
+            found = segments(self.folder)
             for path in self.folder.glob(_UNFINISHED.format("*")):
                 path.unlink()
-        self._newest = self._newest_until(epoch)
-        if restored is not None and restored.as_epoch == epoch > self._newest:
-            # An empty file marks that scans since the older checkpoint are in the map no more.
-            self._newest = self._newest_until(restored.epoch)
-            self.keep(self._open(), epoch)
-            self._writer = None
+            for segment in found:
+                if segment.epoch > epoch:
+                    segment.path.unlink()
+            newest = max((one.epoch for one in of_map(found, epoch, restored)), default=0)
+            self._newest = newest
+            if restored is not None and restored.as_epoch == epoch > newest:
+                # An empty file marks that scans since the older checkpoint are in the map no more.
+                self._open()
+                self.keep(self.cut(), epoch)
 
     def add(self, scan: Scan, rays: ScanRays) -> None:
         """Keep a scan that was taken in, if its source has moved on since the last that was kept.
@@ -85,7 +88,7 @@ class ScanLog:
         if not self._is_apart(scan):
             return
         rotation, position = scan.world_from_sensor[:3, :3], scan.world_from_sensor[:3, 3]
-        beyond = position + _BEYOND * (rays.far_ends - position)
+        beyond = rays.origin + _BEYOND * (rays.far_ends - rays.origin)
         points = (np.concatenate([rays.ends, beyond]) - position) @ rotation
         pose = scan.world_from_sensor.copy()
         pose[:3, 3] += rays.map_origin
@@ -98,15 +101,14 @@ class ScanLog:
             points.astype(np.float32),
             (no_return / np.maximum(lengths, 1e-9)).astype(np.float32),
         )
-        with self._telling("cannot be written"):
-            self._open().add(logged)
-            self._kept[scan.source] = _Kept(scan.stamp_ns, scan.world_from_sensor)
+        self._kept[scan.source] = _Kept(scan.stamp_ns, scan.world_from_sensor)
+        self._put(lambda writer: writer.add(logged))
 
     def add_reset(self, minimum: Doubles, maximum: Doubles) -> None:
         """Keep that the map forgot what lies between two corners [3] of the user's coordinates."""
         self._kept.clear()
-        with self._telling("cannot be written"):
-            self._open().add_reset(LoggedReset(minimum, maximum), time.time_ns())
+        reset = LoggedReset(minimum, maximum)
+        self._put(lambda writer: writer.add_reset(reset, time.time_ns()))
 
     def cut(self) -> SegmentWriter | None:
         """Return the file with what was added since the last time; ``None``: nothing was."""
@@ -117,20 +119,21 @@ class ScanLog:
         """Make a file durable that ends with ``epoch``; the oldest go that there is no room for."""
         if written is None:
             return
-        with self._telling("cannot be written"):
+        after = epoch if written.after_loss or self._newest is None else self._newest
+        self._newest = None
+        with self._telling("cannot be written", written):
             written.finish()
             with written.path.open("rb") as stream:
                 os.fsync(stream.fileno())
-            os.replace(written.path, self.folder / segment_name(self._newest, epoch))
+            os.replace(written.path, self.folder / segment_name(after, epoch))
             sync_folder(self.folder)
             self._newest = epoch
-        self._make_room()
+            self._make_room()
 
     def close(self) -> None:
         """Give up what was added since the last time, for the map has it in no checkpoint."""
         if (written := self.cut()) is not None:
-            written.close()
-            written.path.unlink(missing_ok=True)
+            written.discard()
 
     def _is_apart(self, scan: Scan) -> bool:
         kept, pose = self._kept.get(scan.source), scan.world_from_sensor
@@ -143,35 +146,44 @@ class ScanLog:
     def _open(self) -> SegmentWriter:
         if self._writer is None:
             self._opened += 1
-            self._writer = SegmentWriter(self.folder / _UNFINISHED.format(self._opened))
+            path = self.folder / _UNFINISHED.format(self._opened)
+            self._writer = SegmentWriter(path, after_loss=self._lost)
+            self._lost = False
         return self._writer
 
-    def _newest_until(self, epoch: int) -> int:
-        """Return the epoch of the newest file that ends with ``epoch`` at the latest."""
-        with suppress(OSError):
-            ends = [segment.epoch for segment in segments(self.folder)]
-            return max((end for end in ends if end <= epoch), default=0)
-        return 0
+    def _put(self, add: Callable[[SegmentWriter], None]) -> None:
+        """Add something to the file; where that fails, it is lost, and what was added before."""
+        with self._telling("cannot be written"):
+            try:
+                add(self._open())
+            except OSError:
+                self._lost = True
+                self._kept.clear()
+                self.close()
+                raise
 
     def _make_room(self) -> None:
         """Delete the oldest files while all take more than they may."""
-        with self._telling("cannot be thinned"):
-            files = [(one.path, one.path.stat().st_size) for one in segments(self.folder)]
-            total = sum(size for _, size in files)
-            for path, size in files[:-1]:
-                if total <= self._max_bytes:
-                    return
-                path.unlink()
-                total -= size
+        files = [(one.path, one.path.stat().st_size) for one in segments(self.folder)]
+        total = sum(size for _, size in files)
+        for path, size in files[:-1]:
+            if total <= self._max_bytes:
+                return
+            path.unlink()
+            total -= size
 
     @contextmanager
-    def _telling(self, what: str) -> Iterator[None]:
-        """Do something to the files; where that fails, mapping goes on, and the error is told."""
+    def _telling(self, what: str, written: SegmentWriter | None = None) -> Iterator[None]:
+        """Do something to the files; where that fails, mapping goes on, and the error is told.
+
+        A file that is being ``written`` is deleted then.
+        """
         try:
             yield
             self.error = None
         except OSError as error:
-            self.close()
+            if written is not None:
+                written.discard()
             if self.error is None:
                 _log.error("the scan log in %s %s: %s", self.folder, what, error)
             self.error = f"the scan log {what}: {error}"

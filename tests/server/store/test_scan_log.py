@@ -24,9 +24,15 @@ def log(tmp_path, epoch: int = 0, restored: Restored | None = None, most: int = 
     return ScanLog(tmp_path, most, LEAF_M, epoch, restored)
 
 
-def add(log: ScanLog, pose: np.ndarray, stamp_s: float, source: str = "roof") -> None:
-    rays = usable_rays(POINTS, pose, ScanSettings(), no_return=NO_RETURN, map_origin=np.zeros(3))
-    log.add(Scan(POINTS, pose, int(stamp_s * 1e9), source, 1, 0), rays)
+def add(
+    log: ScanLog,
+    pose: np.ndarray,
+    stamp_s: float,
+    source: str = "roof",
+    points: np.ndarray = POINTS,
+) -> None:
+    rays = usable_rays(points, pose, ScanSettings(), no_return=NO_RETURN, map_origin=np.zeros(3))
+    log.add(Scan(points, pose, int(stamp_s * 1e9), source, 1, 0), rays)
 
 
 def write(log: ScanLog, epoch: int, count: int = 1) -> None:
@@ -134,6 +140,28 @@ def test_a_disk_that_fails_stops_nothing_and_is_told_until_it_works(tmp_path) ->
     write(scans, 3)
     assert scans.error is None
     assert len(kept(scans)) == 1
+
+
+@pytest.mark.parametrize("count", [1, 400], ids=["at the end", "amid it"])
+def test_scans_before_some_that_were_lost_are_not_taken_for_all(tmp_path, count) -> None:
+    """A reset may have been among what was lost."""
+    scans = log(tmp_path)
+    write(scans, 1)
+    (scans.folder / ".unfinished-2.mcap").symlink_to("/dev/full")
+    points = np.random.default_rng(0).uniform(5, 50, (3000, 3)).astype(np.float32)
+    for number in range(count):
+        add(scans, shifted(x=float(number)), 2.0 + 0.1 * number, points=points)
+        if scans.error is not None:
+            break
+    scans.keep(scans.cut(), 2)
+    assert scans.error is not None
+    assert "No space left" in scans.error
+    write(scans, 3)
+    write(scans, 4)
+    assert scans.error is None
+    assert [one.epoch for one in history(segments(scans.folder))] == [3, 4]
+    assert history(segments(scans.folder))[0].after == 3, "so it is told that earlier ones are lost"
+    assert not list(scans.folder.glob(".*"))
 
 
 def test_a_drive_takes_few_bytes(tmp_path) -> None:

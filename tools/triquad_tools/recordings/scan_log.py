@@ -11,7 +11,7 @@ from triquad_format.errors import FormatError
 from triquad_format.mapfile.checkpoint_folder import checkpoint_files, map_folder
 from triquad_format.mapfile.index import read_checkpoint
 from triquad_format.records.arrays import Floats
-from triquad_format.scan_log.log_folder import LOG_NAME, Segment, history, segments
+from triquad_format.scan_log.log_folder import LOG_NAME, Segment, history, of_map, segments
 from triquad_format.scan_log.segment import LoggedReset, LoggedScan, read_segment
 
 from triquad_tools.console.command import ToolError
@@ -109,19 +109,13 @@ def read_scan_log(folder: Path) -> ScanLogRecording:
 
 
 def _of_map(folder: Path) -> list[Segment]:
-    """Return the files of a log without those of scans that the newest checkpoint went back from.
-
-    A server that keeps scans marks them; one that keeps none may have gone back, too.
-    """
+    """Return the files of a log that the newest checkpoint has; all, where it cannot be read."""
     found = segments(folder)
     with suppress(FormatError, OSError, IndexError):
         newest = checkpoint_files(folder.parent)[0]
         checkpoint = read_checkpoint(newest.path)
         restored = None if checkpoint is None else checkpoint.restored
-        found = [segment for segment in found if segment.epoch <= newest.epoch]
-        if restored is not None:
-            left = range(restored.epoch + 1, restored.as_epoch)
-            found = [segment for segment in found if segment.epoch not in left]
+        return of_map(found, newest.epoch, restored)
     return found
 
 
