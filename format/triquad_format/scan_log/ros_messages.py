@@ -5,6 +5,8 @@ from behind the four bytes that name the encoding.
 """
 
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -121,7 +123,7 @@ def unpack_cloud(data: bytes) -> tuple[int, str, Floats]:
     Raises:
         FormatError: it is something else.
     """
-    try:
+    with _refusing("cloud", data):
         unpacker = _Unpacker(data)
         stamp_ns, frame = unpacker.take_header()
         _, count, fields = unpacker.take("I", 3)
@@ -132,10 +134,7 @@ def unpack_cloud(data: bytes) -> tuple[int, str, Floats]:
             unpacker.take("I")
         unpacker.take("?")
         unpacker.take("I", 2)
-        points = np.frombuffer(unpacker.take_bytes(), "<f4").reshape(count, 3)
-    except (struct.error, UnicodeDecodeError, ValueError) as error:
-        raise FormatError(f"a cloud of {len(data)} bytes is damaged: {error}") from error
-    return stamp_ns, frame, points
+        return stamp_ns, frame, np.frombuffer(unpacker.take_bytes(), "<f4").reshape(count, 3)
 
 
 def pack_transform(stamp_ns: int, parent: str, child: str, pose: Doubles) -> bytes:
@@ -154,12 +153,22 @@ def unpack_transform(data: bytes) -> tuple[int, str, Doubles]:
     Raises:
         FormatError: it is something else.
     """
-    try:
+    with _refusing("transform", data):
         unpacker = _Unpacker(data)
         unpacker.take("I")
         stamp_ns, _ = unpacker.take_header()
-        child = unpacker.take_text()
-        numbers = np.array(unpacker.take("d", 7))
-    except (struct.error, UnicodeDecodeError) as error:
-        raise FormatError(f"a transform of {len(data)} bytes is damaged: {error}") from error
-    return stamp_ns, child, pose_matrices(numbers[:3], numbers[3:])
+        child, numbers = unpacker.take_text(), np.array(unpacker.take("d", 7))
+        return stamp_ns, child, pose_matrices(numbers[:3], numbers[3:])
+
+
+@contextmanager
+def _refusing(what: str, data: bytes) -> Iterator[None]:
+    """Refuse a message that cannot be unpacked.
+
+    Raises:
+        FormatError: it is damaged.
+    """
+    try:
+        yield
+    except (struct.error, UnicodeDecodeError, ValueError) as error:
+        raise FormatError(f"a {what} of {len(data)} bytes is damaged: {error}") from error

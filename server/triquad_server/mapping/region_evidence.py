@@ -27,7 +27,7 @@ what it ends on."""
 
 _FAR_THINNED_AT, _OPEN_THINNED_AT = 0.5, 0.25  # shares of the rays' length
 
-_NORMALS = 500  # that a thread finds at least: half a millisecond
+_LEAST_NORMALS = 500  # that a thread finds: half a millisecond
 
 _SURFELS_REFITTED = 8_000
 """The number of surfels that are fitted again with each epoch while the field is trained: some
@@ -99,9 +99,9 @@ class RegionEvidence:
         sighting = Sighting(origin, leaf_m, stamp_s, self._scans, self._unlearnt_since)
         rows = self.live.record_ends(ends, sighting)
         normals = self.live.outdated_normals(rows, self._unlearnt_since)
-        passed = self._setup.team.along(
-            lambda: self._carved(rays, origin, ends), len(normals.rows), normals.find, _NORMALS
-        )
+        carve = partial(self._carved, rays, origin, ends)
+        count = len(normals.rows)
+        passed = self._setup.team.along(carve, count, normals.find, _LEAST_NORMALS)
         normals.finish()
         return SeenScan(rows, self.live.normals(ends, rows), passed)
 

@@ -18,11 +18,7 @@ from triquad_tools.recordings.folders.scan_folder import ScanFolder
 from triquad_tools.recordings.mcap_bag import find_bag
 from triquad_tools.recordings.recording import ReadingOptions, ScanEntry, options_of
 from triquad_tools.recordings.ros_recording import RosRecording
-from triquad_tools.recordings.scan_log import (
-    ScanLogRecording,
-    find_scan_log,
-    read_scan_log,
-)
+from triquad_tools.recordings.scan_log import ScanLogRecording, find_scan_log, read_scan_log
 from triquad_tools.sensors.ray_check import without_repeated
 from triquad_tools.sensors.sweep import PosedScan
 
@@ -33,9 +29,9 @@ _UNPACK = {
 }  # fmt: skip
 """The commands that unpack files, by how their names end: the first one counts."""
 
-Recording = (
-    RosRecording | ScanFolder | ScanLogRecording
-)  # checked as a whole, so that its errors are known
+Recording = RosRecording | ScanFolder | ScanLogRecording
+"""Checked as a whole, so that its errors are known."""
+
 _MOST_NAMED = 10  # recordings in a folder
 
 _ORIGIN = 0.0, 0.0, 0.0
