@@ -35,7 +35,7 @@ PASSES = (3, 10, 30, 100)  # scans whose rays pass, after which a voxel is looke
 _PASSED = 0.3  # voxels: 6 cm where they are 0.2 m wide
 _BEYOND_M = 0.5  # that such a ray goes on
 _CLEAR_M = 0.35  # a voxel of a thing counts where nothing that stands is nearer
-_LANE_AFTER = 10  # scans of the empty place after which its lane is looked at
+_LANE_AFTER = (10, 30)  # scans of the empty place after which its lane is looked at
 _ROBOT_RADIUS_M = 0.35
 
 
@@ -51,7 +51,8 @@ def _figures(episode: Episode) -> Iterator[Figure]:
         for passes, (surface, count) in sorted(left.items()):
             title = f"{episode.name}: {name}, SURFACE after {passes} scans that pass ({count})"
             yield Figure(title, 100 * surface / max(count, 1), "%")
-    yield Figure(f"{episode.name}: lane blocked after {_LANE_AFTER}", seen.blocked_m, "m")
+    for scans, blocked_m in seen.blocked_m.items():
+        yield Figure(f"{episode.name}: lane blocked after {scans}", blocked_m, "m")
     for what, share in seen.kept.items():
         yield Figure(f"{episode.name}: {what} lost", 100 * (1 - share), "%")
 
@@ -64,7 +65,7 @@ class Seen:
     """By thing and number of passing scans: voxels that are SURFACE still, of how many."""
 
     kept: dict[str, float] = field(default_factory=dict)  # share of what stands that is SURFACE
-    blocked_m: int = 0
+    blocked_m: dict[int, int] = field(default_factory=dict)  # of the lane, by empty scans
 
 
 class Believed:
@@ -130,8 +131,8 @@ def follow(episode: Episode) -> Seen:
             if empty > 0 and any([trail.passed_by(scan) for trail in trails]):
                 for trail in trails:
                     trail.look(believed)
-            if empty == _LANE_AFTER:
-                seen.blocked_m = believed.blocked_m(episode.lane)
+            if empty in _LANE_AFTER:
+                seen.blocked_m[empty] = believed.blocked_m(episode.lane)
             report(number, f"{number} of {len(episode)} scans")
     seen.left |= {trail.name: trail.left for trail in trails}
     seen.kept = record.kept(believed)

@@ -31,7 +31,7 @@ def test_what_left_is_forgotten_and_what_stands_is_kept(seen: Seen) -> None:
     assert left < 0.3 * passed > 20
     assert seen.kept["static"] > 0.98
     assert 0.5 < seen.kept["thin things"] <= 1.0
-    assert seen.blocked_m == 0
+    assert seen.blocked_m == {10: 0}
 
 
 def test_drops_of_rain_are_no_surface(seen: Seen) -> None:

@@ -22,6 +22,7 @@ from triquad_map.compiled.voxel_index import (
     make_row,
 )
 from triquad_map.evidence.observed import (
+    PRIOR_ENDS,
     SAME_SURFACE,
     Observed,
     ObservedVoxel,
@@ -35,8 +36,9 @@ from triquad_map.evidence.seen_voxels import SeenVoxels
 _LEAST_SPREAD = 0.05
 """Standard deviation of the ends in a voxel in any direction, at least, in voxels."""
 
-_PRIOR_SPREAD, _PRIOR_ENDS = 0.15, 2.0
-"""The same before any end, in all directions, and the number of ends that this counts as."""
+_PRIOR_SPREAD = 0.125
+"""The same before any end, in all directions. With 0.1, 3.4 % of cars that were parked across are
+left after ten scans, not 2.9; with 0.15, a crossing loses 0.13 % of what stands, not 0.05."""
 
 
 class Passing(NamedTuple):
@@ -71,7 +73,7 @@ def _crosses(ray: Passing, corner: Voxel, voxel: ObservedVoxel) -> float:
     v = to_x * second[0] + to_y * second[1] + to_z * second[2]
     if u * u + v * v > 1:
         return 0.0
-    share = float(voxel.ends) / (float(voxel.ends) + _PRIOR_ENDS)
+    share = float(voxel.ends) / (float(voxel.ends) + PRIOR_ENDS)
     prior = share * _LEAST_SPREAD**2 + (1 - share) * _PRIOR_SPREAD**2
     uu = share * _across(spread, first, first) + prior
     uv = share * _across(spread, first, second)

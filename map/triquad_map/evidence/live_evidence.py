@@ -10,12 +10,12 @@ from triquad_map.compiled.team import Split, in_one
 from triquad_map.compiled.voxel_index import VoxelIndex, with_room
 from triquad_map.evidence.belief import Belief, Changes, believe, have_surface
 from triquad_map.evidence.carving import Reach, mark_crossed
-from triquad_map.evidence.company import have_company
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.evidence.growth import EvidenceSize, NewEnds, new_blocks, new_ends
+from triquad_map.evidence.neighbours import ask_neighbours
 from triquad_map.evidence.normals import NormalSearch, normals_at
 from triquad_map.evidence.observations import Observations
-from triquad_map.evidence.observed import Sighting
+from triquad_map.evidence.observed import Sighting, extend_new
 from triquad_map.evidence.ray_surfels import ray_surfels
 from triquad_map.evidence.seen_voxels import SeenVoxels, mark
 from triquad_map.surface import Surfels
@@ -75,13 +75,15 @@ class LiveEvidence:
             The row of what is recorded of each ray's voxel; 0 outside the region.
         """
         rows = self.add_ends(voxels, sighting)
-        company = self._observations.arrays.voxels["company"]
-        alone = np.flatnonzero(~company[rows] & (rows > 0))
-        company[rows[alone[have_company(voxels - sighting.origin, alone)]]] = True
+        observed = self._observations.arrays
+        alone = np.flatnonzero(~observed.voxels["company"][rows] & (rows > 0))
+        told = ask_neighbours(voxels - sighting.origin, alone)
+        observed.voxels["company"][rows[alone[told.have_company]]] = True
+        extend_new(rows[alone], told.extents, sighting.scan, observed)
         return rows
 
     def add_ends(self, voxels: Doubles, sighting: Sighting) -> Ints:
-        """Do as :meth:`record_ends` with rays of many scans: none is asked for its company."""
+        """Do as :meth:`record_ends` with rays of many scans: no ray's neighbours are asked."""
         self._frozen = None
         rows = np.empty(len(voxels), np.int32)
         done = 0

@@ -157,6 +157,9 @@ def _add_rows(
     return count
 
 
+PRIOR_ENDS = 2.0
+"""Ends that the shape of a surface counts for that is assumed before any."""
+
 COUNTED_ENDS = 64
 """The ends of a voxel that count; the shape that further ones give counts as that of as many."""
 
@@ -236,6 +239,21 @@ def _add_end(voxel: ObservedVoxel, end: Vector) -> None:
     spread[3] += (np.float32(y * y) * share - spread[3]) / count
     spread[4] += (np.float32(y * z) * share - spread[4]) / count
     spread[5] += (np.float32(z * z) * share - spread[5]) / count
+
+
+@kernel()
+def extend_new(rows: Ints, extents: Doubles, scan: int, observed: Observed) -> None:
+    """Let the surface extend in the voxels of ``rows`` [N], where it was first hit in a scan.
+
+    ``extents`` [N, 6] are covariances, square voxels. Until there are more ends, they are all that
+    tells its shape: they count as much as :data:`PRIOR_ENDS` and the first one.
+    """
+    for i, row in enumerate(rows):
+        voxel = observed.voxels[row]
+        if voxel.first_scan == scan:
+            share = (PRIOR_ENDS + 1) / (voxel.ends * voxel.ended)  # all its rays of the scan add
+            for axis in range(6):
+                voxel.spread[axis] += np.float32(share * extents[i, axis])
 
 
 @kernel()

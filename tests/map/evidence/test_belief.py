@@ -72,6 +72,23 @@ def test_one_scan_with_a_wrong_pose_takes_no_wall_away(rng: np.random.Generator)
         assert watched.believed(panel(rng, WALL_X, half=7.0)) < 0.02
 
 
+def test_a_ray_beside_the_only_hit_contradicts_what_extends_to_it() -> None:
+    y, z = (at.ravel() for at in np.meshgrid(np.arange(-8.0, 9.0), np.arange(-8.0, 9.0)))
+    face = SENSOR + np.stack([np.full(len(y), 40.2), y, z], 1)
+    before_others = np.where(y[:, None] == 0, 1.0, 2.5)  # one column of rays ends on a post
+    left = {}
+    for name, ends in (("face", face), ("post", SENSOR + before_others * (face - SENSOR))):
+        thing = ends[ends[:, 0] == face[:, 0]]
+        watched = Watched()
+        watched.scan(ends)
+        assert watched.believed(thing) == 1.0
+        for _ in range(6):
+            watched.scan(SENSOR + 2.5 * (thing + [0.0, 0.35, 0.0] - SENSOR))
+        left[name] = watched.believed(thing)
+    assert left["face"] < 0.1
+    assert left["post"] > 0.9
+
+
 def test_a_wall_that_rays_reach_stays_for_ever(rng: np.random.Generator) -> None:
     watched = Watched()
     for _ in range(100):

@@ -1,11 +1,11 @@
-"""Which returns of a scan have others beside them."""
+"""What the neighbours of a return in its scan tell."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from triquad_format.records.arrays import Bools, Doubles
-from triquad_map.evidence import company
+from triquad_map.evidence.neighbours import ask_neighbours
 
 SPACING = 2 * np.pi / 512
 """The angle between the rays of :func:`lidar`, radians."""
@@ -20,7 +20,7 @@ def lidar() -> Doubles:
 
 def have_company(rays: Doubles) -> Bools:
     """Return which of all rays have company."""
-    return company.have_company(rays, np.arange(len(rays)))
+    return ask_neighbours(rays, np.arange(len(rays))).have_company
 
 
 def by_all_pairs(rays: Doubles, angles: Doubles) -> Bools:
@@ -109,3 +109,35 @@ def test_it_is_what_all_pairs_tell(seed: int, furthest: float) -> None:
     sure = (slow == slow[0]).all(axis=0)
     assert sure.mean() > 0.2
     np.testing.assert_array_equal(have_company(rays)[sure], slow[0][sure])
+
+
+def extent_of(rays: Doubles, ray: int) -> Doubles:
+    """Return the covariance [3, 3] of the surface on which a ray ends."""
+    xx, xy, xz, yy, yz, zz = ask_neighbours(rays, np.array([ray])).extents[0]
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def test_a_wall_extends_all_over_the_voxel_and_not_along_the_ray() -> None:
+    rays = 50 * lidar()
+    middle = len(rays) // 2 - 10
+    along = rays[middle] / 50
+    extent = extent_of(rays, middle)
+    assert along @ extent @ along < 0.001
+    across = np.linalg.eigvalsh(extent)[1:]
+    np.testing.assert_allclose(across, 1 / 12, rtol=0.3)  # what fills a voxel has 1/12 on an axis
+
+
+def test_a_post_extends_upwards_alone() -> None:
+    rays = 100 * lidar()
+    azimuth = np.arctan2(rays[:, 1], rays[:, 0])
+    post = np.flatnonzero(np.abs(azimuth - 0.5) < 0.6 * SPACING)
+    rays[post] *= 0.5
+    extent = extent_of(rays, int(post[len(post) // 2]))
+    assert extent[2, 2] > 0.1
+    assert np.trace(extent) - extent[2, 2] < 0.02
+
+
+def test_a_drop_may_be_anywhere_in_its_voxel() -> None:
+    rays = 100 * lidar()
+    rays[1000] *= 0.5
+    np.testing.assert_allclose(extent_of(rays, 1000), np.eye(3) / 12)

@@ -1,10 +1,13 @@
-"""Which returns of a scan have company: others of the scan tell that there is a surface.
+"""What the neighbours of a return in its scan tell: if it lies on a surface, and how that extends.
 
 A return has company if two others on neighbouring rays end at its range, or if it ends no nearer
 than two in five of them do: a drop of rain or a grain of dust hangs before what its neighbours
 meet. Rays are neighbours by their spacing, so that a far wall, whose returns lie metres apart, is
 as much a wall as a near one (as in Charron et al., De-noising of lidar point clouds corrupted by
 snowfall, CRV 2018). The spacing is the scan's own: no sensor has to be known.
+
+The surface extends towards those that end at its range, and so through the voxel: along a post, all
+over the back of a car, along ground that is grazed.
 """
 
 from typing import NamedTuple
@@ -37,6 +40,7 @@ _SHARE = 0.4
 """The share of its neighbours than which such a return ends no nearer. Smooth ground has just half:
 with 0.5, a corridor at 16 beams loses 1 % of what stands at the first scan."""
 
+_FILLED = 1 / 12  # square voxels: variance along an axis of what fills a voxel from side to side
 _MOST_COMPARED = 256  # rays with one: where they are spread evenly, some 100 are near enough
 _PATCH = 0.25  # radians: the sensor's field of view is counted in patches of this side
 
@@ -52,8 +56,15 @@ class _Rays(NamedTuple):
     before: Ints  # [N] the one before each ray in its cell; -1: none
 
 
-def have_company(rays: Doubles, chosen: Longs) -> Bools:
-    """Return which of the ``chosen`` [M] rays have company.
+class Neighbourhoods(NamedTuple):
+    """What the neighbours of some returns tell."""
+
+    have_company: Bools  # [M]
+    extents: Doubles  # [M, 6] covariances of the surface in a voxel: xx, xy, xz, yy, yz, zz, voxels
+
+
+def ask_neighbours(rays: Doubles, chosen: Longs) -> Neighbourhoods:
+    """Return what the neighbours of the ``chosen`` [M] rays tell.
 
     Args:
         rays: ends [N, 3] of all rays of a scan, voxels from the sensor.
@@ -63,7 +74,8 @@ def have_company(rays: Doubles, chosen: Longs) -> Bools:
     reach = _SPACINGS * _spacing(directions, empty_keys(len(rays)))
     cells = VoxelIndex(max(16, len(rays))).arrays
     last, before = np.empty((2, len(rays)), np.int32)
-    return _have_company(_Rays(directions, ranges, reach, cells, last, before), chosen)
+    of_scan = _Rays(directions, ranges, reach, cells, last, before)
+    return Neighbourhoods(*_ask_neighbours(of_scan, chosen))
 
 
 @kernel()
@@ -107,7 +119,7 @@ def _are_neighbours(i: int, j: int, rays: _Rays) -> bool:
 
 
 @kernel()
-def _have_company(rays: _Rays, chosen: Longs) -> Bools:
+def _ask_neighbours(rays: _Rays, chosen: Longs) -> tuple[Bools, Doubles]:
     used = 0
     for i in range(len(rays.ranges)):
         x, y, z = _cell(i, rays)
@@ -115,19 +127,19 @@ def _have_company(rays: _Rays, chosen: Longs) -> Bools:
         rays.before[i] = rays.last[row] if row < used else -1
         rays.last[row] = i
         used = max(used, row + 1)
-    found = np.zeros(len(chosen), np.bool_)
+    have_company, extents = np.zeros(len(chosen), np.bool_), np.zeros((len(chosen), 6))
     for n, i in enumerate(chosen):
-        found[n] = _has_company(i, rays)
-    return found
+        have_company[n] = _ask(i, rays, extents[n])
+    return have_company, extents
 
 
 @inner_kernel()
-def _has_company(i: int, rays: _Rays) -> bool:
-    """Return whether two neighbours end at a ray's range, or two in five of them no farther."""
+def _ask(i: int, rays: _Rays, extent: Doubles) -> bool:
+    """Return whether a ray has company, and set the extent [6] of the surface on which it ends."""
     x, y, z = _cell(i, rays)
     compared, count, same, no_farther = 0, 0, 0, 0
     for k in range(27):
-        n = (k + 13) % 27  # its own cell comes first: there, most have enough
+        n = (k + 13) % 27  # its own cell comes first
         row = find_row(rays.cells, pack(x + n // 9 - 1, y + n // 3 % 3 - 1, z + n % 3 - 1))
         j = rays.last[row] if row >= 0 else -1
         while j >= 0 and compared < _MOST_COMPARED:
@@ -136,8 +148,28 @@ def _has_company(i: int, rays: _Rays) -> bool:
                 farther = rays.ranges[j] - rays.ranges[i]
                 count += 1
                 no_farther += farther <= _SAME_RANGE
-                same += abs(farther) <= _SAME_RANGE
-                if same >= _OTHERS:
-                    return True
+                if abs(farther) <= _SAME_RANGE:
+                    same += 1
+                    _extend(i, np.int64(j), rays, extent)
             j = rays.before[j]
-    return no_farther >= _OTHERS and no_farther >= _SHARE * count
+    if same == 0:  # nothing tells where to: it may be anywhere in the voxel
+        extent[0] = extent[3] = extent[5] = _FILLED
+    for k in range(6):
+        extent[k] *= 1.0 if same == 0 else 2 * _FILLED / same
+    return same >= _OTHERS or (no_farther >= _OTHERS and no_farther >= _SHARE * count)
+
+
+@inner_kernel()
+def _extend(i: int, j: int, rays: _Rays, extent: Doubles) -> None:
+    """Add the direction from one ray's end to another's, as a product with itself, to [6]."""
+    one, other = rays.directions[i], rays.directions[j]
+    x = rays.ranges[j] * other[0] - rays.ranges[i] * one[0]
+    y = rays.ranges[j] * other[1] - rays.ranges[i] * one[1]
+    z = rays.ranges[j] * other[2] - rays.ranges[i] * one[2]
+    share = 1 / max(x * x + y * y + z * z, 1e-12)
+    extent[0] += share * x * x
+    extent[1] += share * x * y
+    extent[2] += share * x * z
+    extent[3] += share * y * y
+    extent[4] += share * y * z
+    extent[5] += share * z * z
