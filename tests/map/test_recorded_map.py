@@ -25,7 +25,7 @@ from triquad_map.view import MapView
 def test_the_nearest_surfel_is_the_same(seed, count, reach):
     rng = np.random.default_rng(seed)
     live = LiveEvidence(64)
-    live.mark_surface(rng.uniform(0, 64, (count, 3)) * (1, 1, 0.3))
+    live.mark("surface", rng.uniform(0, 64, (count, 3)) * (1, 1, 0.3))
     evidence = live.freeze()
     places = surfel_places(evidence.cells, evidence.surface)
     surfels = random_surfels(rng, len(places.voxels()))
@@ -77,7 +77,7 @@ def test_the_nearest_surfel_is_the_same_where_surfaces_are_far_apart(reach):
     rng = np.random.default_rng(7)
     live = LiveEvidence(4096)
     middles = rng.uniform(100, 3996, (12, 3))
-    live.mark_surface(middles[rng.integers(12, size=3000)] + rng.uniform(-6, 6, (3000, 3)))
+    live.mark("surface", middles[rng.integers(12, size=3000)] + rng.uniform(-6, 6, (3000, 3)))
     evidence = live.freeze()
     places = surfel_places(evidence.cells, evidence.surface)
     surfels = random_surfels(rng, len(places.voxels()))
@@ -97,7 +97,7 @@ def test_of_more_surfels_than_count_in_the_direction_the_nearest_is_found():
     live = LiveEvidence(64)
     directions = rng.normal(size=(60_000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    live.mark_surface(middle + 25.0 * directions)  # as seen from inside a ball
+    live.mark("surface", middle + 25.0 * directions)  # as seen from inside a ball
     evidence = live.freeze()
     places = surfel_places(evidence.cells, evidence.surface)
     away = places.voxels() + 0.5 - middle

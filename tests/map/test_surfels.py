@@ -131,7 +131,7 @@ def nearest(surfels, points):
 
 def random_evidence(rng, count):
     evidence = LiveEvidence(SIDE)
-    evidence.mark_surface(rng.uniform((0, 0, 28), (SIDE, SIDE, 33), (count, 3)))
+    evidence.mark("surface", rng.uniform((0, 0, 28), (SIDE, SIDE, 33), (count, 3)))
     return evidence
 
 
@@ -140,7 +140,7 @@ def test_surfels_kept_up_to_date_are_those_made_anew():
     evidence = random_evidence(rng, 300)
     before, after = (plane(np.array([0.6, 0, 0.8]), height) for height in (43.0, 43.3))
     surfels = first_surfels(evidence.freeze(), before, 1)
-    evidence.mark_surface(rng.uniform((0, 0, 25), (SIDE, SIDE, 35), (200, 3)))
+    evidence.mark("surface", rng.uniform((0, 0, 25), (SIDE, SIDE, 35), (200, 3)))
     evidence.clear(np.array([0.0, 0, 0]), np.array([20.0, 20, 64]))
     kept = surfels.updated(evidence.freeze(), after, 2, None)
     anew = first_surfels(evidence.freeze(), after, 2)
@@ -156,7 +156,7 @@ def test_a_bounded_update_fits_what_is_new_and_gets_to_the_rest_in_turn():
     low, high = (plane(np.array([0.0, 0, 1]), height) for height in (29.5, 31.5))
     surfels = first_surfels(evidence.freeze(), low, 1)
     new = np.array([[10.5, 10.5, 50.5]])
-    evidence.mark_surface(new)
+    evidence.mark("surface", new)
     points = np.concatenate([new + (0, 0, 3.0), rng.uniform((0, 0, 36), (SIDE, SIDE, 40), (50, 3))])
     wanted = first_surfels(evidence.freeze(), high, 1)
     rounds = 0

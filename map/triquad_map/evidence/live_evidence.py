@@ -1,21 +1,23 @@
 """The evidence of rays in a region, while they go on to show more."""
 
+from typing import Literal
+
 import numpy as np
-from triquad_format.records.arrays import Bools, Doubles, Ints, Longs
+from triquad_format.records.arrays import Doubles, Ints, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.region import BLOCK_BYTES, surface_counts
 from triquad_format.records.region import Evidence as EvidenceRecord
 
 from triquad_map.compiled.team import Split, in_one
 from triquad_map.compiled.voxel_index import VoxelIndex, with_room
-from triquad_map.evidence.belief import Belief, Changes, believe, have_surface
+from triquad_map.evidence.belief import Belief, Changes, believe
 from triquad_map.evidence.carving import Reach, mark_crossed
 from triquad_map.evidence.evidence import FrozenEvidence
-from triquad_map.evidence.growth import EvidenceSize, NewEnds, new_blocks, new_ends
+from triquad_map.evidence.growth import EvidenceSize
 from triquad_map.evidence.neighbours import ask_neighbours
-from triquad_map.evidence.normals import NormalSearch, normals_at
+from triquad_map.evidence.normals import NormalSearch
 from triquad_map.evidence.observations import Observations
-from triquad_map.evidence.observed import Sighting, extend_new
+from triquad_map.evidence.observed import Observed, Sighting, extend_new
 from triquad_map.evidence.ray_surfels import ray_surfels
 from triquad_map.evidence.seen_voxels import SeenVoxels, mark
 from triquad_map.surface import Surfels
@@ -29,11 +31,14 @@ class LiveEvidence:
     One thread owns and changes it; :meth:`freeze` gives what others may read.
     """
 
+    seen: SeenVoxels
+    """What rays have shown of each voxel; its arrays are replaced when there is more."""
+
     def __init__(self, side: int) -> None:
         """Begin without evidence; ``side`` is that of the region, voxels."""
         self._blocks = VoxelIndex(_MIN_CAPACITY)
         masks = np.zeros((2, _MIN_CAPACITY, BLOCK_BYTES), np.uint8)
-        self._seen = SeenVoxels(side, self._blocks.arrays, *masks)
+        self.seen = SeenVoxels(side, self._blocks.arrays, *masks)
         self._observations = Observations(_MIN_CAPACITY)
         self._frozen: FrozenEvidence | None = None  # until anything changes
         self._surface: int | None = 0  # voxels with surface; None: to be counted
@@ -42,27 +47,19 @@ class LiveEvidence:
     def surface_voxels(self) -> int:
         """The number of voxels with surface."""
         if self._surface is None:
-            self._surface = int(surface_counts(self._seen.surface[: self._blocks.count]).sum())
+            self._surface = int(surface_counts(self.seen.surface[: self._blocks.count]).sum())
         return self._surface
+
+    @property
+    def observed(self) -> Observed:
+        """What was observed in each voxel, by the rows that :meth:`record_ends` gives."""
+        return self._observations.arrays
 
     @property
     def size(self) -> EvidenceSize:
         """The size of the evidence."""
         observed = self._observations
         return EvidenceSize(self._blocks.count, observed.blocks, observed.voxels)
-
-    def new_ends(self, ends: Doubles) -> NewEnds:
-        """Return what rays that end at ``ends`` [N, 3] would add; nothing is recorded."""
-        return new_ends(ends, self._seen)
-
-    def new_blocks(self, origin: Doubles, ends: Doubles) -> int:
-        """Return about how many blocks rays from ``origin`` [3] to ``ends`` [N, 3] would add."""
-        return new_blocks(origin, ends, self._seen)
-
-    def mark_surface(self, voxels: Doubles) -> None:
-        """Record that there is surface in ``voxels`` [N, 3]; those outside are left out."""
-        self._surface = None
-        self._mark("surface", voxels)
 
     def record_ends(self, voxels: Doubles, sighting: Sighting) -> Ints:
         """Record that rays ended at ``voxels`` [N, 3], and from where and when.
@@ -75,7 +72,7 @@ class LiveEvidence:
             The row of what is recorded of each ray's voxel; 0 outside the region.
         """
         rows = self.add_ends(voxels, sighting)
-        observed = self._observations.arrays
+        observed = self.observed
         alone = np.flatnonzero(~observed.voxels["company"][rows] & (rows > 0))
         told = ask_neighbours(voxels - sighting.origin, alone)
         observed.voxels["company"][rows[alone[told.have_company]]] = True
@@ -89,7 +86,7 @@ class LiveEvidence:
         done = 0
         while done < len(voxels):
             done, self._blocks.count = self._observations.record(
-                voxels, done, self._seen, self._blocks.count, sighting, rows
+                voxels, done, self.seen, self._blocks.count, sighting, rows
             )
             if self._blocks.count == self._blocks.capacity:
                 self._make_room(more=True)
@@ -97,42 +94,23 @@ class LiveEvidence:
 
     def outdated_normals(self, rows: Ints, since: int) -> NormalSearch:
         """Return the search for normals of the surfaces on which the newest scan ended, by rows."""
-        seen = self._seen._replace(blocks=self._blocks.freeze())
-        return NormalSearch(rows, since, seen, self._observations.arrays)
+        seen = self.seen._replace(blocks=self._blocks.freeze())
+        return NormalSearch(rows, since, seen, self.observed)
 
     def believe(self, hit: Ints, passed: Ints, belief: Belief) -> Changes:
         """Let surface come and go where rays of a scan ended and passed, by rows."""
         self._frozen = None
-        before, observed = self.surface_voxels, self._observations.arrays
-        changes = Changes(*believe(hit, passed, self._seen, observed, belief))
+        before, observed = self.surface_voxels, self.observed
+        changes = Changes(*believe(hit, passed, self.seen, observed, belief))
         self._surface = before + len(changes.new) - len(changes.removed)
         return changes
-
-    def is_surface(self, rows: Ints) -> Bools:
-        """Return whether there is surface in the voxels of ``rows`` [N]."""
-        return have_surface(rows, self._seen, self._observations.arrays)
-
-    def normals(self, ends: Doubles, rows: Ints) -> Doubles:
-        """Return unit normals [N, 3], of either sign, of the surfaces at ``ends`` [N, 3], voxels.
-
-        ``rows`` [N] are those that :meth:`record_ends` gave for them. NaN: no plane is known there.
-        """
-        return normals_at(ends, rows, self._observations.arrays)
-
-    def first_seen_since(self, scan: int, rows: Ints) -> Bools:
-        """Return which rays [N] ended on a surface that was first seen in ``scan`` or later.
-
-        Rays that ended outside the region did not.
-        """
-        is_new: Bools = self._observations.arrays.voxels["first_scan"][rows] >= scan
-        return is_new & (rows > 0)
 
     def set_discs(self, voxels: Longs, surfels: Surfels) -> None:
         """Take from ``surfels`` [N] where the surface lies in ``voxels`` [N, 3].
 
         For evidence that was restored: a record has voxels only.
         """
-        self._observations.set_discs(voxels, surfels, self._seen)
+        self._observations.set_discs(voxels, surfels, self.seen)
 
     def ray_surfels(self, voxels: Longs, hit_since: int = 0, *, since: int) -> Surfels:
         """Return what rays alone show of surface that was first seen in scan ``since`` or later.
@@ -140,7 +118,7 @@ class LiveEvidence:
         Of voxels that were not hit since scan ``hit_since``, nothing is told. See
         :data:`triquad_map.surface.ShownByRays`.
         """
-        return ray_surfels(voxels, since, hit_since, self._seen, self._observations.arrays)
+        return ray_surfels(voxels, since, hit_since, self.seen, self.observed)
 
     def carve(self, origin: Doubles, ends: Doubles, reach: Reach) -> Ints:
         """Record the free space between ``origin`` [3] and ``ends`` [N, 3].
@@ -154,7 +132,7 @@ class LiveEvidence:
             Where rays passed a surface.
         """
         self._frozen = None
-        passed = np.zeros(len(self._observations.arrays.voxels), np.int32)
+        passed = np.zeros(len(self.observed.voxels), np.int32)
         done = 0
         while done < len(ends):
             done, self._blocks.count = mark_crossed(
@@ -162,18 +140,29 @@ class LiveEvidence:
                 ends,
                 done,
                 reach,
-                self._seen,
+                self.seen,
                 self._blocks.count,
-                self._observations.arrays,
+                self.observed,
                 passed,
             )
             if done < len(ends):
                 self._make_room(more=True)
         return passed[1 : 1 + passed[0]]
 
-    def mark_free(self, voxels: Doubles) -> None:
-        """Record that ``voxels`` [N, 3] are free; those outside the region are left out."""
-        self._mark("free", voxels)
+    def mark(self, what: Literal["surface", "free"], voxels: Doubles) -> None:
+        """Record that there is surface in ``voxels`` [N, 3], or that they are free.
+
+        Those outside the region are left out.
+        """
+        self._frozen = None
+        if what == "surface":
+            self._surface = None
+        done = 0
+        while done < len(voxels):
+            mask = getattr(self.seen, what)
+            done, self._blocks.count = mark(voxels, done, self.seen, mask, self._blocks.count)
+            if done < len(voxels):
+                self._make_room(more=True)
 
     def clear(self, low: Doubles, high: Doubles) -> None:
         """Forget the voxels whose centres lie between the corners ``low`` and ``high`` [3]."""
@@ -185,14 +174,14 @@ class LiveEvidence:
             centres = corners[row] + offsets + 0.5
             kept = ~((centres > low) & (centres < high)).all(axis=-1)
             keep = np.packbits(kept, axis=-1, bitorder="little").reshape(BLOCK_BYTES)
-            self._seen.surface[row] &= keep
-            self._seen.free[row] &= keep
-        self._observations.forget(np.flatnonzero(near), self._seen.surface[: self._blocks.count])
+            self.seen.surface[row] &= keep
+            self.seen.free[row] &= keep
+        self._observations.forget(np.flatnonzero(near), self.seen.surface[: self._blocks.count])
 
     def freeze(self, split: Split = in_one) -> FrozenEvidence:
         """Return the evidence as it is now; the same object until anything changes."""
         if self._frozen is None:
-            side, _, *masks = self._seen
+            side, _, *masks = self.seen
             surface, free = (mask[: self._blocks.count].copy() for mask in masks)
             self._frozen = FrozenEvidence(
                 SeenVoxels(side, self._blocks.freeze(), surface, free),
@@ -211,7 +200,7 @@ class LiveEvidence:
         """Return the evidence of a record, of a region of ``side`` voxels."""
         evidence, frozen = cls(side), FrozenEvidence.from_record(side, record)
         evidence._blocks = VoxelIndex.of_cells(frozen.cells)
-        evidence._seen, evidence._surface = frozen.seen, None
+        evidence.seen, evidence._surface = frozen.seen, None
         evidence._observations = Observations.restore(
             frozen.surface,
             frozen.levels,
@@ -222,21 +211,11 @@ class LiveEvidence:
         evidence._make_room()
         return evidence
 
-    def _mark(self, name: str, voxels: Doubles) -> None:
-        """Set the bits of ``voxels`` [N, 3] in one of the masks."""
-        self._frozen = None
-        done = 0
-        while done < len(voxels):
-            mask = getattr(self._seen, name)
-            done, self._blocks.count = mark(voxels, done, self._seen, mask, self._blocks.count)
-            if done < len(voxels):
-                self._make_room(more=True)
-
     def _make_room(self, more: bool = False) -> None:
         """Make room for as many blocks as the index has room for, or for ``more``."""
         if more:
             self._blocks.grow()
-        side, _, *masks = self._seen
+        side, _, *masks = self.seen
         roomy = (with_room(mask, self._blocks.capacity) for mask in masks)
-        self._seen = SeenVoxels(side, self._blocks.arrays, *roomy)
+        self.seen = SeenVoxels(side, self._blocks.arrays, *roomy)
         self._observations.make_room(self._blocks.capacity)

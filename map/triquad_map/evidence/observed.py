@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.records.arrays import Bytes, Doubles, Ints, Longs
+from triquad_format.records.arrays import Bools, Bytes, Doubles, Ints, Longs
 
 from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.voxel_index import (
@@ -95,6 +95,15 @@ def is_flat(voxel: ObservedVoxel) -> bool:
     """Return whether the normal of the surface in a voxel is known."""
     normal = voxel.normal
     return bool(normal[0] != 0 or normal[1] != 0 or normal[2] != 0)
+
+
+def first_seen_since(scan: int, rows: Ints, observed: Observed) -> Bools:
+    """Return which ``rows`` [N] have a surface that was first seen in ``scan`` or later.
+
+    Row 0, outside the region, has none.
+    """
+    is_new: Bools = observed.voxels["first_scan"][rows] >= scan
+    return is_new & (rows > 0)
 
 
 @kernel(inline="always")

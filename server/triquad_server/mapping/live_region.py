@@ -4,7 +4,8 @@ import numpy as np
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.region import Region
-from triquad_map.evidence.growth import EvidenceSize
+from triquad_map.evidence.belief import have_surface
+from triquad_map.evidence.growth import EvidenceSize, new_blocks, new_ends
 from triquad_map.evidence.live_evidence import LiveEvidence
 from triquad_map.field.frozen_field import field_samples
 
@@ -70,14 +71,14 @@ class LiveRegion:
 
     def new_voxels(self, rays: ScanRays) -> int:
         """Return in how many voxels rays would end for the first time."""
-        return len(self.evidence.live.new_ends(self.evidence.voxels(rays.ends)).voxels)
+        return len(new_ends(self.evidence.voxels(rays.ends), self.evidence.live.seen).voxels)
 
     def growth_by(self, rays: ScanRays) -> RegionSize:
         """Return what the rays would add to it; of the space that they cross, an estimate."""
-        voxels, live = self.evidence.voxels, self.evidence.live
-        new = live.new_ends(voxels(rays.ends))
+        voxels, seen = self.evidence.voxels, self.evidence.live.seen
+        new = new_ends(voxels(rays.ends), seen)
         ways = voxels(np.concatenate([rays.ends, rays.free_corners]))
-        blocks = live.new_blocks(voxels(rays.origin[None])[0], ways)
+        blocks = new_blocks(voxels(rays.origin[None])[0], ways, seen)
         size = EvidenceSize(blocks, new.blocks, len(new.voxels))
         return RegionSize(size, self.field.growth_by(new.voxels))
 
@@ -98,7 +99,8 @@ class LiveRegion:
         is_new = self.evidence.first_seen_within(LEARNT_SCANS, seen.rows)
         # A return that is not believed, a drop of rain or the first of far things, teaches nothing.
         ends_elsewhere = seen.rows == 0
-        used = ends_elsewhere | self.evidence.live.is_surface(seen.rows)
+        live = self.evidence.live
+        used = ends_elsewhere | have_surface(seen.rows, live.seen, live.observed)
         self.training.scan_taken(rays, seen.normals, used, is_new & used)
 
     def take_step(self) -> tuple[Loss, int]:

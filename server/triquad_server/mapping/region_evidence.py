@@ -13,7 +13,8 @@ from triquad_map.evidence.carving import Reach
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.evidence.growth import EvidenceSize
 from triquad_map.evidence.live_evidence import LiveEvidence
-from triquad_map.evidence.observed import Sighting
+from triquad_map.evidence.normals import normals_at
+from triquad_map.evidence.observed import Sighting, first_seen_since
 from triquad_map.surface import SampleField, ShownByRays, nothing_shown
 from triquad_map.surfels.surfel_map import SurfelMap, first_surfels
 
@@ -103,7 +104,7 @@ class RegionEvidence:
         count = len(normals.rows)
         passed = self._setup.team.along(carve, count, normals.find, _LEAST_NORMALS)
         normals.finish()
-        return SeenScan(rows, self.live.normals(ends, rows), passed)
+        return SeenScan(rows, normals_at(ends, rows, self.live.observed), passed)
 
     def _carved(self, rays: ScanRays, origin: Doubles, ends: Doubles) -> Ints:
         """Record what the rays crossed; return the rows that they may have."""
@@ -117,7 +118,7 @@ class RegionEvidence:
         open_ends = self._thinned(origin, self.voxels(rays.open_ends), _OPEN_THINNED_AT)
         self.live.carve(origin, open_ends, Reach(0.0))
         if rays.robot is not None:
-            self.live.mark_free(self.voxels(rays.robot.voxel_centres(self._setup.field.leaf_m)))
+            self.live.mark("free", self.voxels(rays.robot.voxel_centres(self._setup.field.leaf_m)))
         return np.concatenate([passed, passed_farther])
 
     def believe(self, seen: SeenScan) -> Longs:
@@ -129,7 +130,7 @@ class RegionEvidence:
 
     def first_seen_within(self, scans: int, rows: Ints) -> Bools:
         """Return which rays [N] ended on a surface first seen in the last ``scans`` scans."""
-        return self.live.first_seen_since(self._scans - scans + 1, rows)
+        return first_seen_since(self._scans - scans + 1, rows, self.live.observed)
 
     def published(
         self, samples: SampleField, version: int, epoch: int, *, is_settled: bool

@@ -11,7 +11,7 @@ from triquad_map.evidence.belief import Belief
 from triquad_map.evidence.carving import Reach
 from triquad_map.evidence.live_evidence import LiveEvidence
 from triquad_map.evidence.observations import outcome_counts
-from triquad_map.evidence.observed import Sighting
+from triquad_map.evidence.observed import Sighting, first_seen_since
 from triquad_map.surface import SurfelKind, nothing_shown
 
 SIDE = 256
@@ -120,8 +120,8 @@ def test_surface_is_new_for_some_scans_and_again_where_it_comes_back(
         watched.scans += 1
         sighting = Sighting(SENSOR, 0.2, watched.scans, scan=watched.scans)
         rows = watched.evidence.record_ends(wall[:5], sighting)
-        watched.evidence.mark_surface(wall[:5])
-        return bool(watched.evidence.first_seen_since(watched.scans - 2, rows).all())
+        watched.evidence.mark("surface", wall[:5])
+        return bool(first_seen_since(watched.scans - 2, rows, watched.evidence.observed).all())
 
     assert [are_new() for _ in range(5)] == [True, True, True, False, False]
     while watched.believed(wall[:5]) > 0:

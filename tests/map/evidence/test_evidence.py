@@ -19,7 +19,7 @@ def voxel(*xyz: float) -> np.ndarray:
 
 def test_surface_reaches_half_a_voxel() -> None:
     evidence = LiveEvidence(SIDE)
-    evidence.mark_surface(voxel(10.5, 20.5, 30.5))
+    evidence.mark("surface", voxel(10.5, 20.5, 30.5))
     near = voxel(11.49, 20.5, 30.5), voxel(9.51, 19.51, 29.51), voxel(10.01, 20.99, 30.5)
     far = voxel(11.51, 20.5, 30.5), voxel(10.5, 20.5, 29.49)
     assert [int(evidence.freeze().status(p)[0]) for p in near] == [Status.SURFACE] * 3
@@ -57,7 +57,7 @@ def test_it_remembers_exactly_the_marked_voxels(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
     points = rng.uniform(-4, SIDE + 4, (count, 3))
     evidence = LiveEvidence(SIDE)
-    evidence.mark_surface(points)
+    evidence.mark("surface", points)
     inside = points[((points >= 0) & (points < SIDE)).all(axis=1)]
     marked = {tuple(cell) for cell in np.floor(inside).astype(int).tolist()}
     asked = rng.integers(0, SIDE, (2000, 3))
@@ -68,7 +68,7 @@ def test_it_remembers_exactly_the_marked_voxels(seed: int, count: int) -> None:
 
 def test_a_record_restores_it() -> None:
     evidence = LiveEvidence(SIDE)
-    evidence.mark_surface(RNG.uniform(0, SIDE, (5000, 3)))
+    evidence.mark("surface", RNG.uniform(0, SIDE, (5000, 3)))
     evidence.carve(np.full(3, 32.0), RNG.uniform(0, SIDE, (300, 3)), Reach(0.5))
     record = evidence.freeze().record()
     assert (np.diff(record.codes) > 0).all()
@@ -76,14 +76,14 @@ def test_a_record_restores_it() -> None:
     asked = RNG.uniform(-2, SIDE + 2, (20_000, 3))
     for again in (restored.freeze(), FrozenEvidence.from_record(SIDE, record)):
         np.testing.assert_array_equal(again.status(asked), evidence.freeze().status(asked))
-    restored.mark_surface(RNG.uniform(0, SIDE, (3000, 3)))
+    restored.mark("surface", RNG.uniform(0, SIDE, (3000, 3)))
     assert restored.size.blocks >= len(record.codes)
 
 
 def test_clearing_forgets_a_box_and_no_more() -> None:
     evidence = LiveEvidence(SIDE)
     grid = np.stack(np.meshgrid(*[np.arange(SIDE) + 0.5] * 3, indexing="ij"), -1).reshape(-1, 3)
-    evidence.mark_surface(grid)
+    evidence.mark("surface", grid)
     low, high = np.array([3.0, 10.0, 20.0]), np.array([17.0, 30.0, 21.0])
     evidence.clear(low, high)
     inside = ((grid > low) & (grid < high)).all(axis=1)
@@ -167,9 +167,9 @@ _SHIFTS = 1e-6 * np.stack(np.meshgrid(*[(-1, 0, 1)] * 3), -1).reshape(-1, 3)
 
 def test_voxels_marked_free_keep_their_surface() -> None:
     evidence = LiveEvidence(SIDE)
-    evidence.mark_surface(voxel(20.5, 20.5, 20.5))
+    evidence.mark("surface", voxel(20.5, 20.5, 20.5))
     grid = np.stack(np.meshgrid(*[np.arange(-8, SIDE + 8) + 0.5] * 3), -1).reshape(-1, 3)
-    evidence.mark_free(grid)
+    evidence.mark("free", grid)
     inside = ((grid > 0) & (grid < SIDE)).all(axis=1)
     status = evidence.freeze().status(grid, reach=0.4)
     at_surface = (grid == 20.5).all(axis=1)

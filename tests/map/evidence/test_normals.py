@@ -5,6 +5,7 @@ from support.maps.seen_scans import end
 from triquad_format.records.arrays import Doubles
 from triquad_map.evidence.carving import Reach
 from triquad_map.evidence.live_evidence import LiveEvidence
+from triquad_map.evidence.normals import normals_at
 from triquad_map.evidence.observed import Sighting
 
 SIDE = 128
@@ -22,7 +23,8 @@ def plane(rng: np.random.Generator, normal: Doubles, count: int, half: float = 1
 
 def normals(evidence: LiveEvidence, ends: Doubles, scan: int = 1) -> Doubles:
     """Have a scan end at ``ends`` [N, 3], and return the normals there."""
-    return evidence.normals(ends, end(evidence, ends, Sighting(SENSOR, 0.2, 1, scan)))
+    rows = end(evidence, ends, Sighting(SENSOR, 0.2, 1, scan))
+    return normals_at(ends, rows, evidence.observed)
 
 
 def off_degrees(found: Doubles, normal: Doubles) -> Doubles:
@@ -82,6 +84,6 @@ def test_rays_that_carve_meanwhile_change_no_normal() -> None:
             if not carves_first:
                 evidence.carve(SENSOR, ends, Reach(0.5, 2.5, number))
             search.finish()
-            found.append(evidence.normals(ends, rows))
+            found.append(normals_at(ends, rows, evidence.observed))
     np.testing.assert_array_equal(found[:3], found[3:])
     assert not np.isnan(found[-1]).all()

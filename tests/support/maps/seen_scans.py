@@ -17,5 +17,5 @@ def end(evidence: LiveEvidence, ends: Doubles, sighting: Sighting) -> Ints:
 def see(evidence: LiveEvidence, ends: Doubles, sighting: Sighting) -> Ints:
     """Record rays that end at ``ends`` [N, 3], and believe all of them; return their rows."""
     rows = end(evidence, ends, sighting)
-    evidence.mark_surface(ends)
+    evidence.mark("surface", ends)
     return rows

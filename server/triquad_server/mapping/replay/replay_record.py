@@ -13,6 +13,7 @@ from triquad_format.records.replay_rays import SLOPE_SCALE, STEPS, ReplayRays
 from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.team import Team
 from triquad_map.evidence.live_evidence import LiveEvidence
+from triquad_map.evidence.normals import normals_at
 from triquad_map.evidence.observed import Sighting
 
 from triquad_server.mapping.replay.held_out import end_in_steps, is_held_out
@@ -127,7 +128,7 @@ def restored_rays(rays: ReplayRays, settings: FieldSettings, team: Team) -> RayT
     search = evidence.outdated_normals(places, sighting.unlearnt_since)
     team.split(len(search.rows), search.find)
     search.finish()
-    normals = evidence.normals(voxels, places)
+    normals = normals_at(voxels, places, evidence.observed)
     ways = ends - rays.origins[rays.origin_of]
     cosines = (ways * normals).sum(axis=1) / np.maximum(np.linalg.norm(ways, axis=1), 1e-9)
     slopes = np.maximum(np.abs(cosines), LEAST_SLOPE)
