@@ -1,5 +1,6 @@
 """Planners: one, and sixteen at once while a lidar streams."""
 
+import argparse
 import statistics
 import time
 from collections.abc import Sequence
@@ -20,6 +21,7 @@ from bench.clients.served import MAP, Served, around, latency_figures, served, s
 from bench.figures import Figure, seconds
 from bench.parts.ground import ground_latency, ground_points, measure_ground
 from bench.parts.truths import REACH_M, measure_answers
+from bench.street import bench_street
 from bench.street_scores import DrivenStreet
 
 _ASKED = 1_000
@@ -30,8 +32,9 @@ _SETTLE_LIMIT_S = 600.0
 _WARM_S = 3.0  # until sixteen processes have started
 
 
-def measure_planners(made: DrivenStreet) -> list[Figure]:
+def measure(options: argparse.Namespace) -> list[Figure]:
     """Return figures of answers, and of how soon they come."""
+    made = bench_street(options.seed)
     with served() as server:
         points = _planner_points(made, _ASKED)
         figures = _one(server, made, points[0])

@@ -6,7 +6,6 @@ middle of the hits in it, and on beyond. So what no ray shows any more is nobody
 
 import math
 from collections import defaultdict
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -25,36 +24,15 @@ from triquad_tools.console.progress import progress
 from triquad_tools.sensors.sweep import moved
 from triquad_tools.simulation.scene import Scene
 
-from bench.ended_voxels import EndedVoxels, end_keys, voxel_centres, voxel_keys
-from bench.figures import Figure
+from bench.ended_voxels import NO_VOXEL, end_keys, voxel_centres, voxel_keys
 from bench.scenes.episodes import STANDING, Episode, EpisodeScan, lies_on
-from bench.scenes.known_episodes import held_episodes, tuned_episodes
 
-_EMPTY_SCANS = 110  # of each place, once the things have left
 PASSES = (3, 10, 30, 100)  # scans whose rays pass, after which a voxel is looked at
 _PASSED = 0.3  # voxels: 6 cm where they are 0.2 m wide
 _BEYOND_M = 0.5  # that such a ray goes on
 _CLEAR_M = 0.35  # a voxel of a thing counts where nothing that stands is nearer
 _LANE_AFTER = (10, 30)  # scans of the empty place after which its lane is looked at
 _ROBOT_RADIUS_M = 0.35
-
-
-def measure_belief(*, held: bool) -> list[Figure]:
-    """Return figures of the episodes to tune on, or of those ``held`` back to score on only."""
-    episodes = held_episodes(_EMPTY_SCANS) if held else tuned_episodes(_EMPTY_SCANS)
-    return [figure for episode in episodes for figure in _figures(episode)]
-
-
-def _figures(episode: Episode) -> Iterator[Figure]:
-    seen = follow(episode)
-    for name, left in seen.left.items():
-        for passes, (surface, count) in sorted(left.items()):
-            title = f"{episode.name}: {name}, SURFACE after {passes} scans that pass ({count})"
-            yield Figure(title, 100 * surface / max(count, 1), "%")
-    for scans, blocked_m in seen.blocked_m.items():
-        yield Figure(f"{episode.name}: lane blocked after {scans}", blocked_m, "m")
-    for what, share in seen.kept.items():
-        yield Figure(f"{episode.name}: {what} lost", 100 * (1 - share), "%")
 
 
 @dataclass
@@ -188,9 +166,8 @@ class _Record:
 
     def __init__(self, episode: Episode, settings: Settings) -> None:
         self._episode, self._settings = episode, settings
-        self._names = episode.names
-        self._on: dict[int, EndedVoxels] = defaultdict(EndedVoxels)
-        self._on_thin = EndedVoxels()
+        self._on: dict[int, list[Longs]] = defaultdict(list)  # keys, scan by scan, by thing
+        self._on_thin: list[Longs] = []
         self._hits: dict[int, list[Doubles]] = defaultdict(list)
 
     def add(self, scan: EpisodeScan) -> None:
@@ -200,11 +177,11 @@ class _Record:
         if self._episode.thin:
             bounds = self._episode.standing.scene.bounds
             on_thin = lies_on(Scene(self._episode.thin, bounds), scan.true_hits)
-            self._on_thin.add(keys[on_thin])
+            self._on_thin.append(np.unique(keys[on_thin]))
         points = moved(scan.points, scan.world_from_sensor)
         for number in np.unique(scan.thing_of).tolist():
             chosen = (scan.thing_of == number) & ~on_thin
-            self._on[number].add(keys[chosen])
+            self._on[number].append(np.unique(keys[chosen]))
             if number != STANDING:
                 self._hits[number].append(points[chosen])
 
@@ -212,9 +189,9 @@ class _Record:
         """Return what the things alone have left so far."""
         standing, voxel_m = self._standing(), self._settings.field.leaf_m
         found = []
-        for number, name in enumerate(self._names):
+        for number, name in enumerate(self._episode.names):
             if number in self._on:
-                keys = np.setdiff1d(self._on[number].keys(), standing)
+                keys = np.setdiff1d(_keys(self._on[number]), standing)
                 centres = voxel_centres(keys, voxel_m)
                 keys = keys[self._episode.standing.scene.sdf(centres) > _CLEAR_M]
                 middles = _middles(keys, np.concatenate(self._hits[number]), voxel_m)
@@ -226,14 +203,18 @@ class _Record:
         voxel_m = self._settings.field.leaf_m
         kept = {"static": _share(believed, voxel_centres(self._standing(), voxel_m))}
         if self._episode.thin:
-            others = np.concatenate([one.keys() for one in self._on.values()])
-            alone = np.setdiff1d(self._on_thin.keys(), others)
+            others = np.concatenate([_keys(parts) for parts in self._on.values()])
+            alone = np.setdiff1d(_keys(self._on_thin), others)
             kept["thin things"] = _share(believed, voxel_centres(alone, voxel_m))
         return kept
 
     def _standing(self) -> Longs:
-        standing = self._on[STANDING].keys()
-        return np.union1d(standing, self._on_thin.keys()) if self._episode.thin else standing
+        return _keys([*self._on[STANDING], *self._on_thin])
+
+
+def _keys(parts: list[Longs]) -> Longs:
+    """Return the keys [N] of all voxels of some scans, sorted."""
+    return np.setdiff1d(np.concatenate(parts), [NO_VOXEL])
 
 
 def _share(believed: Believed, centres: Doubles) -> float:

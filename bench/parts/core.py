@@ -3,6 +3,7 @@
 The baseline is the engine of tensors with automatic differentiation, on all cores.
 """
 
+import argparse
 import statistics
 from functools import partial
 
@@ -23,6 +24,7 @@ from triquad_server.settings import MeshSettings, Settings
 from triquad_tools.console.progress import progress
 
 from bench.figures import Figure, compare, seconds
+from bench.street import bench_street
 from bench.street_scores import DrivenStreet
 
 _QUERY_POINTS = 100_000
@@ -31,10 +33,10 @@ _FIRST_SCANS = 20  # they meet only new surface, and are not counted
 _RATE = 1e-4  # of learning: so slow that the baseline leaves the field as it is
 
 
-def measure_core(made: DrivenStreet, device: str) -> list[Figure]:
+def measure(options: argparse.Namespace) -> list[Figure]:
     """Return figures of the map's core, which trains on a device."""
-    settings = Settings()
-    mapper = Mapper("bench", settings, device)
+    made = bench_street(options.seed)
+    mapper = Mapper("bench", Settings(), options.device)
     with progress("core", 4) as report:
         report(0, "taking in scans")
         ingest_s = [

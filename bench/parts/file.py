@@ -1,5 +1,6 @@
 """Map files: how small, how true, how quickly opened."""
 
+import argparse
 import dataclasses
 import subprocess
 import sys
@@ -18,7 +19,8 @@ from triquad_tools.mapfiles.quantise import field_change, quantise
 
 from bench.figures import Figure, seconds
 from bench.parts.offline import measure_offline
-from bench.street import settled_mapper
+from bench.parts.store import measure_store
+from bench.street import bench_street, settled_mapper
 from bench.street_scores import DrivenStreet
 
 _LARGE_BYTES = 100_000_000
@@ -35,15 +37,17 @@ print(time.perf_counter() - started)
 """
 
 
-def measure_file(made: DrivenStreet) -> list[Figure]:
-    """Return figures of the street's map as a file."""
+def measure(options: argparse.Namespace) -> list[Figure]:
+    """Return figures of the street's map as a file, and of a larger one's checkpoints."""
+    made = bench_street(options.seed)
     epoch = settled_mapper("the street", made.scans).publish()
     record = epoch.record()
     with tempfile.TemporaryDirectory(prefix="triquad-bench-") as name:
         folder = Path(name)
         figures = _sizes(epoch, record, made, folder=folder)
         figures += _opening(record, folder)
-        return figures + measure_offline(made, epoch, folder / "fp16.triquad")
+        figures += measure_offline(made, epoch, folder / "fp16.triquad")
+    return figures + measure_store(made)
 
 
 def _sizes(epoch: Epoch, record: MapRecord, made: DrivenStreet, folder: Path) -> list[Figure]:

@@ -1,5 +1,6 @@
 """Presets: the places and sensors that each is for, streamed at 10 Hz."""
 
+import argparse
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -63,9 +64,9 @@ PLACES = (
 )
 
 
-def measure_presets(seed: int) -> list[Figure]:
+def measure(options: argparse.Namespace) -> list[Figure]:
     """Return figures of all places, each with a server of its preset."""
-    return [figure for place in PLACES for figure in _place_figures(place, seed)]
+    return [figure for place in PLACES for figure in _place_figures(place, options.seed)]
 
 
 def _place_figures(place: Place, seed: int) -> list[Figure]:

@@ -1,5 +1,6 @@
 """A whole server through the network: a server process, a lidar at 10 Hz and a planner."""
 
+import argparse
 import statistics
 import time
 from collections.abc import Callable
@@ -21,6 +22,8 @@ from bench.clients.served import (
 )
 from bench.figures import Figure, seconds
 from bench.parts.core import seen_points
+from bench.parts.neighbours import measure_neighbours
+from bench.street import bench_street
 from bench.street_scores import DrivenStreet, score_street
 
 _SOON_S = 2.0  # after the last scan
@@ -32,8 +35,9 @@ _ASKED = 1_000
 _QUESTIONS, _FIRST = 320, 20  # the first are not counted
 
 
-def measure_server(made: DrivenStreet) -> list[Figure]:
+def measure(options: argparse.Namespace) -> list[Figure]:
     """Return figures of a whole server: what a robot would meet."""
+    made = bench_street(options.seed)
     with served() as server:
         client = server.client
         met = stream_beside_planner(server, made)
@@ -50,7 +54,7 @@ def measure_server(made: DrivenStreet) -> list[Figure]:
         figures.append(Figure("resident memory right after it", _resident_mb(client), "MB"))
         resident_mb = _resident_at_rest_mb(client)
     figures.append(Figure("resident memory of the server at rest", resident_mb, "MB", at_most=380))
-    return figures
+    return figures + measure_neighbours(made)
 
 
 def _resident_mb(client: Client) -> float:

@@ -1,5 +1,6 @@
 """How soon and how smoothly the viewer shows a map."""
 
+import argparse
 import statistics
 import time
 from contextlib import closing
@@ -12,7 +13,7 @@ from triquad_tools.viewer.viewer import Viewer
 from bench.clients.browser import opened_page, running_browser, wait_until_drawn
 from bench.clients.served import served, stream
 from bench.figures import Figure
-from bench.street_scores import DrivenStreet
+from bench.street import bench_street
 
 _ROUNDS = 5
 _SETTLE_LIMIT_S = 300.0
@@ -35,10 +36,10 @@ seconds => new Promise(done => {
 """
 
 
-def measure_viewer(made: DrivenStreet) -> list[Figure]:
+def measure(options: argparse.Namespace) -> list[Figure]:
     """Return figures of the viewer, in a browser that draws in software on the same two cores."""
     with served() as server:
-        stream(server.client, made.scans)
+        stream(server.client, bench_street(options.seed).scans)
         wait_until_settled(server.client, _SETTLE_LIMIT_S)
         with (
             closing(Viewer(LiveSource(server.client, ""), "127.0.0.1", 0)) as viewer,
