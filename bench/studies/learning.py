@@ -1,19 +1,15 @@
-"""``python -m bench.studies.learning``: how soon fields learn, and what each rule of learning pays.
+"""``python -m bench.studies.learning``: how soon fields learn.
 
 Each place is mapped in this process: all scans first, then training, scored by samples; then the
-robot rests; then it sees the first part of the place again. Rules are switched off in turn. Places
-that are not tuned on are only to be scored.
+robot rests; then it sees the first part of the place again. Places that are not tuned on are only
+to be scored.
 """
 
 import argparse
-import statistics
 import sys
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from unittest.mock import patch
 
 import numpy as np
 from triquad_client import Mesh, OfflineMap
@@ -22,8 +18,6 @@ from triquad_client.offline.offline_map import REACH_LEAVES
 from triquad_format.records.arrays import Doubles
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mapping.training.slopes import Slopes
-from triquad_server.process.resources import resident_bytes
 from triquad_server.settings.loading import load_settings
 from triquad_tools.console.report import Row, print_rows
 from triquad_tools.evaluation.metrics import ScoreSettings
@@ -79,49 +73,20 @@ PLACES = {
 }
 
 
-def _never(*_args: object) -> None:
-    """Do nothing, in place of a rule."""
-
-
-RULES: dict[str, tuple[type, str] | None] = {
-    "all rules": None,
-    "without slopes": (Slopes, "after"),
-}
-
-
-@contextmanager
-def _rules(name: str) -> Iterator[None]:
-    rule = RULES[name]
-    if rule is None:
-        yield
-    else:
-        with patch.object(*rule, _never):
-            yield
-
-
 class _Learner:
     """A map that learns a place, and is scored from time to time."""
 
     def __init__(self, place: Place) -> None:
         self._place, self._driven = place, driven(place.make(), place.voxel_m)
         self.scans = self._driven.scans
-        before = resident_bytes()
         settings = load_settings(None, place.settings, preset=place.preset)
         self.mapper = Mapper("bench", settings, "cpu")
         self._random = np.random.default_rng(0)
         self._samples = 0
-        scan_s = statistics.median(map(self._take_in, self.scans))
+        for scan in self.scans:
+            self.mapper.ingest(scan.points, scan.world_from_sensor)
         self.mapper.publish()
-        self.figures = [
-            Figure("a scan, processor", 1e3 * scan_s, "ms"),
-            Figure("memory with all scans", (resident_bytes() - before) / 1e6, "MB"),
-        ]
-
-    def _take_in(self, scan: PosedScan) -> float:
-        """Take in a scan; return the processor's seconds."""
-        began_s = time.process_time()
-        self.mapper.ingest(scan.points, scan.world_from_sensor)
-        return time.process_time() - began_s
+        self.figures: list[Figure] = []
 
     def learn(self, samples: float = np.inf) -> None:
         """Train until so many samples were trained on, or nothing is left to learn."""
@@ -187,17 +152,14 @@ def measure_learning(place: Place) -> list[Figure]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Measure places with and without rules, and print the figures."""
+    """Measure places, and print the figures."""
     parser = argparse.ArgumentParser(prog="learning", description=__doc__)
-    parser.add_argument("--rules", nargs="*", choices=RULES, default=list(RULES))
     parser.add_argument("--places", nargs="*", choices=PLACES, default=list(PLACES))
     options = parser.parse_args(argv)
     for place in options.places:
         kind = "tuned on" if PLACES[place].is_tuned_on else "held out"
-        for rules in options.rules:
-            with _rules(rules):
-                figures = measure_learning(PLACES[place])
-            print_rows(f"{place} ({kind}), {rules}", [Row(one.name, one.shown) for one in figures])
+        figures = measure_learning(PLACES[place])
+        print_rows(f"{place} ({kind})", [Row(one.name, one.shown) for one in figures])
     return 0
 
 
