@@ -6,9 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 from triquad_client.pose import Pose
-from triquad_tools.sensors.motion.frame_tree import STATIC, FrameTree, Transform
+from triquad_tools.sensors.motion.frame_tree import FrameTree
 from triquad_tools.sensors.motion.placing import place
 from triquad_tools.sensors.motion.track import Track
+from triquad_tools.sensors.motion.transform import STATIC, Transform
 from triquad_tools.sensors.sweep import NoTransformError, Sweep
 
 SECOND = 10**9
@@ -188,16 +189,16 @@ def test_two_publishers_of_the_same_poses_are_told(same_time: bool) -> None:
     single = tree(*(edge("odom", "base", T0 + n, at_x(n + n % 2 / 10)) for n in range(50)))
     single.check()
     assert len(single.poses("odom", "base", at(T0))) == 1
-    assert single.problems() == []
-    ((child, problem),) = frames.problems()
-    assert child == "base"
+    assert [edge.problem() for edge in single.moving] == [""]
+    (moves,) = frames.moving
+    assert moves.child == "base"
     frames.check()
     with pytest.raises(
         NoTransformError, match=r"jumps to and fro, \d+ times, by 0.(15|5) m"
     ) as caught:
         frames.poses("odom", "base", at(T0))
     assert caught.value.reason == "two_publishers"
-    assert problem in str(caught.value)
+    assert moves.problem() in str(caught.value)
 
 
 def moving(stamp_ns: int) -> Pose:

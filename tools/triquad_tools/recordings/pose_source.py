@@ -13,7 +13,9 @@ from triquad_format.records.arrays import Doubles
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.recording import ReadingOptions
 from triquad_tools.recordings.ros_content import RosContent, SeenCloud
-from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES, STATIC, FrameTree, Transform
+from triquad_tools.sensors.motion.frame_graph import ROOT_NAMES
+from triquad_tools.sensors.motion.frame_tree import FrameTree
+from triquad_tools.sensors.motion.transform import STATIC, Transform
 from triquad_tools.sensors.ros.type_store import ALL_TF, TRANSFORMS
 from triquad_tools.sensors.sweep import NoTransformError, PosedScan, Sweep
 
@@ -110,7 +112,8 @@ def _source(content: RosContent, name: str, frame: str, options: ReadingOptions)
     if name == ALL_TF:
         if frames.moves(frames.root(frame), frame):
             body = frame
-        body = body or frames.lowest_moving or frame
+        lowest = max(frames.moving, key=lambda edge: len(frames.path(edge.child)), default=None)
+        body = body or (frame if lowest is None else lowest.child)
         return PoseSource(ALL_TF, frames, options.map_frame or frames.fixed_frame(body), body)
     poses = content.poses[name]
     assumed = not (body or poses.child)

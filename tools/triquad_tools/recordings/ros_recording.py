@@ -17,7 +17,7 @@ from triquad_tools.recordings.pose_source import (
 )
 from triquad_tools.recordings.recording import ReadingOptions, ScanEntry, Stream, with_remedies
 from triquad_tools.recordings.ros_content import RosContent, SeenCloud
-from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES
+from triquad_tools.sensors.motion.frame_graph import ROOT_NAMES
 from triquad_tools.sensors.motion.placing import place
 from triquad_tools.sensors.ros import type_store
 from triquad_tools.sensors.ros.depth_camera import raw_topic

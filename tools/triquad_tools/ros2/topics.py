@@ -6,6 +6,7 @@ show how many never arrived.
 """
 
 import struct
+import threading
 from dataclasses import dataclass
 from enum import Enum
 
@@ -147,10 +148,11 @@ def _ros_type(dds_type: str) -> str:
 
 
 class SequenceGaps:
-    """The last number of each publisher."""
+    """The last number of each publisher; for several threads."""
 
     def __init__(self) -> None:
         self._last: dict[bytes, int] = {}
+        self._lock = threading.Lock()
 
     def missed(self, attachment: bytes) -> int:
         """Return how many messages of its publisher are missing before one with this attachment.
@@ -162,9 +164,10 @@ class SequenceGaps:
             return 0
         number: int
         number, _, _, publisher = ATTACHMENT.unpack(attachment)
-        if len(self._last) > _MAX_PUBLISHERS:
-            self._last.clear()
-        last = self._last.get(publisher, number - 1)
-        self._last[publisher] = number
+        with self._lock:
+            if len(self._last) > _MAX_PUBLISHERS:
+                self._last.clear()
+            last = self._last.get(publisher, number - 1)
+            self._last[publisher] = number
         missed = number - last - 1
         return missed if 0 <= missed <= _MAX_MISSED and last >= 0 else 0

@@ -15,7 +15,8 @@ from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.arguments import SENSOR, WORLD
 from triquad_tools.recordings.folders.pose_forms import UNIT_TOLERANCE, Form, order_of, read_form
 from triquad_tools.recordings.text_lines import Line, parse_time, read_lines, rigid, unit_ns
-from triquad_tools.sensors.motion.frame_tree import FrameTree, Transform
+from triquad_tools.sensors.motion.frame_tree import FrameTree
+from triquad_tools.sensors.motion.transform import Transform
 from triquad_tools.sensors.sweep import NoTransformError
 
 DEFAULT_PERIOD_NS = 100_000_000  # the time between scans of a recording without times

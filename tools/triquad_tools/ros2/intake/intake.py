@@ -133,7 +133,6 @@ class Intake:
         )
         self._rays = RayCheck()
         self._gaps = SequenceGaps()
-        self._gaps_lock = threading.Lock()
         self._first_scan = FirstScan(options.topics, time.monotonic())
         self._check_s = time.monotonic() + LOG_PERIOD_S  # when the transforms are checked next
         self._stopping = threading.Event()
@@ -167,9 +166,7 @@ class Intake:
         limit = _OTHER_BYTES
         if arrival.role.brings_scans:
             limit = _SCAN_BYTES
-            with self._gaps_lock:
-                missed = self._gaps.missed(arrival.attachment)
-            if missed:
+            if missed := self._gaps.missed(arrival.attachment):
                 text = "their numbers are missing"
                 self.drops.add(arrival.topic_name, "not_received", text, missed)
         if len(arrival.payload) > limit:
@@ -189,8 +186,9 @@ class Intake:
             self._first_scan.check(self._listener.found, now_s)
             if now_s >= self._check_s:
                 self._check_s = now_s + LOG_PERIOD_S
-                for child, problem in self._motion.frames.problems():
-                    self.drops.remark(child, problem, "two_publishers")
+                for edge in self._motion.frames.moving:
+                    if problem := edge.problem():
+                        self.drops.remark(edge.child, problem, "two_publishers")
 
     def _publish(self, placed: Placed) -> None:
         if isinstance(placed.outcome, NoScanError):
@@ -235,7 +233,7 @@ class Intake:
         if self.scans.time_went_back(topic_name, sweep.stamp_ns):
             self.drops.remark(topic_name, "time went back, it starts again")
             self._placement.give_up_after(topic_name, sweep.stamp_ns)
-            self._motion.forget_after(sweep.stamp_ns)
+            self._motion.frames.forget_after(sweep.stamp_ns)
         self._placement.add(topic_name, sweep, time.monotonic())
 
 

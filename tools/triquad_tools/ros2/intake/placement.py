@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from triquad_client.errors import InvalidScanError
 
-from triquad_tools.sensors.motion.frame_tree import ROOT_NAMES, STATIC, FrameTree, Transform
+from triquad_tools.sensors.motion.frame_graph import ROOT_NAMES
+from triquad_tools.sensors.motion.frame_tree import FrameTree
 from triquad_tools.sensors.motion.placing import place
+from triquad_tools.sensors.motion.transform import Transform
 from triquad_tools.sensors.sweep import NoScanError, NoTransformError, PosedScan, Sweep
 
 _log = logging.getLogger("triquad_ros2")
-RESTART_NS = 10 * 10**9  # transforms that go back by more are of a bag that was started again
 _POSES_KEPT = 2000  # of each frame; 20 s at 100 Hz
-_MAX_FRAMES = 1000
 _MAX_NAME = 256
 _CHOICE_S = 1.0  # after a sweep could first be placed, for a better map frame to appear
 
@@ -43,30 +43,13 @@ class Motion:
             if self._from_topic and not is_body and transform.child == self._body:
                 continue
             try:
-                self._check(transform)
-                if transform.stamp_ns is not STATIC:
-                    self._forget_after(transform.child, transform.stamp_ns)
+                if not 0 < len(transform.child) <= _MAX_NAME >= len(transform.parent):
+                    raise NoScanError("bad_transform", "its name is empty or too long")
                 self.frames.add(transform)
             except (InvalidScanError, NoScanError) as error:
                 refusal = NoScanError("bad_transform", f"{transform.child[:_MAX_NAME]}: {error}")
         if refusal is not None:
             raise refusal
-
-    def forget_after(self, stamp_ns: int) -> None:
-        """Remove poses from before time went back to a stamp."""
-        for child in self.frames.moving:
-            self._forget_after(child, stamp_ns)
-
-    def _forget_after(self, child: str, stamp_ns: int) -> None:
-        newest_ns = self.frames.newest_ns(child)
-        if newest_ns is not None and newest_ns > stamp_ns + RESTART_NS:
-            self.frames.forget(child)
-
-    def _check(self, transform: Transform) -> None:
-        if max(len(transform.parent), len(transform.child)) > _MAX_NAME or not transform.child:
-            raise NoScanError("bad_transform", "its name is empty or too long")
-        if len(self.frames) >= _MAX_FRAMES and not self.frames.knows(transform.child):
-            raise NoScanError("bad_transform", f"more than {_MAX_FRAMES} frames")
 
 
 @dataclass(frozen=True)
