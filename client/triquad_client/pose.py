@@ -11,7 +11,7 @@ from triquad_format.records.pose import RIGID_TOLERANCE, is_rotation, pose_matri
 from triquad_client.errors import NO_NUMBER, InvalidScanError
 from triquad_client.real_numbers import real_numbers
 
-_UNIT_TOLERANCE = 1e-2
+UNIT_TOLERANCE = 1e-2
 """The allowed error of a quaternion's length: files of three digits have it."""
 
 
@@ -40,7 +40,7 @@ class Pose:
         quaternion = _numbers("quaternion_xyzw", self.quaternion_xyzw, 4)
         with np.errstate(over="ignore"):  # what overflows has no length of 1
             length = float(np.linalg.norm(quaternion))
-        if abs(length - 1.0) > _UNIT_TOLERANCE:
+        if abs(length - 1.0) > UNIT_TOLERANCE:
             raise InvalidScanError(
                 f"quaternion_xyzw = {quaternion.tolist()} has the length {length:.4g}, not 1"
             )

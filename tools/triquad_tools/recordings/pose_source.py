@@ -17,16 +17,20 @@ from triquad_tools.sensors.motion.frame_graph import ROOT_NAMES
 from triquad_tools.sensors.motion.frame_tree import FrameTree
 from triquad_tools.sensors.motion.transform import STATIC, Transform
 from triquad_tools.sensors.ros.type_store import ALL_TF, TRANSFORMS
-from triquad_tools.sensors.sweep import NoTransformError, PosedScan, Sweep
+from triquad_tools.sensors.sweep import NoScanError, NoTransformError, PosedScan, Sweep
 
 _SLACK_M, _SLACK_S = 1.0, 2.0  # between the parts of a recording the robot goes on as it was
+_NO_POSES = (
+    "it holds no poses: record /tf with /tf_static, or a topic of odometry or poses, together with "
+    "the clouds"
+)
 
 
 @dataclass(frozen=True)
 class PoseSource:
     """Poses that may be used, and the frame to map in."""
 
-    name: str  # a topic, or ALL_TF
+    name: str  # a topic, or ALL_TF; empty where there are no poses
     frames: FrameTree
     target: str
     body: str  # the frame whose poses they are, or one that hangs on it
@@ -51,8 +55,10 @@ class PoseSource:
         stamps = np.array([stamp_ns], np.int64)
         return np.asarray(self.frames.poses(self.target, frame, stamps)[0])
 
-    def find(self, cloud: SeenCloud) -> NoTransformError | None:
+    def find(self, cloud: SeenCloud) -> NoScanError | None:
         """Return why the pose of a cloud is not known; None if it is."""
+        if not self.name:
+            return NoScanError("no_poses", _NO_POSES)
         times = np.array([cloud.first_ns, cloud.last_ns], np.int64)
         try:
             self.frames.poses(self.target, cloud.frame, times)
@@ -63,14 +69,17 @@ class PoseSource:
 
 def choose_poses(
     content: RosContent, clouds: Sequence[SeenCloud], options: ReadingOptions
-) -> PoseSource | None:
-    """Return the source that places the most clouds; None if there is no pose at all.
+) -> PoseSource:
+    """Return the source that places the most clouds; one without a name if there is none.
 
     Raises:
         ToolError: the source that was asked for does not exist.
     """
     for transform in options.transforms:
         content.frames.add(transform)
+    no_poses = PoseSource("", content.frames, "", "")
+    if not clouds:
+        return no_poses
     _check_body(content, {cloud.frame for cloud in clouds}, options)
     content.frames.wanted = options.map_frame or ""
     frame = clouds[0].frame
@@ -90,7 +99,7 @@ def choose_poses(
         placed = sum(source.find(cloud) is None for cloud in clouds)
         return placed, source.target in ROOT_NAMES
 
-    return max(moving, key=merit, default=None)
+    return max(moving, key=merit, default=no_poses)
 
 
 def _check_body(content: RosContent, sensors: set[str], options: ReadingOptions) -> None:

@@ -9,12 +9,7 @@ import numpy as np
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.arguments import SENSOR, WORLD
 from triquad_tools.recordings.bag import Bag, Message
-from triquad_tools.recordings.pose_source import (
-    PoseSource,
-    check_places,
-    check_times,
-    choose_poses,
-)
+from triquad_tools.recordings.pose_source import check_places, check_times, choose_poses
 from triquad_tools.recordings.recording import ReadingOptions, ScanEntry, Stream, with_remedies
 from triquad_tools.recordings.ros_content import RosContent, SeenCloud
 from triquad_tools.sensors.motion.frame_graph import ROOT_NAMES
@@ -50,10 +45,6 @@ _STANDS = (
 _NO_CLOUDS = (
     "it holds no clouds (PointCloud2, Livox CustomMsg) and no depth images (Image): nothing to map"
 )
-_NO_POSES = (
-    "it holds no poses: record /tf with /tf_static, or a topic of odometry or poses, together with "
-    "the clouds"
-)
 _PACKETS = {
     package: f"packets: play it to {driver}, and record the PointCloud2 that this publishes"
     for driver, packages in {
@@ -84,11 +75,14 @@ class RosRecording:
         self._content = RosContent(bag, self._reader, options.poses)
         self._topics = _chosen_topics(self._content, options)
         self._options = options
-        self._poses: PoseSource | None = None
+        clouds = [cloud for cloud in self._content.clouds if cloud.topic in self._topics]
+        good = [cloud for cloud in clouds if cloud.problem is None]
+        check_times(good)
+        self._poses = choose_poses(self._content, good, options)
         self._placed: list[SeenCloud] = []
         self._left_out: dict[tuple[str, str], list[SeenCloud]] = defaultdict(list)
-        self._place_clouds()
-        if self._poses is not None and options.map_frame is None:
+        self._place(clouds)
+        if options.map_frame is None:
             check_places(self._placed, self._poses)
 
     @property
@@ -116,13 +110,11 @@ class RosRecording:
             f"{topic}: {len(texts)} poses are left out: {texts[0]}"
             for topic, texts in found.broken.items()
         ]
-        if self._poses is not None and self._poses.assumed:
-            lines.append(_ASSUMED.format(topic=self._poses.name, body=self._poses.body))
-        if self._poses is not None:
-            frames, target = self._poses.frames, self._poses.target
-            sensors = dict.fromkeys(cloud.frame for cloud in self._placed)
-            corrected = (frames.corrections(target, frame) for frame in sensors)
-            lines += dict.fromkeys(line for each in corrected for line in each)
+        poses = self._poses
+        lines += [_ASSUMED.format(topic=poses.name, body=poses.body)] if poses.assumed else []
+        sensors = dict.fromkeys(cloud.frame for cloud in self._placed)
+        corrected = (poses.frames.corrections(poses.target, frame) for frame in sensors)
+        lines += dict.fromkeys(line for each in corrected for line in each)
         return [*lines, *(self._left_out_line(*key) for key in self._left_out)]
 
     def read(self, indices: Sequence[int]) -> Iterator[PosedScan]:
@@ -148,25 +140,22 @@ class RosRecording:
             )
 
     def _read(self, message: Message) -> PosedScan:
-        assert self._poses is not None
         topic, kind = message.channel.topic, message.channel.kind
         try:
             sweep = self._reader.sweep(topic, kind, message.decoded(), message.recorded_ns)
             scan = place(sweep, self._poses.frames, self._poses.target)
-            stands = self._options.points_in == WORLD and not self._poses.moves(sweep.frame)
-            return self._poses.seen(scan, sweep) if stands else scan
+            return self._poses.seen(scan, sweep) if self._stands(sweep.frame) else scan
         except NoScanError as error:
             raise ToolError(f"{self._bag.path}: a message on {topic}: {error}") from error
 
-    def _place_clouds(self) -> None:
-        """Choose the poses, and find out which clouds they place."""
-        clouds = [cloud for cloud in self._content.clouds if cloud.topic in self._topics]
-        good = [cloud for cloud in clouds if cloud.problem is None]
-        check_times(good)
-        if good:
-            self._poses = choose_poses(self._content, good, self._options)
-        if self._poses is not None and self._options.points_in == WORLD:
-            self._poses.know({cloud.frame for cloud in good})
+    def _stands(self, frame: str) -> bool:
+        """Return whether points in a frame are taken to stand still in the map, as it does."""
+        return self._options.points_in == WORLD and not self._poses.moves(frame)
+
+    def _place(self, clouds: Sequence[SeenCloud]) -> None:
+        """Find out which clouds the poses place."""
+        if self._options.points_in == WORLD:
+            self._poses.know({cloud.frame for cloud in clouds if cloud.problem is None})
         newest_ns: dict[str, int] = {}
         for cloud in clouds:
             problem = self._problem(cloud, newest_ns)
@@ -183,9 +172,7 @@ class RosRecording:
 
     def _check_rays(self, topic: str, frame: str) -> None:
         """Leave out placed clouds whose points and poses cannot be metres seen from their frame."""
-        assert self._poses is not None
-        stands = self._options.points_in == WORLD and not self._poses.moves(frame)
-        if stands or self._options.ray_origin is not None:
+        if self._stands(frame) or self._options.ray_origin is not None:
             return
         clouds = [each for each in self._placed if (each.topic, each.frame) == (topic, frame)]
         stamps = np.array([cloud.stamp_ns for cloud in clouds])
@@ -201,21 +188,18 @@ class RosRecording:
     def _problem(self, cloud: SeenCloud, newest_ns: dict[str, int]) -> NoScanError | None:
         if cloud.problem is not None:
             return cloud.problem
-        if self._poses is None:
-            return NoScanError("no_poses", _NO_POSES)
         if cloud.stamp_ns < newest_ns.get(cloud.topic, cloud.stamp_ns):
             return NoScanError("time_backwards", "its stamp lies before that of the one before it")
         return self._poses.find(cloud) or self._misplaced(cloud)
 
     def _misplaced(self, cloud: SeenCloud) -> NoScanError | None:
         """Return why the rays of a cloud, whose pose is known, do not begin at its frame."""
-        assert self._poses is not None
-        body, way = self._poses.body, self._options.points_in
-        if not self._poses.moves(cloud.frame) and way != SENSOR:
-            if way == WORLD:
-                return self._poses.find(replace(cloud, frame=body))
-            return NoScanError("map_frame", _STANDS.format(frame=cloud.frame, body=body))
-        return None
+        body = self._poses.body
+        if self._stands(cloud.frame):
+            return self._poses.find(replace(cloud, frame=body))
+        if self._options.points_in == SENSOR or self._poses.moves(cloud.frame):
+            return None
+        return NoScanError("map_frame", _STANDS.format(frame=cloud.frame, body=body))
 
     def _left_out_line(self, topic: str, reason: str) -> str:
         clouds = self._left_out[topic, reason]
@@ -224,9 +208,8 @@ class RosRecording:
         if reason == "no_transform" and clouds[0].frame in ROOT_NAMES:
             return f"{line}; if its points are in the map already, use --points-in world"
         if reason == "no_transform":
-            body = self._poses.body if self._poses else "BODY"
             root = self._content.frames.root(clouds[0].frame)
-            return f"{line}; {_NO_TRANSFORM.format(body=body, root=root)}"
+            return f"{line}; {_NO_TRANSFORM.format(body=self._poses.body, root=root)}"
         if reason in _OF_TIME and not any(placed.topic == topic for placed in self._placed):
             return f"{line}; {_CLOCKS}"
         return line
@@ -250,8 +233,7 @@ class RosRecording:
             notes = Counter(each.note for each in self._placed if each.topic == topic)
             words = [note for note, _ in notes.most_common(2) if note]
             return ", ".join([f"{placed} scans", f"source {source_of_topic(topic)}", *words])
-        chosen = self._poses.name if self._poses else ""
-        kind = self._content.kinds[topic]
+        chosen, kind = self._poses.name, self._content.kinds[topic]
         if kind in TRANSFORMS:
             return "the poses" if chosen == ALL_TF else "where sensors sit"
         if kind in type_store.POSES:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from triquad_client.pose import UNIT_TOLERANCE
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.pose import is_rotation
 
@@ -45,7 +46,6 @@ class Form(NamedTuple):
         return table
 
 
-UNIT_TOLERANCE = 1e-2  # the allowed error of a quaternion's length: files of three digits have it
 _XYZ = "x y z"
 _XYZW, _WXYZ = "qx qy qz qw", "qw qx qy qz"
 _ROWS, _SQUARE = " m" * 12, " m" * 16

@@ -7,16 +7,16 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from triquad_client.pose import Pose
+from triquad_client.pose import UNIT_TOLERANCE
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.pose import pose_matrices
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.arguments import SENSOR, WORLD
-from triquad_tools.recordings.folders.pose_forms import UNIT_TOLERANCE, Form, order_of, read_form
+from triquad_tools.recordings.folders.pose_forms import Form, order_of, read_form
 from triquad_tools.recordings.text_lines import Line, parse_time, read_lines, rigid, unit_ns
 from triquad_tools.sensors.motion.frame_tree import FrameTree
-from triquad_tools.sensors.motion.transform import Transform
+from triquad_tools.sensors.motion.track import Track
 from triquad_tools.sensors.sweep import NoTransformError
 
 DEFAULT_PERIOD_NS = 100_000_000  # the time between scans of a recording without times
@@ -120,7 +120,7 @@ def _trajectory(
 
 
 def _timed(found: Trajectory, stamps: Longs) -> Trajectory:
-    remarks, frames = list(found.remarks), FrameTree()
+    remarks, track = list(found.remarks), Track()
     order = np.argsort(stamps, kind="stable")
     poses, ordered = found.poses[order], stamps[order]
     backwards, repeated = int((np.diff(stamps) < 0).sum()), int((np.diff(ordered) == 0).sum())
@@ -131,8 +131,10 @@ def _timed(found: Trajectory, stamps: Longs) -> Trajectory:
         remarks.append(f"{of_all} that of another pose ({repeated}): the last of each is taken")
     known = np.isfinite(poses[:, 0, 3])
     turns = Rotation.from_matrix(poses[known, :3, :3]).as_quat()
-    for stamp, pose, turn in zip(ordered[known].tolist(), poses[known], turns, strict=True):
-        frames.add(Transform(WORLD, SENSOR, stamp, Pose(pose[:3, 3], turn)))
+    rows = zip(ordered[known].tolist(), poses[known, :3, 3].tolist(), turns.tolist(), strict=True)
+    for stamp, position, turn in rows:
+        track.add(stamp, position, turn)
+    frames = FrameTree().with_track(WORLD, SENSOR, track)
     return Trajectory(found.path, found.kind, poses, ordered, frames, None, tuple(remarks))
 
 
