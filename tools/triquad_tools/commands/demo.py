@@ -1,19 +1,13 @@
 """``triquad-demo``: the whole of triquad on one simulated street."""
 
 import argparse
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from triquad_tools.console.arguments import PAGE_PORT, command_parser, count, port, seed
 from triquad_tools.console.command import run_work
 
 COMMAND = "triquad-demo"
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the tool: 0 all is as promised, 1 something is not or failed, 2 wrong usage."""
-    interrupted = "interrupted; the server is stopped"
-    return run_work(COMMAND, "demo", _parser().parse_args(argv), interrupted=interrupted)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -31,3 +25,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--port", type=port, default=PAGE_PORT, metavar="N", help=of_page)
     add("--seed", type=seed, default=1, metavar="N", help="of the street (default: 1)")
     return parser
+
+
+main = partial(run_work, "demo", _parser, interrupted="interrupted; the server is stopped")

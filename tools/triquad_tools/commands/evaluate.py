@@ -1,23 +1,16 @@
 """``triquad-eval``: how good a mesh is."""
 
 import argparse
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from triquad_tools.console.arguments import command_parser, not_negative, positive
 from triquad_tools.console.command import run_work
 
-COMMAND = "triquad-eval"
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the tool: 0 done, 2 wrong usage or input that cannot be used."""
-    return run_work(COMMAND, "evaluate", _parser().parse_args(argv))
-
 
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser(
-        COMMAND,
+        "triquad-eval",
         description="Score a mesh against true surface points. docs/tools.md defines the figures.",
         epilog="Exit status: 0 done, 2 wrong usage or input.",
     )
@@ -31,3 +24,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--range-min", type=not_negative, default=0.0, metavar="M", help=nearer)
     add("--json", action="store_true", help="print JSON")
     return parser
+
+
+main = partial(run_work, "evaluate", _parser)

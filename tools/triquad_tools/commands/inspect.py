@@ -1,19 +1,13 @@
 """``triquad-inspect``: what maps hold, whether their files are valid, and how they differ."""
 
 import argparse
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from triquad_tools.console.arguments import add_config, command_parser, picture
 from triquad_tools.console.command import run_work
 
 COMMAND = "triquad-inspect"
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the tool: 0 valid, 1 damaged, 2 not readable, or wrong usage."""
-    options = _parser().parse_intermixed_args(argv)
-    return run_work(COMMAND, "inspect", options)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -38,3 +32,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--plot", type=picture, metavar="OUT.png", help=plot)
     add("--json", action="store_true", help="print JSON")
     return parser
+
+
+main = partial(run_work, "inspect", _parser, intermixed=True)

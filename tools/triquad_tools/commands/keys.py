@@ -1,7 +1,6 @@
 """``triquad-keys``: who may do what on a server, by certificates."""
 
 import argparse
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -9,7 +8,6 @@ from triquad_tools.console.arguments import command_parser, positive, whole
 from triquad_tools.console.command import run_work
 from triquad_tools.credentials.roles import Role
 
-COMMAND = "triquad-keys"
 _DAYS = 365.0
 _LAST_DOMAIN = 232  # of ROS 2
 _ROLES = {
@@ -20,15 +18,9 @@ _ROLES = {
 }
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the tool: 0 done, 2 wrong usage, or a folder that cannot be used."""
-    options = _parser().parse_args(argv)
-    return run_work(COMMAND, "keys", options)
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser(
-        COMMAND,
+        "triquad-keys",
         description="Give roles to those who use a map server: a certificate authority in a "
         "folder, and a Zenoh configuration for the server, routers and each client, who may do "
         "what their roles say, and nothing else. docs/security.md tells more.",
@@ -74,3 +66,6 @@ def _add_sources(
     add("--source", action="append", required=required, metavar="NAME", help=sources)
     domain = "let nodes of ROS 2 with this certificate take part in this domain"
     add("--ros2-domain", type=partial(whole, 0, _LAST_DOMAIN), metavar="N", help=domain)
+
+
+main = partial(run_work, "keys", _parser)

@@ -1,7 +1,7 @@
 """``triquad-map``: a recording in, a map out."""
 
 import argparse
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from triquad_server.process.installed import DEVICES
@@ -12,12 +12,7 @@ from triquad_tools.console.suffixes import SUFFIXES
 from triquad_tools.recordings.arguments import add_recording
 
 COMMAND = "triquad-map"
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the tool: 0 done, 1 nothing could be written, 2 bad input, 130 interrupted."""
-    interrupted = "interrupted; the same command goes on where the map was saved last"
-    return run_work(COMMAND, "map_recording", _parser().parse_args(argv), interrupted=interrupted)
+_INTERRUPTED = "interrupted; the same command goes on where the map was saved last"
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -40,3 +35,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--training", action="store_true", help="keep what further training needs in the map file")
     add("--force", action="store_true", help="replace OUT where it exists")
     return parser
+
+
+main = partial(run_work, "map_recording", _parser, interrupted=_INTERRUPTED)

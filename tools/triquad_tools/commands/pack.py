@@ -1,7 +1,7 @@
 """``triquad-pack``: rewrite a map file: smaller, from history, repaired, as a mesh or a picture."""
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -13,11 +13,6 @@ COMMAND = "triquad-pack"
 _CELL_RANGE_M = (0.01, 10.0)
 _ERROR_RANGE_M = (1e-5, 0.1)
 _Add = Callable[..., argparse.Action]
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the tool: 0 done, 1 damage, or nothing lies in the box, 2 otherwise."""
-    return run_work(COMMAND, "pack", _parser().parse_args(argv))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -59,3 +54,6 @@ def _add_target(add: _Add) -> None:
     cell = "side of cells of a mesh or a picture (default: half a leaf)"
     add("--cell", type=partial(within, *_CELL_RANGE_M), metavar="M", help=cell)
     add("--force", action="store_true", help="replace OUT where it exists")
+
+
+main = partial(run_work, "pack", _parser)

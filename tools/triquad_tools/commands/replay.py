@@ -1,30 +1,21 @@
 """``triquad-replay``: publish a recording to a map server, or tell what it holds."""
 
 import argparse
-import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 
 from triquad_tools.console.arguments import add_server, command_parser, positive
 from triquad_tools.console.command import run_work
 from triquad_tools.recordings.arguments import add_recording
 
-COMMAND = "triquad-replay"
+_INTERRUPTED = "interrupted; scans that were sent are in the map"
 DueTimes = Callable[[Sequence[int]], list[float]]
 """Returns when scans are sent, seconds after the first, by their stamps in nanoseconds."""
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the tool: 0 done, 1 scans were lost or refused or the server failed, 2 bad input."""
-    arguments = sys.argv[1:] if argv is None else list(argv)
-    options = _parser().parse_args(arguments)
-    options.arguments = [argument for argument in arguments if argument != "--list"]
-    interrupted = "interrupted; scans that were sent are in the map"
-    return run_work(COMMAND, "replay", options, interrupted=interrupted)
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser(
-        COMMAND,
+        "triquad-replay",
         description="Publish a recording to a map server. By default the server sets the pace, and "
         "no scan is lost.",
         epilog="Exit status: 0 all scans are in the map (--list: there are some to map), 1 some "
@@ -47,3 +38,6 @@ def due_times(text: str) -> DueTimes:
     if text.endswith("x"):
         return lambda stamps_ns: [(stamp - stamps_ns[0]) / 1e9 / factor for stamp in stamps_ns]
     return lambda stamps_ns: [number / factor for number in range(len(stamps_ns))]
+
+
+main = partial(run_work, "replay", _parser, interrupted=_INTERRUPTED)

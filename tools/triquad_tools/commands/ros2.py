@@ -4,26 +4,20 @@ import argparse
 import os
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 
 from triquad_tools.console.arguments import add_server, command_parser, count, whole, within
 from triquad_tools.console.command import run_work
 from triquad_tools.sensors.ros.type_store import ALL_TF, frame_name
 
-COMMAND = "triquad-ros2"
 _TOPIC = re.compile(r"(/?[A-Za-z_][A-Za-z0-9_]*)+")
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the tool: 0 stopped, 1 the server failed, 2 wrong usage; with --serve, as the server."""
-    return run_work(COMMAND, "ros2", parser().parse_args(argv))
 
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line; ``@FILE`` stands for what a file has, line by line."""
     made = command_parser(
-        COMMAND,
+        "triquad-ros2",
         description="Map the clouds and depth images of a robot with ROS 2 (rmw_zenoh or "
         "zenoh-bridge-ros2dds), and publish the map's mesh and an occupancy grid to it: "
         "docs/guides/ros2.md. @FILE stands for the arguments in a file, one a line.",
@@ -85,6 +79,8 @@ def _topic(text: str) -> str:
         raise argparse.ArgumentTypeError(f"{text!r:.300} is not the name of a topic")
     return text
 
+
+main = partial(run_work, "ros2", parser)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -1,17 +1,12 @@
 """``triquad-top``: how a map server is doing, live."""
 
 import argparse
-from collections.abc import Sequence
+from functools import partial
 
 from triquad_tools.console.arguments import add_server, command_parser, positive
 from triquad_tools.console.command import run_work
 
 COMMAND = "triquad-top"
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the tool: 0 done, 1 the server failed, 2 wrong usage, 130 ended by Ctrl-C."""
-    return run_work(COMMAND, "top", _parser().parse_args(argv))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -27,3 +22,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--once", action="store_true", help="print one page as plain text, after one interval")
     add("--json", action="store_true", help="print an object of JSON a line, one each interval")
     return parser
+
+
+main = partial(run_work, "top", _parser)

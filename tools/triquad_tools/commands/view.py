@@ -1,7 +1,7 @@
 """``triquad-view``: a map in the browser, as it grows, or as a file or a store has it."""
 
 import argparse
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from triquad_tools.console.arguments import PAGE_PORT, add_server, command_parser, port
@@ -10,14 +10,11 @@ from triquad_tools.console.command import run_work
 COMMAND = "triquad-view"
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the tool until it is interrupted: 130 then, 1 the server failed, 2 bad input."""
-    return run_work(COMMAND, "view", _parser().parse_args(argv))
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser(
-        COMMAND, description="Show a map in the browser: of a server, as it grows, or of a file."
+        COMMAND,
+        description="Show a map in the browser: of a server, as it grows, or of a file.",
+        epilog="Exit status: 130 ended by Ctrl-C, 1 the server failed, 2 wrong usage or input.",
     )
     add = parser.add_argument
     file = "a map file, or a store with its history, to be shown without a server"
@@ -29,3 +26,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--allow-host", action="append", default=[], metavar="NAME", help=name)
     add("--port", type=port, default=PAGE_PORT, metavar="PORT", help=f"default: {PAGE_PORT}")
     return parser
+
+
+main = partial(run_work, "view", _parser)

@@ -6,7 +6,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import TextIO
@@ -121,15 +121,24 @@ def run(command: str, work: Callable[[], int], *, interrupted: str = "interrupte
 
 
 def run_work(
-    command: str, module: str, options: argparse.Namespace, *, interrupted: str = "interrupted"
+    module: str,
+    parser: Callable[[], argparse.ArgumentParser],
+    argv: Sequence[str] | None = None,
+    *,
+    intermixed: bool = False,
+    interrupted: str = "interrupted",
 ) -> int:
-    """Return the exit status of a command whose arguments are right, as :func:`run`.
+    """Return the exit status of a command with arguments, those of the process by default.
 
-    Its work is the function ``work`` of a module of ``triquad_tools.work``, which is imported only
-    here: that takes a second, for which nobody waits who asks for help.
+    Its work, as of :func:`run`, is the function ``work`` of a module of ``triquad_tools.work``. It
+    is imported once the arguments are right: nobody waits a second for it who asks for help. With
+    ``intermixed``, options may stand between names.
     """
+    made, arguments = parser(), sys.argv[1:] if argv is None else list(argv)
+    options = (made.parse_intermixed_args if intermixed else made.parse_args)(arguments)
+    options.arguments = arguments
     work = importlib.import_module(f"triquad_tools.work.{module}").work
-    return run(command, partial(work, options), interrupted=interrupted)
+    return run(made.prog, partial(work, options), interrupted=interrupted)
 
 
 def _in_words(error: OSError) -> str:

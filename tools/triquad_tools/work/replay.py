@@ -32,7 +32,7 @@ def _list(options: argparse.Namespace) -> int:
     seconds = length_s(entries)
     rate = f", {(len(entries) - 1) / seconds:.1f} a second" if seconds > 0 else ""
     print_line(f"{len(entries):,} scans in {seconds:.1f} s{rate}")
-    words = options.arguments
+    words = [word for word in options.arguments if word != "--list"]
     at = next(at for at, word in enumerate(words) if Path(word) == path) + 1
     words = [*words[:at], f"{path.resolve().stem}.triquad", *words[at:]]
     print_line(f"to map it: triquad-map {shlex.join(words)}")
