@@ -32,7 +32,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parts = [BY_NAME[name] for name in options.part] or PARTS
     campaign = Campaign(options.out, parts)
     try:
-        campaign.run(60.0 * options.minutes, options.lanes)
+        campaign.run(60.0 * options.minutes)
     except KeyboardInterrupt:
         print("stopped; the same command goes on from here", file=sys.stderr)
     finally:
@@ -46,7 +46,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--part", choices=sorted(BY_NAME), action="append", default=[], help="this one alone")
     add("--seed", type=int, help="repeat the turn of --part with this seed, and nothing else")
     add("--minutes", type=float, default=5.0, help="how long (default: 5)")
-    add("--lanes", type=int, default=2, help="turns at a time (default: 2)")
     add("--out", type=Path, default=Path("campaign-out"), help="default: campaign-out")
     add("--most", type=int, help="of --seed: things to do, at most")
     return parser

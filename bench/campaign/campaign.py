@@ -1,4 +1,4 @@
-"""A campaign: turns of all parts, two at a time, each in a process of its own, until time is up."""
+"""A campaign: turns of all parts, each in a process of its own, until time is up."""
 
 import contextlib
 import os
@@ -6,10 +6,8 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from bench.campaign.record import TurnResult, results, table
@@ -31,81 +29,40 @@ class Campaign:
         self._folder = folder
         self._missing = {part.name: why for part in parts if (why := part.missing())}
         self._parts = [part for part in parts if part.name not in self._missing]
-        self._lock = threading.Lock()
-        self._running: set[str] = set()
-        self._children: set[subprocess.Popen[bytes]] = set()
-        self._stopped = threading.Event()
-        self._ends_s = 0.0
 
     @property
     def broken(self) -> int:
         """The number of promises that were not kept."""
-        return sum(len(turn.broken) for part in self._parts for turn in self._results(part))
+        found = (results(self._folder, part) for part in self._parts)
+        return sum(len(turn.broken) for turns in found for turn in turns)
 
     def table(self) -> str:
         """Return what was done and what broke, in Markdown."""
         return table(self._parts, self._folder, self._missing)
 
-    def run(self, seconds: float, lanes: int) -> None:
+    def run(self, seconds: float) -> None:
         """Run turns until the time is up; the part that is farthest from its goal comes next."""
-        self._ends_s = time.monotonic() + seconds
-        with ThreadPoolExecutor(lanes) as pool:
-            try:
-                for lane in [pool.submit(self._lane) for _ in range(lanes)]:
-                    lane.result()
-            except BaseException:
-                self._stop()
-                raise
-
-    def _results(self, part: Part) -> list[TurnResult]:
-        return results(self._folder, part)
+        ends_s = time.monotonic() + seconds
+        while self._parts and (left_s := ends_s - time.monotonic()) > 0:
+            part = min(self._parts, key=lambda part: self._done(part) / part.goal)
+            seeds = (turn.seed for turn in results(self._folder, part))
+            self._turn(part, 1 + max(seeds, default=0), min(max(left_s, 1.0), _TURN_S))
 
     def _done(self, part: Part) -> int:
-        return sum(turn.done for turn in self._results(part))
+        return sum(turn.done for turn in results(self._folder, part))
 
-    def _stop(self) -> None:
-        """End the turns that run; they do not count."""
-        self._stopped.set()
-        for child in tuple(self._children):
-            _kill(child)
-
-    def _lane(self) -> None:
-        while (part := self._next_part()) is not None:
-            seed = 1 + max((turn.seed for turn in self._results(part)), default=0)
-            left_s = max(1.0, self._ends_s - time.monotonic())
-            result = self._turn(part, seed, min(left_s, _TURN_S))
-            if result is not None:
-                self._tell(part, seed, result)
-            with self._lock:
-                self._running.discard(part.name)
-
-    def _next_part(self) -> Part | None:
-        with self._lock:
-            free = [part for part in self._parts if part.name not in self._running]
-            if not free or self._stopped.is_set() or time.monotonic() >= self._ends_s:
-                return None
-            part = min(free, key=lambda part: self._done(part) / part.goal)
-            self._running.add(part.name)
-            return part
-
-    def _turn(self, part: Part, seed: int, seconds: float) -> TurnResult | None:
-        """Run a turn in a process group of its own, which is killed if it hangs.
-
-        ``None``: it was stopped.
-        """
+    def _turn(self, part: Part, seed: int, seconds: float) -> None:
+        """Run a turn in a process group of its own, which is killed if it hangs, and report it."""
         log = self._folder / f"{part.name}-{seed}.log"
         how = self._run(part, seed, seconds, log)
         written = log.with_suffix(".json")
-        if self._stopped.is_set():
-            written.unlink(missing_ok=True)
-            return None
         if not written.exists():
             TurnResult(seed, {}, {}, [f"{how}: {log}"], seconds).write(written)
         result = TurnResult.read(written)
         if not result.broken:
             log.unlink()
             shutil.rmtree(self._folder / f"{part.name}-{seed}", ignore_errors=True)
-        return result
+        self._tell(part, seed, result)
 
     def _run(self, part: Part, seed: int, seconds: float, log: Path) -> str:
         """Wait until the process of a turn has ended; return how it ended."""
@@ -116,16 +73,14 @@ class Campaign:
             child = subprocess.Popen(
                 command, stdout=output, stderr=output, start_new_session=True, env=environment
             )
-        self._children.add(child)
-        if self._stopped.is_set():  # before the turn was known to be one to end
-            _kill(child)
         try:
             return f"the turn ended with {child.wait(seconds + _HANG_S)} and told nothing"
         except subprocess.TimeoutExpired:
             return "the turn hangs"
-        finally:
-            _kill(child)
-            self._children.discard(child)
+        finally:  # with all processes that it left
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(child.pid, signal.SIGKILL)
+            child.wait()
 
     def _tell(self, part: Part, seed: int, result: TurnResult) -> None:
         broken = f"{len(result.broken)} BROKEN" if result.broken else "nothing broke"
@@ -139,10 +94,3 @@ class Campaign:
         if result.broken:
             command = f"{sys.executable} -m bench.campaign --part {part.name} --seed {seed}"
             print(f"  again: PYTHONPATH=tests {command}", flush=True)
-
-
-def _kill(child: "subprocess.Popen[bytes]") -> None:
-    """End a turn and all processes that it left."""
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(child.pid, signal.SIGKILL)
-    child.wait()

@@ -46,7 +46,7 @@ def test_a_campaign_goes_on_where_it_was_stopped(tmp_path: Path) -> None:
     counts = []
     for _ in range(2):
         campaign = Campaign(tmp_path, [BY_NAME["files"]])
-        campaign.run(seconds=2.0, lanes=1)
+        campaign.run(seconds=2.0)
         assert campaign.broken == 0
         counts.append(int(campaign.table().splitlines()[2].split()[3].replace(",", "")))
     assert 0 < counts[0] < counts[1]
@@ -68,6 +68,6 @@ def test_ctrl_c_ends_all_turns_and_keeps_what_was_done(tmp_path: Path) -> None:
 def test_a_part_whose_process_ends_is_told_as_broken(tmp_path: Path) -> None:
     unknown = Part("unknown", "things", time.sleep, 1, 1)  # type: ignore[arg-type]
     campaign = Campaign(tmp_path, [unknown])
-    campaign.run(seconds=1.0, lanes=1)
+    campaign.run(seconds=1.0)
     assert campaign.broken >= 1
     assert "ended with 2" in (tmp_path / "unknown-1.json").read_text()
