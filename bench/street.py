@@ -8,8 +8,8 @@ from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
 from triquad_tools.console.progress import progress
 from triquad_tools.sensors.sweep import PosedScan
-from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
-from triquad_tools.simulation.street import street
+from triquad_tools.simulation.lidar import Lidar
+from triquad_tools.simulation.street import street_drive
 
 from bench.street_scores import DrivenStreet, StreetProbes, driven_street, score_street
 
@@ -23,9 +23,8 @@ _PUBLISHED = 5  # one such scan in N
 @lru_cache(1)
 def bench_street(seed: int) -> DrivenStreet:
     """Return 100 scans along the exact street ``seed``."""
-    scene = street(seed, LENGTH_M)
-    poses = drive(scene, SCANS, LENGTH_M / SCANS)
-    return driven_street(SimulatedDrive(scene, Lidar(columns=_COLUMNS), poses, seed=seed))
+    lidar = Lidar(columns=_COLUMNS)
+    return driven_street(street_drive(seed, SCANS, LENGTH_M / SCANS, LENGTH_M, lidar))
 
 
 def settled_mapper(

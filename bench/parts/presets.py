@@ -10,8 +10,8 @@ import numpy as np
 from triquad_client import Mesh
 from triquad_tools.evaluation.metrics import ScoreSettings
 from triquad_tools.recordings.publishing import FLUSH_TIMEOUT_S, wait_until_settled
-from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
-from triquad_tools.simulation.street import street
+from triquad_tools.simulation.lidar import Lidar, SimulatedDrive
+from triquad_tools.simulation.street import street_drive
 
 from bench.clients.served import served, stream
 from bench.driven import Driven, driven
@@ -21,8 +21,6 @@ from bench.scenes.tabletop import tabletop_by_camera
 
 _SETTLE_LIMIT_S = 300.0
 _SCANS = 200
-_STREET = (100, 110.0)  # scans, metres
-_LONG_STREET = (150, 300.0)  # at 72 km/h
 
 
 @dataclass(frozen=True)
@@ -36,16 +34,12 @@ class Place:
     voxel_m: float  # between the points of the truth and of the mesh that are compared
 
 
-def _street_by(lidar: Lidar, scans: int, length_m: float, seed: int) -> SimulatedDrive:
-    scene = street(seed, length_m)
-    return SimulatedDrive(scene, lidar, drive(scene, scans, length_m / scans), seed)
-
-
 _FAR = Lidar(beams=128, columns=1024, range_max_m=120.0, noise_m=0.02)
 _SIXTEEN = Lidar(beams=16, columns=1800, elevation_min_deg=-15.0, elevation_max_deg=15.0)
-_ALL_BEAMS = partial(_street_by, Lidar(columns=1024), *_STREET)
-_FEW_BEAMS = partial(_street_by, _SIXTEEN, *_STREET)
-_FAR_BEAMS = partial(_street_by, _FAR, *_LONG_STREET)
+_STREET = partial(street_drive, scans=100, step_m=1.1, length_m=110.0)
+_ALL_BEAMS = partial(_STREET, sensor=Lidar(columns=1024))
+_FEW_BEAMS = partial(_STREET, sensor=_SIXTEEN)
+_FAR_BEAMS = partial(street_drive, scans=150, step_m=2.0, length_m=300.0, sensor=_FAR)  # 72 km/h
 _FINE = {0.02: 90.0, 0.05: 99.0}
 
 PLACES = (

@@ -11,7 +11,7 @@ from triquad_format.records.arrays import Doubles
 from triquad_tools.simulation.lidar import Lidar, Sensor, SimulatedDrive, SimulatedScan, drive
 from triquad_tools.simulation.scene import Scene
 from triquad_tools.simulation.solids import Solid, box, cylinder, half_space
-from triquad_tools.simulation.street import ROAD_HALF_WIDTH_M, street
+from triquad_tools.simulation.street import ROAD_HALF_WIDTH_M, street, street_drive
 
 from bench.scenes.episodes import Episode, Things, straight_lane, thin_things
 from bench.scenes.room import room_by_lidar
@@ -75,9 +75,7 @@ def _busy_street(scans: int) -> Episode:
 
 def _street_in_rain(scans: int) -> Episode:
     """Another street, empty, while it rains: a return of a hundred comes from a drop."""
-    scene = street(5)
-    poses = drive(scene, _BUSY_SCANS + scans, 0.4)
-    standing = SimulatedDrive(scene, Lidar(), poses, 5)
+    standing = street_drive(5, _BUSY_SCANS + scans, 0.4)
     lane = straight_lane((2.0, 25.0), -1.6, _ROBOT_Z_M)
     return Episode("street in rain", standing, lambda _: {}, _BUSY_SCANS, lane, rain=0.01)
 

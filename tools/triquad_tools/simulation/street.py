@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
+from triquad_tools.simulation.lidar import Lidar, Sensor, SimulatedDrive, drive
 from triquad_tools.simulation.scene import Scene
 from triquad_tools.simulation.solids import Solid, Vector, box, cylinder, gable, half_space, sphere
 
@@ -14,6 +14,7 @@ _KERB_M = 0.14  # height of the pavement over the road
 _BURIED_M = 1.0  # what stands on the ground reaches this far into it, so that no seam shows
 _TOP_M = 13.0  # above all roofs
 _MARGIN_M = 12.0  # of street before the start and after the end of the drive
+_LIDAR = Lidar()
 
 
 def street(seed: int, length_m: float = 100.0) -> Scene:
@@ -37,10 +38,12 @@ def street(seed: int, length_m: float = 100.0) -> Scene:
     return Scene(tuple(parts), bounds, drive_length_m=length_m, houses=tuple(houses))
 
 
-def street_drive(seed: int, scans: int, step_m: float = 1.0) -> SimulatedDrive:
+def street_drive(
+    seed: int, scans: int, step_m: float = 1.0, length_m: float = 100.0, sensor: Sensor = _LIDAR
+) -> SimulatedDrive:
     """Return a drive along street ``seed``, scans ``step_m`` apart; always the same scans."""
-    scene = street(seed)
-    return SimulatedDrive(scene, Lidar(), drive(scene, scans, step_m), seed=seed)
+    scene = street(seed, length_m)
+    return SimulatedDrive(scene, sensor, drive(scene, scans, step_m), seed=seed)
 
 
 def _standing(foot: Vector, half_x: float, half_y: float, height: float, yaw: float = 0.0) -> Solid:
