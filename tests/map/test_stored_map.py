@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from support.files import checkpoint_folder
 from support.files.mapfile_edit import edited, file_bytes, set_array, stored
-from support.maps.map_records import SMALL, assert_same, random_record
+from support.maps.map_records import SMALL, assert_same, random_record, with_support
 from triquad_format.errors import DamagedMapFileError
 from triquad_format.mapfile.files import FileBytes
 from triquad_format.mapfile.reader import read_map
@@ -37,7 +37,7 @@ BOXES = [
 
 @pytest.mark.parametrize(("low", "high"), BOXES)
 def test_a_box_holds_what_it_needs(tmp_path, low, high):
-    record = random_record(44, settings=WIDE, points=3000)
+    record = with_support(random_record(44, settings=WIDE, points=3000))
     path = tmp_path / "map.triquad"
     write_map(record, path)
     with StoredMap.open(path) as map_file:

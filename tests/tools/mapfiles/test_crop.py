@@ -4,8 +4,9 @@ import itertools
 
 import numpy as np
 import pytest
-from support.maps.map_records import assert_same, random_record
+from support.maps.map_records import assert_same, random_record, with_support
 from triquad_format.errors import FormatError
+from triquad_format.records.region import seen_voxels
 from triquad_map.composition.recorded_view import RecordedView
 from triquad_tools.mapfiles.crop import crop_record, without_training
 
@@ -47,6 +48,23 @@ def test_a_crop_drops_regions_that_the_box_does_not_meet():
     assert crop_record(record, [500, 0, 0], [501, 1, 1]).regions == ()
     everything = crop_record(record, [-1e9] * 3, [1e9] * 3)
     assert_same(everything, without_training(record))
+
+
+def told_of(evidence):
+    """Level, outcome, margins and time of each surface voxel; blocks without surface have none."""
+    counts = np.unpackbits(evidence.surface, axis=1).sum(axis=1, dtype=np.int64)
+    assert not evidence.seen_s[counts == 0].any()
+    voxels = seen_voxels(evidence, evidence.surface)
+    times = np.repeat(evidence.seen_s, counts)
+    columns = (voxels, evidence.levels, evidence.outcomes, evidence.margins, times)
+    return set(map(tuple, np.column_stack(columns).tolist()))
+
+
+def test_a_crop_tells_the_same_of_the_surface_that_it_keeps():
+    record = with_support(random_record(21, indices=CUBE[:2], points=500))
+    cropped = crop_record(record, (-5, -6, -6), (30, 6, 5))
+    for some, whole in zip(cropped.regions, record.regions, strict=True):
+        assert set() < told_of(some.evidence) < told_of(whole.evidence)
 
 
 @pytest.mark.parametrize(
