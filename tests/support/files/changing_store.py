@@ -2,24 +2,16 @@
 
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-from support.maps.exact_maps import Height, exact_map, flat
+from support.files.checkpoint_folder import HOUR_NS, START_NS
+from support.maps.exact_maps import Height, exact_map, flat, table
 from triquad_format.mapfile.writer import write_map
 
-START_NS = 1_769_860_800 * 10**9  # 2026-01-31T12:00:00Z
-HOUR_NS = 3600 * 10**9
 EMPTY = flat(0.1)
 
 
 def box_at(x_m: float, y_m: float) -> Height:
     """A ground with a box."""
-
-    def height(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        inside = np.maximum(np.abs(x - x_m), np.abs(y - y_m)) < 1.5
-        return np.where(inside, 1.5, 0.1)
-
-    return height
+    return table(0.1, 1.5, 3.0, (x_m, y_m))
 
 
 def write_checkpoint(folder: Path, epoch: int, height: Height) -> Path:

@@ -4,11 +4,10 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
-from support.maps.map_records import evidence_of
+from support.maps.map_records import blocks_of, evidence_of, masks
 from triquad_format.records import morton
-from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
+from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import (
-    BLOCK_BYTES,
     Evidence,
     MapRecord,
     Mlp,
@@ -36,11 +35,14 @@ def flat(height_m: float) -> Height:
     return lambda x, y: np.full(np.broadcast(x, y).shape, height_m)
 
 
-def table(low_m: float, high_m: float, side_m: float = 4.0) -> Height:
-    """A ground at ``low_m`` with a square in the middle, ``side_m`` long, at ``high_m``."""
+def table(
+    low_m: float, high_m: float, side_m: float = 4.0, at: tuple[float, float] = (0.0, 0.0)
+) -> Height:
+    """A ground at ``low_m`` with a square around ``at``, ``side_m`` long, at ``high_m``."""
 
     def height(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.where(np.maximum(np.abs(x), np.abs(y)) < side_m / 2, high_m, low_m)
+        inside = np.maximum(np.abs(x - at[0]), np.abs(y - at[1])) < side_m / 2
+        return np.where(inside, high_m, low_m)
 
     return height
 
@@ -87,17 +89,8 @@ def _evidence(height: Height) -> Evidence:
     z = np.floor(ground / SETTINGS.leaf_m).astype(np.int64)
     surface = np.stack([x, y, z], axis=1) + half
     free = np.concatenate([surface + [0, 0, up] for up in range(1, _SEEN_ABOVE + 1)])
-    blocks = np.concatenate([surface, free]) // BLOCK_VOXELS
-    codes = np.unique(morton.encode(blocks))
-    return evidence_of(codes, _masks(codes, surface), _masks(codes, free))
-
-
-def _masks(codes: NDArray[np.int64], voxels: NDArray[np.int64]) -> NDArray[np.uint8]:
-    masks = np.zeros((len(codes), BLOCK_BYTES), np.uint8)
-    rows = np.searchsorted(codes, morton.encode(voxels // BLOCK_VOXELS))
-    x, y, z = (voxels % BLOCK_VOXELS).T
-    np.bitwise_or.at(masks, (rows, x * BLOCK_VOXELS + y), (1 << z).astype(np.uint8))
-    return masks
+    codes = blocks_of(np.concatenate([surface, free]))
+    return evidence_of(codes, masks(codes, surface), masks(codes, free))
 
 
 def _training(

@@ -104,7 +104,8 @@ def _mlp(rng: np.random.RandomState, settings: FieldSettings) -> Mlp:
 
 
 def _evidence(rng: np.random.RandomState, leaves: NDArray[np.int64]) -> Evidence:
-    codes, surface = _surface(leaves)
+    codes = blocks_of(leaves)
+    surface = masks(codes, leaves)
     free = rng.randint(0, 256, surface.shape, np.int64).astype(np.uint8)
     return evidence_of(codes, surface, free)
 
@@ -128,19 +129,23 @@ def evidence_of(
 def surface_evidence(points: NDArray[np.float64], settings: FieldSettings) -> Evidence:
     """Evidence of surface at points [N, 3], metres from a region's centre."""
     leaves = np.floor(points / settings.leaf_m).astype(np.int64) + (1 << (settings.depth - 1))
-    codes, surface = _surface(leaves)
+    codes = blocks_of(leaves)
+    surface = masks(codes, leaves)
     return evidence_of(codes, surface, np.zeros_like(surface))
 
 
-def _surface(leaves: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-    """Codes [B] and masks [B, BLOCK_BYTES] of the blocks with leaves [N, 3]."""
-    blocks = morton.encode(leaves // BLOCK_VOXELS)
-    codes = np.unique(blocks)
-    surface = np.zeros((len(codes), BLOCK_BYTES), np.uint8)
+def blocks_of(leaves: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Codes [B] of the blocks with leaves [N, 3]."""
+    return np.unique(morton.encode(leaves // BLOCK_VOXELS))
+
+
+def masks(codes: NDArray[np.int64], leaves: NDArray[np.int64]) -> NDArray[np.uint8]:
+    """Bits [B, BLOCK_BYTES] of the leaves [N, 3] in their blocks."""
+    bits = np.zeros((len(codes), BLOCK_BYTES), np.uint8)
+    rows = np.searchsorted(codes, morton.encode(leaves // BLOCK_VOXELS))
     x, y, z = (leaves % BLOCK_VOXELS).T
-    rows = np.searchsorted(codes, blocks)
-    np.bitwise_or.at(surface, (rows, x * BLOCK_VOXELS + y), (1 << z).astype(np.uint8))
-    return codes, surface
+    np.bitwise_or.at(bits, (rows, x * BLOCK_VOXELS + y), (1 << z).astype(np.uint8))
+    return bits
 
 
 def _training(

@@ -2,7 +2,7 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from support.maps.exact_maps import SETTINGS, exact_map
+from support.maps.exact_maps import SETTINGS, Height, exact_map, table
 from support.maps.map_records import with_region
 from triquad_format.wire.tile_codec import TileSurface, decode_tile
 from triquad_map.mesh.tile_lattice import TileIndex
@@ -50,15 +50,10 @@ def surfaces(cache: TileCache, level: int = 0) -> dict[TileIndex, TileSurface]:
 
 def bump(where: float, height_m: float) -> Epoch:
     """A flat ground at 0.3 m, with the square 2 m around (where, where) raised."""
-
-    def height(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        near = np.maximum(np.abs(x - where), np.abs(y - where)) < 1.0
-        return np.where(near, 0.3 + height_m, 0.3)
-
-    return ground(height)
+    return ground(table(0.3, 0.3 + height_m, 2.0, (where, where)))
 
 
-def ground(height: object, **parts: object) -> Epoch:
+def ground(height: Height, **parts: object) -> Epoch:
     """A ground of that height, of whose region some ``parts`` are others."""
-    record = with_region(exact_map(height, epoch=next(_EPOCHS)), **parts)  # type: ignore[arg-type]
+    record = with_region(exact_map(height, epoch=next(_EPOCHS)), **parts)
     return Mapper("test", Settings(field=SETTINGS, mesh=MESH), "cpu", record).publish()
