@@ -128,6 +128,13 @@ def test_where_all_have_too_many_bytes_the_one_with_most_is_refused():
     assert work.put(B, 10, nbytes=20) == [2]
 
 
+def test_a_single_request_may_be_larger_than_all_may_be_together():
+    work = Work(workers=1, nbytes=100)
+    work.put(A, 0)
+    assert work.put(A, 1, nbytes=500) == []
+    assert work.put(B, 10) == [1]
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_every_request_ends_once_whatever_happens(seed):
     chance = random.Random(seed)
