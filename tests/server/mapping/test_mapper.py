@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from support.maps.map_records import assert_same
 from support.maps.small_world import (
+    damage,
     mapper_of,
     settings,
     settle,
@@ -15,10 +16,12 @@ from support.maps.small_world import (
     take_in,
     world,
 )
+from triquad_format.records.region import MapProgress
 from triquad_format.records.replay_rays import no_rays
 from triquad_format.records.status import Status
 from triquad_map.field_fit import in_cube
 from triquad_server.mapping.mapper import Mapper
+from triquad_server.mapping.progress import map_fit
 from triquad_server.mapping.replay.kept_rays import RAY_BYTES
 from triquad_server.mapping.replay.ray_table import END
 from triquad_server.settings import Settings
@@ -73,6 +76,29 @@ def test_a_record_restores_the_map_and_its_training(mapped: Mapper) -> None:
     after = surface_error(restarted.publish(), world())
     assert during < before + 0.005, "the optimiser goes on where it was"
     assert after < before + 0.004, "what the scan did not see is not forgotten"
+
+
+def test_a_restarted_map_tells_what_it_was_made_of_until_all_of_it_is_reset(
+    mapped: Mapper,
+) -> None:
+    record = mapped.changes_since(None).record
+    restarted = Mapper("test", settings(), "cpu", record)
+    assert restarted.publish().record().progress == record.progress, "a download tells it, too"
+    restarted.reset(np.zeros(3), np.ones(3))
+    assert restarted.progress == record.progress, "only a corner was forgotten"
+    restarted.reset(*EVERYWHERE)
+    assert restarted.changes_since(None).record.progress == MapProgress()
+    take_in(restarted, world().scans[-1])
+    assert restarted.scans_taken == 1
+
+
+def test_what_the_field_forgets_after_a_restart_is_told(mapped: Mapper) -> None:
+    restarted = Mapper("test", settings(), "cpu", mapped.changes_since(None).record)
+    before, before_m = map_fit(restarted.regions), surface_error(restarted.publish(), world())
+    damage(restarted)
+    settle(restarted)
+    assert surface_error(restarted.publish(), world()) > 1.2 * before_m
+    assert map_fit(restarted.regions).median_m > 1.2 * before.median_m
 
 
 def test_the_records_of_a_moment_are_the_same_however_the_map_goes_on() -> None:
