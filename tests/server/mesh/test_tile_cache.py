@@ -21,7 +21,7 @@ from triquad_format.wire.tile_codec import decode_tile
 from triquad_map.mesh.tile_lattice import TileIndex
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mesh.tile_cache import ShownTile, ShownTiles, TileCache, TileKey, tile_lattice
+from triquad_server.mesh.tile_cache import TileCache, tile_lattice
 from triquad_server.process.threads import Teams
 from triquad_server.settings import MeshSettings, Settings
 
@@ -140,23 +140,6 @@ def test_tiles_whose_bytes_went_are_made_again_and_stay_the_same() -> None:
         again = cache.make(0, index)
         assert (again.version, again.data) == (made[index].version, made[index].data)
     assert cache.changed(0, *EVERYWHERE, cache.revision(0)) == {}
-
-
-def test_tiles_that_are_unused_for_longest_are_dropped() -> None:
-    def tile(size: int) -> ShownTile:
-        return ShownTile(1, bytes(size), np.zeros(0, np.uint8))
-
-    kept = ShownTiles(limit=10)
-    one, other, last = (TileKey(0, (x, 0, 0)) for x in range(3))
-    kept.put(one, tile(4))
-    kept.put(other, tile(4))
-    assert kept.get(one) is not None
-    kept.put(last, tile(4))
-    assert kept.get(other) is None
-    assert kept.size == 8
-    kept.put(one, tile(50))
-    assert kept.get(one) is not None, "one may be larger"
-    assert kept.size == 50
 
 
 def test_tiles_of_an_epoch_are_kept_apart_from_those_that_are_followed() -> None:

@@ -91,16 +91,6 @@ def test_parts_go_with_the_last_checkpoint_that_names_them(tmp_path):
         assert set(PartFiles(store.folder).folder.iterdir()) == needed
 
 
-def test_what_undoes_something_stays_until_enough_others_do(tmp_path):
-    with closing(Store(tmp_path, "lab", StoreSettings(keep=2, keep_resets=2))) as store:
-        for epoch in range(1, 10):
-            undoes = "a reset" if epoch in (2, 4, 6) else ""
-            info = store.write(changes(grown(epoch, epoch)), undoes)
-            assert store.base_epoch == info.epoch == epoch
-        assert sorted(paths(store)) == [4, 6, 8, 9]
-        assert_same(read_map(paths(store)[4]), grown(4, 4))
-
-
 def test_a_checkpoint_that_is_replaced_within_a_tick_of_the_clock_is_read_again(tmp_path):
     with closing(Store(tmp_path, "lab", StoreSettings(keep=2))) as store:
         store.write(changes(grown(1, 1)))
