@@ -31,18 +31,29 @@ def test_a_disc_lies_where_the_field_is_zero(normal):
     normal = np.array(normal) / np.linalg.norm(normal)
     voxels = np.array([[30, 30, 30]])
     field = plane(normal, float(voxels[0] @ normal) + 0.6 * normal.sum())
-    surfels = fit_surfels(voxels, field, lambda asked: np.zeros(len(asked), bool))
+    surfels = fit_surfels(voxels, field, seen(False))
     assert surfels.kinds[0] == SurfelKind.DISC
     point = voxels[0] + 0.5 + surfels.offsets[0]
     assert abs(field(point[None]).values[0]) < 1e-4
     np.testing.assert_allclose(surfels.normals[0], normal, atol=1e-5)
 
 
-def test_where_the_field_shows_nothing_a_point_stands_for_what_was_seen():
-    def flat(points):
-        return FieldSample(np.full(len(points), 2.0, np.float32), np.zeros((len(points), 3)))
+def seen(is_seen):
+    """Whether there is surface in the voxels that are asked for."""
+    return lambda asked: np.full(len(asked), is_seen)
 
-    surfels = fit_surfels(np.array([[5, 6, 7]]), flat, lambda asked: np.zeros(len(asked), bool))
+
+def flat(value):
+    """A field that is the same everywhere."""
+
+    def sample(points):
+        return FieldSample(np.full(len(points), value, np.float32), np.zeros((len(points), 3)))
+
+    return sample
+
+
+def test_where_the_field_shows_nothing_a_point_stands_for_what_was_seen():
+    surfels = fit_surfels(np.array([[5, 6, 7]]), flat(2.0), seen(False))
     assert surfels.kinds[0] == SurfelKind.POINT
     np.testing.assert_array_equal(surfels.offsets[0], 0)
 
@@ -59,35 +70,28 @@ def by_rays(kind, offset):
 
 
 @pytest.mark.parametrize("kind", [SurfelKind.RAY_DISC, SurfelKind.RAY_POINT])
-@pytest.mark.parametrize("height", [29.7, 20.0])  # of the field's surface, next door or far below
-def test_where_the_field_has_not_learnt_what_rays_saw_they_count(kind, height):
-    voxels, field = np.array([[30, 30, 30]]), plane(np.array([0.0, 0, 1]), height)
-    surfels = fit_surfels(
-        voxels, field, lambda asked: np.ones(len(asked), bool), by_rays(kind, 0.3)
-    )
+@pytest.mark.parametrize(
+    ("field", "seen_beside"),
+    [
+        (plane(np.array([0.0, 0, 1]), 29.7), True),  # its surface is next door,
+        (plane(np.array([0.0, 0, 1]), 20.0), True),  # far below,
+        (flat(0.0), False),  # or nowhere
+    ],
+)
+def test_where_the_field_has_not_learnt_what_rays_saw_they_count(kind, field, seen_beside):
+    surfels = fit_surfels(np.array([[30, 30, 30]]), field, seen(seen_beside), by_rays(kind, 0.3))
     assert surfels.kinds[0] == kind
     np.testing.assert_allclose(surfels.offsets[0], (0, 0, 0.3), atol=1e-6)
-
-
-def test_where_the_field_is_flat_rays_count():
-    def flat(points):
-        return FieldSample(np.zeros(len(points), np.float32), np.zeros((len(points), 3)))
-
-    shown = by_rays(SurfelKind.RAY_DISC, 0.3)
-    surfels = fit_surfels(
-        np.array([[5, 6, 7]]), flat, lambda asked: np.zeros(len(asked), bool), shown
-    )
-    assert surfels.kinds[0] == SurfelKind.RAY_DISC
 
 
 def test_the_field_takes_over_once_it_has_learnt_the_surface():
     voxels, shown = np.array([[30, 30, 30]]), by_rays(SurfelKind.RAY_DISC, 0.3)
     field = plane(np.array([0.0, 0, 1]), 30.75)
-    surfels = fit_surfels(voxels, field, lambda asked: np.ones(len(asked), bool), shown)
+    surfels = fit_surfels(voxels, field, seen(True), shown)
     assert surfels.kinds[0] == SurfelKind.DISC
     next_door = plane(np.array([0.0, 0, 1]), 31.1)  # and rays ended a little below it, too
     shown = by_rays(SurfelKind.RAY_DISC, 0.45)
-    surfels = fit_surfels(voxels, next_door, lambda asked: np.ones(len(asked), bool), shown)
+    surfels = fit_surfels(voxels, next_door, seen(True), shown)
     assert surfels.kinds[0] == SurfelKind.NONE
 
 
