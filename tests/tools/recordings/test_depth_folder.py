@@ -12,7 +12,6 @@ from PIL import Image
 from support.files.file_damage import flipped
 from support.recordings.trajectories import drive, matrices, write_log, write_tum
 from triquad_client.depth_image import Intrinsics
-from triquad_client.pose import Pose
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.folders import depth_folder
 from triquad_tools.recordings.folders.depth_folder import is_depth_folder
@@ -197,13 +196,6 @@ def test_units_and_stride_can_be_given(tmp_path):
     assert _off_the_walls_m(recording) < 5e-4
     (scan,) = recording.read([2])
     assert scan.points.shape == (12 * 16, 3)
-
-
-def test_poses_in_millimetres_are_told(tmp_path):
-    far = [Pose(1000 * np.asarray(pose.position_m), pose.quaternion_xyzw) for pose in POSES]
-    write_tum(_tum(tmp_path) / "groundtruth.txt", STAMPS, far)
-    with pytest.raises(ToolError, match="the sensor moves 100 m, .* of the poses in metres"):
-        read_depth_folder(tmp_path)
 
 
 def test_the_camera_of_tum_is_known_by_the_name_of_its_folder(tmp_path):

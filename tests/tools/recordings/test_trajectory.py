@@ -181,12 +181,6 @@ def test_whatever_a_file_says_it_is_poses_or_one_line(tmp_path_factory, text):
     assert "\n" not in told
 
 
-def test_commas_and_comments_are_allowed(tmp_path):
-    path = tmp_path / "a.tum"
-    path.write_text("# t, x\n1.5,1,2,3,0,0,0,1\n\n  # more\n2.5, 2,2,3, 0,0,0,1\n")
-    assert read_trajectory(path).poses[:, 0, 3].tolist() == [1.0, 2.0]
-
-
 @pytest.mark.parametrize(
     ("names", "stamps"),
     [
