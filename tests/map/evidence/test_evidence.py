@@ -43,14 +43,6 @@ def test_a_ray_carves_the_voxels_it_crosses_and_stops_short() -> None:
     assert crossed <= free <= crossed + 2, "no voxel beside the ray is carved"
 
 
-def test_a_ray_from_outside_carves_inside_only() -> None:
-    evidence = LiveEvidence(SIDE)
-    evidence.carve(np.array([-20.0, 30.2, 30.2]), voxel(90, 31.1, 30.7), Reach(0.5))
-    assert evidence.freeze().status(voxel(5, 30.43, 30.3))[0] == Status.FREE
-    assert evidence.freeze().status(voxel(SIDE - 0.5, 30.85, 30.6))[0] == Status.FREE
-    assert evidence.freeze().status(voxel(SIDE + 2, 31, 30.6))[0] == Status.UNKNOWN
-
-
 @settings(max_examples=25)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 3000))
 def test_it_remembers_exactly_the_marked_voxels(seed: int, count: int) -> None:
