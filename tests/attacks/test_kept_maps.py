@@ -46,8 +46,7 @@ def test_the_map_of_before_outlives_resets_and_checkpoints_without_end(
     caplog.set_level("INFO")
     few = servers.SMALL.model_copy(update={"store": StoreSettings(keep=3)})
     with servers.service_and_client(few, store=tmp_path / "store") as client:
-        servers.learn(client)
-        client.settle(servers.WAIT_S)
+        servers.learn_all(client)
         before = client.query_sdf(PROBES)
         made_of = counts(client)
         replies = []
@@ -116,8 +115,7 @@ def test_nothing_is_reset_where_the_map_cannot_be_kept_and_mapping_goes_on_while
 
 def test_a_part_that_rots_is_written_again(tmp_path: Path) -> None:
     with served(tmp_path, "--set", f"store.scrub_h={0.5 / 3600}") as (server, client):
-        servers.learn(client)
-        client.settle(servers.WAIT_S)
+        servers.learn_all(client)
         newest = client.checkpoint()
         server.wait_for("checkpoints on disk")
         before = client.query_sdf(PROBES)

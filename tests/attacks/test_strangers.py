@@ -17,10 +17,10 @@ from support.servers import (
     ServerProcess,
     free_endpoint,
     learn,
+    learn_all,
     raw_session,
     server_process,
     sphere,
-    until,
 )
 from triquad_client import Client
 from triquad_format.wire import codec, keys
@@ -41,8 +41,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcess]:
     arguments = ["--settings", SMALL_FILE, "--store", folder / "store"]
     with server_process(arguments, endpoint) as running:
         with connected(running) as client:
-            learn(client)
-            until(lambda: client.status().settled)  # later epochs have another cause than strangers
+            learn_all(client)  # later epochs have another cause than strangers
             client.checkpoint()
         yield running
 

@@ -29,9 +29,7 @@ def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """A service that has learnt a sphere."""
     with servers.running_service(store=tmp_path_factory.mktemp("store")) as endpoint:
         with triquad_client.connect(endpoint) as client:
-            client.publish_scan(servers.sphere(), POSE)
-            client.flush(servers.WAIT_S)
-            client.settle(servers.WAIT_S)
+            servers.learn_all(client, 1)
         yield endpoint
 
 

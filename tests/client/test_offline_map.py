@@ -96,15 +96,6 @@ def test_the_file_answers_as_the_server(pair: Pair, offline: OfflineMap, name: s
     assert_close(QUESTIONS[name](offline), QUESTIONS[name](pair.client), name)
 
 
-def test_large_questions_are_one_call(offline: OfflineMap) -> None:
-    many = np.tile(POINTS, (60, 1))  # more than go into one request
-    answer = offline.query_distance(many)
-    np.testing.assert_array_equal(
-        answer.distance_m[: len(POINTS)], answer.distance_m[-len(POINTS) :]
-    )
-    assert len(offline.query_sdf(many).sdf) == len(many)
-
-
 def test_only_its_own_epoch_can_be_asked_for(offline: OfflineMap) -> None:
     here = offline.query_sdf(POINTS, at_epoch=offline.epoch)
     np.testing.assert_array_equal(here.sdf, offline.query_sdf(POINTS).sdf)

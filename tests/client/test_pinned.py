@@ -9,7 +9,6 @@ from support import servers
 from triquad_client import Client, InvalidInputError, RefusedError
 from triquad_server.settings import ServiceSettings
 
-POSE = np.eye(4)
 POINTS = servers.sphere(300).astype(np.float64)
 SETTINGS = servers.SMALL.model_copy(
     update={"service": ServiceSettings(epochs_kept=1, epochs_pinned=2)}
@@ -26,9 +25,7 @@ def client() -> Iterator[Client]:
 
 def learn_more(client: Client) -> None:
     """Have the map change, and settle."""
-    client.publish_scan(servers.sphere() * np.float32(1.1), POSE)
-    client.flush(servers.WAIT_S)
-    client.settle(servers.WAIT_S)
+    servers.learn_all(client, 1, servers.sphere() * np.float32(1.1))
 
 
 def test_a_pinned_map_stays_as_it_was(client: Client) -> None:

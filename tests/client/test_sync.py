@@ -42,9 +42,7 @@ def client() -> Iterator[Client]:
 
 def learn(client: Client, x_m: float, radius_m: float = 4.0) -> None:
     """Have the server learn a room, and settle."""
-    client.publish_scan(servers.sphere(radius_m=radius_m), shifted(x_m))
-    client.flush(servers.WAIT_S)
-    client.settle(servers.WAIT_S)
+    servers.learn_all(client, 1, servers.sphere(radius_m=radius_m), shifted(x_m))
 
 
 def assert_same_answers(local: SyncedMap, client: Client, points: np.ndarray = POINTS) -> None:

@@ -49,8 +49,7 @@ def test_scans_are_counted_by_source(client):
 
 
 def test_memory_and_time_are_told_by_part(client):
-    servers.learn(client, 4)
-    client.settle(servers.WAIT_S)
+    servers.learn_all(client)
     client.mesh()
     metrics = client.metrics()
     assert metrics.resident_bytes > 2**20

@@ -71,8 +71,7 @@ def port():
     settings = servers.SMALL.model_copy(update={"metrics": MetricsSettings(port=port)})
     servers.compiled()
     with triquad_server.serve(settings=settings) as server, server.client() as client:
-        servers.learn(client)
-        client.settle(servers.WAIT_S)
+        servers.learn_all(client, 2)
         client.mesh()
         for _ in range(5):
             client.query_sdf(servers.sphere(100))
@@ -193,8 +192,7 @@ def test_while_the_disk_is_full_it_goes_on_mapping_and_says_so(tmp_path, argumen
         servers.server_process([*arguments, "--set", f"metrics.port={port}"]) as server,
         triquad_client.connect(server.endpoint) as client,
     ):
-        servers.learn(client)
-        client.settle(servers.WAIT_S)
+        servers.learn_all(client, 2)
         kept = client.checkpoint()
         code, report = health(port)
         assert (code, report["problem"]) == (200, None)

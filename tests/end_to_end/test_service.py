@@ -25,19 +25,6 @@ def test_what_was_flushed_shows_in_the_next_answer(client):
     assert (client.query_sdf(servers.sphere(100, 2.0)).status == Status.FREE).all()
 
 
-def test_a_settled_map_has_learnt_the_surface(client):
-    servers.learn(client, 4)
-    status = client.settle(servers.WAIT_S)
-    assert status.scans_taken == 4
-    assert status.samples_trained > 0
-    assert status.regions == 1
-    result = client.query_sdf(servers.sphere(200), gradient=True)
-    assert np.abs(result.sdf).mean() < 0.05
-    assert np.isfinite(result.gradient).all()
-    assert client.query_sdf(servers.sphere(200, 2.0)).sdf.mean() > 0.15
-    assert client.query_sdf(PROBES).epoch == result.epoch == status.epoch
-
-
 def test_settling_begins_with_what_was_just_published(client):
     large = servers.sphere(400_000)  # long on its way
     for count in range(1, 4):
@@ -95,8 +82,7 @@ def test_large_queries_are_answered_from_one_epoch_while_the_map_changes(client,
 
 
 def test_many_threads_may_ask_at_once(client):
-    servers.learn(client)
-    epoch = client.settle(servers.WAIT_S).epoch
+    epoch = servers.learn_all(client).epoch
     expected = client.query_sdf(PROBES, gradient=True)
     with ThreadPoolExecutor(8) as pool:
         asked = [pool.submit(client.query_sdf, PROBES, gradient=True) for _ in range(64)]
@@ -107,16 +93,8 @@ def test_many_threads_may_ask_at_once(client):
         assert np.array_equal(result.gradient, expected.gradient)
 
 
-def test_a_query_of_no_points_tells_the_epoch(client):
-    result = client.query_sdf(np.zeros((0, 3)), gradient=True)
-    assert result.sdf.shape == (0,)
-    assert result.gradient.shape == (0, 3)
-    assert result.epoch == client.status().epoch
-
-
 def test_tiles_make_one_mesh(client):
-    servers.learn(client)
-    client.settle(servers.WAIT_S)
+    servers.learn_all(client)
     mesh = client.mesh()
     distance = np.linalg.norm(mesh.vertices, axis=1)
     assert np.abs(distance - servers.RADIUS_M).mean() < 0.2  # after little training
@@ -133,10 +111,7 @@ def test_tiles_make_one_mesh(client):
 def test_holes_of_a_mesh_are_filled_where_that_is_asked_for(client):
     client.reset()
     points = servers.sphere(20_000)
-    for _ in range(5):
-        client.publish_scan(points[np.abs(points[:, 0]) > 0.3], np.eye(4))
-    client.flush(servers.WAIT_S)
-    client.settle(servers.WAIT_S)
+    servers.learn_all(client, 5, points[np.abs(points[:, 0]) > 0.3])
     plain, mesh = client.mesh(), client.mesh(fill_m=np.float64(0.6))
     assert plain.filled is None
     assert (~mesh.filled).sum() == len(plain.faces)

@@ -15,8 +15,7 @@ from triquad_server.store.store import Store
 
 
 def test_a_downloaded_map_is_the_map(client, tmp_path):
-    servers.learn(client)
-    client.settle(servers.WAIT_S)
+    servers.learn_all(client)
     path = tmp_path / "map.triquad"
     info = client.download_map(path)
     assert path.stat().st_size == info.bytes

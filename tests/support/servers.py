@@ -51,6 +51,20 @@ def learn(client: triquad_client.Client, scans: int = 2) -> triquad_client.Flush
     return client.flush(WAIT_S)
 
 
+def learn_all(
+    client: triquad_client.Client,
+    scans: int = 3,
+    points: NDArray[np.float32] | None = None,
+    pose: NDArray[np.float64] | None = None,
+) -> triquad_client.ServerStatus:
+    """Have the server take in some scans, of a sphere unless points are given, and settle."""
+    for _ in range(scans):
+        client.publish_scan(
+            sphere() if points is None else points, np.eye(4) if pose is None else pose
+        )
+    return client.settle(WAIT_S)
+
+
 def assert_same_map(before: triquad_client.SdfResult, after: triquad_client.SdfResult) -> None:
     assert after.epoch >= before.epoch
     assert np.array_equal(after.status, before.status)

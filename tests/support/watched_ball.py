@@ -2,7 +2,7 @@
 
 import numpy as np
 from support import servers
-from triquad_client import AsyncMeshWatch, Client, MeshWatch
+from triquad_client import AsyncMeshWatch, MeshWatch
 from triquad_server.settings import MeshSettings
 
 SETTINGS = servers.SMALL.model_copy(update={"mesh": MeshSettings(tile_cells=16, tolerance_m=0.1)})
@@ -21,14 +21,6 @@ def agree(*watches: MeshWatch) -> bool:
     for watch in watches:
         watch.catch_up(servers.WAIT_S)
     return all(digests(watch) == digests(watches[0]) for watch in watches)
-
-
-def learn(client: Client, points: np.ndarray | None = None) -> None:
-    """Have the server learn the ball, or other points, and settle."""
-    for _ in range(3):
-        client.publish_scan(servers.sphere() if points is None else points, np.eye(4))
-    client.flush(servers.WAIT_S)
-    client.settle(servers.WAIT_S)
 
 
 def half(side: int) -> np.ndarray:

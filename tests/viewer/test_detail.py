@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from support.files.changing_store import box_at, write_checkpoint
 from support.maps.exact_maps import exact_map, flat
-from support.servers import SMALL, learn, running_service
+from support.servers import SMALL, learn_all, running_service
 from triquad_client import connect
 from triquad_client.mesh.followed_mesh import MeshTile
 from triquad_format.mapfile.writer import write_map
@@ -20,8 +20,7 @@ from triquad_tools.viewer.sources import COARSEST, LiveSource, MapSource, Stored
 
 def test_near_tiles_are_those_of_the_server() -> None:
     with running_service(SMALL) as endpoint, connect(endpoint) as client:
-        learn(client)
-        client.settle()
+        learn_all(client)
         source = LiveSource(client, endpoint)
         for level in range(COARSEST):
             near = NearTiles(source, level)

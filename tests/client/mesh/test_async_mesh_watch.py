@@ -13,7 +13,7 @@ import triquad_client
 import zenoh
 from support import servers
 from support.event_loop import connected
-from support.watched_ball import SETTINGS, digests, half, learn
+from support.watched_ball import SETTINGS, digests, half
 from triquad_client import AsyncClient, ClosedError, KnownTiles
 from triquad_format.wire import codec, keys
 from triquad_format.wire.mesh_messages import TileChanges
@@ -24,7 +24,7 @@ def endpoint() -> Iterator[str]:
     """A service that has learnt half of a ball."""
     with servers.running_service(SETTINGS) as endpoint:
         with triquad_client.connect(endpoint) as client:
-            learn(client, half(1))
+            servers.learn_all(client, points=half(1))
         yield endpoint
 
 

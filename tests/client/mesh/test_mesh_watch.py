@@ -12,9 +12,16 @@ import pytest
 import triquad_client
 import zenoh
 from support import servers
-from support.watched_ball import SETTINGS, agree, digests, half, learn
+from support.watched_ball import SETTINGS, agree, digests, half
 from triquad_client import Client, InvalidInputError, RequestTimeoutError
-from triquad_format.wire import keys
+from triquad_format.wire import codec, keys
+from triquad_format.wire.mesh_messages import (
+    MeshReply,
+    MeshRequest,
+    TileChanges,
+    TileChangesRequest,
+)
+from triquad_format.wire.tile_codec import decode_tile
 
 
 @pytest.fixture
@@ -33,19 +40,19 @@ def client(endpoint: str) -> Iterator[Client]:
 def learnt() -> Iterator[Client]:
     """A client of a server that has learnt the ball."""
     with servers.service_and_client(SETTINGS) as client:
-        learn(client)
+        servers.learn_all(client)
         yield client
 
 
 def test_a_watch_holds_the_mesh_and_follows_it(client: Client) -> None:
-    learn(client, half(1))
+    servers.learn_all(client, points=half(1))
     with client.watch_mesh() as watch:
         watch.catch_up()
         assert watch.complete
         first = watch.mesh()
         assert np.abs(np.linalg.norm(first.vertices, axis=1) - servers.RADIUS_M).mean() < 0.2
         assert first.vertices[:, 0].min() > -1
-        learn(client, half(-1))
+        servers.learn_all(client, points=half(-1))
         changed = set()
         while not (update := watch.next(servers.WAIT_S)).complete:
             changed.update(update.changed)
@@ -57,11 +64,11 @@ def test_a_watch_holds_the_mesh_and_follows_it(client: Client) -> None:
 
 
 def test_late_joiners_hold_the_same_bytes(client: Client, endpoint: str) -> None:
-    learn(client, half(1))
+    servers.learn_all(client, points=half(1))
     with client.watch_mesh() as early, client.watch_mesh(max_bytes_per_s=200_000) as slow:
         early.catch_up()
         for _ in range(2):
-            learn(client, half(-1))
+            servers.learn_all(client, points=half(-1))
             early.catch_up()
         client.settle(servers.WAIT_S)  # from then on all are of the same epoch
         with triquad_client.connect(endpoint) as other, other.watch_mesh() as late:
@@ -74,7 +81,7 @@ def test_late_joiners_hold_the_same_bytes(client: Client, endpoint: str) -> None
 
 
 def test_of_known_tiles_only_the_difference_travels(client: Client) -> None:
-    learn(client)
+    servers.learn_all(client)
     with client.watch_mesh() as watch:
         watch.catch_up()
         known = watch.known_tiles()
@@ -96,7 +103,7 @@ def test_of_known_tiles_only_the_difference_travels(client: Client) -> None:
 
 
 def test_catching_up_sees_what_changed_while_tiles_were_left_to_fetch(client: Client) -> None:
-    learn(client)
+    servers.learn_all(client)
     quarter = ((0.2, 0.2, -9), (9, 9, 9))  # a few more tiles than are fetched at once
     with client.watch_mesh(quarter) as watch:
         assert watch.next(servers.WAIT_S).changed
@@ -154,7 +161,7 @@ def test_who_waits_for_bandwidth_waits_no_longer_than_told(learnt: Client) -> No
 
 def test_a_watch_that_waits_ends_when_something_comes(client: Client, endpoint: str) -> None:
     """Many wait at once, and none of them holds up queries or the others."""
-    learn(client, half(1))
+    servers.learn_all(client, points=half(1))
     watches = [client.watch_mesh() for _ in range(12)]
     for watch in watches:
         watch.catch_up()
@@ -164,7 +171,7 @@ def test_a_watch_that_waits_ends_when_something_comes(client: Client, endpoint: 
             assert len(other.query_sdf(servers.sphere(50)).sdf) == 50
             other.mesh()
             assert other.status().map_name == servers.MAP
-            learn(other, half(-1))
+            servers.learn_all(other, points=half(-1))
         assert all(future.result().changed for future in waiting)
     client.settle(servers.WAIT_S)  # from then on all are of the same epoch
     servers.until(lambda: agree(*watches))
@@ -191,7 +198,7 @@ def test_bad_arguments_are_refused_before_anything_is_sent(
 def test_a_restarted_server_is_followed_anew(tmp_path: Path) -> None:
     """What is held from the old process is void: all comes again, and the old stays until then."""
     with servers.service_and_client(SETTINGS, store=tmp_path) as client:
-        learn(client)
+        servers.learn_all(client)
         with client.watch_mesh() as watch:
             watch.catch_up()
             known = watch.known_tiles()
@@ -244,3 +251,40 @@ def test_iteration_ends_with_the_watch(learnt: Client) -> None:
         assert seen.wait(servers.WAIT_S)
         watch.close()
         assert following.result(servers.WAIT_S) > 0
+
+
+def by_hand(peer: servers.RawPeer, request: TileChangesRequest) -> TileChanges:
+    answer = peer.ask(keys.TILE_CHANGES, codec.encode(request))
+    assert isinstance(answer, bytes)
+    return codec.decode(TileChanges, answer)
+
+
+def test_a_follower_that_speaks_the_protocol_by_hand_holds_the_same(
+    client: Client, endpoint: str
+) -> None:
+    """As the document says: what changed, then these tiles, decoded by its words."""
+    servers.learn_all(client)
+    with servers.raw_session(connect=endpoint) as session:
+        peer = servers.RawPeer(session)
+        known: dict[tuple[int, int, int], bytes] = {}
+        while not (told := by_hand(peer, servers.tile_changes())).is_newest:
+            time.sleep(0.1)
+        for (x, y, z), changed in zip(told.tiles.tolist(), told.changed.tolist(), strict=True):
+            request = MeshRequest(np.array([[x, y, z]], np.int32), 0)
+            answer = peer.ask(keys.MESH, codec.encode(request))
+            assert isinstance(answer, bytes)
+            reply = codec.decode(MeshReply, answer)
+            assert reply.versions[0] >= changed
+            known[x, y, z] = reply.data
+        with client.watch_mesh() as watch:
+            watch.catch_up()
+            surfaces = {index: decode_tile(data) for index, data in known.items()}
+            assert watch.tiles.keys() == {i for i, s in surfaces.items() if len(s.faces)}
+            for index, tile in watch.tiles.items():
+                np.testing.assert_array_equal(surfaces[index].positions(0.1), tile.vertices)
+                np.testing.assert_array_equal(surfaces[index].faces, tile.faces)
+        later = by_hand(peer, servers.tile_changes(server=told.server, since=told.revision))
+        assert (later.is_newest, len(later.tiles)) == (True, 0)
+        strange = by_hand(peer, servers.tile_changes(server="another", since=10**6))
+        assert strange.server == told.server
+        assert {tuple(tile) for tile in strange.tiles.tolist()} == watch.tiles.keys()

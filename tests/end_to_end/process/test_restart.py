@@ -34,14 +34,12 @@ def test_what_is_told_of_the_map_goes_on_and_of_the_process_begins_anew(
         with_holes = servers.sphere()
         with_holes[:10] = np.nan
         client.publish_scan(with_holes, np.eye(4))
-        servers.learn(client, SCANS - 1)
-        before = client.settle(servers.WAIT_S)
+        before = servers.learn_all(client, SCANS - 1)
     assert main([str(tmp_path / "store" / servers.MAP), "--json"]) == 0
     file = json.loads(capsys.readouterr().out)
     with servers.service_and_client(store=tmp_path / "store") as client:
         after, metrics = client.status(), client.metrics()
-        servers.learn(client, 1)
-        later, later_metrics = client.settle(servers.WAIT_S), client.metrics()
+        later, later_metrics = servers.learn_all(client, 1), client.metrics()
     names = ("scans_taken", "samples_trained", "samples_left", "regions", "parameters", "rays_kept")
     for name in names:
         assert getattr(after, name) == getattr(before, name), name

@@ -28,8 +28,7 @@ def newest_checkpoint(store):
 
 def learn(endpoint):
     with triquad_client.connect(endpoint) as client:
-        assert servers.learn(client).taken == 2
-        client.settle(servers.WAIT_S)
+        assert servers.learn_all(client).scans_taken == 3
         return client.query_sdf(PROBES, gradient=True)
 
 

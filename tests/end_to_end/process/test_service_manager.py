@@ -142,9 +142,7 @@ def test_it_is_ready_once_it_answers_and_says_when_it_stops(manager, arguments) 
         assert "STATUS=preparing compiled code: questions, step 3 of 6" in stages
         assert told(manager, "EXTEND_TIMEOUT_USEC")
         with triquad_client.connect(server.endpoint) as client:
-            servers.learn(client)
-            client.settle(servers.WAIT_S)
-            epoch = client.status().epoch
+            epoch = servers.learn_all(client, 2).epoch
         manager.wait_for(f"STATUS=serving map 'default': epoch {epoch}, 2 scans taken")
         server.process.send_signal(signal.SIGTERM)
         manager.wait_for("STOPPING=1")

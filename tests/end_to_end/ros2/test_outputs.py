@@ -126,8 +126,7 @@ def shown(server: str) -> Iterator[Client]:
     shape = ("--map-frame", "world", "--grid-side-m", 12, "--grid-height-m", HEIGHT_M)
     mesh = ("--mesh-bytes-per-s", 10**9, "--mesh-level", 0)
     with bridging(server, *shape, *mesh) as bridged:
-        servers.learn(bridged.client)
-        bridged.client.settle(servers.WAIT_S)
+        servers.learn_all(bridged.client)
         yield bridged.client
 
 

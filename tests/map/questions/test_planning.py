@@ -194,6 +194,9 @@ def test_a_grid_of_several_requests_is_put_together_right(client):
 
 
 def test_no_points_are_no_error(client):
+    nothing = client.query_sdf(np.zeros((0, 3)), gradient=True)
+    assert (nothing.sdf.shape, nothing.gradient.shape) == ((0,), (0, 3))
+    assert nothing.epoch == client.status().epoch
     assert len(client.query_distance(np.zeros((0, 3)), surface_point=True).distance_m) == 0
     assert len(client.query_spheres(np.zeros((0, 3)), 1.0).status) == 0
     assert len(client.query_segments(np.zeros((0, 3)), np.zeros((0, 3))).contact_m) == 0

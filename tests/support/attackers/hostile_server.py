@@ -72,8 +72,7 @@ def hostile_server() -> Iterator[HostileServer]:
         ExitStack() as declared,
     ):
         with triquad_client.connect(endpoint) as client:
-            servers.learn(client, scans=3)
-            client.settle(servers.WAIT_S)
+            servers.learn_all(client)
         server = HostileServer(servers.free_endpoint(), real)
         session = declared.enter_context(servers.raw_session("router", listen=server.endpoint))
         for operation in OPERATIONS:
