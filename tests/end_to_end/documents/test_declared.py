@@ -22,19 +22,7 @@ DISTRIBUTIONS = {
     "pydantic_core": "pydantic",
     "prometheus_client": "prometheus-client",
 }
-EVERY_EXTRA = (
-    "fast",
-    "gpu",
-    "keys",
-    "mesh",
-    "notebook",
-    "open3d",
-    "preview",
-    "ros",
-    "server",
-    "tools",
-    "viewer",
-)
+EVERY_EXTRA = tuple(PROJECT["optional-dependencies"].keys() - {"demo", "dev"})
 
 
 def declared(*extras: str) -> set[str]:

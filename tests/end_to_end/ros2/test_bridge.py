@@ -9,7 +9,7 @@ from support import servers
 from support.poses import shifted
 from support.ros.ros_bridge import AT, MAST, Bridged, bridging, stand
 from support.ros.ros_robot import T0, robot, stamp
-from support.ros_messages import CLOUD, PATH, POSE_WITH_COVARIANCE, TRANSFORM
+from support.ros_messages import CLOUD, PATH
 from triquad_client import Client, Status
 from triquad_server.settings import SourceSettings
 from triquad_tools.ros2.intake import drop_log, intake
@@ -46,6 +46,10 @@ def test_clouds_and_transforms_become_a_map(endpoint: str, way: str, mode: str) 
             r2.cloud(0.2 * number + 0.1, servers.sphere())
         bridged.wait_for(lambda: bridged.accounted == 4)
         assert (bridged.taken, bridged.bridge.published) == (4, 4), bridged.bridge.dropped
+        newest = bridged.client.sources().sources["points"].newest
+        np.testing.assert_allclose(newest.position_m, (AT[0], AT[1], AT[2] + 0.5), atol=1e-6)
+        apart = np.linalg.norm(newest.points[:, None] - servers.sphere(), axis=2).min(axis=1)
+        assert apart.max() < 1e-3, "the server has the points that the robot sent"
         assert finds_its_sphere(bridged)
 
 
@@ -189,8 +193,6 @@ def test_a_rare_correction_stays_and_two_parents_are_refused(endpoint: str, fram
     [
         ("/odom", "/odom", "rmw"),
         ("/pose", "/map", "bridge"),
-        ("/covariance", "/map", "rmw"),
-        ("/transform", "/map", "bridge"),
         ("/path", "/map", "rmw"),
     ],
 )
@@ -201,21 +203,14 @@ def test_poses_come_from_a_topic(endpoint: str, topic: str, frame: str, way: str
         for second in (0, 1):
             # What transforms say of the body does not count then.
             r2.tf(second, ("map", "body", shifted(x=99)))
-            at = stamp(second), shifted(*AT)
             match topic:
                 case "/odom":
                     r2.odometry(second, shifted(*AT), "body")
                 case "/pose":
                     r2.pose(second, shifted(*AT))
-                case "/covariance":
-                    message = r2.messages.pose_with_covariance(*at, "map")
-                    r2.send(topic, POSE_WITH_COVARIANCE, message)
-                case "/transform":
-                    (edge,) = r2.messages.tf(at[0], ("map", "body", at[1])).transforms
-                    r2.send(topic, TRANSFORM, edge)
                 case "/path":
                     stamps = [stamp(each) for each in range(second + 1)]
-                    path = r2.messages.path(stamps, [at[1]] * len(stamps), "map")
+                    path = r2.messages.path(stamps, [shifted(*AT)] * len(stamps), "map")
                     r2.send(topic, PATH, path)
         r2.cloud(0.5, servers.sphere())
         bridged.wait_for(lambda: bridged.taken == 1)
