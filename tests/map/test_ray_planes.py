@@ -4,13 +4,12 @@ from functools import partial
 
 import numpy as np
 from support.maps.seen_scans import see
-from support.maps.small_world import settings, take_in, world
+from support.maps.small_world import mapper_of, world
 from triquad_format.records.field_settings import FieldSettings
 from triquad_map.evidence.live_evidence import LiveEvidence
 from triquad_map.evidence.observed import Sighting
 from triquad_map.surface import FieldSample, SurfelKind, level_confidence
 from triquad_map.surfels.surfel_map import first_surfels
-from triquad_server.mapping.mapper import Mapper
 
 FIELD = FieldSettings(depth=6)
 SIDE = 1 << FIELD.depth
@@ -58,9 +57,7 @@ def test_planes_are_summed_as_told():
 
 def test_a_map_is_right_before_it_has_learnt_anything():
     seen = world()
-    mapper = Mapper("test", settings(), "cpu")
-    take_in(mapper, *seen.scans)
-    epoch = mapper.publish()
+    epoch = mapper_of(*seen.scans).publish()
     rng = np.random.default_rng(0)
     hits = seen.hits[rng.choice(len(seen.hits), 4000)]
     normals = seen.scene.gradient(hits)

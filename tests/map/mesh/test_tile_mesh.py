@@ -2,13 +2,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from support.maps.small_world import settings, settled_epoch, world
+from support.maps.small_world import mapper_of, settings, settled_epoch, world
 from triquad_client import OfflineMap
 from triquad_format.records.status import Status
 from triquad_map.mesh.tile_mesh import TileMesh, mesh_tile
 from triquad_map.triangles import Triangles, joined
 from triquad_server.epochs.epoch import Epoch
-from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.tile_cache import tile_lattice
 from triquad_server.mesh.tile_queries import surface_tiles
 from triquad_server.settings import MeshSettings
@@ -88,10 +87,8 @@ def test_every_tile_with_faces_is_listed_however_small_tiles_are() -> None:
     small = chosen.model_copy(
         update={"mesh": MeshSettings(cell_m=0.05, tile_cells=16, reach_m=0.2)}
     )
-    mapper = Mapper("test", small, "cpu")
-    scan = world(1).scans[0]
-    mapper.ingest(scan.points, scan.world_from_sensor)
-    epoch, lattice = mapper.publish(), tile_lattice(small.mesh, 0)
+    epoch = mapper_of(*world(1).scans, chosen=small).publish()
+    lattice = tile_lattice(small.mesh, 0)
     low = np.array([3.0, -2.0, -1.0])
     listed = {tuple(tile) for tile in surface_tiles(epoch, lattice).tolist()}
     side = lattice.tile_side_m

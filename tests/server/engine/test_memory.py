@@ -131,7 +131,6 @@ def test_a_map_is_learnt_in_either_and_goes_on_in_the_other(device: str, other: 
     before, after = (e.query(points, gradient=True) for e in (epoch, again.publish()))
     np.testing.assert_allclose(after.sdf, before.sdf, atol=2e-3)
     np.testing.assert_array_equal(after.status, before.status)
-    for scan in world.scans:
-        again.ingest(scan.points, scan.world_from_sensor)
+    small_world.take_in(again, *world.scans)
     small_world.settle(again)
     assert small_world.surface_error(again.publish(), world) < 0.02

@@ -1,10 +1,9 @@
 import numpy as np
 import pytest
 import torch
-from support.maps.small_world import settings, settled_mapper, world
+from support.maps.small_world import mapper_of, settings, settled_mapper, world
 from triquad_map.composition.recorded_view import RecordedView
 from triquad_server.epochs.epoch import Epoch, buffers_of
-from triquad_server.mapping.mapper import Mapper
 
 RNG = np.random.default_rng(0)
 
@@ -14,7 +13,7 @@ def epoch() -> Epoch:
     return settled_mapper(settings(samples_per_ray=3.0), world(3)).publish()
 
 
-def test_the_numpy_evaluator_gives_the_same_answers(epoch: Epoch) -> None:
+def test_a_record_answers_as_the_epoch_that_it_is_of(epoch: Epoch) -> None:
     hits = world(3).hits
     near = hits[RNG.choice(len(hits), 5000)] + RNG.normal(0, 0.1, (5000, 3))
     anywhere = RNG.uniform(hits.min(axis=0) - 30, hits.max(axis=0) + 30, (5000, 3))
@@ -43,9 +42,7 @@ def test_a_piece_of_memory_counts_once_and_whole() -> None:
 
 
 def test_a_map_takes_what_its_arrays_take() -> None:
-    mapper = Mapper("test", settings(), "cpu")
-    scan = world(1).scans[0]
-    mapper.ingest(scan.points, scan.world_from_sensor)
+    mapper = mapper_of(*world(1).scans)
     mapper.train()
     for live, region in zip(mapper.regions, mapper.publish().frozen_regions, strict=True):
         rows = live.field.features

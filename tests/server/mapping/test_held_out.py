@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support.maps.small_world import settings, settled_mapper, world
+from support.maps.small_world import mapper_of, settings, settled_mapper, world
 from triquad_format.records import replay_rays
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.replay_rays import HELD_OUT
@@ -23,9 +23,7 @@ def test_one_ray_in_some_dozens_is_held_out_by_compiled_code_too() -> None:
 
 
 def test_rays_are_held_out_from_training_and_after_a_restart() -> None:
-    mapper = Mapper("test", settings(), "cpu")
-    for scan in world().scans:
-        mapper.ingest(scan.points, scan.world_from_sensor)
+    mapper = mapper_of(*world().scans)
     restarted = Mapper("test", settings(), "cpu", mapper.changes_since(None).record)
     for region, again in zip(mapper.regions, restarted.regions, strict=True):
         assert are_held_out(region.training.rays.held_out.table.rows, settings().field).all()
