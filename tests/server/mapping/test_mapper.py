@@ -82,6 +82,7 @@ def test_a_restarted_map_tells_what_it_was_made_of_until_all_of_it_is_reset(
     mapped: Mapper,
 ) -> None:
     record = mapped.changes_since(None).record
+    assert record.progress.scans_taken == len(world().scans)
     restarted = Mapper("test", settings(), "cpu", record)
     assert restarted.publish().record().progress == record.progress, "a download tells it, too"
     restarted.reset(np.zeros(3), np.ones(3))
