@@ -197,16 +197,7 @@ def serve(
     folder = None if store is None else Path(store)
     with _free_endpoint() if listen is None else nullcontext(full_endpoint(listen)) as endpoint:
         network = NetworkOptions(listen=(endpoint,))
-        return Server(
-            LaunchOptions(
-                map_name=map,
-                network=network,
-                settings=loaded,
-                store=folder,
-                device=device,
-                restore=restore,
-            )
-        )
+        return Server(LaunchOptions(map, network, loaded, folder, device, restore))
 
 
 def _loaded(settings: "Settings | str | Path | None") -> "Settings":

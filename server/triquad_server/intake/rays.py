@@ -134,12 +134,11 @@ class _Selection(NamedTuple):
     too_near: int
     too_far: int
 
-    @property
-    def dropped(self) -> dict[str, int]:
-        """Return how many points are not used, by reason."""
-        counts = self._asdict()
+    def dropped(self, **others: int) -> dict[str, int]:
+        """Return how many points are not used, by reason, and how many ``others``."""
         reasons = ("not_finite", "no_range", "on_robot", "too_near", "too_far")
-        return {reason: counts[reason] for reason in reasons if counts[reason]}
+        counts = {reason: getattr(self, reason) for reason in reasons} | others
+        return {reason: count for reason, count in counts.items() if count}
 
 
 @kernel(inline="always")
@@ -190,21 +189,24 @@ def _select(points: Floats, limits: _Limits, keys: Longs) -> _Selection:
     )
 
 
-def _thinned(rays: Doubles, limit: int, of_all: Sequence[Doubles]) -> Doubles:
-    """Return an even part of some rays [N, 3], so that at most ``limit`` are left of all kinds.
+def _thinned(kinds: Sequence[Doubles], limit: int) -> Sequence[Doubles]:
+    """Return an even part of rays [N, 3] of some kinds, so that at most ``limit`` are left of all.
 
     One is drawn of each few in a row: every second one may be of every second laser.
     """
-    step = -(-sum(map(len, of_all)) // limit)
+    step = -(-sum(map(len, kinds)) // limit)
     if step <= 1:
-        return rays
-    chosen = np.arange(0, len(rays), step)
-    chosen += np.random.default_rng(0).integers(step, size=len(chosen))
-    return rays[np.minimum(chosen, len(rays) - 1)]
+        return kinds
+    drawn = []
+    for rays in kinds:
+        chosen = np.arange(0, len(rays), step)
+        chosen += np.random.default_rng(0).integers(step, size=len(chosen))
+        drawn.append(rays[np.minimum(chosen, len(rays) - 1)])
+    return drawn
 
 
 def _why_empty(
-    points: int, disbelieved: int, settings: ScanSettings, *, source: SourceSettings
+    points: int, disbelieved: int, settings: ScanSettings, source: SourceSettings
 ) -> str:
     """Return why nothing is left of a scan of ``points`` points, and which setting decides that."""
     box = " and outside of robot_box_m" if source.robot_box_m else ""
@@ -218,6 +220,30 @@ def _why_empty(
         f"none of {points} points is finite and at least range_min_m = {settings.range_min_m:g} m "
         f"from the sensor{box}, and {rays}"
     )
+
+
+def _selected(points: Floats, settings: ScanSettings, source: SourceSettings) -> _Selection:
+    """Return which of points [N, 3] are used, from where the source's rays begin."""
+    if any(source.ray_origin_m):
+        points = (points - np.array(source.ray_origin_m)).astype(np.float32)
+    low, high = _robot_corners(source)
+    limits = _Limits(
+        settings.range_min_m,
+        settings.range_max_m,
+        settings.thin_m,
+        by_direction=settings.thin_by == "direction",
+        robot_low=low,
+        robot_high=high,
+    )
+    given = np.ascontiguousarray(points).view()
+    given.flags.writeable = False  # as those of the network, so nothing is compiled again
+    return _select(given, limits, empty_keys(len(points)))
+
+
+def _robot_corners(source: SourceSettings) -> tuple[Doubles, Doubles]:
+    """Return the corners [3] of the robot, from where the source's rays begin."""
+    low, high = np.array(source.robot_box_m or _NOWHERE) - source.ray_origin_m
+    return low, high
 
 
 def usable_rays(
@@ -237,54 +263,31 @@ def usable_rays(
         settings: thinning, and the ranges of the source.
         source: what else is particular to the source.
         no_return: directions [M, 3], sensor frame, of rays that met nothing.
-        map_origin: [3] from where the map counts, in the coordinates of the pose; ``None``: that
-            of a map whose first scan this is.
-
-    Returns:
-        The rays, from that origin.
+        map_origin: [3] from where the map counts; ``None``: that of one whose first scan this is.
 
     Raises:
         ScanRefusedError: the pose or a direction is bad, or no ray can be used.
     """
-    empty = np.empty((0, 3), np.float32) if no_return is None else no_return
+    given = np.empty((0, 3), np.float32) if no_return is None else no_return
     _check_pose(world_from_sensor)
-    map_origin = first_origin(world_from_sensor) if map_origin is None else map_origin
-    pose = local_pose(world_from_sensor, map_origin)
-    _check_shapes(points, empty)
-    directions = _unit_vectors(empty) if source.no_return else np.empty((0, 3))
-    disbelieved = 0 if source.no_return else len(empty)
-    begin = np.array(source.ray_origin_m)
-    low, high = (np.array(corner) - begin for corner in source.robot_box_m or _NOWHERE)
-    if begin.any():
-        points = (points - begin).astype(np.float32)
-        pose = moved_pose(pose, pose[:3, :3] @ begin)
-    limits = _Limits(
-        settings.range_min_m,
-        settings.range_max_m,
-        settings.thin_m,
-        by_direction=settings.thin_by == "direction",
-        robot_low=low,
-        robot_high=high,
-    )
-    given = np.ascontiguousarray(points).view()
-    given.flags.writeable = False  # as those of the network, so nothing is compiled again
-    found = _select(given, limits, empty_keys(len(points)))
-    if len(found.kept) + len(found.beyond) + len(directions) == 0:
-        raise ScanRefusedError(
-            "empty", _why_empty(len(points), disbelieved, settings, source=source)
-        )
-    given_rays = found.kept, found.beyond, directions
-    used = [_thinned(rays, settings.max_points, given_rays) for rays in given_rays]
-    surplus = sum(map(len, given_rays)) - sum(map(len, used))
-    others = {"no_return": disbelieved, "too_many": surplus}
-    rotation, origin = pose[:3, :3], pose[:3, 3]
-    ends, far, open_directions = (rays @ rotation.T for rays in used)
+    origin = first_origin(world_from_sensor) if map_origin is None else map_origin
+    pose = local_pose(world_from_sensor, origin)
+    _check_shapes(points, given)
+    directions = _unit_vectors(given) if source.no_return else np.empty((0, 3))
+    pose = moved_pose(pose, pose[:3, :3] @ source.ray_origin_m)
+    found = _selected(points, settings, source)
+    disbelieved = len(given) - len(directions)
+    rays = found.kept, found.beyond, settings.range_max_m * directions
+    if (count := sum(map(len, rays))) == 0:
+        raise ScanRefusedError("empty", _why_empty(len(points), disbelieved, settings, source))
+    used = _thinned(rays, settings.max_points)
+    ends, far_ends, open_ends = (some @ pose[:3, :3].T + pose[:3, 3] for some in used)
     return ScanRays(
-        origin.copy(),
-        ends + origin,
-        found.dropped | {reason: count for reason, count in others.items() if count},
-        far_ends=far + origin,
-        open_ends=settings.range_max_m * open_directions + origin,
-        robot=RobotBox(low, high, pose) if source.robot_box_m else None,
-        map_origin=map_origin,
+        pose[:3, 3].copy(),
+        ends,
+        found.dropped(no_return=disbelieved, too_many=count - sum(map(len, used))),
+        far_ends,
+        open_ends,
+        robot=None if source.robot_box_m is None else RobotBox(*_robot_corners(source), pose),
+        map_origin=origin,
     )

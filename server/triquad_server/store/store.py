@@ -33,13 +33,14 @@ from triquad_format.wire.messages import CheckpointInfo
 from triquad_server.errors import StoreError
 from triquad_server.mapping.map_snapshot import MapChanges
 from triquad_server.settings import StoreSettings
-from triquad_server.store.map_folder import StoreLock, delete_unneeded
+from triquad_server.store.lock import StoreLock
 from triquad_server.store.restore import (
     ValidCheckpoint,
     check_countable,
     newest_valid,
     valid_checkpoint,
 )
+from triquad_server.store.retention import delete_unneeded
 from triquad_server.store.scan_log import ScanLog
 
 _log = logging.getLogger(__name__)

@@ -10,7 +10,7 @@ from triquad_format.mapfile.checkpoint_folder import PartFiles
 from triquad_format.mapfile.index import read_checkpoint, write_checkpoint
 from triquad_format.mapfile.reader import read_map
 from triquad_server.settings import StoreSettings
-from triquad_server.store.map_folder import StoredCheckpoint, staying
+from triquad_server.store.retention import StoredCheckpoint, staying
 from triquad_server.store.store import Store
 
 

@@ -1,12 +1,9 @@
-"""The folder of a map: its lock, and which checkpoints in it stay; all other files are deleted."""
+"""Retention: which checkpoints of a map are kept, and what is deleted once one was written."""
 
-import fcntl
 import logging
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
 
 from triquad_format.errors import FormatError, TooLargeMapFileError, UnsupportedMapFileError
 from triquad_format.mapfile.checkpoint_folder import (
@@ -18,7 +15,6 @@ from triquad_format.mapfile.checkpoint_folder import (
 from triquad_format.mapfile.files import sync_folder
 from triquad_format.mapfile.index import read_checkpoint
 
-from triquad_server.errors import StoreError
 from triquad_server.settings import StoreSettings
 
 _log = logging.getLogger(__name__)
@@ -28,54 +24,6 @@ _UNFINISHED = ".*.tmp"
 
 _MIN_KEPT = 2
 """The number of newest checkpoints that always stay: should one be damaged, there is another."""
-
-_LOCK_NAME = "lock"
-
-
-class StoreLock:
-    """Holds a locked file in the folder; the system releases it however the process ends."""
-
-    def __init__(self, folder: Path) -> None:
-        """Lock the folder.
-
-        Raises:
-            StoreError: another process has it locked.
-            OSError: the file cannot be made.
-        """
-        self._path = folder / _LOCK_NAME
-        self._file = _locked(self._path)
-
-    def close(self) -> None:
-        """Release the folder."""
-        self._file.close()
-
-    def renew(self) -> None:
-        """Lock the folder again if the locked file is no longer the one that others see.
-
-        Deleting it, alone or with the folder, would let another process in.
-
-        Raises:
-            StoreError: another process has locked it first.
-            OSError: the file cannot be made.
-        """
-        path = self._path
-        if path.exists() and os.path.samestat(os.fstat(self._file.fileno()), path.stat()):
-            return
-        lost, self._file = self._file, _locked(path)
-        lost.close()
-
-
-def _locked(path: Path) -> IO[bytes]:
-    file = path.open("a+b")
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        file.close()
-        raise StoreError(
-            f"store {path.parent} is in use by another server: stop that one first, or give "
-            "another --store or --map"
-        ) from None
-    return file
 
 
 @dataclass(frozen=True)
