@@ -39,10 +39,6 @@ class Exchange:
         asked = float(getattr(self.question, bound.removeprefix("-"))) * (1 + _ROUNDING)
         return -asked if bound.startswith("-") else asked
 
-    def rows(self, field: str) -> int:
-        """Return the rows of an array that stands next to the field, or around it."""
-        return len(self.other(field))
-
     def other(self, field: str) -> Any:
         """Return the value of a field that stands next to the one that is checked, or around it."""
         holder = next(message for message in self.around if field in message.forms())
@@ -145,7 +141,7 @@ def rows_of(field: str, more: int = 0) -> Bound:
     """Bound rows to as many as another array of the message has, and ``more``."""
 
     def problem(value: Any, exchange: Exchange) -> str | None:
-        count = exchange.rows(field) + more
+        count = len(exchange.other(field)) + more
         return None if len(value) == count else f"{len(value)} rows do not go with {count}"
 
     return Bound(problem)
@@ -155,7 +151,7 @@ def parts_of(field: str) -> Bound:
     """Bound the numbers of rows that parts have of another array of the reply: all of its rows."""
 
     def problem(value: Any, exchange: Exchange) -> str | None:
-        parts, count = int(value.sum()), exchange.rows(field)
+        parts, count = int(value.sum()), len(exchange.other(field))
         return None if parts == count else f"parts of {parts} rows do not go with {count}"
 
     return Bound(problem)
