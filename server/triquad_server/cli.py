@@ -26,6 +26,7 @@ _PROGRAM = "triquad-server"
 _LOG_FORMAT_VARIABLE = "TRIQUAD_LOG_FORMAT"
 
 OK, UNEXPECTED, USAGE, CANNOT_LISTEN, STORE, LAST_CHECKPOINT = 0, 1, 2, 3, 4, 5
+_CODES = {ListenError: CANNOT_LISTEN, LastCheckpointError: LAST_CHECKPOINT, StoreError: STORE}
 
 _EPILOG = """\
 exit codes:
@@ -66,18 +67,9 @@ def _exit_code(options: argparse.Namespace) -> int:
     """Do what the options say; every error becomes a line in the log and an exit code."""
     try:
         return _run(options)
-    except ListenError as error:
-        _log.error("%s", error)
-        return CANNOT_LISTEN
-    except LastCheckpointError as error:
-        _log.error("%s", error)
-        return LAST_CHECKPOINT
-    except StoreError as error:
-        _log.error("%s", error)
-        return STORE
     except (ServerError, FormatError) as error:
         _log.error("%s", error)
-        return USAGE
+        return next((code for kind, code in _CODES.items() if isinstance(error, kind)), USAGE)
     except Exception:
         _log.exception("unexpected")
         return UNEXPECTED
