@@ -17,7 +17,6 @@ from triquad_format.records.arrays import Floats
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES
 from triquad_map.compiled.voxel_index import home_slot, longest_probe, morton_code
-from triquad_map.field.field import FieldArrays
 from triquad_map.field.frozen_field import FieldValues
 from triquad_map.field.quadtree import (
     PLANE_BITS,
@@ -45,12 +44,6 @@ class FieldTensors:
         features, mlp, frequencies = field.numbers
         tensor = torch.as_tensor
         return cls(tensor(features), tuple(map(tensor, mlp)), tensor(frequencies))
-
-    @property
-    def arrays(self) -> FieldArrays:
-        """Return the numbers as arrays, which share memory with tensors on the CPU."""
-        mlp = tuple(part.cpu().numpy() for part in self.mlp)
-        return FieldArrays(self.features.cpu().numpy(), mlp, self.frequencies.cpu().numpy())
 
 
 @dataclass(frozen=True)
@@ -142,11 +135,6 @@ class TensorField:
         self._corners = (
             CornerIndex(tree, settings, self.device) if settings.encoding != "fourier" else None
         )
-
-    @property
-    def arrays(self) -> FieldArrays:
-        """The numbers of the field, as arrays that share memory with tensors on the CPU."""
-        return self.tensors.arrays
 
     def evaluate(self, points: Floats, gradient: bool) -> FieldValues:
         """Evaluate the field at points [N, 3]."""
