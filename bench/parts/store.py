@@ -39,7 +39,7 @@ def _row(made: DrivenStreet) -> MapRecord:
         mapper.ingest(scan.points, scan.world_from_sensor)
     while mapper.samples_trained < _SAMPLES:
         mapper.train()
-    record = mapper.changes_since(None).record
+    record = mapper.snapshot_since(None).record()
     (region,) = record.regions
     training = region.training
     assert training is not None
@@ -90,7 +90,8 @@ class _Cost:
 def _checkpoint(mapper: Mapper, store: Store) -> _Cost:
     before = _stored_bytes(store.folder)
     started = time.perf_counter()
-    store.write(mapper.changes_since(store.base_epoch))
+    snapshot = mapper.snapshot_since(store.base_epoch)
+    store.write(snapshot.record(), snapshot.regions)
     seconds = time.perf_counter() - started
     return _Cost(_stored_bytes(store.folder) - before, seconds)
 

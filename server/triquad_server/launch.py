@@ -158,7 +158,6 @@ def _restored_map(
         mapper=mapper,
         device=options.device,
         store=store,
-        restored=restored.info if restored else None,
         teams=teams,
     )
     return served, settings

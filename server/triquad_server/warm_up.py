@@ -92,7 +92,7 @@ class _SyntheticMap:
 
     @cached_property
     def _restored(self) -> Mapper:
-        return self._map_of(record=self._mapper.changes_since(None).record)
+        return self._map_of(record=self._mapper.snapshot_since(None).record())
 
     def scans(self) -> None:
         """Take in a scan of the sphere."""

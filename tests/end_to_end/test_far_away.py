@@ -276,7 +276,7 @@ def test_a_place_beyond_all_is_refused() -> None:
     mapper.reset(*EVERYWHERE)
     with pytest.raises(ScanRefusedError, match="origin 450000 5400000 400"):
         mapper.ingest(servers.sphere(), pose(NEAR))
-    emptied = mapper.changes_since(None).record
+    emptied = mapper.snapshot_since(None).record()
     again = Mapper("far", servers.SMALL, "cpu", record=emptied)
     again.ingest(servers.sphere(), pose(NEAR))
     assert not again.origin.any()

@@ -19,7 +19,7 @@ from triquad_server.mapping.thread_time import ThreadTime
 from triquad_server.process.stop import Stop
 from triquad_server.server_status import ENDLESS_S, STUCK_S, Health
 from triquad_server.serving.operations import Operations
-from triquad_server.settings import ServiceSettings, Settings
+from triquad_server.settings import ServiceSettings, Settings, StoreSettings
 from triquad_server.store.checkpoint_writer import CheckpointWriter
 
 COMPUTED_S = 0.5
@@ -44,7 +44,7 @@ def running(
         warnings=ScanWarnings(scans, Settings()),
         mapper=thread,
         epochs=epochs,
-        checkpoints=CheckpointWriter(thread, None, period_s=0, last=None),
+        checkpoints=CheckpointWriter(thread, None, StoreSettings()),
         map_max_bytes=10**9,
     )
     with closing(thread):

@@ -102,12 +102,11 @@ def running_service(
     opened = Store(store, map_name, settings.store) if store else None
     restored: ValidCheckpoint | None = opened.newest() if opened else None
     mapper = Mapper(map_name, settings, "cpu", restored.record if restored else None)
-    info = restored.info if restored else None
     if opened:
         opened.log_scans(settings.field.leaf_m)
     session = open_session(network)
     try:
-        with closing(Service(session, ServedMap(map_name, mapper, "cpu", opened, info), settings)):
+        with closing(Service(session, ServedMap(map_name, mapper, "cpu", opened), settings)):
             yield endpoint
     finally:
         session.close()

@@ -43,29 +43,19 @@ class RegionSnapshot:
 
 
 @dataclass(frozen=True)
-class MapChanges:
-    """The changes that a checkpoint that follows another needs."""
-
-    record: MapRecord  # of the regions that changed, with training state
-    regions: tuple[RegionIndex, ...]  # all regions of the map
-    epoch: Epoch  # the same state, for queries
-
-
-@dataclass(frozen=True)
 class MapSnapshot:
-    """The changes of the map, as it was at a moment."""
+    """The map as it was at a moment: of the regions that changed since another, what they hold."""
 
     name: str
     settings: FieldSettings
     changed: tuple[RegionSnapshot, ...]
     regions: tuple[RegionIndex, ...]  # all regions of the map
-    epoch: Epoch  # the same state
+    epoch: Epoch  # the same state, for queries
 
-    def changes(self) -> MapChanges:
-        """Return the records of the changes, which takes a second for 100 m of a street."""
+    def record(self) -> MapRecord:
+        """Return the changed regions with training state: a second for 100 m of a street."""
         regions = tuple(region.record() for region in self.changed)
         epoch = self.epoch
-        record = MapRecord(
+        return MapRecord(
             self.name, epoch.number, self.settings, regions, epoch.progress, epoch.origin_m
         )
-        return MapChanges(record, self.regions, epoch)

@@ -15,7 +15,7 @@ from triquad_server.errors import NO_MEMORY, ScanRefusedError
 from triquad_server.intake.rays import ScanRays, usable_rays
 from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.live_regions import LiveRegions
-from triquad_server.mapping.map_snapshot import MapChanges, MapSnapshot
+from triquad_server.mapping.map_snapshot import MapSnapshot
 from triquad_server.mapping.progress import MapFigures
 from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.process.threads import Teams
@@ -112,7 +112,7 @@ class Mapper:
             samples_left=self.samples_left,
             samples_discarded=sum(one.budget.discarded for one in training),
             rays_kept=self.rays_kept,
-            rays_discarded=sum(one.rays.pool.kept.discarded for one in training),
+            rays_discarded=sum(one.rays.pool.discarded for one in training),
             replay_share=self.regions.rays_share,
             map_bytes=self.regions.bytes_used,
         )
@@ -232,15 +232,11 @@ class Mapper:
             self.scans_taken, self.samples_trained, self._loss = 0, 0, None
         self._structure_changed = True
 
-    def changes_since(self, epoch: int | None) -> MapChanges:
-        """Return the newest epoch, with training state, of the regions changed after ``epoch``.
-
-        ``None`` returns all regions.
-        """
-        return self.snapshot_since(epoch).changes()
-
     def snapshot_since(self, epoch: int | None) -> MapSnapshot:
-        """Return a snapshot for :meth:`changes_since`, whose records other threads make."""
+        """Return the newest epoch, and the regions changed after ``epoch``; ``None``: all regions.
+
+        Other threads may make the record of it.
+        """
         newest = self.publish()
         changed = {
             frozen.index

@@ -4,7 +4,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TypeVar
 
 from triquad_format.errors import TriquadError
@@ -25,16 +25,6 @@ from triquad_server.mapping.publish_schedule import PublishSchedule
 from triquad_server.mapping.thread_time import Activity, ThreadTime
 from triquad_server.process.stop import Stop
 from triquad_server.process.threads import NICENESS
-
-
-@dataclass(frozen=True)
-class MapListeners:
-    """Functions that the mapper's thread calls; they are quick, and raise nothing."""
-
-    # With what of it is used; both count from the map's origin.
-    scan_taken: Sequence[Callable[[Scan, ScanRays], None]] = ()
-    published: Sequence[Callable[[Epoch], None]] = ()  # before others can see the epoch
-
 
 _log = logging.getLogger(__name__)
 
@@ -61,7 +51,8 @@ class MapperThread:
         epochs: EpochHistory,
         period_s: float,
         failed: Callable[[Stop], None],
-        listeners: MapListeners | None = None,
+        scan_taken: Sequence[Callable[[Scan, ScanRays], None]] = (),
+        published: Callable[[Epoch], None] = lambda _: None,
     ) -> None:
         """Make the thread, which begins with :meth:`start`.
 
@@ -71,13 +62,16 @@ class MapperThread:
             epochs: where epochs are published.
             period_s: between two epochs while the map changes.
             failed: called with the reason where an error ends the thread.
-            listeners: functions that are called with scans and epochs.
+            scan_taken: called with each scan, and what of it is used, from the map's origin.
+            published: called with each epoch before others can see it; these are quick, and raise
+                nothing.
         """
         self._mapper = mapper
         self._scans = scans
         self._epochs = epochs
         self._failed = failed
-        self._listeners = listeners or MapListeners()
+        self._scan_taken = scan_taken
+        self._published = published
         self.time = ThreadTime()
         self._commands = CommandQueue()
         self._wake = threading.Event()
@@ -246,7 +240,7 @@ class MapperThread:
             _log.debug("scan %d of %s refused: %s", scan.sequence, scan.source, error)
             return
         seen = moved(scan, -rays.map_origin)
-        for listener in self._listeners.scan_taken:
+        for listener in self._scan_taken:
             listener(seen, rays)
         self._schedule.is_changed = True
         self._scans.taken(scan, rays)
@@ -256,8 +250,7 @@ class MapperThread:
         started = time.monotonic()
         epoch = self._mapper.publish()
         if epoch is not self._epochs.newest:
-            for listener in self._listeners.published:
-                listener(epoch)
+            self._published(epoch)
             self._epochs.add(epoch)
         fit = map_fit(self._mapper.regions)
         self.progress = replace(self.progress, loss=self._mapper.loss, fit=fit)

@@ -12,7 +12,7 @@ from triquad_server.mapping.live_region import LiveRegion
 
 @dataclass(frozen=True)
 class MapFigures:
-    """The figures of a live map."""
+    """The figures of a live map, by their names in the status."""
 
     scans_taken: int = 0  # also those before a restart
     samples_trained: int = 0  # also those before a restart

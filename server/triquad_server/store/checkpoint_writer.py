@@ -4,10 +4,8 @@ import logging
 import threading
 import time
 from dataclasses import replace
-from functools import partial
 
 from triquad_format.errors import RefusedError
-from triquad_format.scan_log.segment import SegmentWriter
 from triquad_format.wire.messages import (
     CheckpointInfo,
     CheckpointRequest,
@@ -23,9 +21,10 @@ from triquad_server.errors import (
     StoreError,
 )
 from triquad_server.intake.source_trails import SourceTrails
-from triquad_server.mapping.map_snapshot import MapSnapshot
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
+from triquad_server.settings import StoreSettings
+from triquad_server.store.scrub import Scrubber
 from triquad_server.store.store import Store
 
 _log = logging.getLogger(__name__)
@@ -46,21 +45,26 @@ class CheckpointWriter:
         self,
         mapper: MapperThread,
         store: Store | None,
-        period_s: float,
-        last: CheckpointInfo | None,
+        settings: StoreSettings,
     ) -> None:
-        """Make the writer; ``last`` is the checkpoint that the map was restored from."""
+        """Make the writer; ``settings`` say how often the store is written, and checked."""
         self._mapper = mapper
         self._store = store
-        self._period_s = period_s
+        self._period_s = settings.period_s
+        self._scrub_h = settings.scrub_h
+        self._scrubber: Scrubber | None = None
         self._stopping = threading.Event()
         self._metrics = CheckpointMetrics(0, 0, None, None)
         self._saved_s = time.monotonic()  # when the map was as the newest checkpoint has it
         self._ended_s: float | None = None  # when the last was written, monotonic
         self._timer = threading.Thread(target=self._write_regularly, name="checkpoints")
         self._writing = threading.RLock()  # locked while anything is written
-        self.last = last
         self.error = None if store else _NO_STORE
+
+    @property
+    def last(self) -> CheckpointInfo | None:
+        """The newest checkpoint; it may be the one that the map was restored from."""
+        return None if self._store is None else self._store.last
 
     @property
     def has_store(self) -> bool:
@@ -68,9 +72,13 @@ class CheckpointWriter:
         return self._store is not None
 
     def start(self) -> None:
-        """Begin to write checkpoints, while the map changes and on request."""
-        if self._store is not None and self._period_s > 0:
+        """Begin to write checkpoints, while the map changes and on request, and to check them."""
+        if self._store is None:
+            return
+        if self._period_s > 0:
             self._timer.start()
+        if self._scrub_h > 0:
+            self._scrubber = Scrubber(self._store.folder, self._scrub_h, self._found_damaged)
 
     def metrics(self) -> CheckpointMetrics:
         """Return how many checkpoints were written, and how long the last took."""
@@ -89,8 +97,7 @@ class CheckpointWriter:
         """Return that checkpoints are late, and what helps, or why scans are not kept."""
         late_s = self.late_s
         if late_s == 0:
-            scans = None if self._store is None else self._store.scans
-            return None if scans is None else scans.error
+            return None if self._store is None else self._store.scans.error
         unsaved_s = late_s + _LATE_PERIODS * self._period_s
         return (
             f"checkpoints are late: what was mapped in the last {unsaved_s:.0f} s is on no disk, "
@@ -104,6 +111,8 @@ class CheckpointWriter:
         Raises:
             LastCheckpointError: it cannot be written.
         """
+        if self._scrubber is not None:
+            self._scrubber.close()
         self._stopping.set()
         if self._timer.ident is not None:
             self._timer.join()
@@ -142,7 +151,7 @@ class CheckpointWriter:
 
         def forget(mapper: Mapper) -> int:
             mapper.reset(request.minimum, request.maximum)
-            if self._store is not None and self._store.scans is not None:
+            if self._store is not None:
                 corners = request.minimum + mapper.origin, request.maximum + mapper.origin
                 self._store.scans.add_reset(*corners)
             trails.forget(request.minimum, request.maximum)
@@ -155,15 +164,6 @@ class CheckpointWriter:
         epoch = self._mapper.call(forget)
         _log.warning("the map was reset as of epoch %d: %s", epoch, undo)
         return ResetReply(epoch, kept, undo)
-
-    def found_damaged(self, name: str) -> None:
-        """Write all of the map again, if the newest checkpoint needs the file ``name``."""
-        with self._writing:
-            if self._store is not None and self._store.forget_base(name):
-                _log.warning(
-                    "the newest checkpoint needs %s: all of the map is written again", name
-                )
-                self._write_if_changed()
 
     def write(self, undoes: str = "") -> CheckpointInfo:
         """Write what changed since the last checkpoint, and return that one if nothing did.
@@ -211,17 +211,18 @@ class CheckpointWriter:
         base, last = store.base_epoch, self.last
         try:
             asked_s = time.monotonic()
-            snapshot, scans = self._mapper.call(partial(_snapshot, store, base))
-            if store.scans is not None:
-                store.scans.keep(scans, snapshot.epoch.number)
+            snapshot, scans = self._mapper.call(
+                lambda mapper: (mapper.snapshot_since(base), store.scans.cut())
+            )
+            store.scans.keep(scans, snapshot.epoch.number)
             # The base is the last checkpoint, as long as its file and parts are there.
             if not undoes and last is not None and last.epoch == snapshot.epoch.number == base:
                 self._saved_s = asked_s
                 return last
             started = time.monotonic()
-            changes = snapshot.changes()
-            del snapshot  # the records have all of it, and memory is shortest now
-            info = store.write(changes, undoes)
+            record, regions = snapshot.record(), snapshot.regions
+            del snapshot  # the record has all of it, and memory is shortest now
+            info = store.write(record, regions, undoes)
         except MemoryError as error:
             raise StoreError(f"a checkpoint was not written: {NO_MEMORY}") from error
         if (warning := self.warning) is not None:
@@ -232,7 +233,7 @@ class CheckpointWriter:
 
     def _record(self, info: CheckpointInfo, took_s: float) -> None:
         """Record that a checkpoint was written."""
-        self.last, self.error = info, None
+        self.error = None
         self._ended_s = time.monotonic()
         self._metrics = replace(
             self._metrics, written=self._metrics.written + 1, last_duration_s=took_s
@@ -254,10 +255,11 @@ class CheckpointWriter:
             self.error = "an internal error of the server; its log has the details"
             _log.exception("a checkpoint met an internal error")
 
-
-def _snapshot(
-    store: Store, base: int | None, mapper: Mapper
-) -> tuple[MapSnapshot, SegmentWriter | None]:
-    """Return what a checkpoint needs since ``base``, and the scans that the log kept since then."""
-    scans = None if store.scans is None else store.scans.cut()
-    return mapper.snapshot_since(base), scans
+    def _found_damaged(self, name: str) -> None:
+        """Write all of the map again, if the newest checkpoint needs the file ``name``."""
+        with self._writing:
+            if self._store is not None and self._store.forget_base(name):
+                _log.warning(
+                    "the newest checkpoint needs %s: all of the map is written again", name
+                )
+                self._write_if_changed()

@@ -47,8 +47,8 @@ class MapDownloads:
                     self._files.move_to_end(file.info.sha256)
                     return file.info
         if request.training:
-            changes = self._mapper.call(lambda mapper: mapper.snapshot_since(None)).changes()
-            record, newest = changes.record, changes.epoch
+            snapshot = self._mapper.call(lambda mapper: mapper.snapshot_since(None))
+            record, newest = snapshot.record(), snapshot.epoch
         else:
             record = newest.record()
         buffer, stamp_ns = io.BytesIO(), stamp_now_ns()

@@ -50,7 +50,7 @@ class ScanLog:
 
         Args:
             folder: of the map's checkpoints.
-            max_bytes: that the files may have together.
+            max_bytes: that the files may have together; 0: nothing is kept, nor written.
             leaf_m: side of the map's voxels.
             epoch: of the checkpoint from which the map goes on; 0: it begins. What the map took in
                 later than that it has lost, and so does the log.
@@ -65,6 +65,8 @@ class ScanLog:
         self._opened = 0  # files
         self._lost = False  # what was added could not be written; of the mapper's thread
         self._newest: int | None = 0  # epoch with which the newest file ends; None: it was lost
+        if max_bytes == 0:
+            return
         with self._telling("cannot be opened"):
             self.folder.mkdir(exist_ok=True)
             found = segments(self.folder)
@@ -85,7 +87,7 @@ class ScanLog:
 
         Both count from the map's origin.
         """
-        if not self._is_apart(scan):
+        if self._max_bytes == 0 or not self._is_apart(scan):
             return
         rotation, position = scan.world_from_sensor[:3, :3], scan.world_from_sensor[:3, 3]
         beyond = rays.origin + _BEYOND * (rays.far_ends - rays.origin)
@@ -106,6 +108,8 @@ class ScanLog:
 
     def add_reset(self, minimum: Doubles, maximum: Doubles) -> None:
         """Keep that the map forgot what lies between two corners [3] of the user's coordinates."""
+        if self._max_bytes == 0:
+            return
         self._kept.clear()
         reset = LoggedReset(minimum, maximum)
         self._put(lambda writer: writer.add_reset(reset, time.time_ns()))

@@ -31,7 +31,6 @@ from triquad_format.records.region import MapRecord
 from triquad_format.wire.messages import CheckpointInfo
 
 from triquad_server.errors import StoreError
-from triquad_server.mapping.map_snapshot import MapChanges
 from triquad_server.settings import StoreSettings
 from triquad_server.store.lock import StoreLock
 from triquad_server.store.restore import (
@@ -71,7 +70,9 @@ class Store:
         self._newest: _Newest | None = None
         self._restored: Restored | None = None  # the last time that the map was restored
         self._settings = settings
-        self.scans: ScanLog | None = None  # that the map takes in, from :meth:`log_scans` on
+        # That the map takes in, from :meth:`log_scans` on.
+        self.scans = ScanLog(self.folder, 0, leaf_m=1.0, epoch=0, restored=None)
+        self.last: CheckpointInfo | None = None  # the checkpoint that was read or written last
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             self._lock = StoreLock(self.folder)
@@ -84,15 +85,13 @@ class Store:
 
     def log_scans(self, leaf_m: float) -> None:
         """Keep scans, too, from the newest checkpoint on; ``leaf_m`` is the side of a voxel."""
-        if self._settings.log_max_bytes > 0:
-            epoch = 0 if self._newest is None else self._newest.info.epoch
-            most = self._settings.log_max_bytes
-            self.scans = ScanLog(self.folder, most, leaf_m, epoch, self._restored)
+        epoch = 0 if self._newest is None else self._newest.info.epoch
+        most = self._settings.log_max_bytes
+        self.scans = ScanLog(self.folder, most, leaf_m, epoch, self._restored)
 
     def close(self) -> None:
         """Release the folder."""
-        if self.scans is not None:
-            self.scans.close()
+        self.scans.close()
         self._lock.close()
 
     @property
@@ -120,24 +119,27 @@ class Store:
             StoreError: see :func:`triquad_server.store.restore.newest_valid`.
         """
         newest = newest_valid(self.folder)
+        self.last = None if newest is None else newest.info
         if newest is not None and newest.checkpoint is not None:
             self._newest = _Newest(newest.checkpoint.manifest, newest.info)
             self._restored = newest.checkpoint.restored
         return newest
 
-    def write(self, changes: MapChanges, undoes: str = "") -> CheckpointInfo:
+    def write(
+        self, record: MapRecord, regions: tuple[RegionIndex, ...], undoes: str = ""
+    ) -> CheckpointInfo:
         """Write a checkpoint of what changed since :attr:`base_epoch`; delete what need not stay.
 
-        One that ``undoes`` something, such as a reset, stays for longer.
+        ``record`` has the regions that changed, ``regions`` names all there are. One that
+        ``undoes`` something, such as a reset, stays for longer.
 
         Raises:
             StoreError: it could not be written; the older ones are untouched.
         """
-        record = changes.record
         path = self.folder / checkpoint_name(record.epoch)
         with self._writing(f"checkpoint {path} cannot be written"):
             check_record(record)
-            return self._write(self._manifest(record, changes.regions), undoes)
+            return self._write(self._manifest(record, regions), undoes)
 
     def forget_base(self, name: str) -> bool:
         """Write all of the map next time, if the newest checkpoint needs the file ``name``."""
@@ -227,7 +229,7 @@ class Store:
             sha256=written.sha256,
             stamp_ns=manifest.stamp_ns,
         )
-        self._newest = _Newest(manifest, info)
+        self._newest, self.last = _Newest(manifest, info), info
         delete_unneeded(self.folder, self._settings, info.epoch)
         return info
 

@@ -126,7 +126,7 @@ def test_a_map_is_learnt_in_either_and_goes_on_in_the_other(device: str, other: 
     mapper = small_world.settled_mapper(settings, world, device)
     epoch = mapper.publish()
     assert small_world.surface_error(epoch, world) < 0.02
-    again = Mapper("test", settings, other, mapper.changes_since(None).record)
+    again = Mapper("test", settings, other, mapper.snapshot_since(None).record())
     points = world.hits[:2000]
     before, after = (e.query(points, gradient=True) for e in (epoch, again.publish()))
     np.testing.assert_allclose(after.sdf, before.sdf, atol=2e-3)

@@ -24,7 +24,7 @@ def test_one_ray_in_some_dozens_is_held_out_by_compiled_code_too() -> None:
 
 def test_rays_are_held_out_from_training_and_after_a_restart() -> None:
     mapper = mapper_of(*world().scans)
-    restarted = Mapper("test", settings(), "cpu", mapper.changes_since(None).record)
+    restarted = Mapper("test", settings(), "cpu", mapper.snapshot_since(None).record())
     for region, again in zip(mapper.regions, restarted.regions, strict=True):
         assert are_held_out(region.training.rays.held_out.table.rows, settings().field).all()
         for kept in (region, again):

@@ -56,7 +56,7 @@ def test_epochs_share_what_did_not_change_between_them() -> None:
 
 def test_a_record_restores_the_map_and_its_training(mapped: Mapper) -> None:
     epoch = mapped.publish()
-    restarted = Mapper("test", settings(), "cpu", mapped.changes_since(None).record)
+    restarted = Mapper("test", settings(), "cpu", mapped.snapshot_since(None).record())
     restored = restarted.publish()
     assert restored.number == epoch.number
     points = world().hits[::40] + [0, 0, 0.02]
@@ -109,18 +109,18 @@ def test_the_records_of_a_moment_are_the_same_however_the_map_goes_on() -> None:
     mapper = mapper_of(first, chosen=chosen)
     mapper.train()
     snapshot = mapper.snapshot_since(None)
-    at_once = snapshot.changes().record
+    at_once = snapshot.record()
     for scan in others:
         take_in(mapper, scan)
         mapper.train()
-    assert mapper.changes_since(None).record.progress != at_once.progress
-    assert_same(snapshot.changes().record, at_once)
+    assert mapper.snapshot_since(None).record().progress != at_once.progress
+    assert_same(snapshot.record(), at_once)
 
 
 def test_a_record_with_nothing_to_train_on_has_no_training_budget() -> None:
     scan = world().scans[0]
     mapper = mapper_of(scan)
-    record = mapper.changes_since(None).record
+    record = mapper.snapshot_since(None).record()
     emptied = []
     for region in record.regions:
         state = region.training

@@ -238,7 +238,7 @@ def test_a_checkpoint_takes_one_epoch_however_fast_the_map_changes(tmp_path: Pat
     store = Store(tmp_path, "test", StoreSettings())
     with closing(store), running(learning_mapper()) as mapping:
         thread = mapping.thread
-        checkpoints = CheckpointWriter(thread, store, 0.0, None)
+        checkpoints = CheckpointWriter(thread, store, StoreSettings(period_s=0))
         checkpoints.start()
         with closing(checkpoints):
             for _ in range(5):
@@ -257,7 +257,7 @@ def test_a_checkpoint_for_which_there_is_no_memory_is_refused_and_the_next_is_wr
 
     store = Store(tmp_path, "test", StoreSettings())
     with closing(store), running(learning_mapper()) as mapping:
-        checkpoints = CheckpointWriter(mapping.thread, store, 0.0, None)
+        checkpoints = CheckpointWriter(mapping.thread, store, StoreSettings(period_s=0))
         with monkeypatch.context() as patched:
             patched.setattr(store, "write", fail)
             with pytest.raises(RefusedError, match="store: .*no more memory"):
@@ -272,7 +272,7 @@ def test_checkpoints_that_are_late_are_told_until_one_is_written(tmp_path: Path)
     """While the mapper's thread is kept at something else, the map cannot be saved."""
     store, let_go = Store(tmp_path, "test", StoreSettings()), Event()
     with closing(store), running(learning_mapper()) as mapping, ThreadPoolExecutor() as pool:
-        checkpoints = CheckpointWriter(mapping.thread, store, 2.0, None)
+        checkpoints = CheckpointWriter(mapping.thread, store, StoreSettings(period_s=2))
         assert (checkpoints.warning, checkpoints.metrics().late_s) == (None, 0.0)
         checkpoints.start()
         with closing(checkpoints):

@@ -52,7 +52,7 @@ class Watched:
 
     def restart(self, edit: Callable[[Region], Region] = lambda region: region) -> None:
         """Go on from a file of the map, as a server does that was started again."""
-        record = read_bytes(file_bytes(self.mapper.changes_since(None).record))
+        record = read_bytes(file_bytes(self.mapper.snapshot_since(None).record()))
         bare = tuple(edit(replace(region, training=None)) for region in record.regions)
         self.mapper = Mapper("test", self.settings, "cpu", replace(record, regions=bare))
 

@@ -45,7 +45,7 @@ def empty_place() -> MapRecord:
         scan = LIDAR.scan(Scene(WALLED, WALLED_BOUNDS), pose, rng)
         mapper.ingest(scan.points, pose, stamp_s=number)
     settle(mapper)
-    return mapper.changes_since(None).record
+    return mapper.snapshot_since(None).record()
 
 
 class Seen:

@@ -107,7 +107,7 @@ def test_the_number_of_regions_is_bounded() -> None:
 
 def test_the_replay_pool_is_bounded_after_a_restart_and_after_a_reset() -> None:
     mapper = mapper_of(*world(2).scans)
-    record = mapper.changes_since(None).record
+    record = mapper.snapshot_since(None).record()
     assert len(record.regions) > 1
     bounded = settings(pool_bytes=4000 * RAY_BYTES)
     restarted = Mapper("test", bounded, "cpu", record)

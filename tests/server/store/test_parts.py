@@ -50,10 +50,10 @@ def test_a_checkpoint_writes_what_changed_and_reads_back_whole(store):
 
 def test_what_did_not_change_is_neither_encoded_nor_written(store, monkeypatch):
     first = grown(1, 1)
-    store.write(changes(first))
+    store.write(*changes(first))
     before = {path: path.stat() for path in parts_of(paths(store)[1])}
     monkeypatch.setattr("triquad_format.mapfile.checkpoint_folder.compressed", None)
-    store.write(changes(dataclasses.replace(first, epoch=2), only=ROW[:3]))
+    store.write(*changes(dataclasses.replace(first, epoch=2), only=ROW[:3]))
     assert {path: path.stat() for path in parts_of(paths(store)[2])} == before
     assert_same(read_map(paths(store)[2]), dataclasses.replace(first, epoch=2))
 
@@ -68,7 +68,7 @@ def test_a_restarted_store_goes_on_from_the_newest(store, tmp_path):
         assert_same(restored.record, records[3])
         assert again.base_epoch == 3
         fourth = grown(4, 4, records[3], ROW[:1])
-        info = again.write(changes(fourth, ROW[:1]))
+        info = again.write(*changes(fourth, ROW[:1]))
         assert_same(read_map(info.path), fourth)
 
 
@@ -79,7 +79,7 @@ def test_a_backup_is_restored_and_gone_on_from(store):
     assert restored is not None
     assert_same(restored.record, first)
     assert store.base_epoch is None, "its parts are not in the store"
-    store.write(changes(grown(2, 8)))
+    store.write(*changes(grown(2, 8)))
     store.restore(7)
     assert_same(store.newest().record, dataclasses.replace(first, epoch=9))
     assert store.base_epoch == 9
@@ -98,11 +98,11 @@ def test_where_something_is_gone_all_is_written_again(store, harm):
         path.write_bytes(path.read_bytes()[:-1])
     assert store.base_epoch is None
     third = dataclasses.replace(records[2], epoch=3)  # the same map
-    store.write(changes(third))
+    store.write(*changes(third))
     assert_same(read_map(paths(store)[3]), third)
     assert store.base_epoch == 3, "later ones are of what changed"
     fourth = grown(4, 4, third, ROW[:1])
-    store.write(changes(fourth, ROW[:1]))
+    store.write(*changes(fourth, ROW[:1]))
     assert_same(read_map(paths(store)[4]), fourth)
 
 
@@ -127,9 +127,9 @@ def test_a_checkpoint_that_is_deleted_while_it_is_read_is_not_called_damaged(
 
 def test_a_part_that_nothing_new_needs_is_no_reason_to_write(store):
     first = grown(1, 1)
-    store.write(changes(first))
+    store.write(*changes(first))
     part = part_of(paths(store)[1], ROW[0])
-    store.write(changes(grown(2, 2)))
+    store.write(*changes(grown(2, 2)))
     assert not store.forget_base(part.name)
     assert store.base_epoch == 2
 
@@ -153,7 +153,7 @@ def test_an_older_checkpoint_serves_where_a_part_of_the_newest_is_damaged(store,
     assert_same(restored.record, records[2])
     assert f"parts/{part.name}" in caplog.text
     assert "epoch-000000002.checkpoint is used instead" in caplog.text
-    store.write(changes(records[3]))
+    store.write(*changes(records[3]))
     assert_same(read_map(paths(store)[3]), records[3])
 
 
@@ -162,7 +162,7 @@ def test_what_was_set_aside_can_still_be_recovered(store):
     rot(part_of(paths(store)[3], ROW[3], "/triquad/region"))
     assert store.newest().record.epoch == 2
     for epoch in (4, 5):
-        store.write(changes(grown(epoch, epoch)))
+        store.write(*changes(grown(epoch, epoch)))
     (aside,) = store.folder.glob("*.damaged")
     saved = recover(aside)
     assert saved.record.epoch == 3
@@ -179,7 +179,7 @@ def test_what_could_not_be_read_again_is_not_written(store, monkeypatch):
     larger = dataclasses.replace(random_record(3, indices=ROW, name="lab", points=300), epoch=3)
     message = f"000000003.checkpoint cannot be written: .* limit of {most} bytes"
     with pytest.raises(StoreError, match=message):
-        store.write(changes(larger))
+        store.write(*changes(larger))
     assert sorted(store.folder.rglob("*")) == before
 
 
@@ -195,9 +195,9 @@ def test_parts_stay_where_a_checkpoint_needs_a_newer_release(store, monkeypatch,
 
 
 def test_whoever_deletes_the_lock_lets_nobody_else_in(store, tmp_path):
-    store.write(changes(grown(1, 1)))
+    store.write(*changes(grown(1, 1)))
     (store.folder / "lock").unlink()
-    store.write(changes(grown(2, 2)))
+    store.write(*changes(grown(2, 2)))
     with pytest.raises(StoreError, match="in use by another server"):
         Store(tmp_path, "lab", StoreSettings(keep=2))
     (store.folder / "lock").unlink()
@@ -205,12 +205,12 @@ def test_whoever_deletes_the_lock_lets_nobody_else_in(store, tmp_path):
         closing(Store(tmp_path, "lab", StoreSettings(keep=2))),
         pytest.raises(StoreError, match="in use by another server"),
     ):
-        store.write(changes(grown(3, 3)))
-    store.write(changes(grown(3, 3)))
+        store.write(*changes(grown(3, 3)))
+    store.write(*changes(grown(3, 3)))
 
 
 @pytest.mark.parametrize("clock_ns", [-(10**18), 2**63])
 def test_no_clock_keeps_a_checkpoint_from_being_written(store, monkeypatch, clock_ns):
     monkeypatch.setattr("time.time_ns", lambda: clock_ns)
-    store.write(changes(grown(1, 1)))
+    store.write(*changes(grown(1, 1)))
     assert read_map(paths(store)[1]).epoch == 1

@@ -76,7 +76,7 @@ def test_what_is_no_file_does_not_stop_the_retention(tmp_path):
         os.mkfifo(store.folder / "epoch-000000000.triquad")
         (store.folder / "epoch-000000001.checkpoint").symlink_to("nowhere")
         for epoch in range(2, 6):
-            store.write(changes(grown(1, epoch)))
+            store.write(*changes(grown(1, epoch)))
         assert sorted(paths(store)) == [4, 5]
 
 
@@ -93,13 +93,13 @@ def test_parts_go_with_the_last_checkpoint_that_names_them(tmp_path):
 
 def test_a_checkpoint_that_is_replaced_within_a_tick_of_the_clock_is_read_again(tmp_path):
     with closing(Store(tmp_path, "lab", StoreSettings(keep=2))) as store:
-        store.write(changes(grown(1, 1)))
+        store.write(*changes(grown(1, 1)))
         path = paths(store)[1]
         before = path.stat()
         write_checkpoint(path, dataclasses.replace(read_checkpoint(path), undoes="a reset"))
         os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
         for epoch in range(2, 5):
-            store.write(changes(grown(1, epoch)))
+            store.write(*changes(grown(1, epoch)))
         assert sorted(paths(store)) == [1, 3, 4]
 
 
@@ -124,7 +124,7 @@ def test_a_map_that_was_restored_can_be_restored_once_more(tmp_path, caplog):
         records = drive(store, 1)
         store.restore(1)
         for epoch in range(4, 8):
-            store.write(changes(grown(epoch, epoch)))
+            store.write(*changes(grown(epoch, epoch)))
         store.restore(1)
         assert "to go back there again, use --restore 3" in caplog.text
         store.restore(3)

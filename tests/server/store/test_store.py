@@ -10,18 +10,14 @@ from triquad_format.errors import TooLargeMapFileError
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.region import MapRecord
 from triquad_server.errors import StoreError
-from triquad_server.mapping.map_snapshot import MapChanges
-from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import StoreSettings
 from triquad_server.store import restore
 from triquad_server.store.restore import MAX_EPOCH
 from triquad_server.store.store import Store
 
-EMPTY = Mapper("lab", servers.SMALL, "cpu").publish()
-
 
 def record(epoch):
-    return MapChanges(MapRecord("lab", epoch, servers.SMALL.field, ()), (), EMPTY)
+    return MapRecord("lab", epoch, servers.SMALL.field, ()), ()
 
 
 @pytest.fixture
@@ -39,7 +35,7 @@ def names(store):
 def test_the_newest_checkpoints_are_kept_and_described_and_other_files_left_alone(store):
     (store.folder / "notes.txt").write_text("mine")
     for epoch in (0, 1, 2, 10):
-        info = store.write(record(epoch))
+        info = store.write(*record(epoch))
     newest = ["epoch-000000002.checkpoint", "epoch-000000010.checkpoint"]
     assert names(store) == [*newest, "notes.txt"]
     restored = store.newest()
@@ -50,7 +46,7 @@ def test_the_newest_checkpoints_are_kept_and_described_and_other_files_left_alon
 
 
 def test_a_damaged_checkpoint_is_left_out_by_name_and_kept_aside(store, caplog):
-    store.write(record(1))
+    store.write(*record(1))
     bad = store.folder / "epoch-000000002.checkpoint"
     bad.write_bytes(b"not a map")
     with caplog.at_level(logging.WARNING):
@@ -58,8 +54,8 @@ def test_a_damaged_checkpoint_is_left_out_by_name_and_kept_aside(store, caplog):
     assert "epoch-000000002.checkpoint is damaged" in caplog.text
     assert "epoch-000000001.checkpoint is used instead" in caplog.text
     assert names(store) == ["epoch-000000001.checkpoint", "epoch-000000002.checkpoint.damaged"]
-    store.write(record(2))
-    store.write(record(3))
+    store.write(*record(2))
+    store.write(*record(3))
     assert store.newest().record.epoch == 3
 
 
@@ -74,7 +70,7 @@ def test_a_damaged_checkpoint_is_left_out_by_name_and_kept_aside(store, caplog):
 )
 def test_a_valid_checkpoint_that_cannot_be_read_now_is_not_demoted(store, monkeypatch, error):
     for epoch in (1, 2):
-        store.write(record(epoch))
+        store.write(*record(epoch))
     before = names(store)
 
     def fail(path):
@@ -87,18 +83,18 @@ def test_a_valid_checkpoint_that_cannot_be_read_now_is_not_demoted(store, monkey
 
 
 def test_a_damaged_file_of_a_higher_number_does_not_push_out_a_valid_one(store):
-    store.write(record(1))
+    store.write(*record(1))
     for epoch in (8, 9):
         (store.folder / f"epoch-00000000{epoch}.checkpoint").write_bytes(b"damaged")
-    store.write(record(2))
+    store.write(*record(2))
     assert names(store)[:2] == ["epoch-000000001.checkpoint", "epoch-000000002.checkpoint"]
-    store.write(record(3))
+    store.write(*record(3))
     assert names(store)[:2] == ["epoch-000000002.checkpoint", "epoch-000000003.checkpoint"]
     assert store.newest().record.epoch == 3
 
 
 def test_what_a_killed_server_left_unfinished_goes(store, tmp_path):
-    store.write(record(1))
+    store.write(*record(1))
     store.close()
     (store.folder / ".epoch-000000002.checkpoint.0a1b2c3d.tmp").write_bytes(b"half")
     with closing(Store(tmp_path, "lab", StoreSettings(keep=2))) as again:
@@ -107,7 +103,7 @@ def test_what_a_killed_server_left_unfinished_goes(store, tmp_path):
 
 
 def test_an_epoch_of_another_map_is_told_with_the_maps_there_are(store, tmp_path):
-    store.write(record(3))
+    store.write(*record(3))
     with (
         closing(Store(tmp_path, "default", StoreSettings())) as forgotten,
         pytest.raises(StoreError, match="the store has checkpoints of lab: name the map by --map"),
@@ -118,14 +114,14 @@ def test_an_epoch_of_another_map_is_told_with_the_maps_there_are(store, tmp_path
 
 
 def test_a_checkpoint_under_a_wrong_number_does_not_pass_for_a_later_one(store, caplog):
-    store.write(record(3))
+    store.write(*record(3))
     valid = store.folder / "epoch-000000003.checkpoint"
     (store.folder / "epoch-000000009.checkpoint").write_bytes(valid.read_bytes())
     with caplog.at_level(logging.WARNING):
         restored = store.newest()
     assert restored.info.epoch == restored.record.epoch == 3
     assert "epoch-000000009.checkpoint holds epoch 3" in caplog.text
-    store.write(record(4))
+    store.write(*record(4))
     assert store.newest().record.epoch == 4
 
 

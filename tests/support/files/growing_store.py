@@ -7,14 +7,8 @@ from support.maps.map_records import random_record
 from triquad_format.mapfile.checkpoint_folder import PartFiles, checkpoint_files
 from triquad_format.mapfile.reader import read_map_file
 from triquad_format.records.field_settings import RegionIndex
-from triquad_server.mapping.map_snapshot import MapChanges
-from triquad_server.mapping.mapper import Mapper
-from triquad_server.settings import Settings
 
 ROW: tuple[RegionIndex, ...] = tuple((x, 0, 0) for x in range(6))
-
-
-EMPTY = Mapper("lab", Settings(), "cpu").publish()  # a store does not look at it
 
 
 fresh_record = cache(partial(random_record, indices=ROW, name="lab", points=60))
@@ -34,17 +28,17 @@ def changes(record, only=ROW):
     """What the mapper hands over where the regions ``only`` changed."""
     changed = tuple(region for region in record.regions if region.index in only)
     indices = tuple(region.index for region in record.regions)
-    return MapChanges(dataclasses.replace(record, regions=changed), indices, EMPTY)
+    return dataclasses.replace(record, regions=changed), indices
 
 
 def drive(store, epochs, rows=ROW):
     """Epochs of which each changes the next one of the regions ``rows``; the first all of them."""
     records = {1: grown(1, 1)}
-    store.write(changes(records[1]))
+    store.write(*changes(records[1]))
     for epoch in range(2, 2 + epochs):
         only = (rows[epoch % len(rows)],)
         record = grown(epoch, epoch, records[max(records)], only)
-        store.write(changes(record, only))
+        store.write(*changes(record, only))
         records[epoch] = record
     return records
 

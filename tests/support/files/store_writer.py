@@ -46,5 +46,5 @@ def write_for_ever(root: Path, acknowledged: Connection) -> None:
             epoch += 1
             base = store.base_epoch
             only = [r for i, r in enumerate(ROW) if base is None or changed_last(epoch, i) > base]
-            store.write(changes(record_at(epoch), only))
+            store.write(*changes(record_at(epoch), only))
             acknowledged.send(epoch)

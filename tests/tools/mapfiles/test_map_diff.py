@@ -82,7 +82,7 @@ def test_maps_of_different_places_have_seen_nothing_of_each_other():
 
 
 def test_the_same_scans_give_maps_that_differ_by_their_noise_alone():
-    few = settled_mapper(settings(samples_per_ray=9.0), world()).changes_since(None).record
+    few = settled_mapper(settings(samples_per_ray=9.0), world()).snapshot_since(None).record()
     many = settled_epoch().record()
     total = difference(compared(few, many))
     assert total.points_a > 10_000

@@ -142,7 +142,7 @@ class MappingRun:
     def _save(self) -> None:
         """Write the map; where it cannot be written, what was saved before is untouched."""
         started_s = time.monotonic()
-        record = self.mapper.changes_since(None).record
+        record = self.mapper.snapshot_since(None).record()
         try:
             write_map(replace(record, name=f"{self.key}.{self.scans_taken}"), self.unfinished)
         except OSError as error:

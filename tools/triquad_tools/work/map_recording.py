@@ -42,7 +42,7 @@ def work(options: argparse.Namespace) -> int:
         mapping.take(selection)
         _check_result(mapper, mapping, selection)
         mapping.settle()  # which saves the map, should the output not be written
-        record, cell_m = mapper.changes_since(None).record, settings.mesh.cell_m
+        record, cell_m = mapper.snapshot_since(None).record(), settings.mesh.cell_m
         try:
             written = write_output(
                 record, output, cell_m=cell_m, training=options.training, fill_m=options.fill

@@ -18,33 +18,24 @@ from triquad_server.mapping.replay.ray_table import (
 _NONE = np.zeros(0, np.int64)
 
 
-class ReplayPool:
+class ReplayPool(KeptRays):
     """Keeps rays of one region, and draws samples on them."""
 
     def __init__(
         self, placement: Placement, settings: FieldSettings, seed: int, team: Team
     ) -> None:
         """Begin without rays and limit; ``team`` draws samples on them."""
-        self._settings = settings
+        super().__init__(settings, np.random.default_rng(seed))
         self._team = team
         self.placement = placement
-        self._rng = np.random.default_rng(seed)
-        self.kept = KeptRays(settings, self._rng)
         self._fresh = _NONE  # places of the newest
 
-    def __len__(self) -> int:
-        return len(self.kept)
-
-    @property
-    def table(self) -> RayTable:
-        """Return all that is kept; it changes with the pool."""
-        return self.kept.table
-
-    def add(self, new: RayTable, fresh: bool = True) -> None:
-        """Take in rays; if ``fresh``, they become the newest."""
-        places = self.kept.add(new)
+    def add(self, new: RayTable, fresh: bool = True) -> Longs:
+        """Take in rays; return their places [N]; if ``fresh``, they become the newest."""
+        places = super().add(new)
         if fresh:
             self._fresh = places
+        return places
 
     def draw(self, count: int, fresh: int) -> Batch:
         """Draw ``count`` samples on rays at random, ``fresh`` of them on the newest."""
@@ -75,18 +66,18 @@ class ReplayPool:
     def limit(self, capacity: int) -> None:
         """Change the capacity; surplus rays are removed at random."""
         is_too_much = len(self) > capacity
-        self.kept.limit(capacity)
+        super().limit(capacity)
         if is_too_much:
             self._fresh = _NONE
 
     def forget(self, low: Doubles, high: Doubles) -> None:
         """Drop the rays that end between two corners [3], metres from the region's centre."""
-        self.kept.forget(low, high)
+        super().forget(low, high)
         self._fresh = _NONE
 
     def forget_ends(self, voxels: Longs) -> None:
         """Drop the rays that end in ``voxels`` [N, 3]."""
-        self.kept.forget_ends(voxels)
+        super().forget_ends(voxels)
         self._fresh = self._fresh[self._fresh < len(self)]
 
     def _at_random(self, count: int, fresh: int) -> Longs:

@@ -1,0 +1,58 @@
+"""The requests of clients: which part of the server answers each kind, and in which lane."""
+
+from triquad_format.wire.limits import MAX_QUERY_POINTS, payload_limit
+from triquad_format.wire.mesh_messages import MeshRequest, TileChangesRequest, TileListRequest
+from triquad_format.wire.messages import (
+    CheckpointRequest,
+    FlushRequest,
+    MapChunkRequest,
+    MapInfoRequest,
+    ResetRequest,
+    StatusRequest,
+)
+from triquad_format.wire.metrics_messages import MetricsRequest
+from triquad_format.wire.query_messages import ChangesRequest, GridRequest
+from triquad_format.wire.source_messages import SourcesRequest
+from triquad_map.questions.answers import QUESTIONS, Answers
+
+from triquad_server.epochs.surface_history import SurfaceHistory, changes_reply
+from triquad_server.intake.source_trails import SourceTrails
+from triquad_server.mesh.tile_cache import TileCache
+from triquad_server.mesh.tile_queries import TileQueries
+from triquad_server.server_status import Health
+from triquad_server.serving.operations import Lane
+from triquad_server.store.download import MapDownloads
+
+
+def answer_requests(
+    parts: Health, tiles: TileCache, surface: SurfaceHistory, trails: SourceTrails
+) -> None:
+    """Answer the requests of clients from now on, by the parts of the server."""
+    serve = parts.operations.serve
+    answers, max_bytes = Answers(parts.epochs.view), payload_limit(MAX_QUERY_POINTS)
+    for question in QUESTIONS:
+        lane = Lane.LONG_QUESTIONS if question is GridRequest else Lane.QUESTIONS
+        serve(question, answers.answer, lane, max_bytes)
+    serve(
+        ChangesRequest,
+        lambda request: changes_reply(request, surface, parts.epochs.newest, parts.server),
+    )
+    serve(SourcesRequest, trails.answer)
+
+    mesh = TileQueries(parts.epochs, tiles, parts.server)
+    serve(TileListRequest, mesh.tiles, Lane.MESH)
+    serve(TileChangesRequest, mesh.changes, Lane.MESH)
+    serve(MeshRequest, mesh.mesh, Lane.MESH)
+
+    ledger, soon, warnings = parts.scans.ledger, parts.mapper.publish_soon, parts.warnings.of
+    lane = Lane.ADMINISTRATION
+    serve(StatusRequest, lambda _: parts.status(), lane)
+    serve(MetricsRequest, lambda _: parts.metrics(), lane)
+    serve(FlushRequest, lambda request: ledger.answer(request, soon, warnings), lane)
+
+    checkpoints = parts.checkpoints
+    downloads = MapDownloads(parts.mapper, parts.epochs, parts.server)
+    serve(CheckpointRequest, checkpoints.answer, Lane.FILES)
+    serve(ResetRequest, lambda request: checkpoints.reset(request, trails), Lane.FILES)
+    serve(MapInfoRequest, downloads.info, Lane.FILES)
+    serve(MapChunkRequest, downloads.chunk, Lane.LONG_QUESTIONS)
