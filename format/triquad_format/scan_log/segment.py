@@ -4,23 +4,17 @@ It is an MCAP file of ROS 2 messages: for each scan a transform from ``map`` to 
 name of the source, on ``/tf``, and a cloud in that frame, on ``/scans/<source>``, with the stamp of
 the scan both. Rays that met nothing come between the two, as directions [M, 3], little-endian
 float32, on ``/no_return/<source>``; what was reset is on ``/resets``: the least and the greatest
-corner of a box, six little-endian float64. ``docs/scan-log.md`` has all of it.
+corner of a box, six little-endian float64.
 """
 
-import io
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
 import numpy as np
-from mcap.records import Channel, Footer, Message
-from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
-from triquad_format.errors import DamagedMapFileError, FormatError
-from triquad_format.mapfile.files import open_regular
 from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.scan_log.ros_messages import (
     CLOUD_TYPE,
@@ -28,15 +22,15 @@ from triquad_format.scan_log.ros_messages import (
     TRANSFORMS_TYPE,
     pack_cloud,
     pack_transform,
-    unpack_cloud,
-    unpack_transform,
 )
 
 GRAIN_M = 2.0**-8
 """Points are rounded to 4 mm: single precision has that exactly, with zeros that compress."""
 
 _MAP_FRAME = "map"
-_TRANSFORMS, _RESETS, _SCANS, _NO_RETURN = "/tf", "/resets", "/scans/", "/no_return/"
+TRANSFORMS, RESETS, SCANS, NO_RETURN = "/tf", "/resets", "/scans/", "/no_return/"
+"""The topics; the last two before the name of a source."""
+
 _CHUNK_BYTES = 1 << 20
 
 
@@ -87,12 +81,12 @@ class SegmentWriter:
         """
         stamp_ns, source = scan.stamp_ns, scan.source
         pose = pack_transform(stamp_ns, _MAP_FRAME, source, scan.world_from_sensor)
-        self._put(_TRANSFORMS, TRANSFORMS_TYPE, stamp_ns, pose)
+        self._put(TRANSFORMS, TRANSFORMS_TYPE, stamp_ns, pose)
         if len(scan.no_return):
             directions = np.ascontiguousarray(scan.no_return, "<f4").tobytes()
-            self._put(_NO_RETURN + source, "", stamp_ns, directions)
+            self._put(NO_RETURN + source, "", stamp_ns, directions)
         points = (np.round(scan.points / GRAIN_M) * GRAIN_M).astype(np.float32)
-        self._put(_SCANS + source, CLOUD_TYPE, stamp_ns, pack_cloud(stamp_ns, source, points))
+        self._put(SCANS + source, CLOUD_TYPE, stamp_ns, pack_cloud(stamp_ns, source, points))
 
     def add_reset(self, reset: LoggedReset, stamp_ns: int) -> None:
         """Add that the map forgot a box.
@@ -101,7 +95,7 @@ class SegmentWriter:
             OSError: it cannot be written.
         """
         corners = np.concatenate([reset.minimum, reset.maximum]).astype("<f8")
-        self._put(_RESETS, "", stamp_ns, corners.tobytes())
+        self._put(RESETS, "", stamp_ns, corners.tobytes())
 
     def finish(self) -> None:
         """End the file.
@@ -132,44 +126,3 @@ class SegmentWriter:
             text = DEFINITIONS[kind].encode()
             self._schemas[kind] = self._mcap.register_schema(kind, "ros2msg", text)
         return self._schemas[kind]
-
-
-def read_segment(path: Path) -> Iterator[LoggedScan | LoggedReset]:
-    """Yield what a file holds, in the order in which it came.
-
-    Raises:
-        DamagedMapFileError: the file is damaged, or is none of the log.
-        OSError: it cannot be read.
-    """
-    with io.BufferedReader(open_regular(path)) as stream:
-        try:
-            yield from _entries(stream)
-        except Exception as error:  # as the library comes upon what it did not expect
-            raise DamagedMapFileError(f"{path} is damaged: {error!r}") from error
-
-
-def _entries(stream: IO[bytes]) -> Iterator[LoggedScan | LoggedReset]:
-    topics: dict[int, str] = {}
-    pose: tuple[int, str, Doubles] | None = None
-    no_return = np.zeros((0, 3), np.float32)
-    is_whole = False
-    for record in StreamReader(stream, validate_crcs=True).records:
-        is_whole |= isinstance(record, Footer)
-        if isinstance(record, Channel):
-            topics[record.id] = record.topic
-        if not isinstance(record, Message):
-            continue
-        topic, data = topics[record.channel_id], record.data
-        if topic == _TRANSFORMS:
-            pose, no_return = unpack_transform(data), no_return[:0]
-        elif topic == _RESETS:
-            yield LoggedReset(*np.frombuffer(data, "<f8").reshape(2, 3))
-        elif topic.startswith(_NO_RETURN):
-            no_return = np.frombuffer(data, "<f4").reshape(-1, 3)
-        elif topic.startswith(_SCANS):
-            stamp_ns, source, points = unpack_cloud(data)
-            if pose is None or pose[:2] != (stamp_ns, source):
-                raise FormatError(f"a scan of {source} has no pose before it")
-            yield LoggedScan(source, stamp_ns, pose[2], points, no_return)
-    if not is_whole:
-        raise FormatError("it has no end")

@@ -1,22 +1,36 @@
 """The scans that a server has kept with the checkpoints of a map."""
 
+import io
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
-from triquad_format.errors import FormatError
+from mcap.records import Channel, Footer, Message
+from mcap.stream_reader import StreamReader
+from triquad_format.errors import DamagedMapFileError, FormatError
 from triquad_format.mapfile.checkpoint_folder import checkpoint_files, map_folder
+from triquad_format.mapfile.files import open_regular
 from triquad_format.mapfile.index import read_checkpoint
 from triquad_format.records.arrays import Floats
+from triquad_format.records.pose import pose_matrices
 from triquad_format.scan_log.log_folder import LOG_NAME, Segment, history, of_map, segments
-from triquad_format.scan_log.segment import LoggedReset, LoggedScan, read_segment
+from triquad_format.scan_log.segment import (
+    NO_RETURN,
+    RESETS,
+    SCANS,
+    TRANSFORMS,
+    LoggedReset,
+    LoggedScan,
+)
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
 from triquad_tools.recordings.recording import ScanEntry, Stream
+from triquad_tools.sensors.ros.from_bytes import decode_cdr
+from triquad_tools.sensors.ros.type_store import POINT_CLOUD, TF, stamp_ns
 from triquad_tools.sensors.sweep import PosedScan, moved
 
 
@@ -124,6 +138,54 @@ def _read(segment: Segment) -> Iterator[LoggedScan | LoggedReset]:
         yield from read_segment(segment.path)
     except (FormatError, OSError) as error:
         raise ToolError(str(error)) from error
+
+
+def read_segment(path: Path) -> Iterator[LoggedScan | LoggedReset]:
+    """Yield what a file of the log has, in the order in which it came.
+
+    Raises:
+        DamagedMapFileError: the file is damaged, or is none of the log.
+        OSError: it cannot be read.
+    """
+    with io.BufferedReader(open_regular(path)) as stream:
+        try:
+            yield from _entries(stream)
+        except Exception as error:  # as the library comes upon what it did not expect
+            raise DamagedMapFileError(f"{path} is damaged: {error!r}") from error
+
+
+def _entries(stream: IO[bytes]) -> Iterator[LoggedScan | LoggedReset]:
+    topics: dict[int, str] = {}
+    transform, no_return = None, np.zeros((0, 3), np.float32)
+    is_whole = False
+    for record in StreamReader(stream, validate_crcs=True).records:
+        is_whole |= isinstance(record, Footer)
+        if isinstance(record, Channel):
+            topics[record.id] = record.topic
+        if not isinstance(record, Message):
+            continue
+        topic, data = topics[record.channel_id], record.data
+        if topic == TRANSFORMS:
+            (transform,), no_return = decode_cdr(data, TF).transforms, no_return[:0]
+        elif topic == RESETS:
+            yield LoggedReset(*np.frombuffer(data, "<f8").reshape(2, 3))
+        elif topic.startswith(NO_RETURN):
+            no_return = np.frombuffer(data, "<f4").reshape(-1, 3)
+        elif topic.startswith(SCANS):
+            yield _scan(decode_cdr(data, POINT_CLOUD), transform, no_return)
+    if not is_whole:
+        raise FormatError("it has no end")
+
+
+def _scan(cloud: Any, transform: Any, no_return: Floats) -> LoggedScan:
+    """Return a scan of its cloud and the transform before it."""
+    source, stamp = cloud.header.frame_id, stamp_ns(cloud.header)
+    if (transform.child_frame_id, stamp_ns(transform.header)) != (source, stamp):
+        raise FormatError(f"a scan of {source} has no pose before it")
+    at, turn = transform.transform.translation, transform.transform.rotation
+    pose = pose_matrices(np.array([at.x, at.y, at.z]), np.array([turn.x, turn.y, turn.z, turn.w]))
+    points = np.frombuffer(cloud.data, "<f4").reshape(-1, 3)
+    return LoggedScan(source, stamp, pose, points, no_return)
 
 
 def _outside(scan: LoggedScan, resets: Sequence[LoggedReset]) -> Floats:

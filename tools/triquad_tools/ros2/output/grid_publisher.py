@@ -6,11 +6,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 from triquad_client import Client, Grid, Status
+from triquad_format.scan_log.cdr import CdrWriter
 
 from triquad_tools.ros2.intake.intake import Place
 from triquad_tools.ros2.options import SliceShape
 from triquad_tools.ros2.output.topic_publisher import TopicPublisher
-from triquad_tools.sensors.ros.type_store import CdrWriter
 
 _PERIOD_S = 1.0  # between two slices
 _MAX_SHARE = 4  # the server works on slices for at most one part in four of the time

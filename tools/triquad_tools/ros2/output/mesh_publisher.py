@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from triquad_client import Client, MeshTile, MeshWatch
 from triquad_format.records.arrays import Doubles, Floats
+from triquad_format.scan_log.cdr import CdrWriter
 
 from triquad_tools.ros2.intake.intake import Place
 from triquad_tools.ros2.output.topic_publisher import TopicPublisher
-from triquad_tools.sensors.ros.type_store import CdrWriter
 
 _TRIANGLE_LIST = 11
 _NO_CORNERS = np.empty((0, 3))

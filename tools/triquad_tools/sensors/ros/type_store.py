@@ -1,14 +1,9 @@
-"""Messages of ROS: their names, times and types; and written as CDR from arrays.
-
-The library writes messages too, but from objects: large ones take seconds.
-"""
+"""Messages of ROS: their names, times and types."""
 
 import re
 from functools import cache
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
@@ -33,7 +28,6 @@ MARKER = "visualization_msgs/msg/Marker"
 OCCUPANCY_GRID = "nav_msgs/msg/OccupancyGrid"
 
 _MAX_CHARACTERS = 64  # of the name of a source
-_LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 
 
 @cache
@@ -56,35 +50,3 @@ def source_of_topic(topic: str) -> str:
     """Return the source name of a topic's scans: ``/lidar/points`` is ``lidar.points``."""
     name = re.sub(r"[^A-Za-z0-9_.-]", "_", topic.strip("/").replace("/", "."))
     return re.sub(r"^[^A-Za-z0-9]+", "", name)[:_MAX_CHARACTERS] or "default"
-
-
-class CdrWriter:
-    """Fields in the order of the message's definition (OMG formal/02-06-51, chapter 15)."""
-
-    def __init__(self) -> None:
-        self._data = bytearray()
-
-    def numbers(self, dtype: str, *values: float) -> "CdrWriter":
-        """Write numbers of one type, such as ``<f8``."""
-        return self._array(np.array(values, dtype))
-
-    def text(self, value: str) -> "CdrWriter":
-        """Write a string."""
-        data = value.encode() + b"\x00"
-        self.numbers("<u4", len(data))
-        self._data += data
-        return self
-
-    def sequence(self, values: NDArray[np.generic]) -> "CdrWriter":
-        """Write elements [N, ...] of one or more numbers each."""
-        self.numbers("<u4", len(values))
-        return self._array(values) if len(values) else self
-
-    def payload(self) -> bytes:
-        """Return the bytes of the message."""
-        return _LITTLE_ENDIAN + bytes(self._data)
-
-    def _array(self, values: NDArray[np.generic]) -> "CdrWriter":
-        self._data += bytes(-len(self._data) % values.itemsize)
-        self._data += values.tobytes()
-        return self
