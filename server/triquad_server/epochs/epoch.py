@@ -101,9 +101,13 @@ class Epoch(ComposedView):
         """The memory of the epoch; epochs share that of what did not change between them."""
         return ChainMap(*(dict(region.buffers) for region in self.frozen_regions))
 
-    def record(self) -> MapRecord:
-        """Return the epoch as a map file holds it, without training state."""
-        regions = tuple(region.record() for region in self.frozen_regions)
+    def record(self, regions: tuple[Region, ...] | None = None) -> MapRecord:
+        """Return the epoch as a map file holds it, with these ``regions`` of it.
+
+        ``None``: all regions, without training state.
+        """
+        if regions is None:
+            regions = tuple(region.record() for region in self.frozen_regions)
         return MapRecord(
             self._name, self.number, self.field_settings, regions, self.progress, self.origin_m
         )

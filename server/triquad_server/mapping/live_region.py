@@ -148,7 +148,5 @@ class LiveRegion:
             training=self.training.state(),
             table=self.training.rays.table,
             trained=len(self.training.rays.pool),
-            placement=self._setup.placement,
-            settings=self._setup.field,
-            team=self._setup.team,
+            setup=self._setup,
         )

@@ -3,12 +3,12 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from triquad_format.records.field_settings import FieldSettings, RegionIndex
+from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.region import MapRecord, Region, TrainingState
-from triquad_map.compiled.team import Team
 
 from triquad_server.epochs.epoch import Epoch
-from triquad_server.mapping.replay.ray_table import Placement, RayTable, draw_ordered_samples
+from triquad_server.mapping.region_setup import RegionSetup
+from triquad_server.mapping.replay.ray_table import RayTable, draw_ordered_samples
 from triquad_server.mapping.replay.replay_record import recorded_rays
 
 
@@ -23,16 +23,16 @@ class RegionSnapshot:
     training: TrainingState  # without rays and samples
     table: RayTable  # all kept rays: those to train on, then those that are held out
     trained: int  # how many are to train on
-    placement: Placement  # of samples in place of what is no ray that ends in the cube
-    settings: FieldSettings
-    team: Team
+    setup: RegionSetup
 
     def record(self) -> Region:
         """Return the region with all of its training state as plain arrays."""
-        rays, others = recorded_rays(self.table, self.settings)
+        setup = self.setup
+        rays, others = recorded_rays(self.table, setup.field)
         others = others[others < self.trained]  # samples are for training
         rng = np.random.default_rng(len(others))
-        samples = draw_ordered_samples(self.table, others, self.placement, rng, self.team)
+        # In place of what is no ray that ends in the cube.
+        samples = draw_ordered_samples(self.table, others, setup.placement, rng, setup.team)
         training = replace(
             self.training,
             rays=rays,
@@ -46,16 +46,10 @@ class RegionSnapshot:
 class MapSnapshot:
     """The map as it was at a moment: of the regions that changed since another, what they hold."""
 
-    name: str
-    settings: FieldSettings
     changed: tuple[RegionSnapshot, ...]
     regions: tuple[RegionIndex, ...]  # all regions of the map
     epoch: Epoch  # the same state, for queries
 
     def record(self) -> MapRecord:
         """Return the changed regions with training state: a second for 100 m of a street."""
-        regions = tuple(region.record() for region in self.changed)
-        epoch = self.epoch
-        return MapRecord(
-            self.name, epoch.number, self.settings, regions, epoch.progress, epoch.origin_m
-        )
+        return self.epoch.record(tuple(region.record() for region in self.changed))

@@ -245,4 +245,4 @@ class Mapper:
         }
         snapshots = tuple(r.snapshot() for r in self.regions if r.index in changed)
         indices = tuple(region.index for region in self.regions)
-        return MapSnapshot(self._name, self._setup.field, snapshots, indices, newest)
+        return MapSnapshot(snapshots, indices, newest)
