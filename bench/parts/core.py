@@ -12,7 +12,7 @@ from triquad_format.records.arrays import Doubles
 from triquad_format.records.status import Status
 from triquad_map.mesh.tile_mesh import mesh_tile
 from triquad_server.engine.live_field import Batch, Rates
-from triquad_server.engine.tensor_field import FieldTensors, TensorField
+from triquad_server.engine.tensor_field import TensorField, tensors_of
 from triquad_server.engine.tensor_trainer import TensorTrainer
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.live_region import LiveRegion
@@ -96,7 +96,7 @@ def _training(region: LiveRegion) -> list[Figure]:
 def _queries(epoch: Epoch, region: LiveRegion, points: Doubles) -> list[Figure]:
     local = (points - region.centre).astype(np.float32)
     field, team = region.field, Teams().answers
-    slow, fast = TensorField(field.settings, field.tree, FieldTensors.of(field)), field.freeze()
+    slow, fast = TensorField(field.settings, field.tree, tensors_of(field)), field.freeze()
 
     def ratio(gradient: bool) -> float:
         def evaluate(first: int, last: int) -> None:

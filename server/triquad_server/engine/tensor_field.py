@@ -25,25 +25,16 @@ from triquad_map.field.quadtree import (
 )
 
 from triquad_server.engine.live_field import LiveField
-from triquad_server.engine.memory import Array
+from triquad_server.engine.memory import Array, FieldNumbers
 
 _CHUNK = 131_072  # points that tensors are made for at a time
 
 
-@dataclass(frozen=True)
-class FieldTensors:
-    """The numbers of a field, all on one device."""
-
-    features: Tensor  # [rows, d] by the rows of the tree; row 0, of absent vertices, is zero
-    mlp: tuple[Tensor, ...]  # weights [in, out] and bias [out] of each layer in turn
-    frequencies: Tensor  # [m] of Fourier features, on coordinates normalised to [-1, 1]
-
-    @classmethod
-    def of(cls, field: LiveField) -> "FieldTensors":
-        """Return the numbers of a field as they are now; those in arrays as tensors, too."""
-        features, mlp, frequencies = field.numbers
-        tensor = torch.as_tensor
-        return cls(tensor(features), tuple(map(tensor, mlp)), tensor(frequencies))
+def tensors_of(field: LiveField) -> FieldNumbers:
+    """Return the numbers of a field as they are now, as tensors; they share memory with arrays."""
+    features, mlp, frequencies = field.numbers
+    tensor = torch.as_tensor
+    return FieldNumbers(tensor(features), tuple(map(tensor, mlp)), tensor(frequencies))
 
 
 @dataclass(frozen=True)
@@ -126,7 +117,7 @@ class TensorField:
     """
 
     def __init__(
-        self, settings: FieldSettings, tree: LiveQuadtree | FrozenQuadtree, tensors: FieldTensors
+        self, settings: FieldSettings, tree: LiveQuadtree | FrozenQuadtree, tensors: FieldNumbers
     ) -> None:
         self.settings = settings
         self.tree = tree

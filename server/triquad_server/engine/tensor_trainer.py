@@ -8,7 +8,7 @@ from torch import Tensor
 
 from triquad_server.engine.compiled_trainer import EPSILON
 from triquad_server.engine.live_field import LAST_AGE, Batch, LiveField, Parameter, Rates
-from triquad_server.engine.tensor_field import Corners, FieldTensors, TensorField
+from triquad_server.engine.tensor_field import Corners, TensorField, tensors_of
 
 
 class ParameterTensors(NamedTuple):
@@ -31,7 +31,7 @@ class TensorTrainer:
 
     def __init__(self, field: LiveField) -> None:
         self._field = field
-        self._tensor_field = TensorField(field.settings, field.tree, FieldTensors.of(field))
+        self._tensor_field = TensorField(field.settings, field.tree, tensors_of(field))
 
     def train(self, batch: Batch, rates: Rates) -> Tensor:
         """Take one optimiser step; return the loss before it.
@@ -60,7 +60,7 @@ class TensorTrainer:
         """Return the field with all its present vertices, in their present memory."""
         field = self._field
         field.thaw()
-        tensors = FieldTensors.of(field)
+        tensors = tensors_of(field)
         if len(self._tensor_field.tensors.features) != len(tensors.features):
             self._tensor_field = TensorField(field.settings, field.tree, tensors)
         else:

@@ -16,7 +16,7 @@ from triquad_server.engine.field_record import field_from_record, region_record
 from triquad_server.engine.gradient_sums import GradientSums
 from triquad_server.engine.live_field import Batch, LiveField, Parameter, Rates, initial_field
 from triquad_server.engine.memory import ArrayMemory, memory_on
-from triquad_server.engine.tensor_field import FieldTensors, TensorField
+from triquad_server.engine.tensor_field import TensorField, tensors_of
 from triquad_server.engine.tensor_trainer import (
     ParameterTensors,
     TensorTrainer,
@@ -48,7 +48,7 @@ def trained(settings: FieldSettings) -> LiveField:
 
 
 def in_tensors(field: LiveField) -> TensorField:
-    return TensorField(field.settings, field.tree, FieldTensors.of(field))
+    return TensorField(field.settings, field.tree, tensors_of(field))
 
 
 def leaves(settings: FieldSettings, batch: Batch) -> np.ndarray:
