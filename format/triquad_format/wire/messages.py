@@ -5,7 +5,6 @@ Positions are ``float32`` offsets from a ``float64`` origin, so that a map in la
 Numbers of epochs compare only within one ``ServerStatus.server``.
 """
 
-import functools
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -29,8 +28,6 @@ from triquad_format.wire.places import PLACE
 
 MAX_ORIGIN_BYTES = 1024
 """A longer attachment is not read."""
-
-_REMEMBERED = 256
 
 Positions = Annotated[NDArray[np.float32], ArraySpec("<f4", (None, 3))]
 Values = Annotated[NDArray[np.float32], ArraySpec("<f4", (None,))]
@@ -280,11 +277,8 @@ class RequestOrigin(Message):
 
 def read_origin(attachment: bytes) -> RequestOrigin | None:
     """Return the origin that an attachment names; ``None`` where it names none."""
-    return None if len(attachment) > MAX_ORIGIN_BYTES else _decoded(attachment)
-
-
-@functools.lru_cache(_REMEMBERED)  # a client attaches the same to all that it asks
-def _decoded(attachment: bytes) -> RequestOrigin | None:
+    if len(attachment) > MAX_ORIGIN_BYTES:
+        return None
     try:
         return decode(RequestOrigin, attachment)
     except WireError:
