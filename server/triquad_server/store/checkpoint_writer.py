@@ -227,18 +227,14 @@ class CheckpointWriter:
             raise StoreError(f"a checkpoint was not written: {NO_MEMORY}") from error
         if (warning := self.warning) is not None:
             _log.warning("%s", warning)
-        self._record(info, time.monotonic() - started)
-        self._saved_s = asked_s
-        return info
-
-    def _record(self, info: CheckpointInfo, took_s: float) -> None:
-        """Record that a checkpoint was written."""
-        self.error = None
-        self._ended_s = time.monotonic()
+        self.error, self._saved_s, self._ended_s = None, asked_s, time.monotonic()
         self._metrics = replace(
-            self._metrics, written=self._metrics.written + 1, last_duration_s=took_s
+            self._metrics,
+            written=self._metrics.written + 1,
+            last_duration_s=self._ended_s - started,
         )
         _log.info("checkpoint %s: epoch %d, %d bytes", info.path, info.epoch, info.bytes)
+        return info
 
     def _write_regularly(self) -> None:
         due_s = time.monotonic() + self._period_s

@@ -10,7 +10,6 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 from triquad_format.errors import FormatError
@@ -48,14 +47,6 @@ _FEATURE_DTYPE = "<f2"
 _MAPS_NAMED = 8  # maps of a store that are named where an epoch is not found
 
 
-@dataclass(frozen=True)
-class _Newest:
-    """The newest checkpoint, from which later ones take the parts that did not change."""
-
-    manifest: Manifest
-    info: CheckpointInfo
-
-
 class Store:
     """Manages the checkpoints of one map, for one thread; one server at a time locks the folder."""
 
@@ -67,7 +58,7 @@ class Store:
         """
         self.folder = root / map_name
         self.keep_resets = settings.keep_resets
-        self._newest: _Newest | None = None
+        self._newest: Manifest | None = None  # from which later ones take what did not change
         self._restored: Restored | None = None  # the last time that the map was restored
         self._settings = settings
         # That the map takes in, from :meth:`log_scans` on.
@@ -85,7 +76,7 @@ class Store:
 
     def log_scans(self, leaf_m: float) -> None:
         """Keep scans, too, from the newest checkpoint on; ``leaf_m`` is the side of a voxel."""
-        epoch = 0 if self._newest is None else self._newest.info.epoch
+        epoch = 0 if self._newest is None else self._newest.facts.epoch
         most = self._settings.log_max_bytes
         self.scans = ScanLog(self.folder, most, leaf_m, epoch, self._restored)
 
@@ -101,16 +92,16 @@ class Store:
         That is the newest checkpoint's, as long as its file is as it was written, and its parts are
         there.
         """
-        newest = self._newest
-        if newest is None:
+        newest, info = self._newest, self.last
+        if newest is None or info is None:
             return None
         try:
-            data = Path(newest.info.path).read_bytes()
+            data = Path(info.path).read_bytes()
         except OSError:
             return None
-        unchanged = hashlib.sha256(data).hexdigest() == newest.info.sha256
-        has_parts = all(map(PartFiles(self.folder).has, newest.manifest.entries))
-        return newest.info.epoch if unchanged and has_parts else None
+        unchanged = hashlib.sha256(data).hexdigest() == info.sha256
+        has_parts = all(map(PartFiles(self.folder).has, newest.entries))
+        return info.epoch if unchanged and has_parts else None
 
     def newest(self) -> ValidCheckpoint | None:
         """Return the newest valid checkpoint, from which the map goes on; ``None``: there is none.
@@ -121,7 +112,7 @@ class Store:
         newest = newest_valid(self.folder)
         self.last = None if newest is None else newest.info
         if newest is not None and newest.checkpoint is not None:
-            self._newest = _Newest(newest.checkpoint.manifest, newest.info)
+            self._newest = newest.checkpoint.manifest
             self._restored = newest.checkpoint.restored
         return newest
 
@@ -146,8 +137,8 @@ class Store:
         newest = self._newest
         if newest is None:
             return False
-        names = {entry.name for entry in newest.manifest.entries}
-        if name not in names | {Path(newest.info.path).name}:
+        names = {entry.name for entry in newest.entries}
+        if name not in names | {checkpoint_name(newest.facts.epoch)}:
             return False
         self._newest = None
         return True
@@ -202,7 +193,7 @@ class Store:
         Those of ``regions`` that are not in the record are in the newest checkpoint.
         """
         before: dict[RegionIndex, list[Entry]] = {}
-        for entry in self._newest.manifest.entries if self._newest else ():
+        for entry in self._newest.entries if self._newest else ():
             before.setdefault(entry.key.region, []).append(entry)
         changed = {region.index: region for region in record.regions}
         new = NewParts(self.folder, record.epoch)
@@ -229,7 +220,7 @@ class Store:
             sha256=written.sha256,
             stamp_ns=manifest.stamp_ns,
         )
-        self._newest, self.last = _Newest(manifest, info), info
+        self._newest, self.last = manifest, info
         delete_unneeded(self.folder, self._settings, info.epoch)
         return info
 
