@@ -81,20 +81,20 @@ def test_a_record_restores_the_map_and_its_training(mapped: Mapper) -> None:
 def test_a_restarted_map_tells_what_it_was_made_of_until_all_of_it_is_reset(
     mapped: Mapper,
 ) -> None:
-    record = mapped.changes_since(None).record
+    record = mapped.snapshot_since(None).record()
     assert record.progress.scans_taken == len(world().scans)
     restarted = Mapper("test", settings(), "cpu", record)
     assert restarted.publish().record().progress == record.progress, "a download tells it, too"
     restarted.reset(np.zeros(3), np.ones(3))
     assert restarted.progress == record.progress, "only a corner was forgotten"
     restarted.reset(*EVERYWHERE)
-    assert restarted.changes_since(None).record.progress == MapProgress()
+    assert restarted.snapshot_since(None).record().progress == MapProgress()
     take_in(restarted, world().scans[-1])
     assert restarted.scans_taken == 1
 
 
 def test_what_the_field_forgets_after_a_restart_is_told(mapped: Mapper) -> None:
-    restarted = Mapper("test", settings(), "cpu", mapped.changes_since(None).record)
+    restarted = Mapper("test", settings(), "cpu", mapped.snapshot_since(None).record())
     before, before_m = map_fit(restarted.regions), surface_error(restarted.publish(), world())
     damage(restarted)
     settle(restarted)
