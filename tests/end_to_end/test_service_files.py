@@ -105,11 +105,11 @@ def test_a_reset_while_the_last_checkpoint_is_written_is_not_acknowledged(tmp_pa
     replies = []
     write = Store.write
 
-    def reset_meanwhile(store, changes, undoes=""):
+    def reset_meanwhile(store, *checkpoint):
         with servers.raw_session(connect=endpoint) as session:
             request = ResetRequest(np.full(3, -np.inf), np.full(3, np.inf))
             replies.append(servers.RawPeer(session).ask(keys.RESET, codec.encode(request)))
-        return write(store, changes, undoes)
+        return write(store, *checkpoint)
 
     with servers.running_service(store=tmp_path) as endpoint:
         with triquad_client.connect(endpoint) as client:

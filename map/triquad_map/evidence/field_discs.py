@@ -4,8 +4,9 @@ import numpy as np
 from triquad_format.records.arrays import Bytes, Floats, Longs
 
 from triquad_map.compiled.kernel import inner_kernel, kernel
+from triquad_map.evidence.ended_rays import COUNTED_ENDS
 from triquad_map.evidence.observed import (
-    COUNTED_ENDS,
+    FILLED,
     Observed,
     ObservedVoxel,
     is_flat,
@@ -17,7 +18,6 @@ from triquad_map.evidence.seen_voxels import SeenVoxels
 from triquad_map.surface import SurfelKind
 
 _DISC = int(SurfelKind.DISC)
-_DISC_SPREAD = 1 / 12  # variance of ends that lie evenly over the side of a voxel
 
 
 @kernel()
@@ -39,7 +39,7 @@ def set_discs(
         for axis in range(3):
             voxel.mean[axis] = offsets[i, axis] + 0.5 if is_disc else np.nan
             voxel.normal[axis] = normals[i, axis] if is_disc else 0.0
-        _set_spread(voxel, _DISC_SPREAD)
+        _set_spread(voxel, FILLED)
         voxel.ends = COUNTED_ENDS if is_disc else 0
     for i in range(len(voxels)):
         row = row_of(seen, observed, voxels[i, 0], voxels[i, 1], voxels[i, 2])

@@ -12,12 +12,13 @@ from triquad_map.compiled.team import Split, in_one
 from triquad_map.compiled.voxel_index import VoxelIndex, with_room
 from triquad_map.evidence.belief import Belief, Changes, believe
 from triquad_map.evidence.carving import Reach, mark_crossed
+from triquad_map.evidence.ended_rays import extend_new
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.evidence.growth import EvidenceSize
 from triquad_map.evidence.neighbours import ask_neighbours
 from triquad_map.evidence.normals import NormalSearch
 from triquad_map.evidence.observations import Observations
-from triquad_map.evidence.observed import Observed, Sighting, extend_new
+from triquad_map.evidence.observed import Observed, Sighting
 from triquad_map.evidence.ray_surfels import ray_surfels
 from triquad_map.evidence.seen_voxels import SeenVoxels, mark
 from triquad_map.surface import Surfels

@@ -25,6 +25,7 @@ from triquad_map.compiled.voxel_index import (
     make_row,
     pack,
 )
+from triquad_map.evidence.observed import FILLED
 
 _SPACINGS = 3.0
 """Spacings of a scan's rays within which two are neighbours: some 28 are, of each."""
@@ -40,7 +41,6 @@ _SHARE = 0.4
 """The share of its neighbours than which such a return ends no nearer. Smooth ground has just half:
 with 0.5, a corridor at 16 beams loses 1 % of what stands at the first scan."""
 
-_FILLED = 1 / 12  # square voxels: variance along an axis of what fills a voxel from side to side
 _MOST_COMPARED = 256  # rays with one: where they are spread evenly, some 100 are near enough
 _PATCH = 0.25  # radians: the sensor's field of view is counted in patches of this side
 
@@ -153,9 +153,9 @@ def _ask(i: int, rays: _Rays, extent: Doubles) -> bool:
                     _extend(i, np.int64(j), rays, extent)
             j = rays.before[j]
     if same == 0:  # nothing tells where to: it may be anywhere in the voxel
-        extent[0] = extent[3] = extent[5] = _FILLED
+        extent[0] = extent[3] = extent[5] = FILLED
     for k in range(6):
-        extent[k] *= 1.0 if same == 0 else 2 * _FILLED / same
+        extent[k] *= 1.0 if same == 0 else 2 * FILLED / same
     return same >= _OTHERS or (no_farther >= _OTHERS and no_farther >= _SHARE * count)
 
 

@@ -19,6 +19,7 @@ from triquad_format.records.region import (
 
 from triquad_map.compiled.team import Split
 from triquad_map.compiled.voxel_index import SHIFT, with_room
+from triquad_map.evidence.ended_rays import record_ends
 from triquad_map.evidence.field_discs import set_discs
 from triquad_map.evidence.observed import (
     EIGHTHS,
@@ -26,7 +27,6 @@ from triquad_map.evidence.observed import (
     OBSERVED_VOXEL,
     Observed,
     Sighting,
-    record_ends,
 )
 from triquad_map.evidence.seen_voxels import SeenVoxels
 from triquad_map.evidence.support import Support, fill_support

@@ -1,7 +1,4 @@
-"""Observations of each voxel in which rays ended: a record for each, to which scans add.
-
-Kernels stop where there is no more room; the caller makes room and goes on.
-"""
+"""Observations of each voxel in which rays ended: a record for each, and which are around it."""
 
 from typing import Any, NamedTuple
 
@@ -13,16 +10,11 @@ from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.voxel_index import (
     LOW,
     SHIFT,
-    bit_of,
-    block_key,
     byte_of,
     find_block,
-    is_inside,
-    make_row,
     unpack,
 )
 from triquad_map.evidence.seen_voxels import SeenVoxels
-from triquad_map.surface import NEAR_M
 
 OBSERVED_VOXEL = np.dtype(
     [
@@ -61,6 +53,11 @@ are two where one is higher over the other."""
 MOST_SEEN = np.float32(10)
 """Scans' worth of rays that a record counts: what was seen longer is no surer, so that what stood
 for an hour goes as what stood for a minute."""
+
+FILLED = 1 / 12  # square voxels: variance of ends that lie evenly over the side of a voxel
+
+PRIOR_ENDS = 2.0
+"""Ends that the shape of a surface counts for that is assumed before any."""
 
 ObservedVoxel = Any
 """A record of OBSERVED_VOXEL."""
@@ -166,13 +163,6 @@ def _add_rows(
     return count
 
 
-PRIOR_ENDS = 2.0
-"""Ends that the shape of a surface counts for that is assumed before any."""
-
-COUNTED_ENDS = 64
-"""The ends of a voxel that count; the shape that further ones give counts as that of as many."""
-
-
 class Sighting(NamedTuple):
     """The place and the time of a scan."""
 
@@ -181,139 +171,3 @@ class Sighting(NamedTuple):
     stamp_s: int  # seconds since 1970
     scan: int  # its number, from 1 on; that of the next is greater
     unlearnt_since: int = 0  # the first scan of whose surface the field has not learnt all
-
-
-@kernel(inline="always")
-def _sector(x: float, y: float) -> int:
-    """Return which eighth of the horizon a direction lies in."""
-    eighth = 0 if y >= 0 else 4
-    if (x >= 0) != (y >= 0):
-        eighth += 2
-    return eighth + (1 if abs(y) > abs(x) else 0)
-
-
-@kernel(inline="always")
-def _add_ray(voxel: ObservedVoxel, end: Vector, sighting: Sighting) -> None:
-    """Count a ray that ended at ``end``, voxels, by how far and where the sensor was."""
-    origin, towards = sighting.origin, voxel.towards
-    dx, dy, dz = origin[0] - end[0], origin[1] - end[1], origin[2] - end[2]
-    towards[0], towards[1], towards[2] = dx, dy, dz
-    square = (dx * dx + dy * dy + dz * dz) * (sighting.leaf_m / NEAR_M) ** 2
-    voxel.weight += np.float32(1 / (1 + square))
-    voxel.sectors |= 1 << _sector(dx, dy)
-
-
-@kernel(inline="always")
-def _begin_hit(voxel: ObservedVoxel, scan: int) -> None:
-    """Count a scan of which a ray ended in a voxel: what passed before goes to its record."""
-    if voxel.hit_scan == scan:
-        voxel.ended += 1
-        return
-    voxel.hit_scan = scan
-    voxel.ended, voxel.crossed = 1, 0
-    voxel.scans = min(voxel.scans + 1, MOST_SCANS)
-    if voxel.ends > 0:  # else they passed while nothing was there
-        voxel.earlier_misses += voxel.misses
-    else:
-        voxel.first_scan = scan
-        voxel.hits = voxel.earlier_misses = 0
-    voxel.misses = 0
-    voxel.hits += 1
-    share = MOST_SEEN / max(np.float32(MOST_SEEN), voxel.hits + voxel.earlier_misses)
-    voxel.hits *= share
-    voxel.earlier_misses *= share
-
-
-@kernel(inline="always")
-def _add_end(voxel: ObservedVoxel, end: Vector) -> None:
-    """Move the shape of the surface in a voxel by a ray that ended at a place in it."""
-    mean, normal = voxel.mean, voxel.normal
-    count = min(voxel.ends + np.float32(1), np.float32(COUNTED_ENDS))
-    if count == 1:
-        for axis in range(3):
-            mean[axis], normal[axis] = end[axis], 0
-        voxel.spread[:] = 0
-    voxel.ends = count
-    x, y, z = end[0] - mean[0], end[1] - mean[1], end[2] - mean[2]
-    for axis in range(3):
-        eighth = int(EIGHTHS * end[axis])
-        voxel.lowest[axis] = min(voxel.lowest[axis], eighth)
-        voxel.highest[axis] = max(voxel.highest[axis], eighth)
-        mean[axis] += np.float32(end[axis] - mean[axis]) / count
-    share = np.float32(1 - 1 / count)  # from the old mean to the new one
-    spread = voxel.spread
-    spread[0] += (np.float32(x * x) * share - spread[0]) / count
-    spread[1] += (np.float32(x * y) * share - spread[1]) / count
-    spread[2] += (np.float32(x * z) * share - spread[2]) / count
-    spread[3] += (np.float32(y * y) * share - spread[3]) / count
-    spread[4] += (np.float32(y * z) * share - spread[4]) / count
-    spread[5] += (np.float32(z * z) * share - spread[5]) / count
-
-
-@kernel()
-def extend_new(rows: Ints, extents: Doubles, scan: int, observed: Observed) -> None:
-    """Let the surface extend in the voxels of ``rows`` [N], where it was first hit in a scan.
-
-    ``extents`` [N, 6] are covariances, square voxels. Until there are more ends, they are all that
-    tells its shape: they count as much as :data:`PRIOR_ENDS` and the first one.
-    """
-    for i, row in enumerate(rows):
-        voxel = observed.voxels[row]
-        if voxel.first_scan == scan:
-            share = (PRIOR_ENDS + 1) / (voxel.ends * voxel.ended)  # all its rays of the scan add
-            for axis in range(6):
-                voxel.spread[axis] += np.float32(share * extents[i, axis])
-
-
-@kernel()
-def record_ends(
-    voxels: Doubles,
-    start: int,
-    seen: SeenVoxels,
-    blocks: int,
-    sighting: Sighting,
-    observed: Observed,
-    places: int,
-    rows: int,
-    found: Ints,
-) -> tuple[int, int, int, int]:
-    """Count rays that ended at ``voxels`` [N, 3].
-
-    The row of each ray's voxel goes to ``found`` [N]; 0 outside the region. Returns (points done,
-    blocks, places, rows in use); where there is no more room, not all points are done.
-    """
-    for i in range(start, len(voxels)):
-        end = (voxels[i, 0], voxels[i, 1], voxels[i, 2])
-        x, y, z = int(np.floor(end[0])), int(np.floor(end[1])), int(np.floor(end[2]))
-        found[i] = 0
-        if not is_inside(x, y, z, seen.side):
-            continue
-        block = make_row(seen.blocks, blocks, block_key(x, y, z))
-        if block < 0:
-            return i, blocks, places, rows
-        blocks = max(blocks, block + 1)
-        place = observed.places[block]
-        if place == 0:
-            if places == len(observed.seen_s):
-                return i, blocks, places, rows
-            place = places
-            observed.places[block] = place
-            places += 1
-        voxel = byte_of(x, y) << SHIFT | (z & LOW)
-        row = observed.rows[place, voxel]
-        if row == 0:
-            if rows == len(observed.voxels):
-                return i, blocks, places, rows
-            row = rows
-            observed.rows[place, voxel] = row
-            observed.ended[place, voxel >> SHIFT] |= bit_of(z)
-            observed.voxels[row].owner = block << (3 * SHIFT) | voxel
-            forget_ends(observed.voxels[row])
-            rows += 1
-        found[i] = row
-        observed.seen_s[place] = max(observed.seen_s[place], sighting.stamp_s)
-        known = observed.voxels[row]
-        _add_ray(known, end, sighting)
-        _begin_hit(known, sighting.scan)
-        _add_end(known, (end[0] - x, end[1] - y, end[2] - z))
-    return len(voxels), blocks, places, rows
