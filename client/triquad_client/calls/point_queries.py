@@ -17,7 +17,7 @@ from triquad_map.questions.spheres import Spheres
 from triquad_map.view import FieldAnswer
 
 from triquad_client import checks
-from triquad_client.calls.parts import Asking, Part
+from triquad_client.calls.questions_in_parts import Asking, Part
 from triquad_client.checks import Bounds
 from triquad_client.net.connection import NEWEST, Answering, retried
 

@@ -24,7 +24,7 @@ from triquad_map.questions.rays import RayRanges
 from triquad_map.questions.segments import Polyline, Segments, along_polyline
 
 from triquad_client import checks
-from triquad_client.calls.parts import Asking, Part
+from triquad_client.calls.questions_in_parts import Asking, Part
 from triquad_client.pose import PoseLike, rigid_pose
 
 _MOST_WAYS = 1_000

@@ -1,1 +1,1 @@
-"""Kernels of the evidence: what rays have shown."""
+"""The evidence: what rays have shown of each voxel, and what is believed of it."""

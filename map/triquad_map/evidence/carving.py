@@ -1,9 +1,8 @@
 """Rays that carve: the voxels that they cross are free, surfaces that they pass contradicted.
 
 A ray contradicts the surface in a voxel by the chance that it would have ended there: the ends in a
-voxel lie about their mean as a Gaussian. Near its own end a ray says nothing.
-
-Kernels stop where the index has no more room; the caller makes room and goes on.
+voxel lie about their mean as a Gaussian. Kernels stop where the index has no more room; the caller
+makes room and goes on.
 """
 
 from typing import NamedTuple
@@ -32,6 +31,12 @@ from triquad_map.evidence.observed import (
     voxel_of,
 )
 from triquad_map.evidence.seen_voxels import SeenVoxels
+
+FREE_SHORT = 0.5  # voxels before its end up to which a ray shows free space
+
+CLEAR_SHORT = 2.5
+"""Voxels before its end up to which a ray shows that surface is not there: closer, it may belong to
+what it ends on."""
 
 _LEAST_SPREAD = 0.05
 """Standard deviation of the ends in a voxel in any direction, at least, in voxels."""

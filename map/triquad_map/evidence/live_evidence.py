@@ -62,12 +62,13 @@ class LiveEvidence:
         observed = self._observations
         return EvidenceSize(self._blocks.count, observed.blocks, observed.voxels)
 
-    def record_ends(self, voxels: Doubles, sighting: Sighting) -> Ints:
+    def record_ends(self, voxels: Doubles, sighting: Sighting, split: Split = in_one) -> Ints:
         """Record that rays ended at ``voxels`` [N, 3], and from where and when.
 
         Args:
             voxels: the ends of all rays of a scan.
             sighting: the scan.
+            split: shares the work.
 
         Returns:
             The row of what is recorded of each ray's voxel; 0 outside the region.
@@ -75,7 +76,7 @@ class LiveEvidence:
         rows = self.add_ends(voxels, sighting)
         observed = self.observed
         alone = np.flatnonzero(~observed.voxels["company"][rows] & (rows > 0))
-        told = ask_neighbours(voxels - sighting.origin, alone)
+        told = ask_neighbours(voxels - sighting.origin, alone, split)
         observed.voxels["company"][rows[alone[told.have_company]]] = True
         extend_new(rows[alone], told.extents, sighting.scan, observed)
         return rows

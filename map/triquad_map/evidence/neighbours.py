@@ -16,6 +16,7 @@ import numpy as np
 from triquad_format.records.arrays import Bools, Doubles, Ints, Longs
 
 from triquad_map.compiled.kernel import inner_kernel, kernel
+from triquad_map.compiled.team import Split, in_one
 from triquad_map.compiled.voxel_index import (
     Index,
     VoxelIndex,
@@ -42,6 +43,7 @@ _SHARE = 0.4
 with 0.5, a corridor at 16 beams loses 1 % of what stands at the first scan."""
 
 _MOST_COMPARED = 256  # rays with one: where they are spread evenly, some 100 are near enough
+_LEAST_ASKED = 512  # rays; of fewer, a thread of its own gains nothing
 _PATCH = 0.25  # radians: the sensor's field of view is counted in patches of this side
 
 
@@ -63,19 +65,28 @@ class Neighbourhoods(NamedTuple):
     extents: Doubles  # [M, 6] covariances of the surface in a voxel: xx, xy, xz, yy, yz, zz, voxels
 
 
-def ask_neighbours(rays: Doubles, chosen: Longs) -> Neighbourhoods:
+def ask_neighbours(rays: Doubles, chosen: Longs, split: Split = in_one) -> Neighbourhoods:
     """Return what the neighbours of the ``chosen`` [M] rays tell.
 
     Args:
         rays: ends [N, 3] of all rays of a scan, voxels from the sensor.
         chosen: numbers of those that are asked about.
+        split: shares the work.
     """
     directions, ranges = _directions(rays)
     reach = _SPACINGS * _spacing(directions, empty_keys(len(rays)))
     cells = VoxelIndex(max(16, len(rays))).arrays
     last, before = np.empty((2, len(rays)), np.int32)
     of_scan = _Rays(directions, ranges, reach, cells, last, before)
-    return Neighbourhoods(*_ask_neighbours(of_scan, chosen))
+    _enter_cells(of_scan)
+    told = Neighbourhoods(np.zeros(len(chosen), np.bool_), np.zeros((len(chosen), 6)))
+
+    def ask(first: int, last: int) -> None:
+        part = slice(first, last)
+        _ask_some(of_scan, chosen[part], told.have_company[part], told.extents[part])
+
+    split(len(chosen), ask, least=_LEAST_ASKED)
+    return told
 
 
 @kernel()
@@ -119,7 +130,8 @@ def _are_neighbours(i: int, j: int, rays: _Rays) -> bool:
 
 
 @kernel()
-def _ask_neighbours(rays: _Rays, chosen: Longs) -> tuple[Bools, Doubles]:
+def _enter_cells(rays: _Rays) -> None:
+    """Enter each ray in the list of its cell."""
     used = 0
     for i in range(len(rays.ranges)):
         x, y, z = _cell(i, rays)
@@ -127,10 +139,12 @@ def _ask_neighbours(rays: _Rays, chosen: Longs) -> tuple[Bools, Doubles]:
         rays.before[i] = rays.last[row] if row < used else -1
         rays.last[row] = i
         used = max(used, row + 1)
-    have_company, extents = np.zeros(len(chosen), np.bool_), np.zeros((len(chosen), 6))
+
+
+@kernel()
+def _ask_some(rays: _Rays, chosen: Longs, have_company: Bools, extents: Doubles) -> None:
     for n, i in enumerate(chosen):
         have_company[n] = _ask(i, rays, extents[n])
-    return have_company, extents
 
 
 @inner_kernel()

@@ -9,7 +9,7 @@ from triquad_format.records.arrays import Bools, Doubles, Ints, Longs
 from triquad_format.records.region import Evidence
 from triquad_map.compiled.voxel_index import empty_keys, thin
 from triquad_map.evidence.belief import Belief
-from triquad_map.evidence.carving import Reach
+from triquad_map.evidence.carving import CLEAR_SHORT, FREE_SHORT, Reach
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.evidence.growth import EvidenceSize
 from triquad_map.evidence.live_evidence import LiveEvidence
@@ -20,11 +20,6 @@ from triquad_map.surfels.surfel_map import SurfelMap, first_surfels
 
 from triquad_server.intake.rays import ScanRays
 from triquad_server.mapping.region_setup import RegionSetup
-
-_CARVE_SHORT = 0.5  # voxels before its end up to which a ray shows free space
-_CLEAR_SHORT = 2.5
-"""Voxels before its end up to which a ray shows that surface is not there: closer, it may belong to
-what it ends on."""
 
 _FAR_THINNED_AT, _OPEN_THINNED_AT = 0.5, 0.25  # shares of the rays' length
 
@@ -98,7 +93,7 @@ class RegionEvidence:
         ends, origin = self.voxels(rays.ends), self.voxels(rays.origin[None])[0]
         leaf_m = self._setup.field.leaf_m
         sighting = Sighting(origin, leaf_m, stamp_s, self._scans, self._unlearnt_since)
-        rows = self.live.record_ends(ends, sighting)
+        rows = self.live.record_ends(ends, sighting, self._setup.team.split)
         normals = self.live.outdated_normals(rows, self._unlearnt_since)
         carve = partial(self._carved, rays, origin, ends)
         count = len(normals.rows)
@@ -108,8 +103,8 @@ class RegionEvidence:
 
     def _carved(self, rays: ScanRays, origin: Doubles, ends: Doubles) -> Ints:
         """Record what the rays crossed; return the rows that they may have."""
-        clear = math.inf if self._setup.change.static else _CLEAR_SHORT
-        reach = Reach(_CARVE_SHORT, clear, self._scans)
+        clear = math.inf if self._setup.change.static else CLEAR_SHORT
+        reach = Reach(FREE_SHORT, clear, self._scans)
         thinned = ends[thin(ends, 1.0, empty_keys(len(ends)))]
         far_ends = self._thinned(origin, self.voxels(rays.far_ends), _FAR_THINNED_AT)
         passed = self.live.carve(origin, thinned, reach)

@@ -1,4 +1,4 @@
-"""Files that say where a sensor was: ``pose_forms.py`` tells how, as lines of one pose each."""
+"""Files that say where a sensor was; ``trajectory_forms.py`` tells how they are written."""
 
 import re
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from triquad_format.records.pose import pose_matrices
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.arguments import SENSOR, WORLD
-from triquad_tools.recordings.folders.pose_forms import Form, order_of, read_form
+from triquad_tools.recordings.folders.trajectory_forms import Form, order_of, read_form
 from triquad_tools.recordings.text_lines import Line, parse_time, read_lines, rigid, unit_ns
 from triquad_tools.sensors.motion.frame_tree import FrameTree
 from triquad_tools.sensors.motion.track import Track

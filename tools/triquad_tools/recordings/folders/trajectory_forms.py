@@ -84,7 +84,7 @@ _LEVEL = 0.1  # at most, of the x and y of a quaternion: a robot that leans by 1
 def read_form(path: Path) -> tuple[Form, list[Line]]:
     """Return how the poses of a file are written, and the lines that hold them.
 
-    The form is ``None`` where a pose takes several lines, of 3 or 4 numbers.
+    Where a pose takes several lines, of 3 or 4 numbers, they are joined.
 
     Raises:
         ToolError: there are no poses, lines are not of one length, or are of no known form.
