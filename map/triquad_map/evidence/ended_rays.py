@@ -126,10 +126,12 @@ def _add(known: ObservedVoxel, end: Vector, corner: Voxel, sighting: Sighting) -
 
 
 @kernel(inline="always")
-def _begin_voxel(row: int, place: int, voxel: int, observed: Observed) -> None:
+def _begin_voxel(row: int, block: int, voxel: int, observed: Observed) -> None:
     """Let a voxel of a block have the row, in which nothing is recorded."""
+    place = observed.places[block]
     observed.rows[place, voxel] = row
     observed.ended[place, voxel >> SHIFT] |= bit_of(voxel & LOW)
+    observed.voxels[row].owner = block << (3 * SHIFT) | voxel
     forget_ends(observed.voxels[row])
 
 
@@ -172,8 +174,7 @@ def record_ends(
             if rows == len(observed.voxels):
                 return i, blocks, places, rows
             row = rows
-            _begin_voxel(row, place, voxel, observed)
-            observed.voxels[row].owner = block << (3 * SHIFT) | voxel
+            _begin_voxel(row, block, voxel, observed)
             rows += 1
         found[i] = row
         observed.seen_s[place] = max(observed.seen_s[place], sighting.stamp_s)

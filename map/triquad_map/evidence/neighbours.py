@@ -16,6 +16,7 @@ import numpy as np
 from triquad_format.records.arrays import Bools, Doubles, Ints, Longs
 
 from triquad_map.compiled.kernel import inner_kernel, kernel
+from triquad_map.compiled.planes import MOMENTS, add_points
 from triquad_map.compiled.team import Split, in_one
 from triquad_map.compiled.voxel_index import (
     Index,
@@ -79,14 +80,14 @@ def ask_neighbours(rays: Doubles, chosen: Longs, split: Split = in_one) -> Neigh
     last, before = np.empty((2, len(rays)), np.int32)
     of_scan = _Rays(directions, ranges, reach, cells, last, before)
     _enter_cells(of_scan)
-    told = Neighbourhoods(np.zeros(len(chosen), np.bool_), np.zeros((len(chosen), 6)))
+    have_company, moments = np.zeros(len(chosen), np.bool_), np.zeros((len(chosen), MOMENTS))
 
     def ask(first: int, last: int) -> None:
         part = slice(first, last)
-        _ask_some(of_scan, chosen[part], told.have_company[part], told.extents[part])
+        _ask_some(of_scan, chosen[part], have_company[part], moments[part])
 
     split(len(chosen), ask, least=_LEAST_ASKED)
-    return told
+    return Neighbourhoods(have_company, moments[:, 4:])
 
 
 @kernel()
@@ -142,14 +143,14 @@ def _enter_cells(rays: _Rays) -> None:
 
 
 @kernel()
-def _ask_some(rays: _Rays, chosen: Longs, have_company: Bools, extents: Doubles) -> None:
+def _ask_some(rays: _Rays, chosen: Longs, have_company: Bools, moments: Doubles) -> None:
     for n, i in enumerate(chosen):
-        have_company[n] = _ask(i, rays, extents[n])
+        have_company[n] = _ask(i, rays, moments[n])
 
 
 @inner_kernel()
-def _ask(i: int, rays: _Rays, extent: Doubles) -> bool:
-    """Return whether a ray has company, and set the extent [6] of the surface on which it ends."""
+def _ask(i: int, rays: _Rays, moments: Doubles) -> bool:
+    """Return whether a ray has company; ``moments`` tell how the surface extends where it ends."""
     x, y, z = _cell(i, rays)
     compared, count, same, no_farther = 0, 0, 0, 0
     for k in range(27):
@@ -164,26 +165,20 @@ def _ask(i: int, rays: _Rays, extent: Doubles) -> bool:
                 no_farther += farther <= _SAME_RANGE
                 if abs(farther) <= _SAME_RANGE:
                     same += 1
-                    _extend(i, np.int64(j), rays, extent)
+                    _extend(i, np.int64(j), rays, moments)
             j = rays.before[j]
     if same == 0:  # nothing tells where to: it may be anywhere in the voxel
-        extent[0] = extent[3] = extent[5] = FILLED
-    for k in range(6):
-        extent[k] *= 1.0 if same == 0 else 2 * FILLED / same
+        moments[4] = moments[7] = moments[9] = FILLED
+    else:
+        moments *= 2 * FILLED / same
     return same >= _OTHERS or (no_farther >= _OTHERS and no_farther >= _SHARE * count)
 
 
 @inner_kernel()
-def _extend(i: int, j: int, rays: _Rays, extent: Doubles) -> None:
-    """Add the direction from one ray's end to another's, as a product with itself, to [6]."""
+def _extend(i: int, j: int, rays: _Rays, moments: Doubles) -> None:
+    """Add the direction from one ray's end to another's to the moments of such directions."""
     one, other = rays.directions[i], rays.directions[j]
     x = rays.ranges[j] * other[0] - rays.ranges[i] * one[0]
     y = rays.ranges[j] * other[1] - rays.ranges[i] * one[1]
     z = rays.ranges[j] * other[2] - rays.ranges[i] * one[2]
-    share = 1 / max(x * x + y * y + z * z, 1e-12)
-    extent[0] += share * x * x
-    extent[1] += share * x * y
-    extent[2] += share * x * z
-    extent[3] += share * y * y
-    extent[4] += share * y * z
-    extent[5] += share * z * z
+    add_points(moments, (x, y, z), 1 / max(x * x + y * y + z * z, 1e-12))
