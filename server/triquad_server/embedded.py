@@ -197,7 +197,8 @@ def serve(
     folder = None if store is None else Path(store)
     with _free_endpoint() if listen is None else nullcontext(full_endpoint(listen)) as endpoint:
         network = NetworkOptions(listen=(endpoint,))
-        return Server(LaunchOptions(map, network, loaded, folder, device, restore))
+        options = LaunchOptions(map, network, loaded, store=folder, device=device, restore=restore)
+        return Server(options)
 
 
 def _loaded(settings: "Settings | str | Path | None") -> "Settings":

@@ -9,8 +9,13 @@ from triquad_server.engine.gradient_sums import GradientSums
 from triquad_server.engine.live_field import Batch, LiveField, Rates
 from triquad_server.engine.memory import ArrayMemory
 
-Loss = Any
-"""A number that a GPU may still be computing; reading it waits for that."""
+
+class Loss(Protocol):
+    """A number that a GPU may still be computing; reading it waits for that."""
+
+    def __float__(self) -> float: ...
+    def __add__(self, other: Any) -> Any: ...
+    def __rmul__(self, factor: Any) -> Any: ...
 
 
 class Trainer(Protocol):
