@@ -4,42 +4,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.maps.watched_evidence import SENSOR, SIDE, Watched
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.region import seen_voxels
 from triquad_format.records.status import Status
-from triquad_map.evidence.belief import Belief
-from triquad_map.evidence.carving import Reach
 from triquad_map.evidence.live_evidence import LiveEvidence
 from triquad_map.evidence.observations import outcome_counts
 from triquad_map.evidence.observed import Sighting, first_seen_since
 from triquad_map.surface import SurfelKind, nothing_shown
 
-SIDE = 256
-SENSOR = np.array([20.3, 128.4, 128.6])
 WALL_X = 60.5
-
-
-class Watched:
-    """Evidence that takes in scans, as the server does."""
-
-    def __init__(self) -> None:
-        self.evidence = LiveEvidence(SIDE)
-        self.scans = 0
-
-    def scan(self, ends: Doubles, sensor: Doubles = SENSOR) -> int:
-        """Take in rays that end at ``ends`` [N, 3]; returns how many voxels were taken back."""
-        self.scans += 1
-        sighting = Sighting(sensor, 0.2, self.scans, scan=self.scans)
-        rows = self.evidence.record_ends(ends, sighting)
-        search = self.evidence.outdated_normals(rows, sighting.unlearnt_since)
-        search.find(0, len(search.rows))
-        passed = self.evidence.carve(sensor, ends, Reach(0.5, 2.5, self.scans))
-        search.finish()
-        return len(self.evidence.believe(rows, passed, Belief()).removed)
-
-    def believed(self, voxels: Doubles) -> float:
-        """Share of ``voxels`` [N, 3] that are surface."""
-        return float(self.evidence.freeze().ended_in(np.floor(voxels).astype(np.int64)).mean())
 
 
 def panel(rng: np.random.Generator, x: float, half: float = 8.0, count: int = 1500) -> Doubles:
