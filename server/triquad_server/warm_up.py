@@ -1,61 +1,65 @@
 """Compiles all kernels of a server before it is ready, using a small synthetic map.
 
-That takes half a minute or more, once per machine and release; from then on the compiled code is
-found on disk. ``python -m triquad_server.warm_up`` does it without starting a server.
+That takes half a minute or more, once per machine and release, in two processes of their own: on
+both cores, and the compiler's memory goes with them. From then on the compiled code is found on
+disk. ``python -m triquad_server.warm_up`` does it without starting a server.
 """
 
 import gc
 import logging
+import os
 import shutil
-from collections.abc import Callable
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
 from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 from triquad_format.records.arrays import Doubles
-from triquad_map.compiled.kernel import CODE_FOLDER, count_compiled, is_first_use
+from triquad_map.compiled.kernel import CODE_FOLDER, count_compiled
+from triquad_map.field.frozen_field import field_samples
 from triquad_map.questions.distance import DistanceOptions, distances
 
+from triquad_server.engine.gradient_sums import GradientSums
+from triquad_server.engine.live_field import Batch, Rates, initial_field
+from triquad_server.engine.memory import memory_on
+from triquad_server.engine.trainer import trainer_of
 from triquad_server.intake.rays import ScanRays
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.process.threads import Teams
 from triquad_server.settings import MemorySettings, Settings
 
-_COMPILING = "compiling, step %d of %d: %s; half a minute or more, once per machine and release"
+_COMPILING = "compiling, %s; half a minute or more, once per machine and release"
+_COMMAND = [sys.executable, "-m", "triquad_server.warm_up"]
+_DONE = "complete"  # the file that says that nothing is missing among the compiled code
+_OF_FIELD = "field"  # the argument of the process that compiles what needs no map
 _REMOVING_SCANS = 6  # scans of rays that pass the synthetic sphere, until it is removed
 _DIRECTIONS = 400  # of the rays of a synthetic scan
 _RADIUS_M = 3.0  # of the sphere that it sees
 
 _log = logging.getLogger("triquad_server")
 
+Report = Callable[[str], None]
+
 
 def warm_up(
-    settings: Settings,
-    device: str,
-    teams: Teams | None = None,
-    report: Callable[[str], None] = lambda _: None,
+    settings: Settings, device: str, teams: Teams | None = None, report: Report = lambda _: None
 ) -> None:
     """Compile all kernels, or load what was compiled before.
 
     ``report`` is called with the name of each step before it begins; what it raises ends the work.
     """
     _log.info("preparing compiled code")
-    before, compiles = count_compiled(), is_first_use()
-    synthetic = _SyntheticMap(settings, device, teams or Teams())
-    steps = [
-        synthetic.scans,
-        synthetic.training,
-        synthetic.questions,
-        synthetic.meshes,
-        synthetic.restored_training,
-        synthetic.removal,
-    ]
-    for number, step in enumerate(steps, start=1):
-        name = step.__name__.replace("_", " ")
-        report(f"{name}, step {number} of {len(steps)}")
-        compiles = compiles or count_compiled() > before
-        if compiles:
-            _log.warning(_COMPILING, number, len(steps), name)
+    if CODE_FOLDER is not None and not (CODE_FOLDER / _DONE).exists():
+        _compile_apart(report)
+    before = count_compiled()
+    for name, step in _SyntheticMap(settings, device, teams or Teams()).steps():
+        report(name)
+        if CODE_FOLDER is None or count_compiled() > before:
+            _log.warning(_COMPILING, name)
         go_through(step)
 
 
@@ -76,6 +80,46 @@ def go_through(step: Callable[[], None]) -> None:
             gc.enable()
 
 
+def _compile_apart(report: Report) -> None:
+    """Compile all kernels in other processes; what they leave undone is compiled in this one."""
+    # In a group of its own, which interrupts from the keyboard do not reach, and whatever modules
+    # lie in the folder where the server was started.
+    safe = {**os.environ, "PYTHONSAFEPATH": "1"}
+    options: Any = {"stdout": subprocess.PIPE, "text": True, "start_new_session": True}
+    with subprocess.Popen(_COMMAND, env=safe, **options) as process:
+        try:
+            for line in process.stdout or ():
+                report(line.strip())
+                _log.warning(_COMPILING, line.strip())
+        except BaseException:  # the start is given up
+            os.killpg(process.pid, signal.SIGTERM)
+            raise
+
+
+def _compile() -> None:
+    """Compile all kernels, those of a field in a second process; print each step."""
+    with subprocess.Popen([*_COMMAND, _OF_FIELD]) as field:
+        for name, step in _SyntheticMap(Settings(), "cpu", Teams()).steps():
+            sys.stdout.write(name + "\n")
+            sys.stdout.flush()  # whoever started this process shows it
+            go_through(step)
+            field.wait()  # from the second step on, its kernels are called
+    if CODE_FOLDER is not None:
+        (CODE_FOLDER / _DONE).touch()
+
+
+def _compile_field() -> None:
+    """Train a field by itself, and question it."""
+    settings, teams, generator = Settings().field, Teams(), np.random.default_rng(0)
+    field = initial_field(settings, memory_on("cpu"), seed=0)
+    field.grow(generator.integers(0, 1 << settings.depth, (_DIRECTIONS, 3)))
+    points = generator.normal(size=(_DIRECTIONS, 3)).astype(np.float32)
+    trainer = trainer_of(field, GradientSums(), teams.mapping)
+    trainer.train(Batch(points, points[:, 0]), Rates(0.01))
+    field_samples(field.freeze(), settings, teams.mapping.split)(points.astype(float))
+    field.live_view().evaluate_in_grid(points.T.copy(), np.zeros((1, 3), np.int64))
+
+
 class _SyntheticMap:
     """Maps a sphere, queries it, meshes it and removes it: each step uses some kernels."""
 
@@ -90,6 +134,19 @@ class _SyntheticMap:
         self._map_of = partial(Mapper, "warm-up", self._settings, device, teams=teams)
         self._mapper = self._map_of()
 
+    def steps(self) -> Iterator[tuple[str, Callable[[], None]]]:
+        """Yield each step with its number and name; the first one needs no field."""
+        steps = (
+            self.scans,
+            self.training,
+            self.questions,
+            self.meshes,
+            self.restored_training,
+            self.removal,
+        )
+        for number, step in enumerate(steps, start=1):
+            yield f"step {number} of {len(steps)}: {step.__name__.replace('_', ' ')}", step
+
     @cached_property
     def _restored(self) -> Mapper:
         return self._map_of(record=self._mapper.snapshot_since(None).record())
@@ -98,10 +155,10 @@ class _SyntheticMap:
         """Take in a scan of the sphere."""
         rays = self._ingest(self._radius_m)
         next(iter(self._mapper.regions)).growth_by(rays)
-        self._mapper.publish()
 
     def training(self) -> None:
         """Train the map."""
+        self._mapper.publish()
         self._mapper.train()
         self._mapper.publish()
 
@@ -145,5 +202,4 @@ class _SyntheticMap:
 
 
 if __name__ == "__main__":
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
-    warm_up(Settings(), "cpu")
+    (_compile_field if sys.argv[1:] == [_OF_FIELD] else _compile)()

@@ -63,15 +63,16 @@ def test_sigterm_keeps_the_map_and_the_next_server_gives_the_same_answers(store,
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("missing", ["ray_bins.*", "*"])
 def test_what_is_not_compiled_yet_is_compiled_before_it_serves_and_the_log_says_so(
-    tmp_path, arguments
+    tmp_path, arguments, missing
 ):
     servers.compiled()
     assert CODE_FOLDER is not None
     cache = tmp_path / "cache"
     code = cache / "triquad" / "kernels" / CODE_FOLDER.relative_to(CODE_FOLDER.parents[1])
     shutil.copytree(CODE_FOLDER, code)
-    for file in code.rglob("ray_bins.*"):
+    for file in filter(Path.is_file, list(code.rglob(missing))):
         file.unlink()
     with servers.server_process(arguments, environment={"XDG_CACHE_HOME": str(cache)}) as server:
         told = [server.log.index(text) for text in ("compiling, step", "once per mach", "ready: ")]
