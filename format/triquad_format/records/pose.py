@@ -7,6 +7,8 @@ from triquad_format.records.arrays import Doubles
 RIGID_TOLERANCE = 1e-3
 """The allowed error of an element of R R^T: files of 6 digits and single precision have it."""
 
+_NEARLY_PARALLEL = 0.9995  # quaternions, of which spherical interpolation would divide by nearly 0
+
 
 def rotation_error(pose: Doubles) -> float:
     """Return the largest error of an element of R R^T, for the rotation R of a pose [4, 4]."""
@@ -78,3 +80,18 @@ def quaternion_of(rotation: Doubles) -> Doubles:
     )
     vectors = np.linalg.eigh(products).eigenvectors  # which reads the lower triangle alone
     return np.asarray(vectors[:, -1], np.float64)
+
+
+def slerp(first: Doubles, second: Doubles, share: Doubles) -> Doubles:
+    """Interpolate between unit quaternions [M, 4], by the shorter way.
+
+    ``share`` [M, 1] is that of the second.
+    """
+    cosine = (first * second).sum(axis=1, keepdims=True)
+    second = np.where(cosine < 0, -second, second)
+    cosine = np.abs(cosine)
+    angle = np.arccos(np.minimum(cosine, _NEARLY_PARALLEL))
+    of_first = np.where(cosine < _NEARLY_PARALLEL, np.sin((1 - share) * angle), 1 - share)
+    of_second = np.where(cosine < _NEARLY_PARALLEL, np.sin(share * angle), share)
+    between = of_first * first + of_second * second
+    return np.asarray(between / np.linalg.norm(between, axis=1, keepdims=True))

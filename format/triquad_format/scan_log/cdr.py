@@ -1,7 +1,9 @@
-"""Messages of ROS 2 written as CDR, little-endian, from arrays.
+"""Messages of ROS 2 as CDR, little-endian: written from arrays, and those read again.
 
-Libraries write messages too, but from objects: large ones take seconds.
+Libraries do that too, but with objects: large messages take seconds.
 """
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,3 +41,37 @@ class CdrWriter:
         self._data += bytes(-len(self._data) % values.itemsize)
         self._data += values.tobytes()
         return self
+
+
+class CdrReader:
+    """The fields of a message, in the order of its definition."""
+
+    def __init__(self, payload: bytes) -> None:
+        """Begin with the first field.
+
+        Raises:
+            ValueError: it is no plain little-endian CDR.
+        """
+        if payload[:4] != _LITTLE_ENDIAN:
+            raise ValueError(f"no plain little-endian CDR: {payload[:4].hex()}")
+        self._data = memoryview(payload)[4:]
+        self._at = 0
+
+    def numbers(self, dtype: str, count: int = 1) -> NDArray[Any]:
+        """Read numbers [count] of one type, such as ``<f8``.
+
+        Raises:
+            ValueError: the message ends before.
+        """
+        self._at += -self._at % np.dtype(dtype).itemsize
+        values = np.frombuffer(self._data, dtype, count, self._at)
+        self._at += values.nbytes
+        return values
+
+    def text(self) -> str:
+        """Read a string.
+
+        Raises:
+            ValueError: the message ends before, or it is no text.
+        """
+        return self.numbers("u1", int(self.numbers("<u4")[0])).tobytes()[:-1].decode()

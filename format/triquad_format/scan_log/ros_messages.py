@@ -1,18 +1,22 @@
-"""A cloud and a transform as ROS 2 writes them to MCAP, and the definitions of their types."""
+"""A cloud, a transform and a path as ROS 2 writes them to MCAP, with the types' definitions."""
+
+from typing import NamedTuple
 
 import numpy as np
 
-from triquad_format.records.arrays import Doubles, Floats
-from triquad_format.records.pose import quaternion_of
-from triquad_format.scan_log.cdr import CdrWriter
+from triquad_format.records.arrays import Doubles, Floats, Longs
+from triquad_format.records.pose import pose_matrices, quaternion_of
+from triquad_format.scan_log.cdr import CdrReader, CdrWriter
 
 CLOUD_TYPE, TRANSFORMS_TYPE = "sensor_msgs/msg/PointCloud2", "tf2_msgs/msg/TFMessage"
+PATH_TYPE = "nav_msgs/msg/Path"
 
 _LINE = "\n" + 80 * "=" + "\nMSG: "
 _HEADER = (
     f"{_LINE}std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id"
     f"{_LINE}builtin_interfaces/Time\nint32 sec\nuint32 nanosec"
 )
+_QUATERNION = f"{_LINE}geometry_msgs/Quaternion\nfloat64 x\nfloat64 y\nfloat64 z\nfloat64 w"
 DEFINITIONS = {
     CLOUD_TYPE: "std_msgs/Header header\nuint32 height\nuint32 width\n"
     "sensor_msgs/PointField[] fields\nbool is_bigendian\nuint32 point_step\nuint32 row_step\n"
@@ -23,8 +27,11 @@ DEFINITIONS = {
     f"geometry_msgs/Transform transform{_HEADER}"
     f"{_LINE}geometry_msgs/Transform\ngeometry_msgs/Vector3 translation\n"
     "geometry_msgs/Quaternion rotation"
-    f"{_LINE}geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z"
-    f"{_LINE}geometry_msgs/Quaternion\nfloat64 x\nfloat64 y\nfloat64 z\nfloat64 w",
+    f"{_LINE}geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z{_QUATERNION}",
+    PATH_TYPE: f"std_msgs/Header header\ngeometry_msgs/PoseStamped[] poses{_HEADER}"
+    f"{_LINE}geometry_msgs/PoseStamped\nstd_msgs/Header header\nPose pose"
+    f"{_LINE}geometry_msgs/Pose\nPoint position\nQuaternion orientation"
+    f"{_LINE}geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z{_QUATERNION}",
 }
 """The definitions of the types, for the schemas of a file."""
 
@@ -49,6 +56,79 @@ def pack_transform(stamp_ns: int, parent: str, child: str, pose: Doubles) -> byt
     writer = _with_header(CdrWriter().numbers("<u4", 1), stamp_ns, parent).text(child)
     writer.numbers("<f8", *pose[:3, 3].tolist(), *quaternion_of(pose[:3, :3]).tolist())
     return writer.payload()
+
+
+class Transform(NamedTuple):
+    """The pose of a frame in another."""
+
+    stamp_ns: int
+    child: str
+    pose: Doubles  # [4, 4]
+
+
+def pack_path(stamp_ns: int, frame: str, stamps_ns: Longs, poses: Doubles) -> bytes:
+    """Return a path of ``poses`` [K, 4, 4] at times [K], in the frame of that name."""
+    writer = _with_header(CdrWriter(), stamp_ns, frame).numbers("<u4", len(poses))
+    for stamp, pose in zip(stamps_ns.tolist(), poses, strict=True):
+        _with_header(writer, stamp, frame)
+        writer.numbers("<f8", *pose[:3, 3].tolist(), *quaternion_of(pose[:3, :3]).tolist())
+    return writer.payload()
+
+
+def unpack_cloud(data: bytes) -> tuple[int, str, Floats]:
+    """Return stamp, frame and points [N, 3] of what :func:`pack_cloud` has made.
+
+    Raises:
+        ValueError: it is something else.
+    """
+    reader = CdrReader(data)
+    stamp_ns, frame = _read_header(reader)
+    _, count, fields = reader.numbers("<u4", 3).tolist()
+    for _ in range(fields):
+        reader.text()
+        reader.numbers("<u4"), reader.numbers("u1"), reader.numbers("<u4")
+    reader.numbers("?"), reader.numbers("<u4", 2)
+    size = int(reader.numbers("<u4")[0])
+    points = reader.numbers("u1", size).view("<f4").reshape(count, 3)
+    return stamp_ns, frame, points
+
+
+def unpack_transform(data: bytes) -> Transform:
+    """Return what :func:`pack_transform` was given.
+
+    Raises:
+        ValueError: it is something else.
+    """
+    reader = CdrReader(data)
+    reader.numbers("<u4")
+    stamp_ns, _ = _read_header(reader)
+    child = reader.text()
+    return Transform(stamp_ns, child, _read_pose(reader))
+
+
+def unpack_path(data: bytes) -> tuple[int, Longs, Doubles]:
+    """Return stamp, and times [K] and poses [K, 4, 4], of what :func:`pack_path` has made.
+
+    Raises:
+        ValueError: it is something else.
+    """
+    reader = CdrReader(data)
+    stamp_ns, _ = _read_header(reader)
+    stamps, poses = [], []
+    for _ in range(int(reader.numbers("<u4")[0])):
+        stamps.append(_read_header(reader)[0])
+        poses.append(_read_pose(reader))
+    return stamp_ns, np.array(stamps, np.int64), np.array(poses).reshape(-1, 4, 4)
+
+
+def _read_pose(reader: CdrReader) -> Doubles:
+    numbers = reader.numbers("<f8", 7)
+    return pose_matrices(numbers[:3], numbers[3:])
+
+
+def _read_header(reader: CdrReader) -> tuple[int, str]:
+    seconds, nanoseconds = int(reader.numbers("<i4")[0]), int(reader.numbers("<u4")[0])
+    return seconds * _SECOND_NS + nanoseconds, reader.text()
 
 
 def _with_header(writer: CdrWriter, stamp_ns: int, frame: str) -> CdrWriter:

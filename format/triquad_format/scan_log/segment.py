@@ -1,10 +1,11 @@
 """A file of the scan log: the scans that a map took in between two of its checkpoints.
 
 It is an MCAP file of ROS 2 messages: for each scan a transform from ``map`` to a frame with the
-name of the source, on ``/tf``, and a cloud in that frame, on ``/scans/<source>``, with the stamp of
-the scan both. Rays that met nothing come between the two, as directions [M, 3], little-endian
-float32, on ``/no_return/<source>``; what was reset is on ``/resets``: the least and the greatest
-corner of a box, six little-endian float64.
+name of the source, on ``/tf``, and, of those that are kept, a cloud in that frame, on
+``/scans/<source>``, with the stamp of the scan both. Rays that met nothing come between the two, as
+directions [M, 3], little-endian float32, on ``/no_return/<source>``; what was reset is on
+``/resets``: the least and the greatest corner of a box, six little-endian float64. A correction of
+poses before it is a path on ``/corrections/<source>``: its own stamp is the last that it moves.
 """
 
 from contextlib import suppress
@@ -15,12 +16,15 @@ from typing import IO
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
-from triquad_format.records.arrays import Doubles, Floats
+from triquad_format.records.arrays import Doubles, Floats, Longs
 from triquad_format.scan_log.ros_messages import (
     CLOUD_TYPE,
     DEFINITIONS,
+    PATH_TYPE,
     TRANSFORMS_TYPE,
+    Transform,
     pack_cloud,
+    pack_path,
     pack_transform,
 )
 
@@ -28,8 +32,9 @@ GRAIN_M = 2.0**-8
 """Points are rounded to 4 mm: single precision has that exactly, with zeros that compress."""
 
 _MAP_FRAME = "map"
-TRANSFORMS, RESETS, SCANS, NO_RETURN = "/tf", "/resets", "/scans/", "/no_return/"
-"""The topics; the last two before the name of a source."""
+TRANSFORMS, RESETS = "/tf", "/resets"
+SCANS, NO_RETURN, CORRECTIONS = "/scans/", "/no_return/", "/corrections/"
+"""The topics; the last three before the name of a source."""
 
 _CHUNK_BYTES = 1 << 20
 
@@ -53,6 +58,17 @@ class LoggedReset:
     maximum: Doubles
 
 
+@dataclass(frozen=True)
+class LoggedCorrection:
+    """Better poses of a source, in the coordinates of who gave them."""
+
+    source: str
+    stamps_ns: Longs  # [K] rising, nanoseconds since 1970
+    world_from_sensor: Doubles  # [K, 4, 4] the poses at these times
+    until_ns: int
+    """The stamp of the last scan that it moves; scans after the last of the poses move as that."""
+
+
 class SegmentWriter:
     """Writes a file as scans come; it is whole once :meth:`finish` was called."""
 
@@ -73,6 +89,16 @@ class SegmentWriter:
         self._channels: dict[str, int] = {}
         self.messages = 0
 
+    def add_pose(self, transform: Transform) -> None:
+        """Add the pose of a scan, of which no more is kept.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        stamp_ns, source, pose = transform
+        data = pack_transform(stamp_ns, _MAP_FRAME, source, pose)
+        self._put(TRANSFORMS, TRANSFORMS_TYPE, stamp_ns, data)
+
     def add(self, scan: LoggedScan) -> None:
         """Add a scan.
 
@@ -80,8 +106,7 @@ class SegmentWriter:
             OSError: it cannot be written.
         """
         stamp_ns, source = scan.stamp_ns, scan.source
-        pose = pack_transform(stamp_ns, _MAP_FRAME, source, scan.world_from_sensor)
-        self._put(TRANSFORMS, TRANSFORMS_TYPE, stamp_ns, pose)
+        self.add_pose(Transform(stamp_ns, source, scan.world_from_sensor))
         if len(scan.no_return):
             directions = np.ascontiguousarray(scan.no_return, "<f4").tobytes()
             self._put(NO_RETURN + source, "", stamp_ns, directions)
@@ -96,6 +121,16 @@ class SegmentWriter:
         """
         corners = np.concatenate([reset.minimum, reset.maximum]).astype("<f8")
         self._put(RESETS, "", stamp_ns, corners.tobytes())
+
+    def add_correction(self, correction: LoggedCorrection) -> None:
+        """Add that the poses of scans before were corrected.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        until_ns, poses = correction.until_ns, correction.world_from_sensor
+        data = pack_path(until_ns, _MAP_FRAME, correction.stamps_ns, poses)
+        self._put(CORRECTIONS + correction.source, PATH_TYPE, until_ns, data)
 
     def finish(self) -> None:
         """End the file.

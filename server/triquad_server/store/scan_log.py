@@ -1,12 +1,14 @@
 """Keeps the scans that a map is learnt from, with its checkpoints, so that it can be learnt again.
 
-Not all: of each source, one wherever it has moved on or turned, and now and then while it rests.
+Not all: of each source, one wherever it has moved on or turned, and now and then while it rests. Of
+the others the pose is kept, so that corrections of poses at any time find what they correct.
 """
 
 import logging
 import math
 import os
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,8 +19,16 @@ from triquad_format.mapfile.files import sync_folder
 from triquad_format.mapfile.index import Restored
 from triquad_format.records.arrays import Doubles
 from triquad_format.scan_log.log_folder import LOG_NAME, of_map, segment_name, segments
-from triquad_format.scan_log.segment import LoggedReset, LoggedScan, SegmentWriter
+from triquad_format.scan_log.reading import Entry
+from triquad_format.scan_log.ros_messages import Transform
+from triquad_format.scan_log.segment import (
+    LoggedCorrection,
+    LoggedReset,
+    LoggedScan,
+    SegmentWriter,
+)
 from triquad_format.wire.messages import Scan
+from triquad_format.wire.places import moved_pose
 
 from triquad_server.intake.rays import ScanRays
 
@@ -61,6 +71,7 @@ class ScanLog:
         self._max_bytes = max_bytes
         self._apart_m = _APART_VOXELS * leaf_m
         self._kept: dict[str, _Kept] = {}
+        self._followed: deque[Entry] | None = None
         self._writer: SegmentWriter | None = None
         self._opened = 0  # files
         self._lost = False  # what was added could not be written; of the mapper's thread
@@ -76,24 +87,42 @@ class ScanLog:
                 if segment.epoch > epoch:
                     segment.path.unlink()
             newest = max((one.epoch for one in of_map(found, epoch, restored)), default=0)
-            self._newest = newest
+            # Of a map that is there already, and has none, what came before was lost.
+            self._newest = newest or (None if epoch else 0)
             if restored is not None and restored.as_epoch == epoch > newest:
                 # An empty file marks that scans since the older checkpoint are in the map no more.
                 self._open()
                 self.keep(self.cut(), epoch)
 
+    @property
+    def is_kept(self) -> bool:
+        """Return whether any scans are kept."""
+        return self._max_bytes > 0
+
+    def follow(self) -> "deque[Entry]":
+        """Return the queue to which is added what is added here from now on, until the next one."""
+        self._followed = deque()
+        return self._followed
+
+    def unfollow(self) -> None:
+        """Add to no queue any more."""
+        self._followed = None
+
     def add(self, scan: Scan, rays: ScanRays) -> None:
-        """Keep a scan that was taken in, if its source has moved on since the last that was kept.
+        """Keep a scan that was taken in; its pose, if its source has not moved on since another.
 
         Both count from the map's origin.
         """
-        if self._max_bytes == 0 or not self._is_apart(scan):
+        if not self.is_kept:
+            return
+        pose = moved_pose(scan.world_from_sensor, rays.map_origin)
+        if not self._is_apart(scan):
+            transform = Transform(scan.stamp_ns, scan.source, pose)
+            self._put(transform, lambda writer: writer.add_pose(transform))
             return
         rotation, position = scan.world_from_sensor[:3, :3], scan.world_from_sensor[:3, 3]
         beyond = rays.origin + _BEYOND * (rays.far_ends - rays.origin)
         points = (np.concatenate([rays.ends, beyond]) - position) @ rotation
-        pose = scan.world_from_sensor.copy()
-        pose[:3, 3] += rays.map_origin
         no_return = (rays.open_ends - rays.origin) @ rotation
         lengths = np.linalg.norm(no_return, axis=1, keepdims=True)
         logged = LoggedScan(
@@ -104,15 +133,20 @@ class ScanLog:
             (no_return / np.maximum(lengths, 1e-9)).astype(np.float32),
         )
         self._kept[scan.source] = _Kept(scan.stamp_ns, scan.world_from_sensor)
-        self._put(lambda writer: writer.add(logged))
+        self._put(logged, lambda writer: writer.add(logged))
 
     def add_reset(self, minimum: Doubles, maximum: Doubles) -> None:
         """Keep that the map forgot what lies between two corners [3] of the user's coordinates."""
-        if self._max_bytes == 0:
+        if not self.is_kept:
             return
         self._kept.clear()
         reset = LoggedReset(minimum, maximum)
-        self._put(lambda writer: writer.add_reset(reset, time.time_ns()))
+        self._put(reset, lambda writer: writer.add_reset(reset, time.time_ns()))
+
+    def add_correction(self, correction: LoggedCorrection) -> None:
+        """Keep that poses of scans before were corrected."""
+        self._kept.pop(correction.source, None)
+        self._put(correction, lambda writer: writer.add_correction(correction))
 
     def cut(self) -> SegmentWriter | None:
         """Return the file with what was added since the last time; ``None``: nothing was."""
@@ -155,8 +189,10 @@ class ScanLog:
             self._lost = False
         return self._writer
 
-    def _put(self, add: Callable[[SegmentWriter], None]) -> None:
-        """Add something to the file; where that fails, it is lost, and what was added before."""
+    def _put(self, entry: Entry, add: Callable[[SegmentWriter], None]) -> None:
+        """Add an entry to the file; where that fails, it is lost, and what was added before."""
+        if self._followed is not None:
+            self._followed.append(entry)
         with self._telling("cannot be written"):
             try:
                 add(self._open())

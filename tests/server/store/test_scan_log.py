@@ -9,12 +9,12 @@ from support.maps.small_world import world
 from support.poses import shifted
 from triquad_format.mapfile.index import Restored
 from triquad_format.scan_log.log_folder import history, segments
+from triquad_format.scan_log.reading import read_segment
 from triquad_format.scan_log.segment import GRAIN_M, LoggedScan
 from triquad_format.wire.messages import Scan
 from triquad_server.intake.rays import usable_rays
 from triquad_server.settings import ScanSettings
 from triquad_server.store.scan_log import ScanLog
-from triquad_tools.recordings.scan_log import read_segment
 
 LEAF_M = 0.2
 POINTS = np.array([[10.0, 0, 0], [0, 20, 1], [300, 5, 0]], np.float32)
@@ -45,7 +45,8 @@ def write(log: ScanLog, epoch: int, count: int = 1) -> None:
 
 def kept(log: ScanLog) -> list[LoggedScan]:
     files = history(segments(log.folder))
-    return [scan for file in files for scan in read_segment(file.path)]
+    found = (one for file in files for one in read_segment(file.path))
+    return [one for one in found if isinstance(one, LoggedScan)]
 
 
 def turned(degrees: float) -> np.ndarray:

@@ -1,36 +1,24 @@
 """The scans that a server has kept with the checkpoints of a map."""
 
-import io
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from mcap.records import Channel, Footer, Message
-from mcap.stream_reader import StreamReader
-from triquad_format.errors import DamagedMapFileError, FormatError
+from triquad_format.errors import FormatError
 from triquad_format.mapfile.checkpoint_folder import checkpoint_files, map_folder
-from triquad_format.mapfile.files import open_regular
 from triquad_format.mapfile.index import read_checkpoint
-from triquad_format.records.arrays import Floats
-from triquad_format.records.pose import pose_matrices
+from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.scan_log.log_folder import LOG_NAME, Segment, history, of_map, segments
-from triquad_format.scan_log.segment import (
-    NO_RETURN,
-    RESETS,
-    SCANS,
-    TRANSFORMS,
-    LoggedReset,
-    LoggedScan,
-)
+from triquad_format.scan_log.reading import Entry, read_segment
+from triquad_format.scan_log.segment import LoggedCorrection, LoggedReset, LoggedScan
+from triquad_format.scan_log.tracks import SourceTracks
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
 from triquad_tools.recordings.recording import ScanEntry, Stream
-from triquad_tools.sensors.ros.from_bytes import decode_cdr
-from triquad_tools.sensors.ros.type_store import POINT_CLOUD, TF, stamp_ns
 from triquad_tools.sensors.sweep import PosedScan, moved
 
 
@@ -45,13 +33,14 @@ class PlacedReset(NamedTuple):
 class ScanLogRecording:
     """The scans that are in a map now, in the order in which it took them in.
 
-    What was reset later is left out of the scans before.
+    What was reset later is left out of the scans before; poses are as they were corrected last.
     """
 
     files: Sequence[Segment]  # the oldest first
     entries: Sequence[ScanEntry]
     counts: Sequence[int]  # of scans in each file
     resets: Sequence[PlacedReset]
+    tracks: SourceTracks
     streams: Sequence[Stream]
     remarks: Sequence[str] = ()
 
@@ -74,8 +63,8 @@ class ScanLogRecording:
             for index, scan in zip(here, scans, strict=True):
                 if index in wanted:
                     later = [reset.box for reset in self.resets if reset.scans > index]
-                    points = _outside(scan, later)
-                    yield PosedScan(points, scan.world_from_sensor, no_return=scan.no_return)
+                    pose = self.tracks[scan.source].pose(scan.stamp_ns)
+                    yield PosedScan(_outside(scan, pose, later), pose, no_return=scan.no_return)
 
 
 def find_scan_log(path: Path) -> Path | None:
@@ -98,14 +87,21 @@ def read_scan_log(folder: Path) -> ScanLogRecording:
     entries: list[ScanEntry] = []
     counts: list[int] = []
     resets: list[PlacedReset] = []
+    tracks, corrections = SourceTracks(), 0
     with progress("looking through the scans", len(files)) as report:
         for number, segment in enumerate(files, start=1):
             before = len(entries)
             for one in _read(segment):
                 if isinstance(one, LoggedReset):
                     resets.append(PlacedReset(len(entries), one))
-                else:
+                elif isinstance(one, LoggedCorrection):
+                    tracks.correct(one)
+                    corrections += 1
+                elif isinstance(one, LoggedScan):
+                    tracks[one.source].add(one.stamp_ns, one.world_from_sensor)
                     entries.append(ScanEntry(one.stamp_ns, one.source))
+                else:
+                    tracks[one.child].add(one.stamp_ns, one.pose)
             counts.append(len(entries) - before)
             report(number, f"{number} of {len(files)} files")
     names = sorted({entry.source for entry in entries})
@@ -119,7 +115,9 @@ def read_scan_log(folder: Path) -> ScanLogRecording:
         remarks.append(told)
     if resets:
         remarks.append(f"what was reset, {len(resets)} times, is left out")
-    return ScanLogRecording(files, entries, counts, resets, streams, remarks)
+    if corrections:
+        remarks.append(f"poses are as they were corrected, {corrections} times")
+    return ScanLogRecording(files, entries, counts, resets, tracks, streams, remarks)
 
 
 def _of_map(folder: Path) -> list[Segment]:
@@ -133,66 +131,18 @@ def _of_map(folder: Path) -> list[Segment]:
     return found
 
 
-def _read(segment: Segment) -> Iterator[LoggedScan | LoggedReset]:
+def _read(segment: Segment) -> Iterator[Entry]:
     try:
         yield from read_segment(segment.path)
     except (FormatError, OSError) as error:
         raise ToolError(str(error)) from error
 
 
-def read_segment(path: Path) -> Iterator[LoggedScan | LoggedReset]:
-    """Yield what a file of the log has, in the order in which it came.
-
-    Raises:
-        DamagedMapFileError: the file is damaged, or is none of the log.
-        OSError: it cannot be read.
-    """
-    with io.BufferedReader(open_regular(path)) as stream:
-        try:
-            yield from _entries(stream)
-        except Exception as error:  # as the library comes upon what it did not expect
-            raise DamagedMapFileError(f"{path} is damaged: {error!r}") from error
-
-
-def _entries(stream: IO[bytes]) -> Iterator[LoggedScan | LoggedReset]:
-    topics: dict[int, str] = {}
-    transform, no_return = None, np.zeros((0, 3), np.float32)
-    is_whole = False
-    for record in StreamReader(stream, validate_crcs=True).records:
-        is_whole |= isinstance(record, Footer)
-        if isinstance(record, Channel):
-            topics[record.id] = record.topic
-        if not isinstance(record, Message):
-            continue
-        topic, data = topics[record.channel_id], record.data
-        if topic == TRANSFORMS:
-            (transform,), no_return = decode_cdr(data, TF).transforms, no_return[:0]
-        elif topic == RESETS:
-            yield LoggedReset(*np.frombuffer(data, "<f8").reshape(2, 3))
-        elif topic.startswith(NO_RETURN):
-            no_return = np.frombuffer(data, "<f4").reshape(-1, 3)
-        elif topic.startswith(SCANS):
-            yield _scan(decode_cdr(data, POINT_CLOUD), transform, no_return)
-    if not is_whole:
-        raise FormatError("it has no end")
-
-
-def _scan(cloud: Any, transform: Any, no_return: Floats) -> LoggedScan:
-    """Return a scan of its cloud and the transform before it."""
-    source, stamp = cloud.header.frame_id, stamp_ns(cloud.header)
-    if (transform.child_frame_id, stamp_ns(transform.header)) != (source, stamp):
-        raise FormatError(f"a scan of {source} has no pose before it")
-    at, turn = transform.transform.translation, transform.transform.rotation
-    pose = pose_matrices(np.array([at.x, at.y, at.z]), np.array([turn.x, turn.y, turn.z, turn.w]))
-    points = np.frombuffer(cloud.data, "<f4").reshape(-1, 3)
-    return LoggedScan(source, stamp, pose, points, no_return)
-
-
-def _outside(scan: LoggedScan, resets: Sequence[LoggedReset]) -> Floats:
+def _outside(scan: LoggedScan, pose: Doubles, resets: Sequence[LoggedReset]) -> Floats:
     """Return the points [N, 3] of a scan that lie in none of the boxes."""
     if not resets:
         return scan.points
-    at = moved(scan.points, scan.world_from_sensor)
+    at = moved(scan.points, pose)
     kept = np.ones(len(at), np.bool_)
     for box in resets:
         kept &= ~((at >= box.minimum) & (at <= box.maximum)).all(axis=1)

@@ -8,13 +8,12 @@ from collections.abc import Sequence
 import numpy as np
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.plausibility import JUMP_M, jumps
-from triquad_format.records.pose import pose_matrices
+from triquad_format.records.pose import pose_matrices, slerp
 
 from triquad_tools.sensors.sweep import NoTransformError
 
 MAX_GAP_S = 2.0  # between poses farther apart nothing is interpolated, unless they only correct
 _WIDTH = 7  # numbers of a pose
-_NEARLY_PARALLEL = 0.9995  # quaternions, of which spherical interpolation would divide by nearly 0
 _RARER = 3.0  # times, at least, is a correction rarer than the poses that it corrects
 _CORRECTED_M, _CORRECTED_RAD = 0.3, 0.05  # drift; a correction by more, at a loop, comes at once
 
@@ -115,7 +114,7 @@ class Track:
         else:
             self._check_gaps(stamps_ns, stamps[before], stamps[after])
         positions = first[:, :3] + share * (second[:, :3] - first[:, :3])
-        return pose_matrices(positions, _slerp(first[:, 3:], second[:, 3:], share))
+        return pose_matrices(positions, slerp(first[:, 3:], second[:, 3:], share))
 
     def _check_covered(self, stamps_ns: Longs) -> None:
         if not self._stamps:
@@ -135,15 +134,3 @@ class Track:
         if gaps_s.max() > MAX_GAP_S:
             text = f"between two poses {gaps_s.max():.3g} s apart (at most {MAX_GAP_S:g})"
             raise NoTransformError("pose_gap", text)
-
-
-def _slerp(first: Doubles, second: Doubles, share: Doubles) -> Doubles:
-    """Interpolate between unit quaternions [M, 4], by the shorter way."""
-    cosine = (first * second).sum(axis=1, keepdims=True)
-    second = np.where(cosine < 0, -second, second)
-    cosine = np.abs(cosine)
-    angle = np.arccos(np.minimum(cosine, _NEARLY_PARALLEL))
-    of_first = np.where(cosine < _NEARLY_PARALLEL, np.sin((1 - share) * angle), 1 - share)
-    of_second = np.where(cosine < _NEARLY_PARALLEL, np.sin(share * angle), share)
-    between = of_first * first + of_second * second
-    return np.asarray(between / np.linalg.norm(between, axis=1, keepdims=True))
