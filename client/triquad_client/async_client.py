@@ -123,6 +123,7 @@ class AsyncClient(AsyncMapQueries):
     metrics = awaited(Client.metrics)
     checkpoint = awaited(Client.checkpoint)
     reset = awaited(Client.reset)
+    correct_poses = awaited(Client.correct_poses)
     download_map = awaited(Client.download_map)
     maps = awaited(Client.maps)
 

@@ -1,6 +1,6 @@
 """The requests of clients: which part of the server answers each kind, and in which lane."""
 
-from triquad_format.wire.limits import MAX_QUERY_POINTS, payload_limit
+from triquad_format.wire.limits import MAX_KEYFRAMES, MAX_QUERY_POINTS, payload_limit
 from triquad_format.wire.mesh_messages import MeshRequest, TileChangesRequest, TileListRequest
 from triquad_format.wire.messages import (
     CheckpointRequest,
@@ -12,7 +12,7 @@ from triquad_format.wire.messages import (
 )
 from triquad_format.wire.metrics_messages import MetricsRequest
 from triquad_format.wire.query_messages import ChangesRequest, GridRequest
-from triquad_format.wire.source_messages import SourcesRequest
+from triquad_format.wire.source_messages import CorrectPosesRequest, SourcesRequest
 from triquad_map.questions.answers import QUESTIONS, Answers
 
 from triquad_server.epochs.surface_history import SurfaceHistory, changes_reply
@@ -22,6 +22,9 @@ from triquad_server.mesh.tile_queries import TileQueries
 from triquad_server.server_status import Health
 from triquad_server.serving.operations import Lane
 from triquad_server.store.download import MapDownloads
+from triquad_server.store.pose_corrector import PoseCorrector
+
+_KEYFRAME_BYTES = 80  # of a time, a position and a quaternion, with room
 
 
 def answer_requests(
@@ -54,5 +57,7 @@ def answer_requests(
     downloads = MapDownloads(parts.mapper, parts.epochs, parts.server)
     serve(CheckpointRequest, checkpoints.answer, Lane.FILES)
     serve(ResetRequest, lambda request: checkpoints.reset(request, trails), Lane.FILES)
+    corrector = PoseCorrector(parts.mapper, checkpoints, trails)
+    serve(CorrectPosesRequest, corrector.answer, Lane.FILES, _KEYFRAME_BYTES * MAX_KEYFRAMES)
     serve(MapInfoRequest, downloads.info, Lane.FILES)
     serve(MapChunkRequest, downloads.chunk, Lane.LONG_QUESTIONS)

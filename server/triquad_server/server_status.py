@@ -143,7 +143,7 @@ class Health:
         That is :meth:`mapping_problem`, or a store that cannot be written.
         """
         mapping = self.mapping_problem()
-        if mapping is not None or not self.checkpoints.has_store or self.checkpoints.error is None:
+        if mapping is not None or self.checkpoints.store is None or self.checkpoints.error is None:
             return mapping
         return f"what is mapped is not kept: {self.checkpoints.error}"
 

@@ -38,6 +38,7 @@ MAP_CHUNK = "query/map_chunk"
 # Operations on `triquad/<map>/admin/...`: they change the map or the disk.
 CHECKPOINT = "admin/checkpoint"
 RESET = "admin/reset"
+CORRECT_POSES = "admin/correct_poses"
 
 
 def is_name(name: str) -> bool:

@@ -7,10 +7,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triquad_format.wire import keys
-from triquad_format.wire.bounds import MAX_COUNT, at_most_asked, rigid_pose, rows_of, within
-from triquad_format.wire.codec import Message, Request
+from triquad_format.wire.bounds import MAX_COUNT, at_most_asked, rigid_pose, rows_of, text, within
+from triquad_format.wire.codec import ArraySpec, Message, Request
 from triquad_format.wire.limits import MAX_SAMPLE_POINTS
-from triquad_format.wire.messages import Count, FinitePoints, FinitePositions, Integers, Name, Pose
+from triquad_format.wire.messages import (
+    Count,
+    Epoch,
+    FinitePoints,
+    FinitePositions,
+    Integers,
+    Name,
+    Pose,
+    Ticket,
+)
+
+Quaternions = Annotated[NDArray[np.float64], ArraySpec("<f8", (None, 4)), within(-1.01, 1.01)]
 
 
 @dataclass(frozen=True)
@@ -68,3 +79,26 @@ class SourcesRequest(Request[SourceReport], operation=keys.SOURCES, background=T
     server: str  # of the reply before, to which revision belongs; empty at first
     revision: int  # of the reply before, which is not sent again; 0 at first
     max_points: Annotated[int, within(0, MAX_SAMPLE_POINTS)]  # of each newest scan
+
+
+@dataclass(frozen=True)
+class CorrectPosesReply(Message):
+    """Answer to :class:`CorrectPosesRequest`: what was corrected, and how to go back."""
+
+    epoch: Epoch  # the first of the corrected map
+    scans_moved: Count  # kept scans whose pose changed by more than a twentieth of a voxel
+    scans_learnt: Count  # kept scans of which the map was made again
+    kept_epoch: Epoch | None = None  # as which the map of before stays on disk; None: it does not
+    undo: Annotated[str, text(4096)] | None = None  # how to go back to it, or why one cannot
+
+
+@dataclass(frozen=True)
+class CorrectPosesRequest(Request[CorrectPosesReply], operation=keys.CORRECT_POSES):
+    """Make the map again as better poses of a source's scans would have made it."""
+
+    source: Name
+    stamps_ns: Integers  # [K] rising, nanoseconds since 1970
+    positions: FinitePoints  # [K, 3] metres, of the sensor in the map frame
+    quaternions: Quaternions  # [K, 4] of its rotations, x, y, z, w, unit
+    onward: bool  # scans after the last of these poses move as that
+    ticket: Ticket = 0

@@ -69,6 +69,16 @@ class _Source:
         jumped = self.newest is None or math.dist(position, _position(self.newest)) > jump_m
         self.scans += 1
         self.newest = taken
+        self._go(position, jumped=jumped)
+
+    def retrace(self, positions: Doubles, jump_m: float) -> None:
+        """Have been at positions [N, 3], one after the other, and nowhere else."""
+        self.trail.clear()
+        steps_m = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+        for position, step_m in zip(positions, [0.0, *steps_m.tolist()], strict=True):
+            self._go(position, jumped=step_m > jump_m)
+
+    def _go(self, position: Doubles, *, jumped: bool) -> None:
         piece = 0
         if self.trail:
             last = self.trail[-1]
@@ -144,6 +154,13 @@ class SourceTrails:
                 source.forget(minimum, maximum)
                 if source.newest is None and not source.trail:
                     del self._sources[name]
+
+    def retrace(self, name: str, positions: Doubles) -> None:
+        """Have a source been at positions [N, 3], map frame, whose poses were corrected."""
+        with self._lock:
+            self.revision += 1
+            if (source := self._sources.get(name)) is not None:
+                source.retrace(positions, self._jump_m)
 
     def answer(self, request: SourcesRequest) -> SourceReport:
         """Return all sources, if anything of them is new since the reply before."""

@@ -43,6 +43,7 @@ class Mapper:
         self._name = name
         self._teams = teams or Teams()
         self._settings = settings
+        self._device = device
         self._setup = RegionSetup(
             field=record.settings if record else settings.field,
             scan=settings.scan,
@@ -73,6 +74,11 @@ class Mapper:
     def origin(self) -> Doubles:
         """[3] of the user's coordinates, from where the map counts: 0 0 0 until it is chosen."""
         return _NOWHERE_YET if self._origin is None else self._origin
+
+    @property
+    def leaf_m(self) -> float:
+        """The side of a voxel, metres."""
+        return self._setup.field.leaf_m
 
     @property
     def settled(self) -> bool:
@@ -230,6 +236,23 @@ class Mapper:
         self.regions.forget(minimum, maximum)
         if not self.regions:
             self.scans_taken, self.samples_trained, self._loss = 0, 0, None
+        self._structure_changed = True
+
+    def other(self, record: MapRecord | None) -> "Mapper":
+        """Return another map with these settings, name and origin, which goes on from a record.
+
+        Without one it begins with nothing. Another thread may own it.
+        """
+        other = Mapper(self._name, self._settings, self._device, record, self._teams)
+        other._origin = self._origin
+        return other
+
+    def become(self, other: "Mapper") -> None:
+        """Have all that another map has learnt in place of what this one has.
+
+        The other one must not be used any more. Epochs, scans and samples are counted on.
+        """
+        self._setup, self.regions, self._loss = other._setup, other.regions, other._loss
         self._structure_changed = True
 
     def snapshot_since(self, epoch: int | None) -> MapSnapshot:

@@ -89,6 +89,11 @@ class MapperThread:
         return self._mapper.origin
 
     @property
+    def leaf_m(self) -> float:
+        """The side of a voxel, metres."""
+        return self._mapper.leaf_m
+
+    @property
     def ended(self) -> str | None:
         """Return why the thread takes no more commands; ``None`` while it does."""
         return self._commands.ended

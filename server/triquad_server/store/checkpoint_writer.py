@@ -3,9 +3,11 @@
 import logging
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import replace
 
 from triquad_format.errors import RefusedError
+from triquad_format.scan_log.segment import SegmentWriter
 from triquad_format.wire.messages import (
     CheckpointInfo,
     CheckpointRequest,
@@ -21,6 +23,7 @@ from triquad_server.errors import (
     StoreError,
 )
 from triquad_server.intake.source_trails import SourceTrails
+from triquad_server.mapping.map_snapshot import MapSnapshot
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.settings import StoreSettings
@@ -32,6 +35,14 @@ _log = logging.getLogger(__name__)
 _LATE_PERIODS = 2.0  # after so many, what is mapped should be on the disk
 
 _NO_STORE = "the server was started without a store: the map is not kept"
+
+
+def way_back(kept: int) -> str:
+    """Return how to go back to the map before, which is kept as epoch ``kept``."""
+    return (
+        f"epoch {kept}, the map before, is kept; to go back to it, stop the server and start "
+        f"it with --restore {kept}"
+    )
 
 
 class CheckpointWriter:
@@ -67,9 +78,9 @@ class CheckpointWriter:
         return None if self._store is None else self._store.last
 
     @property
-    def has_store(self) -> bool:
-        """Return whether there is a store to write checkpoints to."""
-        return self._store is not None
+    def store(self) -> Store | None:
+        """The store; ``None``: the map is not kept."""
+        return self._store
 
     def start(self) -> None:
         """Begin to write checkpoints, while the map changes and on request, and to check them."""
@@ -165,10 +176,11 @@ class CheckpointWriter:
         _log.warning("the map was reset as of epoch %d: %s", epoch, undo)
         return ResetReply(epoch, kept, undo)
 
-    def write(self, undoes: str = "") -> CheckpointInfo:
+    def write(self, undoes: str = "", at_cut: Callable[[], None] = lambda: None) -> CheckpointInfo:
         """Write what changed since the last checkpoint, and return that one if nothing did.
 
-        A checkpoint that ``undoes`` something is written even if nothing changed.
+        A checkpoint that ``undoes`` something is written even if nothing changed. ``at_cut`` is
+        called by the mapper's thread where what the checkpoint has ends.
 
         Raises:
             StoreError: it cannot be written, for lack of memory too, or there is no store.
@@ -178,7 +190,7 @@ class CheckpointWriter:
             raise StoreError(_NO_STORE)
         with self._writing:
             try:
-                return self._write(self._store, undoes)
+                return self._write(self._store, undoes, at_cut)
             except Exception as error:
                 self._metrics = replace(self._metrics, failed=self._metrics.failed + 1)
                 if isinstance(error, StoreError):
@@ -201,19 +213,19 @@ class CheckpointWriter:
             raise RefusedError(
                 "store", f"nothing was reset, for the map as it is could not be kept: {error}"
             ) from error
-        return kept, (
-            f"epoch {kept}, the map before, is kept; to go back to it, stop the server and start "
-            f"it with --restore {kept}"
-        )
+        return kept, way_back(kept)
 
-    def _write(self, store: Store, undoes: str) -> CheckpointInfo:
+    def _write(self, store: Store, undoes: str, at_cut: Callable[[], None]) -> CheckpointInfo:
         """Do as :meth:`write`; an error is not recorded yet."""
         base, last = store.base_epoch, self.last
+
+        def cut(mapper: Mapper) -> tuple[MapSnapshot, SegmentWriter | None]:
+            at_cut()
+            return mapper.snapshot_since(base), store.scans.cut()
+
         try:
             asked_s = time.monotonic()
-            snapshot, scans = self._mapper.call(
-                lambda mapper: (mapper.snapshot_since(base), store.scans.cut())
-            )
+            snapshot, scans = self._mapper.call(cut)
             store.scans.keep(scans, snapshot.epoch.number)
             # The base is the last checkpoint, as long as its file and parts are there.
             if not undoes and last is not None and last.epoch == snapshot.epoch.number == base:

@@ -99,14 +99,9 @@ class ScanLog:
         """Return whether any scans are kept."""
         return self._max_bytes > 0
 
-    def follow(self) -> "deque[Entry]":
-        """Return the queue to which is added what is added here from now on, until the next one."""
-        self._followed = deque()
-        return self._followed
-
-    def unfollow(self) -> None:
-        """Add to no queue any more."""
-        self._followed = None
+    def follow(self, followed: "deque[Entry] | None") -> None:
+        """Add to a queue, too, what is added from now on; ``None``: to none any more."""
+        self._followed = followed
 
     def add(self, scan: Scan, rays: ScanRays) -> None:
         """Keep a scan that was taken in; its pose, if its source has not moved on since another.

@@ -76,14 +76,23 @@ class Store:
 
     def log_scans(self, leaf_m: float) -> None:
         """Keep scans, too, from the newest checkpoint on; ``leaf_m`` is the side of a voxel."""
-        epoch = 0 if self._newest is None else self._newest.facts.epoch
         most = self._settings.log_max_bytes
-        self.scans = ScanLog(self.folder, most, leaf_m, epoch, self._restored)
+        self.scans = ScanLog(self.folder, most, leaf_m, self.epoch, self._restored)
 
     def close(self) -> None:
         """Release the folder."""
         self.scans.close()
         self._lock.close()
+
+    @property
+    def epoch(self) -> int:
+        """The epoch of the newest checkpoint; 0: there is none."""
+        return 0 if self._newest is None else self._newest.facts.epoch
+
+    @property
+    def restored(self) -> Restored | None:
+        """When the map went back to an older checkpoint, the last time; ``None``: never."""
+        return self._restored
 
     @property
     def base_epoch(self) -> int | None:

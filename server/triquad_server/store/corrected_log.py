@@ -1,0 +1,115 @@
+"""The scans that were kept, with corrected poses, from the first one that moves."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from triquad_format.errors import RefusedError
+from triquad_format.mapfile.checkpoint_folder import CheckpointFile, checkpoint_files
+from triquad_format.records.arrays import Bools, Doubles
+from triquad_format.scan_log.log_folder import Segment, history, of_map, segments
+from triquad_format.scan_log.reading import read_segment
+from triquad_format.scan_log.segment import LoggedCorrection, LoggedReset, LoggedScan
+from triquad_format.scan_log.tracks import SourceTracks
+
+from triquad_server.store.store import Store
+
+_TOLERANCE_VOXELS, _AT_VOXELS = 0.05, 100.0
+"""A scan has moved if anything within 100 voxels of its sensor has, by a twentieth of a voxel."""
+
+
+@dataclass(frozen=True)
+class CorrectedLog:
+    """What a map is to be made of again."""
+
+    correction: LoggedCorrection
+    base: CheckpointFile | None  # from which it goes on; None: it begins with nothing
+    files: list[Segment]  # of the log, with all that came after that
+    tracks: SourceTracks
+    moved: int  # the number of kept scans that move
+
+    def entries(self) -> Iterator[LoggedScan | LoggedReset]:
+        """Yield kept scans, with corrected poses, and resets, in their order.
+
+        Raises:
+            FormatError: a file is damaged.
+            OSError: it cannot be read.
+        """
+        for segment in self.files:
+            for entry in read_segment(segment.path):
+                if isinstance(entry, LoggedScan):
+                    pose = self.tracks[entry.source].pose(entry.stamp_ns)
+                    yield replace(entry, world_from_sensor=pose)
+                elif isinstance(entry, LoggedReset):
+                    yield entry
+
+
+def corrected_log(
+    store: Store, correction: LoggedCorrection, leaf_m: float, *, onward: bool
+) -> CorrectedLog:
+    """Return the log of a store, up to its newest checkpoint, after a correction.
+
+    With ``onward`` it moves all scans that come after its poses.
+
+    Raises:
+        RefusedError: it does not go back to the first scan that moves, or has none of the source.
+        FormatError: a file is damaged.
+        OSError: it cannot be read.
+    """
+    files = history(of_map(segments(store.scans.folder), store.epoch, store.restored))
+    tracks, scans = SourceTracks(), list[tuple[int, int]]()
+    for number, segment in enumerate(files):
+        for entry in read_segment(segment.path):
+            if isinstance(entry, LoggedScan):
+                tracks[entry.source].add(entry.stamp_ns, entry.world_from_sensor)
+                if entry.source == correction.source:
+                    scans.append((number, entry.stamp_ns))
+            elif isinstance(entry, LoggedCorrection):
+                tracks.correct(entry)
+            elif not isinstance(entry, LoggedReset):
+                tracks[entry.child].add(entry.stamp_ns, entry.pose)
+    if correction.source not in tracks:
+        raise RefusedError("bad_request", _no_source(correction.source, tracks))
+    track = tracks[correction.source]
+    if onward:
+        correction = replace(correction, until_ns=int(track.stamps_ns[-1]))
+    before = track.poses
+    tracks.correct(correction)
+    moved = set(track.stamps_ns[_moved(before, track.poses, leaf_m)].tolist())
+    first = next((number for number, stamp_ns in scans if stamp_ns in moved), len(files))
+    count = sum(stamp_ns in moved for _, stamp_ns in scans)
+    log = CorrectedLog(correction, None, files, tracks, count)
+    return log if count == 0 else _from(first, files, log, store)
+
+
+def _from(first: int, files: list[Segment], log: CorrectedLog, store: Store) -> CorrectedLog:
+    """Return the log from the newest checkpoint on that has nothing of file ``first``."""
+    least = 0 if store.restored is None else store.restored.as_epoch
+    checkpoints = [one for one in checkpoint_files(store.folder) if one.epoch >= least]
+    for number in range(first, -1, -1):
+        since, until = files[number].after, files[number].epoch
+        bases = [one for one in checkpoints if since <= one.epoch < until]
+        if bases:
+            base = max(bases, key=lambda one: one.epoch)
+            return replace(log, base=base, files=files[number:])
+    if files[0].after == 0:
+        return log
+    raise RefusedError(
+        "store",
+        f"scans before epoch {files[0].after} are not kept any more (store.log_max_bytes), and no "
+        "checkpoint of before the first scan that moves is left (store.keep): the map cannot be "
+        "made again without losing what only they have shown",
+    )
+
+
+def _moved(before: Doubles, after: Doubles, leaf_m: float) -> Bools:
+    """Return which poses [N, 4, 4] differ by more than the tolerance."""
+    shifts = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
+    turns = np.linalg.norm(after[:, :3, :3] - before[:, :3, :3], axis=(1, 2)) / np.sqrt(2)
+    result: Bools = shifts + _AT_VOXELS * leaf_m * turns > _TOLERANCE_VOXELS * leaf_m
+    return result
+
+
+def _no_source(name: str, tracks: SourceTracks) -> str:
+    known = ", ".join(sorted(tracks)) or "none"
+    return f"no scan of source '{name}' is kept: those of {known} are"

@@ -1,0 +1,165 @@
+"""Makes the map again from the scans that were kept, where better poses of them come."""
+
+import logging
+import time
+from collections import deque
+
+import numpy as np
+from triquad_format.errors import FormatError, RefusedError
+from triquad_format.records.arrays import Doubles
+from triquad_format.records.pose import pose_matrices
+from triquad_format.scan_log.reading import Entry
+from triquad_format.scan_log.segment import LoggedCorrection, LoggedReset, LoggedScan
+from triquad_format.wire.limits import MAX_KEYFRAMES
+from triquad_format.wire.source_messages import CorrectPosesReply, CorrectPosesRequest
+
+from triquad_server.errors import ScanRefusedError, StoreError
+from triquad_server.intake.source_trails import SourceTrails
+from triquad_server.mapping.mapper import Mapper
+from triquad_server.mapping.mapper_thread import MapperThread
+from triquad_server.store.checkpoint_writer import CheckpointWriter, way_back
+from triquad_server.store.corrected_log import CorrectedLog, corrected_log
+from triquad_server.store.restore import valid_checkpoint
+from triquad_server.store.store import Store
+
+_log = logging.getLogger(__name__)
+
+_LAST_SCANS = 2  # that came meanwhile and are taken in while mapping waits
+
+_UNIT_TOLERANCE = 1e-3  # of the length of a quaternion
+
+_OFTEN = {"map_full", "no_memory", "too_many_regions"}  # reasons for which all else is refused, too
+
+
+class PoseCorrector:
+    """Corrects the poses of kept scans. While the map is made again, it goes on as it was."""
+
+    def __init__(
+        self,
+        mapper: MapperThread,
+        checkpoints: CheckpointWriter,
+        trails: SourceTrails,
+    ) -> None:
+        """Correct the map of ``mapper``, with its store, and the ``trails`` of its sources."""
+        self._mapper = mapper
+        self._checkpoints = checkpoints
+        self._trails = trails
+
+    def answer(self, request: CorrectPosesRequest) -> CorrectPosesReply:
+        """Make the map as the corrected poses would have made it, and reply once it is there.
+
+        Raises:
+            RefusedError: ``bad_request``, or ``store`` where what is needed for it is not kept; the
+                map stays as it is.
+        """
+        store = self._checkpoints.store
+        if store is None or not store.scans.is_kept:
+            raise RefusedError(
+                "store",
+                "poses are corrected by making the map again from its scans, and they are not "
+                "kept: start the server with --store, and store.log_max_bytes above 0",
+            )
+        leaf_m, origin = self._mapper.leaf_m, self._mapper.origin
+        correction = _correction(request, origin)
+        followed = deque[Entry]()
+        try:
+            kept = self._checkpoints.write(
+                "correcting poses", at_cut=lambda: store.scans.follow(followed)
+            ).epoch
+            log = corrected_log(store, correction, leaf_m, onward=request.onward)
+            if log.moved == 0:
+                return CorrectPosesReply(kept, scans_moved=0, scans_learnt=0)
+            return self._correct(store, log, followed, kept)
+        except (StoreError, FormatError, OSError) as error:
+            raise RefusedError("store", f"no pose was corrected: {error}") from error
+        finally:
+            store.scans.follow(None)
+
+    def _correct(
+        self, store: Store, log: CorrectedLog, followed: "deque[Entry]", kept: int
+    ) -> CorrectPosesReply:
+        """Make the map again, and have it in place of the one before."""
+        began_s = time.monotonic()
+        again = _MapAgain(self._mapper.call(lambda mapper: mapper), log)
+        for entry in log.entries():
+            again.take(entry)
+        while len(followed) > _LAST_SCANS:
+            again.take(followed.popleft())
+
+        def change(mapper: Mapper) -> int:
+            while followed:
+                again.take(followed.popleft())
+            mapper.become(again.map)
+            store.scans.add_correction(log.correction)
+            source = log.correction.source
+            self._trails.retrace(source, log.tracks[source].poses[:, :3, 3] - mapper.origin)
+            return mapper.publish().number
+
+        epoch = self._mapper.call(change)
+        took_s, undo = time.monotonic() - began_s, way_back(kept)
+        _log.warning(
+            "%d scans of %s were corrected as of epoch %d, after %.1f s: %s",
+            *(log.moved, log.correction.source, epoch, took_s, undo),
+        )
+        if store.keep_resets == 0:
+            return CorrectPosesReply(epoch, log.moved, again.scans)
+        return CorrectPosesReply(epoch, log.moved, again.scans, kept, undo)
+
+
+class _MapAgain:
+    """A map that is made again."""
+
+    def __init__(self, live: Mapper, log: CorrectedLog) -> None:
+        base = log.base
+        self.map = live.other(None if base is None else valid_checkpoint(base).record)
+        self.scans = 0  # that were taken in
+
+    def take(self, entry: Entry) -> None:
+        """Take in a scan, or forget what was reset.
+
+        Raises:
+            RefusedError: the map has no room for it.
+        """
+        if isinstance(entry, LoggedReset):
+            origin = self.map.origin
+            self.map.reset(entry.minimum - origin, entry.maximum - origin)
+        elif isinstance(entry, LoggedScan):
+            try:
+                self._take_scan(entry)
+            except ScanRefusedError as error:
+                if error.reason in _OFTEN:
+                    raise RefusedError("store", f"no pose was corrected: {error}") from error
+                _log.warning("a kept scan of %s is left out: %s", entry.source, error)
+
+    def _take_scan(self, scan: LoggedScan) -> None:
+        self.map.ingest(
+            scan.points,
+            scan.world_from_sensor,
+            scan.stamp_ns // 1_000_000_000,
+            source=scan.source,
+            no_return=scan.no_return,
+        )
+        self.scans += 1
+
+
+def _correction(request: CorrectPosesRequest, origin: Doubles) -> LoggedCorrection:
+    """Return the correction that a request wants, in the coordinates of the map's user.
+
+    Raises:
+        RefusedError: it is none.
+    """
+    stamps_ns, turns = request.stamps_ns, request.quaternions
+    counts = {len(stamps_ns), len(request.positions), len(turns)}
+    if len(counts) > 1 or not 0 < len(stamps_ns) <= MAX_KEYFRAMES:
+        raise RefusedError(
+            "bad_request",
+            f"{len(stamps_ns)} times, {len(request.positions)} positions and {len(turns)} "
+            f"quaternions: as many of each, 1 to {MAX_KEYFRAMES}, make a correction",
+        )
+    if (np.diff(stamps_ns) <= 0).any():
+        raise RefusedError("bad_request", "the times do not rise")
+    lengths = np.linalg.norm(turns, axis=1, keepdims=True)
+    if (abs(lengths - 1) > _UNIT_TOLERANCE).any():
+        raise RefusedError("bad_request", "a quaternion has not the length 1")
+    poses = pose_matrices(request.positions + origin, turns / lengths)
+    return LoggedCorrection(request.source, stamps_ns, poses, until_ns=int(stamps_ns[-1]))

@@ -1,0 +1,180 @@
+"""A map whose poses are corrected is the one that the corrected poses would have made."""
+
+import threading
+from functools import cache
+
+import numpy as np
+import pytest
+import triquad_client
+from scipy.spatial import cKDTree
+from support import servers
+from support.maps.small_world import world
+from support.poses import shifted
+from triquad_client import InvalidScanError, RefusedError
+from triquad_server.mapping.mapper import Mapper
+from triquad_server.settings import Settings
+from triquad_tools.recordings.opening import open_recording
+from triquad_tools.recordings.recording import ReadingOptions
+
+SCANS = 6
+FIRST_S = 1e9
+SETTINGS = Settings.model_validate(
+    {"field": {"leaf_m": 0.2}, "store": {"log_max_bytes": 10**9, "period_s": 0}}
+)
+SAME = 0.995  # share of voxels that are within one of each other
+
+
+def off(share: float = 1.0) -> np.ndarray:
+    """How far a pose is off, in the sensor's own frame."""
+    pose, angle = shifted(y=0.7 * share), np.radians(3.0 * share)
+    pose[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    return pose
+
+
+def publish(client, number: int, error: np.ndarray, source: str = "roof", at_s: float = 0.0):
+    scan = world(SCANS).scans[number]
+    pose = scan.world_from_sensor @ error
+    stamp_s = FIRST_S + number + at_s
+    client.publish_scan(scan.points, pose, stamp_s, source, no_return=scan.no_return)
+    client.flush()
+
+
+def corrections(*numbers: int) -> tuple[list[float], list[np.ndarray]]:
+    """The true poses of some scans."""
+    poses = [world(SCANS).scans[number].world_from_sensor for number in numbers]
+    return [FIRST_S + number for number in numbers], poses
+
+
+@cache
+def truth(scans: int = SCANS) -> np.ndarray:
+    """The surface voxels [N, 3] of the drive with its true poses."""
+    mapper = Mapper("truth", SETTINGS, "cpu")
+    for scan in world(SCANS).scans[:scans]:
+        mapper.ingest(scan.points, scan.world_from_sensor, no_return=scan.no_return)
+    with triquad_client.OfflineMap(mapper.publish().record()) as done:
+        return done.surface_voxels()
+
+
+def surface(client, folder) -> np.ndarray:
+    client.download_map(folder / "now.triquad")
+    with triquad_client.open_map(folder / "now.triquad") as found:
+        return found.surface_voxels()
+
+
+def shared(found: np.ndarray, expected: np.ndarray) -> float:
+    """The share of voxels that are within one of the others, the lesser of both ways."""
+    ways = [(found, expected), (expected, found)]
+    return min(float((cKDTree(there).query(here)[0] < 0.21).mean()) for here, there in ways)
+
+
+def test_the_map_is_as_the_corrected_poses_would_have_made_it(tmp_path):
+    with servers.service_and_client(SETTINGS, tmp_path / "store") as client:
+        for number in range(SCANS):
+            publish(client, number, off() if number >= 3 else np.eye(4))
+        assert shared(surface(client, tmp_path), truth()) < 0.95
+        before = client.status().epoch
+        reply = client.correct_poses("roof", *corrections(*range(SCANS)))
+        assert (reply.scans_moved, reply.scans_learnt) == (3, SCANS)
+        assert reply.epoch > before
+        assert shared(surface(client, tmp_path), truth()) > SAME
+        trail = client.sources().sources["roof"].trail
+        np.testing.assert_allclose(trail[-1], corrections(SCANS - 1)[1][0][:3, 3], atol=1e-3)
+    with servers.service_and_client(SETTINGS, tmp_path / "store") as client:
+        assert shared(surface(client, tmp_path), truth()) > SAME
+    recording = open_recording(tmp_path / "store", ReadingOptions())
+    for scan, pose in zip(recording.read(range(SCANS)), corrections(*range(SCANS))[1], strict=True):
+        np.testing.assert_allclose(scan.world_from_sensor, pose, atol=1e-6)
+
+
+def test_scans_between_keyframes_move_with_them(tmp_path):
+    with servers.service_and_client(SETTINGS, tmp_path) as client:
+        for number in range(SCANS):
+            publish(client, number, off(number / (SCANS - 1)))
+        client.correct_poses("roof", *corrections(0, SCANS - 1))
+        assert shared(surface(client, tmp_path), truth()) > SAME
+
+
+def test_scans_after_the_last_keyframe_move_where_that_is_asked_for(tmp_path):
+    with servers.service_and_client(SETTINGS, tmp_path) as client:
+        for number in range(SCANS):
+            publish(client, number, off())
+        assert client.correct_poses("roof", *corrections(0, 1)).scans_moved == 2
+        assert shared(surface(client, tmp_path), truth()) < 0.95
+        assert client.correct_poses("roof", *corrections(0, 1, 2), onward=True).scans_moved == 4
+        assert shared(surface(client, tmp_path), truth()) > SAME
+
+
+def test_what_came_before_the_first_scan_that_moves_is_taken_from_a_checkpoint(tmp_path):
+    with servers.service_and_client(SETTINGS, tmp_path) as client:
+        for number in range(SCANS):
+            publish(client, number, off() if number >= 4 else np.eye(4))
+            client.checkpoint()
+        reply = client.correct_poses("roof", *corrections(*range(SCANS)))
+        assert (reply.scans_moved, reply.scans_learnt) == (2, 2)
+        assert shared(surface(client, tmp_path), truth()) > SAME
+        again = client.correct_poses("roof", *corrections(*range(SCANS)))
+        assert (again.scans_moved, again.scans_learnt) == (0, 0)
+
+
+def test_scans_that_come_meanwhile_and_those_of_others_are_in_the_map(tmp_path):
+    with servers.service_and_client(SETTINGS, tmp_path) as client:
+        for number in range(SCANS - 2):
+            publish(client, number, off() if number % 2 else np.eye(4), f"lidar-{number % 2}")
+        replies = []
+        numbers = range(1, SCANS - 2, 2)
+        correcting = threading.Thread(
+            target=lambda: replies.append(client.correct_poses("lidar-1", *corrections(*numbers)))
+        )
+        correcting.start()
+        for number in (SCANS - 2, SCANS - 1):
+            publish(client, number, np.eye(4), "lidar-1")
+        correcting.join()
+        assert replies[0].scans_moved == 2
+        assert shared(surface(client, tmp_path), truth()) > SAME
+
+
+def test_the_way_back_is_told(tmp_path):
+    with servers.service_and_client(SETTINGS, tmp_path / "store") as client:
+        for number in range(SCANS):
+            publish(client, number, np.eye(4))
+        wrong = [pose @ off() for pose in corrections(4, 5)[1]]
+        reply = client.correct_poses("roof", corrections(4, 5)[0], wrong)
+        assert f"--restore {reply.kept_epoch}" in reply.undo
+        client.download_map(tmp_path / "wrong.triquad")
+    kept = next(tmp_path.glob(f"store/*/epoch-{reply.kept_epoch:09d}.*"))
+    with triquad_client.open_map(kept) as before:
+        assert shared(before.surface_voxels(), truth()) > SAME
+
+
+@pytest.mark.parametrize(
+    ("numbers", "source", "error", "named"),
+    [
+        ((0, 1), "front", RefusedError, "those of roof are"),
+        ((1, 0), "roof", InvalidScanError, "they rise"),
+        ((), "roof", InvalidScanError, "0 poses"),
+    ],
+)
+def test_what_cannot_be_corrected_is_refused_by_name(tmp_path, numbers, source, error, named):
+    with servers.service_and_client(SETTINGS, tmp_path) as client:
+        publish(client, 0, np.eye(4))
+        with pytest.raises(error, match=named):
+            client.correct_poses(source, *corrections(*numbers))
+        assert client.correct_poses("roof", *corrections(0)).scans_moved == 0
+
+
+@pytest.mark.parametrize("log_max_bytes", [0, 1])
+def test_where_scans_are_not_kept_the_map_stays_and_the_remedy_is_named(tmp_path, log_max_bytes):
+    settings = SETTINGS.model_copy(
+        update={"store": SETTINGS.store.model_copy(update={"log_max_bytes": log_max_bytes})}
+    )
+    with servers.service_and_client(settings, tmp_path) as client:
+        for number in range(3):
+            publish(client, number, off())
+            client.checkpoint()  # of the log, the newest file alone stays
+        before = surface(client, tmp_path)
+        for path in tmp_path.glob("*/epoch-*"):
+            if path.name < f"epoch-{client.status().epoch:09d}":
+                path.unlink()
+        with pytest.raises(RefusedError, match="store.log_max_bytes"):
+            client.correct_poses("roof", *corrections(0, 1, 2))
+        assert len(surface(client, tmp_path)) == len(before)
