@@ -21,7 +21,7 @@ from triquad_tools.console.report import Row, print_rows
 
 from bench.results import RESULTS, Result, machine, write_page
 
-PARTS = ("core", "server", "answers", "file", "moving", "presets", "start", "viewer")
+PARTS = ("core", "server", "answers", "file", "moving", "poses", "presets", "start", "viewer")
 """The modules of ``bench.parts`` that measure, each imported in its turn: one needs a browser."""
 
 

@@ -34,7 +34,7 @@ from triquad_format.wire.query_messages import (
     SegmentsRequest,
     SpheresRequest,
 )
-from triquad_format.wire.source_messages import SourcesRequest
+from triquad_format.wire.source_messages import CorrectPosesRequest, SourcesRequest
 
 NUMBERS = (0, 1, -1, 2, 7, 2**15, 2**31, -(2**31), 2**53, 2**62, 2**63 - 1, -(2**63), 2**64 - 1)
 _VALUES: tuple[Any, ...] = (
@@ -75,6 +75,9 @@ def good_requests() -> dict[str, list[Message]]:
         keys.MAP_CHUNK: [MapChunkRequest("0" * 64, 0, 1000)],
         keys.CHECKPOINT: [CheckpointRequest()],
         keys.RESET: [ResetRequest(*_BOX)],
+        keys.CORRECT_POSES: [
+            CorrectPosesRequest("lidar", np.arange(2), np.ones((2, 3)), np.eye(4)[2:], True)
+        ],
     }
 
 

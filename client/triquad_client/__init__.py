@@ -20,7 +20,12 @@ from triquad_format.wire.metrics_messages import (
     SourceMetrics,
     TimeHistogram,
 )
-from triquad_format.wire.source_messages import NewestScan, ScanSource, SourceReport
+from triquad_format.wire.source_messages import (
+    CorrectPosesReply,
+    NewestScan,
+    ScanSource,
+    SourceReport,
+)
 from triquad_map.questions.align import Alignment
 from triquad_map.questions.distance import Distances, Unknown, UnknownSpaceError
 from triquad_map.questions.grid import Grid
@@ -79,6 +84,7 @@ __all__ = [
     "Client",
     "ClosedError",
     "ConnectError",
+    "CorrectPosesReply",
     "Distances",
     "DownloadError",
     "EmptierMapError",

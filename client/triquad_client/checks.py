@@ -7,7 +7,7 @@ import math
 import reprlib
 import time
 from collections.abc import Sequence
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -90,14 +90,17 @@ def stamp_ns(stamp_s: float) -> int:
     return round(seconds * 1e9)
 
 
-def keyframes(stamps_s: ArrayLike, poses: Sequence[PoseLike]) -> tuple[Longs, Doubles]:
+def keyframes(stamps_s: ArrayLike, poses: ArrayLike | Sequence[PoseLike]) -> tuple[Longs, Doubles]:
     """Return times [K] in nanoseconds since 1970, and poses [K, 4, 4] at them."""
     try:
         times = real_numbers(stamps_s).ravel().tolist()
     except NO_NUMBER as error:
         raise InvalidScanError(f"stamps_s are no times in seconds since 1970: {error}") from error
     stamps_ns = np.array([stamp_ns(time_s) for time_s in times], np.int64)
-    matrices = [rigid_pose(pose) for pose in poses]
+    try:
+        matrices = [rigid_pose(pose) for pose in cast("Sequence[PoseLike]", poses)]
+    except TypeError as error:
+        raise InvalidScanError(f"the poses are no list of matrices [4, 4]: {error}") from error
     if len(stamps_ns) != len(matrices) or not 0 < len(matrices) <= MAX_KEYFRAMES:
         raise InvalidScanError(
             f"{len(stamps_ns)} stamps_s and {len(matrices)} poses: as many of both, 1 to "

@@ -210,7 +210,7 @@ class Client(ScanCalls, MapQueries, MeshCalls, ChangeCalls, DownloadCalls):
         self,
         source: str,
         stamps_s: ArrayLike,
-        world_from_sensor: Sequence[PoseLike],
+        world_from_sensor: ArrayLike | Sequence[PoseLike],
         *,
         onward: bool = False,
         timeout_s: float = 600.0,

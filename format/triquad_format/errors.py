@@ -12,7 +12,7 @@ ERROR_CODES = {
     "under_way": "the server is at it; ask again with the same ticket",
     "timeout": "the server could not finish in the time that the request allows",
     "busy": "too many requests are waiting, or the server stops or is short of memory",
-    "store": "the checkpoint could not be written, or the map not be kept before a reset",
+    "store": "what is needed could not be written, or is not kept; the map stays as it is",
     "internal": "an error inside the server; its log has the details",
 }
 """The reasons to refuse a request, in :class:`triquad_format.wire.messages.ErrorReply`."""

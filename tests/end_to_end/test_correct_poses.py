@@ -76,6 +76,7 @@ def test_the_map_is_as_the_corrected_poses_would_have_made_it(tmp_path):
         reply = client.correct_poses("roof", *corrections(*range(SCANS)))
         assert (reply.scans_moved, reply.scans_learnt) == (3, SCANS)
         assert reply.epoch > before
+        assert not client.status().settled  # it has to learn again
         assert shared(surface(client, tmp_path), truth()) > SAME
         trail = client.sources().sources["roof"].trail
         np.testing.assert_allclose(trail[-1], corrections(SCANS - 1)[1][0][:3, 3], atol=1e-3)

@@ -34,6 +34,8 @@ MAP = "default"
 WAIT_S = 120.0  # for what takes milliseconds unless something is broken
 SMALL_FILE = Path(__file__).with_name("small.toml")
 SMALL = load_settings(SMALL_FILE)
+LOGGED = load_settings(SMALL_FILE, ["store.log_max_bytes=1000000000"])
+"""The same, with scans kept."""
 RADIUS_M = 4.0
 
 

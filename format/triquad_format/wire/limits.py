@@ -36,8 +36,8 @@ m of rays take about as long as 1,000 distances."""
 SEGMENT_M_PER_SEARCH = 0.25
 """Metres of a segment that count as one search: it is walked in shorter steps than a ray."""
 
-MAX_KEYFRAMES = 100_000
-"""Poses of one correction: 100 km with one each metre."""
+MAX_KEYFRAMES = 50_000
+"""Poses of one correction: 50 km with one each metre."""
 
 LEVELS = 3
 """Levels of detail of meshes: cells of level ``l`` are ``2**l`` times as large as those of 0."""

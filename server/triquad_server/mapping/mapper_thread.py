@@ -212,7 +212,8 @@ class MapperThread:
 
     def _run_command(self, command: Command) -> None:
         result = command.run(self._mapper)
-        self._publish()  # first: the caller may request its epoch
+        self._publish()  # first: the caller may request its epoch, and how much is left to learn
+        self._record_progress()
         command.result.set_result(result)
 
     def _ingest_scans(self, for_s: float) -> bool:

@@ -39,9 +39,14 @@ class PoseCorrector:
         mapper: MapperThread,
         checkpoints: CheckpointWriter,
         trails: SourceTrails,
+        max_bytes: int,
     ) -> None:
-        """Correct the map of ``mapper``, with its store, and the ``trails`` of its sources."""
+        """Correct the map of ``mapper``, with its store, and the ``trails`` of its sources.
+
+        ``max_bytes`` are what the maps may take together.
+        """
         self._mapper = mapper
+        self._max_bytes = max_bytes
         self._checkpoints = checkpoints
         self._trails = trails
 
@@ -49,8 +54,8 @@ class PoseCorrector:
         """Make the map as the corrected poses would have made it, and reply once it is there.
 
         Raises:
-            RefusedError: ``bad_request``, or ``store`` where what is needed for it is not kept; the
-                map stays as it is.
+            RefusedError: ``bad_request``; ``store`` where what is needed for it is not kept;
+                ``busy`` where there is no room for a second map. The map stays as it is.
         """
         store = self._checkpoints.store
         if store is None or not store.scans.is_kept:
@@ -58,6 +63,13 @@ class PoseCorrector:
                 "store",
                 "poses are corrected by making the map again from its scans, and they are not "
                 "kept: start the server with --store, and store.log_max_bytes above 0",
+            )
+        used = self._mapper.progress.map.map_bytes
+        if 2 * used > self._max_bytes:
+            raise RefusedError(
+                "busy",
+                f"it takes a second map of {used / 1e6:.0f} MB for a while, and memory.max_bytes = "
+                f"{self._max_bytes} has no room for that: start the server with more",
             )
         leaf_m, origin = self._mapper.leaf_m, self._mapper.origin
         correction = _correction(request, origin)
@@ -128,7 +140,7 @@ class _MapAgain:
                 self._take_scan(entry)
             except ScanRefusedError as error:
                 if error.reason in _OFTEN:
-                    raise RefusedError("store", f"no pose was corrected: {error}") from error
+                    raise RefusedError("busy", f"no pose was corrected: {error}") from error
                 _log.warning("a kept scan of %s is left out: %s", entry.source, error)
 
     def _take_scan(self, scan: LoggedScan) -> None:

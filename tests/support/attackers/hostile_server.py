@@ -67,7 +67,7 @@ def hostile_server() -> Iterator[HostileServer]:
     """A router before a service that has learnt a sphere: all questions and scans pass it."""
     with (
         TemporaryDirectory() as store,
-        servers.running_service(store=Path(store)) as endpoint,
+        servers.running_service(servers.LOGGED, store=Path(store)) as endpoint,
         servers.raw_session(connect=endpoint) as real,
         ExitStack() as declared,
     ):

@@ -127,6 +127,10 @@ def _questions() -> dict[str, tuple[str, Ask]]:
         "flush": (keys.FLUSH, _flush),
         "checkpoint": (keys.CHECKPOINT, lambda client, _: client.checkpoint()),
         "reset": (keys.RESET, lambda client, _: client.reset(NOWHERE)),
+        "correct poses": (
+            keys.CORRECT_POSES,
+            lambda client, _: client.correct_poses("default", [1.0], [np.eye(4)]),
+        ),
         "download": (keys.MAP_INFO, lambda client, path: client.download_map(path)),
         "chunk": (keys.MAP_CHUNK, lambda client, path: client.download_map(path)),
         "copy": (keys.MAP_CHUNK, lambda client, path: client.sync(AROUND, path)),

@@ -1,0 +1,143 @@
+"""Poses that are corrected: the map after that, how soon it is there, and what a planner meets.
+
+A car drives along a street and back in the other lane. The way back is off by 0.3 m and 1 degree,
+or all of the way drifts by 0.5 % and 0.3 degrees each 10 m, or the last tenth alone is off.
+"""
+
+import argparse
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from triquad_client import Client, Mesh
+from triquad_format.records.arrays import Doubles
+from triquad_tools.demo.probe import ProbeReport
+from triquad_tools.evaluation.metrics import MeshScores
+from triquad_tools.recordings.publishing import FLUSH_TIMEOUT_S, publish_all, wait_until_settled
+from triquad_tools.recordings.recording import DEFAULT_SOURCE, ScanEntry
+from triquad_tools.sensors.sweep import PosedScan
+from triquad_tools.simulation.lidar import Lidar
+from triquad_tools.simulation.street import street_drive
+
+from bench.clients.served import Served, latency_figures, near_surface, served
+from bench.figures import Figure
+from bench.street_scores import DrivenStreet, driven_street
+
+_LENGTH_M, _SCANS = 60.0, 130  # a metre apart: there, around and back
+_BACK, _LAST = 65, 117  # the first scan of the way back, and of the last tenth
+_OFF_M, _OFF_DEG = 0.3, 1.0
+_DRIFT_SHARE, _DRIFT_DEG_PER_M = 0.005, 0.03
+_FIRST_S = 1_700_000_000  # when the drive begins; a scan each second
+_SETTLE_LIMIT_S = 600.0
+_SETTINGS = ("--set", "store.log_max_bytes=2000000000", "--set", "store.period_s=3")
+
+
+@dataclass(frozen=True)
+class _Corrected:
+    """A map that wrong poses have made, and that was corrected."""
+
+    wrong: MeshScores
+    right: MeshScores
+    scans: int  # of which it was made again
+    taken_s: float  # until the first epoch of the corrected map
+    settled_s: float  # and until that had settled
+    met: ProbeReport  # by a planner meanwhile
+
+
+def measure(options: argparse.Namespace) -> list[Figure]:
+    """Return figures of corrected poses."""
+    drive = street_drive(options.seed, _SCANS, 1.0, _LENGTH_M, Lidar(columns=1024))
+    made, true = driven_street(drive), drive.poses
+    with _driven(made, true) as server:
+        never = made.mesh_scores(_settled_mesh(server.client))
+        log_bytes = sum(path.stat().st_size for path in server.folder.rglob("scans-*.mcap"))
+    back = _corrected(made, _off(true, _BACK), _BACK)
+    drift = _corrected(made, _drifting(true), 0)
+    last = _corrected(made, _off(true, _LAST), _LAST)
+    points = sum(len(scan.points) for scan in made.scans)
+    return [
+        Figure("F of a map that never was wrong", 100 * never.f_score, "%"),
+        *_map_figures("way back off by 0.3 m and 1 degree", back, never),
+        *_map_figures("drift of 0.5 % and 0.3 degrees each 10 m", drift, never),
+        *_map_figures("last tenth off", last, never),
+        Figure("corrected map there, all scans", drift.taken_s, "s"),
+        Figure("and settled, after", drift.settled_s, "s"),
+        Figure("corrected map there, last tenth", last.taken_s, "s"),
+        Figure("scans made again for the last tenth", last.scans, ""),
+        Figure("last tenth against all", last.taken_s / drift.taken_s, "", at_most=0.2),
+        *latency_figures("1,000 points with gradient meanwhile", drift.met),
+        Figure("scan log, per point", log_bytes / points, "bytes"),
+        Figure("scan log, per km", log_bytes / 1e6 / (_SCANS / 1000), "MB"),
+    ]
+
+
+def _map_figures(name: str, corrected: _Corrected, never: MeshScores) -> list[Figure]:
+    """Return how good the map was before and after, beside one that never was wrong."""
+    lost = 100 * (never.f_score - corrected.right.f_score)
+    doubled = 100 * (never.accuracy_ratio - corrected.right.accuracy_ratio)
+    return [
+        Figure(f"{name}: F before", 100 * corrected.wrong.f_score, "%"),
+        Figure(f"{name}: F less than never wrong", lost, "points", at_most=0.3),
+        Figure(f"{name}: more surface that is none", doubled, "points", at_most=1),
+    ]
+
+
+def _off(true: Doubles, first: int) -> Doubles:
+    """Return poses [N, 4, 4] that are off from a scan on, turned about the place of that one."""
+    turn, place = np.eye(4), true[first, :3, 3]
+    turn[:3, :3] = Rotation.from_euler("z", _OFF_DEG, degrees=True).as_matrix()
+    turn[:3, 3] = place - turn[:3, :3] @ place + _OFF_M * np.array([0.6, 0.8, 0.0])
+    return np.concatenate([true[:first], turn @ true[first:]])
+
+
+def _drifting(true: Doubles) -> Doubles:
+    """Return poses [N, 4, 4] of an odometry that goes too far and turns too much."""
+    steps = np.linalg.inv(true[:-1]) @ true[1:]
+    lengths_m = np.linalg.norm(steps[:, :3, 3], axis=1)
+    steps[:, :3, 3] *= 1 + _DRIFT_SHARE
+    turned_deg = _DRIFT_DEG_PER_M * lengths_m[:, None]
+    steps[:, :3, :3] @= Rotation.from_euler("z", turned_deg, degrees=True).as_matrix()
+    poses = [true[0]]
+    for step in steps:
+        poses.append(poses[-1] @ step)
+    return np.array(poses)
+
+
+def _corrected(made: DrivenStreet, wrong: Doubles, first: int) -> _Corrected:
+    """Map with wrong poses, and correct them from scan ``first`` on."""
+    true = made.drive.poses
+    with _driven(made, wrong) as server:
+        before = made.mesh_scores(_settled_mesh(server.client))
+        stamps_s = [_FIRST_S + number for number in range(first, _SCANS)]
+        started_s = time.monotonic()
+        with server.planner(near_surface(made), "gradient") as probe:
+            reply = server.client.correct_poses(DEFAULT_SOURCE, stamps_s, true[first:])
+            taken_s = time.monotonic() - started_s
+            met = probe.finish()
+        mesh = _settled_mesh(server.client)
+        settled_s = time.monotonic() - started_s
+        after = made.mesh_scores(mesh)
+    return _Corrected(before, after, reply.scans_learnt, taken_s, settled_s, met)
+
+
+def _settled_mesh(client: Client) -> Mesh:
+    wait_until_settled(client, _SETTLE_LIMIT_S)
+    return client.mesh()
+
+
+@contextmanager
+def _driven(made: DrivenStreet, poses: Doubles) -> Iterator[Served]:
+    """Yield a server that keeps scans and was given all of them, with these poses."""
+
+    def scans() -> Iterator[tuple[ScanEntry, PosedScan]]:
+        for number, (scan, pose) in enumerate(zip(made.scans, poses, strict=True)):
+            entry = ScanEntry((_FIRST_S + number) * 1_000_000_000, DEFAULT_SOURCE)
+            yield entry, PosedScan(scan.points, pose)
+
+    with served(arguments=_SETTINGS) as server:
+        publish_all(server.client, scans(), _SCANS)
+        server.client.flush(FLUSH_TIMEOUT_S)
+        yield server
