@@ -1,5 +1,6 @@
 """A map whose poses are corrected is the one that the corrected poses would have made."""
 
+import signal
 import threading
 from functools import cache
 
@@ -10,7 +11,7 @@ from scipy.spatial import cKDTree
 from support import servers
 from support.maps.small_world import world
 from support.poses import shifted
-from triquad_client import InvalidScanError, RefusedError
+from triquad_client import InvalidScanError, RefusedError, TriquadError
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
 from triquad_tools.recordings.opening import open_recording
@@ -179,3 +180,33 @@ def test_where_scans_are_not_kept_the_map_stays_and_the_remedy_is_named(tmp_path
         with pytest.raises(RefusedError, match="store.log_max_bytes"):
             client.correct_poses("roof", *corrections(0, 1, 2))
         assert len(surface(client, tmp_path)) == len(before)
+
+
+@pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGKILL])
+def test_a_server_that_ends_amid_a_correction_has_the_map_of_before(tmp_path, end):
+    arguments = ["--store", tmp_path / "store", "--set", "store.log_max_bytes=1000000000"]
+    arguments += ["--set", "field.leaf_m=0.2", "--set", "store.period_s=0"]
+    with (
+        servers.server_process(arguments) as server,
+        triquad_client.connect(server.endpoint) as client,
+    ):
+        for number in range(SCANS):
+            publish(client, number, off())
+        before = surface(client, tmp_path)
+        correcting = threading.Thread(
+            target=lambda: pytest.raises(
+                TriquadError, client.correct_poses, "roof", *corrections(*range(SCANS))
+            )
+        )
+        correcting.start()
+        server.wait_for("the map is made again")
+        server.process.send_signal(end)
+        server.process.wait()
+        correcting.join()
+    with (
+        servers.server_process(arguments) as server,
+        triquad_client.connect(server.endpoint) as client,
+    ):
+        assert shared(surface(client, tmp_path), before) > SAME
+        client.correct_poses("roof", *corrections(*range(SCANS)))
+        assert shared(surface(client, tmp_path), truth()) > SAME

@@ -3,6 +3,8 @@
 import logging
 import time
 from collections import deque
+from collections.abc import Iterator
+from itertools import chain
 
 import numpy as np
 from triquad_format.errors import FormatError, RefusedError
@@ -24,7 +26,7 @@ from triquad_server.store.store import Store
 
 _log = logging.getLogger(__name__)
 
-_LAST_SCANS = 2  # that came meanwhile and are taken in while mapping waits
+_LAST_SCANS = 2  # that came meanwhile
 
 _UNIT_TOLERANCE = 1e-3  # of the length of a quaternion
 
@@ -81,7 +83,8 @@ class PoseCorrector:
             log = corrected_log(store, correction, leaf_m, onward=request.onward)
             if log.moved == 0:
                 return CorrectPosesReply(kept, scans_moved=0, scans_learnt=0)
-            return self._correct(store, log, followed, kept)
+            with self._mapper.training_rests():
+                return self._correct(store, log, followed, kept)
         except (StoreError, FormatError, OSError) as error:
             raise RefusedError("store", f"no pose was corrected: {error}") from error
         finally:
@@ -92,18 +95,19 @@ class PoseCorrector:
     ) -> CorrectPosesReply:
         """Make the map again, and have it in place of the one before."""
         began_s = time.monotonic()
+        source = log.correction.source
+        _log.info("%d scans of %s have better poses: the map is made again", log.moved, source)
         again = _MapAgain(self._mapper.call(lambda mapper: mapper), log)
-        for entry in log.entries():
+        for entry in chain(log.entries(), _until_few_are_left(followed)):
+            if self._mapper.is_paused:
+                raise RefusedError("busy", "the server is stopping: no pose was corrected")
             again.take(entry)
-        while len(followed) > _LAST_SCANS:
-            again.take(followed.popleft())
 
         def change(mapper: Mapper) -> int:
             while followed:
                 again.take(followed.popleft())
             mapper.become(again.map)
             store.scans.add_correction(log.correction)
-            source = log.correction.source
             self._trails.retrace(source, log.tracks[source].poses[:, :3, 3] - mapper.origin)
             return mapper.publish().number
 
@@ -111,7 +115,7 @@ class PoseCorrector:
         took_s, undo = time.monotonic() - began_s, way_back(kept)
         _log.warning(
             "%d scans of %s were corrected as of epoch %d, after %.1f s: %s",
-            *(log.moved, log.correction.source, epoch, took_s, undo),
+            *(log.moved, source, epoch, took_s, undo),
         )
         if store.keep_resets == 0:
             return CorrectPosesReply(epoch, log.moved, again.scans)
@@ -152,6 +156,12 @@ class _MapAgain:
             no_return=scan.no_return,
         )
         self.scans += 1
+
+
+def _until_few_are_left(followed: "deque[Entry]") -> Iterator[Entry]:
+    """Yield what came meanwhile; the last few are taken in while mapping waits."""
+    while len(followed) > _LAST_SCANS:
+        yield followed.popleft()
 
 
 def _correction(request: CorrectPosesRequest, origin: Doubles) -> LoggedCorrection:
