@@ -126,3 +126,19 @@ def test_a_server_that_cannot_be_reached_is_a_failure(replay, tmp_path, capsys):
     assert f"cannot connect to {endpoint}" in capsys.readouterr().err
     assert replay(folder, "--map", "other") == 1
     assert "no server has a map 'other'; available: default" in capsys.readouterr().err
+
+
+def test_poses_of_scans_that_were_published_are_corrected(tmp_path, capsys):
+    folder, better = _folder(tmp_path / "drive"), tmp_path / "better.txt"
+    poses = np.loadtxt(folder / "poses.txt")
+    poses[:, 7] += 0.5  # to the left
+    np.savetxt(better, poses)
+    log = ["--set", "store.log_max_bytes=100000000", "--store", tmp_path / "store"]
+    with servers.server_process(["--settings", servers.SMALL_FILE, *log]) as server:
+        there = ["--connect", server.endpoint]
+        assert main([str(folder), *there]) == 0
+        assert main([str(folder), *there, "--trajectory", str(better), "--correct-poses"]) == 0
+        assert "2 kept scans moved, 2 taken in again" in capsys.readouterr().out
+        with triquad_client.connect(server.endpoint) as client:
+            trail = client.sources().sources["default"].trail
+    np.testing.assert_allclose(trail[:, 1], 0.5, atol=1e-6)

@@ -28,6 +28,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--source", metavar="NAME", help="publish as this sensor (default: as the recording says)")
     rate = "scans a second, or 1x: as recorded, 2x: twice as fast; whatever the server takes"
     add("--rate", type=due_times, metavar="HZ|FACTORx", help=rate)
+    corrected = "publish nothing: the scans are in the map, and their poses are to be these"
+    add("--correct-poses", action="store_true", help=corrected)
     add("--settle", action="store_true", help="wait until the server has learnt all of it")
     return parser
 

@@ -6,9 +6,11 @@ import time
 from pathlib import Path
 
 from triquad_client import FlushReport
+from triquad_format.records.arrays import Doubles
 
 from triquad_tools.console.arguments import connect_to
 from triquad_tools.console.command import FAILED, OK, print_line
+from triquad_tools.console.progress import progress
 from triquad_tools.console.report import print_columns
 from triquad_tools.recordings.opening import entries_of, length_s, open_recording, open_selected
 from triquad_tools.recordings.publishing import FLUSH_TIMEOUT_S, publish_all, wait_until_settled
@@ -17,7 +19,9 @@ from triquad_tools.recordings.recording import ScanEntry, options_of
 
 def work(options: argparse.Namespace) -> int:
     """Publish a recording, or tell what it holds."""
-    return _list(options) if options.list else _replay(options)
+    if options.list:
+        return _list(options)
+    return _correct(options) if options.correct_poses else _replay(options)
 
 
 def _list(options: argparse.Namespace) -> int:
@@ -62,6 +66,33 @@ def _replay(options: argparse.Namespace) -> int:
             trained = f"{status.samples_trained / 1e6:.1f} M samples trained"
             print_line(f"settled: epoch {status.epoch}, {trained}")
     return OK if flush.lost == flush.refused == 0 else FAILED
+
+
+def _correct(options: argparse.Namespace) -> int:
+    """Have the poses of scans that were published before be those that they have now."""
+    selection = open_selected(options)
+    poses: dict[str, dict[int, Doubles]] = {}  # by source and stamp
+    for entry, scan in zip(selection.entries, selection.scans(), strict=True):
+        of_source = poses.setdefault(options.source or entry.source, {})
+        of_source[entry.stamp_ns] = scan.world_from_sensor
+    with connect_to(options) as client:
+        for source, known in poses.items():
+            stamps_ns = sorted(known)
+            with progress(f"correcting poses of {source}"):
+                reply = client.correct_poses(
+                    source,
+                    [stamp_ns / 1e9 for stamp_ns in stamps_ns],
+                    [known[stamp_ns] for stamp_ns in stamps_ns],
+                )
+            print_line(
+                f"{source}: {reply.scans_moved} kept scans moved, {reply.scans_learnt} taken in "
+                f"again, epoch {reply.epoch}"
+            )
+            if reply.undo:
+                print_line(reply.undo)
+        if options.settle:
+            wait_until_settled(client)
+    return OK
 
 
 def _summary(published: int, skipped: int, flush: FlushReport, refusals: dict[str, int]) -> str:
