@@ -77,12 +77,12 @@ class PoseCorrector:
         correction = _correction(request, origin)
         followed = deque[Entry]()
         try:
-            kept = self._checkpoints.write(
-                "correcting poses", at_cut=lambda: store.scans.follow(followed)
-            ).epoch
+            # So that the log has all until there.
+            newest = self._checkpoints.write(at_cut=lambda: store.scans.follow(followed))
             log = corrected_log(store, correction, leaf_m, onward=request.onward)
             if log.moved == 0:
-                return CorrectPosesReply(kept, scans_moved=0, scans_learnt=0)
+                return CorrectPosesReply(newest.epoch, scans_moved=0, scans_learnt=0)
+            kept = self._checkpoints.write("correcting poses").epoch
             with self._mapper.training_rests():
                 return self._correct(store, log, followed, kept)
         except (StoreError, FormatError, OSError) as error:
