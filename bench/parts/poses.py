@@ -32,7 +32,8 @@ _OFF_M, _OFF_DEG = 0.3, 1.0
 _DRIFT_SHARE, _DRIFT_DEG_PER_M = 0.005, 0.03
 _FIRST_S = 1_700_000_000  # when the drive begins; a scan each second
 _SETTLE_LIMIT_S = 600.0
-_SETTINGS = ("--set", "store.log_max_bytes=2000000000", "--set", "store.period_s=3")
+_ASSIGNED = ("store.log_max_bytes=2000000000", "store.period_s=3", "store.keep=100")
+_SETTINGS = [word for one in _ASSIGNED for word in ("--set", one)]
 
 
 @dataclass(frozen=True)
