@@ -20,9 +20,9 @@ from triquad_tools.recordings.publishing import FLUSH_TIMEOUT_S, wait_until_sett
 from bench.clients.served import MAP, Served, around, latency_figures, served, stream
 from bench.figures import Figure, seconds
 from bench.parts.ground import ground_latency, ground_points, measure_ground
-from bench.parts.truths import REACH_M, measure_answers
 from bench.street import bench_street
 from bench.street_scores import DrivenStreet
+from bench.truths import REACH_M, measure_answers
 
 _ASKED = 1_000
 _ASKED_AT_ONCE = 100_000

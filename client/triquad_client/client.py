@@ -1,15 +1,11 @@
 """The client: publishes scans to a map server, and asks it about the map."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import ArrayLike
 from triquad_format.errors import InvalidInputError
 from triquad_format.printable import printable
 from triquad_format.records.arrays import Doubles
-from triquad_format.records.pose import quaternion_of
 from triquad_format.wire.limits import MAX_SAMPLE_POINTS
 from triquad_format.wire.messages import (
     CheckpointInfo,
@@ -21,16 +17,12 @@ from triquad_format.wire.messages import (
 )
 from triquad_format.wire.metrics_messages import MetricsRequest, ServerMetrics
 from triquad_format.wire.places import known_origin
-from triquad_format.wire.source_messages import (
-    CorrectPosesReply,
-    CorrectPosesRequest,
-    SourceReport,
-    SourcesRequest,
-)
+from triquad_format.wire.source_messages import SourceReport, SourcesRequest
 
 from triquad_client import checks
 from triquad_client.brief_errors import brief, brief_errors
 from triquad_client.calls.changes import ChangeCalls
+from triquad_client.calls.corrections import CorrectionCalls
 from triquad_client.calls.download import DownloadCalls
 from triquad_client.calls.point_queries import pin_newest
 from triquad_client.calls.queries import MapQueries, PinnedMap
@@ -42,7 +34,6 @@ from triquad_client.mesh.mesh_watch import MeshWatch
 from triquad_client.net.connection import Connection, new_ticket
 from triquad_client.net.opening import open_connection
 from triquad_client.offline.synced_map import SyncedMap
-from triquad_client.pose import PoseLike
 
 MAX_DOWNLOAD_BYTES = 2**30
 """Some hundred times the map of a town; larger ones need a limit of the caller's."""
@@ -51,7 +42,7 @@ _NO_SOURCES = SourceReport(server="", revision=0, sources={})
 
 
 @brief_errors
-class Client(ScanCalls, MapQueries, MeshCalls, ChangeCalls, DownloadCalls):
+class Client(ScanCalls, CorrectionCalls, MapQueries, MeshCalls, ChangeCalls, DownloadCalls):
     """A connection to one map of a server. Close it, or use it in a ``with`` statement.
 
     Positions are metres in the map frame, or from the map's origin where it was connected with
@@ -203,49 +194,6 @@ class Client(ScanCalls, MapQueries, MeshCalls, ChangeCalls, DownloadCalls):
             RequestTimeoutError: not done after ``timeout_s``; the server goes on with it.
         """
         request = ResetRequest(*checks.box(bounds), new_ticket())
-        reply = self._connection.ask_until_done(request, timeout_s)
-        return reply if reply.undo is None else replace(reply, undo=printable(reply.undo))
-
-    def correct_poses(
-        self,
-        source: str,
-        stamps_s: ArrayLike,
-        world_from_sensor: ArrayLike | Sequence[PoseLike],
-        *,
-        onward: bool = False,
-        timeout_s: float = 600.0,
-    ) -> CorrectPosesReply:
-        """Have the map be as better poses of a source's scans would have made it.
-
-        The server makes it again from the scans that it keeps (``store.log_max_bytes``), which
-        takes a fraction of the drive, and goes on with the map of before meanwhile. A scan between
-        two of the poses moves, in its own frame, by what lies between their moves.
-
-        Args:
-            source: whose scans they are; those of others stay where they are.
-            stamps_s: [K] rising, seconds since 1970: those of scans, or between them.
-            world_from_sensor: the corrected poses of the sensor at these times, such as of
-                keyframes: [K, 4, 4], or a list of :class:`Pose`.
-            onward: scans after the last of the poses move as that, until now, as when a SLAM
-                corrects where the robot is. Else scans before and after these poses stay.
-            timeout_s: how long to wait for that, at most.
-
-        Returns:
-            ``epoch``: the first of the corrected map. ``scans_moved``: kept scans whose pose
-            changed. ``scans_learnt``: those of which the map was made again. ``kept_epoch`` and
-            ``undo``: as of :meth:`reset`.
-
-        Raises:
-            InvalidScanError: the times do not rise, or a pose is none.
-            RefusedError: ``bad_request``, where no scan of the source is kept; ``store``, where
-                what is needed is not kept. The map stays as it is.
-            RequestTimeoutError: not done after ``timeout_s``; the server goes on with it.
-        """
-        stamps_ns, poses = checks.keyframes(stamps_s, world_from_sensor)
-        quaternions = np.array([quaternion_of(pose[:3, :3]) for pose in poses])
-        request = CorrectPosesRequest(
-            source, stamps_ns, poses[:, :3, 3], quaternions, onward, new_ticket()
-        )
         reply = self._connection.ask_until_done(request, timeout_s)
         return reply if reply.undo is None else replace(reply, undo=printable(reply.undo))
 

@@ -57,7 +57,13 @@ def answer_requests(
     downloads = MapDownloads(parts.mapper, parts.epochs, parts.server)
     serve(CheckpointRequest, checkpoints.answer, Lane.FILES)
     serve(ResetRequest, lambda request: checkpoints.reset(request, trails), Lane.FILES)
-    corrector = PoseCorrector(parts.mapper, checkpoints, trails, parts.map_max_bytes)
+    corrector = PoseCorrector(
+        parts.mapper,
+        checkpoints,
+        trails,
+        max_bytes=parts.map_max_bytes,
+        is_stopping=lambda: parts.operations.is_stopping,
+    )
     serve(CorrectPosesRequest, corrector.answer, Lane.FILES, _KEYFRAME_BYTES * MAX_KEYFRAMES)
     serve(MapInfoRequest, downloads.info, Lane.FILES)
     serve(MapChunkRequest, downloads.chunk, Lane.LONG_QUESTIONS)

@@ -76,11 +76,6 @@ class Mapper:
         return _NOWHERE_YET if self._origin is None else self._origin
 
     @property
-    def leaf_m(self) -> float:
-        """The side of a voxel, metres."""
-        return self._setup.field.leaf_m
-
-    @property
     def settled(self) -> bool:
         """Return whether nothing is left to learn from the scans so far."""
         return self.samples_left == 0

@@ -3,8 +3,7 @@
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
@@ -78,7 +77,6 @@ class MapperThread:
         self._wake = threading.Event()
         self._paused = threading.Event()
         self._stopping = threading.Event()
-        self._resting = threading.Event()
         self._schedule = PublishSchedule(period_s)
         self._step_s = _GIVE_WAY_S  # seconds that the last step of training took
         self.progress = Progress(loss=mapper.loss, fit=map_fit(mapper.regions))
@@ -91,29 +89,9 @@ class MapperThread:
         return self._mapper.origin
 
     @property
-    def leaf_m(self) -> float:
-        """The side of a voxel, metres."""
-        return self._mapper.leaf_m
-
-    @property
     def ended(self) -> str | None:
         """Return why the thread takes no more commands; ``None`` while it does."""
         return self._commands.ended
-
-    @property
-    def is_paused(self) -> bool:
-        """Return whether the map stays as it is, for the server is stopping."""
-        return self._paused.is_set()
-
-    @contextmanager
-    def training_rests(self) -> Iterator[None]:
-        """Do not train meanwhile: what there is to learn will be another map's."""
-        self._resting.set()
-        try:
-            yield
-        finally:
-            self._resting.clear()
-            self._wake.set()
 
     def start(self) -> None:
         """Start the thread."""
@@ -189,14 +167,13 @@ class MapperThread:
             return else_s
         took_scans = self._ingest_scans(max(_SCANS_S, _SCANS_SHARE * else_s))
         ingested_s = time.monotonic()
-        learns = not (self._mapper.settled or self._resting.is_set())
-        if learns and not self._commands:
+        if not (self._mapper.settled or self._commands):
             self._train()
         if self._schedule.take_due():
             self._publish()
         self._record_progress()
         else_s = time.monotonic() - ingested_s
-        if not (learns or took_scans):
+        if self._mapper.settled and not took_scans:
             self.time.begin(Activity.IDLE)
             if not self._epochs.is_recent:
                 self._mapper.release()

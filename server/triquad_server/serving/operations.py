@@ -153,7 +153,7 @@ class Operations:
         self._queryables: list[zenoh.Queryable[Any]] = []
         self._pools: list[ThreadPoolExecutor] = []
         self._queues = {lane: self._queue(lane, settings.request_queue) for lane in Lane}
-        self._stopping = self._closed = False
+        self.is_stopping = self._closed = False  # all requests are refused from then on
         self.counts: dict[str, OperationCounts] = {}  # by operation, such as "query/sdf"
 
     @property
@@ -194,7 +194,7 @@ class Operations:
 
     def stop(self) -> None:
         """Refuse all waiting and new requests."""
-        self._stopping = True
+        self.is_stopping = True
         for queue in self._queues.values():
             for request in queue.clear():
                 self._refusals.send(request, "busy", _STOPPING)
@@ -264,7 +264,7 @@ class Operations:
         if request.size > operation.max_bytes:
             text = f"{request.size} bytes exceed the limit of {operation.max_bytes}: split it"
             self._refusals.send(request, "too_large", text)
-        elif self._stopping:
+        elif self.is_stopping:
             self._refusals.send(request, "busy", _STOPPING)
         else:
             for excess in queue.put(request, request.size):
@@ -292,7 +292,7 @@ class Operations:
 
     def _check(self, request: Request) -> None:
         """Refuse a request whose client no longer waits."""
-        if self._stopping:
+        if self.is_stopping:
             raise RefusedError("busy", _STOPPING)
         if self._sessions.have_left(request.owner):
             raise RefusedError("timeout", "the client has left")

@@ -14,8 +14,9 @@ from triquad_format.scan_log.tracks import SourceTracks
 
 from triquad_server.store.store import Store
 
-_TOLERANCE_VOXELS, _AT_VOXELS = 0.05, 100.0
-"""A scan has moved if anything within 100 voxels of its sensor has, by a twentieth of a voxel."""
+_TOLERANCE, _AT = 0.02, 40.0
+"""A scan has moved if anything within 100 voxels of its sensor has, by a twentieth of a voxel: in
+units of how far kept scans are apart."""
 
 
 @dataclass(frozen=True)
@@ -44,9 +45,7 @@ class CorrectedLog:
                     yield entry
 
 
-def corrected_log(
-    store: Store, correction: LoggedCorrection, leaf_m: float, *, onward: bool
-) -> CorrectedLog:
+def corrected_log(store: Store, correction: LoggedCorrection, *, onward: bool) -> CorrectedLog:
     """Return the log of a store, up to its newest checkpoint, after a correction.
 
     With ``onward`` it moves all scans that come after its poses.
@@ -75,7 +74,7 @@ def corrected_log(
         correction = replace(correction, until_ns=int(track.stamps_ns[-1]))
     before = track.poses
     tracks.correct(correction)
-    moved = set(track.stamps_ns[_moved(before, track.poses, leaf_m)].tolist())
+    moved = set(track.stamps_ns[_moved(before, track.poses, store.scans.apart_m)].tolist())
     first = next((number for number, stamp_ns in scans if stamp_ns in moved), len(files))
     count = sum(stamp_ns in moved for _, stamp_ns in scans)
     log = CorrectedLog(correction, None, files, tracks, count)
@@ -102,11 +101,11 @@ def _from(first: int, files: list[Segment], log: CorrectedLog, store: Store) -> 
     )
 
 
-def _moved(before: Doubles, after: Doubles, leaf_m: float) -> Bools:
+def _moved(before: Doubles, after: Doubles, apart_m: float) -> Bools:
     """Return which poses [N, 4, 4] differ by more than the tolerance."""
     shifts = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
     turns = np.linalg.norm(after[:, :3, :3] - before[:, :3, :3], axis=(1, 2)) / np.sqrt(2)
-    result: Bools = shifts + _AT_VOXELS * leaf_m * turns > _TOLERANCE_VOXELS * leaf_m
+    result: Bools = shifts + _AT * apart_m * turns > _TOLERANCE * apart_m
     return result
 
 

@@ -3,7 +3,7 @@
 import logging
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import chain
 
 import numpy as np
@@ -42,13 +42,15 @@ class PoseCorrector:
         checkpoints: CheckpointWriter,
         trails: SourceTrails,
         max_bytes: int,
+        is_stopping: Callable[[], bool],
     ) -> None:
         """Correct the map of ``mapper``, with its store, and the ``trails`` of its sources.
 
-        ``max_bytes`` are what the maps may take together.
+        ``max_bytes`` are what maps may take together. Once ``is_stopping``, nothing is corrected.
         """
         self._mapper = mapper
         self._max_bytes = max_bytes
+        self._is_stopping = is_stopping
         self._checkpoints = checkpoints
         self._trails = trails
 
@@ -73,18 +75,16 @@ class PoseCorrector:
                 f"it takes a second map of {used / 1e6:.0f} MB for a while, and memory.max_bytes = "
                 f"{self._max_bytes} has no room for that: start the server with more",
             )
-        leaf_m, origin = self._mapper.leaf_m, self._mapper.origin
-        correction = _correction(request, origin)
+        correction = _correction(request, self._mapper.origin)
         followed = deque[Entry]()
         try:
             # So that the log has all until there.
             newest = self._checkpoints.write(at_cut=lambda: store.scans.follow(followed))
-            log = corrected_log(store, correction, leaf_m, onward=request.onward)
+            log = corrected_log(store, correction, onward=request.onward)
             if log.moved == 0:
                 return CorrectPosesReply(newest.epoch, scans_moved=0, scans_learnt=0)
             kept = self._checkpoints.write("correcting poses").epoch
-            with self._mapper.training_rests():
-                return self._correct(store, log, followed, kept)
+            return self._correct(store, log, followed, kept)
         except (StoreError, FormatError, OSError) as error:
             raise RefusedError("store", f"no pose was corrected: {error}") from error
         finally:
@@ -99,7 +99,7 @@ class PoseCorrector:
         _log.info("%d scans of %s have better poses: the map is made again", log.moved, source)
         again = _MapAgain(self._mapper.call(lambda mapper: mapper), log)
         for entry in chain(log.entries(), _until_few_are_left(followed)):
-            if self._mapper.is_paused:
+            if self._is_stopping():
                 raise RefusedError("busy", "the server is stopping: no pose was corrected")
             again.take(entry)
 

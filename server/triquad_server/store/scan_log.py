@@ -69,7 +69,7 @@ class ScanLog:
         self.folder = folder / LOG_NAME
         self.error: str | None = None
         self._max_bytes = max_bytes
-        self._apart_m = _APART_VOXELS * leaf_m
+        self.apart_m = _APART_VOXELS * leaf_m
         self._kept: dict[str, _Kept] = {}
         self._followed: deque[Entry] | None = None
         self._writer: SegmentWriter | None = None
@@ -174,7 +174,7 @@ class ScanLog:
             return True
         moved = np.linalg.inv(kept.world_from_sensor) @ pose
         turned = math.degrees(math.acos(min(1.0, max(-1.0, (np.trace(moved[:3, :3]) - 1) / 2))))
-        return float(np.linalg.norm(moved[:3, 3])) >= self._apart_m or turned >= _APART_DEG
+        return float(np.linalg.norm(moved[:3, 3])) >= self.apart_m or turned >= _APART_DEG
 
     def _open(self) -> SegmentWriter:
         if self._writer is None:
