@@ -7,11 +7,15 @@ import math
 import reprlib
 import time
 from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
 from typing import Any, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from triquad_format.errors import InvalidInputError
+from triquad_format.errors import InvalidInputError, MapFileError
+from triquad_format.mapfile.container import is_map
+from triquad_format.mapfile.files import FileBytes
 from triquad_format.records.arrays import Doubles, Floats, Longs
 from triquad_format.wire.limits import (
     LEVELS,
@@ -29,7 +33,7 @@ from triquad_client.real_numbers import real_number, real_numbers, whole_number
 Bounds: TypeAlias = tuple[Sequence[float], Sequence[float]]
 """Minimum and maximum corner of a box, metres, map frame; sides may be infinite."""
 
-LONGEST_S = 1e6  # that a request may take
+SHORTEST_S, LONGEST_S = 1e-3, 1e6  # that a request may take
 
 _MAX_COLUMNS = 16  # of a scan's points: more is rather an array that was transposed
 _MAX_CELLS = 100_000_000  # of a grid
@@ -166,6 +170,28 @@ def count(name: str, value: int, most: int, *, least: int = 0) -> int:
     if not least <= number <= most:
         raise InvalidInputError(f"{name} = {_shown(value)}: use {least} to {most}")
     return number
+
+
+def map_target(path: str | Path) -> Path:
+    """Return the file to which a map is to be written: only an older map may be there.
+
+    Raises:
+        OSError: what is there cannot be read.
+    """
+    if not isinstance(path, str | Path) or Path(path).is_dir():
+        raise InvalidInputError(f"path = {_shown(path)} is no file: give the name of one")
+    try:
+        with closing(FileBytes(Path(path))) as file:
+            is_older_map = is_map(file)
+    except FileNotFoundError:
+        is_older_map = True  # nothing to lose
+    except MapFileError:
+        is_older_map = False  # a device
+    if not is_older_map:
+        raise InvalidInputError(
+            f"{path} is there, and is no map of triquad: give another name, or delete it first"
+        )
+    return Path(path)
 
 
 def are_local(coordinates: str) -> bool:

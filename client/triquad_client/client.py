@@ -1,5 +1,7 @@
 """The client: publishes scans to a map server, and asks it about the map."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from pathlib import Path
 
@@ -61,7 +63,7 @@ class Client(ScanCalls, CorrectionCalls, MapQueries, MeshCalls, ChangeCalls, Dow
         state = ", closed" if self._connection.is_closed else ""
         return f"Client(map {self.map_name!r} {self._connection.where}{state})"
 
-    def __enter__(self) -> "Client":
+    def __enter__(self) -> Client:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -119,18 +121,19 @@ class Client(ScanCalls, CorrectionCalls, MapQueries, MeshCalls, ChangeCalls, Dow
         Args:
             bounds: corners of a box, metres, map frame. Surfaces are known as far as it reaches:
                 make it larger than where you ask by the largest distance that you ask for.
-            path: the file; one that is no valid map file is replaced. :func:`open_map` opens it
-                without a server.
+            path: the file; an older map is replaced, also a damaged one, and nothing else.
+                :func:`open_map` opens it without a server.
             accept_emptier: replace a copy that is in the file already also by a map that knows less
                 than half as much of the box.
 
         Raises:
-            InvalidInputError: the bounds are not a box, or contain nothing.
+            InvalidInputError: the bounds are not a box, or contain nothing; or the file is there,
+                and is not a triquad map.
             EmptierMapError: the file has a copy that knows far more, and stays as it is.
             DownloadError: what arrived is not valid.
             OSError: the file cannot be read or written.
         """
-        synced = SyncedMap(Path(path), bounds, self._connection)
+        synced = SyncedMap(path, bounds, self._connection)
         synced.refresh(accept_emptier)
         return synced
 

@@ -66,7 +66,7 @@ def test_a_map_name_that_cannot_be_is_refused(endpoint: str, name: Any) -> None:
         triquad_client.connect(endpoint, name)
 
 
-@pytest.mark.parametrize("timeout_s", [10**400, -1, np.inf, "long"])
+@pytest.mark.parametrize("timeout_s", [10**400, -1, 0, 0.0, np.inf, "long"])
 def test_a_timeout_that_cannot_be_is_refused(endpoint: str, timeout_s: Any) -> None:
     with pytest.raises(InvalidInputError, match="timeout_s = "):
         triquad_client.connect(endpoint, timeout_s=timeout_s)

@@ -1,15 +1,19 @@
 """Copies of a server's map that stay current, and answer when the link drops."""
 
+import io
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import triquad_client
+from mcap.writer import Writer as McapWriter
 from support import servers
 from support.files.file_damage import rot
 from support.poses import shifted
@@ -96,9 +100,7 @@ def test_the_copy_of_an_earlier_run_is_taken_up(client: Client, tmp_path: Path) 
     assert_same_answers(again, client)
 
 
-def test_a_damaged_copy_is_mended_and_a_foreign_file_replaced(
-    client: Client, tmp_path: Path
-) -> None:
+def test_a_damaged_copy_is_mended(client: Client, tmp_path: Path) -> None:
     path = tmp_path / "copy.triquad"
     parts = client.sync(WHOLE, path).report.parts
     rot(path)
@@ -106,10 +108,43 @@ def test_a_damaged_copy_is_mended_and_a_foreign_file_replaced(
     assert mended.report.parts_received >= 1
     assert mended.report.parts_kept + mended.report.parts_received == parts
     assert_same_answers(mended, client)
-    for content in (b"", b"something else", path.read_bytes()[:-50]):
+    for content in (b"", path.read_bytes()[:-50], path.read_bytes()[:20]):
         path.write_bytes(content)
         assert client.sync(WHOLE, path).report.parts_received == parts
         assert triquad_client.open_map(path).epoch == client.status().epoch
+
+
+@pytest.mark.parametrize("way", ["sync", "refresh", "download_map"])
+def test_what_is_no_map_is_never_replaced(client: Client, tmp_path: Path, way: str) -> None:
+    path = tmp_path / "notes.txt"
+    if way == "refresh":
+        write = client.sync(WHOLE, path).refresh
+    elif way == "sync":
+        write = partial(client.sync, WHOLE, path)
+    else:
+        write = partial(client.download_map, path)
+    recording = io.BytesIO()
+    writer = McapWriter(recording)
+    writer.start(profile="ros2", library="triquad")
+    writer.finish()
+    whole = recording.getvalue()
+    for content in (b"something else", b"triquad checkpoint\n", whole, whole[:-50]):
+        path.write_bytes(content)
+        with pytest.raises(
+            InvalidInputError, match=r"notes\.txt is there.*another name, or delete"
+        ):
+            write()
+        assert path.read_bytes() == content
+    path.unlink()
+    write()
+    write()  # an older map is replaced
+
+
+@pytest.mark.parametrize("name", ["", ".", None, 7])
+def test_a_map_is_written_to_a_file_that_has_a_name(client: Client, name: Any) -> None:
+    for write in (partial(client.sync, WHOLE, name), partial(client.download_map, name)):
+        with pytest.raises(InvalidInputError, match=f"path = {name!r} is no file: give the name"):
+            write()
 
 
 def test_it_answers_while_the_server_is_gone_and_outlives_one_that_lost_its_map(

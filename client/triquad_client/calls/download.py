@@ -1,5 +1,7 @@
 """Fetching the map as a file; its chunks go in the background of everything else."""
 
+from __future__ import annotations
+
 import hashlib
 import shutil
 from pathlib import Path
@@ -78,16 +80,17 @@ class DownloadCalls:
         """Write the newest map to a file, checked against its digest, all of it or nothing.
 
         Args:
-            path: the file; an older one is replaced.
+            path: the file; an older map is replaced, and nothing else.
             training: with the state from which training can go on.
 
         Raises:
+            InvalidInputError: the file is there, and is not a triquad map.
             DownloadError: what arrived is not what the server announced.
             OSError: the file cannot be written.
         """
-        training = checks.flag("training", training)
+        training, target = checks.flag("training", training), checks.map_target(path)
         # Newer map files may push this one out of the server: then the newest is used.
-        return retried("chunk_gone", lambda: _fetch(self._connection, Path(path), training))
+        return retried("chunk_gone", lambda: _fetch(self._connection, target, training))
 
 
 def _fetch(connection: Connection, path: Path, training: bool) -> MapInfo:

@@ -43,7 +43,7 @@ def open_connection(
     coordinates: str,
 ) -> Connection:
     """Return a connection to a server; arguments and errors as of ``triquad_client.connect``."""
-    timeout_s = checks.within("timeout_s", timeout_s, checks.LONGEST_S, least=0.0)
+    timeout_s = checks.within("timeout_s", timeout_s, checks.LONGEST_S, least=checks.SHORTEST_S)
     most = checks.count("max_download_bytes", max_download_bytes, MAX_COUNT)
     local = checks.are_local(coordinates)
     where = f"with {config}" if endpoint is None and config else f"to {endpoint or _HERE}"

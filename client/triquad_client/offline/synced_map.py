@@ -1,5 +1,7 @@
 """A copy of the part of a server's map that a box needs: it answers also while the link is down."""
 
+from __future__ import annotations
+
 import dataclasses
 import threading
 import time
@@ -67,9 +69,9 @@ class SyncedMap(MapQueries):
     epoch, and ``at_epoch`` may be none but :attr:`epoch`.
     """
 
-    def __init__(self, path: Path, bounds: Bounds, connection: Connection) -> None:
+    def __init__(self, path: str | Path, bounds: Bounds, connection: Connection) -> None:
         """Use ``Client.sync``."""
-        self._path = path
+        self._path = checks.map_target(path)
         self._connection = connection
         self._low, self._high = checks.finite_box(bounds)
         self._updating = threading.Lock()
@@ -102,6 +104,7 @@ class SyncedMap(MapQueries):
 
         Raises:
             TriquadError: the server cannot be reached, as for any call of :class:`Client`.
+            InvalidInputError: something else than a map has taken the place of the file.
             EmptierMapError: the server has lost its map, and ``accept_emptier`` is not set.
             DownloadError: what arrived is not valid.
             OSError: the file cannot be written.
@@ -114,6 +117,7 @@ class SyncedMap(MapQueries):
 
     def _fetch(self, accept_emptier: bool) -> SyncReport:
         with self._updating:
+            checks.map_target(self._path)
             asked_s = time.monotonic()
             info = newest_file(self._connection)
             known = self._state
@@ -180,7 +184,7 @@ class SyncedMap(MapQueries):
             )
 
     def _seen_before(self) -> int:
-        """Return what the file that is there knows of the box; it may be no map file."""
+        """Return what the file that is there knows of the box; it may be damaged."""
         with suppress(FormatError, FileNotFoundError), StoredMap.open(self._path) as older:
             return _seen_bytes(self._wanted(older))
         return 0
@@ -197,7 +201,7 @@ def _seen_bytes(parts: Iterable[Entry]) -> int:
 
 
 def _kept(path: Path, wanted: Sequence[Entry]) -> dict[PartKey, bytes]:
-    """Return the wanted parts that a file has already; it may be no map file."""
+    """Return the wanted parts that a file has already; it may be damaged, or not be there."""
     kept: dict[PartKey, bytes] = {}
     with suppress(FormatError, FileNotFoundError), StoredMap.open(path) as older:
         known = {entry.key: entry for entry in older.manifest.entries}

@@ -50,6 +50,9 @@ _MAX_WINDOW_BYTES = 8 * 2**20
 """Memory that zstd may ask for besides its output; RFC 8878 has every decoder support it."""
 
 _DATA_END_BYTES = 9 + 4
+_BEGIN = MCAP0_MAGIC + b"\x01\x0f" + bytes(11) + b"\x07\0\0\0triquad"
+"""The header of each map file, which names no profile; recordings of triquad name one."""
+
 _END_BYTES = 9 + 20 + len(MCAP0_MAGIC)  # of the footer and the closing magic
 _OUT_OF_MEMORY = "not enough memory"
 
@@ -72,6 +75,18 @@ class RandomAccess(Protocol):
 
     def close(self) -> None:
         """Close the source."""
+
+
+def is_map(source: RandomAccess) -> bool:
+    """Return whether the source is a map file, or was one: damaged, but begun as such."""
+    try:
+        read_end(source)
+    except DamagedMapFileError:
+        begin = source.read(0, min(len(_BEGIN), source.size))
+        return begin == _BEGIN[: len(begin)]
+    except MapFileError:
+        return False
+    return True
 
 
 @dataclass(frozen=True)
