@@ -1,5 +1,7 @@
 """The client for programs with an event loop: the blocking one, each of its calls in a thread."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any
@@ -76,13 +78,13 @@ class AsyncMeshWatch(InThreads, WatchedTiles):
     catch_up = awaited(MeshWatch.catch_up)
     mesh = awaited(MeshWatch.mesh)
 
-    async def __aenter__(self) -> "AsyncMeshWatch":
+    async def __aenter__(self) -> AsyncMeshWatch:
         return self
 
     async def __aexit__(self, *_: object) -> None:
         await self.close()
 
-    def __aiter__(self) -> "AsyncMeshWatch":
+    def __aiter__(self) -> AsyncMeshWatch:
         """Yield updates as they come, until the watch is closed."""
         return self
 

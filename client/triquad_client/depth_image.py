@@ -1,5 +1,7 @@
 """Depth images turned into the points of a scan."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,7 +38,7 @@ class Intrinsics:
             )
 
     @classmethod
-    def from_matrix(cls, camera_matrix: ArrayLike) -> "Intrinsics":
+    def from_matrix(cls, camera_matrix: ArrayLike) -> Intrinsics:
         """Return those of a camera matrix [3, 3], as OpenCV's ``K`` or the ``k`` of ``CameraInfo``.
 
         Raises:

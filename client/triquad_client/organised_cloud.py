@@ -1,5 +1,7 @@
 """Organised clouds, in which a ray without a return has its place too."""
 
+from __future__ import annotations
+
 import numpy as np
 from numpy.typing import ArrayLike
 from triquad_format.records.arrays import Doubles

@@ -1,5 +1,7 @@
 """A pose as a position and a quaternion, the way ROS and trajectory files have it."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import TypeAlias
 

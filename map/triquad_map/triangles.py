@@ -1,5 +1,7 @@
 """A surface as triangles, and the meshes of tiles joined to one, without seams."""
 
+from __future__ import annotations
+
 import dataclasses
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -20,7 +22,7 @@ class Triangles:
     # status there is UNKNOWN; None where no holes were to be filled
     filled: Bools | None = None
 
-    def moved(self, by: Doubles) -> "Triangles":
+    def moved(self, by: Doubles) -> Triangles:
         """Return the triangles ``by`` [3] metres off."""
         return dataclasses.replace(self, vertices=self.vertices + by) if by.any() else self
 

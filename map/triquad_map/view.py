@@ -1,5 +1,7 @@
 """The interface of every map, live or from a file; all questions are put together from this."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, TypeVar
 

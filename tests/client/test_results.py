@@ -1,6 +1,8 @@
 """What a person sees of clients, maps and results at a prompt, and does with them."""
 
 import asyncio
+import pydoc
+import re
 from pathlib import Path
 
 import matplotlib
@@ -91,9 +93,30 @@ def test_a_layer_of_a_grid_is_drawn_where_it_is(offline: OfflineMap, tmp_path: P
     axes.figure.savefig(tmp_path / "grid.png")
 
 
+def test_the_ground_is_drawn_where_it_is(offline: OfflineMap, tmp_path: Path) -> None:
+    points = np.array([[0.0, 0, 1.5], [2.0, 1, 1.2], [0.5, 0.5, 9.0], [90, 90, 90]])
+    ground = offline.query_ground(points)
+    assert np.array_equal(ground.points, points)
+    axes = ground.plot()
+    heights, none = axes.collections
+    for kind, drawn in ((Status.SURFACE, heights), (Status.FREE, none)):
+        assert np.array_equal(drawn.get_offsets(), points[ground.status == kind, :2])
+    assert np.array_equal(heights.get_array(), ground.height_m[ground.status == Status.SURFACE])
+    assert len(heights.get_array()) > 0
+    axes.figure.savefig(tmp_path / "ground.png")
+    assert ground[:0].plot(axes) is axes, "nothing is drawn of nothing"
+
+
+@pytest.mark.parametrize("name", sorted({*triquad_client.__all__} - {"__version__", "Statuses"}))
+def test_help_names_types_as_programs_do(name: str) -> None:
+    told = pydoc.render_doc(getattr(triquad_client, name), renderer=pydoc.plaintext)
+    for expanded in ("numpy._typing", "collections.abc.Sequence[", "numpy.dtype[", "<function"):
+        assert expanded not in told
+
+
 def test_servers_clients_and_what_they_give_say_what_they_are(tmp_path: Path) -> None:
     with serve(settings=servers.SMALL) as server, server.client() as client:
-        servers.learn(client)
+        servers.learn_all(client)
         assert repr(server) == f"Server(map 'default' at {server.endpoint})"
         assert repr(client) == f"Client(map 'default' to {server.endpoint})"
         assert repr(client.pinned()).startswith("PinnedMap(epoch ")
@@ -108,6 +131,17 @@ def test_servers_clients_and_what_they_give_say_what_they_are(tmp_path: Path) ->
                 return repr(waiting)
 
         assert asyncio.run(told()) == f"AsyncClient(map 'default' to {server.endpoint})"
+        epoch, report = client.status().epoch, client.sources()
+        assert re.fullmatch(
+            rf"ServerStatus\(map 'default': \d+ scans, 100 % learnt; epoch {epoch}\)",
+            repr(client.status()),
+        )
+        results: list[object] = [client.metrics(), report, *report.sources.values()]
+        results += [client.status().fit, client.changes(1), client.flush(), client.reset()]
+        results += [client.download_map(tmp_path / "map.triquad"), synced.report]
+        for result in results:
+            assert len(repr(result)) < 300
+            assert "\n" not in repr(result)
         mesh: Mesh = client.mesh(BOX)
         assert repr(mesh).endswith(f"epoch {mesh.epoch})")
     assert repr(client).endswith(", closed)")

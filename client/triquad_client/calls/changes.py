@@ -1,5 +1,7 @@
 """The changes of a map: where surface appeared and vanished."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from enum import Enum
 
@@ -43,6 +45,10 @@ class ChangeReport:
     since: int
     server: str  # the run of the server, within which numbers of epochs compare
     boxes: tuple[ChangedBox, ...]  # those of most voxels first
+
+    def __repr__(self) -> str:
+        told = f"{len(self.boxes)} boxes since epoch {self.since}"
+        return f"ChangeReport({told}; epoch {self.epoch})"
 
 
 class ChangeCalls:

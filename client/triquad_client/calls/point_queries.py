@@ -3,6 +3,8 @@
 :mod:`triquad_map.questions.answers` is the other side.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Publishing scans, and waiting until they are in the map."""
 
+from __future__ import annotations
+
 import logging
 import secrets
 import threading

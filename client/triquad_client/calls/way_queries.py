@@ -3,6 +3,8 @@
 :mod:`triquad_map.questions.answers` is the other side.
 """
 
+from __future__ import annotations
+
 import numpy as np
 from numpy.typing import ArrayLike
 from triquad_format.errors import InvalidInputError
@@ -130,7 +132,7 @@ class WayQueries(Asking):
 
         most = _ways_at_once(drop_m / RAY_M_PER_SEARCH)
         fields = self._in_parts(request, checked, most=most, at_epoch=at_epoch).joined()
-        return Ground(height_m=checked[:, 2] - fields.pop("drop_m"), **fields)
+        return Ground(checked, height_m=checked[:, 2] - fields.pop("drop_m"), **fields)
 
     def align(
         self,

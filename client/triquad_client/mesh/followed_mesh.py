@@ -1,5 +1,7 @@
 """The mesh of a box as a follower knows it: what it asks next, and what replies make of it."""
 
+from __future__ import annotations
+
 import hashlib
 import math
 from collections.abc import Iterator, Mapping
@@ -101,7 +103,7 @@ class FollowedMesh:
         known: KnownTiles | None,
         *,
         max_bytes: int,
-    ) -> "FollowedMesh":
+    ) -> FollowedMesh:
         """Begin with nothing, or ``known`` tiles; arguments as of :meth:`Client.watch_mesh`.
 
         Raises:
@@ -136,7 +138,7 @@ class FollowedMesh:
         """Return the question which tiles changed."""
         return TileChangesRequest(self.minimum, self.maximum, self.level, self.server, self.since)
 
-    def told(self, reply: TileChanges) -> "FollowedMesh":
+    def told(self, reply: TileChanges) -> FollowedMesh:
         """Return what is known after the reply to :meth:`changes_request`.
 
         Raises:
@@ -172,7 +174,7 @@ class FollowedMesh:
         )
         return told._settled()
 
-    def fetched(self, asked: MeshRequest, reply: MeshReply) -> "FollowedMesh":
+    def fetched(self, asked: MeshRequest, reply: MeshReply) -> FollowedMesh:
         """Return what is known after the reply about some of the pending tiles.
 
         Raises:
@@ -193,7 +195,7 @@ class FollowedMesh:
         )
         return after._settled()
 
-    def _settled(self) -> "FollowedMesh":
+    def _settled(self) -> FollowedMesh:
         """Return the same without stale tiles, once all is known that the server told of."""
         if self.pending:
             return self

@@ -1,5 +1,7 @@
 """A surface as triangles, and how it is written to files."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +35,7 @@ class Mesh(Triangles):
         return f"Mesh({told}{f', {filled} of them filled' if filled else ''}; epoch {self.epoch})"
 
     @classmethod
-    def of(cls, triangles: Triangles, epoch: int) -> "Mesh":
+    def of(cls, triangles: Triangles, epoch: int) -> Mesh:
         """Return the triangles, which show the ``epoch``."""
         return cls(triangles.vertices, triangles.faces, triangles.filled, epoch)
 
@@ -66,7 +68,7 @@ class Mesh(Triangles):
             raise InvalidInputError(f"suffix = {suffix!r}: use one of {', '.join(_FORMATS)}")
         return encode(self)
 
-    def to_trimesh(self) -> "trimesh.Trimesh":
+    def to_trimesh(self) -> trimesh.Trimesh:
         """Return a copy for the library trimesh.
 
         Raises:
@@ -78,7 +80,7 @@ class Mesh(Triangles):
             raise InvalidInputError("trimesh is missing: pip install 'triquad[mesh]'") from error
         return trimesh.Trimesh(self.vertices.copy(), self.faces.copy(), process=False)
 
-    def to_open3d(self) -> "open3d.geometry.TriangleMesh":
+    def to_open3d(self) -> open3d.geometry.TriangleMesh:
         """Return a copy for the library Open3D, with normals of its vertices.
 
         Raises:
@@ -144,7 +146,7 @@ def _parts(mesh: Mesh) -> dict[str, Mesh]:
     }
 
 
-def _scene(mesh: Mesh) -> "trimesh.Scene":
+def _scene(mesh: Mesh) -> trimesh.Scene:
     import trimesh
 
     scene = trimesh.Scene()
@@ -153,7 +155,7 @@ def _scene(mesh: Mesh) -> "trimesh.Scene":
     return scene
 
 
-def _exported(surface: "trimesh.Trimesh | trimesh.Scene", kind: str) -> bytes:
+def _exported(surface: trimesh.Trimesh | trimesh.Scene, kind: str) -> bytes:
     data = surface.export(file_type=kind)
     return data.encode("ascii") if isinstance(data, str) else cast(bytes, data)
 

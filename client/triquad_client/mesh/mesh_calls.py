@@ -1,5 +1,7 @@
 """The call that fetches a surface as triangles, in the background of all else."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 
 import numpy as np

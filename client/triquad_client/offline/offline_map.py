@@ -1,5 +1,7 @@
 """A map file that answers as a server does, without one."""
 
+from __future__ import annotations
+
 import dataclasses
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -48,7 +50,7 @@ class LocalMap(Answering):
         """[3] from where the map counts, in the coordinates of requests: 0 if those are local."""
 
     @property
-    def view(self) -> "RecordedView":
+    def view(self) -> RecordedView:
         """The map.
 
         Raises:
@@ -108,7 +110,7 @@ class OfflineMap(MapQueries):
         regions = len(self._seen.regions)
         return f"OfflineMap({self.name!r}, {regions} regions; epoch {self.epoch})"
 
-    def __enter__(self) -> "OfflineMap":
+    def __enter__(self) -> OfflineMap:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -122,7 +124,7 @@ class OfflineMap(MapQueries):
         self,
         bounds: Bounds | None = None,
         cell_m: float | None = None,
-        report: "Report | None" = None,
+        report: Report | None = None,
         fill_m: float = 0.0,
     ) -> Mesh:
         """Return the surface that rays have seen, by marching cubes: faces centred in ``bounds``.
@@ -142,7 +144,7 @@ class OfflineMap(MapQueries):
         """
         return self._tiles(cell_m, bounds, fill_m, whole=True).joined(report)
 
-    def mesh_tiles(self, cell_m: float | None = None) -> "MapTiles":
+    def mesh_tiles(self, cell_m: float | None = None) -> MapTiles:
         """Return the surface as :meth:`mesh` has it, everywhere, to be made tile by tile.
 
         Args:
@@ -156,7 +158,7 @@ class OfflineMap(MapQueries):
 
     def _tiles(
         self, cell_m: float | None, bounds: Bounds | None, fill_m: float, *, whole: bool
-    ) -> "MapTiles":
+    ) -> MapTiles:
         view = self._map.view
         chosen_m = _CELL_LEAVES * self.leaf_m if cell_m is None else cell_m
         checked_m = checks.within("cell_m", chosen_m, CELL_RANGE_M[1], least=CELL_RANGE_M[0])

@@ -1,5 +1,7 @@
 """The status of a queried point, by the evidence."""
 
+from __future__ import annotations
+
 from enum import IntEnum
 from typing import Any
 
@@ -24,7 +26,7 @@ class Statuses(np.ndarray):
     """An array of ``uint8`` whose values are told as those of :class:`Status`, by their names."""
 
     @classmethod
-    def of(cls, values: NDArray[np.uint8]) -> "Statuses":
+    def of(cls, values: NDArray[np.uint8]) -> Statuses:
         """Return the same numbers, to be told by name."""
         return values.view(cls)
 

@@ -5,6 +5,8 @@ Positions are ``float32`` offsets from a ``float64`` origin, so that a map in la
 Numbers of epochs compare only within one ``ServerStatus.server``.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -130,6 +132,9 @@ class FieldFit(Message):
     worst: FinitePoints  # [K, 3] map frame, metres: centres of the places with the largest medians
     worst_median_m: Annotated[Lengths, rows_of("worst")]  # [K]
 
+    def __repr__(self) -> str:
+        return f"FieldFit({self.rays} rays: median {1e3 * self.median_m:.1f} mm)"
+
 
 @dataclass(frozen=True)
 class ServerStatus(Message):
@@ -168,6 +173,16 @@ class ServerStatus(Message):
 
     samples_discarded: Count = 0  # above the limit of a region's training budget
     origin_m: Origin | None = None  # [3] from where the map itself counts; None: from 0 0 0
+
+    def __repr__(self) -> str:
+        told = f"{self.scans_taken} scans, {self.learnt_percent} % learnt"
+        return f"ServerStatus(map {self.map_name!r}: {told}; epoch {self.epoch})"
+
+    @property
+    def learnt_percent(self) -> int:
+        """How much is learnt of what the scans so far can teach, 0 to 100; 100: it is settled."""
+        in_all = self.samples_trained + self.samples_left
+        return 100 if self.settled else min(100 * self.samples_trained // max(in_all, 1), 99)
 
 
 @dataclass(frozen=True)

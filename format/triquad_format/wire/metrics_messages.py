@@ -4,6 +4,8 @@ Counts, sums and times only grow while a server runs: the difference of two answ
 seconds between them. ``docs/wire-protocol.md`` says more.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 from typing import Annotated
@@ -103,8 +105,12 @@ class ServerMetrics(Message):
     sessions: dict[Name, Name]  # Zenoh sessions that are connected, by id: client, peer or router
     samples_trained: Count = 0  # by this process; the status counts those of the map
 
+    def __repr__(self) -> str:
+        told = f"{len(self.operations)} operations, {len(self.sources)} sources"
+        return f"ServerMetrics(up {self.uptime_s:.0f} s, {told}; epoch {self.epoch})"
+
     def answer_time_s(
-        self, operation: str, quantile: float, since: "ServerMetrics | None" = None
+        self, operation: str, quantile: float, since: ServerMetrics | None = None
     ) -> float | None:
         """Return the time within which a share of an operation's requests was answered, seconds.
 

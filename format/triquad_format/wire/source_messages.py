@@ -1,5 +1,7 @@
 """The wire messages about the sources of scans; see :mod:`triquad_format.wire.messages`."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -34,6 +36,10 @@ class NewestScan(Message):
     points: Annotated[FinitePositions, at_most_asked("max_points")]
     points_used: Count  # as many the map uses, in range, and thinned: N or more
 
+    def __repr__(self) -> str:
+        at = ", ".join(f"{metres:.2f}" for metres in self.position_m)
+        return f"NewestScan({self.points_used} points used, taken at {at} m)"
+
     @property
     def position_m(self) -> NDArray[np.float64]:
         """The position of the sensor: [3] metres, map frame."""
@@ -54,6 +60,9 @@ class ScanSource(Message):
     # [N] the piece of the trail each is part of: rises where the sensor jumped
     pieces: Annotated[Integers, within(0, MAX_COUNT), rows_of("trail")]
     newest: NewestScan | None  # None: a reset forgot it, and no scan has come since
+
+    def __repr__(self) -> str:
+        return f"ScanSource({self.scans} scans, {len(self.trail)} places of its trail)"
 
     def lines(self) -> list[NDArray[np.float64]]:
         """Return the trail as lines to draw: [K, 3] a piece, the last one up to the newest scan."""

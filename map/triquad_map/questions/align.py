@@ -1,5 +1,7 @@
 """The pose of a scan: it is moved until its points lie on surfaces of the map."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 

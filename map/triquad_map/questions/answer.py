@@ -1,5 +1,7 @@
 """The behaviour that all answers about many things share."""
 
+from __future__ import annotations
+
 import dataclasses
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
@@ -46,7 +48,7 @@ class Answer:
             told += f": {self._told()}"
         return f"{type(self).__name__}({told}; epoch {self.epoch})"
 
-    def to_pandas(self) -> "pd.DataFrame":
+    def to_pandas(self) -> pd.DataFrame:
         """Return a table with a row for each thing, and three columns for each vector.
 
         Raises:

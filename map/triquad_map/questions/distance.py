@@ -1,5 +1,7 @@
 """True distances to the nearest surface, at any range."""
 
+from __future__ import annotations
+
 import dataclasses
 from dataclasses import dataclass
 from enum import Enum

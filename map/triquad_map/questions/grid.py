@@ -1,13 +1,15 @@
 """Dense grids of distance and status: costmaps and slices."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from triquad_format.errors import InvalidInputError
 from triquad_format.records.arrays import Bytes, Doubles, Floats
 from triquad_format.records.status import Status, Statuses
 
+from triquad_map.questions.axes import drawn_on
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.view import MapView
 
@@ -53,7 +55,7 @@ class Grid:
         told = Statuses.of(self.status).counted()
         return f"Grid({cells} cells of {self.shape.cell_m:g} m: {told}; epoch {self.epoch})"
 
-    def plot(self, layer: int = 0, axes: "Axes | None" = None) -> "Axes":
+    def plot(self, layer: int = 0, axes: Axes | None = None) -> Axes:
         """Draw a level layer of the grid, as distances in metres; unknown cells stay empty.
 
         Args:
@@ -64,12 +66,7 @@ class Grid:
             InvalidInputError: matplotlib is not installed.
             IndexError: the grid has no such layer.
         """
-        try:
-            from matplotlib import pyplot
-        except ModuleNotFoundError as error:
-            told = "matplotlib is missing: pip install 'triquad[notebook]'"
-            raise InvalidInputError(told) from error
-        drawn = pyplot.subplots()[1] if axes is None else axes
+        drawn = drawn_on(axes)
         (x, y, z), cell_m = self.shape.corner, self.shape.cell_m
         sides = np.array(self.shape.counts[:2]) * cell_m
         known = np.where(self.status == Status.UNKNOWN, np.nan, self.distance_m)[:, :, layer]
@@ -77,7 +74,7 @@ class Grid:
         image = drawn.imshow(known.T, origin="lower", extent=extent, cmap="viridis")
         drawn.figure.colorbar(image, ax=drawn, label="distance to surface, m")
         height_m = z + (layer % self.shape.counts[2] + 0.5) * cell_m
-        drawn.set(xlabel="x, m", ylabel="y, m", title=f"z = {height_m:g} m, epoch {self.epoch}")
+        drawn.set(title=f"z = {height_m:g} m, epoch {self.epoch}")
         return drawn
 
 

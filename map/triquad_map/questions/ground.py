@@ -1,15 +1,22 @@
 """The ground below points: what a robot would stand on, or that nothing is there."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Longs
 from triquad_format.records.status import Status
 
 from triquad_map.questions.answer import Answer
+from triquad_map.questions.axes import drawn_on
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.questions.rays import trace
 from triquad_map.view import REACH_VOXELS, MapView
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 _STEEP = 0.5
 """The normal's z of a surface at 60 degrees. What is steeper is a wall: what is new there is not in
@@ -27,6 +34,7 @@ class Ground(Answer):
     what lies between has not been seen, or the point lies in or behind a surface.
     """
 
+    points: Doubles  # [N, 3] that were asked about, metres, map frame
     status: Bytes  # [N] Status
     height_m: Doubles  # [N] z of the ground; else down to where all was seen to be free
     normal: Floats  # [N, 3] of the ground, a unit vector to free space; 0: there is none
@@ -37,6 +45,26 @@ class Ground(Answer):
     def slope_deg(self) -> Floats:
         """The slope of the ground [N], 0 to 90 degrees; 90 where there is none."""
         return np.degrees(np.arccos(np.clip(self.normal[:, 2], 0.0, 1.0)))
+
+    def plot(self, axes: Axes | None = None) -> Axes:
+        """Draw the ground from above: its height in metres, crosses where rays saw that none is.
+
+        What is unknown stays empty.
+
+        Args:
+            axes: where to draw; ``None``: axes of a new figure.
+
+        Raises:
+            InvalidInputError: matplotlib is not installed.
+        """
+        drawn = drawn_on(axes)
+        found, none = (self[self.status == kind] for kind in (Status.SURFACE, Status.FREE))
+        (x, y), (none_x, none_y) = found.points[:, :2].T, none.points[:, :2].T
+        heights = drawn.scatter(x, y, s=9, c=found.height_m, cmap="viridis")
+        drawn.figure.colorbar(heights, ax=drawn, label="height of the ground, m")
+        drawn.scatter(none_x, none_y, s=9, c="tab:red", marker="x")
+        drawn.set(title=f"ground, epoch {self.epoch}")
+        return drawn
 
 
 @dataclass(frozen=True)
@@ -57,6 +85,7 @@ def ground(view: MapView, points: Doubles, max_drop_m: float) -> Ground:
     seen_m = _seen_down(view, columns.starts, to_see_m)
     clear = (seen_m >= to_see_m) & ~columns.buried
     answer = Ground(
+        points,
         status=np.where(clear & ~columns.hit, Status.FREE, Status.UNKNOWN).astype(np.uint8),
         height_m=np.minimum(columns.starts[:, 2] - seen_m, points[:, 2]),
         normal=np.zeros((len(points), 3), np.float32),

@@ -1,5 +1,7 @@
 """The ranges of rays: a simulated lidar, or what a localiser expects to see."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import ClassVar
 

@@ -1,5 +1,7 @@
 """The contacts of a ball that moves along straight segments."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar

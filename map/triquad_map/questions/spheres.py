@@ -1,5 +1,7 @@
 """The status of spheres: a robot's body, made of spheres."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import ClassVar
 
