@@ -46,7 +46,12 @@ _log = logging.getLogger("triquad_server")
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the server until SIGINT or SIGTERM, and return the exit code."""
     _on_signals(_leave)
-    options = _parser().parse_args(argv)
+    parser = _parser()
+    if "_ARGCOMPLETE" in os.environ:  # the shell asks what could come next
+        import argcomplete
+
+        argcomplete.autocomplete(parser)
+    options = parser.parse_args(argv)
     start_log(options.log_format)
     logging.getLogger().setLevel(options.log_level.upper())
     return _exit_code(options)

@@ -1,5 +1,6 @@
 """What all commands have in common, as processes."""
 
+import os
 import subprocess
 import sys
 from importlib import import_module
@@ -13,7 +14,18 @@ from triquad_format.mapfile.reader import read_map
 COMMANDS = (
     "demo", "evaluate", "inspect", "keys", "map_recording", "pack", "replay", "ros2", "top", "view"
 )  # fmt: skip
-SLOW = {"matplotlib", "numba", "pydantic", "rich", "scipy", "torch", "trimesh", "viser", "zenoh"}
+SLOW = {
+    "argcomplete",
+    "matplotlib",
+    "numba",
+    "pydantic",
+    "rich",
+    "scipy",
+    "torch",
+    "trimesh",
+    "viser",
+    "zenoh",
+}
 """What no one waits for who asks for help."""
 WAIT_S = 60.0
 
@@ -69,6 +81,43 @@ def test_wrong_usage_ends_with_code_2(name: str, arguments: tuple[str, ...]) -> 
     with pytest.raises(SystemExit) as caught:
         import_module(f"triquad_tools.commands.{name}").main(arguments)
     assert caught.value.code == 2
+
+
+@pytest.mark.parametrize(
+    ("entry", "typed", "expected"),
+    [
+        ("triquad_tools.commands.entry_points:pack", "triquad-pack --max", {"--max-error"}),
+        ("triquad_tools.commands.entry_points:map_recording", "triquad-map a b --fo", {"--force"}),
+        ("triquad_tools.commands.entry_points:keys", "triquad-keys in", {"init"}),
+        ("triquad_server.cli:main", "triquad-server --device c", {"cpu", "cuda"}),
+        ("triquad_tools.commands.entry_points:inspect", "triquad-inspect map", {"map.triquad"}),
+    ],
+)
+def test_the_shell_completes_what_was_typed(
+    entry: str, typed: str, expected: set[str], tmp_path: Path
+) -> None:
+    (tmp_path / "map.triquad").touch()
+    module, name = entry.split(":")
+    code = f"import sys; from {module} import {name}; sys.exit({name}())"
+    asked = {"_ARGCOMPLETE": "1", "COMP_LINE": typed, "COMP_POINT": str(len(typed))}
+    asked |= {"COMP_TYPE": "9", "_ARGCOMPLETE_IFS": "\n", "_ARGCOMPLETE_SHELL": "bash"}
+    done = subprocess.run(
+        [
+            "bash",
+            "-c",
+            '"$@" 8>&1 9>&2 1>/dev/null 2>/dev/null',
+            "bash",
+            sys.executable,
+            "-c",
+            code,
+        ],
+        capture_output=True,
+        text=True,
+        timeout=WAIT_S,
+        env={**os.environ, **asked},
+        cwd=tmp_path,
+    )
+    assert {*done.stdout.split()} == expected
 
 
 def test_closed_streams_are_no_error(tmp_path: Path) -> None:

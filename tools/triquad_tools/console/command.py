@@ -81,8 +81,8 @@ def _write(stream: TextIO, text: str) -> None:
 class ToolError(TriquadError):
     """An error of the tools, or of their use: it names the file, the place and the value.
 
-    Functions of the tools do not list it among what they raise, nor the errors of files, formats
-    and servers, unless a caller expects it: :func:`run` ends the command with its text.
+    Any function of the tools may raise it, as the errors of files, formats and servers, and says so
+    where that is what its caller needs to know: :func:`run` ends the command with its text.
     """
 
 
@@ -135,6 +135,10 @@ def run_work(
     ``intermixed``, options may stand between names.
     """
     made, arguments = parser(), sys.argv[1:] if argv is None else list(argv)
+    if "_ARGCOMPLETE" in os.environ:  # the shell asks what could come next
+        import argcomplete
+
+        argcomplete.autocomplete(made)
     options = (made.parse_intermixed_args if intermixed else made.parse_args)(arguments)
     options.arguments = arguments
     work = importlib.import_module(f"triquad_tools.work.{module}").work
