@@ -32,7 +32,7 @@ from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.process.threads import Teams
 from triquad_server.settings import MemorySettings, Settings
 
-_COMPILING = "compiling, %s; half a minute or more, once per machine and release"
+_COMPILING = "compiling, %s; in all half a minute or more, once per machine and release"
 _COMMAND = [sys.executable, "-m", "triquad_server.warm_up"]
 _DONE = "complete"  # the file that says that nothing is missing among the compiled code
 _OF_FIELD = "field"  # the argument of the process that compiles what needs no map

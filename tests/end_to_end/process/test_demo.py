@@ -15,7 +15,7 @@ from triquad_tools.mapfiles.meshfile import read_mesh
 
 GOOD = DemoResults(
     seed=1,
-    intake=Intake(60, 60, 0, 0, 6.0, 30.0, True, 15_000_000),
+    intake=Intake(60, 60, 0, 0, 6.0, 30.0, 100, 15_000_000),
     queries=ProbeReport(500, 0, None, 60, 0, 1000, 2.0, 4.0, 5.0),
     fit=FieldFit(30_000, 0.004, 0.014, np.zeros((0, 3)), np.zeros(0, np.float32)),
     map_bytes=2_000_000,
@@ -36,6 +36,8 @@ def test_a_few_scans_leave_all_results(
     for name in ("scans taken in", "training", "query of 1,000 points", "map file", "mesh"):
         assert name in output.out
     assert "the first run of all compiles" in output.err
+    assert "training, for 3 s at most" in output.err
+    assert "s left" not in output.err.partition("training, for")[2].partition("done in")[0]
     # Two scans and a second do not make a good map; everything else is promised of them too.
     broken = [line for line in output.err.splitlines() if "; promised is at" in line]
     assert all("error at held-out rays" in line for line in broken), broken
@@ -59,6 +61,14 @@ def test_results_as_promised_break_nothing() -> None:
     assert values["training"] == "0.50 M samples/s"
     assert values["error at held-out rays"] == "4.00 mm"
     assert values["map file"] == "2.00 MB"
+    for percent, words in ((100, "all there is to learn"), (37, "37 % of what there is to learn")):
+        intake = dataclasses.replace(GOOD.intake, learnt_percent=percent)
+        (row,) = (
+            one
+            for one in table_rows(dataclasses.replace(GOOD, intake=intake))
+            if one.name == "training"
+        )
+        assert words in row.note
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ class Intake:
     lost: int
     seconds: float  # from the first scan until all were integrated
     learning_s: float  # from the first scan until nothing was left to learn, or the limit
-    settled: bool  # False: the limit came first
+    learnt_percent: int  # of what the scans can teach; below 100 the limit came first
     samples_trained: int
 
 
@@ -71,7 +71,9 @@ def broken_promises(results: DemoResults) -> list[str]:
 def table_rows(results: DemoResults) -> list[Row]:
     """Return the results as lines of a table."""
     intake, queries, fit = results.intake, results.queries, results.fit
-    end = "until nothing was left to learn" if intake.settled else "cut off; still learning"
+    end = "which is all there is to learn"
+    if intake.learnt_percent < 100:
+        end = f"{intake.learnt_percent} % of what there is to learn: a server would go on"
     taken_per_s = intake.taken / max(intake.seconds, 1e-9)
     samples_m, learning_s = intake.samples_trained / 1e6, intake.learning_s
     trained = f"{samples_m / max(learning_s, 1e-9):.2f} M samples/s"
@@ -148,6 +150,6 @@ def _learnt(client: Client, scans: Sequence[SimulatedScan], period_s: float) -> 
         lost=flush.lost,
         seconds=taken_in - started,
         learning_s=time.monotonic() - started,
-        settled=status.settled,
+        learnt_percent=status.learnt_percent,
         samples_trained=status.samples_trained,
     )

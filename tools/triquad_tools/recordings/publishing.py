@@ -50,11 +50,14 @@ def wait_until_settled(client: Client, limit_s: float | None = None) -> ServerSt
     """Return the server's status once nothing is left to learn, or after ``limit_s`` seconds."""
     started = time.monotonic()
     first = client.status()
-    with progress("training", first.samples_left) as report:
+    # With a limit, how long all of it would take is not how long it will take.
+    title = "training" if limit_s is None else f"training, for {limit_s:g} s at most"
+    with progress(title, first.samples_left if limit_s is None else None) as report:
         while True:
             status = client.status()
             waited_s = time.monotonic() - started
-            note = f"{status.samples_trained / 1e6:.1f} M samples, loss {status.loss:.4f}"
+            samples = f"{status.samples_trained / 1e6:.1f} M samples"
+            note = f"{status.learnt_percent} % learnt, {samples}"
             report(first.samples_left - status.samples_left, note)
             if status.settled or (limit_s is not None and waited_s >= limit_s):
                 return status
