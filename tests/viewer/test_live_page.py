@@ -138,9 +138,10 @@ def test_a_map_is_watched_from_its_first_scan(looked: Looked) -> None:
     expect(page.get_by_text("default at tcp/")).to_be_visible()
     expect(page.get_by_text("0 scans taken")).to_be_visible()
     assert drawn_share(page) == 0.0
+    expect(page.get_by_text("nothing was seen yet")).to_be_visible()
     publish_sphere(client)
     expect(page.get_by_text("roof: 2 scans, now at 0.0, 0.0, 0.0 m")).to_be_visible()
-    expect(page.get_by_text("2 scans taken, 0 waiting")).to_be_visible()
+    expect(page.get_by_text("2 scans taken; ")).to_be_visible()
     wait_until_drawn(page)
     wait_until(page, lambda: share_where(page, is_orange) > 5e-4, "the scan is drawn")
     # The camera frames all there is.
@@ -207,7 +208,7 @@ def test_the_border_of_unknown_space_is_drawn_and_goes(mapped: Looked) -> None:
 def test_the_view_tells_its_scale_and_direction(mapped: Looked) -> None:
     page, _ = mapped
     expect(page.get_by_text("m in the middle")).to_be_visible(timeout=TIMEOUT_MS)
-    expect(page.get_by_text("x, looking to")).to_be_visible()
+    expect(page.get_by_text("x axis; the view looks")).to_be_visible()
 
 
 def test_a_click_asks_the_map(mapped: Looked) -> None:

@@ -13,11 +13,12 @@ from triquad_tools.viewer.page.page import Focus, surface_along
 from triquad_tools.viewer.questions.cell_box import CellBox
 from triquad_tools.viewer.questions.clicks import Path
 from triquad_tools.viewer.questions.measure import Measure
-from triquad_tools.viewer.questions.slice import Slice
+from triquad_tools.viewer.questions.slice import Slice, slider_places
 from triquad_tools.viewer.questions.unknown_space import ask_boundary, border_faces
 from triquad_tools.viewer.view_panel import round_length, turned_back
 
 GROUND_M = 0.1  # in the middle of a voxel
+ROOM = np.array([[0.0, 0, 0], [5, 4, 2.5]])  # [2, 3] its corners
 FOCUS = Focus(np.array([0.3, -0.4, 1.2]), 16.0)
 
 
@@ -45,6 +46,23 @@ def test_a_slice_is_asked_and_drawn_where_it_is(ground: OfflineMap, axis: int) -
     expected = np.array(box.corner)
     expected[axis] = 0.9
     np.testing.assert_allclose(corner, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("extent", "wanted_m", "places"),
+    [
+        (ROOM, 1.0, (-0.5, 1.0, 3.0)),  # a tenth of its five metres beyond floor and ceiling
+        (ROOM, 900.0, (-0.5, 3.0, 3.0)),
+        (10 * ROOM, 5.0, (-5.0, 5.0, 25.0)),
+        (100 * ROOM, 50.0, (30.0, 50.0, 70.0)),
+        (np.zeros((2, 3)), 0.75, (-0.05, 0.05, 0.05)),
+        (None, 4.0, (-16.0, 4.0, 24.0)),
+    ],
+)
+def test_a_slice_moves_as_far_as_the_map_goes(
+    extent: np.ndarray | None, wanted_m: float, places: tuple[float, float, float]
+) -> None:
+    assert slider_places(extent, 2, wanted_m) == pytest.approx(places)
 
 
 @pytest.mark.parametrize(("beyond_m", "is_met"), [(-0.5, True), (0.15, True), (1.0, False)])

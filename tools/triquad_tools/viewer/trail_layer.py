@@ -6,8 +6,9 @@ from matplotlib.colors import to_rgb
 from triquad_client import Client, ScanSource, ServerStatus, SourceReport
 from triquad_format.records.arrays import Doubles
 
+from triquad_tools.viewer.mesh.mesh_layer import MeshLayer
 from triquad_tools.viewer.page.layer import Layer
-from triquad_tools.viewer.page.legends import problem_html, text_html
+from triquad_tools.viewer.page.legends import problem_html
 from triquad_tools.viewer.page.page import Page
 
 _PERIOD_S = 0.5
@@ -21,9 +22,9 @@ _POINT_M, _LINE_PIXELS = 0.08, 3.0
 class TrailLayer(Layer):
     """Draws trails and newest scans, and keeps them up to date."""
 
-    def __init__(self, page: Page, client: Client) -> None:
+    def __init__(self, page: Page, client: Client, mesh: MeshLayer) -> None:
         super().__init__(page, "Robot and server", _PERIOD_S)
-        self._client = client
+        self._client, self._mesh = client, mesh
         self._report: SourceReport | None = None
         self._shown: tuple[object, ...] = ()
         self._robot: Doubles | None = None  # where the robot was seen last, [3] metres, map frame
@@ -39,8 +40,9 @@ class TrailLayer(Layer):
         report = self._report = self._client.sources(since=self._report, max_points=_SCAN_POINTS)
         status = self._client.status()
         problems = (problem_html(text or "") for text in (status.store_error, status.warnings))
-        lines = (*_state(status), *(_line(name, source) for name, source in report.sources.items()))
-        self.tell(text_html("\n".join(lines)) + "".join(problems))
+        lines = (_line(name, source) for name, source in report.sources.items())
+        self.page.entitle(_state(status), *lines)
+        self.tell("".join(problems))
         self._follow(report)
         wanted = (report.server, report.revision, self._trails.value, self._scans.value)
         if wanted == self._shown:
@@ -71,6 +73,7 @@ class TrailLayer(Layer):
             marks.append(self.lines(pieces, colour, _LINE_PIXELS, "screen"))
         if source.newest is not None and self._scans.value:
             points, light = self.page.in_scene(source.newest.points_m), np.array(to_rgb(colour))
+            self._mesh.show_first(source.newest.points_m)
             cloud = self.page.scene.add_point_cloud(
                 self.node("scan"), points, light, point_size=_POINT_M, precision="float32"
             )
@@ -78,11 +81,12 @@ class TrailLayer(Layer):
         return marks
 
 
-def _state(status: ServerStatus) -> tuple[str, str]:
+def _state(status: ServerStatus) -> str:
     dropped, lost = sum(status.scans_dropped.values()), sum(status.scans_lost.values())
-    left = "settled" if status.settled else f"{status.samples_left / 1e6:.1f} M samples left"
-    scans = f"{status.scans_taken:,} scans taken, {status.scans_waiting} waiting"
-    return f"epoch {status.epoch}, {left}", f"{scans}, {dropped:,} refused, {lost:,} lost"
+    counts = {"waiting": status.scans_waiting, "refused": dropped, "lost": lost}
+    unusual = "".join(f", {count:,} {what}" for what, count in counts.items() if count)
+    learnt = f"{status.learnt_percent} % learnt"
+    return f"{status.scans_taken:,} scans taken{unusual}; {learnt}, epoch {status.epoch}"
 
 
 def _line(name: str, source: ScanSource) -> str:

@@ -14,7 +14,6 @@ from triquad_format.errors import TriquadError
 from triquad_tools.console.command import ToolError
 from triquad_tools.viewer.allowed_origins import serving_only
 from triquad_tools.viewer.mesh.mesh_layer import MeshLayer
-from triquad_tools.viewer.page.legends import text_html
 from triquad_tools.viewer.page.page import Page
 from triquad_tools.viewer.questions.clicks import Clicks
 from triquad_tools.viewer.questions.slice import SliceQuestion
@@ -32,10 +31,10 @@ _OF_ONE_WHO_LEFT = ("Queued a .* on a closed connection", "Attempted to remove a
 def open_page(client: viser.ClientHandle, shown: MapSource | History) -> ExitStack:
     """Build the page of one browser; return what ends it."""
     _prepare(client)
-    title, page, parts = client.gui.add_html(""), Page(client), ExitStack()
+    page, parts = Page(client), ExitStack()
     try:
         page.source = source = shown.newest() if isinstance(shown, History) else shown
-        title.content = text_html(source.title)
+        page.entitle()
         with _controls(client):
             if isinstance(shown, History):
                 parts.callback(TimePanel(page, shown).close)
@@ -45,7 +44,7 @@ def open_page(client: viser.ClientHandle, shown: MapSource | History) -> ExitSta
             for part in (SliceQuestion, UnknownSpace, Clicks):
                 parts.callback(part(page).close)
             if isinstance(source, LiveSource):
-                parts.callback(TrailLayer(page, source.client).close)
+                parts.callback(TrailLayer(page, source.client, mesh).close)
     except TriquadError as error:
         page.failed("page", str(error))
     except Exception:

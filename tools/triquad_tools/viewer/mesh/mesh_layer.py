@@ -23,6 +23,7 @@ from triquad_tools.viewer.mesh.tile_colours import (
 )
 from triquad_tools.viewer.mesh.tiles_in_view import TileName, TilesInView
 from triquad_tools.viewer.page.layer import Layer
+from triquad_tools.viewer.page.legends import text_html
 from triquad_tools.viewer.page.page import Page
 
 _NEAR_M, _FAR_M = 0.1, 20_000.0
@@ -142,6 +143,11 @@ class MeshLayer(Layer):
         self._framed = 0.0
         self.wake()
 
+    def show_first(self, points: Doubles) -> None:
+        """Look at ``points`` [N, 3], metres, map frame, as long as there is no mesh."""
+        if self.page.extent is None:
+            self._camera.follow(points)
+
     def refresh(self) -> None:
         """Draw what came since the last round, and remove what it replaces."""
         for handle in self._replaced:
@@ -164,6 +170,7 @@ class MeshLayer(Layer):
     def _draw(self, wanted: Mapping[TileName, MeshTile]) -> None:
         """Draw these tiles alone; those that they replace go a round later."""
         points = _some_vertices(self._tiles.roots.values())
+        self.page.extent = np.stack([points.min(0), points.max(0)]) if len(points) else None
         aspect = self.page.client.camera.aspect  # another one once the panel has its place
         if self.page.source.grows or aspect != self._framed:
             self._camera.follow(points)
@@ -172,7 +179,7 @@ class MeshLayer(Layer):
         colours = height_colours(points[points[:, 2] <= top_m, 2])
         if self._by.value == _CONFIDENCE:
             colours = confidence_colours(self.page.source.queries)
-        self.tell(colours.scale.html)
+        self.tell(colours.scale.html if len(points) else text_html("nothing was seen yet"))
         shown = wanted if self._on.value else {}
         for name, tile in shown.items():
             scale = colours.scale

@@ -66,7 +66,7 @@ def compass_html(turn_deg: float) -> str:
     The angle is counted from the x axis towards the y axis.
     """
     arrow = f"display: inline-block; transform: rotate({turn_deg - 90.0:.0f}deg)"
-    told = f"x, looking to {turn_deg:.0f}° from it"
+    told = f"x axis; the view looks {turn_deg:.0f}° from it"
     return f'<div style="{_TEXT}"><span style="{arrow}">⟶</span> {told}</div>'
 
 

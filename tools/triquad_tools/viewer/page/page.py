@@ -12,7 +12,7 @@ from triquad_client.calls.queries import MapQueries
 from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.records.status import Status
 
-from triquad_tools.viewer.page.legends import problem_html
+from triquad_tools.viewer.page.legends import problem_html, text_html
 from triquad_tools.viewer.sources import MapSource
 
 _GRID_M = 100.0
@@ -38,17 +38,27 @@ class Page:
     source: MapSource  # the map, which a part may replace: all others go on with the new one
     drawn: MapSource | None = None  # the map whose mesh is in the scene
     top_m = math.inf  # map frame: what lies above is not drawn, and no click meets it
+    extent: Doubles | None = (
+        None  # [2, 3] corners of the mesh, metres, map frame; None: it is empty
+    )
 
     def __init__(self, client: viser.ClientHandle) -> None:
         self.client = client
         self.scene = client.scene
         self.gui = client.gui
+        self._title = client.gui.add_html("")
         self._shown_problems = client.gui.add_html("")
         self._problems: dict[str, str] = {}  # by part of the page
         # [3] metres, map frame: the zero of the scene, near the first point that is drawn, since a
         # browser computes in single precision: half a metre in coordinates as large as UTM's
         self._origin: Doubles | None = None
         self._choosing = threading.Lock()
+
+    def entitle(self, *lines: str) -> None:
+        """Show which map it is and, in more lines, how it is doing; on a phone, this alone."""
+        text = text_html("\n".join((self.source.title, *lines)))
+        if self._title.content != text:
+            self._title.content = text
 
     def in_scene(self, points: NDArray[np.floating]) -> Floats:
         """Return points [..., 3] of the map frame as the scene has them."""

@@ -21,7 +21,8 @@ from triquad_tools.viewer.questions.cell_box import CellBox
 _HEIGHT_AXIS = 2
 _AXES = {"level, at some z": _HEIGHT_AXIS, "upright, at some x": 0, "upright, at some y": 1}
 _CELLS, _UPRIGHT_CELLS = 192, 96  # along the width, and along the height of an upright slice
-_REACH_M = 20.0  # of the slider, to both sides of where the slice was put
+_REACH_M = 20.0  # of the slider, at most, to both sides of where the slice was put
+_BEYOND = 0.1  # the map it reaches as well, as a share of the map's longest side
 _STEP_M = 0.05
 _ABOVE_M = 0.75  # the ground in the middle of the view: where a level slice is put
 _MAX_DISTANCE_M = 3.0
@@ -127,10 +128,26 @@ class SliceQuestion(Question[Slice]):
     def _place(self, axis: int) -> None:
         """Put the slice through the middle of the view, with room to move it."""
         above_m = _ABOVE_M if axis == _HEIGHT_AXIS else 0.0
-        at_m = round(float(ground_in_view(self.page)[axis]) + above_m, 2)
+        at_m = float(ground_in_view(self.page)[axis]) + above_m
+        low_m, at_m, high_m = slider_places(self.page.extent, axis, at_m)
         self._unplaced = False
-        self._at.min, self._at.max = at_m - _REACH_M, at_m + _REACH_M
+        self._at.min, self._at.max = low_m, high_m
         self._at.value = at_m  # type: ignore[misc]  # mypy takes it for read-only
+
+
+def slider_places(extent: Doubles | None, axis: int, wanted_m: float) -> tuple[float, float, float]:
+    """Return the least place of a slice, where it is put first, and the greatest one, metres.
+
+    They are those of the map's ``extent`` [2, 3], and a little beyond, as far as a slider can show
+    them in steps; ``None``: nothing is known of it.
+    """
+    ends_m = np.array([wanted_m - _REACH_M, wanted_m + _REACH_M])
+    if extent is not None:
+        beyond_m = max(_BEYOND * float(np.ptp(extent, axis=0).max()), _STEP_M)
+        ends_m = extent[:, axis] + [-beyond_m, beyond_m]
+    first_m = float(np.clip(wanted_m, *ends_m))
+    low_m, high_m = np.clip(ends_m, first_m - _REACH_M, first_m + _REACH_M).round(2).tolist()
+    return low_m, min(max(round(first_m, 2), low_m), high_m), high_m
 
 
 def _line_distances(max_distance_m: float) -> Doubles:
