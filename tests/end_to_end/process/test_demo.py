@@ -36,8 +36,8 @@ def test_a_few_scans_leave_all_results(
     for name in ("scans taken in", "training", "query of 1,000 points", "map file", "mesh"):
         assert name in output.out
     assert "the first run of all compiles" in output.err
-    assert "training, for 3 s at most" in output.err
-    assert "s left" not in output.err.partition("training, for")[2].partition("done in")[0]
+    assert "waiting 3 s at most for training" in output.err
+    assert "s left" not in output.err.partition("waiting 3 s")[2].partition("done in")[0]
     # Two scans and a second do not make a good map; everything else is promised of them too.
     broken = [line for line in output.err.splitlines() if "; promised is at" in line]
     assert all("error at held-out rays" in line for line in broken), broken

@@ -51,7 +51,7 @@ def wait_until_settled(client: Client, limit_s: float | None = None) -> ServerSt
     started = time.monotonic()
     first = client.status()
     # With a limit, how long all of it would take is not how long it will take.
-    title = "training" if limit_s is None else f"training, for {limit_s:g} s at most"
+    title = "training" if limit_s is None else f"waiting {limit_s:g} s at most for training"
     with progress(title, first.samples_left if limit_s is None else None) as report:
         while True:
             status = client.status()

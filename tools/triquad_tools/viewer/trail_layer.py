@@ -85,8 +85,8 @@ def _state(status: ServerStatus) -> str:
     dropped, lost = sum(status.scans_dropped.values()), sum(status.scans_lost.values())
     counts = {"waiting": status.scans_waiting, "refused": dropped, "lost": lost}
     unusual = "".join(f", {count:,} {what}" for what, count in counts.items() if count)
-    learnt = f"{status.learnt_percent} % learnt"
-    return f"{status.scans_taken:,} scans taken{unusual}; {learnt}, epoch {status.epoch}"
+    learnt = f"{status.learnt_percent} % learnt"  # one line on a phone, where nothing is unusual
+    return f"{status.scans_taken:,} scans{unusual}; {learnt}; epoch {status.epoch}"
 
 
 def _line(name: str, source: ScanSource) -> str:
