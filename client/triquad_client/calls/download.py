@@ -1,7 +1,5 @@
 """Fetching the map as a file; its chunks go in the background of everything else."""
 
-from __future__ import annotations
-
 import hashlib
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Questions about the map, which clients, pinned epochs and maps in memory answer alike."""
 
-from __future__ import annotations
-
 from triquad_client.brief_errors import brief_errors
 from triquad_client.calls.point_queries import PointQueries
 from triquad_client.calls.way_queries import WayQueries

@@ -1,7 +1,5 @@
 """Following the mesh of a box: only what changed travels."""
 
-from __future__ import annotations
-
 import math
 import threading
 import time
@@ -109,7 +107,7 @@ class MeshWatch(WatchedTiles):
     def __repr__(self) -> str:
         return f"MeshWatch({len(self.tiles)} tiles{'' if self.complete else ', more to come'})"
 
-    def __enter__(self) -> MeshWatch:
+    def __enter__(self) -> "MeshWatch":
         return self
 
     def __exit__(self, *_: object) -> None:

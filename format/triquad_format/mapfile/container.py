@@ -78,15 +78,9 @@ class RandomAccess(Protocol):
 
 
 def is_map(source: RandomAccess) -> bool:
-    """Return whether the source is a map file, or was one: damaged, but begun as such."""
-    try:
-        read_end(source)
-    except DamagedMapFileError:
-        begin = source.read(0, min(len(_BEGIN), source.size))
-        return begin == _BEGIN[: len(begin)]
-    except MapFileError:
-        return False
-    return True
+    """Return whether a source begins as the map files of triquad; it may be damaged, or empty."""
+    begin = source.read(0, min(len(_BEGIN), source.size))
+    return begin == _BEGIN[: len(begin)]
 
 
 @dataclass(frozen=True)

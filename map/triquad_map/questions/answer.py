@@ -12,6 +12,7 @@ from triquad_format.records.status import Status, Statuses
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.axes import Axes
 
 AnswerT = TypeVar("AnswerT", bound="Answer")
 _AXES = "xyz"
@@ -79,3 +80,19 @@ class Answer:
         """Return the arrays by the names of their fields; what was not asked for has none."""
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}  # type: ignore[arg-type]
         return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+
+
+def drawn_on(axes: Axes | None) -> Axes:
+    """Return ``axes``, or where there are none those of a new figure, labelled as a plan.
+
+    Raises:
+        InvalidInputError: matplotlib is not installed.
+    """
+    try:
+        from matplotlib import pyplot
+    except ModuleNotFoundError as error:
+        told = "matplotlib is missing: pip install 'triquad[notebook]'"
+        raise InvalidInputError(told) from error
+    drawn = pyplot.subplots()[1] if axes is None else axes
+    drawn.set(xlabel="x, m", ylabel="y, m", aspect="equal")
+    return drawn

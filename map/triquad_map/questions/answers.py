@@ -3,8 +3,6 @@
 A server answers with this from its epochs, and a client from a map file: so the two cannot differ.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import Any

@@ -9,7 +9,7 @@ import numpy as np
 from triquad_format.records.arrays import Bytes, Doubles, Floats
 from triquad_format.records.status import Status, Statuses
 
-from triquad_map.questions.axes import drawn_on
+from triquad_map.questions.answer import drawn_on
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.view import MapView
 

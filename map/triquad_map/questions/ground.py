@@ -9,8 +9,7 @@ import numpy as np
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Longs
 from triquad_format.records.status import Status
 
-from triquad_map.questions.answer import Answer
-from triquad_map.questions.axes import drawn_on
+from triquad_map.questions.answer import Answer, drawn_on
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.questions.rays import trace
 from triquad_map.view import REACH_VOXELS, MapView
