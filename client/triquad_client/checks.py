@@ -9,25 +9,23 @@ import time
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any, TypeAlias, cast
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from triquad_format.errors import InvalidInputError, MapFileError
 from triquad_format.mapfile.container import is_map
 from triquad_format.mapfile.files import FileBytes
-from triquad_format.records.arrays import Doubles, Floats, Longs
+from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.wire.limits import (
     LEVELS,
     MAX_DISTANCE_M,
-    MAX_KEYFRAMES,
     MAX_POSITION_M,
     MIN_LENGTH_M,
 )
 from triquad_map.questions.grid import GridShape
 
 from triquad_client.errors import NO_NUMBER, InvalidScanError
-from triquad_client.pose import PoseLike, rigid_pose
 from triquad_client.real_numbers import real_number, real_numbers, whole_number
 
 Bounds: TypeAlias = tuple[Sequence[float], Sequence[float]]
@@ -92,31 +90,6 @@ def stamp_ns(stamp_s: float) -> int:
     if not 0 <= seconds < 2**63 / 1e9:
         raise InvalidScanError(f"stamp_s = {_shown(stamp_s)} is not a time in seconds since 1970")
     return round(seconds * 1e9)
-
-
-def keyframes(stamps_s: ArrayLike, poses: ArrayLike | Sequence[PoseLike]) -> tuple[Longs, Doubles]:
-    """Return times [K] in nanoseconds since 1970, and poses [K, 4, 4] at them."""
-    try:
-        times = real_numbers(stamps_s).ravel().tolist()
-    except NO_NUMBER as error:
-        raise InvalidScanError(f"stamps_s are no times in seconds since 1970: {error}") from error
-    stamps_ns = np.array([stamp_ns(time_s) for time_s in times], np.int64)
-    try:
-        matrices = [rigid_pose(pose) for pose in cast("Sequence[PoseLike]", poses)]
-    except TypeError as error:
-        raise InvalidScanError(f"the poses are no list of matrices [4, 4]: {error}") from error
-    if len(stamps_ns) != len(matrices) or not 0 < len(matrices) <= MAX_KEYFRAMES:
-        raise InvalidScanError(
-            f"{len(stamps_ns)} stamps_s and {len(matrices)} poses: as many of both, 1 to "
-            f"{MAX_KEYFRAMES}, make a correction"
-        )
-    falls = np.flatnonzero(np.diff(stamps_ns) <= 0)
-    if len(falls):
-        at = int(falls[0]) + 1
-        raise InvalidScanError(
-            f"stamps_s[{at}] = {stamps_ns[at] / 1e9!r} is not later than the one before: they rise"
-        )
-    return stamps_ns, np.array(matrices)
 
 
 def deadline(timeout_s: float) -> float:

@@ -2,16 +2,21 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 from triquad_format.printable import printable
+from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.pose import quaternion_of
+from triquad_format.wire.limits import MAX_KEYFRAMES
 from triquad_format.wire.source_messages import CorrectPosesReply, CorrectPosesRequest
 
 from triquad_client import checks
+from triquad_client.errors import NO_NUMBER, InvalidScanError
 from triquad_client.net.connection import Connection, new_ticket
-from triquad_client.pose import PoseLike
+from triquad_client.pose import PoseLike, rigid_pose
+from triquad_client.real_numbers import real_numbers
 
 
 class CorrectionCalls:
@@ -54,10 +59,35 @@ class CorrectionCalls:
                 what is needed is not kept. The map stays as it is.
             RequestTimeoutError: not done after ``timeout_s``; the server goes on with it.
         """
-        stamps_ns, poses = checks.keyframes(stamps_s, world_from_sensor)
+        stamps_ns, poses = _keyframes(stamps_s, world_from_sensor)
         quaternions = np.array([quaternion_of(pose[:3, :3]) for pose in poses])
         request = CorrectPosesRequest(
             source, stamps_ns, poses[:, :3, 3], quaternions, onward, new_ticket()
         )
         reply = self._connection.ask_until_done(request, timeout_s)
         return reply if reply.undo is None else replace(reply, undo=printable(reply.undo))
+
+
+def _keyframes(stamps_s: ArrayLike, poses: ArrayLike | Sequence[PoseLike]) -> tuple[Longs, Doubles]:
+    """Return times [K] in nanoseconds since 1970, and poses [K, 4, 4] at them."""
+    try:
+        times = real_numbers(stamps_s).ravel().tolist()
+    except NO_NUMBER as error:
+        raise InvalidScanError(f"stamps_s are no times in seconds since 1970: {error}") from error
+    stamps_ns = np.array([checks.stamp_ns(time_s) for time_s in times], np.int64)
+    try:
+        matrices = [rigid_pose(pose) for pose in cast("Sequence[PoseLike]", poses)]
+    except TypeError as error:
+        raise InvalidScanError(f"the poses are no list of matrices [4, 4]: {error}") from error
+    if len(stamps_ns) != len(matrices) or not 0 < len(matrices) <= MAX_KEYFRAMES:
+        raise InvalidScanError(
+            f"{len(stamps_ns)} stamps_s and {len(matrices)} poses: as many of both, 1 to "
+            f"{MAX_KEYFRAMES}, make a correction"
+        )
+    falls = np.flatnonzero(np.diff(stamps_ns) <= 0)
+    if len(falls):
+        at = int(falls[0]) + 1
+        raise InvalidScanError(
+            f"stamps_s[{at}] = {stamps_ns[at] / 1e9!r} is not later than the one before: they rise"
+        )
+    return stamps_ns, np.array(matrices)
