@@ -193,6 +193,9 @@ class Intake:
     def _publish(self, placed: Placed) -> None:
         if isinstance(placed.outcome, NoScanError):
             raise placed.outcome
+        if (problem := self._rays.problem(placed.topic_name)) is not None:
+            setting = f", {_SETTING}" if problem.reason == "ray_origin" else ""
+            self.drops.remark(placed.topic_name, f"{problem}{setting}")
         stamp_ns = placed.sweep.stamp_ns
         self.scans.publish(placed.topic_name, placed.outcome, stamp_ns, self._placement.map_frame)
 
@@ -220,9 +223,6 @@ class Intake:
             sweep = self._reader.sweep(topic_name, kind, message, came_ns)
             if role is Role.CLOUD:
                 self._rays.see(topic_name, sweep.points)
-                if (problem := self._rays.problem(topic_name)) is not None:
-                    setting = f", {_SETTING}" if problem.reason == "ray_origin" else ""
-                    self.drops.remark(topic_name, f"{problem}{setting}")
             self._place(topic_name, sweep)
         else:
             static = role is Role.TF_STATIC

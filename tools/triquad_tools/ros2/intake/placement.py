@@ -134,15 +134,16 @@ class Placement:
     def _scan(self, entry: _Waiting, now_s: float) -> PosedScan:
         frame = entry.sweep.frame
         target = self.map_frame or self._best_frame(frame, now_s)
-        if frame in (target, *ROOT_NAMES):
+        frames = self.motion.frames
+        if frame not in (target, *ROOT_NAMES):
+            # Asked first, since it is quick, and most that wait will wait on.
+            frames.poses(target, frame, np.array(entry.needs_ns, np.int64))
+        if frame in (target, *ROOT_NAMES) or frames.is_world(target, frame):
             raise NoScanError(
                 "registered",
                 f"the cloud is in the frame {frame!r}, so where the sensor was is not known: "
                 "choose the topic of the sensor itself with --clouds",
             )
-        # Asked first, since it is quick, and most that wait will wait on.
-        frames = self.motion.frames
-        frames.poses(target, frame, np.array(entry.needs_ns, np.int64))
         scan = place(entry.sweep, frames, target)
         if not self.map_frame:
             _log.info("mapping in the frame %r", target)

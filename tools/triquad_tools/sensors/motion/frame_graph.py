@@ -151,6 +151,12 @@ class FrameGraph:
         edges = map(self.edge, {*self.path(frame)} ^ {*self.path(target)})
         return any(edge is not None and edge.standing is None for edge in edges)
 
+    def is_world(self, target: str, frame: str) -> bool:
+        """Return whether ``frame`` stands still in ``target`` while others move in it."""
+        if self.moves(target, frame):
+            return False
+        return any(frame in self.path(edge.parent) for edge in self.moving)
+
     def _forget_after(self, edge: Edge | None, stamp_ns: int) -> None:
         is_moving = edge is not None and edge.standing is None
         if edge is not None and is_moving and edge.track.span_ns[1] > stamp_ns + _RESTART_NS:
