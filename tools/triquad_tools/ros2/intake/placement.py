@@ -164,7 +164,9 @@ class Placement:
             return self.motion.body_parent
         found = self.motion.frames.fixed_frame(frame)
         if found not in ROOT_NAMES:
-            above = "no transform names it" if found == frame else f"it is in {found!r}"
+            above = f"it is in {found!r}" if found != frame else "no transform names it"
+            if found == frame and frame in self.motion.frames.frames:
+                above = "it is in no other"
             raise NoTransformError(
                 "no_transform",
                 f"{frame!r} is in none of the frames {', '.join(ROOT_NAMES)}: {above}",
