@@ -38,9 +38,8 @@ class Page:
     source: MapSource  # the map, which a part may replace: all others go on with the new one
     drawn: MapSource | None = None  # the map whose mesh is in the scene
     top_m = math.inf  # map frame: what lies above is not drawn, and no click meets it
-    extent: Doubles | None = (
-        None  # [2, 3] corners of the mesh, metres, map frame; None: it is empty
-    )
+    extent: Doubles | None = None
+    """[2, 3] The corners of the mesh, metres, map frame; ``None``: it is empty."""
 
     def __init__(self, client: viser.ClientHandle) -> None:
         self.client = client
