@@ -92,8 +92,6 @@ def _section(result: Result) -> str:
             lines.append(f"| {one.name} | {one.shown} | {one.wanted} | {kept} |")
         lines.append("")
     others = [f"{one.name} {one.shown}" for one in result.figures if not one.wanted]
-    if others:
-        lines += [f"Also measured: {'; '.join(others)}.", ""]
-    if result.remark:
-        lines += [result.remark, ""]
+    also = f"Also measured: {'; '.join(others)}." if others else ""
+    lines += [" ".join(filter(None, (result.remark, also))), ""]
     return "\n".join(lines)
