@@ -1,5 +1,7 @@
 """Better poses for scans that are in the map."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import cast

@@ -144,7 +144,7 @@ def test_paths_bend_away_from_what_blocks_the_straight_one(ask: Run) -> None:
     chosen = next(row for row in rows if row[0] == best)
     assert not chosen[3]
     assert 24 < float(chosen[1]) < 26
-    assert float(chosen[2]) > RADIUS_M
+    assert float(chosen[2]) >= RADIUS_M  # as printed, to the millimetre
     path = printed_places(output)
     assert len(path) > 5
     assert np.quantile(clearances(path), 0.02) > RADIUS_M - 0.1

@@ -139,7 +139,7 @@ def test_it_is_ready_once_it_answers_and_says_when_it_stops(manager, arguments) 
         assert ready[1].startswith("STATUS=serving map 'default': epoch 1")
         stages = told(manager, "STATUS")[:-1]
         assert stages[0] == "STATUS=restoring the newest checkpoint"
-        assert "STATUS=preparing compiled code: questions, step 3 of 6" in stages
+        assert "STATUS=preparing compiled code: step 3 of 6: questions" in stages
         assert told(manager, "EXTEND_TIMEOUT_USEC")
         with triquad_client.connect(server.endpoint) as client:
             epoch = servers.learn_all(client, 2).epoch
