@@ -76,7 +76,7 @@ def measure(options: argparse.Namespace) -> list[Figure]:
 
 
 def _map_figures(name: str, corrected: _Corrected, never: MeshScores) -> list[Figure]:
-    """Return how good the map was before and after, beside one that never was wrong."""
+    """Return how good the map was before and after, against one that never was wrong."""
     lost = 100 * (never.f_score - corrected.right.f_score)
     doubled = 100 * (never.accuracy_ratio - corrected.right.accuracy_ratio)
     return [

@@ -101,7 +101,7 @@ def _compile() -> None:
     with subprocess.Popen([*_COMMAND, _OF_FIELD]) as field:
         for name, step in _SyntheticMap(Settings(), "cpu", Teams()).steps():
             sys.stdout.write(name + "\n")
-            sys.stdout.flush()  # whoever started this process shows it
+            sys.stdout.flush()  # who started this process shows it
             go_through(step)
             field.wait()  # from the second step on, its kernels are called
     if CODE_FOLDER is not None:

@@ -1,4 +1,4 @@
-"""Reads a file of the scan log: docs/map-file.md says where a log lies."""
+"""Reads a file of the scan log: docs/reliability.md says where it lies."""
 
 import io
 from collections.abc import Iterator

@@ -54,8 +54,7 @@ def pack_cloud(stamp_ns: int, frame: str, points: Floats) -> bytes:
 def pack_transform(stamp_ns: int, parent: str, child: str, pose: Doubles) -> bytes:
     """Return the ``pose`` [4, 4] of frame ``child`` in frame ``parent``."""
     writer = _with_header(CdrWriter().numbers("<u4", 1), stamp_ns, parent).text(child)
-    writer.numbers("<f8", *pose[:3, 3].tolist(), *quaternion_of(pose[:3, :3]).tolist())
-    return writer.payload()
+    return _with_pose(writer, pose).payload()
 
 
 class Transform(NamedTuple):
@@ -70,8 +69,7 @@ def pack_path(stamp_ns: int, frame: str, stamps_ns: Longs, poses: Doubles) -> by
     """Return a path of ``poses`` [K, 4, 4] at times [K], in the frame of that name."""
     writer = _with_header(CdrWriter(), stamp_ns, frame).numbers("<u4", len(poses))
     for stamp, pose in zip(stamps_ns.tolist(), poses, strict=True):
-        _with_header(writer, stamp, frame)
-        writer.numbers("<f8", *pose[:3, 3].tolist(), *quaternion_of(pose[:3, :3]).tolist())
+        _with_pose(_with_header(writer, stamp, frame), pose)
     return writer.payload()
 
 
@@ -119,6 +117,10 @@ def unpack_path(data: bytes) -> tuple[int, Longs, Doubles]:
         stamps.append(_read_header(reader)[0])
         poses.append(_read_pose(reader))
     return stamp_ns, np.array(stamps, np.int64), np.array(poses).reshape(-1, 4, 4)
+
+
+def _with_pose(writer: CdrWriter, pose: Doubles) -> CdrWriter:
+    return writer.numbers("<f8", *pose[:3, 3].tolist(), *quaternion_of(pose[:3, :3]).tolist())
 
 
 def _read_pose(reader: CdrReader) -> Doubles:

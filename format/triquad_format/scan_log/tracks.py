@@ -6,7 +6,9 @@ import numpy as np
 
 from triquad_format.records.arrays import Bools, Doubles, Longs
 from triquad_format.records.pose import pose_matrices, quaternion_of, slerp
-from triquad_format.scan_log.segment import LoggedCorrection
+from triquad_format.scan_log.reading import Entry
+from triquad_format.scan_log.ros_messages import Transform
+from triquad_format.scan_log.segment import LoggedCorrection, LoggedScan
 
 
 class SourceTrack:
@@ -80,9 +82,17 @@ class SourceTracks(defaultdict[str, SourceTrack]):
     def __init__(self) -> None:
         super().__init__(SourceTrack)
 
-    def correct(self, correction: LoggedCorrection) -> None:
-        """Move the poses that a correction is about."""
-        self[correction.source].correct(correction)
+    def take(self, entry: Entry) -> None:
+        """Go on with the next entry of a log: a pose is added, and a correction moves those before.
+
+        A reset moves none.
+        """
+        if isinstance(entry, LoggedScan):
+            self[entry.source].add(entry.stamp_ns, entry.world_from_sensor)
+        elif isinstance(entry, Transform):
+            self[entry.child].add(entry.stamp_ns, entry.pose)
+        elif isinstance(entry, LoggedCorrection):
+            self[entry.source].correct(entry)
 
 
 def _between(stamps_ns: Longs, poses: Doubles, at_ns: Longs) -> Doubles:

@@ -225,8 +225,8 @@ class StoreSettings(BaseModel):
     """The oldest checkpoints are deleted while all take more, but for two; 0: no limit."""
 
     log_max_bytes: Annotated[int, Field(ge=0, le=2**60)] = 0
-    """Bytes of scans that are kept with the checkpoints, to make the map again with other settings;
-    the oldest go; 0: none are kept."""
+    """Bytes of scans that are kept with the checkpoints, to make the map again with other settings
+    or better poses; the oldest go; 0: none are kept."""
 
     scrub_h: Annotated[float, Field(ge=0, le=1e6)] = 24.0
     """Hours between checks of all checkpoints on disk, which find what rots there; 0: none."""

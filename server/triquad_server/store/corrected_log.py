@@ -59,21 +59,16 @@ def corrected_log(store: Store, correction: LoggedCorrection, *, onward: bool) -
     tracks, scans = SourceTracks(), list[tuple[int, int]]()
     for number, segment in enumerate(files):
         for entry in read_segment(segment.path):
-            if isinstance(entry, LoggedScan):
-                tracks[entry.source].add(entry.stamp_ns, entry.world_from_sensor)
-                if entry.source == correction.source:
-                    scans.append((number, entry.stamp_ns))
-            elif isinstance(entry, LoggedCorrection):
-                tracks.correct(entry)
-            elif not isinstance(entry, LoggedReset):
-                tracks[entry.child].add(entry.stamp_ns, entry.pose)
+            tracks.take(entry)
+            if isinstance(entry, LoggedScan) and entry.source == correction.source:
+                scans.append((number, entry.stamp_ns))
     if correction.source not in tracks:
         raise RefusedError("bad_request", _no_source(correction.source, tracks))
     track = tracks[correction.source]
     if onward:
         correction = replace(correction, until_ns=int(track.stamps_ns[-1]))
     before = track.poses
-    tracks.correct(correction)
+    track.correct(correction)
     moved = set(track.stamps_ns[_moved(before, track.poses, store.scans.apart_m)].tolist())
     first = next((number for number, stamp_ns in scans if stamp_ns in moved), len(files))
     count = sum(stamp_ns in moved for _, stamp_ns in scans)

@@ -92,16 +92,12 @@ def read_scan_log(folder: Path) -> ScanLogRecording:
         for number, segment in enumerate(files, start=1):
             before = len(entries)
             for one in _read(segment):
+                tracks.take(one)
+                corrections += isinstance(one, LoggedCorrection)
                 if isinstance(one, LoggedReset):
                     resets.append(PlacedReset(len(entries), one))
-                elif isinstance(one, LoggedCorrection):
-                    tracks.correct(one)
-                    corrections += 1
                 elif isinstance(one, LoggedScan):
-                    tracks[one.source].add(one.stamp_ns, one.world_from_sensor)
                     entries.append(ScanEntry(one.stamp_ns, one.source))
-                else:
-                    tracks[one.child].add(one.stamp_ns, one.pose)
             counts.append(len(entries) - before)
             report(number, f"{number} of {len(files)} files")
     names = sorted({entry.source for entry in entries})
