@@ -1,5 +1,6 @@
 """A map whose poses are corrected is the one that the corrected poses would have made."""
 
+import logging
 import signal
 import threading
 from functools import cache
@@ -133,6 +134,42 @@ def test_scans_that_come_meanwhile_and_those_of_others_are_in_the_map(tmp_path):
         correcting.join()
         assert replies[0].scans_moved == 2
         assert shared(surface(client, tmp_path), truth()) > SAME
+
+
+def test_a_scan_that_comes_later_than_its_correction_moves_with_the_others(tmp_path, caplog):
+    caplog.set_level(logging.INFO, "triquad_server")
+    with servers.service_and_client(SETTINGS, tmp_path / "store") as client:
+        for number in range(SCANS - 1):
+            publish(client, number, off())
+        late = _WhenItBegins(lambda: publish(client, SCANS - 1, off()))
+        logging.getLogger("triquad_server").addHandler(late)
+        try:
+            client.correct_poses("roof", *corrections(*range(SCANS)))
+        finally:
+            logging.getLogger("triquad_server").removeHandler(late)
+        assert late.is_done
+        assert shared(surface(client, tmp_path), truth()) > SAME
+        trail = client.sources().sources["roof"].trail
+        there = world(SCANS).scans[-1].world_from_sensor[:3, 3]
+        assert np.linalg.norm(trail - there, axis=1).min() < 1e-3
+        client.checkpoint()
+    recording = open_recording(tmp_path / "store", ReadingOptions())
+    for scan, pose in zip(recording.read(range(SCANS)), corrections(*range(SCANS))[1], strict=True):
+        np.testing.assert_allclose(scan.world_from_sensor, pose, atol=1e-6)
+
+
+class _WhenItBegins(logging.Handler):
+    """Does something once the map begins to be made again."""
+
+    def __init__(self, action):
+        super().__init__(logging.INFO)
+        self._action = action
+        self.is_done = False
+
+    def emit(self, record):
+        if not self.is_done and "the map is made again" in record.getMessage():
+            self.is_done = True
+            self._action()
 
 
 def test_the_way_back_is_told(tmp_path):

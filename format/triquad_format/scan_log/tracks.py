@@ -1,6 +1,7 @@
 """The poses of all scans of a log, as they were corrected last."""
 
 from collections import defaultdict
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,6 +12,22 @@ from triquad_format.scan_log.ros_messages import Transform
 from triquad_format.scan_log.segment import LoggedCorrection, LoggedScan
 
 
+class _Moves(NamedTuple):
+    """How a correction moves poses, each in its own frame."""
+
+    stamps_ns: Longs  # [K] rising
+    moves: Doubles  # [K, 4, 4] at these times
+    first_ns: int
+    until_ns: int
+
+    def apply(self, stamps_ns: Longs, poses: Doubles) -> Doubles:
+        """Return poses [N, 4, 4] at times [N] as they are after the correction."""
+        moved = (stamps_ns >= self.first_ns) & (stamps_ns <= self.until_ns)
+        after: Doubles = poses.copy()
+        after[moved] = poses[moved] @ _between(self.stamps_ns, self.moves, stamps_ns[moved])
+        return after
+
+
 class SourceTrack:
     """The poses of the scans of one source, in the order of their stamps."""
 
@@ -18,6 +35,7 @@ class SourceTrack:
         self._new: dict[int, Doubles] = {}  # by stamp, those that came since they were put in order
         self._stamps_ns: Longs = np.zeros(0, np.int64)
         self._poses: Doubles = np.zeros((0, 4, 4))
+        self._corrected: _Moves | None = None  # last
 
     def add(self, stamp_ns: int, pose: Doubles) -> None:
         """Add a pose [4, 4]; one with the same stamp is replaced."""
@@ -52,10 +70,16 @@ class SourceTrack:
             return
         given, better = correction.stamps_ns[known], correction.world_from_sensor[known]
         moves = np.linalg.inv(_between(stamps, before, given)) @ better
-        moved = (stamps >= correction.stamps_ns[0]) & (stamps <= correction.until_ns)
-        after = before.copy()
-        after[moved] = before[moved] @ _between(given, moves, stamps[moved])
-        self._poses = after
+        first_ns = int(correction.stamps_ns[0])
+        self._corrected = _Moves(given, moves, first_ns, correction.until_ns)
+        self._poses = self._corrected.apply(stamps, before)
+
+    def add_late(self, stamp_ns: int, pose: Doubles) -> Doubles:
+        """Add a pose [4, 4] that came amid the last correction; return it as that moves it."""
+        if self._corrected is not None:
+            pose = self._corrected.apply(np.array([stamp_ns]), pose[None])[0]
+        self.add(stamp_ns, pose)
+        return pose
 
     def _known(self, stamps_ns: Longs) -> Bools:
         """Return at which times [K] its pose is known."""

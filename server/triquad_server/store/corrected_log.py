@@ -8,7 +8,8 @@ from triquad_format.errors import RefusedError
 from triquad_format.mapfile.checkpoint_folder import CheckpointFile, checkpoint_files
 from triquad_format.records.arrays import Bools, Doubles
 from triquad_format.scan_log.log_folder import Segment, history, of_map, segments
-from triquad_format.scan_log.reading import read_segment
+from triquad_format.scan_log.reading import Entry, read_segment
+from triquad_format.scan_log.ros_messages import Transform
 from triquad_format.scan_log.segment import LoggedCorrection, LoggedReset, LoggedScan
 from triquad_format.scan_log.tracks import SourceTracks
 
@@ -44,6 +45,20 @@ class CorrectedLog:
                 elif isinstance(entry, LoggedReset):
                     yield entry
 
+    def late(self, entry: Entry) -> Entry:
+        """Return what came meanwhile as the log will have it: before the correction, so it moves.
+
+        The tracks have it, too, from then on.
+        """
+        source = self.correction.source
+        track = self.tracks[source]
+        if isinstance(entry, LoggedScan) and entry.source == source:
+            pose = track.add_late(entry.stamp_ns, entry.world_from_sensor)
+            return replace(entry, world_from_sensor=pose)
+        if isinstance(entry, Transform) and entry.child == source:
+            return entry._replace(pose=track.add_late(entry.stamp_ns, entry.pose))
+        return entry
+
 
 def corrected_log(store: Store, correction: LoggedCorrection, *, onward: bool) -> CorrectedLog:
     """Return the log of a store, up to its newest checkpoint, after a correction.
@@ -65,8 +80,7 @@ def corrected_log(store: Store, correction: LoggedCorrection, *, onward: bool) -
     if correction.source not in tracks:
         raise RefusedError("bad_request", _no_source(correction.source, tracks))
     track = tracks[correction.source]
-    if onward:
-        correction = replace(correction, until_ns=int(track.stamps_ns[-1]))
+    correction = _until(int(track.stamps_ns[-1]), correction, onward=onward)
     before = track.poses
     track.correct(correction)
     moved = set(track.stamps_ns[_moved(before, track.poses, store.scans.apart_m)].tolist())
@@ -74,6 +88,20 @@ def corrected_log(store: Store, correction: LoggedCorrection, *, onward: bool) -
     count = sum(stamp_ns in moved for _, stamp_ns in scans)
     log = CorrectedLog(correction, None, files, tracks, count)
     return log if count == 0 else _from(first, files, log, store)
+
+
+def _until(newest_ns: int, correction: LoggedCorrection, *, onward: bool) -> LoggedCorrection:
+    """Return a correction without its poses after the newest scan.
+
+    Scans that come later find it as it is then: those that it is about move as the newest one.
+    """
+    known = correction.stamps_ns <= newest_ns
+    return LoggedCorrection(
+        correction.source,
+        correction.stamps_ns[known],
+        correction.world_from_sensor[known],
+        newest_ns if onward else correction.until_ns,
+    )
 
 
 def _from(first: int, files: list[Segment], log: CorrectedLog, store: Store) -> CorrectedLog:

@@ -98,14 +98,14 @@ class PoseCorrector:
         source = log.correction.source
         _log.info("%d scans of %s have better poses: the map is made again", log.moved, source)
         again = _MapAgain(self._mapper.call(lambda mapper: mapper), log)
-        for entry in chain(log.entries(), _until_few_are_left(followed)):
+        for entry in chain(log.entries(), map(log.late, _until_few_are_left(followed))):
             if self._is_stopping():
                 raise RefusedError("busy", "the server is stopping: no pose was corrected")
             again.take(entry)
 
         def change(mapper: Mapper) -> int:
             while followed:
-                again.take(followed.popleft())
+                again.take(log.late(followed.popleft()))
             mapper.become(again.map)
             store.scans.add_correction(log.correction)
             self._trails.retrace(source, log.tracks[source].poses[:, :3, 3] - mapper.origin)
