@@ -65,12 +65,12 @@ class WatchedTiles(ABC):
     @property
     def cell_m(self) -> float:
         """Side of the cells of which faces are made; NaN before the first update."""
-        return self._now().cell_m
+        return self._now().served.cell_m
 
     @property
     def tile_side_m(self) -> float:
         """Side of the tiles; NaN before the first update, unless tiles were known."""
-        return self._now().tile_side_m
+        return self._now().served.tile_side_m
 
     def known_tiles(self) -> KnownTiles:
         """Return the tiles, for a later watch to go on with."""

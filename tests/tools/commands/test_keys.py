@@ -71,7 +71,7 @@ def test_what_cannot_be_is_refused_and_changes_nothing(
     assert {file: file.read_bytes() for file in path.rglob("*.*")} == before
 
 
-@pytest.mark.parametrize("host", ["robot:7447", "tcp/robot", ""])
+@pytest.mark.parametrize("host", ["robot:7447", "tcp/robot", "10", ""])
 def test_a_host_that_is_none_is_refused_before_anything_is_made(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], host: str
 ) -> None:

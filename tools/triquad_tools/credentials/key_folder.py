@@ -59,7 +59,7 @@ class KeyFolder:
             OSError: the folder exists, or cannot be written.
         """
         for host in hosts:
-            if not _HOST.fullmatch(host):
+            if not _HOST.fullmatch(host) or host.isdigit():
                 raise ToolError(f"host {host!r}: use a name or an address, without a port")
         path.parent.mkdir(parents=True, exist_ok=True)
         path.mkdir(mode=0o700)
