@@ -7,7 +7,6 @@ from pathlib import Path
 from triquad_format.records.arrays import Doubles
 from triquad_format.wire.places import known_origin
 
-from triquad_client.brief_errors import brief, brief_errors
 from triquad_client.calls.changes import ChangeCalls
 from triquad_client.calls.corrections import CorrectionCalls
 from triquad_client.calls.download import DownloadCalls
@@ -16,6 +15,7 @@ from triquad_client.calls.queries import MapQueries, PinnedMap
 from triquad_client.calls.scans import ScanCalls
 from triquad_client.calls.server import ServerCalls
 from triquad_client.checks import Bounds
+from triquad_client.errors import brief, brief_errors
 from triquad_client.mesh.followed_mesh import FollowedMesh, KnownTiles
 from triquad_client.mesh.mesh_calls import MeshCalls
 from triquad_client.mesh.mesh_watch import MeshWatch

@@ -16,8 +16,7 @@ from triquad_format.wire.limits import MAX_TILES_ASKED
 from triquad_format.wire.mesh_messages import MeshRequest
 
 from triquad_client import checks
-from triquad_client.brief_errors import brief_errors
-from triquad_client.errors import ClosedError, RequestTimeoutError
+from triquad_client.errors import ClosedError, RequestTimeoutError, brief_errors
 from triquad_client.mesh.followed_mesh import (
     FollowedMesh,
     KnownTiles,

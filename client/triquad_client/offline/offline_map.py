@@ -15,9 +15,9 @@ from triquad_format.records.seen_space import surface_voxels
 from triquad_format.wire.limits import MAX_FILL_M
 
 from triquad_client import checks
-from triquad_client.brief_errors import brief, brief_errors
 from triquad_client.calls.queries import MapQueries
 from triquad_client.checks import Bounds
+from triquad_client.errors import brief, brief_errors
 from triquad_client.mesh.mesh import Mesh
 from triquad_client.offline.local_map import LocalMap
 
