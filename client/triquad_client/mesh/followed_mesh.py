@@ -57,10 +57,6 @@ class ServedTiles:
     cell_m: float = math.nan
     origin: Doubles = field(default_factory=lambda: np.zeros(3))  # [3] map frame: of tile 0 0 0
 
-    def are_those_of(self, other: ServedTiles) -> bool:
-        """Return whether tiles of the other one are valid here."""
-        return self.server == other.server and bool((self.origin == other.origin).all())
-
 
 @dataclass(frozen=True)
 class KnownTiles:
@@ -158,7 +154,8 @@ class FollowedMesh:
         """
         origin = known_origin(reply.origin)
         served = ServedTiles(reply.server, reply.tile_side_m, reply.cell_m, origin)
-        is_same = self.served.are_those_of(served)
+        is_same = reply.server == self.served.server
+        is_same &= bool((origin == self.served.origin).all())
         if is_same and reply.epoch < self.epoch:
             raise BadReplyError(f"epoch {reply.epoch} comes after epoch {self.epoch}")
         since, empty = (self.since, self.empty) if is_same else (0, {})

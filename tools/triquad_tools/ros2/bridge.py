@@ -13,7 +13,7 @@ from triquad_client import Client
 from triquad_format.errors import TriquadError
 from triquad_format.wire.codec import MAX_MESSAGE_BYTES
 from triquad_format.wire.endpoints import DEFAULT_ENDPOINT, full_endpoint
-from triquad_format.wire.zenoh_config import QUIET, fill, put
+from triquad_format.wire.zenoh_config import QUIET, fill, put, reason
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.ros2.intake.intake import Intake
@@ -107,7 +107,6 @@ def open_session(router: str | None, file: Path | None) -> zenoh.Session:
     except zenoh.ZError as error:
         where = router or file or DEFAULT_ENDPOINT
         raise ToolError(
-            f"the router of the ROS nodes, {where}, cannot be reached: "
-            f"{str(error).partition(' at /')[0]}: start rmw_zenohd or the robot's "
-            "zenoh-bridge-ros2dds, name it with --router, or use --serve"
+            f"the router of the ROS nodes, {where}, cannot be reached: {reason(error)}: start "
+            "rmw_zenohd or the robot's zenoh-bridge-ros2dds, name it with --router, or use --serve"
         ) from error
