@@ -45,7 +45,7 @@ def test_a_folder_that_is_there_is_left_alone(
     path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = {file: file.read_bytes() for file in path.rglob("*.*")}
-    assert "file exists" in refused(capsys, "init", path)
+    assert "is there already" in refused(capsys, "init", path)
     assert {file: file.read_bytes() for file in path.rglob("*.*")} == before
 
 

@@ -38,7 +38,7 @@ def _parser() -> argparse.ArgumentParser:
     for one in (*adding.values(), command("remove", "take a role away")):
         one.add_argument("name", metavar="NAME", help="of the client")
     command("list", "tell who has which role, and until when")
-    sources = "of scans that the robot publishes, and nobody else, repeatable"
+    sources = "of scans that the robot publishes, and nobody else, repeatable (init: default)"
     domain = "let nodes of ROS 2 with this certificate take part in this domain"
     for one in (init, adding[ROBOT], adding[ADMIN]):
         required = one is adding[ROBOT]

@@ -55,9 +55,11 @@ class KeyFolder:
         """Make a new folder, with an authority, a server and a router on ``hosts``, and no clients.
 
         Raises:
-            ToolError: a host is neither a name nor an address.
-            OSError: the folder exists, or cannot be written.
+            ToolError: the folder exists, or a host is neither a name nor an address.
+            OSError: it cannot be written.
         """
+        if path.exists():
+            raise ToolError(f"{path} is there already: choose another folder")
         for host in hosts:
             if not _HOST.fullmatch(host) or host.isdigit():
                 raise ToolError(f"host {host!r}: use a name or an address, without a port")
