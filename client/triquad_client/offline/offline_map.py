@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike
 from triquad_format.mapfile.checkpoint_folder import checkpoint_files, map_folder
 from triquad_format.mapfile.reader import read_map_file
 from triquad_format.records.arrays import Bools, Doubles
-from triquad_format.records.region import MapRecord
-from triquad_format.records.seen_space import surface_voxels
+from triquad_format.records.region import MapRecord, surface_voxels
 from triquad_format.wire.limits import MAX_FILL_M
 
 from triquad_client import checks
