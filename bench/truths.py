@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import spearmanr
 from triquad_format.records.arrays import Bools, Doubles
-from triquad_format.records.region import MapRecord
-from triquad_format.records.seen_space import surface_voxels
+from triquad_format.records.region import MapRecord, surface_voxels
 from triquad_format.records.status import Status
 from triquad_map.questions.distance import DistanceOptions, Distances, distances
 from triquad_map.questions.spheres import spheres

@@ -1,21 +1,20 @@
 """Arguments turned into values of known type, shape and range.
 
 What cannot be is refused with :class:`InvalidInputError`, of scans with :class:`InvalidScanError`.
+Text and truth values are no numbers, though Python and numpy convert them, and masked values are
+unknown.
 """
 
 import math
+import operator
 import reprlib
 import time
 from collections.abc import Sequence
-from contextlib import closing
-from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from triquad_format.errors import InvalidInputError, MapFileError
-from triquad_format.mapfile.container import is_map
-from triquad_format.mapfile.files import FileBytes
+from triquad_format.errors import InvalidInputError
 from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.wire.limits import (
     LEVELS,
@@ -26,7 +25,6 @@ from triquad_format.wire.limits import (
 from triquad_map.questions.grid import GridShape
 
 from triquad_client.errors import NO_NUMBER, InvalidScanError
-from triquad_client.real_numbers import real_number, real_numbers, whole_number
 
 Bounds: TypeAlias = tuple[Sequence[float], Sequence[float]]
 """Minimum and maximum corner of a box, metres, map frame; sides may be infinite."""
@@ -35,6 +33,41 @@ SHORTEST_S, LONGEST_S = 1e-3, 1e6  # that a request may take
 
 _MAX_COLUMNS = 16  # of a scan's points: more is rather an array that was transposed
 _MAX_CELLS = 100_000_000  # of a grid
+
+
+def real_numbers(values: ArrayLike) -> NDArray[Any]:
+    """Return an array of whole or floating numbers, or raise one of :data:`NO_NUMBER`."""
+    if np.ma.is_masked(values):
+        raise TypeError("some values are masked: fill them with NaN, or leave them out")
+    columns = list(getattr(values, "columns", ()))  # of a table of pandas or polars
+    if columns[:3] != ["x", "y", "z"] and any(isinstance(column, str) for column in columns):
+        raise TypeError(f"a table with columns {columns}: give table[['x', 'y', 'z']]")
+    array = np.asarray(values)
+    if array.dtype.kind not in "fiu":
+        example = repr(array.item(0))[:40] if array.size else "nothing"
+        raise TypeError(f"{example} ({array.dtype}) is not a real number")
+    return array
+
+
+def real_number(value: Any) -> float:
+    """Return a number as a float; an integer that is too large for one is infinite.
+
+    Raises:
+        TypeError, ValueError: it is none.
+    """
+    if isinstance(value, str | bytes | bool | np.bool_):
+        raise TypeError("text, or a truth value")
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf if value > 0 else -math.inf
+
+
+def whole_number(value: Any) -> int:
+    """Return an integer, also one of numpy's; raise TypeError where it is none."""
+    if isinstance(value, bool):
+        raise TypeError("a truth value")
+    return operator.index(value)
 
 
 def query_points(points: ArrayLike) -> Doubles:
@@ -88,7 +121,7 @@ def stamp_ns(stamp_s: float) -> int:
     except NO_NUMBER:
         seconds = math.nan
     if not 0 <= seconds < 2**63 / 1e9:
-        raise InvalidScanError(f"stamp_s = {_shown(stamp_s)} is not a time in seconds since 1970")
+        raise InvalidScanError(f"stamp_s = {shown(stamp_s)} is not a time in seconds since 1970")
     return round(seconds * 1e9)
 
 
@@ -105,10 +138,10 @@ def chosen_epoch(at_epoch: int | None, name: str = "at_epoch") -> int:
         number = whole_number(at_epoch)
     except TypeError as error:
         raise InvalidInputError(
-            f"{name} = {_shown(at_epoch)} is not the number of an epoch"
+            f"{name} = {shown(at_epoch)} is not the number of an epoch"
         ) from error
     if not 0 < number < 2**63:
-        raise InvalidInputError(f"{name} = {_shown(at_epoch)}: epochs are numbered from 1 on")
+        raise InvalidInputError(f"{name} = {shown(at_epoch)}: epochs are numbered from 1 on")
     return number
 
 
@@ -119,7 +152,7 @@ def box(bounds: Bounds | None) -> tuple[Doubles, Doubles]:
     try:
         minimum, maximum = (real_numbers(corner).astype(np.float64) for corner in bounds)
     except NO_NUMBER as error:
-        raise InvalidInputError(f"bounds = {_shown(bounds)}: give (minimum, maximum)") from error
+        raise InvalidInputError(f"bounds = {shown(bounds)}: give (minimum, maximum)") from error
     if minimum.shape != (3,) or maximum.shape != (3,):
         raise InvalidInputError(f"bounds = {bounds!r}: each corner has three coordinates")
     if not (minimum <= maximum).all():
@@ -130,7 +163,7 @@ def box(bounds: Bounds | None) -> tuple[Doubles, Doubles]:
 def flag(name: str, value: bool) -> bool:
     """Return ``value`` where it is a truth value, also one of numpy's."""
     if not isinstance(value, bool | np.bool_):
-        raise InvalidInputError(f"{name} = {_shown(value)}: use True or False")
+        raise InvalidInputError(f"{name} = {shown(value)}: use True or False")
     return bool(value)
 
 
@@ -139,32 +172,10 @@ def count(name: str, value: int, most: int, *, least: int = 0) -> int:
     try:
         number = whole_number(value)
     except TypeError as error:
-        raise InvalidInputError(f"{name} = {_shown(value)} is not a whole number") from error
+        raise InvalidInputError(f"{name} = {shown(value)} is not a whole number") from error
     if not least <= number <= most:
-        raise InvalidInputError(f"{name} = {_shown(value)}: use {least} to {most}")
+        raise InvalidInputError(f"{name} = {shown(value)}: use {least} to {most}")
     return number
-
-
-def map_target(path: str | Path) -> Path:
-    """Return the file to which a map is to be written: only an older map may be there.
-
-    Raises:
-        OSError: what is there cannot be read.
-    """
-    if not isinstance(path, str | Path) or Path(path).is_dir():
-        raise InvalidInputError(f"path = {_shown(path)} is no file: give the name of one")
-    try:
-        with closing(FileBytes(Path(path))) as file:
-            is_older_map = is_map(file)
-    except FileNotFoundError:
-        is_older_map = True  # nothing to lose
-    except MapFileError:
-        is_older_map = False  # a device
-    if not is_older_map:
-        raise InvalidInputError(
-            f"{path} is there, and is no map of triquad: give another name, or delete it first"
-        )
-    return Path(path)
 
 
 def are_local(coordinates: str) -> bool:
@@ -213,9 +224,9 @@ def within(
     try:
         number = real_number(value)
     except NO_NUMBER as error:
-        raise InvalidInputError(f"{name} = {_shown(value)} is not a number") from error
+        raise InvalidInputError(f"{name} = {shown(value)} is not a number") from error
     if not least <= number <= most:
-        raise InvalidInputError(f"{name} = {_shown(value)}: use {least:g} to {most:g}")
+        raise InvalidInputError(f"{name} = {shown(value)}: use {least:g} to {most:g}")
     return number
 
 
@@ -277,7 +288,7 @@ def _points(
     return array[:, :3].astype(dtype, copy=False)
 
 
-def _shown(value: Any) -> str:
+def shown(value: Any) -> str:
     """Return ``value`` for a text, cut short; Python writes no integers of thousands of digits."""
     try:
         return reprlib.repr(value)

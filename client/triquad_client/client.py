@@ -2,49 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
-from triquad_format.errors import InvalidInputError
-from triquad_format.printable import printable
 from triquad_format.records.arrays import Doubles
-from triquad_format.wire.limits import MAX_SAMPLE_POINTS
-from triquad_format.wire.messages import (
-    CheckpointInfo,
-    CheckpointRequest,
-    ResetReply,
-    ResetRequest,
-    ServerStatus,
-    StatusRequest,
-)
-from triquad_format.wire.metrics_messages import MetricsRequest, ServerMetrics
 from triquad_format.wire.places import known_origin
-from triquad_format.wire.source_messages import SourceReport, SourcesRequest
 
-from triquad_client import checks
-from triquad_client.brief_errors import brief, brief_errors
 from triquad_client.calls.changes import ChangeCalls
 from triquad_client.calls.corrections import CorrectionCalls
 from triquad_client.calls.download import DownloadCalls
 from triquad_client.calls.point_queries import pin_newest
 from triquad_client.calls.queries import MapQueries, PinnedMap
 from triquad_client.calls.scans import ScanCalls
+from triquad_client.calls.server import ServerCalls
 from triquad_client.checks import Bounds
+from triquad_client.errors import brief, brief_errors
 from triquad_client.mesh.followed_mesh import FollowedMesh, KnownTiles
 from triquad_client.mesh.mesh_calls import MeshCalls
 from triquad_client.mesh.mesh_watch import MeshWatch
-from triquad_client.net.connection import Connection, new_ticket
+from triquad_client.net.connection import Connection
 from triquad_client.net.opening import open_connection
 from triquad_client.offline.synced_map import SyncedMap
 
 MAX_DOWNLOAD_BYTES = 2**30
 """Some hundred times the map of a town; larger ones need a limit of the caller's."""
 
-_NO_SOURCES = SourceReport(server="", revision=0, sources={})
-
 
 @brief_errors
-class Client(ScanCalls, CorrectionCalls, MapQueries, MeshCalls, ChangeCalls, DownloadCalls):
+class Client(
+    ScanCalls, CorrectionCalls, MapQueries, MeshCalls, ChangeCalls, DownloadCalls, ServerCalls
+):
     """A connection to one map of a server. Close it, or use it in a ``with`` statement.
 
     Positions are metres in the map frame, or from the map's origin where it was connected with
@@ -136,73 +122,6 @@ class Client(ScanCalls, CorrectionCalls, MapQueries, MeshCalls, ChangeCalls, Dow
         synced = SyncedMap(path, bounds, self._connection)
         synced.refresh(accept_emptier)
         return synced
-
-    def sources(self, since: SourceReport | None = None, max_points: int = 5_000) -> SourceReport:
-        """Return where each source of scans has been, and its newest scan.
-
-        To follow them, give the report before: it comes back where nothing is new.
-
-        Args:
-            since: the report before; ``None``: nothing is known yet.
-            max_points: 0 to 10,000: as many points of each newest scan come, evenly drawn.
-
-        Raises:
-            NoReplyError: the server may be of a release that does not know this question.
-        """
-        if since is not None and not isinstance(since, SourceReport):
-            raise InvalidInputError(f"since = {since!r}: give what an earlier call returned")
-        limit = checks.count("max_points", max_points, MAX_SAMPLE_POINTS)
-        known = since or _NO_SOURCES
-        reply = self._connection.ask(SourcesRequest(known.server, known.revision, limit))
-        is_same = (reply.server, reply.revision) == (known.server, known.revision)
-        return known if is_same else reply
-
-    def status(self) -> ServerStatus:
-        """Return how the server is doing."""
-        return self._connection.ask(StatusRequest())
-
-    def metrics(self) -> ServerMetrics:
-        """Return how the server is doing, in figures: requests and their times, queues, memory.
-
-        Counts and times only grow while a server runs: take the difference of two answers.
-        """
-        return self._connection.ask(MetricsRequest())
-
-    def checkpoint(self, timeout_s: float = 600.0) -> CheckpointInfo:
-        """Have the server write the map to its store now, and wait until it is there.
-
-        Raises:
-            RefusedError: ``store``, where it cannot be written.
-            RequestTimeoutError: it was not after ``timeout_s``; the text says for how long the
-                server has been at it, which it will finish.
-        """
-        return self._connection.ask_until_done(CheckpointRequest(new_ticket()), timeout_s)
-
-    def reset(self, bounds: Bounds | None = None, timeout_s: float = 600.0) -> ResetReply:
-        """Forget what was learnt within ``bounds``.
-
-        A server with a store first writes the map as it is to a checkpoint, which stays until
-        its setting ``store.keep_resets`` has been exceeded by later resets.
-
-        Args:
-            bounds: corners of a box, metres, map frame; ``None``: everything is forgotten.
-            timeout_s: how long to wait for that, at most.
-
-        Returns:
-            ``epoch``: the first without it. ``kept_epoch``: the checkpoint of the map before;
-            ``None`` where there is none. ``undo``: how to go back to it, or why one cannot.
-
-        Raises:
-            RefusedError: ``store``, where the map as it is cannot be kept: nothing is forgotten.
-            RequestTimeoutError: not done after ``timeout_s``; the server goes on with it.
-        """
-        request = ResetRequest(*checks.box(bounds), new_ticket())
-        reply = self._connection.ask_until_done(request, timeout_s)
-        return reply if reply.undo is None else replace(reply, undo=printable(reply.undo))
-
-    def maps(self) -> list[str]:
-        """Return names of all maps that can be reached, also those of other servers."""
-        return self._connection.maps()
 
 
 @brief

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from triquad_format.records.arrays import Doubles, Floats
 
+from triquad_client.checks import real_number, real_numbers, whole_number
 from triquad_client.errors import NO_NUMBER, InvalidScanError
-from triquad_client.real_numbers import real_number, real_numbers, whole_number
 
 _MILLIMETRES_PER_M = 1000.0
 

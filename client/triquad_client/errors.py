@@ -1,10 +1,22 @@
-"""The errors of the client. Each text says what to do about it."""
+"""The errors of the client. Each text says what to do about it.
+
+Callers see a trace that ends at their own line, not a dozen frames below it: :func:`brief`.
+"""
+
+from collections.abc import Callable
+from functools import wraps
+from types import FunctionType
+from typing import ParamSpec, TypeVar
 
 from triquad_format.errors import InvalidInputError, TriquadError
 
 NO_NUMBER = (TypeError, ValueError, OverflowError, RuntimeError)
 """The errors of conversions to numbers: Python's integers may be larger than any float, and torch
 gives no array of a tensor that requires a gradient."""
+
+ArgumentsP = ParamSpec("ArgumentsP")
+ResultT = TypeVar("ResultT")
+ClassT = TypeVar("ClassT", bound=type)
 
 _MAPS_NAMED = 20
 _NO_MAPS = "none (is this a router without a triquad server?)"
@@ -52,3 +64,25 @@ class ClosedError(TriquadError):
 
 class DownloadError(TriquadError):
     """A map file or a mesh could not be fetched whole, or is larger than this client takes."""
+
+
+def brief(function: Callable[ArgumentsP, ResultT]) -> Callable[ArgumentsP, ResultT]:
+    """Let the errors of triquad that a function raises begin here, without what caused them."""
+
+    @wraps(function)
+    def call(*args: ArgumentsP.args, **kwargs: ArgumentsP.kwargs) -> ResultT:
+        try:
+            return function(*args, **kwargs)
+        except TriquadError as error:
+            raise error.with_traceback(None) from None
+
+    return call
+
+
+def brief_errors(public: ClassT) -> ClassT:
+    """Do so for all public methods of a class, also for those that it inherits."""
+    for name in dir(public):
+        method = getattr(public, name)
+        if isinstance(method, FunctionType) and not name.startswith("_"):
+            setattr(public, name, brief(method))
+    return public

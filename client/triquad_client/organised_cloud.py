@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from triquad_format.records.arrays import Doubles
 
+from triquad_client.checks import real_numbers
 from triquad_client.errors import NO_NUMBER, InvalidScanError
-from triquad_client.real_numbers import real_numbers
 
 
 def empty_returns(cloud: ArrayLike, directions: ArrayLike) -> Doubles:

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.pose import RIGID_TOLERANCE, is_rotation, pose_matrices, rotation_error
 
+from triquad_client.checks import real_numbers
 from triquad_client.errors import NO_NUMBER, InvalidScanError
-from triquad_client.real_numbers import real_numbers
 
 UNIT_TOLERANCE = 1e-2
 """The allowed error of a quaternion's length: files of three digits have it."""

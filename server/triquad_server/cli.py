@@ -87,7 +87,8 @@ def _run(options: argparse.Namespace) -> int:
     from triquad_server.process.stop import Stop, Stops
     from triquad_server.settings.loading import load_settings, settings_toml
 
-    assignments = [*options.set, *_implied(options)]
+    port = options.metrics_port
+    assignments = [*options.set, *([] if port is None else [f"metrics.port={port}"])]
     settings = load_settings(options.settings, assignments, preset=options.preset)
     if options.print_settings:
         sys.stdout.write(settings_toml(settings))
@@ -114,11 +115,6 @@ def _run(options: argparse.Namespace) -> int:
     _on_signals(lambda *_: stops.put(Stop.ASKED))
     why = run_server(launch, stops)
     return OK if why is Stop.ASKED else UNEXPECTED
-
-
-def _implied(options: argparse.Namespace) -> list[str]:
-    """Return the settings that flags stand for."""
-    return [] if options.metrics_port is None else [f"metrics.port={options.metrics_port}"]
 
 
 def _log_format(name: str) -> str:

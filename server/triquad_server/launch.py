@@ -19,7 +19,7 @@ from triquad_server.process.service_manager import ServiceManager
 from triquad_server.process.stop import Stop, Stops, wait_for_stop
 from triquad_server.process.threads import Teams
 from triquad_server.service import ServedMap, Service
-from triquad_server.serving.starting import StartingNotice
+from triquad_server.serving.refusals import StartingNotice
 from triquad_server.settings import Settings
 from triquad_server.store.restore import ValidCheckpoint
 from triquad_server.store.store import Store

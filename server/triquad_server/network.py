@@ -12,7 +12,7 @@ import zenoh
 from triquad_format.wire.access_control import access_control, without_credentials
 from triquad_format.wire.endpoints import DEFAULT_ENDPOINT, is_of_this_machine
 from triquad_format.wire.limits import MAX_QUERY_POINTS, payload_limit
-from triquad_format.wire.zenoh_config import QUIET, fill, is_set, put
+from triquad_format.wire.zenoh_config import QUIET, fill, is_set, put, reason
 
 from triquad_server.errors import ListenError, ServerError
 from triquad_server.settings import Settings
@@ -105,7 +105,7 @@ def configuration(options: NetworkOptions, map_name: str, settings: Settings) ->
         return _configuration(options, _safe(map_name, settings))
     except (zenoh.ZError, ValueError, OSError) as error:
         file = "" if options.config_file is None else f" {options.config_file}"
-        raise ServerError(f"Zenoh configuration{file}: {_first_line(error)}") from error
+        raise ServerError(f"Zenoh configuration{file}: {reason(error)}") from error
 
 
 def _configuration(options: NetworkOptions, safe: dict[str, Any]) -> Configuration:
@@ -161,11 +161,6 @@ def _max_message_bytes(scan_points: int) -> int:
     return max(largest, payload_limit(0) + scan_points * _SENSOR_POINT_BYTES)
 
 
-def _first_line(error: Exception) -> str:
-    """Return the text of an error without Zenoh's source locations."""
-    return " ".join(str(error).split(" at /", 1)[0].split())
-
-
 def open_session(config: Configuration) -> zenoh.Session:
     """Open a Zenoh session.
 
@@ -176,18 +171,18 @@ def open_session(config: Configuration) -> zenoh.Session:
     try:
         return zenoh.open(config.zenoh)
     except zenoh.ZError as error:
-        raise ListenError(_what_failed(config, _first_line(error))) from error
+        raise ListenError(_what_failed(config, reason(error))) from error
 
 
-def _what_failed(config: Configuration, reason: str) -> str:
-    if reason.startswith("Unable to connect"):
+def _what_failed(config: Configuration, why: str) -> str:
+    if why.startswith("Unable to connect"):
         endpoints = ", ".join(config.connect)
-        return f"cannot connect to {endpoints}: {reason} Start a router there first."
+        return f"cannot connect to {endpoints}: {why} Start a router there first."
     remedy = "is another server running there? choose another endpoint with --listen"
-    if "TLS" in reason and "in use" not in reason:
+    if "TLS" in why and "in use" not in why:
         remedy = "check the credentials of the Zenoh configuration: triquad-keys makes them"
-    elif "not supported" in reason:
+    elif "not supported" in why:
         remedy = "write --listen tcp/HOST:PORT"
-    elif "lookup address" in reason:
+    elif "lookup address" in why:
         remedy = "give --listen an address of this machine, or 0.0.0.0 for all of them"
-    return f"cannot open {', '.join(config.listen)}: {reason} ({remedy})"
+    return f"cannot open {', '.join(config.listen)}: {why} ({remedy})"

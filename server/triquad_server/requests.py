@@ -20,7 +20,7 @@ from triquad_server.intake.source_trails import SourceTrails
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_queries import TileQueries
 from triquad_server.server_status import Health
-from triquad_server.serving.operations import Lane
+from triquad_server.serving.lanes import Lane
 from triquad_server.store.download import MapDownloads
 from triquad_server.store.pose_corrector import PoseCorrector
 

@@ -22,9 +22,9 @@ from triquad_client.errors import ConnectError, NoReplyError, UnknownMapError
 from triquad_format.wire import keys
 from triquad_tools.commands import inspect, top
 from triquad_tools.console.command import FAILED, OK
-from triquad_tools.credentials.certificates import Authority
+from triquad_tools.credentials.certificates import new_authority
 from triquad_tools.credentials.key_folder import KeyFolder
-from triquad_tools.credentials.roles import ROUTER, SERVER, Holder, Role
+from triquad_tools.credentials.roles import ROBOT, ROLES, ROUTER, SERVER, Holder
 
 DAYS = 1.0
 PATHS = ("server", "router")
@@ -50,9 +50,9 @@ class Network:
         """Of a member; a stranger comes with the file of the robot, and his own certificate."""
         name = self.folder.holder("robot").common_name
         changes = {
-            "forged authority": showing(Authority.create("forged").client(name, DAYS)),
+            "forged authority": showing(new_authority("forged").issue(name, DAYS)),
             "no certificate": {"transport__link__tls__enable_mtls": False},
-            "expired": showing(self.folder.authority.client(name, -0.01)),
+            "expired": showing(self.folder.authority.issue(name, -0.01)),
         }
         file = self.file(who if who in MEMBERS else "robot")
         with opened(file, self.endpoints[path], **changes.get(who, {})) as session:
@@ -69,11 +69,11 @@ class Network:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> KeyFolder:
     folder = KeyFolder.create(tmp_path_factory.mktemp("roles") / "keys", [], DAYS)
-    for role in Role:
-        folder.add(Holder(role.value, role, MEMBERS[role.value]), DAYS)
-    folder.add(Holder("nodes", Role.ROBOT, ros2_domain=0), DAYS)
-    folder.add(Holder("bridge", Role.ROBOT, PATHS, ros2_domain=0), DAYS)
-    file = folder.add(Holder("removed", Role.ROBOT, MEMBERS["removed"]), DAYS)
+    for role in ROLES:
+        folder.add(Holder(role, role, MEMBERS[role]), DAYS)
+    folder.add(Holder("nodes", ROBOT, ros2_domain=0), DAYS)
+    folder.add(Holder("bridge", ROBOT, PATHS, ros2_domain=0), DAYS)
+    file = folder.add(Holder("removed", ROBOT, MEMBERS["removed"]), DAYS)
     copied = file.read_bytes()
     folder.remove("removed")
     file.write_bytes(copied)
@@ -86,7 +86,7 @@ def network(folder: KeyFolder) -> Iterator[Network]:
     endpoints = {path: free_tls_endpoint() for path in PATHS}
     router = zenoh.Config.from_file(str(server))
     router.insert_json5("listen/endpoints", json.dumps([endpoints["router"]]))
-    own = showing(folder.certificate(ROUTER), "connect", "listen")
+    own = showing(folder.certificates[ROUTER], "connect", "listen")
     for name, value in own.items():
         router.insert_json5(name.replace("__", "/"), json.dumps(value))
     arguments = ["--config", server, "--settings", SMALL_FILE, "--connect", endpoints["router"]]
@@ -147,9 +147,9 @@ def connected(network: Network, path: str, who: str) -> triquad_client.Client:
 
 
 IMPOSTORS = {
-    "with the certificate of a robot": lambda own: own.client("robot:x", DAYS),
-    "of a forged authority": lambda _: Authority.create("forged").server(SERVER, [], DAYS),
-    "that is let in, but is no server": lambda own: own.server("viewer:x", [], DAYS),
+    "with the certificate of a robot": lambda own: own.issue("robot:x", DAYS),
+    "of a forged authority": lambda _: new_authority("forged").issue(SERVER, DAYS, []),
+    "that is let in, but is no server": lambda own: own.issue("viewer:x", DAYS, []),
 }
 
 
@@ -182,7 +182,7 @@ def impostor(folder: KeyFolder, endpoint: str, changes: dict[str, Any]) -> Itera
 
 
 def test_nodes_of_ros_take_part_in_their_domain_alone(folder: KeyFolder) -> None:
-    file = folder.add(Holder("others", Role.ROBOT, ros2_domain=3), DAYS)
+    file = folder.add(Holder("others", ROBOT, ros2_domain=3), DAYS)
     endpoint = free_tls_endpoint()
     received: list[zenoh.Sample] = []
     listens = {"listen__endpoints": [endpoint], "access_control__enabled": True}

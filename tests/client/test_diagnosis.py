@@ -10,14 +10,14 @@ from support import servers
 from support.attackers.role_files import free_tls_endpoint, opened
 from triquad_client.errors import ConnectError
 from triquad_tools.credentials.key_folder import KeyFolder
-from triquad_tools.credentials.roles import SERVER, Holder, Role
+from triquad_tools.credentials.roles import SERVER, VIEWER, Holder
 
 DAYS = 1.0
 
 
 def folder_with_viewer(path: Path, days: float = DAYS) -> KeyFolder:
     folder = KeyFolder.create(path, [], DAYS)
-    folder.add(Holder("viewer", Role.VIEWER), days)
+    folder.add(Holder("viewer", VIEWER), days)
     return folder
 
 
@@ -70,7 +70,7 @@ def test_without_a_certificate_the_file_of_a_role_is_asked_for(secured: str) -> 
 def test_an_expired_certificate_is_told_as_one_that_is_not_taken(
     secured: str, folder: KeyFolder
 ) -> None:
-    expired = folder.add(Holder("expired", Role.VIEWER), -0.01)
+    expired = folder.add(Holder("expired", VIEWER), -0.01)
     assert "does not take the certificate of this configuration" in reason(secured, expired)
 
 

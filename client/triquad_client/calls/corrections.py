@@ -15,10 +15,10 @@ from triquad_format.wire.limits import MAX_KEYFRAMES
 from triquad_format.wire.source_messages import CorrectPosesReply, CorrectPosesRequest
 
 from triquad_client import checks
+from triquad_client.checks import real_numbers
 from triquad_client.errors import NO_NUMBER, InvalidScanError
 from triquad_client.net.connection import Connection, new_ticket
 from triquad_client.pose import PoseLike, rigid_pose
-from triquad_client.real_numbers import real_numbers
 
 
 class CorrectionCalls:

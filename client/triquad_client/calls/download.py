@@ -2,9 +2,12 @@
 
 import hashlib
 import shutil
+from contextlib import closing
 from pathlib import Path
 
-from triquad_format.mapfile.files import check_range, replacing
+from triquad_format.errors import InvalidInputError, MapFileError
+from triquad_format.mapfile.container import is_map
+from triquad_format.mapfile.files import FileBytes, check_range, replacing
 from triquad_format.wire.messages import MapChunkRequest, MapInfo, MapInfoRequest
 
 from triquad_client import checks
@@ -13,6 +16,28 @@ from triquad_client.net.connection import Connection, new_ticket, retried
 
 _BLOCK_BYTES = 2**23
 _PACKED_S = 600.0  # the time in which a server packs its map, at most
+
+
+def map_target(path: str | Path) -> Path:
+    """Return the file to which a map is to be written: only an older map may be there.
+
+    Raises:
+        OSError: what is there cannot be read.
+    """
+    if not isinstance(path, str | Path) or Path(path).is_dir():
+        raise InvalidInputError(f"path = {checks.shown(path)} is no file: give the name of one")
+    try:
+        with closing(FileBytes(Path(path))) as file:
+            is_older_map = is_map(file)
+    except FileNotFoundError:
+        is_older_map = True  # nothing to lose
+    except MapFileError:
+        is_older_map = False  # a device
+    if not is_older_map:
+        raise InvalidInputError(
+            f"{path} is there, and is no map of triquad: give another name, or delete it first"
+        )
+    return Path(path)
 
 
 def newest_file(connection: Connection, training: bool = False) -> MapInfo:
@@ -86,7 +111,7 @@ class DownloadCalls:
             DownloadError: what arrived is not what the server announced.
             OSError: the file cannot be written.
         """
-        training, target = checks.flag("training", training), checks.map_target(path)
+        training, target = checks.flag("training", training), map_target(path)
         # Newer map files may push this one out of the server: then the newest is used.
         return retried("chunk_gone", lambda: _fetch(self._connection, target, training))
 

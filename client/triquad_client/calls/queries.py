@@ -1,8 +1,8 @@
 """Questions about the map, which clients, pinned epochs and maps in memory answer alike."""
 
-from triquad_client.brief_errors import brief_errors
 from triquad_client.calls.point_queries import PointQueries
 from triquad_client.calls.way_queries import WayQueries
+from triquad_client.errors import brief_errors
 from triquad_client.net.connection import Answering
 
 

@@ -48,6 +48,16 @@ class MeshTile:
         return self.vertices.nbytes + self.faces.nbytes
 
 
+@dataclass(frozen=True, eq=False)
+class ServedTiles:
+    """The places where one process of a server has its tiles."""
+
+    server: str = ""  # of which process they are
+    tile_side_m: float = math.nan
+    cell_m: float = math.nan
+    origin: Doubles = field(default_factory=lambda: np.zeros(3))  # [3] map frame: of tile 0 0 0
+
+
 @dataclass(frozen=True)
 class KnownTiles:
     """Tiles for a later watch to go on with.
@@ -82,10 +92,7 @@ class FollowedMesh:
     maximum: Doubles  # [3]
     level: int
     max_bytes: int  # of memory, for all tiles
-    server: str = ""  # which reported all below
-    tile_side_m: float = math.nan
-    cell_m: float = math.nan
-    origin: Doubles = field(default_factory=lambda: np.zeros(3))  # [3] map frame: of tile 0 0 0
+    served: ServedTiles = field(default_factory=ServedTiles)  # of what reported all below
     tiles: Mapping[TileIndex, MeshTile] = field(default_factory=dict)
     empty: Mapping[TileIndex, int] = field(default_factory=dict)  # versions of tiles without faces
     stale: frozenset[TileIndex] = frozenset()  # tiles that go unless they come again
@@ -126,8 +133,8 @@ class FollowedMesh:
             for index, tile in known.tiles.items()
             if (tile.origin <= maximum).all() and (tile.origin + side_m >= minimum).all()
         }
-        server, origin = known.server, known.origin
-        return replace(empty, server=server, tile_side_m=side_m, origin=origin, tiles=tiles)
+        served = ServedTiles(known.server, side_m, origin=known.origin)
+        return replace(empty, served=served, tiles=tiles)
 
     @property
     def complete(self) -> bool:
@@ -136,7 +143,8 @@ class FollowedMesh:
 
     def changes_request(self) -> TileChangesRequest:
         """Return the question which tiles changed."""
-        return TileChangesRequest(self.minimum, self.maximum, self.level, self.server, self.since)
+        server = self.served.server
+        return TileChangesRequest(self.minimum, self.maximum, self.level, server, self.since)
 
     def told(self, reply: TileChanges) -> FollowedMesh:
         """Return what is known after the reply to :meth:`changes_request`.
@@ -145,7 +153,9 @@ class FollowedMesh:
             BadReplyError: it contradicts the reply before.
         """
         origin = known_origin(reply.origin)
-        is_same = reply.server == self.server and bool((origin == self.origin).all())
+        served = ServedTiles(reply.server, reply.tile_side_m, reply.cell_m, origin)
+        is_same = reply.server == self.served.server
+        is_same &= bool((origin == self.served.origin).all())
         if is_same and reply.epoch < self.epoch:
             raise BadReplyError(f"epoch {reply.epoch} comes after epoch {self.epoch}")
         since, empty = (self.since, self.empty) if is_same else (0, {})
@@ -160,10 +170,7 @@ class FollowedMesh:
         pending.sort(key=lambda index: known.get(index, 0))  # first those that are not there at all
         told = replace(
             self,
-            server=reply.server,
-            tile_side_m=reply.tile_side_m,
-            cell_m=reply.cell_m,
-            origin=origin,
+            served=served,
             empty=empty,
             stale=stale,
             pending=tuple(pending),
@@ -214,26 +221,28 @@ class FollowedMesh:
                 version=version,
                 digest=hashlib.sha256(tile.data).hexdigest(),
                 size_bytes=len(tile.data),
-                origin=self.origin + np.array((x, y, z)) * self.tile_side_m,
-                vertices=tile.surface.positions(self.cell_m),
+                origin=self.served.origin + np.array((x, y, z)) * self.served.tile_side_m,
+                vertices=tile.surface.positions(self.served.cell_m),
                 faces=tile.surface.faces,
             )
         return tiles
 
     def mesh(self) -> Mesh:
         """Return the tiles as one mesh, faces by their centroids within the bounds."""
+        origin = self.served.origin
         tiles = (
-            Triangles(tile.origin - self.origin + tile.vertices, tile.faces)
+            Triangles(tile.origin - origin + tile.vertices, tile.faces)
             for tile in self.tiles.values()
         )
-        box = self.minimum - self.origin, self.maximum - self.origin
-        whole = joined(tiles, self.tile_side_m, box).moved(self.origin)
+        box = self.minimum - origin, self.maximum - origin
+        whole = joined(tiles, self.served.tile_side_m, box).moved(origin)
         return Mesh.of(whole, self.epoch)
 
     def known_tiles(self) -> KnownTiles:
         """Return the tiles to go on with."""
         tiles = {index: tile for index, tile in self.tiles.items() if index not in self.stale}
-        return KnownTiles(self.server, self.level, self.tile_side_m, tiles, self.origin)
+        served = self.served
+        return KnownTiles(served.server, self.level, served.tile_side_m, tiles, served.origin)
 
 
 class DecodedTile(NamedTuple):

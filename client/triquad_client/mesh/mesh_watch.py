@@ -16,8 +16,7 @@ from triquad_format.wire.limits import MAX_TILES_ASKED
 from triquad_format.wire.mesh_messages import MeshRequest
 
 from triquad_client import checks
-from triquad_client.brief_errors import brief_errors
-from triquad_client.errors import ClosedError, RequestTimeoutError
+from triquad_client.errors import ClosedError, RequestTimeoutError, brief_errors
 from triquad_client.mesh.followed_mesh import (
     FollowedMesh,
     KnownTiles,
@@ -65,12 +64,12 @@ class WatchedTiles(ABC):
     @property
     def cell_m(self) -> float:
         """Side of the cells of which faces are made; NaN before the first update."""
-        return self._now().cell_m
+        return self._now().served.cell_m
 
     @property
     def tile_side_m(self) -> float:
         """Side of the tiles; NaN before the first update, unless tiles were known."""
-        return self._now().tile_side_m
+        return self._now().served.tile_side_m
 
     def known_tiles(self) -> KnownTiles:
         """Return the tiles, for a later watch to go on with."""

@@ -12,7 +12,7 @@ from triquad_format.errors import FormatError, InvalidInputError
 from triquad_format.wire import codec, keys
 from triquad_format.wire.bounds import MAX_COUNT
 from triquad_format.wire.endpoints import full_endpoint
-from triquad_format.wire.zenoh_config import QUIET, fill, put
+from triquad_format.wire.zenoh_config import QUIET, fill, put, reason
 
 from triquad_client import checks
 from triquad_client.errors import ConnectError, UnknownMapError
@@ -53,7 +53,7 @@ def open_connection(
     except FormatError as error:
         raise InvalidInputError(str(error)) from error
     except zenoh.ZError as error:
-        raise ConnectError(f"cannot connect {where}: {_reason(error)}") from error
+        raise ConnectError(f"cannot connect {where}: {reason(error)}") from error
     patience = _Patience(timeout_s)
     session = _open(configured, where, patience)
     connection = Connection(
@@ -98,7 +98,7 @@ def _open(configured: zenoh.Config, where: str, patience: _Patience) -> zenoh.Se
             return zenoh.open(configured)
         except zenoh.ZError as error:
             obstacle = why_no_link(configured, patience.timeout_s) or Obstacle(
-                f"{_reason(error)} Start triquad-server there, or check the endpoint and the "
+                f"{reason(error)} Start triquad-server there, or check the endpoint and the "
                 "credentials."
             )
             told, remedy = f"cannot connect {where}: {obstacle.why}", ""
@@ -146,10 +146,5 @@ def _read_configuration(file: str | Path) -> zenoh.Config:
     try:
         config: zenoh.Config = zenoh.Config.from_file(str(file))
     except zenoh.ZError as error:
-        raise ConnectError(f"Zenoh configuration {file}: {_reason(error)}") from error
+        raise ConnectError(f"Zenoh configuration {file}: {reason(error)}") from error
     return config
-
-
-def _reason(error: zenoh.ZError) -> str:
-    """Return what Zenoh says, on one line, without where in Zenoh it happened."""
-    return " ".join(str(error).split(" at /", 1)[0].split())

@@ -21,13 +21,12 @@ from triquad_format.wire.messages import MapInfo
 from triquad_map.stored_map import StoredMap
 
 from triquad_client import checks
-from triquad_client.brief_errors import brief_errors
-from triquad_client.calls.download import RemoteBytes, newest_file
+from triquad_client.calls.download import RemoteBytes, map_target, newest_file
 from triquad_client.calls.queries import MapQueries
 from triquad_client.checks import Bounds
-from triquad_client.errors import DownloadError, EmptierMapError
+from triquad_client.errors import DownloadError, EmptierMapError, brief_errors
 from triquad_client.net.connection import Connection, retried
-from triquad_client.offline.offline_map import LocalMap
+from triquad_client.offline.local_map import LocalMap
 
 _EMPTIER_SHARE = 0.5
 """A map that knows less than this of what the copy knows was lost. A server that goes on from its
@@ -71,7 +70,7 @@ class SyncedMap(MapQueries):
 
     def __init__(self, path: str | Path, bounds: Bounds, connection: Connection) -> None:
         """Use ``Client.sync``."""
-        self._path = checks.map_target(path)
+        self._path = map_target(path)
         self._connection = connection
         self._low, self._high = checks.finite_box(bounds)
         self._updating = threading.Lock()
@@ -117,7 +116,7 @@ class SyncedMap(MapQueries):
 
     def _fetch(self, accept_emptier: bool) -> SyncReport:
         with self._updating:
-            checks.map_target(self._path)
+            map_target(self._path)
             asked_s = time.monotonic()
             info = newest_file(self._connection)
             known = self._state

@@ -233,3 +233,20 @@ def masked(evidence: Evidence, mask: Bytes) -> Evidence:
         outcomes=evidence.outcomes[kept],
         margins=evidence.margins[kept],
     )
+
+
+def owned_evidence(settings: FieldSettings, region: Region) -> Evidence:
+    """Return the evidence that answers of the region depend on, without its neighbours' space."""
+    blocks, mine = morton.decode(region.evidence.codes, 3), settings.owned_blocks
+    owned = ((blocks >= mine.start) & (blocks < mine.stop)).all(axis=1, keepdims=True)
+    return masked(region.evidence, np.where(owned, np.uint8(0xFF), np.uint8(0)))
+
+
+def surface_voxels(record: MapRecord) -> Doubles:
+    """Return middles [N, 3] of the voxels in which rays ended, metres from the map's origin."""
+    settings, parts = record.settings, [np.empty((0, 3))]
+    for region in record.regions:
+        evidence = owned_evidence(settings, region)
+        voxels = seen_voxels(evidence, evidence.surface)
+        parts.append(settings.region_corner(region.index) + (voxels + 0.5) * settings.leaf_m)
+    return np.concatenate(parts)

@@ -140,6 +140,11 @@ def serve(map_name: str) -> tuple[Rule, ...]:
     )
 
 
+def nodes_of_ros2(domain: int) -> Rule:
+    """Return rights to a ROS 2 domain, by rmw_zenoh: topics, their history, the graph of nodes."""
+    return Rule(Verb.ALL, (f"{domain}/**", f"{domain}/**/@adv/**", f"@ros2_lv/{domain}/**"))
+
+
 def take_part_in_ros2(
     map_name: str, domain: int, published: Sequence[str] = ()
 ) -> tuple[Rule, ...]:
@@ -149,7 +154,7 @@ def take_part_in_ros2(
     have any name, bridges may publish on all keys, but not on those of the server of the map.
     """
     return (
-        Rule(Verb.ALL, (f"{domain}/**", f"{domain}/**/@adv/**", f"@ros2_lv/{domain}/**")),
+        nodes_of_ros2(domain),
         Rule(Verb.FIND, ("@/*/@ros2_lv/**",)),
         Rule(Verb.BE_FOUND, ("@/*/@ros2_lv/**",)),
         Rule(Verb.ANSWER, ("@/*/@ros2_pub_cache/**", "**/@adv/**")),

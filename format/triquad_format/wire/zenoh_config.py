@@ -30,6 +30,11 @@ class ZenohConfig(Protocol):
         """Set the value at a path."""
 
 
+def reason(error: Exception) -> str:
+    """Return what Zenoh says of an error, on one line, without where in Zenoh it happened."""
+    return " ".join(str(error).split(" at /", 1)[0].split())
+
+
 def put(config: ZenohConfig, values: Mapping[str, Any]) -> None:
     """Set values, by path."""
     for path, value in values.items():

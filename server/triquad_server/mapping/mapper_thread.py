@@ -78,7 +78,6 @@ class MapperThread:
         self._paused = threading.Event()
         self._stopping = threading.Event()
         self._schedule = PublishSchedule(period_s)
-        self._step_s = _GIVE_WAY_S  # seconds that the last step of training took
         self.progress = Progress(loss=mapper.loss, fit=map_fit(mapper.regions))
         self._record_progress()
         self._thread = threading.Thread(target=self._run, name="mapper")
@@ -183,14 +182,13 @@ class MapperThread:
     def _train(self) -> None:
         """Take one step of training, which gives way to queries for a third of its time at most."""
         self.time.begin(Activity.GIVING_WAY)
-        self._epochs.give_way(min(_GIVE_WAY_S, self._step_s / 2))
+        self._epochs.give_way(min(_GIVE_WAY_S, self.progress.step_s / 2))
         self.time.begin(Activity.TRAINING)
-        started, trained = time.monotonic(), self._mapper.samples_trained
+        started_s, before = time.monotonic(), self._mapper.samples_trained
         self._mapper.train()
-        self._step_s = time.monotonic() - started
-        trained = self._mapper.samples_trained - trained
-        own = self.progress.own_samples_trained + trained
-        self.progress = replace(self.progress, own_samples_trained=own)
+        own = self.progress.own_samples_trained + self._mapper.samples_trained - before
+        step_s = time.monotonic() - started_s
+        self.progress = replace(self.progress, own_samples_trained=own, step_s=step_s)
         self._schedule.is_changed = True
 
     def _run_commands(self) -> None:

@@ -1,5 +1,6 @@
 """The progress of a map, in figures, and how well it fits its held-out rays."""
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -30,6 +31,7 @@ class Progress:
 
     settled: bool = True  # nothing is left to learn, and the newest epoch shows all
     own_samples_trained: int = 0  # by this process
+    step_s: float = math.inf  # seconds that the last step of training took
     loss: float = 0.0  # as of the newest epoch
     fit: FieldFit | None = None  # of the newest epoch, to the rays that are held out
     map: MapFigures = MapFigures()

@@ -1,28 +1,26 @@
-"""The operations that a server answers: each has a key, and a lane with a queue and workers."""
+"""The operations that a server answers: each has a key, and is answered in a lane."""
 
 import logging
-import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from enum import Enum
 from functools import partial
 from typing import Any
 
-import numpy as np
 import zenoh
 from triquad_format.errors import RefusedError
 from triquad_format.records.arrays import Doubles
 from triquad_format.wire import codec, keys
-from triquad_format.wire.limits import MAX_WAIT_S
 from triquad_format.wire.metrics_messages import QueueMetrics
 from triquad_format.wire.places import asked_from
-from triquad_map.compiled.team import THREADS, lower_priority
+from triquad_map.compiled.team import lower_priority
 
 from triquad_server.errors import NO_MEMORY, MapperStoppedError
 from triquad_server.process.threads import NICENESS, submit
+from triquad_server.serving.lanes import LANES, Lane, lane_of
 from triquad_server.serving.long_work import LongWork
+from triquad_server.serving.refusals import RefusalSender
 from triquad_server.serving.request import OperationCounts, Request, payload_size
 from triquad_server.serving.request_queue import MOST_SENDING, ClientSessions, RequestQueue
 from triquad_server.settings import ServiceSettings
@@ -32,58 +30,6 @@ _log = logging.getLogger(__name__)
 _QUEUE_BYTES = 64_000_000  # of the requests of all clients that wait in a lane
 _PLAIN_BYTES = 16_384  # of a request that holds neither points nor tiles
 _STOPPING = "the server is stopping"
-_NO_ORIGIN = np.zeros(3)
-
-_REFUSING_THREADS = 2
-
-_REFUSED_BYTES = 4_000_000
-"""The memory of requests that wait for these threads: beyond, large ones are refused by the
-network's thread, so that their sender waits for it and they take no memory."""
-
-_LARGE_BYTES = 65_536
-
-
-class Lane(Enum):
-    """The operations that share a queue and its workers."""
-
-    QUESTIONS = "questions"
-    LONG_QUESTIONS = "long_questions"
-    """The lane of questions about many places, which take a tenth of a second: short ones, such as
-    a planner's, do not wait for them, and mapping is not slowed down."""
-
-    ADMINISTRATION = "administration"
-    """The lane of what takes no time: it is answered however many queries wait."""
-
-    MESH = "mesh"
-    """The lane of the mesh: requests come one after the other, and all cores make their tiles."""
-
-    FILES = "files"
-    """The lane of checkpoints and map files, which take long, one after the other: its workers
-    wait for what :class:`LongWork` does."""
-
-
-@dataclass(frozen=True)
-class _LaneWorkers:
-    """The workers of a lane, and what they give way to."""
-
-    threads: int  # for questions, one for each core
-    niceness: int = 0  # that of mapping where the work is long
-    gives_way_s: float | None = None
-    """The seconds for which scans of a source that is about to lose some have to wait before these
-    workers give way: a planner does not wait for a source that floods, a long question does.
-    ``None``: they never do."""
-
-
-_LANES = {
-    Lane.QUESTIONS: _LaneWorkers(max(2, THREADS), gives_way_s=1.0),
-    Lane.LONG_QUESTIONS: _LaneWorkers(max(2, THREADS), NICENESS, gives_way_s=0.0),
-    Lane.ADMINISTRATION: _LaneWorkers(2),
-    Lane.MESH: _LaneWorkers(1, NICENESS),
-    Lane.FILES: _LaneWorkers(2),
-}
-
-_LONG_BYTES = 32_768
-"""A question of more bytes is long: some 2,700 points, which take a server 10 ms."""
 
 
 @dataclass(frozen=True)
@@ -94,39 +40,6 @@ class _Operation:
     max_bytes: int
 
 
-class RefusalSender:
-    """Sends refusals in threads of its own: a client may delay the reply for seconds."""
-
-    def __init__(self) -> None:
-        self._threads = ThreadPoolExecutor(_REFUSING_THREADS, "refusals")
-        self._lock = threading.Lock()
-        self._waiting_bytes = 0
-
-    def send(self, request: Request, code: str, text: str) -> None:
-        """Refuse a request; ``code`` is one of ``ERROR_CODES``."""
-        size = request.size
-        with self._lock:
-            is_room = size <= _LARGE_BYTES or self._waiting_bytes + size <= _REFUSED_BYTES
-            if is_room:
-                self._waiting_bytes += size
-        if is_room:
-            submit(self._threads, self._refuse, request, code, text)
-        else:
-            request.refuse(code, text)
-
-    def close(self) -> None:
-        """Refuse what is left, and end."""
-        self._threads.shutdown()
-
-    def _refuse(self, request: Request, code: str, text: str) -> None:
-        size = request.size
-        try:
-            request.refuse(code, text)
-        finally:
-            with self._lock:
-                self._waiting_bytes -= size
-
-
 class Operations:
     """Receives the requests of one map, and has them handled: each is answered exactly once."""
 
@@ -135,8 +48,8 @@ class Operations:
         session: zenoh.Session,
         map_name: str,
         settings: ServiceSettings,
-        give_way: Callable[[float], None] = lambda _: None,
-        origin: Callable[[], Doubles] = lambda: _NO_ORIGIN,
+        give_way: Callable[[float], None],
+        origin: Callable[[], Doubles],
     ) -> None:
         """Begin; ``give_way`` returns when a query may begin, as far as other work is concerned.
 
@@ -231,7 +144,7 @@ class Operations:
 
     def _queue(self, lane: Lane, requests_each: int) -> RequestQueue[Request]:
         """Return a queue with workers, whose threads are started when they are needed."""
-        workers = _LANES[lane]
+        workers = LANES[lane]
         pool = ThreadPoolExecutor(
             workers.threads + MOST_SENDING, lane.value, lower_priority, (workers.niceness,)
         )
@@ -257,9 +170,8 @@ class Operations:
     def _take(self, key: str, query: zenoh.Query) -> None:
         """Queue a request, or refuse it."""
         operation = self._operations[key]
-        source = self._sessions.source(query, MAX_WAIT_S)
-        is_long = operation.lane is Lane.QUESTIONS and payload_size(query) > _LONG_BYTES
-        queue = self._queues[Lane.LONG_QUESTIONS if is_long else operation.lane]
+        source = self._sessions.source(query)
+        queue = self._queues[lane_of(operation.lane, payload_size(query))]
         request = Request(query, key, operation.counts, source, queue.send)
         if request.size > operation.max_bytes:
             text = f"{request.size} bytes exceed the limit of {operation.max_bytes}: split it"
@@ -274,7 +186,7 @@ class Operations:
     def _work(self, lane: Lane, request: Request) -> None:
         try:
             request.begin()
-            waited_s = _LANES[lane].gives_way_s
+            waited_s = LANES[lane].gives_way_s
             if waited_s is not None:
                 self._give_way(waited_s)
             self._check(request)

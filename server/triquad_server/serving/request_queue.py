@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
 import zenoh
+from triquad_format.wire.limits import MAX_WAIT_S
 from triquad_format.wire.messages import read_origin
 from triquad_format.wire.metrics_messages import QueueMetrics
 
@@ -59,15 +60,15 @@ class ClientSessions:
         self._linked = frozenset[str]()  # Zenoh ids at the other ends of links
         self._read_s = 0.0  # when that was, monotonic
 
-    def source(self, query: zenoh.Query, longest_s: float) -> Source:
-        """Return a request's owner and deadline; no longer wait than ``longest_s`` is believed."""
+    def source(self, query: zenoh.Query) -> Source:
+        """Return a request's owner and deadline; no longer wait than ``MAX_WAIT_S`` is believed."""
         attachment = query.attachment
         origin = None if attachment is None else read_origin(attachment.to_bytes())
         now = time.monotonic()
         if origin is None:
-            return Source(Owner(_UNLINKED), now + longest_s)
+            return Source(Owner(_UNLINKED), now + MAX_WAIT_S)
         # Written so that NaN counts as not given.
-        wait_s = origin.timeout_s if 0 <= origin.timeout_s <= longest_s else longest_s
+        wait_s = origin.timeout_s if 0 <= origin.timeout_s <= MAX_WAIT_S else MAX_WAIT_S
         group = origin.client if self._is_linked(origin.client) else _UNLINKED
         return Source(Owner(group, origin.client), now + wait_s + _GRACE_S, origin.local)
 

@@ -12,8 +12,7 @@ from support.maps.small_world import settled_epoch, world
 from triquad_client import InvalidInputError, Mesh, OfflineMap
 from triquad_format.records import morton
 from triquad_format.records.field_settings import BLOCK_VOXELS
-from triquad_format.records.region import MapRecord, masked, seen_voxels
-from triquad_format.records.seen_space import surface_voxels
+from triquad_format.records.region import MapRecord, masked, seen_voxels, surface_voxels
 from triquad_format.records.status import Status
 
 HALF = 1 << (SETTINGS.depth - 1)

@@ -23,7 +23,7 @@ from triquad_client import Client, MeshWatch, Status
 from triquad_server.settings import MeshSettings
 from triquad_tools.commands import ros2
 from triquad_tools.ros2 import bridge
-from triquad_tools.ros2.intake.intake import Place
+from triquad_tools.ros2.intake.scan_publisher import Place
 from triquad_tools.ros2.output.mesh_publisher import MeshPublisher
 from triquad_tools.ros2.topics import End, read_token
 from triquad_tools.work.ros2 import bridge_options

@@ -5,7 +5,7 @@ import pytest
 from support.poses import shifted
 from support.servers import sphere
 from triquad_format.errors import RefusedError
-from triquad_format.records.seen_space import surface_voxels
+from triquad_format.records.region import surface_voxels
 from triquad_server.epochs.surface_history import SurfaceHistory
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings

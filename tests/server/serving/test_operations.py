@@ -12,11 +12,15 @@ from support.servers import MAP, WAIT_S, RawPeer, free_endpoint, raw_session
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import ErrorReply, SdfReply, SdfRequest
 from triquad_server.errors import MapperStoppedError
-from triquad_server.serving import operations as module
-from triquad_server.serving.operations import Operations, RefusalSender
+from triquad_server.serving import refusals as module
+from triquad_server.serving.operations import Operations
+from triquad_server.serving.refusals import RefusalSender
 from triquad_server.settings import ServiceSettings
 
 LONG, SHORT = 4_000, 100
+
+ORIGIN = np.zeros(3)
+ALONE = (lambda _: None, lambda: ORIGIN)  # there is nothing to give way to
 
 
 def question(count: int) -> bytes:
@@ -42,7 +46,7 @@ def test_short_questions_are_answered_while_any_number_of_long_ones_are_worked_a
 
     with (
         raw_session("peer", listen=endpoint) as session,
-        closing(Operations(session, MAP, ServiceSettings())) as operations,
+        closing(Operations(session, MAP, ServiceSettings(), *ALONE)) as operations,
         raw_session(connect=endpoint) as client,
     ):
         operations.serve(SdfRequest, work, max_bytes=10**6)
@@ -72,7 +76,7 @@ def test_who_is_not_answered_is_told_why_and_defects_alone_leave_a_traceback(
     endpoint = free_endpoint()
     with (
         raw_session("peer", listen=endpoint) as session,
-        closing(Operations(session, MAP, ServiceSettings())) as operations,
+        closing(Operations(session, MAP, ServiceSettings(), *ALONE)) as operations,
         raw_session(connect=endpoint) as client,
     ):
         operations.serve(SdfRequest, fail)

@@ -184,7 +184,7 @@ class Query:
 
 
 def group(sessions, name):
-    return sessions.source(Query(name), longest_s=60.0).owner.group
+    return sessions.source(Query(name)).owner.group
 
 
 def test_who_is_linked_has_turns_of_its_own_until_it_leaves():
@@ -195,7 +195,7 @@ def test_who_is_linked_has_turns_of_its_own_until_it_leaves():
             name = str(client.info.zid())
             assert group(sessions, name) == name
             assert group(sessions, "invented") == ""
-            owner = sessions.source(Query(name), longest_s=60.0).owner
+            owner = sessions.source(Query(name)).owner
             assert not sessions.have_left(owner)
         until_s = time.monotonic() + WAIT_S
         while not sessions.have_left(owner):

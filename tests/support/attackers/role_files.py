@@ -42,5 +42,5 @@ def showing(certificate: Certificate, *sides: str) -> dict[str, str]:
     return shown
 
 
-def _base64(data: bytes) -> str:
-    return base64.b64encode(data).decode("ascii")
+def _base64(text: str) -> str:
+    return base64.b64encode(text.encode()).decode()

@@ -6,16 +6,10 @@ from pathlib import Path
 
 from triquad_tools.console.arguments import command_parser, positive, whole
 from triquad_tools.console.command import run_work
-from triquad_tools.credentials.roles import Role
+from triquad_tools.credentials.roles import ADMIN, ROBOT, ROLES
 
 _DAYS = 365.0
 _LAST_DOMAIN = 232  # of ROS 2
-_ROLES = {
-    Role.VIEWER: "may question the map and follow it",
-    Role.ROBOT: "may publish scans, as the sources named, and what a viewer may",
-    Role.ADMIN: "may reset the map and have checkpoints written, and what a viewer may; with "
-    "--source, publish scans too",
-}
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -30,7 +24,7 @@ def _parser() -> argparse.ArgumentParser:
 
     def command(name: str, what: str) -> argparse.ArgumentParser:
         added = commands.add_parser(name, help=what, description=what)
-        added.set_defaults(action=name, source=None, ros2_domain=None)
+        added.set_defaults(action=name, name=None, days=None, source=[], ros2_domain=None)
         added.add_argument("folder", type=Path, metavar="DIR", help="the folder of keys")
         return added
 
@@ -38,34 +32,26 @@ def _parser() -> argparse.ArgumentParser:
     hosts = "name or address by which others find the server, or a router, repeatable; the machine "
     hosts += "itself finds it without"
     init.add_argument("--host", action="append", default=[], metavar="HOST", help=hosts)
-    _add_sources(init, default=" (default: default)")
-    with_days = [init]
-    for role, may in _ROLES.items():
-        add = command(role.value, f"add one who {may}")
-        add.set_defaults(role=role)
-        add.add_argument("name", metavar="NAME", help="of the client")
-        if role is not Role.VIEWER:
-            _add_sources(add, required=role is Role.ROBOT)
-        with_days.append(add)
+    adding = {role: command(role, f"add one who {may}") for role, may in ROLES.items()}
     renew = command("renew", "issue new certificates before the old ones expire")
     renew.add_argument("name", nargs="+", metavar="NAME", help="of a client, server or router")
-    until = f"until the certificate expires (default: {_DAYS:g})"
-    for one in (*with_days, renew):
-        one.add_argument("--days", type=positive, default=_DAYS, metavar="N", help=until)
-    remove = command("remove", "take a role away")
-    remove.add_argument("name", metavar="NAME", help="of a client")
+    for one in (*adding.values(), command("remove", "take a role away")):
+        one.add_argument("name", metavar="NAME", help="of the client")
     command("list", "tell who has which role, and until when")
-    return parser
-
-
-def _add_sources(
-    command: argparse.ArgumentParser, *, default: str = "", required: bool = False
-) -> None:
-    add = command.add_argument
-    sources = f"of scans that the robot publishes, and nobody else, repeatable{default}"
-    add("--source", action="append", required=required, metavar="NAME", help=sources)
+    sources = "of scans that the robot publishes, and nobody else, repeatable (init: default)"
     domain = "let nodes of ROS 2 with this certificate take part in this domain"
-    add("--ros2-domain", type=partial(whole, 0, _LAST_DOMAIN), metavar="N", help=domain)
+    for one in (init, adding[ROBOT], adding[ADMIN]):
+        required = one is adding[ROBOT]
+        one.add_argument(
+            "--source", action="append", required=required, metavar="NAME", help=sources
+        )
+        one.add_argument(
+            "--ros2-domain", type=partial(whole, 0, _LAST_DOMAIN), metavar="N", help=domain
+        )
+    until = f"until the certificate expires (default: {_DAYS:g})"
+    for one in (init, *adding.values(), renew):
+        one.add_argument("--days", type=positive, default=_DAYS, metavar="N", help=until)
+    return parser
 
 
 main = partial(run_work, "keys", _parser)

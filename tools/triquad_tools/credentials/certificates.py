@@ -1,4 +1,4 @@
-"""A small certificate authority, whose certificates identify servers and clients."""
+"""Certificates that identify servers and clients, and the authority that signs them."""
 
 import datetime
 import ipaddress
@@ -13,7 +13,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")  # which every server certificate holds
 _AUTHORITY_DAYS = 3650
-_CLIENT = ExtendedKeyUsageOID.CLIENT_AUTH
+_CLIENT = ExtendedKeyUsageOID.CLIENT_AUTH  # a certificate for this alone cannot pass for a server
 _CLOCK_SKEW = datetime.timedelta(hours=1)  # that a robot's clock may be behind the authority's
 
 
@@ -21,72 +21,51 @@ _CLOCK_SKEW = datetime.timedelta(hours=1)  # that a robot's clock may be behind 
 class Certificate:
     """A certificate and its private key on the curve P-256, both PEM."""
 
-    pem: bytes
-    key_pem: bytes
+    pem: str
+    key_pem: str
 
     @property
     def parsed(self) -> x509.Certificate:
         """The library's object."""
-        return x509.load_pem_x509_certificate(self.pem)
+        return x509.load_pem_x509_certificate(self.pem.encode())
 
-    @property
-    def expires(self) -> datetime.datetime:
-        """The end of its validity, UTC."""
-        return self.parsed.not_valid_after_utc
+    def issue(
+        self, common_name: str, days: float, hosts: Sequence[str] | None = None
+    ) -> "Certificate":
+        """Sign a certificate for a client, or for a server on ``hosts``, names or addresses."""
+        if hosts is None:
+            return _signed(self, common_name, days, x509.ExtendedKeyUsage([_CLIENT]))
+        usage = x509.ExtendedKeyUsage([_CLIENT, ExtendedKeyUsageOID.SERVER_AUTH])
+        names = x509.SubjectAlternativeName([_general_name(h) for h in (*LOCAL_HOSTS, *hosts)])
+        return _signed(self, common_name, days, usage, names)
 
 
-@dataclass(frozen=True)
-class Authority:
-    """Signs certificates. A program that has its private key can take any role."""
-
-    own: Certificate
-
-    @classmethod
-    def create(cls, name: str) -> "Authority":
-        """Make a new authority, valid for ten years."""
-        return cls(_signed(name, _AUTHORITY_DAYS, None))
-
-    def client(self, common_name: str, days: float) -> Certificate:
-        """Issue a certificate for a client, which cannot pass for a server with it."""
-        return _signed(common_name, days, self.own, x509.ExtendedKeyUsage([_CLIENT]))
-
-    def server(self, common_name: str, hosts: Sequence[str], days: float) -> Certificate:
-        """Issue a certificate to listen on ``hosts``, names or addresses, and to connect."""
-        names = [_general_name(host) for host in dict.fromkeys((*LOCAL_HOSTS, *hosts))]
-        usage = x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH, _CLIENT])
-        return _signed(common_name, days, self.own, usage, x509.SubjectAlternativeName(names))
+def new_authority(name: str) -> Certificate:
+    """Make a certificate that signs others for ten years: with its key one can take any role."""
+    return _signed(None, name, _AUTHORITY_DAYS)
 
 
 def _signed(
-    common_name: str, days: float, issuer: Certificate | None, *extensions: x509.ExtensionType
+    issuer: Certificate | None, common_name: str, days: float, *extensions: x509.ExtensionType
 ) -> Certificate:
     """Make a key with a certificate that ``issuer`` signs, or without one the key itself."""
-    key = ec.generate_private_key(ec.SECP256R1())
-    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
+    key = signing = ec.generate_private_key(ec.SECP256R1())
+    name = signer = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
+    if issuer:
+        loaded = serialization.load_pem_private_key(issuer.key_pem.encode(), password=None)
+        signing, signer = cast(ec.EllipticCurvePrivateKey, loaded), issuer.parsed.subject
     now = datetime.datetime.now(datetime.timezone.utc)
-    path_length = 0 if issuer is None else None
-    constraints = x509.BasicConstraints(ca=issuer is None, path_length=path_length)
-    builder = (
-        x509.CertificateBuilder()
-        .subject_name(name)
-        .issuer_name(issuer.parsed.subject if issuer else name)
-        .public_key(key.public_key())
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(now - _CLOCK_SKEW)
-        .not_valid_after(now + datetime.timedelta(days=days))
-        .add_extension(constraints, critical=True)
-    )
+    start, end = now - _CLOCK_SKEW, now + datetime.timedelta(days=days)
+    serial = x509.random_serial_number()
+    builder = x509.CertificateBuilder(signer, name, key.public_key(), serial, start, end)
+    constraints = x509.BasicConstraints(ca=not issuer, path_length=None if issuer else 0)
+    builder = builder.add_extension(constraints, critical=True)
     for extension in extensions:
         builder = builder.add_extension(extension, critical=False)
-    signing = key
-    if issuer is not None:
-        loaded = serialization.load_pem_private_key(issuer.key_pem, password=None)
-        signing = cast(ec.EllipticCurvePrivateKey, loaded)
     pem, plain = serialization.Encoding.PEM, serialization.NoEncryption()
-    return Certificate(
-        builder.sign(signing, hashes.SHA256()).public_bytes(pem),
-        key.private_bytes(pem, serialization.PrivateFormat.PKCS8, plain),
-    )
+    signed = builder.sign(signing, hashes.SHA256()).public_bytes(pem)
+    private = key.private_bytes(pem, serialization.PrivateFormat.PKCS8, plain)
+    return Certificate(signed.decode(), private.decode())
 
 
 def _general_name(host: str) -> x509.GeneralName:

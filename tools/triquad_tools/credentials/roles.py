@@ -6,29 +6,26 @@ rest is denied. Clients keep one of their own: they take nothing but from a serv
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import Enum
 
 from triquad_format.wire import access_control as access
 from triquad_format.wire import keys
 
-SERVER = "server"
-ROUTER = "router"  # common names of the certificates of those who listen
-
-
-class Role(Enum):
-    """The role of a client; all may do what a viewer may."""
-
-    VIEWER = "viewer"  # questions the map, and follows it
-    ROBOT = "robot"  # publishes scans as its own sources
-    ADMIN = "admin"  # resets the map, has checkpoints written
+LISTENING = SERVER, ROUTER = "server", "router"  # roles of those who listen, and their names
+VIEWER, ROBOT, ADMIN = "viewer", "robot", "admin"
+ROLES = {
+    VIEWER: "may question the map and follow it",
+    ROBOT: "may publish scans, as the sources named, and what a viewer may",
+    ADMIN: "may reset the map and have checkpoints written, and what a viewer may; with "
+    "--source, publish scans too",
+}  # of clients
 
 
 @dataclass(frozen=True)
 class Holder:
-    """A client with a role. Names that cannot stand in a key are refused with a FormatError."""
+    """The holder of a role. Names that cannot stand in a key are refused with a FormatError."""
 
     name: str
-    role: Role
+    role: str
     sources: tuple[str, ...] = ()  # of scans that it publishes, and nobody else
     ros2_domain: int | None = None  # of ROS 2, in which its nodes take part
     issue: str = ""  # to distinguish it from an earlier client of this name with a certificate
@@ -39,44 +36,41 @@ class Holder:
             keys.check_name("source", source)
 
     @property
+    def listens(self) -> bool:
+        """Whether it is the server or a router rather than a client."""
+        return self.role in LISTENING
+
+    @property
     def common_name(self) -> str:
         """The common name of its certificate, which identifies it to Zenoh."""
-        return f"{self.role.value}:{self.name}:{self.issue}"
+        return self.role if self.listens else f"{self.role}:{self.name}:{self.issue}"
 
 
-def server_grants(holders: Sequence[Holder]) -> tuple[access.Grant, ...]:
-    """Return what a server or a router lets others do; all who are none of these do nothing."""
-    domains = sorted({h.ros2_domain for h in holders if h.ros2_domain is not None})
-    topics = tuple(_take_part(domain) for domain in domains)
-    return (
-        access.Grant(_known_as(SERVER), (*access.serve(keys.EVERY_MAP), *topics)),
-        # Who comes through a router was identified there, and beyond it may be servers, too.
-        access.Grant(_known_as(ROUTER), access.everything()),
-        *(access.Grant(_known_as(holder.common_name), _allowed(holder)) for holder in holders),
+def grants(granting: Holder, holders: Sequence[Holder]) -> tuple[access.Grant, ...]:
+    """Return what one holder lets all of them do; who is none of these does nothing."""
+    if granting.listens:
+        domains = sorted({h.ros2_domain for h in holders if h.ros2_domain is not None})
+        allowed = {holder.common_name: _allowed(holder, domains) for holder in holders}
+    else:
+        allowed = {holder.common_name: access.everything() for holder in holders if holder.listens}
+    return tuple(
+        access.Grant(access.Subject(name, cert_common_names=(name,)), rules)
+        for name, rules in allowed.items()
     )
 
 
-def client_grants() -> tuple[access.Grant, ...]:
-    """Return what a client lets others do: servers and routers all, and nobody else anything."""
-    return tuple(access.Grant(_known_as(name), access.everything()) for name in (SERVER, ROUTER))
-
-
-def _allowed(holder: Holder) -> tuple[access.Rule, ...]:
+def _allowed(holder: Holder, domains: Sequence[int]) -> tuple[access.Rule, ...]:
+    """Return the rights of a holder, where nodes take part in these domains of ROS 2."""
+    if holder.role == ROUTER:
+        # Who comes through it was identified there, and beyond it may be servers, too.
+        return access.everything()
+    if holder.role == SERVER:
+        return (*access.serve(keys.EVERY_MAP), *map(access.nodes_of_ros2, domains))
     rules = access.view(keys.EVERY_MAP)
-    if holder.role is Role.ADMIN:
+    if holder.role == ADMIN:
         rules += access.administer(keys.EVERY_MAP)
     if holder.sources:
         rules += access.publish(keys.EVERY_MAP, holder.sources)
     if holder.ros2_domain is not None:
-        rules += (_take_part(holder.ros2_domain),)
+        rules += (access.nodes_of_ros2(holder.ros2_domain),)
     return rules
-
-
-def _take_part(domain: int) -> access.Rule:
-    """Return rights to a ROS 2 domain, by rmw_zenoh: topics, their history, the graph of nodes."""
-    keys_of_domain = f"{domain}/**", f"{domain}/**/@adv/**", f"@ros2_lv/{domain}/**"
-    return access.Rule(access.Verb.ALL, keys_of_domain)
-
-
-def _known_as(common_name: str) -> access.Subject:
-    return access.Subject(common_name, cert_common_names=(common_name,))

@@ -11,9 +11,14 @@ from triquad_format.mapfile.reader import MapFile
 from triquad_format.records import morton
 from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
-from triquad_format.records.region import MapProgress, MapRecord, Region, surface_counts
+from triquad_format.records.region import (
+    MapProgress,
+    MapRecord,
+    Region,
+    owned_evidence,
+    surface_counts,
+)
 from triquad_format.records.replay_rays import are_held_out
-from triquad_format.records.seen_space import owned_evidence
 from triquad_map.field_fit import MapFit, PlaceFits, in_cube, map_fit
 from triquad_map.opening import open_view
 

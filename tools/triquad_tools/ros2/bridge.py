@@ -3,7 +3,7 @@
 import json
 import logging
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from functools import partial
 from pathlib import Path
@@ -13,10 +13,10 @@ from triquad_client import Client
 from triquad_format.errors import TriquadError
 from triquad_format.wire.codec import MAX_MESSAGE_BYTES
 from triquad_format.wire.endpoints import DEFAULT_ENDPOINT, full_endpoint
-from triquad_format.wire.zenoh_config import QUIET, fill, put
+from triquad_format.wire.zenoh_config import QUIET, fill, put, reason
 
 from triquad_tools.console.command import ToolError
-from triquad_tools.ros2.intake.intake import Intake, Place
+from triquad_tools.ros2.intake.intake import Intake
 from triquad_tools.ros2.node import Node
 from triquad_tools.ros2.options import BridgeOptions
 from triquad_tools.ros2.output.grid_publisher import GridPublisher
@@ -55,18 +55,14 @@ def bridging(session: zenoh.Session, client: Client, options: BridgeOptions) -> 
         mesh = MeshPublisher(markers, client, options.mesh_level, options.mesh_bytes_per_s)
         parts.enter_context(closing(mesh))
         grid = GridPublisher(slices, client, options.grid)
-        for output in (mesh, grid):
-            parts.enter_context(_published(output.publish, intake))
+        parts.enter_context(_published(mesh, intake))
+        parts.enter_context(_published(grid, intake))
         yield intake
 
 
 @contextmanager
-def _published(publish: Callable[[Place, float], None], intake: Intake) -> Iterator[None]:
-    """Publish an output again and again while the context is open; it holds up no other.
-
-    ``publish`` gets the place of the robot and how often it is called, and raises a TriquadError
-    where the map server does not answer.
-    """
+def _published(output: MeshPublisher | GridPublisher, intake: Intake) -> Iterator[None]:
+    """Publish an output again and again while the context is open; it holds up no other."""
     stopping = threading.Event()
 
     def run() -> None:
@@ -75,7 +71,7 @@ def _published(publish: Callable[[Place, float], None], intake: Intake) -> Itera
             place, pause_s = intake.place, _PERIOD_S
             try:
                 if place is not None:
-                    publish(place, _PERIOD_S)
+                    output.publish(place, _PERIOD_S)
             except TriquadError as error:
                 _log.warning("the map cannot be published now: %s", error)
                 pause_s = _RETRY_S
@@ -111,7 +107,6 @@ def open_session(router: str | None, file: Path | None) -> zenoh.Session:
     except zenoh.ZError as error:
         where = router or file or DEFAULT_ENDPOINT
         raise ToolError(
-            f"the router of the ROS nodes, {where}, cannot be reached: "
-            f"{str(error).partition(' at /')[0]}: start rmw_zenohd or the robot's "
-            "zenoh-bridge-ros2dds, name it with --router, or use --serve"
+            f"the router of the ROS nodes, {where}, cannot be reached: {reason(error)}: start "
+            "rmw_zenohd or the robot's zenoh-bridge-ros2dds, name it with --router, or use --serve"
         ) from error

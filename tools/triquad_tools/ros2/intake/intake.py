@@ -5,7 +5,6 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -13,10 +12,10 @@ import numpy as np
 import zenoh
 from triquad_client import Client, InvalidScanError
 from triquad_format.errors import TriquadError
-from triquad_format.records.arrays import Doubles
 
 from triquad_tools.ros2.intake.drop_log import LOG_PERIOD_S, DropLog, FirstScan
 from triquad_tools.ros2.intake.placement import Motion, Placed, Placement
+from triquad_tools.ros2.intake.scan_publisher import Place, ScanPublisher
 from triquad_tools.ros2.intake.topic_listener import Arrival, Limits, MessageQueue, TopicListener
 from triquad_tools.ros2.node import Node
 from triquad_tools.ros2.options import TYPES, BridgeOptions, Role
@@ -24,12 +23,9 @@ from triquad_tools.ros2.topics import SequenceGaps
 from triquad_tools.sensors.ray_check import RayCheck
 from triquad_tools.sensors.ros.from_bytes import decode_cdr
 from triquad_tools.sensors.ros.message_reader import MessageReader
-from triquad_tools.sensors.ros.type_store import source_of_topic
-from triquad_tools.sensors.sweep import NoScanError, PosedScan, Sweep
+from triquad_tools.sensors.sweep import NoScanError, Sweep
 
 _log = logging.getLogger("triquad_ros2")
-MAX_TOPICS = 64  # topics of which scans are made at most
-RESTART_NS = 10**9  # stamps that go back by more start again: a wrong one silences for no longer
 MAX_POINTS = 2_500_000  # of a scan: a message of 30 MB, which servers receive by default
 _OTHER_BYTES = 1_000_000  # of a message of transforms, and of a cloud without its points
 _SCAN_BYTES = 64 * MAX_POINTS + _OTHER_BYTES  # drivers write up to 64 bytes for each point
@@ -39,69 +35,6 @@ _WAITING_BYTES = 512_000_000  # of sweeps that wait for their transforms
 _TICK_S = 0.2
 _SETTING = "which the setting ray_origin_m of its source has to tell the server (docs/server.md)"
 _PATH_POSES = 100  # of a path, whose messages have all of them again and again
-
-
-@dataclass(frozen=True)
-class Place:
-    """The position of the robot."""
-
-    map_frame: str
-    position_m: Doubles  # [3] map frame
-    stamp_ns: int
-
-
-@dataclass
-class _Source:
-    name: str
-    read_ns: int  # newest stamp of a sweep that was read, since time went back
-    sent_ns: int = 0  # and of one that was published: sweeps wait in between
-
-
-class ScanPublisher:
-    """Publishes scans to the map server, those of a topic in the order of their stamps."""
-
-    def __init__(self, client: Client) -> None:
-        self.newest: Place | None = None  # where the newest scan was taken
-        self.count = 0  # scans that were published
-        self._client = client
-        self._sources: dict[str, _Source] = {}
-
-    def time_went_back(self, topic_name: str, stamp_ns: int) -> bool:
-        """Return whether a topic was started again, given the stamp of a sweep that is read.
-
-        Raises:
-            NoScanError: it is a little before the one before, or of too many topics.
-        """
-        source = self._sources.get(topic_name)
-        if source is None:
-            if len(self._sources) >= MAX_TOPICS:
-                others = f"there are {len(self._sources)} others already: choose some with --clouds"
-                raise NoScanError("too_many_topics", others)
-            source = self._sources[topic_name] = _Source(source_of_topic(topic_name), stamp_ns)
-        back_ns, source.read_ns = source.read_ns - stamp_ns, max(source.read_ns, stamp_ns)
-        if 0 < back_ns <= RESTART_NS:
-            raise NoScanError("time_backwards", f"{back_ns / 1e9:.3g} s before the scan before")
-        source.read_ns = stamp_ns
-        return back_ns > 0
-
-    def publish(self, topic_name: str, scan: PosedScan, stamp_ns: int, map_frame: str) -> None:
-        """Publish a scan.
-
-        Raises:
-            NoScanError: it is empty.
-            TriquadError: it could not be sent.
-        """
-        if len(scan.points) == 0:
-            raise NoScanError("empty", "no point of it is finite")
-        source = self._sources[topic_name]
-        if stamp_ns < source.sent_ns:
-            self._client.restart_source(source.name)
-        source.sent_ns = stamp_ns
-        self._client.publish_scan(
-            scan.points, scan.world_from_sensor, stamp_ns / 1e9, source=source.name
-        )
-        self.count += 1
-        self.newest = Place(map_frame, scan.world_from_sensor[:3, 3], stamp_ns)
 
 
 class Intake:

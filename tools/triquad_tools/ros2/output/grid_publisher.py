@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from triquad_client import Client, Grid, Status
 from triquad_format.scan_log.cdr import CdrWriter
 
-from triquad_tools.ros2.intake.intake import Place
+from triquad_tools.ros2.intake.scan_publisher import Place
 from triquad_tools.ros2.options import SliceShape
 from triquad_tools.ros2.output.topic_publisher import TopicPublisher
 

@@ -1,0 +1,75 @@
+"""Publishing the scans of topics to the map server."""
+
+from dataclasses import dataclass
+
+from triquad_client import Client
+from triquad_format.records.arrays import Doubles
+
+from triquad_tools.sensors.ros.type_store import source_of_topic
+from triquad_tools.sensors.sweep import NoScanError, PosedScan
+
+MAX_TOPICS = 64  # topics of which scans are made at most
+RESTART_NS = 10**9  # stamps that go back by more start again: a wrong one silences for no longer
+
+
+@dataclass(frozen=True)
+class Place:
+    """The position of the robot."""
+
+    map_frame: str
+    position_m: Doubles  # [3] map frame
+    stamp_ns: int
+
+
+@dataclass
+class _Source:
+    name: str
+    read_ns: int  # newest stamp of a sweep that was read, since time went back
+    sent_ns: int = 0  # and of one that was published: sweeps wait in between
+
+
+class ScanPublisher:
+    """Publishes scans to the map server, those of a topic in the order of their stamps."""
+
+    def __init__(self, client: Client) -> None:
+        self.newest: Place | None = None  # where the newest scan was taken
+        self.count = 0  # scans that were published
+        self._client = client
+        self._sources: dict[str, _Source] = {}
+
+    def time_went_back(self, topic_name: str, stamp_ns: int) -> bool:
+        """Return whether a topic was started again, given the stamp of a sweep that is read.
+
+        Raises:
+            NoScanError: it is a little before the one before, or of too many topics.
+        """
+        source = self._sources.get(topic_name)
+        if source is None:
+            if len(self._sources) >= MAX_TOPICS:
+                others = f"there are {len(self._sources)} others already: choose some with --clouds"
+                raise NoScanError("too_many_topics", others)
+            source = self._sources[topic_name] = _Source(source_of_topic(topic_name), stamp_ns)
+        back_ns, source.read_ns = source.read_ns - stamp_ns, max(source.read_ns, stamp_ns)
+        if 0 < back_ns <= RESTART_NS:
+            raise NoScanError("time_backwards", f"{back_ns / 1e9:.3g} s before the scan before")
+        source.read_ns = stamp_ns
+        return back_ns > 0
+
+    def publish(self, topic_name: str, scan: PosedScan, stamp_ns: int, map_frame: str) -> None:
+        """Publish a scan.
+
+        Raises:
+            NoScanError: it is empty.
+            TriquadError: it could not be sent.
+        """
+        if len(scan.points) == 0:
+            raise NoScanError("empty", "no point of it is finite")
+        source = self._sources[topic_name]
+        if stamp_ns < source.sent_ns:
+            self._client.restart_source(source.name)
+        source.sent_ns = stamp_ns
+        self._client.publish_scan(
+            scan.points, scan.world_from_sensor, stamp_ns / 1e9, source=source.name
+        )
+        self.count += 1
+        self.newest = Place(map_frame, scan.world_from_sensor[:3, 3], stamp_ns)
