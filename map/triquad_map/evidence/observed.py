@@ -20,6 +20,8 @@ OBSERVED_VOXEL = np.dtype(
     [
         ("owner", np.int64),  # the block's row in the evidence, and the voxel in the block
         ("mean", np.float32, 3),  # of the ends, voxels, in the voxel
+        ("ends", np.float32),  # rays that ended on the surface that is there now, up to a limit
+        ("first_scan", np.int32),  # of which a ray ended on the surface that is there now
         ("normal", np.float32, 3),  # of the surface; 0 where it is not known or not flat
         ("lowest", np.uint8, 3),  # eighths of the voxel in which any of its rays ended, and
         ("highest", np.uint8, 3),  # the last of these, on each axis
@@ -27,11 +29,9 @@ OBSERVED_VOXEL = np.dtype(
         ("company", np.bool_),  # others of its scan told that a ray ended on a surface there
         ("towards", np.float32, 3),  # from the last end to the sensor, voxels
         ("spread", np.float32, 6),  # covariance of the ends, voxels: xx, xy, xz, yy, yz, zz
-        ("ends", np.float32),  # rays that ended on the surface that is there now, up to a limit
         ("weight", np.float32),  # these rays, the near ones counting more
         ("sectors", np.int32),  # a bit for each eighth of the horizon it was seen from
         ("hits", np.float32),  # scans' worth of rays that ended there, to MOST_SEEN with misses
-        ("first_scan", np.int32),  # of which a ray ended on the surface that is there now
         ("hit_scan", np.int32),  # the last of which a ray ended there
         ("passed_scan", np.int32),  # the last of which a ray may have crossed the surface
         ("missed_since", np.int32),  # the first of these since the last hit
