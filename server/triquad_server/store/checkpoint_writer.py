@@ -198,6 +198,16 @@ class CheckpointWriter:
                     _log.error("%s", self.error)
                 raise
 
+    def keep_newest(self, undoes: str) -> CheckpointInfo:
+        """Let the newest checkpoint stay as one that ``undoes`` something; write it if it is lost.
+
+        Raises:
+            StoreError: it cannot be written, or there is no store.
+        """
+        with self._writing:
+            kept = None if self._store is None else self._store.keep_newest(undoes)
+            return kept or self.write(undoes)
+
     def _keep(self) -> tuple[int | None, str]:
         """Write the map to a checkpoint that stays; return its epoch, and how to go back to it.
 

@@ -83,7 +83,7 @@ class PoseCorrector:
             log = corrected_log(store, correction, onward=request.onward)
             if log.moved == 0:
                 return CorrectPosesReply(newest.epoch, scans_moved=0, scans_learnt=0)
-            kept = self._checkpoints.write("correcting poses").epoch
+            kept = self._checkpoints.keep_newest("correcting poses").epoch
             return self._correct(store, log, followed, kept)
         except (StoreError, FormatError, OSError) as error:
             raise RefusedError("store", f"no pose was corrected: {error}") from error

@@ -141,6 +141,20 @@ class Store:
             check_record(record)
             return self._write(self._manifest(record, regions), undoes)
 
+    def keep_newest(self, undoes: str) -> CheckpointInfo | None:
+        """Let the newest checkpoint stay for longer, as one that ``undoes`` something.
+
+        ``None``: it is not there, or not whole.
+
+        Raises:
+            StoreError: that could not be written; it stays as any other.
+        """
+        newest = self._newest
+        if newest is None or self.base_epoch is None:
+            return None
+        with self._writing(f"epoch {newest.facts.epoch} cannot be kept"):
+            return self._write(newest, undoes)
+
     def forget_base(self, name: str) -> bool:
         """Write all of the map next time, if the newest checkpoint needs the file ``name``."""
         newest = self._newest
