@@ -11,6 +11,7 @@ from triquad_tools.console.command import ToolError, print_remark
 from triquad_tools.recordings.cloud import points_in_range
 from triquad_tools.recordings.folders.cloud_folder import is_cloud_folder, read_cloud_folder
 from triquad_tools.recordings.folders.depth_folder import is_depth_folder, read_depth_folder
+from triquad_tools.recordings.folders.point_file import POINT_SUFFIXES
 from triquad_tools.recordings.folders.scan_folder import ScanFolder
 from triquad_tools.recordings.mcap_bag import find_bag
 from triquad_tools.recordings.recording import ReadingOptions, ScanEntry, options_of
@@ -73,6 +74,8 @@ def open_recording(path: Path, options: ReadingOptions) -> Recording:
     folders = [each for each in path.glob("*") if each.is_dir()]
     within = sorted(each.name for each in folders if any(is_one(each) for is_one in kinds))
     there = "a bag of ROS, an MCAP file, or a folder as docs/tools.md describes them"
+    if path.is_dir():
+        there += f" (with clouds, {', '.join(POINT_SUFFIXES)}, or depth images, .png)"
     if within:
         there = f"one of the recordings in it, {', '.join(within[:_MOST_NAMED])}"
     raise ToolError(f"{path}: no recording that is understood: give {there}")
