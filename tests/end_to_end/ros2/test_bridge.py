@@ -53,15 +53,23 @@ def test_clouds_and_transforms_become_a_map(endpoint: str, way: str, mode: str) 
         assert finds_its_sphere(bridged)
 
 
-def test_rays_that_begin_off_their_frame_are_told(
+def test_rays_that_begin_off_their_frame_are_refused_until_it_is_said_where(
     endpoint: str, caplog: pytest.LogCaptureFixture
 ) -> None:
+    points = np.concatenate([servers.sphere(), 2 * servers.sphere()])
     with bridging(endpoint) as bridged, robot(endpoint) as r2:
         stand(r2, 0, 1)
-        r2.cloud(0.1, np.concatenate([servers.sphere(), 2 * servers.sphere()]))
+        r2.cloud(0.1, points)
+        bridged.wait_for(lambda: bridged.bridge.dropped == {"ray_origin": 1})
+    assert "/points: 1 dropped, ray_origin: 50% of the points lie behind others" in caplog.text
+    assert "--ray-origin TOPIC=X,Y,Z says where the sensor sits" in caplog.text
+    with bridging(endpoint, "--ray-origin", "/points=0,0,0.5") as bridged, robot(endpoint) as r2:
+        stand(r2, 0, 1)
+        r2.cloud(0.1, points)
         bridged.wait_for(lambda: bridged.taken == 1)
-    assert "which the setting ray_origin_m of its source has" in caplog.text
-    assert "/points: 50% of the points lie behind others" in caplog.text
+        newest = bridged.client.sources().sources["points"].newest
+    np.testing.assert_allclose(newest.position_m, (AT[0], AT[1], AT[2] + 1.0), atol=1e-6)
+    assert newest.points_m[:, 2].max() > AT[2] + 0.5 + servers.sphere()[:, 2].max()
 
 
 def test_clouds_wait_for_their_transforms_and_stay_in_order(endpoint: str) -> None:

@@ -135,6 +135,21 @@ def in_millimetres(pose: np.ndarray) -> np.ndarray:
     return np.vstack([pose[:3] * [1, 1, 1, 1000], pose[3]])
 
 
+def test_a_sensor_that_stands_still_has_to_be_said(tmp_path):
+    clouds = [Recorded("/tf_static", TF, 1, ROS2.tf(0, ("map", "lidar", shifted(*UP))))]
+    points = in_frame(seen_from(np.eye(4)), np.linalg.inv(shifted(*UP)))
+    clouds += [Recorded("/points", CLOUD, t, ROS2.cloud(points, t, "lidar")) for t in STAMPS]
+    bag = write_bag(tmp_path / "bag", "mcap", clouds)
+    moving = open_recording(bag, ReadingOptions())
+    assert not moving.entries
+    assert "holds no poses: record /tf" in moving.remarks[-1]
+    assert "that stands still, --transform, and --points-in sensor" in moving.remarks[-1]
+    still = open_recording(bag, ReadingOptions(points_in="sensor"))
+    (scan,) = still.read([3])
+    assert len(still.entries) == len(STAMPS)
+    np.testing.assert_allclose(scan.world_from_sensor, shifted(*UP), atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("said", "units", "told"),
     [
@@ -154,9 +169,9 @@ def test_what_else_than_metres_from_the_sensor_to_the_world_a_folder_may_hold_is
 ) -> None:
     lines = ["# x y z qx qy qz qw"]
     for number in range(len(STAMPS)):
-        points = units * (seen_from(base(number)) - UP)
+        pose = base(number + 1)  # turned from the start
+        points = units * (seen_from(pose) - UP)
         np.pad(points, ((0, 0), (0, 1))).astype(np.float32).tofile(tmp_path / f"{number:06d}.bin")
-        pose = base(number)
         pose[:3, 3] += pose[:3, :3] @ UP
         lines.append(said(pose))
     (tmp_path / "poses.txt").write_text("\n".join(lines))

@@ -110,6 +110,14 @@ def test_lines_of_data_sets_are_read(tmp_path, header, form, separator):
         ("1 0,5 0,0 0 0 0 0 1\n", ":1: 0,5 has a comma for its point: write points"),
         ("1,5 0,0 0,0 0,0 0,0 0,0 0,0 1,0\n", ":1: 1,5 has a comma for its point: write points"),
         ("1 0 0 0 1 0 0 0\n2 0 0 0 0.99 0 0 0.141\n", ":1: .* give --quaternion wxyz or --quat"),
+        (
+            "# t x y z qx qy qz qw\n1 0 0 0 1 0 0 0\n",
+            ":2: .* exactly half a turn.* wxyz if that is",
+        ),
+        (
+            "# t x y z qw qx qy qz\n1 0 0 0 0 0 0 1\n",
+            ":2: .* exactly half a turn.* xyzw if that is",
+        ),
         ("0 0 1\n1 0 0 0\n0 1 0 0\n", "3 lines are not whole poses of Open3D's .log"),
         ("0 0 1\n1 0 0 0\n0 1 0\n0 0 1 0\n0 0 0 1\n", ":1: not 3 numbers and four rows of 4"),
         ("0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 1 1\n", ":1: .* where a pose ends with 0 0 0 1"),
@@ -140,6 +148,21 @@ def test_lines_out_of_order_are_sorted_and_lines_without_a_pose_counted(tmp_path
         "has 4 poses, some with a time that",
     ]
     assert read.remarks[0].endswith("a.tum:3")
+
+
+@pytest.mark.parametrize("apart_s", [0.0, 0.04])
+def test_two_trajectories_in_one_file_are_refused(tmp_path, apart_s):
+    path = tmp_path / "a.tum"
+    places = [(second + other * apart_s, other) for second in range(9) for other in (0, 1)]
+    path.write_text("".join(f"{1000 + t} {t} {0.4 * y} 0 0 0 0 1\n" for t, y in places))
+    with pytest.raises(ToolError, match="jump to and fro, .* times.* those of two trajectories"):
+        read_trajectory(path)
+
+
+def test_half_a_turn_at_the_start_may_be_right(tmp_path):
+    path = tmp_path / "a.tum"
+    path.write_text("# t x y z qx qy qz qw\n1 0 0 0 1 0 0 0\n")
+    assert read_trajectory(path, "xyzw").poses[0].diagonal().tolist() == [1, -1, -1, 1]
 
 
 def test_a_quaternion_with_w_first_can_be_told(tmp_path):

@@ -44,8 +44,12 @@ def test_units_may_be_others_and_millimetres_are_told_from_metres() -> None:
     assert np.allclose(sweep_of_depth(whole, INFO, units_per_metre=4000).points[:, 2], 2)
     floating = ROS.image(np.full((4, 6), 2000.0, np.float32), "32FC1", 7)
     assert np.allclose(sweep_of_depth(floating, INFO, units_per_metre=1000).points[:, 2], 2)
-    with pytest.raises(NoScanError, match=r"half of the depths are more than 500 m.*REP 118"):
+    with pytest.raises(NoScanError, match=r"more than 2000 m.*REP 118.*--units-per-metre 1000"):
         sweep_of_depth(floating, INFO)
+    near = ROS.image(np.full((4, 6), 300.0, np.float32), "32FC1", 7)  # 30 cm, on a table
+    with pytest.raises(NoScanError, match=r"more than 300 m"):
+        sweep_of_depth(near, INFO)
+    assert sweep_of_depth(near, INFO, units_per_metre=1).points[0, 2] == 300, "as it is said"
 
 
 def compressed(pixels: np.ndarray, form: str, header: bytes) -> Any:

@@ -7,7 +7,15 @@ import sys
 from collections.abc import Callable
 from functools import partial
 
-from triquad_tools.console.arguments import add_server, command_parser, count, whole, within
+from triquad_tools.console.arguments import (
+    Place,
+    add_server,
+    command_parser,
+    count,
+    place,
+    whole,
+    within,
+)
 from triquad_tools.console.command import run_work
 from triquad_tools.sensors.ros.type_store import ALL_TF, frame_name
 
@@ -49,6 +57,9 @@ def _add_topics(add: Callable[..., argparse.Action]) -> None:
     ):
         add(f"--{name}", type=_topic, nargs="+", default=[], metavar="TOPIC", help=what)
     add("--depth-stride", type=count, default=2, metavar="N", help="every Nth pixel (default: 2)")
+    begin = "where the rays of clouds begin, metres, in their frame (default: 0,0,0, and checked)"
+    origin = "TOPIC=X,Y,Z"
+    add("--ray-origin", type=_origin, nargs="+", default=[], metavar=origin, help=begin)
     poses = "of odometry, poses, transforms or a path (default: /tf)"
     add("--poses", type=_topic, default=ALL_TF, metavar="TOPIC", help=poses)
     add("--body-frame", type=frame_name, default="base_link", metavar="NAME", help="of these poses")
@@ -78,6 +89,11 @@ def _topic(text: str) -> str:
     if len(text) > 255 or not _TOPIC.fullmatch(text):
         raise argparse.ArgumentTypeError(f"{text!r:.300} is not the name of a topic")
     return text
+
+
+def _origin(text: str) -> tuple[str, Place]:
+    topic, _, origin = text.rpartition("=")
+    return _topic(topic), place(origin)
 
 
 main = partial(run_work, "ros2", parser)

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 
 DEFAULT_MAP = "default"
 PAGE_PORT = 8080  # of the page that shows a map
+Place = tuple[float, float, float]  # metres
+
+_FARTHEST_M = 100.0  # that a sensor sits from the frame of its clouds
 
 
 def command_parser(prog: str, description: str, epilog: str = "") -> argparse.ArgumentParser:
@@ -107,3 +110,14 @@ def connect_to(options: argparse.Namespace, **more: Any) -> "Client":
 def server_name(options: argparse.Namespace) -> str:
     """Return the server that the arguments name, for people."""
     return str(options.connect or options.config or DEFAULT_ENDPOINT)
+
+
+def place(text: str) -> Place:
+    """Return a place such as ``0.9,0,1.8``, metres."""
+    try:
+        x, y, z = (within(-_FARTHEST_M, _FARTHEST_M, number) for number in text.split(","))
+    except (ValueError, argparse.ArgumentTypeError) as error:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}: use X,Y,Z in metres, such as 0.9,0,1.8 ({error})"
+        ) from error
+    return x, y, z

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from triquad_tools.console.arguments import count, not_negative, positive, within
+from triquad_tools.console.arguments import count, not_negative, place, positive
 from triquad_tools.sensors.ros.type_store import frame_name
 
 if TYPE_CHECKING:
@@ -14,9 +14,6 @@ if TYPE_CHECKING:
     from triquad_tools.sensors.motion.transform import Transform
 
 WORLD, SENSOR = "world", "sensor"  # the frames in which points may be
-Place = tuple[float, float, float]  # metres
-
-_FARTHEST_M = 100.0  # that a sensor sits from the frame of its clouds
 
 _Add = Callable[..., argparse.Action]
 
@@ -37,7 +34,7 @@ def _add_choice(add: _Add) -> None:
     nearer = "leave out nearer points: the vehicle's own body (default: 0)"
     add("--range-min", type=not_negative, default=0.0, metavar="M", help=nearer)
     begin = "where rays begin, metres, in the frame of the clouds (default: 0,0,0, and checked)"
-    add("--ray-origin", type=_place, metavar="X,Y,Z", help=begin)
+    add("--ray-origin", type=place, metavar="X,Y,Z", help=begin)
 
 
 def _add_ros(add: _Add) -> None:
@@ -96,16 +93,6 @@ def transform(text: str) -> "Transform":
             f"'base_link lidar 0 0 1.5 0 0 0 1' ({error})"
         ) from error
     return Transform(frame_name(parent), frame_name(child), STATIC, pose)
-
-
-def _place(text: str) -> Place:
-    try:
-        x, y, z = (within(-_FARTHEST_M, _FARTHEST_M, number) for number in text.split(","))
-    except (ValueError, argparse.ArgumentTypeError) as error:
-        raise argparse.ArgumentTypeError(
-            f"{text!r}: use X,Y,Z in metres, such as 0.9,0,1.8 ({error})"
-        ) from error
-    return x, y, z
 
 
 def _columns(text: str) -> tuple[str, ...]:

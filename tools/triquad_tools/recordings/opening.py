@@ -6,20 +6,18 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
-import numpy as np
-from triquad_format.wire.places import moved_pose
-
+from triquad_tools.console.arguments import Place
 from triquad_tools.console.command import ToolError, print_remark
-from triquad_tools.recordings.arguments import Place
 from triquad_tools.recordings.cloud import points_in_range
 from triquad_tools.recordings.folders.cloud_folder import is_cloud_folder, read_cloud_folder
 from triquad_tools.recordings.folders.depth_folder import is_depth_folder, read_depth_folder
+from triquad_tools.recordings.folders.point_file import POINT_SUFFIXES
 from triquad_tools.recordings.folders.scan_folder import ScanFolder
 from triquad_tools.recordings.mcap_bag import find_bag
 from triquad_tools.recordings.recording import ReadingOptions, ScanEntry, options_of
 from triquad_tools.recordings.ros_recording import RosRecording
 from triquad_tools.recordings.scan_log import ScanLogRecording, find_scan_log, read_scan_log
-from triquad_tools.sensors.ray_check import without_repeated
+from triquad_tools.sensors.ray_check import as_rays
 from triquad_tools.sensors.sweep import PosedScan
 
 _UNPACK = {
@@ -76,6 +74,8 @@ def open_recording(path: Path, options: ReadingOptions) -> Recording:
     folders = [each for each in path.glob("*") if each.is_dir()]
     within = sorted(each.name for each in folders if any(is_one(each) for is_one in kinds))
     there = "a bag of ROS, an MCAP file, or a folder as docs/tools.md describes them"
+    if path.is_dir():
+        there += f" (with clouds, {', '.join(POINT_SUFFIXES)}, or depth images, .png)"
     if within:
         there = f"one of the recordings in it, {', '.join(within[:_MOST_NAMED])}"
     raise ToolError(f"{path}: no recording that is understood: give {there}")
@@ -111,11 +111,7 @@ class Selection:
     def scans(self, start: int = 0) -> Iterator[PosedScan]:
         """Yield the scans from number ``start`` on, one after the other."""
         for scan in self.recording.read(self.indices[start:]):
-            points = without_repeated(np.asarray(scan.points, np.float32))
-            seen = PosedScan(points, scan.world_from_sensor, no_return=scan.no_return)
-            if any(self.ray_origin):
-                offset = scan.world_from_sensor[:3, :3] @ self.ray_origin
-                seen = seen.seen_from(moved_pose(scan.world_from_sensor, offset))
+            seen = as_rays(scan, self.ray_origin)
             yield replace(seen, points=points_in_range(seen.points, self.range_min_m))
 
 

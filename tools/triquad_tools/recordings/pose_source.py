@@ -11,6 +11,7 @@ from triquad_client.pose import Pose
 from triquad_format.records.arrays import Doubles
 
 from triquad_tools.console.command import ToolError
+from triquad_tools.recordings.arguments import SENSOR
 from triquad_tools.recordings.recording import ReadingOptions
 from triquad_tools.recordings.ros_content import RosContent, SeenCloud
 from triquad_tools.sensors.motion.frame_graph import ROOT_NAMES
@@ -22,7 +23,7 @@ from triquad_tools.sensors.sweep import NoScanError, NoTransformError, PosedScan
 _SLACK_M, _SLACK_S = 1.0, 2.0  # between the parts of a recording the robot goes on as it was
 _NO_POSES = (
     "it holds no poses: record /tf with /tf_static, or a topic of odometry or poses, together with "
-    "the clouds"
+    "the clouds; of a sensor that stands still, --transform, and --points-in sensor"
 )
 
 
@@ -99,7 +100,9 @@ def choose_poses(
         placed = sum(source.find(cloud) is None for cloud in clouds)
         return placed, source.target in ROOT_NAMES
 
-    return max(moving, key=merit, default=no_poses)
+    # By itself nothing that only static transforms place is a scan; but a sensor may stand still.
+    still = sources if options.points_in == SENSOR else [no_poses]
+    return max(moving or still, key=merit)
 
 
 def _check_body(content: RosContent, sensors: set[str], options: ReadingOptions) -> None:

@@ -43,7 +43,8 @@ _STANDS = (
     "X,Y,Z where the sensor sits on it; --points-in sensor is for a sensor that does stand there"
 )
 _NO_CLOUDS = (
-    "it holds no clouds (PointCloud2, Livox CustomMsg) and no depth images (Image): nothing to map"
+    "it holds no clouds (PointCloud2, Livox CustomMsg) and no depth images (Image of 16UC1, mono16 "
+    "or 32FC1): nothing to map"
 )
 _PACKETS = {
     package: f"packets: play it to {driver}, and record the PointCloud2 that this publishes"

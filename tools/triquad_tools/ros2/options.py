@@ -1,6 +1,6 @@
 """Options of the bridge: which topics are received and as what, and what is published."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
 
@@ -8,6 +8,7 @@ import numpy as np
 from triquad_client import Bounds
 from triquad_format.records.arrays import Doubles
 
+from triquad_tools.console.arguments import Place
 from triquad_tools.ros2.topics import Topic, bridge_key, rmw_key
 from triquad_tools.sensors.ros import type_store as types
 from triquad_tools.sensors.ros.depth_camera import camera_topic
@@ -146,6 +147,7 @@ class BridgeOptions:
 
     topics: TopicChoice
     grid: SliceShape
+    ray_origins: Mapping[str, Place]  # by topic, in the frame of its clouds; others are checked
     depth_stride: int  # every how many rows and columns of a depth image one is taken
     body_frame: str  # whose pose a topic of PoseStamped gives
     map_frame: str  # "": map, odom or world, the first that the transforms have

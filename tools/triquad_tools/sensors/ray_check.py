@@ -7,13 +7,16 @@ behind itself, rooms behind their walls. So do points whose columns are not x, y
 
 import statistics
 from collections import Counter, defaultdict
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.plausibility import median_range_m, wrong_units
+from triquad_format.wire.places import moved_pose
 
-from triquad_tools.sensors.sweep import NoScanError
+from triquad_tools.sensors.sweep import NoScanError, PosedScan
 
 _BIN_RAD = np.radians(0.25)  # side of the cells of direction that are compared: one ray of lidars
 _BEHIND = 1.5  # a point lies behind another in its direction if it is this many times as far
@@ -55,6 +58,16 @@ def without_repeated(points: NDArray[np.floating]) -> NDArray[np.floating]:
         return points
     _, number, counts = np.unique(points[suspects], axis=0, return_inverse=True, return_counts=True)
     return np.delete(points, suspects[counts[number.ravel()] > _REPEATED], axis=0)
+
+
+def as_rays(scan: PosedScan, origin: Sequence[float]) -> PosedScan:
+    """Return a scan without repeated points, whose rays begin at an origin [3] in its frame."""
+    points = without_repeated(np.asarray(scan.points, np.float32))
+    scan = replace(scan, points=points)
+    if not any(origin):
+        return scan
+    pose = scan.world_from_sensor
+    return scan.seen_from(moved_pose(pose, pose[:3, :3] @ origin))
 
 
 class RayCheck:

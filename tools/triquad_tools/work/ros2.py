@@ -119,5 +119,7 @@ def bridge_options(options: argparse.Namespace) -> BridgeOptions:
         depth=tuple(full_name(prefix, name) for name in options.depth),
         poses=None if options.poses.strip("/") == ALL_TF else full_name(prefix, options.poses),
     )
-    others = {field.name for field in fields(BridgeOptions)} - {"topics", "grid"}
-    return BridgeOptions(topics, grid, **{name: getattr(options, name) for name in others})
+    origins = {full_name(prefix, name): place for name, place in options.ray_origin}
+    others = {field.name for field in fields(BridgeOptions)} - {"topics", "grid", "ray_origins"}
+    values = {name: getattr(options, name) for name in others}
+    return BridgeOptions(topics, grid, ray_origins=origins, **values)

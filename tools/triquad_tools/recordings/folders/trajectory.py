@@ -134,6 +134,12 @@ def _timed(found: Trajectory, stamps: Longs) -> Trajectory:
     rows = zip(ordered[known].tolist(), poses[known, :3, 3].tolist(), turns.tolist(), strict=True)
     for stamp, position, turn in rows:
         track.add(stamp, position, turn)
+    count, jump_m = track.jumps()
+    if count:
+        raise ToolError(
+            f"{found.path}: its poses jump to and fro, {count} times, by {jump_m:.2g} m: it has "
+            "those of two trajectories: leave one of them"
+        )
     frames = FrameTree().with_track(WORLD, SENSOR, track)
     return Trajectory(found.path, found.kind, poses, ordered, frames, None, tuple(remarks))
 

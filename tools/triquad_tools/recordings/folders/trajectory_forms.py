@@ -141,6 +141,7 @@ def order_of(form: Form, quaternions: Doubles, lines: Sequence[Line]) -> str:
         ToolError: the quaternions are not in the order of the form, or it has no certain one.
     """
     if form.has_header or not len(quaternions):
+        _check_first(form, quaternions, lines)
         return form.order
     near_0 = np.abs(quaternions).max(axis=0) < _LEVEL
     turns = np.ptp(np.abs(quaternions[:, 0])) > _LEVEL / 2 or np.abs(quaternions[:, 0]).max() > 0.95
@@ -157,6 +158,22 @@ def order_of(form: Form, quaternions: Doubles, lines: Sequence[Line]) -> str:
             "--quaternion wxyz or --quaternion xyzw"
         )
     return order
+
+
+def _check_first(form: Form, quaternions: Doubles, lines: Sequence[Line]) -> None:
+    """Check the order that a header says by the first of quaternions [N, 4].
+
+    Trajectories begin without a turn. Exactly half a turn is that, with w at its other end: no
+    measurement gives it. On a straight drive the points then fit each other as well, upside down.
+    """
+    half_turn = {"xyzw": [1, 0, 0, 0], "wxyz": [0, 0, 0, 1]}[form.order]
+    if len(quaternions) and quaternions[0].tolist() == half_turn:
+        other = "wxyz" if form.order == "xyzw" else "xyzw"
+        raise ToolError(
+            f"{lines[0].place}: begins with exactly half a turn, since {' '.join(form.columns)} is "
+            f"said to be its form: give --quaternion {other} if that is wrong, or --quaternion "
+            f"{form.order} if the sensor does lie so"
+        )
 
 
 def _form_of_header(line: Line, count: int) -> Form | None:

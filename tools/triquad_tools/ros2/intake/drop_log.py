@@ -22,6 +22,10 @@ REMEDIES = {
     "poses differ, use --clock arrival",
     "pose_early": "some at the start are usual; else the clocks differ: use --clock arrival",
     "pose_gap": "poses came too seldom or not at all for a while",
+    "ray_origin": "--ray-origin TOPIC=X,Y,Z says where the sensor sits in it, in metres; 0,0,0 if "
+    "they do begin there, or the setting ray_origin_m of the source says it to the server; of "
+    "clouds that were merged, choose those of each sensor with --clouds",
+    "units": "--ray-origin TOPIC=0,0,0 if they are right",
     "not_received": "the network or the publisher drops them: publish fewer or smaller clouds, or "
     "with RELIABLE delivery",
     "pushed_out": "messages come faster than they are read: choose fewer topics with --clouds",

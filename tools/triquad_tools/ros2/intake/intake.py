@@ -20,7 +20,7 @@ from triquad_tools.ros2.intake.topic_listener import Arrival, Limits, MessageQue
 from triquad_tools.ros2.node import Node
 from triquad_tools.ros2.options import TYPES, BridgeOptions, Role
 from triquad_tools.ros2.topics import SequenceGaps
-from triquad_tools.sensors.ray_check import RayCheck
+from triquad_tools.sensors.ray_check import RayCheck, as_rays
 from triquad_tools.sensors.ros.from_bytes import decode_cdr
 from triquad_tools.sensors.ros.message_reader import MessageReader
 from triquad_tools.sensors.sweep import NoScanError, Sweep
@@ -33,7 +33,7 @@ _SCANS_UNREAD = Limits(16, 256_000_000)
 _OTHERS_UNREAD = Limits(4096, 16_000_000)  # 4 s of transforms at 1 kHz
 _WAITING_BYTES = 512_000_000  # of sweeps that wait for their transforms
 _TICK_S = 0.2
-_SETTING = "which the setting ray_origin_m of its source has to tell the server (docs/server.md)"
+_ORIGIN = 0.0, 0.0, 0.0
 _PATH_POSES = 100  # of a path, whose messages have all of them again and again
 
 
@@ -65,6 +65,7 @@ class Intake:
             lambda gone: self.drops.add(gone.topic_name, "pushed_out", "too many messages wait"),
         )
         self._rays = RayCheck()
+        self._ray_origins = options.ray_origins
         self._gaps = SequenceGaps()
         self._first_scan = FirstScan(options.topics, time.monotonic())
         self._check_s = time.monotonic() + LOG_PERIOD_S  # when the transforms are checked next
@@ -126,11 +127,12 @@ class Intake:
     def _publish(self, placed: Placed) -> None:
         if isinstance(placed.outcome, NoScanError):
             raise placed.outcome
-        if (problem := self._rays.problem(placed.topic_name)) is not None:
-            setting = f", {_SETTING}" if problem.reason == "ray_origin" else ""
-            self.drops.remark(placed.topic_name, f"{problem}{setting}")
-        stamp_ns = placed.sweep.stamp_ns
-        self.scans.publish(placed.topic_name, placed.outcome, stamp_ns, self._placement.map_frame)
+        name, stamp_ns = placed.topic_name, placed.sweep.stamp_ns
+        problem = None if name in self._ray_origins else self._rays.problem(name)
+        if problem is not None:
+            raise problem
+        scan = as_rays(placed.outcome, self._ray_origins.get(name, _ORIGIN))
+        self.scans.publish(name, scan, stamp_ns, self._placement.map_frame)
 
     def _guard(self, topic_name: str, step: Callable[[], None]) -> None:
         """Do something with a message; no bytes may stop the intake."""
@@ -154,8 +156,7 @@ class Intake:
             self._reader.cameras[topic_name] = message
         elif role.brings_scans:
             sweep = self._reader.sweep(topic_name, kind, message, came_ns)
-            if role is Role.CLOUD:
-                self._rays.see(topic_name, sweep.points)
+            self._rays.see(topic_name, sweep.points, is_depth=role is Role.DEPTH)
             self._place(topic_name, sweep)
         else:
             static = role is Role.TF_STATIC

@@ -14,7 +14,7 @@ from triquad_tools.sensors.lens import LensCamera, lens_camera
 from triquad_tools.sensors.ros.type_store import frame_name, stamp_ns
 from triquad_tools.sensors.sweep import NoScanError, Sweep
 
-_FAR_M = 500.0  # half of the pixels of no depth camera are farther
+_FAR_M = 65.5  # as far as depth in millimetres reaches; nearer than 6 cm no camera measures
 _ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 _COMPRESSED_HEADER = struct.Struct("<iff")  # of compressedDepth: format, quantisation A and B
 
@@ -79,11 +79,13 @@ def sweep_of_depth(
         points = depth_points(pixels, camera, stride, units_per_metre)
     except InvalidScanError as error:
         raise NoScanError("depth", str(error)) from error
-    if len(points) and np.nanmedian(points[:, 2]) > _FAR_M:
+    far_m = np.nanmedian(points[:, 2]) if len(points) and units_per_metre is None else 0.0
+    if far_m > _FAR_M:
         raise NoScanError(
-            "units",
-            f"half of the depths are more than {_FAR_M:.0f} m: 32FC1 is in metres, 16UC1 in "
-            "millimetres (REP 118), unless --units-per-metre of a recording says otherwise",
+            "depth_units",
+            f"half of the depths are more than {far_m:.0f} m: 32FC1 is in metres, 16UC1 in "
+            "millimetres (REP 118); of a recording, --units-per-metre 1000 says that they are in "
+            "millimetres, and --units-per-metre 1 that they are right",
         )
     note = f"camera {camera_topic(topic)}"
     if isinstance(camera, LensCamera):
