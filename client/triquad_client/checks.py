@@ -121,7 +121,10 @@ def stamp_ns(stamp_s: float) -> int:
     except NO_NUMBER:
         seconds = math.nan
     if not 0 <= seconds < 2**63 / 1e9:
-        raise InvalidScanError(f"stamp_s = {shown(stamp_s)} is not a time in seconds since 1970")
+        finer = ": are these milliseconds, or nanoseconds?" if 0 < seconds < math.inf else ""
+        raise InvalidScanError(
+            f"stamp_s = {shown(stamp_s)} is not a time in seconds since 1970{finer}"
+        )
     return round(seconds * 1e9)
 
 
@@ -283,8 +286,9 @@ def _points(
     if array.size == 0 and array.ndim == 1:
         array = array.reshape(0, 3)
     if array.ndim != 2 or not 3 <= array.shape[1] <= columns:
-        one = "; a single one is [[x, y, z]]" if array.shape == (3,) else ""
-        raise error(f"{what} are {list(array.shape)}, not [N, 3]{one}")
+        hint = {1: "; a single one is [[x, y, z]]", 2: "; is it transposed?"}.get(array.ndim, "")
+        hint = hint if len(array) == 3 else ""
+        raise error(f"{what} are {list(array.shape)}, not [N, 3]{hint}")
     return array[:, :3].astype(dtype, copy=False)
 
 

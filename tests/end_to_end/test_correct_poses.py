@@ -198,6 +198,8 @@ def test_what_cannot_be_corrected_is_refused_by_name(tmp_path, numbers, source, 
         publish(client, 0, np.eye(4))
         with pytest.raises(error, match=named):
             client.correct_poses(source, *corrections(*numbers))
+        with pytest.raises(RefusedError, match=r"0.000 to 1.000 s, lies amid .* 1000000000.000"):
+            client.correct_poses("roof", [0.0, 1.0], corrections(0, 1)[1])
         assert client.correct_poses("roof", *corrections(0)).scans_moved == 0
 
 

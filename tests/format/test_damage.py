@@ -124,15 +124,16 @@ def test_messages_name_file_fault_and_remedy(
         read(tmp_path / "none.triquad")
 
 
+@pytest.mark.parametrize("has_checksums", [True, False])
 @pytest.mark.parametrize("names", [[], ["other"], ["triquad", "triquad"]])
-def test_other_mcap_files(names: list[str]) -> None:
+def test_other_mcap_files(names: list[str], has_checksums: bool) -> None:
     stream = io.BytesIO()
-    writer = Writer(stream, enable_data_crcs=True)
-    writer.start()
+    writer = Writer(stream, enable_data_crcs=has_checksums, enable_crcs=has_checksums)
+    writer.start("ros2")
     for name in names:
         writer.add_metadata(name, {})
     writer.finish()
-    message = "more than once" if len(names) > 1 else "not a map"
+    message = "more than once" if len(names) > 1 and has_checksums else "not a map"
     for read in (read_bytes, stored):
         with pytest.raises(MapFileError, match=message):
             read(stream.getvalue())

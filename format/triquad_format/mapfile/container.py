@@ -53,6 +53,8 @@ _DATA_END_BYTES = 9 + 4
 _BEGIN = MCAP0_MAGIC + b"\x01\x0f" + bytes(11) + b"\x07\0\0\0triquad"
 """The header of each map file, which names no profile; recordings of triquad name one."""
 
+_NO_MAP = "this is an MCAP file, but not a map: of a recording, triquad-map makes one"
+
 _END_BYTES = 9 + 20 + len(MCAP0_MAGIC)  # of the footer and the closing magic
 _OUT_OF_MEMORY = "not enough memory"
 
@@ -114,6 +116,8 @@ def read_end(source: RandomAccess) -> FileEnd:
         raise DamagedMapFileError(f"its footer names byte {footer.summary_start} as the summary's")
     tail = source.read(data_bytes, size - data_bytes)
     if zlib.crc32(tail[_DATA_END_BYTES : -4 - len(MCAP0_MAGIC)]) != footer.summary_crc:
+        if not is_map(source):  # other writers may leave the checksum out
+            raise MapFileError(_NO_MAP)
         raise DamagedMapFileError("the summary fails its checksum")
     data_end = _first(tail, DataEnd, "the end of the data")
     place = _metadata_place(tail, data_bytes, footer)
@@ -132,7 +136,7 @@ def _metadata_place(tail: bytes, start: int, footer: Footer) -> MetadataIndex:
             group = _records(tail[max(offset.group_start - start, 0) :], "the index of metadata")
             places += [r for r in group if isinstance(r, MetadataIndex) and r.name == METADATA_NAME]
     if not places:
-        raise MapFileError("this is an MCAP file, but not a map: it has no metadata 'triquad'")
+        raise MapFileError(_NO_MAP)
     if len(places) > 1:
         raise DamagedMapFileError("the metadata 'triquad' is there more than once")
     return places[0]

@@ -11,7 +11,7 @@ from triquad_format.scan_log.log_folder import Segment, history, of_map, segment
 from triquad_format.scan_log.reading import Entry, read_segment
 from triquad_format.scan_log.ros_messages import Transform
 from triquad_format.scan_log.segment import LoggedCorrection, LoggedReset, LoggedScan
-from triquad_format.scan_log.tracks import SourceTracks
+from triquad_format.scan_log.tracks import SourceTrack, SourceTracks
 
 from triquad_server.store.store import Store
 
@@ -80,6 +80,7 @@ def corrected_log(store: Store, correction: LoggedCorrection, *, onward: bool) -
     if correction.source not in tracks:
         raise RefusedError("bad_request", _no_source(correction.source, tracks))
     track = tracks[correction.source]
+    _check_times(correction, track)
     correction = _until(int(track.stamps_ns[-1]), correction, onward=onward)
     before = track.poses
     track.correct(correction)
@@ -88,6 +89,19 @@ def corrected_log(store: Store, correction: LoggedCorrection, *, onward: bool) -
     count = sum(stamp_ns in moved for _, stamp_ns in scans)
     log = CorrectedLog(correction, None, files, tracks, count)
     return log if count == 0 else _from(first, files, log, store)
+
+
+def _check_times(correction: LoggedCorrection, track: SourceTrack) -> None:
+    """Raise RefusedError where no pose of a correction lies amid the scans that are kept."""
+    first_ns, last_ns = track.stamps_ns[[0, -1]]
+    stamps_ns = correction.stamps_ns
+    if not ((stamps_ns >= first_ns) & (stamps_ns <= last_ns)).any():
+        raise RefusedError(
+            "bad_request",
+            f"none of the times, {stamps_ns[0] / 1e9:.3f} to {stamps_ns[-1] / 1e9:.3f} s, lies "
+            f"amid the scans of '{correction.source}', {first_ns / 1e9:.3f} to "
+            f"{last_ns / 1e9:.3f} s: give the stamps with which they were published",
+        )
 
 
 def _until(newest_ns: int, correction: LoggedCorrection, *, onward: bool) -> LoggedCorrection:

@@ -213,6 +213,7 @@ def test_input_that_cannot_be_used_is_refused(tmp_path: Path, recording: str, ca
     for arguments, words in (
         ((tmp_path / "nowhere", other), "no such file or folder"),
         ((tmp_path, other), "no recording that is understood"),
+        ((exists, other), "is a map, not a recording: triquad-pack"),
         ((recording, tmp_path / "a.obj2"), "use a name that ends in"),
         ((recording, exists), "give --force to replace it"),
         ((recording, tmp_path / "none" / "a.triquad"), "is not a folder: make it first"),

@@ -70,6 +70,8 @@ def open_recording(path: Path, options: ReadingOptions) -> Recording:
     ends = (command for end, command in _UNPACK.items() if path.name.lower().endswith(end))
     if path.is_file() and (command := next(ends, None)):
         raise ToolError(f"{path}: is packed: unpack it with '{command} {path}' first")
+    if path.suffix == ".triquad":
+        raise ToolError(f"{path}: is a map, not a recording: triquad-pack makes a mesh of it")
     kinds = find_bag, is_depth_folder, is_cloud_folder
     folders = [each for each in path.glob("*") if each.is_dir()]
     within = sorted(each.name for each in folders if any(is_one(each) for is_one in kinds))
