@@ -1,6 +1,7 @@
 """Lies of a server, each with the question that it is the answer to."""
 
 import functools
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -62,6 +63,13 @@ def _within(path: str, **fields: object) -> Callable[[Body], object]:
 def _flush(client: Client, _: Path) -> object:
     client.publish_scan(POINTS, np.eye(4))
     return client.flush(9.0)
+
+
+def _correct(client: Client, _: Path) -> object:
+    stamp_s = time.time()
+    client.publish_scan(POINTS, np.eye(4), stamp_s)
+    client.flush(9.0)
+    return client.correct_poses("default", [stamp_s], [np.eye(4)])
 
 
 def _watch(client: Client, _: Path) -> object:
@@ -127,10 +135,7 @@ def _questions() -> dict[str, tuple[str, Ask]]:
         "flush": (keys.FLUSH, _flush),
         "checkpoint": (keys.CHECKPOINT, lambda client, _: client.checkpoint()),
         "reset": (keys.RESET, lambda client, _: client.reset(NOWHERE)),
-        "correct poses": (
-            keys.CORRECT_POSES,
-            lambda client, _: client.correct_poses("default", [1.0], [np.eye(4)]),
-        ),
+        "correct poses": (keys.CORRECT_POSES, _correct),
         "download": (keys.MAP_INFO, lambda client, path: client.download_map(path)),
         "chunk": (keys.MAP_CHUNK, lambda client, path: client.download_map(path)),
         "copy": (keys.MAP_CHUNK, lambda client, path: client.sync(AROUND, path)),
