@@ -287,7 +287,7 @@ def _points(
         array = array.reshape(0, 3)
     if array.ndim != 2 or not 3 <= array.shape[1] <= columns:
         hint = {1: "; a single one is [[x, y, z]]", 2: "; is it transposed?"}.get(array.ndim, "")
-        hint = hint if len(array) == 3 else ""
+        hint = hint if array.shape[:1] == (3,) else ""
         raise error(f"{what} are {list(array.shape)}, not [N, 3]{hint}")
     return array[:, :3].astype(dtype, copy=False)
 

@@ -42,6 +42,7 @@ def client() -> Iterator[Client]:
         (np.zeros((0, 3)), "no points"),
         (np.zeros((5, 2)), r"\[5, 2\], not \[N, 3\]"),
         (np.zeros(3), r"\[3\], not \[N, 3\]; a single one is \[\[x, y, z\]\]"),
+        (5.0, r"\[\], not \[N, 3\]"),
         (np.zeros((3, 500)), r"\[3, 500\], not .*; is it transposed"),
         (np.zeros((2, 3), complex), "complex128"),
         (np.full((2, 3), "1.5"), r"'1.5' \(<U3\) is not a real number"),
