@@ -58,6 +58,13 @@ class SourceTrack:
         result: Doubles = self.poses[np.searchsorted(self.stamps_ns, stamp_ns)]
         return result
 
+    def covers(self, stamps_ns: Longs) -> Bools:
+        """Return at which times [K] its pose is known."""
+        if len(self.stamps_ns) == 0:
+            return np.zeros(len(stamps_ns), np.bool_)
+        known: Bools = (stamps_ns >= self._stamps_ns[0]) & (stamps_ns <= self._stamps_ns[-1])
+        return known
+
     def correct(self, correction: LoggedCorrection) -> None:
         """Move the poses that a correction is about.
 
@@ -65,7 +72,7 @@ class SourceTrack:
         moves; after the last one, by that one's.
         """
         stamps, before = self.stamps_ns, self.poses
-        known = self._known(correction.stamps_ns)
+        known = self.covers(correction.stamps_ns)
         if not known.any():
             return
         given, better = correction.stamps_ns[known], correction.world_from_sensor[known]
@@ -80,13 +87,6 @@ class SourceTrack:
             pose = self._corrected.apply(np.array([stamp_ns]), pose[None])[0]
         self.add(stamp_ns, pose)
         return pose
-
-    def _known(self, stamps_ns: Longs) -> Bools:
-        """Return at which times [K] its pose is known."""
-        if len(self.stamps_ns) == 0:
-            return np.zeros(len(stamps_ns), np.bool_)
-        known: Bools = (stamps_ns >= self._stamps_ns[0]) & (stamps_ns <= self._stamps_ns[-1])
-        return known
 
     def _put_in_order(self) -> None:
         if not self._new:

@@ -93,14 +93,14 @@ def corrected_log(store: Store, correction: LoggedCorrection, *, onward: bool) -
 
 def _check_times(correction: LoggedCorrection, track: SourceTrack) -> None:
     """Raise RefusedError where no pose of a correction lies amid the scans that are kept."""
-    first_ns, last_ns = track.stamps_ns[[0, -1]]
-    stamps_ns = correction.stamps_ns
-    if not ((stamps_ns >= first_ns) & (stamps_ns <= last_ns)).any():
+    if not track.covers(correction.stamps_ns).any():
+        from_s, to_s = correction.stamps_ns[[0, -1]] / 1e9
+        first_s, last_s = track.stamps_ns[[0, -1]] / 1e9
         raise RefusedError(
             "bad_request",
-            f"none of the times, {stamps_ns[0] / 1e9:.3f} to {stamps_ns[-1] / 1e9:.3f} s, lies "
-            f"amid the scans of '{correction.source}', {first_ns / 1e9:.3f} to "
-            f"{last_ns / 1e9:.3f} s: give the stamps with which they were published",
+            f"none of the times, {from_s:.3f} to {to_s:.3f} s, lies amid the scans of "
+            f"'{correction.source}', {first_s:.3f} to {last_s:.3f} s: give the stamps with which "
+            "they were published",
         )
 
 
@@ -110,11 +110,11 @@ def _until(newest_ns: int, correction: LoggedCorrection, *, onward: bool) -> Log
     Scans that come later find it as it is then: those that it is about move as the newest one.
     """
     known = correction.stamps_ns <= newest_ns
-    return LoggedCorrection(
-        correction.source,
-        correction.stamps_ns[known],
-        correction.world_from_sensor[known],
-        newest_ns if onward else correction.until_ns,
+    return replace(
+        correction,
+        stamps_ns=correction.stamps_ns[known],
+        world_from_sensor=correction.world_from_sensor[known],
+        until_ns=newest_ns if onward else correction.until_ns,
     )
 
 

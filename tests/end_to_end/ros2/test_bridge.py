@@ -53,9 +53,7 @@ def test_clouds_and_transforms_become_a_map(endpoint: str, way: str, mode: str) 
         assert finds_its_sphere(bridged)
 
 
-def test_rays_that_begin_off_their_frame_are_refused_until_it_is_said_where(
-    endpoint: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_rays_from_elsewhere_are_refused(endpoint: str, caplog: pytest.LogCaptureFixture) -> None:
     points = np.concatenate([servers.sphere(), 2 * servers.sphere()])
     with bridging(endpoint) as bridged, robot(endpoint) as r2:
         stand(r2, 0, 1)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from triquad_tools.console.arguments import Place
 from triquad_tools.console.command import ToolError, print_remark
+from triquad_tools.console.suffixes import MAP_SUFFIX
 from triquad_tools.recordings.cloud import points_in_range
 from triquad_tools.recordings.folders.cloud_folder import is_cloud_folder, read_cloud_folder
 from triquad_tools.recordings.folders.depth_folder import is_depth_folder, read_depth_folder
@@ -70,7 +71,7 @@ def open_recording(path: Path, options: ReadingOptions) -> Recording:
     ends = (command for end, command in _UNPACK.items() if path.name.lower().endswith(end))
     if path.is_file() and (command := next(ends, None)):
         raise ToolError(f"{path}: is packed: unpack it with '{command} {path}' first")
-    if path.suffix == ".triquad":
+    if path.suffix == MAP_SUFFIX:
         raise ToolError(f"{path}: is a map, not a recording: triquad-pack makes a mesh of it")
     kinds = find_bag, is_depth_folder, is_cloud_folder
     folders = [each for each in path.glob("*") if each.is_dir()]
