@@ -17,6 +17,9 @@ _FLAT = 0.1
 """The share of an extent, a standard deviation, below which the next smaller one is none: a plane
 has two extents, and no third. Greater: rounder things have normals, and fewer surfaces do."""
 
+UNCLEAR, PLANE, ROUND = range(3)
+"""The shape of points: too few to tell, or on a line; in a plane; in none."""
+
 
 @kernel(inline="always")
 def add_points(m: Doubles, at: tuple[float, float, float], count: float) -> None:
@@ -35,14 +38,15 @@ def add_points(m: Doubles, at: tuple[float, float, float], count: float) -> None
 
 
 @inner_kernel()
-def plane_normal(m: Doubles | tuple[float, ...], normal: Doubles) -> bool:
-    """Return the unit normal, of either sign, of the plane of points with the moments ``m``.
+def fit_plane(m: Doubles | tuple[float, ...], normal: Doubles) -> int:
+    """Return the shape of points with the moments ``m``; a plane's unit normal goes to ``normal``.
 
-    False: they lie in none, and ``normal`` [3] means nothing. The plane holds their mean.
+    It [3] has either sign, and the plane holds the mean of the points. Without a plane, it means
+    nothing.
     """
     n = m[0]
     if n < _MIN_POINTS:
-        return False
+        return UNCLEAR
     mx, my, mz = m[1] / n, m[2] / n, m[3] / n
     xx, xy, xz = m[4] / n - mx * mx, m[5] / n - mx * my, m[6] / n - mx * mz
     yy, yz, zz = m[7] / n - my * my, m[8] / n - my * mz, m[9] / n - mz * mz
@@ -51,7 +55,7 @@ def plane_normal(m: Doubles | tuple[float, ...], normal: Doubles) -> bool:
     off = xy * xy + xz * xz + yz * yz
     spread = np.sqrt(((xx - mean) ** 2 + (yy - mean) ** 2 + (zz - mean) ** 2 + 2 * off) / 6)
     if spread <= 1e-12:
-        return False
+        return UNCLEAR
     a, b, c = (xx - mean) / spread, (yy - mean) / spread, (zz - mean) / spread
     d, e, f = xy / spread, xz / spread, yz / spread
     half_det = (a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e)) / 2
@@ -59,8 +63,10 @@ def plane_normal(m: Doubles | tuple[float, ...], normal: Doubles) -> bool:
     greatest = mean + 2 * spread * np.cos(angle)
     least = mean + 2 * spread * np.cos(angle + 2 * np.pi / 3)
     middle = 3 * mean - greatest - least
-    if least > _FLAT**2 * middle or middle < _FLAT**2 * greatest:
-        return False
+    if middle < _FLAT**2 * greatest:
+        return UNCLEAR
+    if least > _FLAT**2 * middle:
+        return ROUND
     # The eigenvector is orthogonal to the rows of (A - least I): take their longest cross product.
     rows = ((xx - least, xy, xz), (xy, yy - least, yz), (xz, yz, zz - least))
     longest = 0.0
@@ -72,6 +78,6 @@ def plane_normal(m: Doubles | tuple[float, ...], normal: Doubles) -> bool:
             longest = squared
             normal[0], normal[1], normal[2] = x, y, z
     if longest == 0.0:
-        return False
+        return UNCLEAR
     normal /= np.sqrt(longest)
-    return True
+    return PLANE

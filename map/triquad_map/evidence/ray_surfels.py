@@ -4,6 +4,7 @@ import numpy as np
 from triquad_format.records.arrays import Bytes, Doubles, Floats, Longs
 
 from triquad_map.compiled.kernel import inner_kernel, kernel
+from triquad_map.compiled.planes import PLANE
 from triquad_map.evidence.normals import NEAREST, find_normal
 from triquad_map.evidence.observed import Observed, is_flat, row_of
 from triquad_map.evidence.seen_voxels import SeenVoxels
@@ -35,7 +36,10 @@ def _set_normal(
     for axis in range(3):
         normal[axis] = voxel.normal[axis]
     # Others may have ended around since its own was looked for.
-    if not is_flat(voxel) and not find_normal(row, NEAREST, since, seen, observed, normal):
+    is_known = is_flat(voxel)
+    if not is_known:
+        is_known = find_normal(row, NEAREST, since, seen, observed, normal) == PLANE
+    if not is_known:
         length = max(np.sqrt(_product(towards, towards)), 1e-6)
         for axis in range(3):
             normal[axis] = towards[axis] / length
