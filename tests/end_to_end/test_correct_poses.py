@@ -3,34 +3,18 @@
 import logging
 import signal
 import threading
-from functools import cache
 
 import numpy as np
 import pytest
 import triquad_client
-from scipy.spatial import cKDTree
 from support import servers
+from support.maps.drifted import SAME, SCANS, SETTINGS, off, shared, surface, truth
 from support.maps.small_world import world
-from support.poses import shifted
 from triquad_client import InvalidScanError, RefusedError, TriquadError
-from triquad_server.mapping.mapper import Mapper
-from triquad_server.settings import Settings
 from triquad_tools.recordings.opening import open_recording
 from triquad_tools.recordings.recording import ReadingOptions
 
-SCANS = 6
 FIRST_S = 1e9
-SETTINGS = Settings.model_validate(
-    {"field": {"leaf_m": 0.2}, "store": {"log_max_bytes": 10**9, "period_s": 0}}
-)
-SAME = 0.995  # share of voxels that are within one of each other
-
-
-def off(share: float = 1.0) -> np.ndarray:
-    """How far a pose is off, in the sensor's own frame."""
-    pose, angle = shifted(y=0.7 * share), np.radians(3.0 * share)
-    pose[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-    return pose
 
 
 def publish(client, number: int, error: np.ndarray, source: str = "roof", at_s: float = 0.0):
@@ -45,28 +29,6 @@ def corrections(*numbers: int) -> tuple[list[float], list[np.ndarray]]:
     """The true poses of some scans."""
     poses = [world(SCANS).scans[number].world_from_sensor for number in numbers]
     return [FIRST_S + number for number in numbers], poses
-
-
-@cache
-def truth(scans: int = SCANS) -> np.ndarray:
-    """The surface voxels [N, 3] of the drive with its true poses."""
-    mapper = Mapper("truth", SETTINGS, "cpu")
-    for scan in world(SCANS).scans[:scans]:
-        mapper.ingest(scan.points, scan.world_from_sensor, no_return=scan.no_return)
-    with triquad_client.OfflineMap(mapper.publish().record()) as done:
-        return done.surface_voxels()
-
-
-def surface(client, folder) -> np.ndarray:
-    client.download_map(folder / "now.triquad")
-    with triquad_client.open_map(folder / "now.triquad") as found:
-        return found.surface_voxels()
-
-
-def shared(found: np.ndarray, expected: np.ndarray) -> float:
-    """The share of voxels that are within one of the others, the lesser of both ways."""
-    ways = [(found, expected), (expected, found)]
-    return min(float((cKDTree(there).query(here)[0] < 0.21).mean()) for here, there in ways)
 
 
 def test_the_map_is_as_the_corrected_poses_would_have_made_it(tmp_path):
@@ -117,6 +79,17 @@ def test_what_came_before_the_first_scan_that_moves_is_taken_from_a_checkpoint(t
         assert shared(surface(client, tmp_path), truth()) > SAME
         again = client.correct_poses("roof", *corrections(*range(SCANS)))
         assert (again.scans_moved, again.scans_learnt) == (0, 0)
+
+
+def test_a_correction_of_later_scans_keeps_the_one_before(tmp_path):
+    with servers.service_and_client(SETTINGS, tmp_path) as client:
+        for number in range(3):
+            publish(client, number, off())
+        client.correct_poses("roof", *corrections(0, 1, 2))
+        for number in range(3, SCANS):
+            publish(client, number, off() if number == SCANS - 1 else np.eye(4))
+        assert client.correct_poses("roof", *corrections(SCANS - 1)).scans_moved == 1
+        assert shared(surface(client, tmp_path), truth()) > SAME
 
 
 def test_scans_that_come_meanwhile_and_those_of_others_are_in_the_map(tmp_path):

@@ -1,7 +1,9 @@
 """The scans that were kept, with corrected poses, from the first one that moves."""
 
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from triquad_format.errors import RefusedError
@@ -60,6 +62,20 @@ class CorrectedLog:
         return entry
 
 
+class _Kept(NamedTuple):
+    """A scan that was kept."""
+
+    file: int  # its number
+    stamp_ns: int
+
+
+class _Earlier(NamedTuple):
+    """A correction that stands in the log."""
+
+    file: int
+    first_moved: int  # the file with the first scan that it moved
+
+
 def corrected_log(store: Store, correction: LoggedCorrection, *, onward: bool) -> CorrectedLog:
     """Return the log of a store, up to its newest checkpoint, after a correction.
 
@@ -71,24 +87,36 @@ def corrected_log(store: Store, correction: LoggedCorrection, *, onward: bool) -
         OSError: it cannot be read.
     """
     files = history(of_map(segments(store.scans.folder), store.epoch, store.restored))
-    tracks, scans = SourceTracks(), list[tuple[int, int]]()
+    apart_m = store.scans.apart_m
+    tracks, scans = SourceTracks(), defaultdict[str, list[_Kept]](list)
+    earlier = list[_Earlier]()
     for number, segment in enumerate(files):
         for entry in read_segment(segment.path):
-            tracks.take(entry)
-            if isinstance(entry, LoggedScan) and entry.source == correction.source:
-                scans.append((number, entry.stamp_ns))
+            if isinstance(entry, LoggedScan):
+                scans[entry.source].append(_Kept(number, entry.stamp_ns))
+            if isinstance(entry, LoggedCorrection):
+                moved = _move(scans[entry.source], tracks[entry.source], entry, apart_m)
+                earlier += [_Earlier(number, moved[0].file)] if moved else []
+            else:
+                tracks.take(entry)
     if correction.source not in tracks:
         raise RefusedError("bad_request", _no_source(correction.source, tracks))
     track = tracks[correction.source]
     _check_times(correction, track)
     correction = _until(int(track.stamps_ns[-1]), correction, onward=onward)
+    moved = _move(scans[correction.source], track, correction, apart_m)
+    log = CorrectedLog(correction, None, files, tracks, len(moved))
+    return _from(moved[0].file, earlier, log, store) if moved else log
+
+
+def _move(
+    scans: list[_Kept], track: SourceTrack, correction: LoggedCorrection, apart_m: float
+) -> list[_Kept]:
+    """Correct a track; return which of the kept scans moved by more than the tolerance."""
     before = track.poses
     track.correct(correction)
-    moved = set(track.stamps_ns[_moved(before, track.poses, store.scans.apart_m)].tolist())
-    first = next((number for number, stamp_ns in scans if stamp_ns in moved), len(files))
-    count = sum(stamp_ns in moved for _, stamp_ns in scans)
-    log = CorrectedLog(correction, None, files, tracks, count)
-    return log if count == 0 else _from(first, files, log, store)
+    stamps = set(track.stamps_ns[_moved(before, track.poses, apart_m)].tolist())
+    return [scan for scan in scans if scan.stamp_ns in stamps]
 
 
 def _check_times(correction: LoggedCorrection, track: SourceTrack) -> None:
@@ -118,11 +146,17 @@ def _until(newest_ns: int, correction: LoggedCorrection, *, onward: bool) -> Log
     )
 
 
-def _from(first: int, files: list[Segment], log: CorrectedLog, store: Store) -> CorrectedLog:
-    """Return the log from the newest checkpoint on that has nothing of file ``first``."""
+def _from(first: int, earlier: list[_Earlier], log: CorrectedLog, store: Store) -> CorrectedLog:
+    """Return the log from the newest checkpoint on that has nothing of file ``first``.
+
+    Nor may it have scans where they were before a correction that came after it.
+    """
+    files = log.files
     least = 0 if store.restored is None else store.restored.as_epoch
     checkpoints = [one for one in checkpoint_files(store.folder) if one.epoch >= least]
     for number in range(first, -1, -1):
+        if any(one.first_moved < number <= one.file for one in earlier):
+            continue
         since, until = files[number].after, files[number].epoch
         bases = [one for one in checkpoints if since <= one.epoch < until]
         if bases:
