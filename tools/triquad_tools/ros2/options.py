@@ -25,6 +25,7 @@ class Role(Enum):
     TF = "transforms"
     TF_STATIC = "static transforms"
     POSE = "pose"
+    CORRECTION = "corrected path"
 
     @property
     def brings_scans(self) -> bool:
@@ -39,6 +40,7 @@ TYPES: dict[Role, tuple[str, ...]] = {
     Role.TF: (types.TF,),
     Role.TF_STATIC: (types.TF,),
     Role.POSE: types.POSES,
+    Role.CORRECTION: (types.PATH,),
 }
 """The types that messages may have."""
 
@@ -62,6 +64,7 @@ class TopicChoice:
     clouds: tuple[str, ...] = ()  # (): all that there are, or none where there are depth images
     depth: tuple[str, ...] = ()
     poses: str | None = None  # None: from transforms
+    corrections: str | None = None  # a path of poses as they are known by now
 
     @property
     def takes_any_cloud(self) -> bool:
@@ -111,6 +114,8 @@ class TopicChoice:
             Role.CAMERA_INFO: tuple(dict.fromkeys(infos)),
             Role.TF_STATIC: (f"{self.prefix}/tf_static",),
         }
+        if self.corrections is not None:
+            names[Role.CORRECTION] = (self.corrections,)
         if self.poses is None:
             return {**names, Role.TF: (f"{self.prefix}/tf",)}
         return {**names, Role.POSE: (self.poses,)}

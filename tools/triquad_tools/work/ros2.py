@@ -103,7 +103,7 @@ def bridge_options(options: argparse.Namespace) -> BridgeOptions:
     """Return what the arguments ask of the bridge.
 
     Raises:
-        ToolError: the grid would have too many cells.
+        ToolError: the grid would have too many cells, or corrections find no scan.
     """
     grid = SliceShape(options.grid_height_m, options.grid_side_m, options.grid_cell_m)
     if grid.cells**2 > MAX_GRID_CELLS:
@@ -111,12 +111,18 @@ def bridge_options(options: argparse.Namespace) -> BridgeOptions:
             f"a grid of {grid.side_m:g} m has {grid.cells} cells of {grid.cell_m:g} m along each "
             f"side: use at most {int(MAX_GRID_CELLS**0.5)}"
         )
+    if options.corrections and options.clock == "arrival":
+        raise ToolError(
+            "--corrections finds scans by the stamps of their headers, so --clock arrival cannot "
+            "be used with it"
+        )
     prefix = full_name("", options.namespace or "").rstrip("/")
     topics = TopicChoice(
         options.domain,
         prefix,
         clouds=tuple(full_name(prefix, name) for name in options.clouds),
         depth=tuple(full_name(prefix, name) for name in options.depth),
+        corrections=options.corrections and full_name(prefix, options.corrections),
         poses=None if options.poses.strip("/") == ALL_TF else full_name(prefix, options.poses),
     )
     origins = {full_name(prefix, name): place for name, place in options.ray_origin}

@@ -12,7 +12,9 @@ import numpy as np
 import zenoh
 from triquad_client import Client, InvalidScanError
 from triquad_format.errors import TriquadError
+from triquad_format.wire.limits import MAX_KEYFRAMES
 
+from triquad_tools.ros2.intake.corrections import Corrections
 from triquad_tools.ros2.intake.drop_log import LOG_PERIOD_S, DropLog, FirstScan
 from triquad_tools.ros2.intake.placement import Motion, Placed, Placement
 from triquad_tools.ros2.intake.scan_publisher import Place, ScanPublisher
@@ -20,7 +22,6 @@ from triquad_tools.ros2.intake.topic_listener import Arrival, Limits, MessageQue
 from triquad_tools.ros2.node import Node
 from triquad_tools.ros2.options import TYPES, BridgeOptions, Role
 from triquad_tools.ros2.topics import SequenceGaps
-from triquad_tools.sensors.ray_check import RayCheck, as_rays
 from triquad_tools.sensors.ros.from_bytes import decode_cdr
 from triquad_tools.sensors.ros.message_reader import MessageReader
 from triquad_tools.sensors.sweep import NoScanError, Sweep
@@ -28,12 +29,12 @@ from triquad_tools.sensors.sweep import NoScanError, Sweep
 _log = logging.getLogger("triquad_ros2")
 MAX_POINTS = 2_500_000  # of a scan: a message of 30 MB, which servers receive by default
 _OTHER_BYTES = 1_000_000  # of a message of transforms, and of a cloud without its points
+_PATH_BYTES = 120 * MAX_KEYFRAMES  # with names of frames
 _SCAN_BYTES = 64 * MAX_POINTS + _OTHER_BYTES  # drivers write up to 64 bytes for each point
 _SCANS_UNREAD = Limits(16, 256_000_000)
 _OTHERS_UNREAD = Limits(4096, 16_000_000)  # 4 s of transforms at 1 kHz
 _WAITING_BYTES = 512_000_000  # of sweeps that wait for their transforms
 _TICK_S = 0.2
-_ORIGIN = 0.0, 0.0, 0.0
 _PATH_POSES = 100  # of a path, whose messages have all of them again and again
 
 
@@ -47,7 +48,7 @@ class Intake:
         frame = options.map_frame
         self._start = Place(frame, np.zeros(3), stamp_ns=0) if frame else None
         self.drops = DropLog()
-        self.scans = ScanPublisher(client)
+        self.scans = ScanPublisher(client, options.ray_origins)
         self._motion = Motion(from_topic=options.topics.poses is not None, map_frame=frame)
         self._reader = MessageReader(
             stride=options.depth_stride,
@@ -64,11 +65,14 @@ class Intake:
             _OTHERS_UNREAD,
             lambda gone: self.drops.add(gone.topic_name, "pushed_out", "too many messages wait"),
         )
-        self._rays = RayCheck()
-        self._ray_origins = options.ray_origins
         self._gaps = SequenceGaps()
         self._first_scan = FirstScan(options.topics, time.monotonic())
         self._check_s = time.monotonic() + LOG_PERIOD_S  # when the transforms are checked next
+        self._corrections = (
+            Corrections(client, self.drops, self._motion.frames, options.body_frame)
+            if options.topics.corrections
+            else None
+        )
         self._stopping = threading.Event()
         self._listener = TopicListener(session, options.topics, node, self._receive)
         self._thread = threading.Thread(target=self._run, name="ros2-intake")
@@ -95,6 +99,8 @@ class Intake:
         self._stopping.set()
         self._queue.close()
         self._thread.join()
+        if self._corrections is not None:
+            self._corrections.close()
 
     def _receive(self, arrival: Arrival) -> None:
         limit = _OTHER_BYTES
@@ -103,9 +109,13 @@ class Intake:
             if missed := self._gaps.missed(arrival.attachment):
                 text = "their numbers are missing"
                 self.drops.add(arrival.topic_name, "not_received", text, missed)
+        if arrival.role is Role.CORRECTION:
+            limit = _PATH_BYTES
         if len(arrival.payload) > limit:
             text = f"{len(arrival.payload)} bytes exceed {limit}"
             self.drops.add(arrival.topic_name, "too_large", text)
+        elif self._corrections is not None and arrival.role is Role.CORRECTION:
+            self._corrections.receive(arrival.topic_name, arrival.payload)
         else:
             self._queue.put(arrival)
 
@@ -128,11 +138,10 @@ class Intake:
         if isinstance(placed.outcome, NoScanError):
             raise placed.outcome
         name, stamp_ns = placed.topic_name, placed.sweep.stamp_ns
-        problem = None if name in self._ray_origins else self._rays.problem(name)
-        if problem is not None:
-            raise problem
-        scan = as_rays(placed.outcome, self._ray_origins.get(name, _ORIGIN))
-        self.scans.publish(name, scan, stamp_ns, self._placement.map_frame)
+        frame = self._placement.map_frame
+        scan = self.scans.publish(name, placed.outcome, stamp_ns, frame)
+        if self._corrections is not None:
+            self._corrections.published(placed, scan, frame)
 
     def _guard(self, topic_name: str, step: Callable[[], None]) -> None:
         """Do something with a message; no bytes may stop the intake."""
@@ -156,7 +165,7 @@ class Intake:
             self._reader.cameras[topic_name] = message
         elif role.brings_scans:
             sweep = self._reader.sweep(topic_name, kind, message, came_ns)
-            self._rays.see(topic_name, sweep.points, is_depth=role is Role.DEPTH)
+            self.scans.see(topic_name, sweep, is_depth=role is Role.DEPTH)
             self._place(topic_name, sweep)
         else:
             static = role is Role.TF_STATIC

@@ -1,14 +1,18 @@
 """Publishing the scans of topics to the map server."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from triquad_client import Client
 from triquad_format.records.arrays import Doubles
 
+from triquad_tools.console.arguments import Place as Origin
+from triquad_tools.sensors.ray_check import RayCheck, as_rays
 from triquad_tools.sensors.ros.type_store import source_of_topic
-from triquad_tools.sensors.sweep import NoScanError, PosedScan
+from triquad_tools.sensors.sweep import NoScanError, PosedScan, Sweep
 
 MAX_TOPICS = 64  # topics of which scans are made at most
+_NOWHERE_ELSE = 0.0, 0.0, 0.0
 RESTART_NS = 10**9  # stamps that go back by more start again: a wrong one silences for no longer
 
 
@@ -31,10 +35,13 @@ class _Source:
 class ScanPublisher:
     """Publishes scans to the map server, those of a topic in the order of their stamps."""
 
-    def __init__(self, client: Client) -> None:
+    def __init__(self, client: Client, ray_origins: Mapping[str, Origin]) -> None:
+        """``ray_origins`` [3] say by topic where rays begin, in its frame; others are checked."""
         self.newest: Place | None = None  # where the newest scan was taken
         self.count = 0  # scans that were published
         self._client = client
+        self._rays = RayCheck()
+        self._ray_origins = ray_origins
         self._sources: dict[str, _Source] = {}
 
     def time_went_back(self, topic_name: str, stamp_ns: int) -> bool:
@@ -55,13 +62,23 @@ class ScanPublisher:
         source.read_ns = stamp_ns
         return back_ns > 0
 
-    def publish(self, topic_name: str, scan: PosedScan, stamp_ns: int, map_frame: str) -> None:
-        """Publish a scan.
+    def see(self, topic_name: str, sweep: Sweep, *, is_depth: bool) -> None:
+        """Look at the rays of a sweep, of which nothing is published yet."""
+        self._rays.see(topic_name, sweep.points, is_depth=is_depth)
+
+    def publish(
+        self, topic_name: str, placed: PosedScan, stamp_ns: int, map_frame: str
+    ) -> PosedScan:
+        """Publish a scan; return it as it was published, seen from where its rays begin.
 
         Raises:
-            NoScanError: it is empty.
+            NoScanError: it is empty, or its rays begin elsewhere than is said.
             TriquadError: it could not be sent.
         """
+        problem = None if topic_name in self._ray_origins else self._rays.problem(topic_name)
+        if problem is not None:
+            raise problem
+        scan = as_rays(placed, self._ray_origins.get(topic_name, _NOWHERE_ELSE))
         if len(scan.points) == 0:
             raise NoScanError("empty", "no point of it is finite")
         source = self._sources[topic_name]
@@ -73,3 +90,4 @@ class ScanPublisher:
         )
         self.count += 1
         self.newest = Place(map_frame, scan.world_from_sensor[:3, 3], stamp_ns)
+        return scan

@@ -1,0 +1,161 @@
+"""Corrections of poses: the path that a SLAM publishes, which changes where it closes a loop."""
+
+import logging
+import threading
+import time
+from typing import NamedTuple
+
+import numpy as np
+import zenoh
+from triquad_client import Client
+from triquad_format.errors import TriquadError
+from triquad_format.records.arrays import Doubles
+from triquad_format.records.pose import pose_matrices
+from triquad_format.wire.limits import MAX_KEYFRAMES
+
+from triquad_tools.ros2.intake.drop_log import DropLog
+from triquad_tools.ros2.intake.placement import Placed
+from triquad_tools.ros2.intake.source_poses import Poses, SourcePoses
+from triquad_tools.sensors.motion.frame_tree import FrameTree
+from triquad_tools.sensors.ros.from_bytes import decode_cdr
+from triquad_tools.sensors.ros.message_reader import MessageReader
+from triquad_tools.sensors.ros.type_store import PATH, source_of_topic
+from triquad_tools.sensors.sweep import NoScanError, PosedScan
+
+_log = logging.getLogger("triquad_ros2")
+
+_PERIOD_S = 1.0  # between two paths that are read: some are published ten times a second
+_RETRY_S = 30.0  # after an error
+_REFUSED = "not_corrected"
+_LEAVE_S = 1.0  # for a correction to end, once the bridge does; the server goes on with it
+
+
+class _Arrived(NamedTuple):
+    """A path as it arrived, and the newest scan of each source before it."""
+
+    topic_name: str
+    payload: zenoh.ZBytes
+    until_ns: dict[str, int]
+
+
+class Corrections:
+    """Has the server correct the poses of scans where the newest path has others."""
+
+    def __init__(self, client: Client, drops: DropLog, frames: FrameTree, body_frame: str) -> None:
+        """``frames`` tell where ``body_frame`` was, whose poses paths have."""
+        self._client = client
+        self._drops = drops
+        self._frames = frames
+        self._body_frame = body_frame
+        self._reader = MessageReader(body_frame=body_frame, path_poses=MAX_KEYFRAMES)
+        self._lock = threading.Lock()
+        self._sources: dict[str, SourcePoses] = {}
+        self._body_from_sensor: dict[str, Doubles] = {}
+        self._map_frame = ""
+        self._arrived: _Arrived | None = None  # the newest that was not read
+        self._stopping = threading.Event()
+        # It waits for the server for as long as a correction takes.
+        self._thread = threading.Thread(target=self._run, name="ros2-corrections", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Correct nothing more."""
+        self._stopping.set()
+        self._thread.join(_LEAVE_S)
+
+    def published(self, placed: Placed, scan: PosedScan, map_frame: str) -> None:
+        """Take the pose of a sweep that was published as a scan."""
+        stamp_ns = placed.sweep.stamp_ns
+        try:
+            at = np.array([stamp_ns], np.int64)
+            map_from_body = self._frames.poses(map_frame, self._body_frame, at)[0]
+        except NoScanError as error:
+            text = f"its scans cannot be corrected: {error}: --body-frame names that of the path"
+            self._drops.remark(placed.topic_name, text, _REFUSED)
+            return
+        name = source_of_topic(placed.topic_name)
+        with self._lock:
+            source = self._sources.get(name)
+            if source is None or stamp_ns < source.newest_ns:  # it was started again
+                source = self._sources[name] = SourcePoses()
+            source.add(stamp_ns, scan.world_from_sensor)
+            self._body_from_sensor[name] = np.linalg.inv(map_from_body) @ scan.world_from_sensor
+            self._map_frame = map_frame
+
+    def receive(self, topic_name: str, payload: zenoh.ZBytes) -> None:
+        """Take a path; the one before is dropped if it was not read yet."""
+        with self._lock:
+            until_ns = {name: poses.newest_ns for name, poses in self._sources.items()}
+            self._arrived = _Arrived(topic_name, payload, until_ns)
+
+    def _run(self) -> None:
+        pause_s = _PERIOD_S
+        while not self._stopping.wait(pause_s):
+            with self._lock:
+                arrived, self._arrived = self._arrived, None
+            if arrived is None:
+                continue
+            began_s = time.monotonic()
+            try:
+                self._follow(arrived)
+                self._correct()
+                # At most half of the time the server makes its map again.
+                pause_s = max(_PERIOD_S, time.monotonic() - began_s)
+            except Exception as error:  # whatever numbers came
+                told = error if isinstance(error, NoScanError | TriquadError) else repr(error)
+                self._drops.remark(arrived.topic_name, f"no pose was corrected: {told}", _REFUSED)
+                pause_s = _RETRY_S
+                with self._lock:
+                    self._arrived = self._arrived or arrived
+
+    def _follow(self, arrived: _Arrived) -> None:
+        """Want scans where a path has them.
+
+        Raises:
+            NoScanError: it cannot be read, is in another frame than the map, or of other times.
+            InvalidScanError: one of its poses is none.
+        """
+        message = decode_cdr(arrived.payload.to_bytes(), PATH)
+        found = self._reader.transforms(PATH, message, 0)
+        numbers = [each.numbers() for each in found]
+        if not found or not arrived.until_ns:
+            return
+        stamps_ns, first = np.unique([each.stamp_ns for each in found], return_index=True)
+        positions, turns = (np.array(part)[first] for part in zip(*numbers, strict=True))
+        world_from_body = pose_matrices(positions, turns)
+        with self._lock:
+            if found[0].parent != self._map_frame:
+                raise NoScanError(
+                    "other_frame",
+                    f"the path is in {found[0].parent!r}, and the map is made in "
+                    f"{self._map_frame!r}: map in the frame of the path with --map-frame",
+                )
+            known = [
+                self._sources[name].follow(
+                    Poses(stamps_ns, world_from_body @ self._body_from_sensor[name]), until_ns
+                )
+                for name, until_ns in arrived.until_ns.items()
+            ]
+        if not any(known):
+            raise NoScanError(
+                "other_times",
+                f"the path has {stamps_ns[0] / 1e9:.3f} to {stamps_ns[-1] / 1e9:.3f} s, and no "
+                "scan came then: its poses need the stamps of the scans",
+            )
+
+    def _correct(self) -> None:
+        """Have the server correct what is not where it should be.
+
+        Raises:
+            TriquadError: it does not.
+        """
+        with self._lock:
+            found = [(*each, each[1].to_correct()) for each in self._sources.items()]
+        for name, source, poses in found:
+            if poses is None:
+                continue
+            stamps_s = poses.stamps_ns / 1e9
+            reply = self._client.correct_poses(name, stamps_s, poses.world_from_sensor)
+            _log.info("%s: scans moved with the path: %d", name, reply.scans_moved)
+            with self._lock:
+                source.corrected(poses)
