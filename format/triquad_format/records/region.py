@@ -180,6 +180,14 @@ class MapRecord:
         return np.array(self.origin_m)
 
     @property
+    def learnt_percent(self) -> int | None:
+        """How much is learnt of what the scans can teach; ``None``: no training state says it."""
+        states = [region.training for region in self.regions if region.training is not None]
+        left, done = sum(state.budget_samples for state in states), self.progress.samples_trained
+        percent = min(100 * done // (done + left), 99) if left else 100
+        return percent if states else None
+
+    @property
     def has_evidence(self) -> bool:
         """True where rays have shown anything; without evidence all is ``UNKNOWN``."""
         return any(len(region.evidence.codes) for region in self.regions)

@@ -1,5 +1,7 @@
 """A recording in, a map out: no server, and nothing lost by an interruption."""
 
+import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -10,12 +12,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import triquad_server
 from matplotlib.image import imread
 from support import servers
 from support.recordings.bags import drive, messages_for, write_bag
 from support.recordings.kitti_folder import write_folder
 from triquad_client import Status, open_map
 from triquad_format.mapfile.reader import read_map
+from triquad_tools.commands.inspect import main as inspect
 from triquad_tools.commands.map_recording import main
 from triquad_tools.mapfiles.meshfile import read_mesh
 from triquad_tools.mapping.output import write_output
@@ -86,13 +90,16 @@ def test_surface_is_continued_only_where_that_is_marked(
     assert told.endswith("of them filled")
 
 
-def test_the_name_says_what_is_written(tmp_path: Path, whole: Path) -> None:
+def test_the_name_says_what_is_written(tmp_path: Path, whole: Path, capsys) -> None:
     record = read_map(whole)
     for name in ("map.ply", "map.glb"):
         assert "faces" in write_output(record, tmp_path / name, cell_m=0.2, training=False)
         radii = np.linalg.norm(read_mesh(tmp_path / name).vertices, axis=1)
         assert np.median(np.abs(radii - servers.RADIUS_M)) < 0.1
+    capsys.readouterr()
     write_output(record, tmp_path / "map.png", cell_m=0.2, training=False)
+    said = [line for line in capsys.readouterr().err.splitlines() if line.endswith(" ...")]
+    assert said == ["meshing ...", "drawing ..."]
     assert imread(tmp_path / "map.png").std() > 0.02
 
 
@@ -131,8 +138,10 @@ def test_after_ctrl_c_the_same_command_goes_on(
     with mapping(*arguments, *LONG, until="training") as (process, said):
         process.send_signal(signal.SIGINT)
         assert process.wait(servers.WAIT_S) == 130
-    words = "interrupted; the same command goes on where the map was saved last"
-    assert said[-1] == f"triquad-map: {words}\n"
+    words = (
+        "the same command goes on where the map was saved last, and with --train-for 0 it writes"
+    )
+    assert said[-1] == f"triquad-map: interrupted; {words} what is there\n"
     assert not output.exists()
     for other in ((), (*LONG, "--range-min", "0.1")):
         assert main([*arguments, *other]) == 2
@@ -155,6 +164,36 @@ def test_after_a_kill_the_same_command_makes_the_map(
     assert not output.exists()
     assert main(arguments) == 0
     assert_no_scan_is_lost(output, whole)
+
+
+def test_a_first_look_says_how_far_it_is_and_more_is_learnt_from_there(
+    tmp_path: Path, recording: str, whole: Path, capsys
+) -> None:
+    output = tmp_path / "map.triquad"
+    arguments = [recording, str(output), "--settings", SETTINGS]
+    assert main([*arguments, "--train-for", "0"]) == 0
+    learnt = re.search(r"it has learnt (\d+) % of what", capsys.readouterr().out)
+    assert learnt is not None
+    assert 0 < int(learnt[1]) < 100
+    assert_no_scan_is_lost(output, whole)
+    assert inspect([str(output)]) == 0
+    assert f"training has not ended: {learnt[1]} % is learnt" in capsys.readouterr().out
+    store = tmp_path / "store" / "default"
+    store.mkdir(parents=True)
+    shutil.copy(output, store / f"epoch-{read_map(output).epoch:09}.triquad")
+    with (
+        triquad_server.serve(store=tmp_path / "store", settings=SETTINGS) as server,
+        server.client() as client,
+    ):
+        assert (
+            client.settle(servers.WAIT_S).samples_trained
+            > read_map(output).progress.samples_trained
+        )
+    assert main([*arguments, "--force"]) == 0
+    assert f"going on after scan {COUNT}" in capsys.readouterr().out
+    assert error_of(output) < 0.1
+    assert_no_scan_is_lost(output, whole)
+    assert not output.with_name("map.triquad.part").exists()
 
 
 @pytest.mark.long

@@ -6,13 +6,14 @@ from pathlib import Path
 
 from triquad_server.process.installed import DEVICES
 
-from triquad_tools.console.arguments import add_fill, command_parser
+from triquad_tools.console.arguments import add_fill, command_parser, not_negative
 from triquad_tools.console.command import run_work
 from triquad_tools.console.suffixes import SUFFIXES
 from triquad_tools.recordings.arguments import add_recording
 
 COMMAND = "triquad-map"
-_INTERRUPTED = "interrupted; the same command goes on where the map was saved last"
+_INTERRUPTED = "interrupted; the same command goes on where the map was saved last, and with "
+_INTERRUPTED += "--train-for 0 it writes what is there"
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -32,6 +33,9 @@ def _parser() -> argparse.ArgumentParser:
     add("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help=one)
     add_fill(parser)
     add("--device", choices=DEVICES, default="cpu", help="what it trains on (default: cpu)")
+    most = "train at most so long after the last scan, to see soon whether all is right; the same "
+    most += "command without this and with --force goes on from there (default: until settled)"
+    add("--train-for", type=not_negative, metavar="S", help=most)
     add("--training", action="store_true", help="keep what further training needs in the map file")
     add("--force", action="store_true", help="replace OUT where it exists")
     return parser

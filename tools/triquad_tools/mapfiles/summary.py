@@ -65,6 +65,7 @@ class MapSummary:
     free_m3: float
     progress: MapProgress
     training: bool
+    learnt_percent: int | None  # of what the scans can teach; None: there is no training state
     fit: MapFit | None  # to the rays that are held out; None: it holds none
     regions: tuple[RegionSummary, ...]
     parts: dict[str, TopicSummary]
@@ -89,7 +90,8 @@ def summarise(file: MapFile) -> MapSummary:
         surface_m3=sum(region.surface_m3 for region in regions),
         free_m3=sum(region.free_m3 for region in regions),
         progress=record.progress,
-        training=any(region.training is not None for region in record.regions),
+        training=record.learnt_percent is not None,
+        learnt_percent=record.learnt_percent,
         fit=_fit(record),
         regions=regions,
         parts={
@@ -130,7 +132,7 @@ def _facts(summary: MapSummary) -> Iterator[Row]:
     done = summary.progress
     made = f"{done.scans_taken:,} scans, {done.samples_trained:,} training samples"
     yield Row("made of", made)
-    yield Row("training state", "yes" if summary.training else "no")
+    yield Row("training state", _training(summary.learnt_percent))
     fit, missing = summary.fit, "rays among it" if summary.training else "training state"
     judged = f"none to judge the map by, as there is no {missing}"
     if fit is not None:
@@ -138,6 +140,14 @@ def _facts(summary: MapSummary) -> Iterator[Row]:
     yield Row("held-out rays", judged)
     settings = vars(summary.settings).items()
     yield Row("settings", ", ".join(f"{name} {value}" for name, value in settings))
+
+
+def _training(learnt_percent: int | None) -> str:
+    if learnt_percent is None:
+        return "no"
+    if learnt_percent == 100:
+        return "yes, nothing is left to learn"
+    return f"yes, training has not ended: {learnt_percent} % is learnt of what there is to learn"
 
 
 def _evidence(summary: MapSummary | RegionSummary) -> str:

@@ -46,7 +46,7 @@ class UnfinishedMap:
 
 
 def read_unfinished(path: Path, key: str) -> UnfinishedMap:
-    """Return what an interrupted run left in a file; nothing where there is none.
+    """Return what a run left in a file that did not finish; nothing where there is none.
 
     Raises:
         ToolError: it is of another recording or other settings, or is not ours.
@@ -70,7 +70,7 @@ def read_unfinished(path: Path, key: str) -> UnfinishedMap:
 
 @dataclass
 class MappingRun:
-    """Integrates the scans of a recording and trains until nothing is left to learn.
+    """Integrates the scans of a recording and trains on them.
 
     What is done is saved each minute, from where an interrupted map goes on: in a map file whose
     map has the key for a name, and the number of scans that are in it.
@@ -122,13 +122,13 @@ class MappingRun:
                 self.mapper.train()
                 report(self.scans_taken, f"{self.scans_taken} of {total} scans")
 
-    def settle(self) -> None:
-        """Save the map, train until nothing is left to learn, and save it again."""
+    def settle(self, limit_s: float | None) -> None:
+        """Save the map, train until nothing is left to learn or the time is up, save it again."""
         self._save()
         mapper = self.mapper
-        total = mapper.samples_left
+        total, ends_s = mapper.samples_left, time.monotonic() + (limit_s or 0.0)
         with progress("training", total) as report:
-            while not mapper.settled:
+            while not mapper.settled and (limit_s is None or time.monotonic() < ends_s):
                 self._save_now_and_then()
                 mapper.train()
                 left = mapper.samples_left

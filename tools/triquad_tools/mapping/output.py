@@ -130,7 +130,8 @@ def export(
         from triquad_tools.plots.picture import draw_mesh  # slow to import
 
         when = f", {utc_time(source.stamp_ns)}" if source.stamp_ns else ""
-        draw_mesh(f"map {record.name!r}, epoch {record.epoch}{when}", mesh, path)
+        with progress("drawing"):  # half a minute for millions of faces
+            draw_mesh(f"map {record.name!r}, epoch {record.epoch}{when}", mesh, path)
         return f"a picture of {len(mesh.faces):,} faces"
     packed = mesh.file_bytes(path.suffix)
     with replacing(path) as stream:

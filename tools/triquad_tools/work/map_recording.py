@@ -41,19 +41,26 @@ def work(options: argparse.Namespace) -> int:
         mapping = MappingRun(mapper, settings, part, key, taken)
         mapping.take(selection)
         _check_result(mapper, mapping, selection)
-        mapping.settle()  # which saves the map, should the output not be written
+        mapping.settle(options.train_for)  # which saves the map, should the output not be written
         record, cell_m = mapper.snapshot_since(None).record(), settings.mesh.cell_m
         try:
+            training = options.training or not mapper.settled
             written = write_output(
-                record, output, cell_m=cell_m, training=options.training, fill_m=options.fill
+                record, output, cell_m=cell_m, training=training, fill_m=options.fill
             )
         except OSError as error:
             raise StoreError(
                 f"{output} cannot be written: {why(error)}; the map is in {part}: the same "
                 "command writes it once there is room"
             ) from error
-    part.unlink()
     print_line(f"{output}: {written}")
+    if mapper.settled:
+        part.unlink()
+        return OK
+    print_line(
+        f"it has learnt {record.learnt_percent} % of what there is to learn: the same command "
+        "without --train-for and with --force goes on from there"
+    )
     return OK
 
 
