@@ -136,12 +136,12 @@ def click_until(page: Page, place: tuple[int, int], holds: Callable[[], bool], w
 def test_a_map_is_watched_from_its_first_scan(looked: Looked) -> None:
     page, client = looked
     expect(page.get_by_text("default at tcp/")).to_be_visible()
-    expect(page.get_by_text("0 scans; ")).to_be_visible()
+    expect(page.get_by_text("0 scans; nothing to learn yet; epoch 1")).to_be_visible()
     assert drawn_share(page) == 0.0
     expect(page.get_by_text("nothing was seen yet")).to_be_visible()
     publish_sphere(client)
     expect(page.get_by_text("roof: 2 scans, now at 0.0, 0.0, 0.0 m")).to_be_visible()
-    expect(page.get_by_text("2 scans; ")).to_be_visible()
+    expect(page.get_by_text(re.compile(r"2 scans; \d+ % learnt; "))).to_be_visible()
     wait_until_drawn(page)
     wait_until(page, lambda: share_where(page, is_orange) > 5e-4, "the scan is drawn")
     # The camera frames all there is.

@@ -85,7 +85,8 @@ def _state(status: ServerStatus) -> str:
     dropped, lost = sum(status.scans_dropped.values()), sum(status.scans_lost.values())
     counts = {"waiting": status.scans_waiting, "refused": dropped, "lost": lost}
     unusual = "".join(f", {count:,} {what}" for what, count in counts.items() if count)
-    learnt = f"{status.learnt_percent} % learnt"  # one line on a phone, where nothing is unusual
+    # One line on a phone, where nothing is unusual. Of no scan, all is learnt.
+    learnt = f"{status.learnt_percent} % learnt" if status.scans_taken else "nothing to learn yet"
     return f"{status.scans_taken:,} scans{unusual}; {learnt}; epoch {status.epoch}"
 
 

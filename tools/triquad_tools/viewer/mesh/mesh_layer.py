@@ -179,7 +179,8 @@ class MeshLayer(Layer):
         colours = height_colours(points[points[:, 2] <= top_m, 2])
         if self._by.value == _CONFIDENCE:
             colours = confidence_colours(self.page.source.queries)
-        self.tell(colours.scale.html if len(points) else text_html("nothing was seen yet"))
+        empty = "nothing was seen yet" if self._tiles.loaded else "the mesh is on its way"
+        self.tell(colours.scale.html if len(points) else text_html(empty))
         shown = wanted if self._on.value else {}
         for name, tile in shown.items():
             scale = colours.scale
