@@ -14,12 +14,10 @@ from triquad_format.records.cells import same_cells
 
 @dataclass(frozen=True)
 class Triangles:
-    """Triangles of the map frame."""
+    """Triangles, as of a :class:`Mesh`."""
 
-    vertices: NDArray[np.float64]  # [V, 3] metres
-    faces: NDArray[np.int32]  # [F, 3] counter-clockwise seen from free space
-    # [F] whether no ray has met the surface there: it is continued from what was seen, and the
-    # status there is UNKNOWN; None where no holes were to be filled
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int32]
     filled: Bools | None = None
 
     def moved(self, by: Doubles) -> Triangles:

@@ -1,6 +1,7 @@
 """What a person sees of clients, maps and results at a prompt, and does with them."""
 
 import asyncio
+import dataclasses
 import pydoc
 import re
 from pathlib import Path
@@ -22,6 +23,32 @@ BOX = ((-2, -2, 0), (2, 2, 2))
 @pytest.fixture(scope="module")
 def offline() -> OfflineMap:
     return OfflineMap(exact_map(table(0.1, 1.1)))
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        triquad_client.Alignment,
+        triquad_client.Distances,
+        triquad_client.Grid,
+        triquad_client.Ground,
+        Mesh,
+        triquad_client.RayRanges,
+        triquad_client.SdfResult,
+        triquad_client.Segments,
+        triquad_client.Spheres,
+    ],
+)
+def test_help_tells_what_each_field_of_a_result_is(kind: type) -> None:
+    """For arrays that is their shape as well."""
+    told = pydoc.plain(pydoc.render_doc(kind))
+    for field in dataclasses.fields(kind):
+        if field.name == "epoch" or field.name.startswith("_"):
+            continue
+        line = re.search(rf"^ \|      {field.name}: (.+)$", told, re.MULTILINE)
+        assert line is not None, field.name
+        is_array = field.type not in ("float", "int", "bool", "GridShape")
+        assert bool(re.match(r"\[[\w, ]+\] ", line[1])) == is_array, line[1]
 
 
 def test_results_are_told_in_a_line(offline: OfflineMap) -> None:

@@ -23,11 +23,11 @@ class ChangeKind(Enum):
 
 @dataclass(frozen=True)
 class ChangedBox:
-    """A box around voxels in which surface appeared, or vanished. Corners are in the map frame."""
+    """A box, metres, map frame, around voxels in which surface appeared, or vanished."""
 
     kind: ChangeKind
-    minimum: Corner  # metres
-    maximum: Corner  # metres
+    minimum: Corner
+    maximum: Corner
     epoch: int  # of the newest change in it
     voxels: int  # that changed: cubes of the side of a leaf
 

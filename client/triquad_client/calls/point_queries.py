@@ -26,7 +26,12 @@ from triquad_client.net.connection import NEWEST, Answering, retried
 
 @dataclass(frozen=True, repr=False)
 class SdfResult(Answer, FieldAnswer):
-    """The field and the status of N points, all of it from one epoch."""
+    """The field and the status of N points, all of it from one epoch.
+
+    Attributes:
+        sdf: [N] metres, positive in free space; NaN where no region is.
+        status: [N] :class:`Status`.
+    """
 
     epoch: int
 

@@ -25,9 +25,17 @@ _Y_UP = np.array([(1, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0, 0, 0, 1.0)])
 
 @dataclass(frozen=True, repr=False)
 class Mesh(Triangles):
-    """Triangles of the map frame."""
+    """Triangles of the map frame.
 
-    epoch: int = 0  # number of the published state of the map that it shows; 0: of none
+    Attributes:
+        vertices: [V, 3] metres, map frame.
+        faces: [F, 3] rows of vertices, counter-clockwise seen from free space.
+        filled: [F] whether no ray has met the surface there: it is continued from what was seen,
+            and the status there is ``UNKNOWN``; ``None`` where no holes were to be filled.
+        epoch: number of the published state of the map that it shows; 0: of none.
+    """
+
+    epoch: int = 0
 
     def __repr__(self) -> str:
         filled = 0 if self.filled is None else int(self.filled.sum())

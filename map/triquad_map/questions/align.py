@@ -52,15 +52,24 @@ class Alignment:
     found, metres, map frame, and the true rotation is the one found turned by the rotation vector
     ``r``, radians, map frame, about the sensor. Along what the surfaces do not fix (along a
     corridor) the guess is kept and the variance is that of 100 m or half a turn.
+
+    Attributes:
+        world_from_sensor: [4, 4] the pose, map frame.
+        covariance: [6, 6] of translation, rotation, as above.
+        inlier_share: of the points of which the map knows, those on a surface.
+        rms_m: metres: of their distances; 0 where there are none.
+        converged: it came to rest, most points are on surfaces, and these fix all directions.
+        iterations: how many steps it took.
+        points: how many were used, of those given.
     """
 
-    world_from_sensor: Doubles  # [4, 4]
-    covariance: Doubles  # [6, 6] of translation, rotation; see above
-    inlier_share: float  # of the points of which the map knows, those on a surface
-    rms_m: float  # of their distances; 0 where there are none
-    converged: bool  # it came to rest, most points are on surfaces, and these fix all directions
+    world_from_sensor: Doubles
+    covariance: Doubles
+    inlier_share: float
+    rms_m: float
+    converged: bool
     iterations: int
-    points: int  # that were used, of those given
+    points: int
     epoch: int
 
     def __repr__(self) -> str:

@@ -19,7 +19,7 @@ _AXES = "xyz"
 
 
 class Answer:
-    """An answer about N things: a dataclass whose arrays [N, ...] have a row for each.
+    """An answer of one ``epoch`` about N things, whose arrays [N, ...] have a row for each.
 
     ``len(answer)`` is N, and ``answer[i]``, with a number, a slice, numbers or a mask, is the
     answer about these alone.

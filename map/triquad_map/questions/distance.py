@@ -90,16 +90,23 @@ class DistanceOptions:
 
 @dataclass(frozen=True, repr=False)
 class Distances(Answer):
-    """Distances from N points to the nearest seen surface, metres, map frame, of one epoch.
+    """Distances from N points to the nearest seen surface, of one epoch.
 
     What was not asked for raises :class:`NotAskedError`.
+
+    Attributes:
+        distance_m: [N] metres, negative behind a surface; at most ``max_distance_m``.
+        gradient: [N, 3] its unit gradient, map frame, pointing to free space; 0: not found.
+        found: [N] False: no surface within ``max_distance_m``, which ``distance_m`` is then.
+        status: [N] :class:`Status` of the points themselves.
+        confidence: [N] in [0, 1]; 0 where nothing was found or the point is unknown.
     """
 
-    distance_m: Floats  # [N] negative behind a surface; at most max_distance_m
-    gradient: Floats  # [N, 3] its unit gradient, pointing to free space; 0: not found
-    found: Bools  # [N] False: no surface within max_distance_m, distance_m then
-    status: Bytes  # [N] Status of the points themselves
-    confidence: Floats  # [N] in [0, 1]; 0 where nothing was found or the point unknown
+    distance_m: Floats
+    gradient: Floats
+    found: Bools
+    status: Bytes
+    confidence: Floats
     epoch: int
     _surface_point: Doubles | None = None
     _unknown_distance_m: Floats | None = None
@@ -107,17 +114,17 @@ class Distances(Answer):
 
     @property
     def surface_point(self) -> Doubles:
-        """[N, 3] nearest point of the surface; the point itself: not found."""
+        """[N, 3] metres, map frame: nearest point of the surface; the point itself: not found."""
         return asked("surface_point", self._surface_point, "surface_point")
 
     @property
     def unknown_distance_m(self) -> Floats:
-        """[N] distance to unknown space, at most max_distance_m, 0 within it."""
+        """[N] metres: distance to unknown space, at most ``max_distance_m``, 0 within it."""
         return asked("unknown_distance_m", self._unknown_distance_m, "unknown_distance")
 
     @property
     def unknown_point(self) -> Doubles:
-        """[N, 3] nearest point of unknown space, within max_distance_m."""
+        """[N, 3] metres, map frame: nearest point of unknown space, within ``max_distance_m``."""
         return asked("unknown_point", self._unknown_point, "unknown_distance")
 
 

@@ -39,11 +39,17 @@ class GridShape:
 
 @dataclass(frozen=True, repr=False)
 class Grid:
-    """A map at the middles of a grid's cells, of one epoch."""
+    """A map at the middles of a grid's cells, of one epoch.
+
+    Attributes:
+        shape: where they are: ``shape.middles()``, ``shape.counts`` of cells along x, y and z.
+        distance_m: [x, y, z] metres to the nearest surface, at most ``max_distance_m``.
+        status: [x, y, z] :class:`Status`.
+    """
 
     shape: GridShape
-    distance_m: Floats  # [x, y, z] to the nearest surface, at most max_distance_m
-    status: Bytes  # [x, y, z] Status
+    distance_m: Floats
+    status: Bytes
     epoch: int
 
     def __post_init__(self) -> None:

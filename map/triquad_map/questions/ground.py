@@ -26,18 +26,26 @@ _DOWN = np.array([0.0, 0.0, -1.0])
 
 @dataclass(frozen=True, repr=False)
 class Ground(Answer):
-    """The ground below N points, metres, map frame, of one epoch.
+    """The ground below N points, of one epoch.
 
     ``SURFACE``: the first surface below the point, which is its ground. ``FREE``: none as far down
     as asked, and rays have passed through all of that: a hole or an edge. ``UNKNOWN``: some of
     what lies between has not been seen, or the point lies in or behind a surface.
+
+    Attributes:
+        points: [N, 3] metres, map frame: those that were asked about.
+        status: [N] :class:`Status`, as above.
+        height_m: [N] metres, map frame: z of the ground; else down to where all was seen to be
+            free.
+        normal: [N, 3] of the ground, a unit vector to free space, map frame; 0: there is none.
+        confidence: [N] in [0, 1], as of distances; 0: there is none.
     """
 
-    points: Doubles  # [N, 3] that were asked about, metres, map frame
-    status: Bytes  # [N] Status
-    height_m: Doubles  # [N] z of the ground; else down to where all was seen to be free
-    normal: Floats  # [N, 3] of the ground, a unit vector to free space; 0: there is none
-    confidence: Floats  # [N] in [0, 1], as of distances; 0: there is none
+    points: Doubles
+    status: Bytes
+    height_m: Doubles
+    normal: Floats
+    confidence: Floats
     epoch: int
 
     @property

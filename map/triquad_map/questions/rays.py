@@ -26,15 +26,19 @@ _LOOK_AHEAD_M = 3.0
 
 @dataclass(frozen=True, repr=False)
 class RayRanges(Answer):
-    """The ranges of N rays, metres, of one epoch.
+    """The ranges of N rays, of one epoch.
 
     ``SURFACE``: to a seen surface. ``UNKNOWN``: to where unknown space begins. ``FREE``: to the
     largest range, through space that was seen to be free (or, where asked for, unknown).
+
+    Attributes:
+        range_m: [N] metres, along the ray.
+        status: [N] :class:`Status`, as above.
     """
 
     _things: ClassVar[str] = "rays"
-    range_m: Floats  # [N]
-    status: Bytes  # [N] Status
+    range_m: Floats
+    status: Bytes
     epoch: int
 
 

@@ -22,20 +22,29 @@ from triquad_map.view import REACH_VOXELS, MapView
 
 @dataclass(frozen=True, repr=False)
 class Segments(Answer):
-    """The contacts of a ball on N segments, metres, of one epoch.
+    """The contacts of a ball on N segments, of one epoch.
 
-    Places are distances along the segment from its start. ``clearance_m`` is that of the ball's
-    centre, up to where it first touches a surface; it is right within half a step of half a voxel.
+    Places are metres along the segment from its start.
+
+    Attributes:
+        length_m: [N] metres.
+        blocked: [N] whether the ball touches a seen surface.
+        contact_m: [N] place where it first does; the length where it does not.
+        clearance_m: [N] metres: the least distance of the ball's centre to a surface up to there,
+            at most ``max_distance_m``; it is right within half a step of half a voxel.
+        clearance_at_m: [N] place of that.
+        meets_unknown: [N] whether the ball enters unknown space, before any contact.
+        unknown_contact_m: [N] place where it first does; the length where it does not.
     """
 
     _things: ClassVar[str] = "segments"
-    length_m: Floats  # [N]
-    blocked: Bools  # [N] the ball touches a seen surface
-    contact_m: Floats  # [N] where it first does; the length where it does not
-    clearance_m: Floats  # [N] least distance to a surface, at most max_distance_m
-    clearance_at_m: Floats  # [N] where
-    meets_unknown: Bools  # [N] the ball enters unknown space, before any contact
-    unknown_contact_m: Floats  # [N] where it first does; the length where it does not
+    length_m: Floats
+    blocked: Bools
+    contact_m: Floats
+    clearance_m: Floats
+    clearance_at_m: Floats
+    meets_unknown: Bools
+    unknown_contact_m: Floats
     epoch: int
 
     def free(self, unknown: UnknownLike = Unknown.OBSTACLE) -> Bools:
@@ -147,7 +156,9 @@ def _march(
 
 @dataclass(frozen=True)
 class Polyline:
-    """The :class:`Segments` of several one after the other; places are metres from the start."""
+    """The fields of :class:`Segments` for several one after the other; places are metres from the
+    start of the first.
+    """
 
     length_m: float
     blocked: bool

@@ -26,10 +26,13 @@ class Spheres(Answer):
 
     ``SURFACE``: a seen surface reaches into the sphere, or it lies behind one. ``UNKNOWN``: none
     does, but unknown space. ``FREE``: all of it was seen to be free.
+
+    Attributes:
+        status: [N] :class:`Status`, as above.
     """
 
     _things: ClassVar[str] = "spheres"
-    status: Bytes  # [N] Status
+    status: Bytes
     epoch: int
 
     def free(self, unknown: UnknownLike = Unknown.OBSTACLE) -> Bools:
