@@ -17,7 +17,12 @@ from triquad_format.records.status import Status
 from triquad_server.mapping.mapper import Mapper
 from triquad_tools.commands.inspect import main
 from triquad_tools.mapfiles.diff import compare, difference
-from triquad_tools.mapfiles.object_changes import LEAST_POINTS, object_changes
+from triquad_tools.mapfiles.object_changes import (
+    LEAST_POINTS,
+    Cluster,
+    object_changes,
+    print_objects,
+)
 from triquad_tools.simulation.lidar import Lidar, drive
 from triquad_tools.simulation.solids import box
 from triquad_tools.simulation.street import street
@@ -195,6 +200,15 @@ def test_the_table_lists_what_differs(files, capsys):
     assert lines[4].split()[0] == "what"
     kinds = [line.split()[0] for line in lines[5:9]]
     assert kinds == ["vanished", "vanished", "appeared", "appeared"]
+
+
+def test_of_many_clusters_the_largest_of_each_kind_are_listed_and_the_rest_is_counted(capsys):
+    moved = [Cluster((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), points) for points in range(83, 20, -1)]
+    print_objects({"vanished": moved[-2:], "no_longer_known": moved[:6], "moved": moved})
+    titles, *rows, more = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in rows] == ["vanished"] * 2 + ["no"] * 5 + ["moved"] * 5
+    assert [line.split()[1] for line in rows[-5:]] == ["83", "82", "81", "80", "79"]
+    assert more == "  and smaller ones: 1 no longer known, 58 moved; --json prints all"
 
 
 def test_programs_get_all(files, capsys):

@@ -15,7 +15,7 @@ LEAST_POINTS = 20
 """Clusters of fewer surface points are left out: noise makes them, too. These are 0.8 square metres
 of surface in leaves of 0.2 m."""
 
-_LISTED = 20  # clusters, at most
+_LISTED = 5  # clusters of a kind, at most: of two drives dozens of places moved by 2 cm
 
 
 @dataclass(frozen=True)
@@ -46,19 +46,20 @@ def object_changes(comparison: Comparison) -> dict[str, list[Cluster]]:
 
 
 def print_objects(changes: Mapping[str, Sequence[Cluster]]) -> None:
-    """Print a table of the first, and how many there are besides."""
+    """Print a table of the largest of each kind, and how many there are besides."""
     rows = [
         (kind.replace("_", " "), f"{one.points:,}", *_metres(one.middle_m), *_metres(one.size_m))
         for kind, found in changes.items()
-        for one in found
+        for one in found[:_LISTED]
     ]
     if not rows:
         print_line("  nothing appeared, vanished or moved as a whole")
         return
     titles = ("what", "points", "middle x m", "y m", "z m", "size x m", "y m", "z m")
-    print_columns(titles, rows[:_LISTED])
-    if len(rows) > _LISTED:
-        print_line(f"  and {len(rows) - _LISTED} more: --json prints all")
+    print_columns(titles, rows)
+    more = {kind.replace("_", " "): len(found) - _LISTED for kind, found in changes.items()}
+    if smaller := ", ".join(f"{count} {kind}" for kind, count in more.items() if count > 0):
+        print_line(f"  and smaller ones: {smaller}; --json prints all")
 
 
 def _clusters(sighting: Sighting) -> list[Cluster]:
