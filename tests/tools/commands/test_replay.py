@@ -4,6 +4,7 @@ import triquad_client
 from support import servers
 from support.recordings.bags import drive, messages_for, write_bag
 from support.recordings.kitti_folder import write_folder
+from triquad_server.settings.loading import load_settings
 from triquad_tools.commands.replay import due_times, main
 
 ROS2 = messages_for("mcap")
@@ -86,6 +87,17 @@ def test_what_a_recording_holds_is_told_without_a_server(tmp_path, capsys):
     error = capsys.readouterr().err
     assert "it holds no poses" in error
     assert "nothing of it can be mapped as it is" in error
+
+
+def test_the_preset_for_rooms_is_named_where_nearly_all_is_within_its_reach(tmp_path, capsys):
+    reach_m = load_settings(preset="indoor").scan.range_max_m
+    for radius_m, fits in ((reach_m - 0.1, True), (reach_m + 0.1, False)):
+        folder = _folder(tmp_path / f"{fits}", radius_m=radius_m)
+        assert main([str(folder), "--list", "--range-min", "1"]) == 0
+        output = capsys.readouterr().out
+        command = f"to map it: triquad-map {folder} {fits}.triquad --range-min 1"
+        assert output.endswith(f"{command} --preset indoor\n" if fits else f"{command}\n")
+        assert ("95 % of the points are within 12.4 m of the sensor" in output) == fits
 
 
 def test_near_points_are_not_sent(replay, tmp_path, capsys):
