@@ -142,7 +142,7 @@ def connect(
             port 7447 of this machine.
         map: name of the map.
         timeout_s: for connecting and for each request: so long a server is waited for that is not
-            there yet, or still starts; a warning says so.
+            there yet, and one that says what it does to start for ten minutes; a warning says so.
         config: Zenoh configuration file (JSON5), such as one of triquad-keys with credentials.
         max_download_bytes: the largest map file that is fetched from the server, and the most that
             the mesh of a box may take of memory, whatever the server announces.

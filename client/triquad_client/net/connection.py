@@ -209,7 +209,8 @@ class Connection(Answering):
             payload = b"" if reply.err is None else reply.err.payload.to_bytes()
             if payload == b"Timeout":
                 raise RequestTimeoutError(
-                    f"no reply on {self._key(request)} within {self.timeout_s:g} s"
+                    f"no reply on {self._key(request)} within {self.timeout_s:g} s, the timeout_s "
+                    "of connect: the server is busy, or does not answer any more"
                 )
             reason = codec.decode(ErrorReply, payload)
         except WireError as error:

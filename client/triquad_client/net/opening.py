@@ -24,6 +24,7 @@ _log = logging.getLogger("triquad_client")
 _HERE = "127.0.0.1"
 _PAUSE_S = 0.1  # between two attempts
 _TOLD_AFTER_S = 3.0  # most servers are ready by then
+_START_S = 600.0  # that a server may start which says so: it compiles, or opens a large map
 
 _OF_CLIENTS: Mapping[str, Any] = {
     "mode": "client",
@@ -68,21 +69,21 @@ def open_connection(
 
 
 class _Patience:
-    """How long a server that is just being started is waited for."""
+    """The wait for a server that is not there yet, or still starts."""
 
     def __init__(self, timeout_s: float) -> None:
         self.timeout_s = timeout_s
         self._began_s = time.monotonic()
         self._told = ""
 
-    def wait(self, why: str) -> bool:
+    def wait(self, why: str, least_s: float = 0.0) -> bool:
         """Wait a moment, and say ``why`` after a while; return False where it was long enough."""
-        waited_s = time.monotonic() - self._began_s
-        if waited_s >= self.timeout_s:
+        waited_s, longest_s = time.monotonic() - self._began_s, max(self.timeout_s, least_s)
+        if waited_s >= longest_s:
             return False
         if waited_s > _TOLD_AFTER_S and why != self._told:
             self._told = why
-            _log.warning("%s; trying for %g s", why, self.timeout_s)
+            _log.warning("%s; waiting for %g s at most", why, longest_s)
         time.sleep(_PAUSE_S)
         return True
 
@@ -122,7 +123,7 @@ def _wait_for_map(connection: Connection, patience: _Patience) -> None:
         stage = connection.start_stage()
         if stage is not None:
             told = f"the server of map {name!r} is starting: {stage}"
-            if not patience.wait(told):
+            if not patience.wait(told, _START_S):
                 raise ConnectError(f"{told}; connect again, or with a longer timeout_s")
         elif (others := connection.maps()) or not patience.wait(
             f"no server has a map {name!r} yet"
