@@ -15,7 +15,7 @@ from PIL import Image
 from scipy.spatial import cKDTree
 from support import servers
 from support.poses import shifted
-from triquad_server.settings import Settings, TrainingSettings
+from triquad_server.settings import Settings, StoreSettings, TrainingSettings
 from triquad_tools.mapfiles.meshfile import read_mesh
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
 from triquad_tools.simulation.street import street
@@ -224,6 +224,20 @@ def test_a_scan_finds_its_place(ask: Run, tmp_path: Path) -> None:
 def test_a_scan_of_another_place_is_doubted(ask: Run, tmp_path: Path) -> None:
     np.save(tmp_path / "scan.npy", servers.sphere())
     assert "do not use it" in ask("localise.py", "--scan", tmp_path / "scan.npy")
+
+
+def test_poses_that_drift_are_corrected(run: Run, tmp_path: Path) -> None:
+    settings = Settings(
+        store=StoreSettings(log_max_bytes=1_000_000_000), training=SETTINGS.training
+    )
+    with servers.running_service(settings, store=tmp_path) as endpoint:
+        output = run("correct_poses.py", "--connect", endpoint)
+    before_m, after_m = map(float, re.findall(r"the wall is ([\d.]+) m away", output))
+    assert abs(before_m - 2.0) > 0.2
+    assert abs(after_m - 2.0) < 0.05
+    assert re.search(
+        r"^20 scans moved, 21 learnt again; epoch \d+, the map before, is", output, re.M
+    )
 
 
 def test_a_scan_finds_its_place_in_a_file(endpoint: str, ask: Run, tmp_path: Path) -> None:
