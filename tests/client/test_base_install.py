@@ -126,3 +126,40 @@ def test_a_tool_whose_libraries_are_missing_says_what_to_install(
     told = [line for line in done.stderr.splitlines() if not line.startswith(passing)]
     assert len(told) == 1
     assert told[0].endswith(message)
+
+
+CLIENT_ALONE = """
+import sys
+more = "argcomplete cryptography laspy llvmlite PIL prometheus_client pydantic pypcd4 rich rosbags"
+heavy = "foxglove_schemas_protobuf google matplotlib numba scipy skimage torch trimesh viser"
+for name in f"{more} {heavy}".split():
+    sys.modules[name] = None  # as if it were not installed
+command, *sys.argv[1:] = sys.argv[1:]
+from triquad_server.cli import main as server
+from triquad_tools.commands import entry_points
+sys.exit(server() if command == "server" else getattr(entry_points, command)())
+"""
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "told"),
+    [
+        ("demo", (), "numba is missing: install triquad[demo]"),
+        ("evaluate", ("x.ply", "--reference", "x"), "rich is missing: install triquad[tools]"),
+        ("inspect", ("x.triquad",), "rich is missing: install triquad[tools]"),
+        ("keys", ("list", "."), "rich is missing: install triquad[keys]"),
+        ("map_recording", ("x", "x.triquad"), "numba is missing: install triquad[demo]"),
+        ("pack", ("x.triquad", "x.ply"), "rich is missing: install triquad[tools]"),
+        ("replay", ("x", "--list"), "rosbags is missing: install triquad[tools]"),
+        ("ros2", (), "rosbags is missing: install triquad[ros]"),
+        ("server", (), "numba and pydantic are missing: install triquad[server]"),
+        ("top", (), "rich is missing: install triquad[tools]"),
+        ("view", (), "viser is missing: install triquad[viewer]"),
+    ],
+)
+def test_with_the_client_alone_each_command_says_what_to_install(command, arguments, told):
+    line = [sys.executable, "-c", CLIENT_ALONE, command, *arguments]
+    done = subprocess.run(line, capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (2, "")
+    (said,) = done.stderr.splitlines()
+    assert said.endswith(told)

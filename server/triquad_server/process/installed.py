@@ -16,7 +16,8 @@ def require_libraries() -> None:
     """
     missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
     if missing:
-        raise ServerError(f"{', '.join(missing)} is missing: install triquad[server]")
+        verb = "is" if len(missing) == 1 else "are"
+        raise ServerError(f"{' and '.join(missing)} {verb} missing: install triquad[server]")
 
 
 def check_device(device: str) -> None:
