@@ -37,7 +37,8 @@ def scan(number: int) -> NDArray[np.float64]:
     rays = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1)
     at, rays = true_pose(number)[:3, 3], rays.reshape(-1, 3)
     ranges = (np.where(rays > 0, HALL_M, 0.0) - at) / rays
-    return ranges.min(axis=1, keepdims=True) * rays
+    points: NDArray[np.float64] = ranges.min(axis=1, keepdims=True) * rays
+    return points
 
 
 def tell(client: triquad_client.Client, when: str) -> None:
