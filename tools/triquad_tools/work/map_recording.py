@@ -59,7 +59,7 @@ def work(options: argparse.Namespace) -> int:
         return OK
     print_line(
         f"it has learnt {record.learnt_percent} % of what there is to learn: the same command "
-        "without --train-for and with --force goes on from there"
+        f"without --train-for and with --force goes on, from {part}"
     )
     return OK
 
