@@ -190,7 +190,7 @@ def connect_async(
     endpoint: str | None = None,
     map: str = "default",  # noqa: A002 - the word of the command line and of the documentation
     *,
-    timeout_s: float = 10.0,
+    timeout_s: float | None = None,
     config: str | Path | None = None,
     max_download_bytes: int = MAX_DOWNLOAD_BYTES,
     coordinates: str = "map",

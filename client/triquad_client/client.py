@@ -129,7 +129,7 @@ def connect(
     endpoint: str | None = None,
     map: str = "default",  # noqa: A002 - the word of the command line and of the documentation
     *,
-    timeout_s: float = 10.0,
+    timeout_s: float | None = None,
     config: str | Path | None = None,
     max_download_bytes: int = MAX_DOWNLOAD_BYTES,
     coordinates: str = "map",
@@ -141,8 +141,9 @@ def connect(
             ``robot:7447``, or an endpoint of Zenoh; ``None``: where ``config`` says, and otherwise
             port 7447 of this machine.
         map: name of the map.
-        timeout_s: for connecting and for each request: so long a server is waited for that is not
-            there yet, and one that says what it does to start for ten minutes; a warning says so.
+        timeout_s: for connecting and for each request, by default ten seconds: so long a server is
+            waited for that is not there yet; a warning says so. By default, one that says what it
+            does to start is waited for ten minutes.
         config: Zenoh configuration file (JSON5), such as one of triquad-keys with credentials.
         max_download_bytes: the largest map file that is fetched from the server, and the most that
             the mesh of a box may take of memory, whatever the server announces.

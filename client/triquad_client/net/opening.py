@@ -24,7 +24,8 @@ _log = logging.getLogger("triquad_client")
 _HERE = "127.0.0.1"
 _PAUSE_S = 0.1  # between two attempts
 _TOLD_AFTER_S = 3.0  # most servers are ready by then
-_START_S = 600.0  # that a server may start which says so: it compiles, or opens a large map
+_USUAL_S = 10.0
+_START_S = 600.0  # for a server that says that it starts: it compiles, or opens a large map
 
 _OF_CLIENTS: Mapping[str, Any] = {
     "mode": "client",
@@ -37,14 +38,16 @@ _OF_CLIENTS: Mapping[str, Any] = {
 def open_connection(
     endpoint: str | None,
     map_name: str,
-    timeout_s: float,
+    timeout_s: float | None,
     config: str | Path | None,
     *,
     max_download_bytes: int,
     coordinates: str,
 ) -> Connection:
     """Return a connection to a server; arguments and errors as of ``triquad_client.connect``."""
-    timeout_s = checks.within("timeout_s", timeout_s, checks.LONGEST_S, least=checks.SHORTEST_S)
+    start_s = _START_S if timeout_s is None else 0.0
+    given_s = _USUAL_S if timeout_s is None else timeout_s
+    timeout_s = checks.within("timeout_s", given_s, checks.LONGEST_S, least=checks.SHORTEST_S)
     most = checks.count("max_download_bytes", max_download_bytes, MAX_COUNT)
     local = checks.are_local(coordinates)
     where = f"with {config}" if endpoint is None and config else f"to {endpoint or _HERE}"
@@ -61,7 +64,7 @@ def open_connection(
         session, map_name, timeout_s, max_download_bytes=most, local=local, where=where
     )
     try:
-        _wait_for_map(connection, patience)
+        _wait_for_map(connection, patience, start_s)
     except BaseException:
         connection.close()
         raise
@@ -110,8 +113,8 @@ def _open(configured: zenoh.Config, where: str, patience: _Patience) -> zenoh.Se
             raise ConnectError(told + remedy) from error
 
 
-def _wait_for_map(connection: Connection, patience: _Patience) -> None:
-    """Return once the server of the map is there and ready.
+def _wait_for_map(connection: Connection, patience: _Patience, start_s: float) -> None:
+    """Return once the server of the map is there and ready; it may take ``start_s`` to start.
 
     Raises:
         UnknownMapError: there is none.
@@ -123,7 +126,7 @@ def _wait_for_map(connection: Connection, patience: _Patience) -> None:
         stage = connection.start_stage()
         if stage is not None:
             told = f"the server of map {name!r} is starting: {stage}"
-            if not patience.wait(told, _START_S):
+            if not patience.wait(told, start_s):
                 raise ConnectError(f"{told}; connect again, or with a longer timeout_s")
         elif (others := connection.maps()) or not patience.wait(
             f"no server has a map {name!r} yet"

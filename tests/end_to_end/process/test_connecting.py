@@ -64,13 +64,12 @@ def test_a_client_of_a_starting_server_waits_and_is_told_what_it_does(
     monkeypatch.setattr(opening, "_TOLD_AFTER_S", -1.0)
     endpoint, let = servers.free_endpoint(), Event()
     with held_start(endpoint, let), ThreadPoolExecutor(1) as pool:
-        with monkeypatch.context() as briefly:
-            briefly.setattr(opening, "_START_S", 0.0)
-            told = f"map 'default' is starting: {STAGE}; connect again"
-            with pytest.raises(ConnectError, match=told):
-                triquad_client.connect(endpoint, timeout_s=0.3)
+        told = f"map 'default' is starting: {STAGE}; connect again"
+        with pytest.raises(ConnectError, match=told):
+            triquad_client.connect(endpoint, timeout_s=0.3)
         caplog.clear()
-        patient = pool.submit(triquad_client.connect, endpoint, timeout_s=0.3)
+        monkeypatch.setattr(opening, "_USUAL_S", 0.3)
+        patient = pool.submit(triquad_client.connect, endpoint)
         servers.until(lambda: f"is starting: {STAGE}; waiting for 600 s" in caplog.text)
         # Longer than a server is waited for that is not there.
         assert wait([patient], timeout=1.0).not_done
