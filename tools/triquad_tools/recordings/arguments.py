@@ -33,6 +33,9 @@ def _add_choice(add: _Add) -> None:
     add("--every", type=count, default=1, metavar="N", help="take every Nth scan of each sensor")
     nearer = "leave out nearer points: the vehicle's own body (default: 0)"
     add("--range-min", type=not_negative, default=0.0, metavar="M", help=nearer)
+    poses = "of the sensor (default: a file with a usual name; those of a bag)"
+    add("--trajectory", type=Path, metavar="FILE", help=poses)
+    add("--odometry", action="store_true", help="find the poses of a lidar by its clouds alone")
     begin = "where rays begin, metres, in the frame of the clouds (default: 0,0,0, and checked)"
     add("--ray-origin", type=place, metavar="X,Y,Z", help=begin)
 
@@ -59,7 +62,6 @@ def _add_ros(add: _Add) -> None:
 
 
 def _add_folder(add: _Add) -> None:
-    add("--trajectory", type=Path, metavar="FILE", help="of poses (default: one with a usual name)")
     order = "order of its quaternions (default: as its header or form has it)"
     add("--quaternion", choices=("xyzw", "wxyz"), help=order)
     frame = "frame of the points of clouds (default: sensor, and checked)"

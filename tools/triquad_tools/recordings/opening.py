@@ -40,10 +40,12 @@ _FLAGS = {"transforms": "--transform", "deskew": "--no-deskew"}
 
 _OF_BAGS = {
     "topics", "poses", "map_frame", "body_frame", "transforms", "recorder_clock", "stride",
-    "points_in", "ray_origin", "deskew", "units_per_metre",
+    "points_in", "ray_origin", "deskew", "units_per_metre", "trajectory", "quaternion", "odometry",
 }  # fmt: skip
 _OF_DEPTH = {"trajectory", "quaternion", "intrinsics", "units_per_metre", "stride"}
-_OF_CLOUDS = {"trajectory", "quaternion", "points_in", "columns", "ray_origin", "deskew"}
+_OF_CLOUDS = {
+    "trajectory", "odometry", "quaternion", "points_in", "columns", "ray_origin", "deskew",
+}  # fmt: skip
 """The choices that mean something for each kind of recording."""
 
 
@@ -55,6 +57,8 @@ def open_recording(path: Path, options: ReadingOptions) -> Recording:
     """
     if not path.exists():
         raise ToolError(f"{path}: no such file or folder")
+    if options.odometry and (options.trajectory or options.poses):
+        raise ToolError("--odometry finds the poses, so --trajectory and --poses mean nothing")
     if (log := find_scan_log(path)) is not None:
         _refuse_others(f"{path} has the scans of a map", set(), options)
         return read_scan_log(log)

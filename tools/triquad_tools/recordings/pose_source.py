@@ -12,6 +12,7 @@ from triquad_format.records.arrays import Doubles
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.arguments import SENSOR
+from triquad_tools.recordings.folders.trajectory import Trajectory
 from triquad_tools.recordings.recording import ReadingOptions
 from triquad_tools.recordings.ros_content import RosContent, SeenCloud
 from triquad_tools.sensors.motion.frame_graph import ROOT_NAMES
@@ -23,7 +24,8 @@ from triquad_tools.sensors.sweep import NoScanError, NoTransformError, PosedScan
 _SLACK_M, _SLACK_S = 1.0, 2.0  # between the parts of a recording the robot goes on as it was
 _NO_POSES = (
     "it holds no poses: record /tf with /tf_static, or a topic of odometry or poses, together with "
-    "the clouds; of a sensor that stands still, --transform, and --points-in sensor"
+    "the clouds, or give --trajectory, or find those of a lidar by --odometry; of a sensor that "
+    "stands still, --transform, and --points-in sensor"
 )
 
 
@@ -36,6 +38,7 @@ class PoseSource:
     target: str
     body: str  # the frame whose poses they are, or one that hangs on it
     assumed: bool = False  # nothing says that they are its poses
+    remarks: tuple[str, ...] = ()
 
     def moves(self, frame: str) -> bool:
         """Return whether a frame moves in the one to map in."""
@@ -103,6 +106,27 @@ def choose_poses(
     # By itself nothing that only static transforms place is a scan; but a sensor may stand still.
     still = sources if options.points_in == SENSOR else [no_poses]
     return max(moving or still, key=merit)
+
+
+def poses_of_trajectory(
+    content: RosContent, clouds: Sequence[SeenCloud], found: Trajectory, options: ReadingOptions
+) -> PoseSource:
+    """Return the poses of a trajectory: of the body frame that is given, or else of the clouds.
+
+    Raises:
+        ToolError: it has no times.
+    """
+    if found.frames is None:
+        raise ToolError(f"{found.path}: has no times, by which a bag's clouds find their poses")
+    for transform in options.transforms:
+        content.frames.add(transform)
+    sensors = {cloud.frame for cloud in clouds}
+    _check_body(content, sensors, options)
+    body, target = options.body_frame or min(sensors), options.map_frame or ROOT_NAMES[0]
+    known = found.frames.edge(SENSOR)
+    assert known is not None
+    frames = content.frames.with_track(target, body, known.track)
+    return PoseSource(str(found.path), frames, target, body, remarks=found.remarks)
 
 
 def _check_body(content: RosContent, sensors: set[str], options: ReadingOptions) -> None:

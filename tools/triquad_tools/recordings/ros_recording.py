@@ -9,7 +9,15 @@ import numpy as np
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.arguments import SENSOR, WORLD
 from triquad_tools.recordings.bag import Bag, Message
-from triquad_tools.recordings.pose_source import check_places, check_times, choose_poses
+from triquad_tools.recordings.folders.trajectory import read_trajectory
+from triquad_tools.recordings.odometry import find_trajectory
+from triquad_tools.recordings.pose_source import (
+    PoseSource,
+    check_places,
+    check_times,
+    choose_poses,
+    poses_of_trajectory,
+)
 from triquad_tools.recordings.recording import ReadingOptions, ScanEntry, Stream, with_remedies
 from triquad_tools.recordings.ros_content import RosContent, SeenCloud
 from triquad_tools.sensors.motion.frame_graph import ROOT_NAMES
@@ -18,7 +26,7 @@ from triquad_tools.sensors.ros import type_store
 from triquad_tools.sensors.ros.depth_camera import raw_topic
 from triquad_tools.sensors.ros.message_reader import MessageReader
 from triquad_tools.sensors.ros.type_store import ALL_TF, TRANSFORMS, source_of_topic
-from triquad_tools.sensors.sweep import NoScanError, PosedScan
+from triquad_tools.sensors.sweep import NoScanError, PosedScan, Sweep
 
 _CLOCKS = (
     "no cloud's stamp lies within the times of the poses: where they are of another clock, "
@@ -79,7 +87,7 @@ class RosRecording:
         clouds = [cloud for cloud in self._content.clouds if cloud.topic in self._topics]
         good = [cloud for cloud in clouds if cloud.problem is None]
         check_times(good)
-        self._poses = choose_poses(self._content, good, options)
+        self._poses = self._choose_poses(good)
         self._placed: list[SeenCloud] = []
         self._left_out: dict[tuple[str, str], list[SeenCloud]] = defaultdict(list)
         self._place(clouds)
@@ -112,6 +120,7 @@ class RosRecording:
             for topic, texts in found.broken.items()
         ]
         poses = self._poses
+        lines += poses.remarks
         lines += [_ASSUMED.format(topic=poses.name, body=poses.body)] if poses.assumed else []
         sensors = dict.fromkeys(cloud.frame for cloud in self._placed)
         corrected = (poses.frames.corrections(poses.target, frame) for frame in sensors)
@@ -139,6 +148,31 @@ class RosRecording:
                 f"{self._bag.path}: {len(wanted)} scans are no longer there; has it changed since "
                 "it was looked through?"
             )
+
+    def _choose_poses(self, clouds: Sequence[SeenCloud]) -> PoseSource:
+        options = self._options
+        if not clouds or not (options.odometry or options.trajectory):
+            return choose_poses(self._content, clouds, options)
+        if options.trajectory is not None:
+            found = read_trajectory(options.trajectory, options.quaternion)
+        else:
+            found = find_trajectory(self._sweeps(clouds), len(clouds))
+        return poses_of_trajectory(self._content, clouds, found, options)
+
+    def _sweeps(self, clouds: Sequence[SeenCloud]) -> Iterator[Sweep]:
+        """Yield the sweeps of clouds, which have to be those of one lidar."""
+        topics = sorted({cloud.topic for cloud in clouds})
+        if len(topics) > 1 or self._content.kinds[topics[0]] in type_store.IMAGES:
+            raise ToolError(
+                f"--odometry takes the clouds of one lidar, and there is {', '.join(topics)}: "
+                "choose a topic of clouds with --topics"
+            )
+        wanted = {cloud.number for cloud in clouds}
+        messages = self._bag.messages(lambda channel: channel.topic == topics[0])
+        for number, message in enumerate(messages):
+            if number in wanted:
+                kind, decoded = message.channel.kind, message.decoded()
+                yield self._reader.sweep(topics[0], kind, decoded, message.recorded_ns)
 
     def _read(self, message: Message) -> PosedScan:
         topic, kind = message.channel.topic, message.channel.kind

@@ -1,12 +1,10 @@
 """``triquad-replay``: publish a recording to a map server, or tell what it holds."""
 
 import argparse
-import math
 import shlex
 import time
 from pathlib import Path
 
-import numpy as np
 from triquad_client import FlushReport
 from triquad_format.records.arrays import Doubles
 
@@ -14,13 +12,8 @@ from triquad_tools.console.arguments import connect_to
 from triquad_tools.console.command import FAILED, OK, print_line
 from triquad_tools.console.progress import progress
 from triquad_tools.console.report import print_columns
-from triquad_tools.recordings.opening import (
-    Recording,
-    entries_of,
-    length_s,
-    open_recording,
-    open_selected,
-)
+from triquad_tools.recordings.cloud import reach_m
+from triquad_tools.recordings.opening import entries_of, length_s, open_recording, open_selected
 from triquad_tools.recordings.publishing import FLUSH_TIMEOUT_S, publish_all, wait_until_settled
 from triquad_tools.recordings.recording import ScanEntry, options_of
 
@@ -47,7 +40,8 @@ def _list(options: argparse.Namespace) -> int:
     seconds = length_s(entries)
     rate = f", {(len(entries) - 1) / seconds:.1f} a second" if seconds > 0 else ""
     print_line(f"{len(entries):,} scans in {seconds:.1f} s{rate}")
-    near_m = _near_m(recording)
+    some = range(0, len(entries), len(entries) // _SOME + 1)
+    near_m = reach_m([scan.points for scan in recording.read(some)])
     fits = ["--preset", "indoor"] if near_m < _INDOOR_REACH_M else []
     if fits:
         told = "for rooms, as 95 % of the points are within"
@@ -57,17 +51,6 @@ def _list(options: argparse.Namespace) -> int:
     words = [*words[:at], f"{path.resolve().stem}.triquad", *words[at:], *fits]
     print_line(f"to map it: triquad-map {shlex.join(words)}")
     return OK
-
-
-def _near_m(recording: Recording) -> float:
-    """Return within how many metres of the sensor 95 % of the points of some scans are.
-
-    In simulated rooms that is 2 to 5 m, on streets with 16 to 128 beams 20 to 66. What lies on a
-    table is not told from a room, which is seen behind it, nor a fast road from a street.
-    """
-    scans = recording.read(range(0, len(recording.entries), len(recording.entries) // _SOME + 1))
-    ranges = [np.linalg.norm(scan.points, axis=1) for scan in scans]
-    return float(np.quantile(np.concatenate(ranges), 0.95)) if any(map(len, ranges)) else math.inf
 
 
 def _replay(options: argparse.Namespace) -> int:

@@ -19,7 +19,8 @@ from triquad_tools.recordings.folders.scan_folder import (
     checked,
     place_files,
 )
-from triquad_tools.recordings.folders.trajectory import Trajectory
+from triquad_tools.recordings.folders.trajectory import DEFAULT_PERIOD_NS, Trajectory
+from triquad_tools.recordings.odometry import find_trajectory
 from triquad_tools.recordings.recording import ReadingOptions, Stream
 from triquad_tools.recordings.text_lines import parse_number, parse_stamps, read_lines, rigid
 from triquad_tools.sensors.motion.placing import place
@@ -48,8 +49,18 @@ def read_cloud_folder(folder: Path, options: ReadingOptions | None = None) -> Sc
     first, above = paths[0], paths[0].parent.parent
     if first.suffix.lower() == ".bin" and options.columns is None:
         point_file.check_columns(paths)
-    placed = place_files(folder, options, paths, read_times([folder, above], len(paths)))
     columns = options.columns or point_file.KITTI_COLUMNS
+    stamps, found = read_times([folder, above], len(paths)), None
+    if options.odometry:
+        stamps = (
+            stamps
+            or stamps_of_names(paths)
+            or [number * DEFAULT_PERIOD_NS for number in range(len(paths))]
+        )
+        in_time = sorted(zip(stamps, paths, strict=False))
+        sweeps = (_sweep(path, stamp, columns) for stamp, path in in_time)
+        found = find_trajectory(sweeps, len(paths))
+    placed = place_files(folder, options, paths, stamps, found)
     if not sum(checked(paths, partial(point_file.check_points, columns=columns))):
         raise ToolError(f"{first.parent}: none of the {len(paths)} files holds any points")
     poses, files = placed.trajectory, placed.files
@@ -70,6 +81,12 @@ def read_cloud_folder(folder: Path, options: ReadingOptions | None = None) -> Sc
     if options.points_in is None:
         check_poses(read)
     return read
+
+
+def _sweep(path: Path, stamp_ns: int, columns: Sequence[str]) -> Sweep:
+    points, times = point_file.read_points(path, columns)
+    offsets = None if times is None else offsets_s(times, stamp_ns)
+    return Sweep(points, SENSOR, stamp_ns, offsets)
 
 
 def _read_scan(trajectory: Trajectory, options: ReadingOptions, file: PlacedFile) -> PosedScan:

@@ -95,6 +95,7 @@ def place_files(
     options: ReadingOptions,
     paths: Sequence[Path],
     stamps_ns: Sequence[int] | None = None,
+    found: Trajectory | None = None,
 ) -> PlacedFiles:
     """Give the files of a folder their poses: by their times or numbers, or else in order.
 
@@ -103,11 +104,12 @@ def place_files(
         options: name the file of the trajectory, and the order of its quaternions.
         paths: the files, one at least, in order.
         stamps_ns: when each was taken; ``None``: as their names say, if they do.
+        found: the poses, where they are known already.
 
     Raises:
         ToolError: there is no trajectory, or no way is possible.
     """
-    trajectory, remarks = _choose(folder, paths, options)
+    trajectory, remarks = (found, []) if found else _choose(folder, paths, options)
     remarks += trajectory.remarks
     if stamps_ns is None and (stamps_ns := stamps_of_names(paths)) is not None:
         stamps_ns, paths = zip(*sorted(zip(stamps_ns, paths, strict=True)), strict=True)
@@ -192,7 +194,7 @@ def _choose(
         return viewpoints, ["poses are the VIEWPOINT of each PCD, as there is no trajectory"]
     raise ToolError(
         f"{folder}: holds no trajectory, {', '.join(TRAJECTORY_NAMES)}: put one there, or name it "
-        "with --trajectory"
+        "with --trajectory; those of a lidar are found by --odometry"
     )
 
 

@@ -114,17 +114,23 @@ def _trajectory(
     stamps = np.arange(len(poses), dtype=np.int64) * DEFAULT_PERIOD_NS
     found = Trajectory(path, form.name, poses, stamps, remarks=remarks)
     if is_timed:
-        return _timed(found, _stamps(form, known))
+        known_at = timed(path, form.name, poses, _stamps(form, known))
+        return replace(known_at, remarks=(*remarks, *known_at.remarks))
     numbers = form.numbers(known, "n").astype(np.int64).ravel().tolist()
     return replace(found, numbers=numbers or None)
 
 
-def _timed(found: Trajectory, stamps: Longs) -> Trajectory:
-    remarks, track = list(found.remarks), Track()
+def timed(path: Path, kind: str, poses: Doubles, stamps: Longs) -> Trajectory:
+    """Return the trajectory of poses [n, 4, 4] at times [n]; those that are not finite are none.
+
+    Raises:
+        ToolError: the poses jump to and fro.
+    """
+    remarks, track = list[str](), Track()
     order = np.argsort(stamps, kind="stable")
-    poses, ordered = found.poses[order], stamps[order]
+    poses, ordered = poses[order], stamps[order]
     backwards, repeated = int((np.diff(stamps) < 0).sum()), int((np.diff(ordered) == 0).sum())
-    of_all = f"{found.path}: has {len(stamps)} poses, some with a time"
+    of_all = f"{path}: has {len(stamps)} poses, some with a time"
     if backwards:
         remarks.append(f"{of_all} before that of the line above ({backwards}): sorted by time")
     if repeated:
@@ -137,11 +143,11 @@ def _timed(found: Trajectory, stamps: Longs) -> Trajectory:
     count, jump_m = track.jumps()
     if count:
         raise ToolError(
-            f"{found.path}: its poses jump to and fro, {count} times, by {jump_m:.2g} m: it has "
+            f"{path}: its poses jump to and fro, {count} times, by {jump_m:.2g} m: it has "
             "those of two trajectories: leave one of them"
         )
     frames = FrameTree().with_track(WORLD, SENSOR, track)
-    return Trajectory(found.path, found.kind, poses, ordered, frames, None, tuple(remarks))
+    return Trajectory(path, kind, poses, ordered, frames, None, tuple(remarks))
 
 
 def _stamps(form: Form, lines: Sequence[Line]) -> Longs:
