@@ -21,6 +21,7 @@ DISTRIBUTIONS = {
     "foxglove_schemas_protobuf": "foxglove-schemas-protobuf",
     "pydantic_core": "pydantic",
     "prometheus_client": "prometheus-client",
+    "small_gicp": "small-gicp",
 }
 EVERY_EXTRA = tuple(PROJECT["optional-dependencies"].keys() - {"demo", "dev"})
 
