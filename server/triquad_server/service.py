@@ -132,7 +132,11 @@ class Service:
             failed=failed,
             scan_taken=(
                 lambda scan, rays: warnings.add(
-                    scan.source, scan.points, rays, stamp_ns=scan.stamp_ns
+                    scan.source,
+                    scan.points,
+                    scan.world_from_sensor,
+                    rays,
+                    stamp_ns=scan.stamp_ns,
                 ),
                 trails.add,
                 *(() if store is None else (store.scans.add,)),

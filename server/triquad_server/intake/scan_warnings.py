@@ -12,6 +12,7 @@ from triquad_format.printable import joined_lines
 from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.records.plausibility import jumps, median_range_m, wrong_units
 
+from triquad_server.intake.pose_check import PoseCheck
 from triquad_server.intake.rays import ScanRays
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.settings import ANY_SOURCE, Settings
@@ -46,6 +47,7 @@ class _Points:
     ranges_m: list[float] = field(default_factory=list)  # median of each scan, of what is used
     sent_ranges_m: list[float] = field(default_factory=list)  # the same of all that was sent
     places: list[tuple[int, Doubles]] = field(default_factory=list)  # stamp and place of each scan
+    poses: PoseCheck = field(default_factory=PoseCheck)  # which goes on with the scans after these
 
 
 @dataclass
@@ -75,12 +77,15 @@ class ScanWarnings:
         # By source and cause, the newest last.
         self._warnings: OrderedDict[tuple[str, str], _Warning] = OrderedDict()
 
-    def add(self, source: str, sent: Floats, rays: ScanRays, *, stamp_ns: int) -> None:
+    def add(
+        self, source: str, sent: Floats, pose: Doubles, rays: ScanRays, *, stamp_ns: int
+    ) -> None:
         """Record that a scan was taken in.
 
         Args:
             source: the name of the sensor.
             sent: its points [N, 3], sensor frame.
+            pose: its pose [4, 4].
             rays: what of it is used.
             stamp_ns: when it was taken.
         """
@@ -97,18 +102,25 @@ class ScanWarnings:
                 points.dropped[reason] += rays.points_dropped.get(reason, 0)
             if len(rays.ends):
                 points.ranges_m.append(median_range_m(rays.ends, rays.origin))
+                points.poses.see(rays, pose[:3, :3])
 
     def check(self) -> None:
         """Log the warnings that are due and were not logged lately."""
         with self._lock:
             self._check_scans()
             for source, points in self._points.items():
+                poses = points.poses
                 if points.scans >= _SCANS:
-                    if not self._check_units(source, points):
+                    if self._check_units(source, points):
+                        poses = PoseCheck()
+                    else:
                         self._check_ranges(source, points)
                         self._check_leaf(source, points)
                         self._check_places(source, points)
-                    self._points[source] = _Points()
+                    self._points[source] = _Points(poses=poses)
+                if (told := poses.problem()) is not None:
+                    self._warn(source, "poses", told)
+                    self._points[source].poses = PoseCheck()  # these may be right from now on
 
     def of(self, source: str) -> str | None:
         """Return the current warnings about a source, a line each."""

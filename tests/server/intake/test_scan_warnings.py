@@ -31,7 +31,7 @@ def take_in(
     scan = settings.scan_of(source)
     for number in range(scans):
         rays = usable_rays(points, np.eye(4), scan, source=source)
-        warnings.add("cam", points, rays, stamp_ns=number)
+        warnings.add("cam", points, np.eye(4), rays, stamp_ns=number)
 
 
 def test_points_that_range_min_m_takes_are_told_with_the_setting_to_change() -> None:
@@ -71,7 +71,7 @@ def test_what_two_publish_and_what_is_in_millimetres_is_told(
         pose = np.eye(4)
         pose[:2, 3] = step_m * number, aside_m * (number % 3 > 0)
         rays = usable_rays(points, pose, SETTINGS.scan)
-        warnings.add("cam", points, rays, stamp_ns=10**8 * number)
+        warnings.add("cam", points, pose, rays, stamp_ns=10**8 * number)
     text = warnings.of("cam") or ""
     assert told in text
     assert len(text.splitlines()) == bool(told), "nothing else is said of it"
@@ -195,5 +195,5 @@ def test_sources_that_are_invented_take_no_memory_without_end() -> None:
     points = cloud((10, 8.0))
     rays = usable_rays(points, np.eye(4), SETTINGS.scan)
     for number in range(2000):
-        warnings.add(f"s{number}", points, rays, stamp_ns=number)
+        warnings.add(f"s{number}", points, np.eye(4), rays, stamp_ns=number)
     assert len(warnings._points) == 256

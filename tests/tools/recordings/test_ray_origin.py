@@ -7,16 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support import hall
 from support.poses import shifted
 from support.recordings.bags import Recorded, messages_for, write_bag
 from support.ros_messages import CLOUD, TF
+from triquad_format.records.agreement import hidden_share
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.arguments import add_recording
 from triquad_tools.recordings.opening import Selection, open_recording, open_selected
 from triquad_tools.recordings.recording import ReadingOptions
-from triquad_tools.sensors.ray_check import hidden_share, without_repeated
+from triquad_tools.sensors.ray_check import without_repeated
 
-LOW, HIGH = np.array([-10.0, -5, 0]), np.array([90.0, 5, 6])  # a hall
 UP = np.array([0.4, 0, 1.7])  # the lidar on the robot's base, which is on the ground
 STAMPS = [1_700_000_000 * 10**9 + i * 10**8 for i in range(9)]
 ROS2 = messages_for("mcap")
@@ -31,12 +32,7 @@ def base(number: int) -> np.ndarray:
 
 def seen_from(pose: np.ndarray) -> np.ndarray:
     """What a lidar of 32 beams on the base sees of the hall, points [N, 3] in the base's frame."""
-    up, around = np.radians(np.meshgrid(np.linspace(-25, 15, 32), np.arange(360) + 0.3))
-    rays = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], -1)
-    rays = rays.reshape(-1, 3)
-    directions, eye = rays @ pose[:3, :3].T, pose[:3, :3] @ UP + pose[:3, 3]
-    lengths = (np.where(directions > 0, HIGH, LOW) - eye) / directions
-    return rays * lengths.min(axis=1, keepdims=True) + UP
+    return hall.seen(hall.lidar_rays(), pose @ shifted(*UP)) + UP
 
 
 def in_frame(points: np.ndarray, pose: np.ndarray) -> np.ndarray:

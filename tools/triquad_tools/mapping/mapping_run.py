@@ -106,7 +106,7 @@ class MappingRun:
                     rays = self.mapper.ingest(
                         scan.points, pose, stamp_s, source=source, no_return=scan.no_return
                     )
-                    self._warnings.add(source, scan.points, rays, stamp_ns=entry.stamp_ns)
+                    self._warnings.add(source, scan.points, pose, rays, stamp_ns=entry.stamp_ns)
                     self._warnings.check()
                     self._outside = False
                 except ScanRefusedError as error:

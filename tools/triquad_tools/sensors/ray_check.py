@@ -1,9 +1,4 @@
-"""Whether rays begin at the frame of their points: seen from there, few lie behind others.
-
-A direction in which a sensor looks has one return. From elsewhere, from the robot's base on the
-ground or from the map's origin, rays to the same points pass through other points: the ground lies
-behind itself, rooms behind their walls. So do points whose columns are not x, y and z.
-"""
+"""Whether rays begin at the frame of their points, and which points are no rays at all."""
 
 import statistics
 from collections import Counter, defaultdict
@@ -12,38 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.records.agreement import HIDDEN, hidden_share
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.plausibility import median_range_m, wrong_units
 from triquad_format.wire.places import moved_pose
 
 from triquad_tools.sensors.sweep import NoScanError, PosedScan
 
-_BIN_RAD = np.radians(0.25)  # side of the cells of direction that are compared: one ray of lidars
-_BEHIND = 1.5  # a point lies behind another in its direction if it is this many times as far
-_WRONG = 0.07
-"""The share of points behind others from which on rays begin elsewhere.
-
-From the sensor it is 0.3 % in streets and halls and up to 5 % amid trees; from the base of a car
-on the ground 8 to 23 %, from the origin of a map 7 to 21 % (recorded and simulated drives)."""
-
-_NEAREST_M = 0.3  # nearer points are the robot's own
 _REPEATED = 16  # equal points of a scan that are no measurements
 _NOWHERE = np.empty((0, 3))
-
-
-def hidden_share(points: NDArray[np.floating]) -> float:
-    """Return which share of points [N, 3], metres, lies behind others, seen from 0, 0, 0."""
-    ranges = np.linalg.norm(points, axis=1)
-    used = np.isfinite(ranges) & (ranges > _NEAREST_M)
-    if not used.any():
-        return 0.0
-    (x, y, z), ranges = points[used].T, ranges[used]
-    azimuth = np.rint(np.arctan2(y, x) / _BIN_RAD).astype(np.int64)
-    elevation = np.rint(np.arcsin(z / ranges) / _BIN_RAD).astype(np.int64)
-    _, cell = np.unique(azimuth * 10_000 + elevation, return_inverse=True)
-    nearest = np.full(cell.max() + 1, np.inf)
-    np.minimum.at(nearest, cell, ranges)
-    return float(np.mean(ranges > _BEHIND * nearest[cell]))
 
 
 def without_repeated(points: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -98,7 +70,7 @@ class RayCheck:
         if (told := wrong_units(range_m, places)) is not None:
             return NoScanError("units", told)
         share = statistics.median(self._shares[stream] or [0.0])
-        if share <= _WRONG:
+        if share <= HIDDEN:
             return None
         return NoScanError(
             "ray_origin",

@@ -1,11 +1,9 @@
 """Whether points and poses of a folder of clouds are in the frames that are said."""
 
-from collections.abc import Callable, Iterable, Sequence
-from functools import partial
+from collections.abc import Iterable, Sequence
 
 import numpy as np
-from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
+from triquad_format.records.agreement import misreading, shares_before, view_of
 from triquad_format.records.arrays import Doubles
 
 from triquad_tools.console.command import ToolError
@@ -13,13 +11,16 @@ from triquad_tools.recordings.folders.point_file import read_points
 from triquad_tools.recordings.folders.scan_folder import PlacedFile, ScanFolder
 from triquad_tools.recordings.recording import with_remedies
 from triquad_tools.sensors.ray_check import RayCheck
-from triquad_tools.sensors.sweep import PosedScan, moved
 
 _TRIED = 4  # clouds, to determine the frame of all
 _CLEARLY = 2.0  # times nearer to where the sensor was than to the origin, or the other way round
 _APART_M, _APART_RAD = 5.0, 0.3  # that two scans are, which tell what the poses are
-_COMPARED = 2_000  # points of the one, each with the nearest of ten times as many of the other
-_WRONG_M = 0.1  # that they lie apart by the poses as they are, where these are wrong
+_REMEDIES = {
+    "inverse": "write the inverses, world_from_sensor",
+    "wxyz": "use --quaternion wxyz",
+    "xyzw": "use --quaternion xyzw",
+    "unmoved": "use --points-in world; if they are not, write rotations of radians, not degrees",
+}
 
 
 def check_frame(files: Sequence[PlacedFile], columns: Sequence[str]) -> None:
@@ -72,31 +73,14 @@ def check_poses(folder: ScanFolder) -> None:
     Raises:
         ToolError: points of scans near each other agree clearly better by another one.
     """
-    pairs = list(_pairs(np.array([file.world_from_sensor for file in folder.files])))
-    apart_m = [_apart_m(*folder.read(pair)) for pair in pairs]
-    as_said_m, *others_m = np.mean(apart_m or [[0.0] * (1 + len(_READINGS))], axis=0).tolist()
-    other_m, (other, remedy) = min(zip(others_m, _READINGS, strict=True))
-    if as_said_m > _WRONG_M and as_said_m > _CLEARLY * other_m:
-        raise ToolError(
-            f"{folder.files[0].path.parent}: the poses seem to {other}: points of scans that "
-            f"follow each other lie {as_said_m:.2g} m apart by them, and {other_m:.2g} m if they "
-            f"are taken so: {remedy}"
-        )
-
-
-def _reordered(shift: int, poses: Doubles) -> Doubles:
-    """Return poses [N, 4, 4] whose quaternions have w at their other end."""
-    turns, poses = Rotation.from_matrix(poses[:, :3, :3]).as_quat(), poses.copy()
-    poses[:, :3, :3] = Rotation.from_quat(np.roll(turns, shift, axis=1)).as_matrix()
-    return poses
-
-
-_READINGS: dict[tuple[str, str], Callable[..., Doubles]] = {
-    ("be sensor_from_world", "write the inverses, world_from_sensor"): np.linalg.inv,
-    ("have quaternions w x y z", "use --quaternion wxyz"): partial(_reordered, -1),
-    ("have quaternions x y z w", "use --quaternion xyzw"): partial(_reordered, 1),
-}
-"""How else poses may be meant, what to do then, and the poses as they are meant."""
+    views = [
+        [view_of(scan.points, scan.world_from_sensor) for scan in folder.read(pair)]
+        for pair in _pairs(np.array([file.world_from_sensor for file in folder.files]))
+    ]
+    shares = [found for pair in views if (found := shares_before(*pair)) is not None]
+    reading, told = misreading(shares) or ("", "")
+    if reading in _REMEDIES:
+        raise ToolError(f"{folder.files[0].path.parent}: {told}: {_REMEDIES[reading]}")
 
 
 def _pairs(poses: Doubles) -> Iterable[tuple[int, int]]:
@@ -109,19 +93,3 @@ def _pairs(poses: Doubles) -> Iterable[tuple[int, int]]:
         apart = (np.linalg.norm(between[:, :3, 3], axis=1) > apart_m) | (turns > _APART_RAD)
         if apart.any():
             yield first, first + 1 + int(apart.argmax())
-
-
-def _apart_m(first: PosedScan, second: PosedScan) -> list[float]:
-    """Return how far points of two scans lie apart by their poses, and by other readings."""
-    some, more = (
-        scan.points[:: max(1, len(scan.points) // count)]
-        for scan, count in ((first, _COMPARED), (second, 10 * _COMPARED))
-    )
-    if not len(some) or not len(more):
-        return [0.0] * (1 + len(_READINGS))
-    poses = np.array([first.world_from_sensor, second.world_from_sensor])
-    medians = []
-    for of_first, of_second in (poses, *(read(poses) for read in _READINGS.values())):
-        tree = cKDTree(moved(more, of_second))
-        medians.append(float(np.median(tree.query(moved(some, of_first))[0])))
-    return medians
