@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.recordings.bags import BagKind, drive, messages_for, write_bag
+from support.recordings.point_files import columns, write_ply
 from triquad_tools.console.command import ToolError
 from triquad_tools.mapping.output import why
 from triquad_tools.recordings.opening import open_recording
@@ -43,3 +44,14 @@ def test_a_damaged_bag_is_refused_with_the_remedy(tmp_path: Path, kind: BagKind)
     with pytest.raises(ToolError, match="saves what is left") as caught:
         list(open_recording(path, ReadingOptions()).read(range(6)))
     assert "\n" not in str(caught.value)
+
+
+def test_recordings_deep_in_a_folder_are_named_and_can_be_read(tmp_path: Path) -> None:
+    folder = tmp_path / "all" / "day" / "lidar"
+    folder.mkdir(parents=True)
+    for number in range(3):
+        write_ply(folder / f"{number}.ply", columns(5 * np.eye(3, dtype=np.float32)))
+    (folder / "poses.txt").write_text("0 0 0 0 0 0 1\n" * 3)
+    with pytest.raises(ToolError, match=r"give one of the recordings in it, \S*/all/day$"):
+        open_recording(tmp_path, ReadingOptions())
+    assert len(open_recording(tmp_path / "all" / "day", ReadingOptions()).entries) == 3

@@ -98,6 +98,7 @@ def test_lines_of_data_sets_are_read(tmp_path, header, form, separator):
         ("time x y z qx qy qz qw\n", "holds no poses"),
         ("1 2 3 4 5\n", ":1: 5 numbers are no pose in a form that is known; the nearest is "),
         ("1 0 0 0 0.1 0.2 0.3\n", ":1: the quaternion .* length .* a line is x y z qx qy qz qw"),
+        ("1 0 0 1.8 0.1 0.2 0.3\n", "roll, pitch and yaw, write quaternions of them"),
         ("t x y z roll pitch yaw\n1 0 0 0 0 0 0\n", ":1: names no qw, qx, qy, qz: name them t x"),
         ("t x y z qx qy qz qw\n1 0 0 0 0 0 0 1 5\n", ":1: names 8 of 9 columns"),
         ("1 0 0 0 1 0 0 0 5\n1 0 0 0 2 0 0 0 5\n", ":1: 9 numbers are no pose"),

@@ -4,6 +4,8 @@ import argparse
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
+from itertools import islice
 from pathlib import Path
 
 from triquad_tools.console.arguments import Place
@@ -32,6 +34,8 @@ Recording = RosRecording | ScanFolder | ScanLogRecording
 """Checked as a whole, so that its errors are known."""
 
 _MOST_NAMED = 10  # recordings in a folder
+_MOST_SEARCHED = 1000  # files and folders
+_DEEP = "*", "*/*", "*/*/*"  # where recordings in a folder are searched for
 
 _ORIGIN = 0.0, 0.0, 0.0
 
@@ -77,15 +81,22 @@ def open_recording(path: Path, options: ReadingOptions) -> Recording:
         raise ToolError(f"{path}: is packed: unpack it with '{command} {path}' first")
     if path.suffix == MAP_SUFFIX:
         raise ToolError(f"{path}: is a map, not a recording: triquad-pack makes a mesh of it")
-    kinds = find_bag, is_depth_folder, is_cloud_folder
-    folders = [each for each in path.glob("*") if each.is_dir()]
-    within = sorted(each.name for each in folders if any(is_one(each) for is_one in kinds))
+    within = next(filter(None, map(partial(_within, path), _DEEP)), [])
     there = "a bag of ROS, an MCAP file, or a folder as docs/tools.md describes them"
     if path.is_dir():
         there += f" (with clouds, {', '.join(POINT_SUFFIXES)}, or depth images, .png)"
     if within:
         there = f"one of the recordings in it, {', '.join(within[:_MOST_NAMED])}"
+    if len(within) > 1:
+        there += "; files of one that follow each other in time may lie in one folder"
     raise ToolError(f"{path}: no recording that is understood: give {there}")
+
+
+def _within(path: Path, pattern: str) -> list[str]:
+    """Return the recordings that some of the folders in one are."""
+    kinds = find_bag, is_depth_folder, is_cloud_folder
+    folders = (each for each in islice(path.glob(pattern), _MOST_SEARCHED) if each.is_dir())
+    return sorted(str(each) for each in folders if any(is_one(each) for is_one in kinds))
 
 
 def _refuse_others(what: str, meaningful: set[str], options: ReadingOptions) -> None:

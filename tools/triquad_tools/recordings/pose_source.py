@@ -167,7 +167,8 @@ def check_times(clouds: Sequence[SeenCloud]) -> None:
         if over_s > 0:
             raise ToolError(
                 f"{before[0].file.name} and {after[0].file.name} overlap by {over_s:.1f} s on "
-                f"{after[0].topic}: they are no parts of one recording; map them one by one"
+                f"{after[0].topic}: they are no parts of one recording; map them one by one: "
+                f"{before[0].file}, {after[0].file}"
             )
 
 

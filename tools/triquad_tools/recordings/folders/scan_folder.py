@@ -177,7 +177,10 @@ def _choose(
             return read_trajectory(path, order), []
         if files := in_order(path.glob("*.txt")):
             return read_pose_files(files), []
-    found = [path for name in TRAJECTORY_NAMES for path in sorted(folder.glob(name))]
+    places = dict.fromkeys((folder, paths[0].parent))
+    found = [
+        path for each in places for name in TRAJECTORY_NAMES for path in sorted(each.glob(name))
+    ]
     # The official layout of KITTI: sequences/00 and poses/00.txt.
     sequence = folder.resolve()
     of_kitti = sequence.parent.parent / "poses" / f"{sequence.name}.txt"

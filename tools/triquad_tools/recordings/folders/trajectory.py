@@ -21,6 +21,10 @@ from triquad_tools.sensors.sweep import NoTransformError
 
 DEFAULT_PERIOD_NS = 100_000_000  # the time between scans of a recording without times
 _ROUNDING_NS = 1_000_000  # files write times with as few as three decimals
+_ANGLES = (
+    "; nearly all are so: where the lines have roll, pitch and yaw, write quaternions of them, as "
+    "Rotation.from_euler('xyz', angles).as_quat() of scipy returns them"
+)
 
 
 @dataclass(frozen=True)
@@ -173,10 +177,13 @@ def _poses(form: Form, lines: Sequence[Line], order: str | None) -> Doubles:
     finite = np.isfinite(positions).all(axis=1) & np.isfinite(quaternions).all(axis=1)
     finite &= np.abs(quaternions).max(axis=1, initial=0.0) > 0
     lengths = np.linalg.norm(quaternions, axis=1)
-    for index in np.flatnonzero(finite & (np.abs(lengths - 1) > UNIT_TOLERANCE)).tolist():
+    wrong = finite & (np.abs(lengths - 1) > UNIT_TOLERANCE)
+    for index in np.flatnonzero(wrong).tolist():
         raise ToolError(
             f"{lines[index].place}: the quaternion {quaternions[index].tolist()} has the length "
             f"{lengths[index]:.4g}, not 1; a line is {' '.join(form.columns)}"
+            + _ANGLES
+            * bool(wrong.sum() > finite.sum() / 2)
         )
     order = order or order_of(form, quaternions[finite], lines)
     names = [f"q{axis}" for axis in order] if order != form.order else names
