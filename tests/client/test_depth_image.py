@@ -17,11 +17,14 @@ def wall_depth(distance_m: float = 4.0) -> np.ndarray:
     return np.full(SHAPE, distance_m, np.float32)
 
 
-def test_a_wall_stands_where_the_camera_saw_it() -> None:
+@pytest.mark.parametrize("units_per_metre", [None, 5000])
+def test_a_wall_stands_where_the_camera_saw_it(units_per_metre: int | None) -> None:
     with servers.service_and_client() as client:
         depth = wall_depth()
         depth[:30, :40] = 0  # nothing is known of the upper left quarter
-        client.publish_depth(depth, CAMERA, FORWARD)
+        if units_per_metre is not None:
+            depth = (units_per_metre * depth).astype(np.uint16)
+        client.publish_depth(depth, CAMERA, FORWARD, units_per_metre=units_per_metre)
         client.settle(servers.WAIT_S)
         # At x = 9; the image's right is towards -y, its down towards -z.
         asked = [[9, 5, 0.5], [9, 7, 0.5], [9, 5, 2.5], [9, 7, 2.5], [7, 5.5, 1]]

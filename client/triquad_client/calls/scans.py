@@ -110,6 +110,7 @@ class ScanCalls:
         stamp_s: float | None = None,
         source: str = "default",
         stride: int = 1,
+        units_per_metre: float | None = None,
     ) -> None:
         """Send a depth image to be learnt. Returns once it is handed to the network.
 
@@ -127,11 +128,12 @@ class ScanCalls:
             source: name of the camera.
             stride: every how many rows and columns one is taken, where an image has more pixels
                 than a scan may have points.
+            units_per_metre: of the depths, where these are no metres or millimetres.
 
         Raises:
             InvalidScanError: the image cannot be used; nothing was sent.
         """
-        points = depth_points(depth, intrinsics, stride)
+        points = depth_points(depth, intrinsics, stride, units_per_metre)
         self.publish_scan(points, world_from_camera, stamp_s, source)
 
     def restart_source(self, source: str = "default") -> None:
