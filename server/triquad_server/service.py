@@ -131,13 +131,7 @@ class Service:
             self._settings.service.publish_period_s,
             failed=failed,
             scan_taken=(
-                lambda scan, rays: warnings.add(
-                    scan.source,
-                    scan.points,
-                    scan.world_from_sensor,
-                    rays,
-                    stamp_ns=scan.stamp_ns,
-                ),
+                warnings.add,
                 trails.add,
                 *(() if store is None else (store.scans.add,)),
             ),

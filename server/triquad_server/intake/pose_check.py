@@ -20,10 +20,10 @@ _SKIPPED = 64  # scans, after the first pairs: one takes 5 to 15 ms, a scan some
 _HIDING = 60_000  # points at most, of which some may lie behind others
 
 _REMEDIES = {
-    "inverse": "publish their inverses, world_from_sensor",
+    "inverse": "give their inverses, world_from_sensor",
     "wxyz": "give quaternions as x y z w, with w last",
     "xyzw": "they were taken for w x y z: give quaternions as x y z w, with w last",
-    "unmoved": "publish points in the frame of the sensor; if they are, make rotations of radians, "
+    "unmoved": "give points in the frame of the sensor; if they are, make rotations of radians, "
     "not of degrees",
     "": "give each scan its own pose, of its time and world_from_sensor, with a rotation made of "
     "radians, or of a quaternion x y z w",
@@ -52,7 +52,8 @@ class PoseCheck:
         if np.array_equal(first.world_from_sensor, pose):
             due = self._scans >= _LAG << min(_LEAST, len(self._pairs))
         else:
-            due = first.is_apart(pose, min(_APART_M, _APART_RANGES * first.range_m), _APART_RAD)
+            apart_m = min(_APART_M, _APART_RANGES * first.range_m)
+            due = agreement.are_apart(first.world_from_sensor, pose[None], apart_m, _APART_RAD)[0]
         if due:
             self._first, self._scans = self._view(rays, pose), 0
             if (shares := agreement.shares_before(first, self._first)) is not None:
@@ -69,7 +70,7 @@ class PoseCheck:
             return None
         return (
             f"{share:.0%} of the points lie behind others as seen from the origin of their frame, "
-            "so their rays begin elsewhere: publish points in the frame of the sensor, or set "
+            "so their rays begin elsewhere: give points in the frame of the sensor, or set "
             "ray_origin_m of the source to where it sits in theirs"
         )
 

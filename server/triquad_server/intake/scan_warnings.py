@@ -9,8 +9,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from triquad_format.printable import joined_lines
-from triquad_format.records.arrays import Doubles, Floats
+from triquad_format.records.arrays import Doubles
 from triquad_format.records.plausibility import jumps, median_range_m, wrong_units
+from triquad_format.wire.messages import Scan
 
 from triquad_server.intake.pose_check import PoseCheck
 from triquad_server.intake.rays import ScanRays
@@ -77,18 +78,9 @@ class ScanWarnings:
         # By source and cause, the newest last.
         self._warnings: OrderedDict[tuple[str, str], _Warning] = OrderedDict()
 
-    def add(
-        self, source: str, sent: Floats, pose: Doubles, rays: ScanRays, *, stamp_ns: int
-    ) -> None:
-        """Record that a scan was taken in.
-
-        Args:
-            source: the name of the sensor.
-            sent: its points [N, 3], sensor frame.
-            pose: its pose [4, 4].
-            rays: what of it is used.
-            stamp_ns: when it was taken.
-        """
+    def add(self, scan: Scan, rays: ScanRays) -> None:
+        """Record that a scan was taken in; ``rays`` are what of it is used."""
+        source, sent = scan.source, scan.points
         with self._lock:
             points = self._points.setdefault(source, _Points())
             self._points.move_to_end(source)
@@ -97,12 +89,12 @@ class ScanWarnings:
             points.scans += 1
             points.sent += len(sent)
             points.sent_ranges_m.append(median_range_m(sent))
-            points.places.append((stamp_ns, rays.origin))
+            points.places.append((scan.stamp_ns, rays.origin))
             for reason in points.dropped:
                 points.dropped[reason] += rays.points_dropped.get(reason, 0)
             if len(rays.ends):
                 points.ranges_m.append(median_range_m(rays.ends, rays.origin))
-                points.poses.see(rays, pose[:3, :3])
+                points.poses.see(rays, scan.world_from_sensor[:3, :3])
 
     def check(self) -> None:
         """Log the warnings that are due and were not logged lately."""

@@ -71,7 +71,7 @@ def drive_camera(client: Client, meant: Meant) -> None:
         client.flush(servers.WAIT_S, pending=4)
 
 
-INVERSE = "seem to be sensor_from_world: by them .* if taken so: publish their inverses"
+INVERSE = "seem to be sensor_from_world: by them .* if taken so: give their inverses"
 W_FIRST = "seem to have quaternions w x y z: .*: give quaternions as x y z w, with w last"
 STILL = "the poses do not fit the points: by them .*: give each scan its own pose, of its time"
 NOT_MOVED = "as if they were in the map frame already: .* make rotations of radians, not of degrees"
@@ -107,4 +107,4 @@ def test_poses_of_another_meaning_are_told_with_the_remedy(
 def test_points_in_the_map_frame_are_told_with_the_remedy() -> None:
     with servers.service_and_client() as client:
         drive_lidar(client, as_it_is, in_map=True)
-        assert_told("rays begin elsewhere: publish points in the frame of the sensor", client)
+        assert_told("rays begin elsewhere: give points in the frame of the sensor", client)

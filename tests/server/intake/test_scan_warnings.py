@@ -5,6 +5,7 @@ import pytest
 from support import servers
 from support.clock import Clock
 from triquad_format.records.field_settings import FieldSettings
+from triquad_format.wire.messages import Scan
 from triquad_server.intake.rays import usable_rays
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
@@ -31,7 +32,7 @@ def take_in(
     scan = settings.scan_of(source)
     for number in range(scans):
         rays = usable_rays(points, np.eye(4), scan, source=source)
-        warnings.add("cam", points, np.eye(4), rays, stamp_ns=number)
+        warnings.add(Scan(points, np.eye(4), number, "cam", 0, number), rays)
 
 
 def test_points_that_range_min_m_takes_are_told_with_the_setting_to_change() -> None:
@@ -71,7 +72,7 @@ def test_what_two_publish_and_what_is_in_millimetres_is_told(
         pose = np.eye(4)
         pose[:2, 3] = step_m * number, aside_m * (number % 3 > 0)
         rays = usable_rays(points, pose, SETTINGS.scan)
-        warnings.add("cam", points, pose, rays, stamp_ns=10**8 * number)
+        warnings.add(Scan(points, pose, 10**8 * number, "cam", 0, number), rays)
     text = warnings.of("cam") or ""
     assert told in text
     assert len(text.splitlines()) == bool(told), "nothing else is said of it"
@@ -195,5 +196,5 @@ def test_sources_that_are_invented_take_no_memory_without_end() -> None:
     points = cloud((10, 8.0))
     rays = usable_rays(points, np.eye(4), SETTINGS.scan)
     for number in range(2000):
-        warnings.add(f"s{number}", points, np.eye(4), rays, stamp_ns=number)
+        warnings.add(Scan(points, np.eye(4), number, f"s{number}", 0, 0), rays)
     assert len(warnings._points) == 256

@@ -7,10 +7,12 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.region import MapRecord
+from triquad_format.wire.messages import Scan
 from triquad_server.errors import ScanRefusedError, StoreError
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
@@ -101,12 +103,12 @@ class MappingRun:
                 self._save_now_and_then()
                 entry = entries[self.scans_taken]
                 try:
-                    stamp_s = entry.stamp_ns // 1_000_000_000
-                    pose, source = scan.world_from_sensor, entry.source
+                    stamp_ns, source = entry.stamp_ns, entry.source
+                    points, pose = np.asarray(scan.points, np.float32), scan.world_from_sensor
                     rays = self.mapper.ingest(
-                        scan.points, pose, stamp_s, source=source, no_return=scan.no_return
+                        points, pose, stamp_ns // 10**9, source=source, no_return=scan.no_return
                     )
-                    self._warnings.add(source, scan.points, pose, rays, stamp_ns=entry.stamp_ns)
+                    self._warnings.add(Scan(points, pose, stamp_ns, source, 0, 0), rays)
                     self._warnings.check()
                     self._outside = False
                 except ScanRefusedError as error:

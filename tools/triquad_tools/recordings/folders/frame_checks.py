@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from triquad_format.records.agreement import misreading, shares_before, view_of
+from triquad_format.records.agreement import are_apart, misreading, shares_before, view_of
 from triquad_format.records.arrays import Doubles
 
 from triquad_tools.console.command import ToolError
@@ -88,8 +88,6 @@ def _pairs(poses: Doubles) -> Iterable[tuple[int, int]]:
     extent_m = float(np.linalg.norm(np.ptp(poses[:, :3, 3], axis=0)))
     apart_m = min(_APART_M, 0.4 * extent_m)
     for first in np.linspace(0, len(poses) - 1, 6).astype(int).tolist()[:-1]:
-        between = np.linalg.inv(poses[first]) @ poses[first + 1 :]
-        turns = np.arccos(np.clip((np.trace(between[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1))
-        apart = (np.linalg.norm(between[:, :3, 3], axis=1) > apart_m) | (turns > _APART_RAD)
+        apart = are_apart(poses[first], poses[first + 1 :], apart_m, _APART_RAD)
         if apart.any():
             yield first, first + 1 + int(apart.argmax())
