@@ -21,7 +21,7 @@ from triquad_format.records.pose import pose_matrices, quaternion_of
 
 _BIN_RAD = np.radians(0.25)  # side of the cells of direction that are compared: one ray of lidars
 _BEHIND = 1.5  # a point lies behind another in its direction if it is this many times as far
-HIDDEN = 0.07
+_HIDDEN = 0.07
 """The share of points behind others from which on rays begin elsewhere.
 
 From the sensor it is 0.3 % in streets and halls and up to 5 % amid trees; from the base of a car
@@ -73,6 +73,20 @@ def hidden_share(points: NDArray[np.floating]) -> float:
     nearest = np.full(len(cells), np.inf)
     np.minimum.at(nearest, cells, ranges)
     return float(np.mean(ranges > _BEHIND * nearest[cells])) if len(cells) else 0.0
+
+
+def hiding(shares: Sequence[float]) -> str | None:
+    """Return why rays begin elsewhere, of whose scans such shares are hidden; None: they may not.
+
+    That is told by the median of the shares.
+    """
+    share = float(np.median(shares)) if shares else 0.0
+    if share <= _HIDDEN:
+        return None
+    return (
+        f"{share:.0%} of the points lie behind others as seen from the origin of their frame, so "
+        "their rays begin elsewhere"
+    )
 
 
 def view_of(points: NDArray[np.floating], world_from_sensor: Doubles) -> ScanView:

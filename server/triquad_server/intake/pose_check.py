@@ -1,7 +1,6 @@
 """Whether the poses of a source fit its points: a few of its scans are compared, ever fewer."""
 
 from collections import deque
-from statistics import median
 
 import numpy as np
 from triquad_format.records import agreement
@@ -28,6 +27,10 @@ _REMEDIES = {
     "": "give each scan its own pose, of its time and world_from_sensor, with a rotation made of "
     "radians, or of a quaternion x y z w",
 }
+_ORIGIN = (
+    "give points in the frame of the sensor, or set ray_origin_m of the source to where it sits in "
+    "theirs"
+)
 
 
 class PoseCheck:
@@ -66,13 +69,8 @@ class PoseCheck:
         told = agreement.misreading(self._pairs) if len(self._pairs) >= _LEAST else None
         if told is not None:
             return f"{told[1]}: {_REMEDIES[told[0]]}"
-        if len(self._hidden) < _LEAST or (share := median(self._hidden)) <= agreement.HIDDEN:
-            return None
-        return (
-            f"{share:.0%} of the points lie behind others as seen from the origin of their frame, "
-            "so their rays begin elsewhere: give points in the frame of the sensor, or set "
-            "ray_origin_m of the source to where it sits in theirs"
-        )
+        begins = agreement.hiding(self._hidden) if len(self._hidden) >= _LEAST else None
+        return begins and f"{begins}: {_ORIGIN}"
 
     def _view(self, rays: ScanRays, pose: Doubles) -> ScanView:
         points = (rays.ends - rays.origin) @ pose[:3, :3]

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from triquad_format.records.agreement import HIDDEN, hidden_share
+from triquad_format.records.agreement import hidden_share, hiding
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.plausibility import median_range_m, wrong_units
 from triquad_format.wire.places import moved_pose
@@ -69,11 +69,5 @@ class RayCheck:
         range_m = statistics.median(self._ranges_m[stream] or [0.0])
         if (told := wrong_units(range_m, places)) is not None:
             return NoScanError("units", told)
-        share = statistics.median(self._shares[stream] or [0.0])
-        if share <= HIDDEN:
-            return None
-        return NoScanError(
-            "ray_origin",
-            f"{share:.0%} of the points lie behind others as seen from the origin of their frame, "
-            "so their rays begin elsewhere",
-        )
+        told = hiding(self._shares[stream])
+        return None if told is None else NoScanError("ray_origin", told)
