@@ -7,17 +7,12 @@ from dataclasses import replace
 import numpy as np
 
 from triquad_tools.console.command import ToolError
+from triquad_tools.recordings import pose_source
 from triquad_tools.recordings.arguments import SENSOR, WORLD
 from triquad_tools.recordings.bag import Bag, Message
 from triquad_tools.recordings.folders.trajectory import read_trajectory
 from triquad_tools.recordings.odometry import find_trajectory
-from triquad_tools.recordings.pose_source import (
-    PoseSource,
-    check_places,
-    check_times,
-    choose_poses,
-    poses_of_trajectory,
-)
+from triquad_tools.recordings.pose_source import PoseSource, check_places, check_times
 from triquad_tools.recordings.recording import ReadingOptions, ScanEntry, Stream, with_remedies
 from triquad_tools.recordings.ros_content import RosContent, SeenCloud
 from triquad_tools.sensors.motion.frame_graph import ROOT_NAMES
@@ -152,12 +147,12 @@ class RosRecording:
     def _choose_poses(self, clouds: Sequence[SeenCloud]) -> PoseSource:
         options = self._options
         if not clouds or not (options.odometry or options.trajectory):
-            return choose_poses(self._content, clouds, options)
+            return pose_source.choose_poses(self._content, clouds, options)
         if options.trajectory is not None:
             found = read_trajectory(options.trajectory, options.quaternion)
         else:
             found = find_trajectory(self._sweeps(clouds), len(clouds))
-        return poses_of_trajectory(self._content, clouds, found, options)
+        return pose_source.poses_of_trajectory(self._content, clouds, found, options)
 
     def _sweeps(self, clouds: Sequence[SeenCloud]) -> Iterator[Sweep]:
         """Yield the sweeps of clouds, which have to be those of one lidar."""
@@ -171,8 +166,8 @@ class RosRecording:
         messages = self._bag.messages(lambda channel: channel.topic == topics[0])
         for number, message in enumerate(messages):
             if number in wanted:
-                kind, decoded = message.channel.kind, message.decoded()
-                yield self._reader.sweep(topics[0], kind, decoded, message.recorded_ns)
+                about = message.channel.kind, message.decoded(), message.recorded_ns
+                yield self._reader.sweep(topics[0], *about)
 
     def _read(self, message: Message) -> PosedScan:
         topic, kind = message.channel.topic, message.channel.kind

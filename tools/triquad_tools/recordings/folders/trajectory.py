@@ -178,12 +178,12 @@ def _poses(form: Form, lines: Sequence[Line], order: str | None) -> Doubles:
     finite &= np.abs(quaternions).max(axis=1, initial=0.0) > 0
     lengths = np.linalg.norm(quaternions, axis=1)
     wrong = finite & (np.abs(lengths - 1) > UNIT_TOLERANCE)
-    for index in np.flatnonzero(wrong).tolist():
+    if wrong.any():
+        index = int(wrong.argmax())
         raise ToolError(
             f"{lines[index].place}: the quaternion {quaternions[index].tolist()} has the length "
             f"{lengths[index]:.4g}, not 1; a line is {' '.join(form.columns)}"
-            + _ANGLES
-            * bool(wrong.sum() > finite.sum() / 2)
+            f"{_ANGLES if wrong.sum() > finite.sum() / 2 else ''}"
         )
     order = order or order_of(form, quaternions[finite], lines)
     names = [f"q{axis}" for axis in order] if order != form.order else names
