@@ -71,6 +71,8 @@ class RmwZenoh:
                     f"{len(self._publishers)}/MP/%/%/robot/{names}"
                 )
             )
+            if not latched:
+                _wait_until_heard(self._publishers[key])
         self._sent[topic] += 1
         identity = hashlib.blake2b(key.encode(), digest_size=16).digest()
         attachment = struct.pack("<qqB", self._sent[topic], T0, 16) + identity
@@ -120,7 +122,7 @@ class Bridge:
 
 
 def _wait_until_heard(publisher: Any) -> None:
-    """A bridge takes nothing out of DDS before somebody listens on its side."""
+    """What is sent before a subscription is known here is lost, as by a node that just started."""
     deadline = time.monotonic() + _HEARD_S
     while not publisher.matching_status.matching and time.monotonic() < deadline:
         time.sleep(0.01)
