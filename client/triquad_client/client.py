@@ -12,7 +12,6 @@ from triquad_client.calls.corrections import CorrectionCalls
 from triquad_client.calls.download import DownloadCalls
 from triquad_client.calls.point_queries import pin_newest
 from triquad_client.calls.queries import MapQueries, PinnedMap
-from triquad_client.calls.scans import ScanCalls
 from triquad_client.calls.server import ServerCalls
 from triquad_client.checks import Bounds
 from triquad_client.errors import brief, brief_errors
@@ -28,9 +27,7 @@ MAX_DOWNLOAD_BYTES = 2**30
 
 
 @brief_errors
-class Client(
-    ScanCalls, CorrectionCalls, MapQueries, MeshCalls, ChangeCalls, DownloadCalls, ServerCalls
-):
+class Client(CorrectionCalls, MapQueries, MeshCalls, ChangeCalls, DownloadCalls, ServerCalls):
     """A connection to one map of a server. Close it, or use it in a ``with`` statement.
 
     Positions are metres in the map frame, or from the map's origin where it was connected with

@@ -15,16 +15,15 @@ from triquad_format.wire.limits import MAX_KEYFRAMES
 from triquad_format.wire.source_messages import CorrectPosesReply, CorrectPosesRequest
 
 from triquad_client import checks
+from triquad_client.calls.scans import ScanCalls
 from triquad_client.checks import real_numbers
 from triquad_client.errors import NO_NUMBER, InvalidScanError
-from triquad_client.net.connection import Connection, new_ticket
+from triquad_client.net.connection import new_ticket
 from triquad_client.pose import PoseLike, rigid_pose
 
 
-class CorrectionCalls:
+class CorrectionCalls(ScanCalls):
     """Corrects the poses of scans."""
-
-    _connection: Connection
 
     def correct_poses(
         self,
@@ -39,29 +38,33 @@ class CorrectionCalls:
 
         The server makes it again from the scans that it keeps (``store.log_max_bytes``), which
         takes a fraction of the drive, and goes on with the map of before meanwhile. A scan between
-        two of the poses moves, in its own frame, by what lies between their moves.
+        two of the poses moves, in its own frame, by what lies between their moves. It waits first
+        until what this client published is dealt with.
 
         Args:
             source: whose scans they are; those of others stay where they are.
             stamps_s: [K] rising, seconds since 1970: those of scans, or between them.
             world_from_sensor: the corrected poses of the sensor at these times, such as of
                 keyframes: [K, 4, 4], or a list of :class:`Pose`.
-            onward: scans after the last of the poses move as that, until now, as when a SLAM
-                corrects where the robot is. Else scans before and after these poses stay.
+            onward: scans after the last of the poses move as that, those that were published
+                before this call, as when a SLAM corrects where the robot is. Else scans before and
+                after these poses stay.
             timeout_s: how long to wait for that, at most.
 
         Returns:
-            ``epoch``: the first of the corrected map. ``scans_moved``: kept scans whose pose
-            changed. ``scans_learnt``: those of which the map was made again. ``kept_epoch`` and
+            ``epoch``: the first of the corrected map. ``scans_moved``: scans whose pose
+            changed. ``scans_learnt``: kept ones of which the map was made again. ``kept_epoch`` and
             ``undo``: as of :meth:`reset`.
 
         Raises:
             InvalidScanError: the times do not rise, or a pose is none.
             RefusedError: ``bad_request``, where no scan of the source is kept; ``store``, where
-                what is needed is not kept. The map stays as it is.
+                what is needed is not kept; ``timeout``, as of :meth:`flush`. The map stays as it
+                is.
             RequestTimeoutError: not done after ``timeout_s``; the server goes on with it.
         """
         stamps_ns, poses = _keyframes(stamps_s, world_from_sensor)
+        self.flush(timeout_s)
         quaternions = np.array([quaternion_of(pose[:3, :3]) for pose in poses])
         request = CorrectPosesRequest(
             source, stamps_ns, poses[:, :3, 3], quaternions, onward, new_ticket()

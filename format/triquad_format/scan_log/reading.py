@@ -15,7 +15,6 @@ from triquad_format.records.arrays import Floats
 from triquad_format.scan_log.ros_messages import (
     Transform,
     unpack_cloud,
-    unpack_path,
     unpack_transform,
 )
 from triquad_format.scan_log.segment import (
@@ -70,9 +69,7 @@ def _entries(stream: IO[bytes]) -> Iterator[Entry]:
             if topic == RESETS:
                 yield LoggedReset(*np.frombuffer(data, "<f8").reshape(2, 3))
             elif topic.startswith(CORRECTIONS):
-                until_ns, stamps_ns, poses = unpack_path(data)
-                source = topic.removeprefix(CORRECTIONS)
-                yield LoggedCorrection(source, stamps_ns, poses, until_ns)
+                yield LoggedCorrection.unpack(topic.removeprefix(CORRECTIONS), data)
     if pose is not None:
         yield pose
     if not is_whole:

@@ -1,15 +1,14 @@
-"""A cloud, a transform and a path as ROS 2 writes them to MCAP, with the types' definitions."""
+"""A cloud and a transform as ROS 2 writes them to MCAP, with the types' definitions."""
 
 from typing import NamedTuple
 
 import numpy as np
 
-from triquad_format.records.arrays import Doubles, Floats, Longs
+from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.records.pose import pose_matrices, quaternion_of
 from triquad_format.scan_log.cdr import CdrReader, CdrWriter
 
 CLOUD_TYPE, TRANSFORMS_TYPE = "sensor_msgs/msg/PointCloud2", "tf2_msgs/msg/TFMessage"
-PATH_TYPE = "nav_msgs/msg/Path"
 
 _LINE = "\n" + 80 * "=" + "\nMSG: "
 _HEADER = (
@@ -28,10 +27,6 @@ DEFINITIONS = {
     f"{_LINE}geometry_msgs/Transform\ngeometry_msgs/Vector3 translation\n"
     "geometry_msgs/Quaternion rotation"
     f"{_LINE}geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z{_QUATERNION}",
-    PATH_TYPE: f"std_msgs/Header header\ngeometry_msgs/PoseStamped[] poses{_HEADER}"
-    f"{_LINE}geometry_msgs/PoseStamped\nstd_msgs/Header header\nPose pose"
-    f"{_LINE}geometry_msgs/Pose\nPoint position\nQuaternion orientation"
-    f"{_LINE}geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z{_QUATERNION}",
 }
 """The definitions of the types, for the schemas of a file."""
 
@@ -65,14 +60,6 @@ class Transform(NamedTuple):
     pose: Doubles  # [4, 4]
 
 
-def pack_path(stamp_ns: int, frame: str, stamps_ns: Longs, poses: Doubles) -> bytes:
-    """Return a path of ``poses`` [K, 4, 4] at times [K], in the frame of that name."""
-    writer = _with_header(CdrWriter(), stamp_ns, frame).numbers("<u4", len(poses))
-    for stamp, pose in zip(stamps_ns.tolist(), poses, strict=True):
-        _with_pose(_with_header(writer, stamp, frame), pose)
-    return writer.payload()
-
-
 def unpack_cloud(data: bytes) -> tuple[int, str, Floats]:
     """Return stamp, frame and points [N, 3] of what :func:`pack_cloud` has made.
 
@@ -102,21 +89,6 @@ def unpack_transform(data: bytes) -> Transform:
     stamp_ns, _ = _read_header(reader)
     child = reader.text()
     return Transform(stamp_ns, child, _read_pose(reader))
-
-
-def unpack_path(data: bytes) -> tuple[int, Longs, Doubles]:
-    """Return stamp, and times [K] and poses [K, 4, 4], of what :func:`pack_path` has made.
-
-    Raises:
-        ValueError: it is something else.
-    """
-    reader = CdrReader(data)
-    stamp_ns, _ = _read_header(reader)
-    stamps, poses = [], []
-    for _ in range(int(reader.numbers("<u4")[0])):
-        stamps.append(_read_header(reader)[0])
-        poses.append(_read_pose(reader))
-    return stamp_ns, np.array(stamps, np.int64), np.array(poses).reshape(-1, 4, 4)
 
 
 def _with_pose(writer: CdrWriter, pose: Doubles) -> CdrWriter:

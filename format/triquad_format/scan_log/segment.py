@@ -5,7 +5,7 @@ name of the source, on ``/tf``, and, of those that are kept, a cloud in that fra
 ``/scans/<source>``, with the stamp of the scan both. Rays that met nothing come between the two, as
 directions [M, 3], little-endian float32, on ``/no_return/<source>``; what was reset is on
 ``/resets``: the least and the greatest corner of a box, six little-endian float64. A correction of
-poses before it is a path on ``/corrections/<source>``: its own stamp is the last that it moves.
+poses before it is on ``/corrections/<source>``, as :class:`LoggedCorrection` packs it.
 """
 
 from contextlib import suppress
@@ -20,11 +20,9 @@ from triquad_format.records.arrays import Doubles, Floats, Longs
 from triquad_format.scan_log.ros_messages import (
     CLOUD_TYPE,
     DEFINITIONS,
-    PATH_TYPE,
     TRANSFORMS_TYPE,
     Transform,
     pack_cloud,
-    pack_path,
     pack_transform,
 )
 
@@ -37,6 +35,8 @@ SCANS, NO_RETURN, CORRECTIONS = "/scans/", "/no_return/", "/corrections/"
 """The topics; the last three before the name of a source."""
 
 _CHUNK_BYTES = 1 << 20
+
+_MOVES = np.dtype([("stamp_ns", "<i8"), ("move", "<f8", (3, 4))])  # of a correction
 
 
 @dataclass(frozen=True)
@@ -60,13 +60,32 @@ class LoggedReset:
 
 @dataclass(frozen=True)
 class LoggedCorrection:
-    """Better poses of a source, in the coordinates of who gave them."""
+    """How the scans of a source move that came before, each in its own frame."""
 
     source: str
-    stamps_ns: Longs  # [K] rising, nanoseconds since 1970
-    world_from_sensor: Doubles  # [K, 4, 4] the poses at these times
-    until_ns: int
-    """The stamp of the last scan that it moves; scans after the last of the poses move as that."""
+    stamps_ns: Longs  # [K] rising, nanoseconds since 1970; scans before the first stay
+    moves: Doubles  # [K, 4, 4] at these times; scans after the last move as that
+    until_ns: int  # the stamp of the last scan that moves
+    since: int = 0  # how often the source's time began again, after the scans that move
+
+    def pack(self) -> bytes:
+        """Return it without the source."""
+        rows = np.zeros(len(self.moves), _MOVES)
+        rows["stamp_ns"], rows["move"] = self.stamps_ns, self.moves[:, :3]
+        return np.array([self.until_ns, self.since], "<i8").tobytes() + rows.tobytes()
+
+    @classmethod
+    def unpack(cls, source: str, data: bytes) -> "LoggedCorrection":
+        """Return what :meth:`pack` has made.
+
+        Raises:
+            ValueError: it is something else.
+        """
+        until_ns, since = np.frombuffer(data, "<i8", 2).tolist()
+        rows = np.frombuffer(data, _MOVES, offset=16)
+        moves = np.zeros((len(rows), 4, 4))
+        moves[:, :3], moves[:, 3, 3] = rows["move"], 1.0
+        return cls(source, rows["stamp_ns"].astype(np.int64), moves, until_ns, since)
 
 
 class SegmentWriter:
@@ -128,9 +147,8 @@ class SegmentWriter:
         Raises:
             OSError: it cannot be written.
         """
-        until_ns, poses = correction.until_ns, correction.world_from_sensor
-        data = pack_path(until_ns, _MAP_FRAME, correction.stamps_ns, poses)
-        self._put(CORRECTIONS + correction.source, PATH_TYPE, until_ns, data)
+        data = correction.pack()
+        self._put(CORRECTIONS + correction.source, "", correction.until_ns, data)
 
     def finish(self) -> None:
         """End the file.

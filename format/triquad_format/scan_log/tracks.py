@@ -5,106 +5,52 @@ from typing import NamedTuple
 
 import numpy as np
 
-from triquad_format.records.arrays import Bools, Doubles, Longs
+from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.pose import pose_matrices, quaternion_of, slerp
 from triquad_format.scan_log.reading import Entry
 from triquad_format.scan_log.ros_messages import Transform
 from triquad_format.scan_log.segment import LoggedCorrection, LoggedScan
 
-
-class _Moves(NamedTuple):
-    """How a correction moves poses, each in its own frame."""
-
-    stamps_ns: Longs  # [K] rising
-    moves: Doubles  # [K, 4, 4] at these times
-    first_ns: int
-    until_ns: int
-
-    def apply(self, stamps_ns: Longs, poses: Doubles) -> Doubles:
-        """Return poses [N, 4, 4] at times [N] as they are after the correction."""
-        moved = (stamps_ns >= self.first_ns) & (stamps_ns <= self.until_ns)
-        after: Doubles = poses.copy()
-        after[moved] = poses[moved] @ _between(self.stamps_ns, self.moves, stamps_ns[moved])
-        return after
+_AGAIN_NS = 1_000_000_000
+"""Where stamps of a source fall by more, its time began again, as with another start of a robot
+whose clock does not go on: the same stamps are those of other scans from then on."""
 
 
-class SourceTrack:
-    """The poses of the scans of one source, in the order of their stamps."""
+class Motion(NamedTuple):
+    """The poses of one source, from one time that its time began until it began again."""
 
-    def __init__(self) -> None:
-        self._new: dict[int, Doubles] = {}  # by stamp, those that came since they were put in order
-        self._stamps_ns: Longs = np.zeros(0, np.int64)
-        self._poses: Doubles = np.zeros((0, 4, 4))
-        self._corrected: _Moves | None = None  # last
+    stamps_ns: Longs  # [N] rising
+    poses: Doubles  # [N, 4, 4]
 
-    def add(self, stamp_ns: int, pose: Doubles) -> None:
-        """Add a pose [4, 4]; one with the same stamp is replaced."""
-        self._new[stamp_ns] = pose
+    def moves(self, stamps_ns: Longs, poses: Doubles) -> tuple[Longs, Doubles]:
+        """Return times [M] and moves [M, 4, 4] there, each in the source's own frame.
 
-    @property
-    def stamps_ns(self) -> Longs:
-        """The stamps [N] of all poses, rising."""
-        self._put_in_order()
-        return self._stamps_ns
-
-    @property
-    def poses(self) -> Doubles:
-        """All poses [N, 4, 4]."""
-        self._put_in_order()
-        return self._poses
-
-    def pose(self, stamp_ns: int) -> Doubles:
-        """Return the pose [4, 4] with a stamp, which must be there."""
-        result: Doubles = self.poses[np.searchsorted(self.stamps_ns, stamp_ns)]
-        return result
-
-    def covers(self, stamps_ns: Longs) -> Bools:
-        """Return at which times [K] its pose is known."""
-        if len(self.stamps_ns) == 0:
-            return np.zeros(len(stamps_ns), np.bool_)
-        known: Bools = (stamps_ns >= self._stamps_ns[0]) & (stamps_ns <= self._stamps_ns[-1])
-        return known
-
-    def correct(self, correction: LoggedCorrection) -> None:
-        """Move the poses that a correction is about.
-
-        A pose between two of the correction moves, in its own frame, by what lies between their
-        moves; after the last one, by that one's.
+        They bring it to ``poses`` [K, 4, 4] at ``stamps_ns`` [K], which rise. Those that do not lie
+        amid its own say nothing: where none does, M is 0.
         """
-        stamps, before = self.stamps_ns, self.poses
-        known = self.covers(correction.stamps_ns)
-        if not known.any():
-            return
-        given, better = correction.stamps_ns[known], correction.world_from_sensor[known]
-        moves = np.linalg.inv(_between(stamps, before, given)) @ better
-        first_ns = int(correction.stamps_ns[0])
-        self._corrected = _Moves(given, moves, first_ns, correction.until_ns)
-        self._poses = self._corrected.apply(stamps, before)
-
-    def add_late(self, stamp_ns: int, pose: Doubles) -> Doubles:
-        """Add a pose [4, 4] that came amid the last correction; return it as that moves it."""
-        if self._corrected is not None:
-            pose = self._corrected.apply(np.array([stamp_ns]), pose[None])[0]
-        self.add(stamp_ns, pose)
-        return pose
-
-    def _put_in_order(self) -> None:
-        if not self._new:
-            return
-        stamps = np.fromiter(self._new, np.int64, len(self._new))
-        kept = ~np.isin(self._stamps_ns, stamps)
-        stamps = np.concatenate([self._stamps_ns[kept], stamps])
-        poses = np.concatenate([self._poses[kept], np.array(list(self._new.values()))])
-        order = np.argsort(stamps)
-        self._stamps_ns, self._poses = stamps[order], poses[order]
-        self._new.clear()
+        known = (stamps_ns >= self.stamps_ns[0]) & (stamps_ns <= self.stamps_ns[-1])
+        given, better = stamps_ns[known], poses[known]
+        if not len(given):
+            return given, better
+        moves = np.linalg.inv(_between(self.stamps_ns, self.poses, given)) @ better
+        if known[0]:
+            return given, moves
+        return np.append(stamps_ns[:1], given), np.concatenate([moves[:1], moves])
 
 
-class SourceTracks(defaultdict[str, SourceTrack]):
-    """The tracks of all sources, by name."""
+class LogPoses:
+    """The poses of the scans of a log, kept or not, a row each in the order in which they came."""
 
     def __init__(self) -> None:
-        super().__init__(SourceTrack)
+        self.poses: list[Doubles] = []
+        self._stamps_ns: list[int] = []
+        # Of each source, and each time that its time began, the last one last.
+        self._rows = defaultdict[str, list[list[int]]](list)
+
+    @property
+    def sources(self) -> list[str]:
+        """The names of all sources."""
+        return sorted(self._rows)
 
     def take(self, entry: Entry) -> None:
         """Go on with the next entry of a log: a pose is added, and a correction moves those before.
@@ -112,11 +58,78 @@ class SourceTracks(defaultdict[str, SourceTrack]):
         A reset moves none.
         """
         if isinstance(entry, LoggedScan):
-            self[entry.source].add(entry.stamp_ns, entry.world_from_sensor)
+            self._add(entry, entry.world_from_sensor)
         elif isinstance(entry, Transform):
-            self[entry.child].add(entry.stamp_ns, entry.pose)
+            self._add(entry, entry.pose)
         elif isinstance(entry, LoggedCorrection):
-            self[entry.source].correct(entry)
+            self.correct(entry)
+
+    def correct(self, correction: LoggedCorrection) -> tuple[Longs, Doubles, Doubles]:
+        """Move poses; return their rows [N], and what they were and are [N, 4, 4]."""
+        starts = self._rows[correction.source]
+        if correction.since >= len(starts):  # they are kept no more
+            return np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.zeros((0, 4, 4))
+        rows = starts[-1 - correction.since]
+        before = np.array([self.poses[row] for row in rows])
+        stamps_ns = np.array([self._stamps_ns[row] for row in rows], np.int64)
+        after = corrected(correction, stamps_ns, before)
+        for row, pose in zip(rows, after, strict=True):
+            self.poses[row] = pose
+        return np.array(rows, np.int64), before, after
+
+    def motion(self, source: str, first_ns: int, last_ns: int) -> tuple[Motion, int]:
+        """Return the last motion of a source that lies amid two times, or its last one.
+
+        With it comes how often its time began again since.
+        """
+        motions = [self._motion(rows) for rows in reversed(self._rows[source])]
+        for since, one in enumerate(motions):
+            if one.stamps_ns[0] <= last_ns and one.stamps_ns[-1] >= first_ns:
+                return one, since
+        return motions[0], 0
+
+    def begin_amid(self, correction: LoggedCorrection) -> bool:
+        """Return whether a correction may have moved scans before the first that are here."""
+        starts = self._rows[correction.source]
+        at = len(starts) - 1 - correction.since
+        first_ns = min(self._stamps_ns[row] for row in starts[0]) if starts else 0
+        return at < 0 or (at == 0 and bool(correction.stamps_ns[0] < first_ns))
+
+    def of(self, source: str) -> Doubles:
+        """Return all poses [N, 4, 4] of a source, in the order in which they came."""
+        rows = [row for rows in self._rows[source] for row in rows]
+        return np.array([self.poses[row] for row in rows])
+
+    def starts(self, source: str) -> int:
+        """Return how often the time of a source began."""
+        return len(self._rows[source])
+
+    def _add(self, entry: LoggedScan | Transform, pose: Doubles) -> None:
+        starts, stamp_ns = self._rows[source_of(entry)], entry.stamp_ns
+        if not starts or stamp_ns < self._stamps_ns[starts[-1][-1]] - _AGAIN_NS:
+            starts.append([])
+        starts[-1].append(len(self.poses))
+        self.poses.append(pose)
+        self._stamps_ns.append(stamp_ns)
+
+    def _motion(self, rows: list[int]) -> Motion:
+        stamps_ns = np.array([self._stamps_ns[row] for row in rows], np.int64)
+        order = np.argsort(stamps_ns, kind="stable")
+        return Motion(stamps_ns[order], np.array([self.poses[row] for row in rows])[order])
+
+
+def source_of(entry: LoggedScan | Transform) -> str:
+    """Return of which source a pose is."""
+    return entry.source if isinstance(entry, LoggedScan) else entry.child
+
+
+def corrected(correction: LoggedCorrection, stamps_ns: Longs, poses: Doubles) -> Doubles:
+    """Return poses [N, 4, 4] at times [N] as they are after a correction."""
+    moved = (stamps_ns >= correction.stamps_ns[0]) & (stamps_ns <= correction.until_ns)
+    after: Doubles = poses.copy()
+    moves = _between(correction.stamps_ns, correction.moves, stamps_ns[moved])
+    after[moved] = poses[moved] @ moves
+    return after
 
 
 def _between(stamps_ns: Longs, poses: Doubles, at_ns: Longs) -> Doubles:
@@ -130,7 +143,9 @@ def _between(stamps_ns: Longs, poses: Doubles, at_ns: Longs) -> Doubles:
     span_ns = np.maximum(stamps_ns[after] - stamps_ns[before], 1)
     share = np.clip((at_ns - stamps_ns[before]) / span_ns, 0.0, 1.0)[:, None]
     share[after == before] = 0.0
-    turns = np.array([quaternion_of(pose[:3, :3]) for pose in poses])
+    turns = np.zeros((len(poses), 4))
+    for row in np.union1d(before, after).tolist():  # of others it would take long
+        turns[row] = quaternion_of(poses[row, :3, :3])
     places = poses[:, :3, 3]
     positions = places[before] + share * (places[after] - places[before])
     return pose_matrices(positions, slerp(turns[before], turns[after], share))

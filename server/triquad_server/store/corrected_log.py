@@ -1,6 +1,6 @@
 """The scans that were kept, with corrected poses, from the first one that moves."""
 
-from collections import defaultdict
+from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 from triquad_format.errors import RefusedError
 from triquad_format.mapfile.checkpoint_folder import CheckpointFile, checkpoint_files
-from triquad_format.records.arrays import Bools, Doubles
+from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.scan_log.log_folder import Segment, history, of_map, segments
 from triquad_format.scan_log.reading import Entry, read_segment
 from triquad_format.scan_log.ros_messages import Transform
 from triquad_format.scan_log.segment import LoggedCorrection, LoggedReset, LoggedScan
-from triquad_format.scan_log.tracks import SourceTrack, SourceTracks
+from triquad_format.scan_log.tracks import LogPoses, corrected, source_of
 
 from triquad_server.store.store import Store
 
@@ -22,15 +22,25 @@ _TOLERANCE, _AT = 0.02, 40.0
 units of how far kept scans are apart."""
 
 
+class WantedPoses(NamedTuple):
+    """Better poses of a source, in the coordinates of who gave them."""
+
+    source: str
+    stamps_ns: Longs  # [K] rising, nanoseconds since 1970
+    world_from_sensor: Doubles  # [K, 4, 4]
+
+
 @dataclass(frozen=True)
 class CorrectedLog:
     """What a map is to be made of again."""
 
     correction: LoggedCorrection
+    start: int  # of the source's times, from 0 on: whose scans move
     base: CheckpointFile | None  # from which it goes on; None: it begins with nothing
     files: list[Segment]  # of the log, with all that came after that
-    tracks: SourceTracks
-    moved: int  # the number of kept scans that move
+    first_row: int  # with which these begin
+    poses: LogPoses
+    moved: int  # the number of scans that move
 
     def entries(self) -> Iterator[LoggedScan | LoggedReset]:
         """Yield kept scans, with corrected poses, and resets, in their order.
@@ -39,119 +49,126 @@ class CorrectedLog:
             FormatError: a file is damaged.
             OSError: it cannot be read.
         """
+        row = self.first_row
         for segment in self.files:
             for entry in read_segment(segment.path):
                 if isinstance(entry, LoggedScan):
-                    pose = self.tracks[entry.source].pose(entry.stamp_ns)
-                    yield replace(entry, world_from_sensor=pose)
+                    yield replace(entry, world_from_sensor=self.poses.poses[row])
                 elif isinstance(entry, LoggedReset):
                     yield entry
+                row += isinstance(entry, LoggedScan | Transform)
 
     def late(self, entry: Entry) -> Entry:
         """Return what came meanwhile as the log will have it: before the correction, so it moves.
 
-        The tracks have it, too, from then on.
+        The poses have it, too, from then on.
         """
         source = self.correction.source
-        track = self.tracks[source]
-        if isinstance(entry, LoggedScan) and entry.source == source:
-            pose = track.add_late(entry.stamp_ns, entry.world_from_sensor)
-            return replace(entry, world_from_sensor=pose)
-        if isinstance(entry, Transform) and entry.child == source:
-            return entry._replace(pose=track.add_late(entry.stamp_ns, entry.pose))
+        self.poses.take(entry)
+        if isinstance(entry, LoggedReset | LoggedCorrection):
+            return entry
+        poses = self.poses.poses
+        if source_of(entry) == source and self.poses.starts(source) - 1 == self.start:
+            stamps_ns = np.array([entry.stamp_ns])
+            poses[-1] = corrected(self.correction, stamps_ns, poses[-1][None])[0]
+        if isinstance(entry, LoggedScan):
+            return replace(entry, world_from_sensor=poses[-1])
         return entry
 
-
-class _Kept(NamedTuple):
-    """A scan that was kept."""
-
-    file: int  # its number
-    stamp_ns: int
+    def logged(self) -> LoggedCorrection:
+        """Return the correction as it stands in the log after what came meanwhile."""
+        since = self.poses.starts(self.correction.source) - 1 - self.start
+        return replace(self.correction, since=since)
 
 
 class _Earlier(NamedTuple):
     """A correction that stands in the log."""
 
     file: int
-    first_moved: int  # the file with the first scan that it moved
+    first_moved: int  # the file with the first scan that it moved; -1: it is not kept any more
 
 
-def corrected_log(store: Store, correction: LoggedCorrection, *, onward: bool) -> CorrectedLog:
-    """Return the log of a store, up to its newest checkpoint, after a correction.
+def corrected_log(
+    store: Store, newest: int, wanted: WantedPoses, *, onward: bool
+) -> CorrectedLog | None:
+    """Return the log of a store, up to the checkpoint of epoch ``newest``, after a correction.
 
-    With ``onward`` it moves all scans that come after its poses.
+    With ``onward`` it moves all scans that come after its poses. ``None``: no scan moves.
 
     Raises:
         RefusedError: it does not go back to the first scan that moves, or has none of the source.
         FormatError: a file is damaged.
         OSError: it cannot be read.
     """
-    files = history(of_map(segments(store.scans.folder), store.epoch, store.restored))
+    files = history(of_map(segments(store.scans.folder), newest, store.restored))
     apart_m = store.scans.apart_m
-    tracks, scans = SourceTracks(), defaultdict[str, list[_Kept]](list)
-    earlier = list[_Earlier]()
+    is_whole = not files or files[0].after == 0
+    poses, first_rows, earlier = LogPoses(), list[int](), list[_Earlier]()
     for number, segment in enumerate(files):
+        first_rows.append(len(poses.poses))
         for entry in read_segment(segment.path):
-            if isinstance(entry, LoggedScan):
-                scans[entry.source].append(_Kept(number, entry.stamp_ns))
             if isinstance(entry, LoggedCorrection):
-                moved = _move(scans[entry.source], tracks[entry.source], entry, apart_m)
-                earlier += [_Earlier(number, moved[0].file)] if moved else []
+                rows = _moved(poses.correct(entry), apart_m)
+                if not is_whole and poses.begin_amid(entry):
+                    earlier.append(_Earlier(number, -1))
+                elif len(rows):
+                    earlier.append(_Earlier(number, _file(first_rows, rows.min())))
             else:
-                tracks.take(entry)
-    if correction.source not in tracks:
-        raise RefusedError("bad_request", _no_source(correction.source, tracks))
-    track = tracks[correction.source]
-    _check_times(correction, track)
-    correction = _until(int(track.stamps_ns[-1]), correction, onward=onward)
-    moved = _move(scans[correction.source], track, correction, apart_m)
-    log = CorrectedLog(correction, None, files, tracks, len(moved))
-    return _from(moved[0].file, earlier, log, store) if moved else log
-
-
-def _move(
-    scans: list[_Kept], track: SourceTrack, correction: LoggedCorrection, apart_m: float
-) -> list[_Kept]:
-    """Correct a track; return which of the kept scans moved by more than the tolerance."""
-    before = track.poses
-    track.correct(correction)
-    stamps = set(track.stamps_ns[_moved(before, track.poses, apart_m)].tolist())
-    return [scan for scan in scans if scan.stamp_ns in stamps]
-
-
-def _check_times(correction: LoggedCorrection, track: SourceTrack) -> None:
-    """Raise RefusedError where no pose of a correction lies amid the scans that are kept."""
-    if not track.covers(correction.stamps_ns).any():
-        from_s, to_s = correction.stamps_ns[[0, -1]] / 1e9
-        first_s, last_s = track.stamps_ns[[0, -1]] / 1e9
-        raise RefusedError(
-            "bad_request",
-            f"none of the times, {from_s:.3f} to {to_s:.3f} s, lies amid the scans of "
-            f"'{correction.source}', {first_s:.3f} to {last_s:.3f} s: give the stamps with which "
-            "they were published",
-        )
-
-
-def _until(newest_ns: int, correction: LoggedCorrection, *, onward: bool) -> LoggedCorrection:
-    """Return a correction without its poses after the newest scan.
-
-    Scans that come later find it as it is then: those that it is about move as the newest one.
-    """
-    known = correction.stamps_ns <= newest_ns
-    return replace(
-        correction,
-        stamps_ns=correction.stamps_ns[known],
-        world_from_sensor=correction.world_from_sensor[known],
-        until_ns=newest_ns if onward else correction.until_ns,
+                poses.take(entry)
+    correction, start = _correction(wanted, poses, onward=onward, is_whole=is_whole)
+    rows = _moved(poses.correct(correction), apart_m)
+    if not len(rows):
+        return None
+    number, base = _base(_file(first_rows, rows.min()), files, earlier, store)
+    return CorrectedLog(
+        correction, start, base, files[number:], first_rows[number], poses, len(rows)
     )
 
 
-def _from(first: int, earlier: list[_Earlier], log: CorrectedLog, store: Store) -> CorrectedLog:
-    """Return the log from the newest checkpoint on that has nothing of file ``first``.
+def _correction(
+    wanted: WantedPoses, poses: LogPoses, *, onward: bool, is_whole: bool
+) -> tuple[LoggedCorrection, int]:
+    """Return the correction that brings a source to some poses, and which of its times it is about.
+
+    Raises:
+        RefusedError: none of the poses lies amid the scans that are kept, or, where the log
+            ``is_whole`` no more, not all of them.
+    """
+    source, stamps_ns = wanted.source, wanted.stamps_ns
+    if source not in poses.sources:
+        known = ", ".join(poses.sources) or "none"
+        known += "" if is_whole else "; the oldest are kept no more (store.log_max_bytes)"
+        text = f"no scan of source '{source}' is kept: those of {known} are"
+        raise RefusedError("bad_request", text)
+    from_ns, to_ns = stamps_ns[[0, -1]].tolist()
+    motion, since = poses.motion(source, from_ns, to_ns)
+    start = poses.starts(source) - 1 - since
+    first_ns, last_ns = motion.stamps_ns[[0, -1]].tolist()
+    known_ns, moves = motion.moves(stamps_ns, wanted.world_from_sensor)
+    if not len(moves):
+        raise RefusedError(
+            "bad_request",
+            f"none of the times, {from_ns / 1e9:.3f} to {to_ns / 1e9:.3f} s, lies amid the scans "
+            f"of '{source}', {first_ns / 1e9:.3f} to {last_ns / 1e9:.3f} s: give the stamps with "
+            "which they were published",
+        )
+    if from_ns < first_ns and start == 0 and not is_whole:
+        raise RefusedError(
+            "store",
+            f"scans of '{source}' before {first_ns / 1e9:.3f} s are not kept any more "
+            "(store.log_max_bytes): give poses from then on, if those before are right",
+        )
+    until_ns = last_ns if onward else to_ns
+    return LoggedCorrection(source, known_ns, moves, until_ns, since), start
+
+
+def _base(
+    first: int, files: list[Segment], earlier: list[_Earlier], store: Store
+) -> tuple[int, CheckpointFile | None]:
+    """Return the newest checkpoint that has nothing of file ``first``, and the file after it.
 
     Nor may it have scans where they were before a correction that came after it.
     """
-    files = log.files
     least = 0 if store.restored is None else store.restored.as_epoch
     checkpoints = [one for one in checkpoint_files(store.folder) if one.epoch >= least]
     for number in range(first, -1, -1):
@@ -161,9 +178,9 @@ def _from(first: int, earlier: list[_Earlier], log: CorrectedLog, store: Store) 
         bases = [one for one in checkpoints if since <= one.epoch < until]
         if bases:
             base = max(bases, key=lambda one: one.epoch)
-            return replace(log, base=base, files=files[number:])
+            return number, base
     if files[0].after == 0:
-        return log
+        return 0, None
     raise RefusedError(
         "store",
         f"scans before epoch {files[0].after} are not kept any more (store.log_max_bytes), and no "
@@ -172,14 +189,15 @@ def _from(first: int, earlier: list[_Earlier], log: CorrectedLog, store: Store) 
     )
 
 
-def _moved(before: Doubles, after: Doubles, apart_m: float) -> Bools:
-    """Return which poses [N, 4, 4] differ by more than the tolerance."""
+def _file(first_rows: list[int], row: int) -> int:
+    """Return the number of the file that has a row."""
+    return bisect_right(first_rows, row) - 1
+
+
+def _moved(corrected: tuple[Longs, Doubles, Doubles], apart_m: float) -> Longs:
+    """Return the rows [M] of those poses [N, 4, 4] that differ by more than the tolerance."""
+    rows, before, after = corrected
     shifts = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
     turns = np.linalg.norm(after[:, :3, :3] - before[:, :3, :3], axis=(1, 2)) / np.sqrt(2)
-    result: Bools = shifts + _AT * apart_m * turns > _TOLERANCE * apart_m
+    result: Longs = rows[shifts + _AT * apart_m * turns > _TOLERANCE * apart_m]
     return result
-
-
-def _no_source(name: str, tracks: SourceTracks) -> str:
-    known = ", ".join(sorted(tracks)) or "none"
-    return f"no scan of source '{name}' is kept: those of {known} are"

@@ -4,6 +4,7 @@ import logging
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from itertools import chain
 
 import numpy as np
@@ -11,7 +12,7 @@ from triquad_format.errors import FormatError, RefusedError
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.pose import pose_matrices
 from triquad_format.scan_log.reading import Entry
-from triquad_format.scan_log.segment import LoggedCorrection, LoggedReset, LoggedScan
+from triquad_format.scan_log.segment import LoggedReset, LoggedScan
 from triquad_format.wire.limits import MAX_KEYFRAMES
 from triquad_format.wire.source_messages import CorrectPosesReply, CorrectPosesRequest
 
@@ -20,7 +21,7 @@ from triquad_server.intake.source_trails import SourceTrails
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.store.checkpoint_writer import CheckpointWriter, way_back
-from triquad_server.store.corrected_log import CorrectedLog, corrected_log
+from triquad_server.store.corrected_log import CorrectedLog, WantedPoses, corrected_log
 from triquad_server.store.restore import valid_checkpoint
 from triquad_server.store.store import Store
 
@@ -75,14 +76,14 @@ class PoseCorrector:
                 f"it takes a second map of {used / 1e6:.0f} MB for a while, and memory.max_bytes = "
                 f"{self._max_bytes} has no room for that: start the server with more",
             )
-        correction = _correction(request, self._mapper.origin)
+        wanted = _wanted(request, self._mapper.origin)
         followed = deque[Entry]()
         try:
             # So that the log has all until there.
-            newest = self._checkpoints.write(at_cut=lambda: store.scans.follow(followed))
-            log = corrected_log(store, correction, onward=request.onward)
-            if log.moved == 0:
-                return CorrectPosesReply(newest.epoch, scans_moved=0, scans_learnt=0)
+            newest = self._checkpoints.write(at_cut=lambda: store.scans.follow(followed)).epoch
+            log = corrected_log(store, newest, wanted, onward=request.onward)
+            if log is None:
+                return CorrectPosesReply(newest, scans_moved=0, scans_learnt=0)
             kept = self._checkpoints.keep_newest("correcting poses").epoch
             return self._correct(store, log, followed, kept)
         except (StoreError, FormatError, OSError) as error:
@@ -107,11 +108,13 @@ class PoseCorrector:
             while followed:
                 again.take(log.late(followed.popleft()))
             mapper.become(again.map)
-            store.scans.add_correction(log.correction)
-            self._trails.retrace(source, log.tracks[source].poses[:, :3, 3] - mapper.origin)
+            store.scans.add_correction(log.logged())
+            self._trails.retrace(source, log.poses.of(source)[:, :3, 3] - mapper.origin)
             return mapper.publish().number
 
         epoch = self._mapper.call(change)
+        with suppress(StoreError):  # which the log and the status tell
+            self._checkpoints.write()  # else a server that is killed would have the map of before
         took_s, undo = time.monotonic() - began_s, way_back(kept)
         _log.warning(
             "%d scans of %s were corrected as of epoch %d, after %.1f s: %s",
@@ -164,8 +167,8 @@ def _until_few_are_left(followed: "deque[Entry]") -> Iterator[Entry]:
         yield followed.popleft()
 
 
-def _correction(request: CorrectPosesRequest, origin: Doubles) -> LoggedCorrection:
-    """Return the correction that a request wants, in the coordinates of the map's user.
+def _wanted(request: CorrectPosesRequest, origin: Doubles) -> WantedPoses:
+    """Return the poses that a request wants, in the coordinates of the map's user.
 
     Raises:
         RefusedError: it is none.
@@ -184,4 +187,4 @@ def _correction(request: CorrectPosesRequest, origin: Doubles) -> LoggedCorrecti
     if (abs(lengths - 1) > _UNIT_TOLERANCE).any():
         raise RefusedError("bad_request", "a quaternion has not the length 1")
     poses = pose_matrices(request.positions + origin, turns / lengths)
-    return LoggedCorrection(request.source, stamps_ns, poses, until_ns=int(stamps_ns[-1]))
+    return WantedPoses(request.source, stamps_ns, poses)

@@ -87,11 +87,13 @@ class ScanLog:
                 if segment.epoch > epoch:
                     segment.path.unlink()
             newest = max((one.epoch for one in of_map(found, epoch, restored)), default=0)
-            # Of a map that is there already, and has none, what came before was lost.
-            self._newest = newest or (None if epoch else 0)
+            # Each checkpoint has its file: else what came before it was lost, or not kept.
+            goes_on = newest == epoch
             if restored is not None and restored.as_epoch == epoch > newest:
-                # An empty file marks that scans since the older checkpoint are in the map no more.
-                self._open()
+                goes_on = newest == restored.epoch
+            self._newest = newest if goes_on else None
+            if newest < epoch:
+                # An empty file marks that what came since is lost, or in the map no more.
                 self.keep(self.cut(), epoch)
 
     @property
@@ -144,13 +146,21 @@ class ScanLog:
         self._put(correction, lambda writer: writer.add_correction(correction))
 
     def cut(self) -> SegmentWriter | None:
-        """Return the file with what was added since the last time; ``None``: nothing was."""
-        written, self._writer = self._writer, None
-        return written
+        """Return the file with what was added since the last time; ``None``: none can be."""
+        if self.is_kept:
+            with self._telling("cannot be written"):
+                self._open()
+        return self._taken()
 
     def keep(self, written: SegmentWriter | None, epoch: int) -> None:
-        """Make a file durable that ends with ``epoch``; the oldest go that there is no room for."""
+        """Make a file durable that ends with ``epoch``; the oldest go that there is no room for.
+
+        An empty one tells that the log goes on until then.
+        """
         if written is None:
+            return
+        if not written.messages and epoch == self._newest:
+            written.discard()
             return
         after = epoch if written.after_loss or self._newest is None else self._newest
         self._newest = None
@@ -165,8 +175,12 @@ class ScanLog:
 
     def close(self) -> None:
         """Give up what was added since the last time, for the map has it in no checkpoint."""
-        if (written := self.cut()) is not None:
+        if (written := self._taken()) is not None:
             written.discard()
+
+    def _taken(self) -> SegmentWriter | None:
+        written, self._writer = self._writer, None
+        return written
 
     def _is_apart(self, scan: Scan) -> bool:
         kept, pose = self._kept.get(scan.source), scan.world_from_sensor

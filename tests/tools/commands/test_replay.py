@@ -150,7 +150,7 @@ def test_poses_of_scans_that_were_published_are_corrected(tmp_path, capsys):
         there = ["--connect", server.endpoint]
         assert main([str(folder), *there]) == 0
         assert main([str(folder), *there, "--trajectory", str(better), "--correct-poses"]) == 0
-        assert "2 kept scans moved, 2 taken in again" in capsys.readouterr().out
+        assert "6 scans moved, 2 taken in again" in capsys.readouterr().out
         with triquad_client.connect(server.endpoint) as client:
             trail = client.sources().sources["default"].trail
     np.testing.assert_allclose(trail[:, 1], 0.5, atol=1e-6)

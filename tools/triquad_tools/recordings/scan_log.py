@@ -14,7 +14,7 @@ from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.scan_log.log_folder import LOG_NAME, Segment, history, of_map, segments
 from triquad_format.scan_log.reading import Entry, read_segment
 from triquad_format.scan_log.segment import LoggedCorrection, LoggedReset, LoggedScan
-from triquad_format.scan_log.tracks import SourceTracks
+from triquad_format.scan_log.tracks import LogPoses
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
@@ -40,7 +40,7 @@ class ScanLogRecording:
     entries: Sequence[ScanEntry]
     counts: Sequence[int]  # of scans in each file
     resets: Sequence[PlacedReset]
-    tracks: SourceTracks
+    poses: Sequence[Doubles]  # of the scans
     streams: Sequence[Stream]
     remarks: Sequence[str] = ()
 
@@ -63,7 +63,7 @@ class ScanLogRecording:
             for index, scan in zip(here, scans, strict=True):
                 if index in wanted:
                     later = [reset.box for reset in self.resets if reset.scans > index]
-                    pose = self.tracks[scan.source].pose(scan.stamp_ns)
+                    pose = self.poses[index]
                     yield PosedScan(_outside(scan, pose, later), pose, no_return=scan.no_return)
 
 
@@ -87,17 +87,18 @@ def read_scan_log(folder: Path) -> ScanLogRecording:
     entries: list[ScanEntry] = []
     counts: list[int] = []
     resets: list[PlacedReset] = []
-    tracks, corrections = SourceTracks(), 0
+    poses, rows, corrections = LogPoses(), list[int](), 0
     with progress("looking through the scans", len(files)) as report:
         for number, segment in enumerate(files, start=1):
             before = len(entries)
             for one in _read(segment):
-                tracks.take(one)
+                poses.take(one)
                 corrections += isinstance(one, LoggedCorrection)
                 if isinstance(one, LoggedReset):
                     resets.append(PlacedReset(len(entries), one))
                 elif isinstance(one, LoggedScan):
                     entries.append(ScanEntry(one.stamp_ns, one.source))
+                    rows.append(len(poses.poses) - 1)
             counts.append(len(entries) - before)
             report(number, f"{number} of {len(files)} files")
     names = sorted({entry.source for entry in entries})
@@ -113,7 +114,8 @@ def read_scan_log(folder: Path) -> ScanLogRecording:
         remarks.append(f"what was reset, {len(resets)} times, is left out")
     if corrections:
         remarks.append(f"poses are as they were corrected, {corrections} times")
-    return ScanLogRecording(files, entries, counts, resets, tracks, streams, remarks)
+    kept = [poses.poses[row] for row in rows]
+    return ScanLogRecording(files, entries, counts, resets, kept, streams, remarks)
 
 
 def _of_map(folder: Path) -> list[Segment]:

@@ -95,7 +95,7 @@ def _correct(options: argparse.Namespace) -> int:
                     [known[stamp_ns] for stamp_ns in stamps_ns],
                 )
             print_line(
-                f"{source}: {reply.scans_moved} kept scans moved, {reply.scans_learnt} taken in "
+                f"{source}: {reply.scans_moved} scans moved, {reply.scans_learnt} taken in "
                 f"again, epoch {reply.epoch}"
             )
             if reply.undo:

@@ -1,13 +1,12 @@
 """The poses of a source's scans: as the server has them, and as a SLAM has them by now."""
 
 from collections import deque
-from copy import copy
 from typing import NamedTuple
 
 import numpy as np
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.scan_log.segment import LoggedCorrection
-from triquad_format.scan_log.tracks import SourceTrack
+from triquad_format.scan_log.tracks import Motion, corrected
 from triquad_format.wire.limits import MAX_KEYFRAMES
 
 MOVED_M, AT_M = 0.05, 10.0
@@ -34,8 +33,9 @@ class SourcePoses:
     def __init__(self) -> None:
         self._recent = deque[tuple[int, Doubles]](maxlen=_RECENT)
         self._kept: Doubles | None = None  # the one that was kept last
-        self._served, self._wanted = SourceTrack(), SourceTrack()  # at the same times
-        self._count = 0  # of these
+        self._stamps_ns: Longs = np.zeros(0, np.int64)  # [N] rising, of those that are kept
+        self._served: Doubles = np.zeros((0, 4, 4))  # [N, 4, 4] where the server has them
+        self._wanted = self._served
 
     @property
     def newest_ns(self) -> int:
@@ -55,19 +55,21 @@ class SourcePoses:
         Returns whether the path has a time amid the scans.
         """
         stamps_ns = path.stamps_ns[path.stamps_ns <= until_ns]
-        if not self._wanted.covers(stamps_ns).any():
-            return False
         poses = path.world_from_sensor[: len(stamps_ns)]
-        correction = LoggedCorrection("", stamps_ns, poses, until_ns)
-        wanted = self._corrected(correction)
+        motion = Motion(self._stamps_ns, self._wanted)
+        stamps_ns, moves = motion.moves(stamps_ns, poses)
+        if not len(moves):
+            return False
+        correction = LoggedCorrection("", stamps_ns, moves, until_ns)
+        wanted = corrected(correction, self._stamps_ns, self._wanted)
         if len(self._moved(wanted)):
             # What lies between a scan that moves and one that stays moves halfway: so the last that
             # moves is kept, and the first that stays.
             at = sum(stamp_ns <= until_ns for stamp_ns, _ in self._recent)
             for stamp_ns, pose in list(self._recent)[max(at - 1, 0) : at + 1]:
-                if stamp_ns not in self._served.stamps_ns:
+                if stamp_ns not in self._stamps_ns:
                     self._keep(stamp_ns, pose)
-            wanted = self._corrected(correction)
+            wanted = corrected(correction, self._stamps_ns, self._wanted)
         self._wanted = wanted
         return True
 
@@ -80,41 +82,29 @@ class SourcePoses:
         if len(moved) == 0:
             return None
         some = slice(moved[0], moved[-1] + 1)
-        return Poses(self._wanted.stamps_ns[some], self._wanted.poses[some])
+        return Poses(self._stamps_ns[some], self._wanted[some])
 
     def corrected(self, poses: Poses) -> None:
         """Record that the server has scans where :meth:`to_correct` said."""
-        for stamp_ns, pose in zip(poses.stamps_ns.tolist(), poses.world_from_sensor, strict=True):
-            self._served.add(stamp_ns, pose)
+        there = np.isin(self._stamps_ns, poses.stamps_ns)
+        self._served = self._served.copy()
+        self._served[there] = poses.world_from_sensor[np.isin(poses.stamps_ns, self._stamps_ns)]
 
     def _keep(self, stamp_ns: int, pose: Doubles) -> None:
         """Keep the pose of a scan, as it was published."""
-        self._count += 1
-        if self._count > MAX_KEYFRAMES:
-            self._served, self._wanted = _newer(self._served), _newer(self._wanted)
-            self._count = len(self._served.stamps_ns) + 1
-        self._served.add(stamp_ns, pose)
-        self._wanted.add(stamp_ns, pose)
+        if len(self._stamps_ns) >= MAX_KEYFRAMES:  # the newer half stays
+            newer = slice(MAX_KEYFRAMES // 2, None)
+            self._stamps_ns = self._stamps_ns[newer]
+            self._served, self._wanted = self._served[newer], self._wanted[newer]
+        at = int(np.searchsorted(self._stamps_ns, stamp_ns))
+        self._stamps_ns = np.insert(self._stamps_ns, at, stamp_ns)
+        self._served = np.insert(self._served, at, pose, axis=0)
+        self._wanted = np.insert(self._wanted, at, pose, axis=0)
 
-    def _corrected(self, correction: LoggedCorrection) -> SourceTrack:
-        """Return where a correction has the kept scans."""
-        track = copy(self._wanted)
-        track.correct(correction)
-        return track
-
-    def _moved(self, wanted: SourceTrack) -> Longs:
+    def _moved(self, wanted: Doubles) -> Longs:
         """Return which of the kept scans the server does not have where they are wanted."""
-        moved: Longs = np.flatnonzero(_motions_m(self._served.poses, wanted.poses) > MOVED_M)
+        moved: Longs = np.flatnonzero(_motions_m(self._served, wanted) > MOVED_M)
         return moved
-
-
-def _newer(track: SourceTrack) -> SourceTrack:
-    """Return the newer half of a track."""
-    newer = SourceTrack()
-    half = len(track.stamps_ns) // 2
-    for stamp_ns, pose in zip(track.stamps_ns[half:].tolist(), track.poses[half:], strict=True):
-        newer.add(stamp_ns, pose)
-    return newer
 
 
 def _motions_m(before: Doubles, after: Doubles) -> Doubles:
