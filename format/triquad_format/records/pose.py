@@ -65,21 +65,19 @@ def pose_matrices(positions: Doubles, quaternions: Doubles) -> Doubles:
 
 
 def quaternion_of(rotation: Doubles) -> Doubles:
-    """Return the unit quaternion [4] x, y, z, w of a rotation [3, 3].
+    """Return the unit quaternions [..., 4] x, y, z, w of rotations [..., 3, 3].
 
     Bar-Itzhack 2000, "New method for extracting the quaternion from a rotation matrix".
     """
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation.tolist()
-    products = np.array(
-        [
-            [xx - yy - zz, 0, 0, 0],
-            [yx + xy, yy - xx - zz, 0, 0],
-            [zx + xz, zy + yz, zz - xx - yy, 0],
-            [zy - yz, xz - zx, yx - xy, xx + yy + zz],
-        ]
-    )
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.moveaxis(rotation, (-2, -1), (0, 1))
+    products = np.zeros((*rotation.shape[:-2], 4, 4))
+    products[..., 0, 0] = xx - yy - zz
+    products[..., 1, 0], products[..., 1, 1] = yx + xy, yy - xx - zz
+    products[..., 2, 0], products[..., 2, 1], products[..., 2, 2] = zx + xz, zy + yz, zz - xx - yy
+    products[..., 3, 0], products[..., 3, 1], products[..., 3, 2] = zy - yz, xz - zx, yx - xy
+    products[..., 3, 3] = xx + yy + zz
     vectors = np.linalg.eigh(products).eigenvectors  # which reads the lower triangle alone
-    return np.asarray(vectors[:, -1], np.float64)
+    return np.asarray(vectors[..., -1], np.float64)
 
 
 def slerp(first: Doubles, second: Doubles, share: Doubles) -> Doubles:

@@ -50,7 +50,7 @@ class LogPoses:
     @property
     def sources(self) -> list[str]:
         """The names of all sources."""
-        return sorted(self._rows)
+        return sorted(name for name, starts in self._rows.items() if starts)
 
     def take(self, entry: Entry) -> None:
         """Go on with the next entry of a log: a pose is added, and a correction moves those before.
@@ -144,8 +144,8 @@ def _between(stamps_ns: Longs, poses: Doubles, at_ns: Longs) -> Doubles:
     share = np.clip((at_ns - stamps_ns[before]) / span_ns, 0.0, 1.0)[:, None]
     share[after == before] = 0.0
     turns = np.zeros((len(poses), 4))
-    for row in np.union1d(before, after).tolist():  # of others it would take long
-        turns[row] = quaternion_of(poses[row, :3, :3])
+    used = np.union1d(before, after)  # of others it would take long
+    turns[used] = quaternion_of(poses[used, :3, :3])
     places = poses[:, :3, 3]
     positions = places[before] + share * (places[after] - places[before])
     return pose_matrices(positions, slerp(turns[before], turns[after], share))

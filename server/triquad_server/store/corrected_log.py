@@ -137,8 +137,8 @@ def _correction(
     source, stamps_ns = wanted.source, wanted.stamps_ns
     if source not in poses.sources:
         known = ", ".join(poses.sources) or "none"
-        known += "" if is_whole else "; the oldest are kept no more (store.log_max_bytes)"
         text = f"no scan of source '{source}' is kept: those of {known} are"
+        text += "" if is_whole else ", and the oldest no more (store.log_max_bytes)"
         raise RefusedError("bad_request", text)
     from_ns, to_ns = stamps_ns[[0, -1]].tolist()
     motion, since = poses.motion(source, from_ns, to_ns)

@@ -19,6 +19,8 @@ APART_M = 0.1
 
 _RECENT = 200  # scans, 20 s at 10 Hz: a path waits for a correction that is under way
 
+_NEW = 1000  # poses that wait, at most, to be put among the others
+
 
 class Poses(NamedTuple):
     """Poses at some times."""
@@ -36,6 +38,7 @@ class SourcePoses:
         self._stamps_ns: Longs = np.zeros(0, np.int64)  # [N] rising, of those that are kept
         self._served: Doubles = np.zeros((0, 4, 4))  # [N, 4, 4] where the server has them
         self._wanted = self._served
+        self._new: list[tuple[int, Doubles]] = []  # that are not among these yet
 
     @property
     def newest_ns(self) -> int:
@@ -54,6 +57,7 @@ class SourcePoses:
 
         Returns whether the path has a time amid the scans.
         """
+        self._put_in_order()
         stamps_ns = path.stamps_ns[path.stamps_ns <= until_ns]
         poses = path.world_from_sensor[: len(stamps_ns)]
         motion = Motion(self._stamps_ns, self._wanted)
@@ -69,6 +73,7 @@ class SourcePoses:
             for stamp_ns, pose in list(self._recent)[max(at - 1, 0) : at + 1]:
                 if stamp_ns not in self._stamps_ns:
                     self._keep(stamp_ns, pose)
+            self._put_in_order()
             wanted = corrected(correction, self._stamps_ns, self._wanted)
         self._wanted = wanted
         return True
@@ -78,6 +83,7 @@ class SourcePoses:
 
         Those between them that stay hold others in place.
         """
+        self._put_in_order()
         moved = self._moved(self._wanted)
         if len(moved) == 0:
             return None
@@ -87,19 +93,26 @@ class SourcePoses:
     def corrected(self, poses: Poses) -> None:
         """Record that the server has scans where :meth:`to_correct` said."""
         there = np.isin(self._stamps_ns, poses.stamps_ns)
-        self._served = self._served.copy()
         self._served[there] = poses.world_from_sensor[np.isin(poses.stamps_ns, self._stamps_ns)]
 
     def _keep(self, stamp_ns: int, pose: Doubles) -> None:
         """Keep the pose of a scan, as it was published."""
-        if len(self._stamps_ns) >= MAX_KEYFRAMES:  # the newer half stays
-            newer = slice(MAX_KEYFRAMES // 2, None)
-            self._stamps_ns = self._stamps_ns[newer]
-            self._served, self._wanted = self._served[newer], self._wanted[newer]
-        at = int(np.searchsorted(self._stamps_ns, stamp_ns))
-        self._stamps_ns = np.insert(self._stamps_ns, at, stamp_ns)
-        self._served = np.insert(self._served, at, pose, axis=0)
-        self._wanted = np.insert(self._wanted, at, pose, axis=0)
+        self._new.append((stamp_ns, pose))
+        if len(self._new) >= _NEW:
+            self._put_in_order()
+
+    def _put_in_order(self) -> None:
+        """Have the new ones among the others; where these are too many, the newer half stays."""
+        if not self._new:
+            return
+        stamps_ns, poses = (np.array(each) for each in zip(*self._new, strict=True))
+        self._new.clear()
+        stamps_ns = np.append(self._stamps_ns, stamps_ns)
+        order = np.argsort(stamps_ns, kind="stable")
+        order = order[-MAX_KEYFRAMES // 2 :] if len(order) > MAX_KEYFRAMES else order
+        self._stamps_ns = stamps_ns[order]
+        self._served = np.concatenate([self._served, poses])[order]
+        self._wanted = np.concatenate([self._wanted, poses])[order]
 
     def _moved(self, wanted: Doubles) -> Longs:
         """Return which of the kept scans the server does not have where they are wanted."""
