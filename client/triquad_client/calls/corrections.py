@@ -58,7 +58,8 @@ class CorrectionCalls(ScanCalls):
 
         Raises:
             InvalidScanError: the times do not rise, or a pose is none.
-            RefusedError: ``bad_request``, where no scan of the source is kept; ``store``, where
+            RefusedError: ``bad_request``, where no scan of the source is kept, or points fit each
+                other clearly better by the inverses or by another reading; ``store``, where
                 what is needed is not kept; ``timeout``, as of :meth:`flush`. The map stays as it
                 is.
             RequestTimeoutError: not done after ``timeout_s``; the server goes on with it.
@@ -93,6 +94,7 @@ def _keyframes(stamps_s: ArrayLike, poses: ArrayLike | Sequence[PoseLike]) -> tu
     if len(falls):
         at = int(falls[0]) + 1
         raise InvalidScanError(
-            f"stamps_s[{at}] = {stamps_ns[at] / 1e9!r} is not later than the one before: they rise"
+            f"stamps_s[{at}] = {int(stamps_ns[at]) / 1e9} is not later than the one before: "
+            "they rise"
         )
     return stamps_ns, np.array(matrices)

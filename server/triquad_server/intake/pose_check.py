@@ -24,8 +24,8 @@ _REMEDIES = {
     "xyzw": "they were taken for w x y z: give quaternions as x y z w, with w last",
     "unmoved": "give points in the frame of the sensor; if they are, make rotations of radians, "
     "not of degrees",
-    "": "give each scan its own pose, of its time and world_from_sensor, with a rotation made of "
-    "radians, or of a quaternion x y z w",
+    "": "give each scan its own pose, of its time and world_from_sensor, of the sensor and not of "
+    "the robot's body, with a rotation made of radians, or of a quaternion x y z w",
 }
 _ORIGIN = (
     "give points in the frame of the sensor, or set ray_origin_m of the source to where it sits in "
@@ -64,13 +64,21 @@ class PoseCheck:
             if len(self._hidden) == _JUDGED:
                 self._first, self._scans = None, -_SKIPPED
 
+    def misreading(self) -> str | None:
+        """Return how poses seem to be meant that fit clearly better so; None: they may be right."""
+        told = self._misreading()
+        return f"{told[1]}: {_REMEDIES[told[0]]}" if told is not None and told[0] else None
+
     def problem(self) -> str | None:
         """Return what seems wrong, and what to do about it."""
-        told = agreement.misreading(self._pairs) if len(self._pairs) >= _LEAST else None
+        told = self._misreading()
         if told is not None:
             return f"{told[1]}: {_REMEDIES[told[0]]}"
         begins = agreement.hiding(self._hidden) if len(self._hidden) >= _LEAST else None
         return begins and f"{begins}: {_ORIGIN}"
+
+    def _misreading(self) -> tuple[str, str] | None:
+        return agreement.misreading(self._pairs) if len(self._pairs) >= _LEAST else None
 
     def _view(self, rays: ScanRays, pose: Doubles) -> ScanView:
         points = (rays.ends - rays.origin) @ pose[:3, :3]

@@ -17,6 +17,7 @@ from triquad_format.wire.limits import MAX_KEYFRAMES
 from triquad_format.wire.source_messages import CorrectPosesReply, CorrectPosesRequest
 
 from triquad_server.errors import ScanRefusedError, StoreError
+from triquad_server.intake.pose_check import PoseCheck
 from triquad_server.intake.source_trails import SourceTrails
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
@@ -59,8 +60,9 @@ class PoseCorrector:
         """Make the map as the corrected poses would have made it, and reply once it is there.
 
         Raises:
-            RefusedError: ``bad_request``; ``store`` where what is needed for it is not kept;
-                ``busy`` where there is no room for a second map. The map stays as it is.
+            RefusedError: ``bad_request``, also where the poses seem to be meant otherwise;
+                ``store`` where what is needed for it is not kept; ``busy`` where there is no room
+                for a second map. The map stays as it is.
         """
         store = self._checkpoints.store
         if store is None or not store.scans.is_kept:
@@ -103,6 +105,8 @@ class PoseCorrector:
             if self._is_stopping():
                 raise RefusedError("busy", "the server is stopping: no pose was corrected")
             again.take(entry)
+        if (told := again.check.misreading()) is not None:
+            raise RefusedError("bad_request", f"no pose was corrected: {told}")
 
         def change(mapper: Mapper) -> int:
             while followed:
@@ -132,6 +136,8 @@ class _MapAgain:
         base = log.base
         self.map = live.other(None if base is None else valid_checkpoint(base).record)
         self.scans = 0  # that were taken in
+        self.check = PoseCheck()  # of those that the correction is about
+        self._correction = log.correction
 
     def take(self, entry: Entry) -> None:
         """Take in a scan, or forget what was reset.
@@ -151,7 +157,7 @@ class _MapAgain:
                 _log.warning("a kept scan of %s is left out: %s", entry.source, error)
 
     def _take_scan(self, scan: LoggedScan) -> None:
-        self.map.ingest(
+        rays = self.map.ingest(
             scan.points,
             scan.world_from_sensor,
             scan.stamp_ns // 1_000_000_000,
@@ -159,6 +165,9 @@ class _MapAgain:
             no_return=scan.no_return,
         )
         self.scans += 1
+        about = self._correction
+        if scan.source == about.source and about.stamps_ns[0] <= scan.stamp_ns <= about.until_ns:
+            self.check.see(rays, scan.world_from_sensor[:3, :3])
 
 
 def _until_few_are_left(followed: "deque[Entry]") -> Iterator[Entry]:

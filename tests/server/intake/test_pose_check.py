@@ -2,12 +2,14 @@
 
 import re
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support import hall, servers
-from triquad_client import Client, Intrinsics, Pose
+from support.maps.drifted import SETTINGS
+from triquad_client import Client, Intrinsics, Pose, RefusedError
 from triquad_format.records.arrays import Doubles
 
 SCANS = 36
@@ -108,3 +110,16 @@ def test_points_in_the_map_frame_are_told_with_the_remedy() -> None:
     with servers.service_and_client() as client:
         drive_lidar(client, as_it_is, in_map=True)
         assert_told("rays begin elsewhere: give points in the frame of the sensor", client)
+
+
+def test_corrections_of_another_meaning_are_refused_and_the_map_stays(tmp_path: Path) -> None:
+    with servers.service_and_client(SETTINGS, tmp_path) as client:
+        drive_lidar(client, as_it_is)
+        client.flush()
+        stamps_s = 1 + 0.1 * np.arange(SCANS)
+        trail = client.sources().sources["it"].trail
+        for meant, told in ((np.linalg.inv, INVERSE), (w_first, W_FIRST)):
+            with pytest.raises(RefusedError, match=f"no pose was corrected: the poses {told}"):
+                client.correct_poses("it", stamps_s, [meant(pose) for pose in way()])
+        np.testing.assert_array_equal(client.sources().sources["it"].trail, trail)
+        assert client.correct_poses("it", stamps_s, way()).scans_moved == 0

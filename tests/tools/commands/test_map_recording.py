@@ -172,7 +172,7 @@ def test_a_first_look_says_how_far_it_is_and_more_is_learnt_from_there(
     output = tmp_path / "map.triquad"
     arguments = [recording, str(output), "--settings", SETTINGS]
     assert main([*arguments, "--train-for", "0"]) == 0
-    learnt = re.search(r"it has learnt (\d+) % of what", capsys.readouterr().out)
+    learnt = re.search(r"it has had (\d+) % of its training", capsys.readouterr().out)
     assert learnt is not None
     assert 0 < int(learnt[1]) < 100
     assert_no_scan_is_lost(output, whole)

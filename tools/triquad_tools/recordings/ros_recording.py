@@ -275,7 +275,11 @@ class RosRecording:
         if not any(cloud.topic == topic for cloud in self._content.clouds):
             is_raw = "Pack" in kind or "Scan" in kind
             return _PACKETS.get(kind.partition("/")[0], "not used") if is_raw else "not used"
-        return "none can be placed" if topic in self._topics else f"other scans: --topics {topic}"
+        return (
+            "none is placed, as told below"
+            if topic in self._topics
+            else f"other scans: --topics {topic}"
+        )
 
 
 def _chosen_topics(found: RosContent, options: ReadingOptions) -> set[str]:

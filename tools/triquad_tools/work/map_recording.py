@@ -58,8 +58,8 @@ def work(options: argparse.Namespace) -> int:
         part.unlink()
         return OK
     print_line(
-        f"it has learnt {record.learnt_percent} % of what there is to learn: the same command "
-        f"without --train-for and with --force goes on, from {part}"
+        f"it has had {record.learnt_percent} % of its training, and triquad-inspect tells how well "
+        f"it fits; the same command without --train-for and with --force goes on, from {part}"
     )
     return OK
 
