@@ -16,7 +16,7 @@ from triquad_format.mapfile.writer import write_map
 from triquad_format.records.status import Status
 from triquad_server.mapping.mapper import Mapper
 from triquad_tools.commands.inspect import main
-from triquad_tools.mapfiles.diff import compare, difference
+from triquad_tools.mapfiles.diff import Change, compare, difference, print_diff
 from triquad_tools.mapfiles.object_changes import (
     LEAST_POINTS,
     Cluster,
@@ -209,6 +209,13 @@ def test_of_many_clusters_the_largest_of_each_kind_are_listed_and_the_rest_is_co
     assert [line.split()[0] for line in rows] == ["vanished"] * 2 + ["no"] * 5 + ["moved"] * 5
     assert [line.split()[1] for line in rows[-5:]] == ["83", "82", "81", "80", "79"]
     assert more == "  and smaller ones: 1 no longer known, 58 moved; --json prints all"
+
+
+@pytest.mark.parametrize(("vanished", "is_told"), [(370, True), (30, False)])
+def test_maps_in_two_frames_are_told(capsys, vanished, is_told):
+    change = Change(1000, 1000, 500, vanished, 0, 0, 0, moved_median_m=0.01, moved_p95_m=0.1)
+    print_diff(change)
+    assert ("are both in one frame?" in capsys.readouterr().out) == is_told
 
 
 def test_programs_get_all(files, capsys):
