@@ -132,6 +132,14 @@ def corrected(correction: LoggedCorrection, stamps_ns: Longs, poses: Doubles) ->
     return after
 
 
+def motions(before: Doubles, after: Doubles, within: float) -> Doubles:
+    """Return how far poses [N, 4, 4] move anything ``within`` so far of the sensor, at most."""
+    shifts = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
+    turns = np.linalg.norm(after[:, :3, :3] - before[:, :3, :3], axis=(1, 2)) / np.sqrt(2)
+    farthest: Doubles = shifts + within * turns
+    return farthest
+
+
 def _between(stamps_ns: Longs, poses: Doubles, at_ns: Longs) -> Doubles:
     """Return poses [M, 4, 4] at times [M], of poses [N, 4, 4] at rising times [N], one at least.
 

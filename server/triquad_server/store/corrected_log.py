@@ -13,7 +13,7 @@ from triquad_format.scan_log.log_folder import Segment, history, of_map, segment
 from triquad_format.scan_log.reading import Entry, read_segment
 from triquad_format.scan_log.ros_messages import Transform
 from triquad_format.scan_log.segment import LoggedCorrection, LoggedReset, LoggedScan
-from triquad_format.scan_log.tracks import LogPoses, corrected, source_of
+from triquad_format.scan_log.tracks import LogPoses, corrected, motions, source_of
 
 from triquad_server.store.store import Store
 
@@ -197,7 +197,5 @@ def _file(first_rows: list[int], row: int) -> int:
 def _moved(corrected: tuple[Longs, Doubles, Doubles], apart_m: float) -> Longs:
     """Return the rows [M] of those poses [N, 4, 4] that differ by more than the tolerance."""
     rows, before, after = corrected
-    shifts = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
-    turns = np.linalg.norm(after[:, :3, :3] - before[:, :3, :3], axis=(1, 2)) / np.sqrt(2)
-    result: Longs = rows[shifts + _AT * apart_m * turns > _TOLERANCE * apart_m]
-    return result
+    moved: Longs = rows[motions(before, after, _AT * apart_m) > _TOLERANCE * apart_m]
+    return moved

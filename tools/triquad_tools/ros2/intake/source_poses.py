@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.scan_log.segment import LoggedCorrection
-from triquad_format.scan_log.tracks import Motion, corrected
+from triquad_format.scan_log.tracks import Motion, corrected, motions
 from triquad_format.wire.limits import MAX_KEYFRAMES
 
 MOVED_M, AT_M = 0.05, 10.0
@@ -48,7 +48,7 @@ class SourcePoses:
     def add(self, stamp_ns: int, pose: Doubles) -> None:
         """Add a scan with its pose [4, 4]."""
         self._recent.append((stamp_ns, pose))
-        if self._kept is None or _motions_m(self._kept[None], pose[None])[0] > APART_M:
+        if self._kept is None or motions(self._kept[None], pose[None], AT_M)[0] > APART_M:
             self._kept = pose
             self._keep(stamp_ns, pose)
 
@@ -116,14 +116,5 @@ class SourcePoses:
 
     def _moved(self, wanted: Doubles) -> Longs:
         """Return which of the kept scans the server does not have where they are wanted."""
-        moved: Longs = np.flatnonzero(_motions_m(self._served, wanted) > MOVED_M)
+        moved: Longs = np.flatnonzero(motions(self._served, wanted, AT_M) > MOVED_M)
         return moved
-
-
-def _motions_m(before: Doubles, after: Doubles) -> Doubles:
-    """Return how far poses [N, 4, 4] move what is near the sensor, at most, metres."""
-    moves = np.linalg.inv(before) @ after
-    shifts = np.linalg.norm(moves[:, :3, 3], axis=1)
-    turns = np.linalg.norm(moves[:, :3, :3] - np.eye(3), axis=(1, 2)) / np.sqrt(2)
-    motions: Doubles = shifts + AT_M * turns
-    return motions
