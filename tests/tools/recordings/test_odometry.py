@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from support.recordings.bags import Recorded, messages_for, write_bag
 from support.recordings.kitti_folder import write_folder
+from support.recordings.point_files import columns, write_ply
 from support.recordings.trajectories import write_tum
 from support.ros_messages import CLOUD
 from triquad_client import Pose
@@ -98,8 +99,24 @@ def test_the_motion_during_sweeps_is_taken_out(tmp_path: Path) -> None:
 
 
 def _part_of(points: NDArray[np.float32], parts: int) -> NDArray[np.int64]:
-    turn = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) % 1.0
-    return np.minimum((turn * parts).astype(np.int64), parts - 1)
+    return np.minimum((_turn(points) * parts).astype(np.int64), parts - 1)
+
+
+def _turn(points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """How far a lidar has turned when it measures points [N, 3], from 0 to 1."""
+    turn: NDArray[np.float32] = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) % 1.0
+    return turn
+
+
+def test_clouds_that_are_free_of_motion_stay_so(tmp_path: Path) -> None:
+    drive = driven(12, 1.0)
+    for number, scan in enumerate(drive):
+        times = (0.1 * _turn(scan.points)).astype(np.float32)
+        write_ply(tmp_path / f"{number:06d}.ply", columns(scan.points, time=times))
+    recording = open_recording(tmp_path, ReadingOptions(odometry=True, deskew=False))
+    assert farthest_m(poses_of(recording), drive.poses) < 0.05
+    for read, scan in zip(recording.read(range(12)), drive, strict=True):
+        np.testing.assert_array_equal(read.points, scan.points)
 
 
 def test_scans_that_do_not_fit_those_before_are_refused(tmp_path: Path) -> None:
@@ -145,6 +162,11 @@ def test_what_odometry_needs_is_named(tmp_path: Path, monkeypatch: pytest.Monkey
         open_recording(bag, BY_CLOUDS)
     with pytest.raises(ToolError, match="--trajectory and --poses mean nothing"):
         open_recording(bag, ReadingOptions(odometry=True, poses="tf"))
+    with pytest.raises(ToolError, match="not --points-in world"):
+        open_recording(bag, ReadingOptions(odometry=True, points_in="world"))
+    nowhere = tmp_path / "nowhere.tum"
+    with pytest.raises(ToolError, match="leave one out"):
+        open_recording(bag, ReadingOptions(trajectory=nowhere, poses="tf"))
     monkeypatch.setitem(sys.modules, "small_gicp", None)
     with pytest.raises(ToolError, match=r"pip install 'triquad\[tools\]'"):
         open_recording(bag, ReadingOptions(odometry=True, topics=("/points",)))

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 from triquad_format.records.arrays import Doubles, Floats
+from triquad_format.records.pose import quaternion_of
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
@@ -80,7 +81,7 @@ class _Way:
         self._seen = library.GaussianVoxelMap(range_m / _CELLS)
         self._stamps_ns: list[int] = []
         self._poses: list[Doubles] = []
-        self._span_ns = (0, 0)  # from the first point to the last
+        self._spans_ns: list[int] = []  # when each sweep began and ended
         self._free: list[int] = []  # numbers of scans that are hardly held along one direction
 
     def add(self, number: int, sweep: Sweep) -> None:
@@ -99,10 +100,7 @@ class _Way:
         self._seen.insert(cloud, pose)
         self._stamps_ns.append(middle_ns)
         self._poses.append(pose)
-        self._span_ns = (
-            min(self._span_ns[0] or sweep.span_ns[0], sweep.span_ns[0]),
-            sweep.span_ns[1],
-        )
+        self._spans_ns += sweep.span_ns
 
     def _expected(self, sweep: Sweep, middle_ns: int) -> tuple[Floats, Doubles]:
         """Return points as seen from one place, and the pose there, if the sensor moves on."""
@@ -111,8 +109,8 @@ class _Way:
         track = Track()
         for stamp_ns in (sweep.span_ns[0], middle_ns, sweep.span_ns[1]):
             pose = self._ahead(stamp_ns)
-            turn = Rotation.from_matrix(pose[:3, :3]).as_quat()
-            track.add(stamp_ns, pose[:3, 3].tolist(), turn.tolist())
+            turn = quaternion_of(pose[:3, :3]).tolist()
+            track.add(stamp_ns, pose[:3, 3].tolist(), turn)
         frames = FrameTree().with_track(WORLD, sweep.frame, track)
         scan = place(sweep, frames, WORLD)
         return scan.points, scan.world_from_sensor
@@ -121,11 +119,8 @@ class _Way:
         """Return the pose [4, 4] at a time, if the sensor moves as it did between two scans."""
         if len(self._poses) < 2:
             return self._poses[0] if self._poses else np.eye(4)
-        at = 0 if stamp_ns < self._stamps_ns[0] else len(self._poses) - 2
-        (before, after), (before_ns, after_ns) = (
-            self._poses[at : at + 2],
-            self._stamps_ns[at : at + 2],
-        )
+        pair = slice(0, 2) if stamp_ns < self._stamps_ns[0] else slice(-2, None)
+        (before, after), (before_ns, after_ns) = self._poses[pair], self._stamps_ns[pair]
         step = np.linalg.inv(before) @ after
         times = min((stamp_ns - after_ns) / max(after_ns - before_ns, 1), _LONGEST)
         further = np.eye(4)
@@ -162,7 +157,7 @@ class _Way:
             raise ToolError("--odometry: no scan has any points")
         stamps_ns, poses = self._stamps_ns, self._poses
         # The first and the last sweep were not taken at once.
-        ends = [stamp_ns for stamp_ns in self._span_ns if stamp_ns not in stamps_ns]
+        ends = {self._spans_ns[0], self._spans_ns[-1]}.difference(stamps_ns)
         of_all = np.array([*stamps_ns, *ends], np.int64)
         found = timed(
             Path("odometry"), "VGICP", np.array([*poses, *map(self._ahead, ends)]), of_all

@@ -11,6 +11,7 @@ from pathlib import Path
 from triquad_tools.console.arguments import Place
 from triquad_tools.console.command import ToolError, print_remark
 from triquad_tools.console.suffixes import MAP_SUFFIX
+from triquad_tools.recordings.arguments import WORLD
 from triquad_tools.recordings.cloud import points_in_range
 from triquad_tools.recordings.folders.cloud_folder import is_cloud_folder, read_cloud_folder
 from triquad_tools.recordings.folders.depth_folder import is_depth_folder, read_depth_folder
@@ -61,8 +62,7 @@ def open_recording(path: Path, options: ReadingOptions) -> Recording:
     """
     if not path.exists():
         raise ToolError(f"{path}: no such file or folder")
-    if options.odometry and (options.trajectory or options.poses):
-        raise ToolError("--odometry finds the poses, so --trajectory and --poses mean nothing")
+    _refuse_contradictions(options)
     if (log := find_scan_log(path)) is not None:
         _refuse_others(f"{path} has the scans of a map", set(), options)
         return read_scan_log(log)
@@ -97,6 +97,17 @@ def _within(path: Path, pattern: str) -> list[str]:
     kinds = find_bag, is_depth_folder, is_cloud_folder
     folders = (each for each in islice(path.glob(pattern), _MOST_SEARCHED) if each.is_dir())
     return sorted(str(each) for each in folders if any(is_one(each) for is_one in kinds))
+
+
+def _refuse_contradictions(options: ReadingOptions) -> None:
+    if options.odometry and (options.trajectory or options.poses):
+        raise ToolError("--odometry finds the poses, so --trajectory and --poses mean nothing")
+    if options.odometry and options.points_in == WORLD:
+        raise ToolError(
+            "--odometry needs points in the frame of their sensor, not --points-in world"
+        )
+    if options.trajectory and options.poses:
+        raise ToolError("--trajectory and --poses both say which poses to take: leave one out")
 
 
 def _refuse_others(what: str, meaningful: set[str], options: ReadingOptions) -> None:

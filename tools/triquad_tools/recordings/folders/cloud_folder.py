@@ -1,12 +1,12 @@
 """Folders of clouds, a file each, with a trajectory next to them."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from triquad_format.records.arrays import Floats
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.arguments import SENSOR, WORLD
@@ -49,7 +49,6 @@ def read_cloud_folder(folder: Path, options: ReadingOptions | None = None) -> Sc
     first, above = paths[0], paths[0].parent.parent
     if first.suffix.lower() == ".bin" and options.columns is None:
         point_file.check_columns(paths)
-    columns = options.columns or point_file.KITTI_COLUMNS
     stamps, found = read_times([folder, above], len(paths)), None
     if options.odometry:
         stamps = (
@@ -58,9 +57,10 @@ def read_cloud_folder(folder: Path, options: ReadingOptions | None = None) -> Sc
             or [number * DEFAULT_PERIOD_NS for number in range(len(paths))]
         )
         in_time = sorted(zip(stamps, paths, strict=False))
-        sweeps = (_sweep(path, stamp, columns) for stamp, path in in_time)
+        sweeps = (_sweep(path, stamp, options) for stamp, path in in_time)
         found = find_trajectory(sweeps, len(paths))
     placed = place_files(folder, options, paths, stamps, found)
+    columns = options.columns or point_file.KITTI_COLUMNS
     if not sum(checked(paths, partial(point_file.check_points, columns=columns))):
         raise ToolError(f"{first.parent}: none of the {len(paths)} files holds any points")
     poses, files = placed.trajectory, placed.files
@@ -83,26 +83,26 @@ def read_cloud_folder(folder: Path, options: ReadingOptions | None = None) -> Sc
     return read
 
 
-def _sweep(path: Path, stamp_ns: int, columns: Sequence[str]) -> Sweep:
-    points, times = point_file.read_points(path, columns)
-    offsets = None if times is None else offsets_s(times, stamp_ns)
-    return Sweep(points, SENSOR, stamp_ns, offsets)
+def _sweep(path: Path, stamp_ns: int, options: ReadingOptions) -> Sweep:
+    """Return the finite points of a file, with their times where there is motion to take out."""
+    points, times = point_file.read_points(path, options.columns or point_file.KITTI_COLUMNS)
+    finite = np.isfinite(points).all(axis=1)
+    if times is None or not options.deskew:
+        return Sweep(points[finite], SENSOR, stamp_ns)
+    return Sweep(points[finite], SENSOR, stamp_ns, offsets_s(times[finite], stamp_ns))
 
 
 def _read_scan(trajectory: Trajectory, options: ReadingOptions, file: PlacedFile) -> PosedScan:
-    points, times = point_file.read_points(file.path, options.columns or point_file.KITTI_COLUMNS)
-    finite = np.isfinite(points).all(axis=1)
-    points = points[finite]
+    sweep = _sweep(file.path, file.stamp_ns, options)
     if options.points_in == WORLD:
-        return PosedScan(points, np.eye(4)).seen_from(file.world_from_sensor)
-    single: Floats = points.astype(np.float32)
-    if times is not None and trajectory.frames is not None and options.deskew:
-        offsets = offsets_s(times[finite], file.stamp_ns)
+        return PosedScan(sweep.points, np.eye(4)).seen_from(file.world_from_sensor)
+    single = replace(sweep, points=sweep.points.astype(np.float32))
+    if sweep.offsets_s is not None and trajectory.frames is not None:
         try:
-            return place(Sweep(single, SENSOR, file.stamp_ns, offsets), trajectory.frames, WORLD)
+            return place(single, trajectory.frames, WORLD)
         except NoTransformError:
             pass  # at the ends of a trajectory, where not the whole sweep has poses
-    return PosedScan(single, file.world_from_sensor)
+    return PosedScan(single.points, file.world_from_sensor)
 
 
 def _folders_of_clouds(folder: Path) -> dict[Path, list[Path]]:
