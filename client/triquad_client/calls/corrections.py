@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import cast
@@ -65,12 +66,13 @@ class CorrectionCalls(ScanCalls):
             RequestTimeoutError: not done after ``timeout_s``; the server goes on with it.
         """
         stamps_ns, poses = _keyframes(stamps_s, world_from_sensor)
+        deadline_s = checks.deadline(timeout_s)
         self.flush(timeout_s)
         quaternions = np.array([quaternion_of(pose[:3, :3]) for pose in poses])
         request = CorrectPosesRequest(
             source, stamps_ns, poses[:, :3, 3], quaternions, onward, new_ticket()
         )
-        reply = self._connection.ask_until_done(request, timeout_s)
+        reply = self._connection.ask_until_done(request, deadline_s - time.monotonic())
         return reply if reply.undo is None else replace(reply, undo=printable(reply.undo))
 
 

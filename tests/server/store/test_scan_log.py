@@ -123,7 +123,7 @@ def test_scans_since_an_older_checkpoint_are_not_of_the_map_that_goes_on_from_it
 @pytest.mark.parametrize("restored", [None, Restored(7, 8)])
 def test_a_map_that_took_in_scans_while_none_were_kept_has_not_those_of_before(tmp_path, restored):
     write(log(tmp_path), 3)
-    # A server without the log went on until epoch 8, or to 7, to which the map was taken back.
+    # A server without the log went on until epoch 8, or to 7, to which the map went back.
     again = log(tmp_path, epoch=8, restored=restored)
     write(again, 9)
     assert len(kept(again)) == 1

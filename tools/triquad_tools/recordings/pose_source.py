@@ -117,7 +117,9 @@ def poses_of_trajectory(
         ToolError: it has no times.
     """
     if found.frames is None:
-        raise ToolError(f"{found.path}: has no times, by which a bag's clouds find their poses")
+        raise ToolError(
+            f"{found.path}: has no times, which the clouds of a bag need to find their poses"
+        )
     for transform in options.transforms:
         content.frames.add(transform)
     sensors = {cloud.frame for cloud in clouds}
