@@ -6,7 +6,7 @@ from triquad_format.errors import NoCompiledCodeError
 from triquad_format.records.region import MapRecord
 
 if TYPE_CHECKING:
-    from triquad_map.composition.recorded_view import RecordedView
+    from triquad_map.composition.composed_view import RecordedView
 
 
 def open_view(record: MapRecord) -> "RecordedView":
@@ -16,7 +16,7 @@ def open_view(record: MapRecord) -> "RecordedView":
         NoCompiledCodeError: there is no numba, or one that does not go with this numpy.
     """
     try:
-        from triquad_map.composition.recorded_view import RecordedView
+        from triquad_map.composition.composed_view import RecordedView
     except ImportError as error:
         raise NoCompiledCodeError(
             "maps are asked by compiled code, and numba is missing: pip install 'triquad[fast]'"

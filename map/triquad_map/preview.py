@@ -19,11 +19,9 @@ from triquad_format.records.cells import same_cells
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import MapRecord, Region, seen_voxels
 
-from triquad_map.composition.composed_view import ComposedView
-from triquad_map.composition.recorded_view import RecordedView
+from triquad_map.composition.composed_view import ComposedView, RecordedView
 from triquad_map.height_scale import HeightScale
-from triquad_map.mesh.tile_lattice import TileLattice
-from triquad_map.mesh.tile_mesh import mesh_tile
+from triquad_map.mesh.tile_mesh import TileLattice, mesh_tile
 from triquad_map.triangles import TileJoin, Triangles
 
 PARAMETERS_A_FACE = 130  # so that a preview takes some 4 % of a map file of fp16

@@ -110,15 +110,15 @@ class Surfels:
 
 
 @dataclass(frozen=True)
-class FieldSample:
-    """A field at N points, in voxels."""
+class FieldValues:
+    """Signed distances [N] and, where asked for, their gradients [N, 3] (else [0, 3])."""
 
-    values: Floats  # [N]
-    gradients: Floats  # [N, 3]
+    sdf: Floats
+    gradient: Floats
 
 
-SampleField = Callable[[Doubles], FieldSample]
-"""The field at leaf coordinates [N, 3]."""
+SampleField = Callable[[Doubles], FieldValues]
+"""The field, in voxels, and its gradient at leaf coordinates [N, 3]."""
 
 Seen = Callable[[Longs], Bools]
 """A function that returns whether rays ended in voxels [N, 3]."""
@@ -141,7 +141,7 @@ def fit_surfels(
     shown = by_rays(voxels, 0)
     rows = np.flatnonzero(shown.kinds != SurfelKind.NONE)
     places = (voxels[rows] + 0.5 + shown.offsets[rows]).astype(np.float64)
-    off, kinds = field(places).values, surfels.kinds[rows]
+    off, kinds = field(places).sdf, surfels.kinds[rows]
     # Next to a surface in the next voxel, noisy rays end on both sides of the border.
     is_noise = (kinds == SurfelKind.NONE) & (off < 0)
     is_off = (kinds == SurfelKind.POINT) | (np.abs(off) > ON_SURFACE)
@@ -160,12 +160,12 @@ def _surfels_of_field(voxels: Longs, field: SampleField, seen: Seen) -> Surfels:
     points: Doubles = middles
     for _ in range(_STEPS):
         sample = field(points)
-        squares = np.maximum((sample.gradients**2).sum(axis=1), FLATTEST**2)
-        steps = -(sample.values / squares)[:, None] * sample.gradients
+        squares = np.maximum((sample.gradient**2).sum(axis=1), FLATTEST**2)
+        steps = -(sample.sdf / squares)[:, None] * sample.gradient
         points = points + np.clip(steps, -_LONGEST_STEP, _LONGEST_STEP)
     at_end = field(points)
-    steepness = np.linalg.norm(at_end.gradients, axis=1)
-    on_surface = (np.abs(at_end.values) < ON_SURFACE) & (steepness > FLATTEST)
+    steepness = np.linalg.norm(at_end.gradient, axis=1)
+    on_surface = (np.abs(at_end.sdf) < ON_SURFACE) & (steepness > FLATTEST)
     there = np.floor(points).astype(np.int64)
     away = np.abs(there - voxels).max(axis=1, initial=0)
     is_shown = on_surface & (away <= 1)
@@ -173,7 +173,7 @@ def _surfels_of_field(voxels: Longs, field: SampleField, seen: Seen) -> Surfels:
     kinds = np.where(is_shown, SurfelKind.DISC, SurfelKind.POINT).astype(np.uint8)
     kinds[next_door[seen(there[next_door])]] = SurfelKind.NONE
     offsets = np.where(is_shown[:, None], points - middles, 0.0)
-    normals = at_end.gradients / np.maximum(steepness, 1e-6)[:, None]
+    normals = at_end.gradient / np.maximum(steepness, 1e-6)[:, None]
     return Surfels(offsets.astype(np.float32), normals.astype(np.float32), kinds)
 
 

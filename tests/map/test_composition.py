@@ -10,7 +10,7 @@ from support.maps.map_records import evidence_of, random_record, with_support
 from triquad_format.records import morton
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.region import BLOCK_BYTES, MapRecord
-from triquad_map.composition.recorded_view import RecordedView
+from triquad_map.composition.composed_view import RecordedView
 from triquad_map.surfels.surfel_search import no_surfels
 
 TWO = ((0, 0, 0), (1, 0, 0))

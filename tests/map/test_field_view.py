@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.status import Status
 from triquad_map.composition.field_view import FieldView
-from triquad_map.field.frozen_field import FieldValues, in_grid
+from triquad_map.field.frozen_field import in_grid
+from triquad_map.surface import FieldValues
 
 FIELD = FieldSettings(depth=8)
 REGIONS = [(0, 0, 0), (1, 0, 0), (-1, 2, 0), (3, 3, -1)]

@@ -29,7 +29,7 @@ from triquad_format.mapfile.writer import write_map
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import BLOCK_BYTES, Evidence, MapRecord
-from triquad_map.composition.recorded_view import RecordedView
+from triquad_map.composition.composed_view import RecordedView
 from triquad_map.field.frozen_field import in_grid
 from triquad_map.height_scale import HeightScale
 from triquad_map.preview import CELL_LEAVES, FACES_MIN, coarse_mesh, previews_of

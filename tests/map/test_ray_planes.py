@@ -8,7 +8,8 @@ from support.maps.small_world import mapper_of, world
 from triquad_format.records.field_settings import FieldSettings
 from triquad_map.evidence.live_evidence import LiveEvidence
 from triquad_map.evidence.observed import Sighting
-from triquad_map.surface import FieldSample, SurfelKind, level_confidence
+from triquad_map.surface import FieldValues, SurfelKind, level_confidence
+from triquad_map.surfels.ray_planes import put_planes
 from triquad_map.surfels.surfel_map import first_surfels
 
 FIELD = FieldSettings(depth=6)
@@ -20,7 +21,7 @@ def learnt_on_one_side(points):
     right = points[:, 0] > 30
     values = np.where(right, 2.0, points[:, 2] - 30.5).astype(np.float32)
     gradients = np.where(right[:, None], 0.0, (0.0, 0, 1)).astype(np.float32)
-    return FieldSample(values, gradients)
+    return FieldValues(values, gradients)
 
 
 def test_planes_are_summed_as_told():
@@ -36,7 +37,8 @@ def test_planes_are_summed_as_told():
     points = rng.uniform((19, 19, 28), (45, 45, 33), (3000, 3))
     local = FIELD.offsets(points).astype(np.float32)
     sdf, gradients = np.full(3000, 7.0, np.float32), np.full((3000, 3), 5.0, np.float32)
-    surfels.put_planes(FIELD, local, sdf, gradients)
+    middle = float(1 << FIELD.depth - 1)
+    put_planes(local, FIELD.leaf_m, middle, surfels.planes, sdf, gradients)
 
     places = surfels.voxels() + 0.5 + surfels.surfels.offsets
     away = points[:, None] - places

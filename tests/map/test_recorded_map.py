@@ -10,13 +10,12 @@ from hypothesis import strategies as st
 from support.maps.exact_maps import exact_map, flat
 from support.maps.map_records import SMALL
 from triquad_format.records.region import MapRecord
-from triquad_map.composition.recorded_view import RecordedView
+from triquad_map.composition.composed_view import RecordedView
 from triquad_map.evidence.live_evidence import LiveEvidence
 from triquad_map.questions.distance import DistanceOptions, distances
 from triquad_map.surface import DISC_RADIUS, SMOOTHING, SurfelKind, Surfels
-from triquad_map.surfels.surfel_map import surfel_places
 from triquad_map.surfels.surfel_search import find_nearest, no_surfels
-from triquad_map.surfels.surfel_tree import surfel_tree
+from triquad_map.surfels.surfel_tree import surfel_places, surfel_tree
 from triquad_map.view import MapView
 
 

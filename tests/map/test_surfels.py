@@ -8,7 +8,7 @@ from triquad_map.compiled.team import in_one
 from triquad_map.evidence.live_evidence import LiveEvidence
 from triquad_map.evidence.observed import Sighting
 from triquad_map.field.frozen_field import field_samples
-from triquad_map.surface import FieldSample, SurfelKind, Surfels, fit_surfels
+from triquad_map.surface import FieldValues, SurfelKind, Surfels, fit_surfels
 from triquad_map.surfels.surfel_map import first_surfels
 from triquad_map.surfels.surfel_search import no_surfels
 from triquad_server.mapping.mapper import Mapper
@@ -21,7 +21,7 @@ def plane(normal, height):
 
     def sample(points):
         values = points @ normal - height
-        return FieldSample(values.astype(np.float32), np.tile(normal, (len(points), 1)))
+        return FieldValues(values.astype(np.float32), np.tile(normal, (len(points), 1)))
 
     return sample
 
@@ -34,7 +34,7 @@ def test_a_disc_lies_where_the_field_is_zero(normal):
     surfels = fit_surfels(voxels, field, seen(False))
     assert surfels.kinds[0] == SurfelKind.DISC
     point = voxels[0] + 0.5 + surfels.offsets[0]
-    assert abs(field(point[None]).values[0]) < 1e-4
+    assert abs(field(point[None]).sdf[0]) < 1e-4
     np.testing.assert_allclose(surfels.normals[0], normal, atol=1e-5)
 
 
@@ -47,7 +47,7 @@ def flat(value):
     """A field that is the same everywhere."""
 
     def sample(points):
-        return FieldSample(np.full(len(points), value, np.float32), np.zeros((len(points), 3)))
+        return FieldValues(np.full(len(points), value, np.float32), np.zeros((len(points), 3)))
 
     return sample
 

@@ -18,7 +18,7 @@ from triquad_client.errors import ClosedError
 from triquad_client.net.connection import Answering, ReplyT
 
 if TYPE_CHECKING:
-    from triquad_map.composition.recorded_view import RecordedView
+    from triquad_map.composition.composed_view import RecordedView
 
 
 class LocalMap(Answering):

@@ -5,8 +5,7 @@ from collections.abc import Callable
 from triquad_format.errors import InvalidInputError
 from triquad_format.records.arrays import Doubles
 from triquad_map.composition.composed_view import ComposedView
-from triquad_map.mesh.tile_lattice import TileIndex, TileLattice
-from triquad_map.mesh.tile_mesh import mesh_tile
+from triquad_map.mesh.tile_mesh import TileIndex, TileLattice, mesh_tile
 from triquad_map.triangles import TileJoin, Triangles
 
 from triquad_client.mesh.mesh import Mesh

@@ -18,8 +18,10 @@ from triquad_format.records.status import Status
 
 from triquad_map.compiled.team import MIN_SHARE, Split, in_one
 from triquad_map.evidence.evidence import FrozenEvidence
-from triquad_map.field.frozen_field import FieldValues, FrozenField, in_grid
-from triquad_map.surfels.surfel_map import ShownField, SurfelMap
+from triquad_map.field.frozen_field import FrozenField, in_grid
+from triquad_map.surface import FieldValues
+from triquad_map.surfels.ray_planes import ShownField
+from triquad_map.surfels.surfel_map import SurfelMap
 from triquad_map.view import REACH_VOXELS, FieldAnswer
 
 

@@ -1,12 +1,13 @@
 """Rays that end: each adds to the record of the voxel in which it does.
 
-Kernels stop where there is no more room; the caller makes room and goes on.
+Kernels stop where there is no more room; the caller makes room and goes on. Files have no ends: in
+evidence that was restored, discs of the field take their place.
 """
 
 import numpy as np
-from triquad_format.records.arrays import Doubles, Ints
+from triquad_format.records.arrays import Bytes, Doubles, Floats, Ints, Longs
 
-from triquad_map.compiled.kernel import kernel
+from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.voxel_index import (
     LOW,
     SHIFT,
@@ -18,6 +19,7 @@ from triquad_map.compiled.voxel_index import (
 )
 from triquad_map.evidence.observed import (
     EIGHTHS,
+    FILLED,
     MOST_SCANS,
     MOST_SEEN,
     PRIOR_ENDS,
@@ -27,12 +29,18 @@ from triquad_map.evidence.observed import (
     Vector,
     Voxel,
     forget_ends,
+    is_flat,
+    row_of,
+    rows_around,
+    voxel_of,
 )
 from triquad_map.evidence.seen_voxels import SeenVoxels
-from triquad_map.surface import NEAR_M
+from triquad_map.surface import NEAR_M, SurfelKind
 
 COUNTED_ENDS = 64
 """The ends of a voxel that count; the shape that further ones give counts as that of as many."""
+
+_DISC = int(SurfelKind.DISC)
 
 
 @kernel(inline="always")
@@ -180,3 +188,68 @@ def record_ends(
         observed.seen_s[place] = max(observed.seen_s[place], sighting.stamp_s)
         _add(observed.voxels[row], end, (x, y, z), sighting)
     return len(voxels), blocks, places, rows
+
+
+@kernel()
+def set_discs(
+    voxels: Longs,
+    offsets: Floats,
+    normals: Floats,
+    kinds: Bytes,
+    seen: SeenVoxels,
+    observed: Observed,
+) -> None:
+    """Take the discs of surfels as the ends in ``voxels`` [N, 3] of which no ray has shown any."""
+    for i in range(len(voxels)):
+        row = row_of(seen, observed, voxels[i, 0], voxels[i, 1], voxels[i, 2])
+        voxel = observed.voxels[row]
+        if row == 0 or voxel.ends != 0:  # rays have shown since
+            continue
+        is_disc = kinds[i] == _DISC
+        for axis in range(3):
+            voxel.mean[axis] = offsets[i, axis] + 0.5 if is_disc else np.nan
+            voxel.normal[axis] = normals[i, axis] if is_disc else 0.0
+        _set_spread(voxel, FILLED)
+        voxel.ends = COUNTED_ENDS if is_disc else 0
+    for i in range(len(voxels)):
+        row = row_of(seen, observed, voxels[i, 0], voxels[i, 1], voxels[i, 2])
+        if row != 0 and observed.voxels[row].ends == 0:
+            _set_disc_beside(row, seen, observed)
+
+
+@inner_kernel()
+def _set_spread(voxel: ObservedVoxel, variance: float) -> None:
+    """Let the ends of a voxel lie in the plane of its normal, with a variance on each axis."""
+    x, y, z = voxel.normal
+    voxel.spread[0], voxel.spread[1], voxel.spread[2] = 1 - x * x, -x * y, -x * z
+    voxel.spread[3], voxel.spread[4], voxel.spread[5] = 1 - y * y, -y * z, 1 - z * z
+    voxel.spread *= np.float32(variance)
+
+
+@inner_kernel()
+def _set_disc_beside(row: int, seen: SeenVoxels, observed: Observed) -> None:
+    """Take the disc of a voxel next to it for one that has none: the nearest to its middle.
+
+    The ends of noisy rays lie in voxels on both sides of a surface, and the disc in one of them.
+    """
+    voxel, corner = observed.voxels[row], voxel_of(row, seen, observed)
+    nearest = np.inf
+    for near in rows_around(row, 1, seen, observed):
+        disc = observed.voxels[near]
+        normal, mean = disc.normal, disc.mean
+        if near == row or not is_flat(disc):
+            continue
+        beside = voxel_of(np.int64(near), seen, observed)
+        height = 0.0
+        for axis in range(3):
+            height += (corner[axis] + 0.5 - beside[axis] - mean[axis]) * normal[axis]
+        is_there = abs(height) < nearest
+        for axis in range(3):
+            foot = corner[axis] + 0.5 - height * normal[axis] - beside[axis]
+            is_there = is_there and 0 <= foot <= 1
+        if is_there:
+            nearest = abs(height)
+            for axis in range(3):
+                voxel.mean[axis] = 0.5 - height * normal[axis]
+                voxel.normal[axis] = normal[axis]
+            voxel.ends = COUNTED_ENDS

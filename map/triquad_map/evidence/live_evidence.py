@@ -12,14 +12,13 @@ from triquad_map.compiled.team import Split, in_one
 from triquad_map.compiled.voxel_index import VoxelIndex, with_room
 from triquad_map.evidence.belief import Belief, Changes, believe
 from triquad_map.evidence.carving import Reach, mark_crossed
-from triquad_map.evidence.ended_rays import extend_new
+from triquad_map.evidence.ended_rays import extend_new, set_discs
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.evidence.growth import EvidenceSize
 from triquad_map.evidence.neighbours import ask_neighbours
-from triquad_map.evidence.normals import NormalSearch
 from triquad_map.evidence.observations import Observations
 from triquad_map.evidence.observed import Observed, Sighting
-from triquad_map.evidence.ray_surfels import ray_surfels
+from triquad_map.evidence.ray_surfels import NormalSearch, put_ray_surfels
 from triquad_map.evidence.seen_voxels import SeenVoxels, mark
 from triquad_map.surface import Surfels
 
@@ -110,9 +109,11 @@ class LiveEvidence:
     def set_discs(self, voxels: Longs, surfels: Surfels) -> None:
         """Take from ``surfels`` [N] where the surface lies in ``voxels`` [N, 3].
 
-        For evidence that was restored: a record has voxels only.
+        For evidence that was restored: a record has voxels only. Where there is no disc, it is the
+        nearest one next to it, or else the next ray that ends there shows where the surface is.
         """
-        self._observations.set_discs(voxels, surfels, self.seen)
+        discs = surfels.offsets, surfels.normals, surfels.kinds
+        set_discs(voxels, *discs, self.seen, self.observed)
 
     def ray_surfels(self, voxels: Longs, hit_since: int = 0, *, since: int) -> Surfels:
         """Return what rays alone show of surface that was first seen in scan ``since`` or later.
@@ -120,7 +121,10 @@ class LiveEvidence:
         Of voxels that were not hit since scan ``hit_since``, nothing is told. See
         :data:`triquad_map.surface.ShownByRays`.
         """
-        return ray_surfels(voxels, since, hit_since, self.seen, self.observed)
+        surfels = Surfels.none(len(voxels))
+        shown = surfels.offsets, surfels.normals, surfels.kinds
+        put_ray_surfels(voxels, since, hit_since, self.seen, self.observed, *shown)
+        return surfels
 
     def carve(self, origin: Doubles, ends: Doubles, reach: Reach) -> Ints:
         """Record the free space between ``origin`` [3] and ``ends`` [N, 3].

@@ -20,7 +20,6 @@ from triquad_format.records.region import (
 from triquad_map.compiled.team import Split
 from triquad_map.compiled.voxel_index import SHIFT, with_room
 from triquad_map.evidence.ended_rays import record_ends
-from triquad_map.evidence.field_discs import set_discs
 from triquad_map.evidence.observed import (
     EIGHTHS,
     MOST_SCANS,
@@ -30,7 +29,7 @@ from triquad_map.evidence.observed import (
 )
 from triquad_map.evidence.seen_voxels import SeenVoxels
 from triquad_map.evidence.support import Support, fill_support
-from triquad_map.surface import LEAST_STRENGTH, Surfels
+from triquad_map.surface import LEAST_STRENGTH
 
 _MOST_HITS = 8
 """A longer record is restored as one of this many hits, which new rays outweigh sooner."""
@@ -113,14 +112,6 @@ class Observations:
         )
         self._grow()
         return done, blocks
-
-    def set_discs(self, voxels: Longs, surfels: Surfels, seen: SeenVoxels) -> None:
-        """Take the middles and normals of ``voxels`` [N, 3] from their ``surfels``.
-
-        Where there is no disc, it is the nearest one next to it, or else the next ray that ends
-        there shows where the surface is.
-        """
-        set_discs(voxels, surfels.offsets, surfels.normals, surfels.kinds, seen, self.arrays)
 
     def support(self, surface: Bytes, split: Split) -> Support:
         """Return the support of each voxel set in ``surface`` [blocks, BLOCK_BYTES], in order."""

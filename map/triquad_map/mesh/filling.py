@@ -22,7 +22,7 @@ from triquad_format.records.cells import CellIndex, cells_of_boxes, same_cells
 from triquad_format.records.status import Status
 
 from triquad_map.composition.composed_view import ComposedView
-from triquad_map.surface import FieldSample, SampleField, SurfelKind, fit_surfels
+from triquad_map.surface import FieldValues, SampleField, SurfelKind, fit_surfels
 
 _STEEPNESS = 0.7
 """The least share of the way from a voxel behind a surface to a voxel before it by which the field
@@ -101,9 +101,9 @@ def _seen_voxels(view: ComposedView, low: Doubles, high: Doubles, margin: int) -
 
 
 def _field_in_voxels(view: ComposedView) -> SampleField:
-    def sample(places: Doubles) -> FieldSample:
+    def sample(places: Doubles) -> FieldValues:
         answer = view.query(places * view.voxel_m, gradient=True)
-        return FieldSample(answer.sdf / np.float32(view.voxel_m), answer.gradient)
+        return FieldValues(answer.sdf / np.float32(view.voxel_m), answer.gradient)
 
     return sample
 
@@ -147,8 +147,8 @@ def _distance_like(view: ComposedView, field: SampleField, voxels: Longs) -> _Pa
     unknown = view.status(_middles(voxels) * view.voxel_m, 0.0) == Status.UNKNOWN
     patches, kinds = _patches(field, voxels[unknown])
     patches = patches.chosen(kinds == SurfelKind.DISC)
-    rise = field(patches.points + patches.normals).values
-    rise -= field(patches.points - patches.normals).values
+    rise = field(patches.points + patches.normals).sdf
+    rise -= field(patches.points - patches.normals).sdf
     return patches.chosen(rise >= 2 * _STEEPNESS)
 
 

@@ -4,17 +4,18 @@ Surfels stand in the order of the evidence: block by block, and within a block v
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Ints, Longs
-from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
-from triquad_format.records.region import BLOCK_BYTES, surface_counts
+from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Longs
+from triquad_format.records.field_settings import BLOCK_VOXELS
+from triquad_format.records.region import BLOCK_BYTES
 
-from triquad_map.compiled.kernel import kernel
-from triquad_map.compiled.voxel_index import LOW, SHIFT, keys_of
+from triquad_map.compiled.kernel import inner_kernel, kernel
+from triquad_map.compiled.voxel_index import keys_of
 from triquad_map.evidence.evidence import FrozenEvidence
-from triquad_map.field.frozen_field import FieldValues, FrozenField, in_grid
 from triquad_map.surface import (
+    HALF_LIFE_S,
     Rows,
     SampleField,
     ShownByRays,
@@ -24,58 +25,18 @@ from triquad_map.surface import (
     nothing_shown,
     support_confidence,
 )
-from triquad_map.surfels.nearest_surface import RegionFrame, ShownSurfels, improve_nearest
-from triquad_map.surfels.ray_planes import put_planes, ray_planes
-from triquad_map.surfels.surfel_search import NearestSurfels, find_nearest
-from triquad_map.surfels.surfel_tree import TreeShape, surfel_tree, tree_shape
-from triquad_map.view import NearestSurface
+from triquad_map.surfels.ray_planes import ray_planes
+from triquad_map.surfels.surfel_search import NearestSurfels, find_nearest, no_surfels
+from triquad_map.surfels.surfel_tree import SurfelPlaces, SurfelTree, surfel_places, surfel_tree
+from triquad_map.view import NO_LENGTH_M, NearestSurface
+
+_RAY_DISC = int(SurfelKind.RAY_DISC)
 
 _NEVER = -1
 
 _FITTED_AT_ONCE = 32_768  # each takes half a kilobyte meanwhile
 
 _AROUND = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-
-
-@dataclass(frozen=True)
-class SurfelPlaces:
-    """The places of the surfels of the voxels in which rays ended."""
-
-    cells: Longs  # [blocks, 3]
-    surface: Bytes  # [blocks, BLOCK_BYTES] these voxels
-    starts: Ints  # [blocks + 1] first surfel of each block
-    shape: TreeShape
-
-    def voxels(self) -> Longs:
-        """Return the voxel [S, 3] of each surfel, not kept: it takes a quarter of the memory."""
-        used = np.flatnonzero(np.diff(self.starts))  # most blocks are of open air
-        return surfel_voxels(self.cells[used], self.surface[used], int(self.starts[-1]))
-
-
-def surfel_places(cells: Longs, surface: Bytes) -> SurfelPlaces:
-    """Return places for voxels in ``surface`` [blocks, BLOCK_BYTES] of blocks ``cells`` [, 3]."""
-    starts = np.append(0, np.cumsum(surface_counts(surface))).astype(np.int32)
-    shape = tree_shape(surfel_voxels(cells, surface, int(starts[-1])))
-    return SurfelPlaces(cells, surface, starts, shape)
-
-
-@kernel()
-def surfel_voxels(cells: Longs, surface: Bytes, count: int) -> Longs:
-    """Return the voxels [count, 3] of surfels, given the blocks' ``cells`` [blocks, 3]."""
-    voxels = np.empty((count, 3), np.int64)
-    at = 0
-    for row in range(len(surface)):
-        for byte in range(BLOCK_BYTES):
-            bits = int(surface[row, byte])
-            if bits == 0:  # as in most blocks, which are of open air
-                continue
-            for z in range(BLOCK_VOXELS):
-                if bits >> z & 1:
-                    voxels[at, 0] = (cells[row, 0] << SHIFT) + (byte >> SHIFT)
-                    voxels[at, 1] = (cells[row, 1] << SHIFT) + (byte & LOW)
-                    voxels[at, 2] = (cells[row, 2] << SHIFT) + z
-                    at += 1
-    return voxels
 
 
 @kernel()
@@ -98,6 +59,69 @@ def _rows_before(before: Bytes, surface: Bytes, count: int) -> Rows:
                 new += bits >> z & 1
                 old += old_bits >> z & 1
     return rows
+
+
+class RegionFrame(NamedTuple):
+    """The place of a region's leaf coordinates in the map, and the time of the query."""
+
+    corner: tuple[float, float, float]  # where they are 0, metres, map frame
+    leaf_m: float
+    newest_s: int  # when anything in the map was seen last, seconds since 1970
+
+
+class ShownSurfels(NamedTuple):
+    """The properties of surfels that were found."""
+
+    kinds: Bytes  # [S]
+    normals: Floats  # [S, 3]
+    confidence: Floats  # [S]
+    seen_s: Longs  # [S]
+
+
+@inner_kernel()
+def _write(
+    i: int, place: Doubles, found: NearestSurfels, frame: RegionFrame, nearest: NearestSurface
+) -> None:
+    """Write where the surface lies that was found for point ``i``, and which way it is."""
+    nearest.found[i] = True
+    nearest.distance[i] = found.distances[i] * frame.leaf_m
+    square = 0.0
+    for axis in range(3):
+        nearest.point[i, axis] = found.closest[i, axis] * frame.leaf_m + frame.corner[axis]
+        away = place[axis] - found.means[i, axis]
+        nearest.gradient[i, axis] = away
+        square += away * away
+    length = np.sqrt(square)
+    for axis in range(3):
+        if length * frame.leaf_m > NO_LENGTH_M:
+            nearest.gradient[i, axis] /= length
+        else:
+            nearest.gradient[i, axis] = 0.0
+
+
+@kernel()
+def improve_nearest(
+    points: Doubles,
+    tree: SurfelTree,
+    shown: ShownSurfels,
+    frame: RegionFrame,
+    nearest: NearestSurface,
+) -> None:
+    """Improve ``nearest`` where a surfel lies nearer to ``points`` [N, 3] of the map frame."""
+    places = (points - np.array(frame.corner)) / frame.leaf_m
+    found = no_surfels(nearest.distance / frame.leaf_m)
+    find_nearest(places, tree, found)
+    for i in range(len(points)):
+        row = found.rows[i]
+        if row < 0:
+            continue
+        _write(i, places[i], found, frame, nearest)
+        age_s = max(frame.newest_s - shown.seen_s[row], 0)
+        nearest.confidence[i] = shown.confidence[row] * np.exp2(-age_s / HALF_LIFE_S)
+        nearest.learnt[i] = shown.kinds[row] < _RAY_DISC
+        for axis in range(3):
+            is_facing = shown.kinds[row] == _RAY_DISC
+            nearest.normal[i, axis] = shown.normals[row, axis] if is_facing else np.float32(0)
 
 
 @dataclass(frozen=True)
@@ -132,7 +156,7 @@ class SurfelMap:
         places = fitted.places
         self._tree = surfel_tree(places.shape, voxels, fitted.surfels)
         kinds = fitted.surfels.kinds
-        self._planes = ray_planes(evidence, places.starts, fitted.surfels)
+        self.planes = ray_planes(evidence, places.starts, fitted.surfels)
         self._shown = ShownSurfels(
             kinds,
             normals=fitted.surfels.normals,
@@ -160,19 +184,6 @@ class SurfelMap:
         """Improve ``nearest`` where a surfel lies nearer to ``points`` [N, 3] of the map frame."""
         improve_nearest(points, self._tree, self._shown, frame, nearest)
 
-    @property
-    def are_learnt(self) -> bool:
-        """Whether the field has learnt all of them: then :meth:`put_planes` changes nothing."""
-        return self._planes is None
-
-    def put_planes(
-        self, settings: FieldSettings, points: Floats, sdf: Floats, gradients: Floats
-    ) -> None:
-        """Correct what a field says where it has not learnt the surface; :func:`put_planes`."""
-        if self._planes is not None:
-            middle = float(1 << (settings.depth - 1))
-            put_planes(points, settings.leaf_m, middle, self._planes, sdf, gradients)
-
     def updated(
         self,
         evidence: FrozenEvidence,
@@ -197,28 +208,6 @@ class SurfelMap:
         fitted.fit(rows, voxels[rows], evidence, field, by_rays)
         fitted.epochs[rows] = epoch
         return SurfelMap(evidence, fitted, voxels)
-
-
-@dataclass(frozen=True)
-class ShownField:
-    """A trained field, and near surface that it has not learnt, the planes that rays have shown."""
-
-    trained: FrozenField
-    surfels: SurfelMap
-
-    def evaluate(self, points: Floats, gradient: bool) -> FieldValues:
-        """Return the field at points [N, 3], on the caller's thread."""
-        values = self.trained.evaluate(points, gradient)
-        self.surfels.put_planes(self.trained.settings, points, values.sdf, values.gradient)
-        return values
-
-    def evaluate_in_grid(self, axes: Floats, points: Longs) -> Floats:
-        """Return distances [N] at points of a grid: :meth:`FrozenField.evaluate_in_grid`."""
-        distances = self.trained.evaluate_in_grid(axes, points)
-        if not self.surfels.are_learnt:
-            places, gradients = in_grid(axes, points), np.zeros((0, 3), np.float32)
-            self.surfels.put_planes(self.trained.settings, places, distances, gradients)
-        return distances
 
 
 def first_surfels(

@@ -6,11 +6,14 @@ depends on the voxels in which rays ended alone; their places and the boxes arou
 in again with each epoch.
 """
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from triquad_format.records import morton
 from triquad_format.records.arrays import Bools, Bytes, Floats, Ints, Longs
+from triquad_format.records.field_settings import BLOCK_VOXELS
+from triquad_format.records.region import BLOCK_BYTES, surface_counts
 
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.lanes import LANES
@@ -94,6 +97,47 @@ def _begin_leaves(codes: Longs) -> Bools:
         too_many = np.minimum(too_many[:-step], too_many[step:])
     begins = (differ ^ too_many <= differ) | (differ >> _BLOCK_BITS > 0)
     return np.append(True, begins)[: len(codes)]
+
+
+@dataclass(frozen=True)
+class SurfelPlaces:
+    """The places of the surfels of the voxels in which rays ended."""
+
+    cells: Longs  # [blocks, 3]
+    surface: Bytes  # [blocks, BLOCK_BYTES] these voxels
+    starts: Ints  # [blocks + 1] first surfel of each block
+    shape: TreeShape
+
+    def voxels(self) -> Longs:
+        """Return the voxel [S, 3] of each surfel, not kept: it takes a quarter of the memory."""
+        used = np.flatnonzero(np.diff(self.starts))  # most blocks are of open air
+        return surfel_voxels(self.cells[used], self.surface[used], int(self.starts[-1]))
+
+
+def surfel_places(cells: Longs, surface: Bytes) -> SurfelPlaces:
+    """Return places for voxels in ``surface`` [blocks, BLOCK_BYTES] of blocks ``cells`` [, 3]."""
+    starts = np.append(0, np.cumsum(surface_counts(surface))).astype(np.int32)
+    shape = tree_shape(surfel_voxels(cells, surface, int(starts[-1])))
+    return SurfelPlaces(cells, surface, starts, shape)
+
+
+@kernel()
+def surfel_voxels(cells: Longs, surface: Bytes, count: int) -> Longs:
+    """Return the voxels [count, 3] of surfels, given the blocks' ``cells`` [blocks, 3]."""
+    voxels = np.empty((count, 3), np.int64)
+    at = 0
+    for row in range(len(surface)):
+        for byte in range(BLOCK_BYTES):
+            bits = int(surface[row, byte])
+            if bits == 0:  # as in most blocks, which are of open air
+                continue
+            for z in range(BLOCK_VOXELS):
+                if bits >> z & 1:
+                    voxels[at, 0] = (cells[row, 0] << SHIFT) + (byte >> SHIFT)
+                    voxels[at, 1] = (cells[row, 1] << SHIFT) + (byte & LOW)
+                    voxels[at, 2] = (cells[row, 2] << SHIFT) + z
+                    at += 1
+    return voxels
 
 
 def surfel_tree(shape: TreeShape, voxels: Longs, surfels: Surfels) -> SurfelTree:

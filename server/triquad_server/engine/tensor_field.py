@@ -17,12 +17,12 @@ from triquad_format.records.arrays import Floats
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import AXES
 from triquad_map.compiled.voxel_index import home_slot, longest_probe, morton_code
-from triquad_map.field.frozen_field import FieldValues
 from triquad_map.field.quadtree import (
     PLANE_BITS,
     FrozenQuadtree,
     LiveQuadtree,
 )
+from triquad_map.surface import FieldValues
 
 from triquad_server.engine.live_field import LiveField
 from triquad_server.engine.memory import Array, FieldNumbers

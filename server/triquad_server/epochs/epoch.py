@@ -13,7 +13,8 @@ from triquad_map.compiled.team import Split, in_one
 from triquad_map.composition.composed_view import ComposedView
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.field.frozen_field import FrozenField
-from triquad_map.surfels.surfel_map import ShownField, SurfelMap
+from triquad_map.surfels.ray_planes import ShownField
+from triquad_map.surfels.surfel_map import SurfelMap
 
 from triquad_server.engine.field_record import region_record
 
@@ -40,7 +41,7 @@ class FrozenRegion:
     @property
     def field(self) -> ShownField:
         """The field as it is shown while it is trained."""
-        return ShownField(self.engine, self.surfels)
+        return ShownField(self.engine, self.surfels.planes)
 
     def record(self) -> Region:
         """Return the region as a map file holds it, without training state."""

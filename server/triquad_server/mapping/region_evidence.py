@@ -13,8 +13,8 @@ from triquad_map.evidence.carving import CLEAR_SHORT, FREE_SHORT, Reach
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.evidence.growth import EvidenceSize
 from triquad_map.evidence.live_evidence import LiveEvidence
-from triquad_map.evidence.normals import normals_at
 from triquad_map.evidence.observed import Sighting, first_seen_since
+from triquad_map.evidence.ray_surfels import normals_at
 from triquad_map.surface import SampleField, ShownByRays, nothing_shown
 from triquad_map.surfels.surfel_map import SurfelMap, first_surfels
 

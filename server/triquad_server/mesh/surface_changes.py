@@ -10,9 +10,10 @@ from triquad_format.records.arrays import Bools, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_map.compiled.team import Team
 from triquad_map.evidence.evidence import FrozenEvidence
-from triquad_map.mesh.tile_lattice import TileBorder, TileIndex, TileLattice
+from triquad_map.mesh.tile_mesh import TileBorder, TileIndex, TileLattice
 from triquad_map.surface import MARGIN_STEP
-from triquad_map.surfels.surfel_map import ShownField, surfel_voxels
+from triquad_map.surfels.ray_planes import ShownField
+from triquad_map.surfels.surfel_tree import surfel_voxels
 from triquad_map.view import REACH_VOXELS
 
 from triquad_server.epochs.epoch import FrozenRegion

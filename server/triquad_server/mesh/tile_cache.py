@@ -12,8 +12,7 @@ from triquad_format.wire.limits import LEVELS
 from triquad_format.wire.tile_codec import encode_tile
 from triquad_map.compiled.team import THREADS, Team
 from triquad_map.composition.composed_view import ComposedView
-from triquad_map.mesh.tile_lattice import TileBorder, TileIndex, TileLattice
-from triquad_map.mesh.tile_mesh import TileMesh, mesh_tile
+from triquad_map.mesh.tile_mesh import TileBorder, TileIndex, TileLattice, TileMesh, mesh_tile
 
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mesh.surface_changes import CachedTile, SurfaceChanges, TileLevel

@@ -14,7 +14,7 @@ from triquad_format.wire.mesh_messages import (
     TileList,
     TileListRequest,
 )
-from triquad_map.mesh.tile_lattice import TileIndex, TileLattice
+from triquad_map.mesh.tile_mesh import TileIndex, TileLattice
 
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.history import EpochHistory

@@ -5,8 +5,8 @@ from support.maps.seen_scans import end
 from triquad_format.records.arrays import Doubles
 from triquad_map.evidence.carving import Reach
 from triquad_map.evidence.live_evidence import LiveEvidence
-from triquad_map.evidence.normals import normals_at
 from triquad_map.evidence.observed import Sighting
+from triquad_map.evidence.ray_surfels import normals_at
 
 SIDE = 128
 MIDDLE = np.array([64.0, 64.0, 64.0])

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 from support.maps.small_world import mapper_of, settings, settled_mapper, world
-from triquad_map.composition.recorded_view import RecordedView
+from triquad_map.composition.composed_view import RecordedView
 from triquad_server.epochs.epoch import Epoch, buffers_of
 
 RNG = np.random.default_rng(0)

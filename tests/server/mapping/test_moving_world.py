@@ -15,7 +15,7 @@ from triquad_format.records.status import Status
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.mesh.marching_cubes import centroids
 from triquad_map.mesh.tile_mesh import mesh_tile
-from triquad_map.surfels.surfel_map import surfel_voxels
+from triquad_map.surfels.surfel_tree import surfel_voxels
 from triquad_server.epochs.epoch import Epoch, FrozenRegion
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.tile_cache import tile_lattice

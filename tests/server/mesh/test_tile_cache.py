@@ -18,7 +18,7 @@ from support.maps.meshed_ground import (
 from triquad_format.records.region import seen_voxels
 from triquad_format.wire.limits import LEVELS
 from triquad_format.wire.tile_codec import decode_tile
-from triquad_map.mesh.tile_lattice import TileIndex
+from triquad_map.mesh.tile_mesh import TileIndex
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.tile_cache import TileCache, tile_lattice

@@ -12,8 +12,7 @@ from support.maps.meshed_ground import MESH, bump, ground, make_all, shown, surf
 from support.maps.small_world import settings, world
 from triquad_format.wire.limits import LEVELS
 from triquad_format.wire.tile_codec import TileSurface
-from triquad_map.mesh.tile_lattice import TileIndex, TileLattice
-from triquad_map.mesh.tile_mesh import mesh_tile
+from triquad_map.mesh.tile_mesh import TileIndex, TileLattice, mesh_tile
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.tile_cache import TileCache

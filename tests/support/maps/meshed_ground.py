@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 from support.maps.exact_maps import SETTINGS, Height, exact_map, table
 from support.maps.map_records import with_region
 from triquad_format.wire.tile_codec import TileSurface, decode_tile
-from triquad_map.mesh.tile_lattice import TileIndex
+from triquad_map.mesh.tile_mesh import TileIndex
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.tile_cache import ShownTile, TileCache

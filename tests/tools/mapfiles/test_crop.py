@@ -7,7 +7,7 @@ import pytest
 from support.maps.map_records import assert_same, random_record, with_support
 from triquad_format.errors import FormatError
 from triquad_format.records.region import seen_voxels
-from triquad_map.composition.recorded_view import RecordedView
+from triquad_map.composition.composed_view import RecordedView
 from triquad_tools.mapfiles.crop import crop_record, without_training
 
 CUBE = tuple(itertools.product((0, 1), repeat=3))

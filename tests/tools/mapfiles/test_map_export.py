@@ -10,7 +10,7 @@ from support.files.mapfile_edit import file_bytes
 from support.maps.map_records import random_record
 from support.maps.small_world import settled_epoch
 from triquad_format.mapfile.reader import read_map
-from triquad_map.composition.recorded_view import RecordedView
+from triquad_map.composition.composed_view import RecordedView
 from triquad_tools.commands.pack import main
 from triquad_tools.mapfiles.crop import crop_record
 from triquad_tools.mapfiles.meshfile import read_mesh

@@ -9,7 +9,7 @@ from support.maps.map_records import assert_same, random_record
 from support.maps.small_world import settings, settled_mapper, world
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.reader import read_map
-from triquad_map.composition.recorded_view import RecordedView
+from triquad_map.composition.composed_view import RecordedView
 from triquad_tools.commands.pack import main
 from triquad_tools.mapfiles.crop import crop_record
 from triquad_tools.mapfiles.quantise import field_change, probes, quantise

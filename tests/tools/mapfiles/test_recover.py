@@ -40,7 +40,7 @@ from triquad_format.mapfile.reader import read_map_file
 from triquad_format.records import morton
 from triquad_format.records.region import seen_voxels
 from triquad_format.records.status import Status
-from triquad_map.composition.recorded_view import RecordedView
+from triquad_map.composition.composed_view import RecordedView
 from triquad_map.view import FieldAnswer
 from triquad_tools.mapfiles.crop import without_training
 from triquad_tools.mapfiles.recovered_map import RecoveredMap, recover

@@ -13,8 +13,8 @@ from triquad_format.records.replay_rays import SLOPE_SCALE, STEPS, ReplayRays
 from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.team import Team
 from triquad_map.evidence.live_evidence import LiveEvidence
-from triquad_map.evidence.normals import normals_at
 from triquad_map.evidence.observed import Sighting
+from triquad_map.evidence.ray_surfels import normals_at
 
 from triquad_server.mapping.replay.held_out import end_in_steps, is_held_out
 from triquad_server.mapping.replay.ray_table import LEAST_SLOPE, VALUE, RayTable
