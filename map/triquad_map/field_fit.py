@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
 from triquad_format.records.cells import same_cells
 from triquad_format.records.field_settings import FieldSettings
+from triquad_format.wire.messages import FieldFit
 
 _PLACE_LEAVES = 32.0  # side of a place
 _WORST = 5  # places that are reported
@@ -52,19 +53,7 @@ class PlaceFits:
         return cls((cells[first] + 0.5) * side_m, rays, medians_m, errors_m)
 
 
-@dataclass(frozen=True)
-class MapFit:
-    """The fit of a map to its held-out rays."""
-
-    rays: int
-    places: int  # in which they end
-    median_m: float  # of all these rays
-    upper_m: float  # what 90 % of them keep below
-    worst: Doubles  # [K, 3] map frame, metres: centres of the places with the largest medians
-    worst_median_m: Doubles  # [K]
-
-
-def map_fit(regions: Sequence[tuple[Doubles, PlaceFits]]) -> MapFit | None:
+def map_fit(regions: Sequence[tuple[Doubles, PlaceFits]]) -> FieldFit | None:
     """Return how well regions, by centre [3] and fit, fit together; ``None`` if there are none."""
     if not regions:
         return None
@@ -74,11 +63,10 @@ def map_fit(regions: Sequence[tuple[Doubles, PlaceFits]]) -> MapFit | None:
     rays = np.concatenate([fits.rays for _, fits in regions])
     enough = np.flatnonzero(rays >= _LEAST_RAYS)
     worst = enough[np.argsort(-medians_m[enough], kind="stable")[:_WORST]]
-    return MapFit(
+    return FieldFit(
         rays=len(errors_m),
-        places=len(rays),
         median_m=float(np.median(errors_m)),
         upper_m=float(np.quantile(errors_m, _UPPER)),
         worst=centres[worst],
-        worst_median_m=medians_m[worst],
+        worst_median_m=medians_m[worst].astype(np.float32),
     )

@@ -4,7 +4,6 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-import numpy as np
 from triquad_format.wire.messages import FieldFit
 from triquad_map import field_fit
 
@@ -40,13 +39,4 @@ class Progress:
 def map_fit(regions: Iterable[LiveRegion]) -> FieldFit | None:
     """Return how well regions fit, as they were judged last; ``None`` where none was."""
     fits = [(region.centre, region.training.fit) for region in regions]
-    fit = field_fit.map_fit([(centre, of_region) for centre, of_region in fits if of_region])
-    if fit is None:
-        return None
-    return FieldFit(
-        rays=fit.rays,
-        median_m=fit.median_m,
-        upper_m=fit.upper_m,
-        worst=fit.worst,
-        worst_median_m=fit.worst_median_m.astype(np.float32),
-    )
+    return field_fit.map_fit([(centre, fit) for centre, fit in fits if fit is not None])

@@ -19,7 +19,8 @@ from triquad_format.records.region import (
     surface_counts,
 )
 from triquad_format.records.replay_rays import are_held_out
-from triquad_map.field_fit import MapFit, PlaceFits, in_cube, map_fit
+from triquad_format.wire.messages import FieldFit
+from triquad_map.field_fit import PlaceFits, in_cube, map_fit
 from triquad_map.opening import open_view
 
 from triquad_tools.console.amounts import within
@@ -66,7 +67,7 @@ class MapSummary:
     progress: MapProgress
     training: bool
     learnt_percent: int | None  # of what the scans can teach; None: there is no training state
-    fit: MapFit | None  # to the rays that are held out; None: it holds none
+    fit: FieldFit | None  # to the rays that are held out; None: it holds none
     regions: tuple[RegionSummary, ...]
     parts: dict[str, TopicSummary]
 
@@ -180,7 +181,7 @@ def _rounded(place: Doubles) -> tuple[float, ...]:
     return tuple(place.round(6).tolist())
 
 
-def _fit(record: MapRecord) -> MapFit | None:
+def _fit(record: MapRecord) -> FieldFit | None:
     """Return how well a map fits rays that it was not trained on, as a server computes it.
 
     ``None``: it has no held-out rays, which are training state, or numba is missing.
