@@ -29,7 +29,7 @@ _SEED = 2  # of the points at which the file is compared with the live map
 
 _OPEN = """
 import sys, time
-from triquad_map.stored_map import StoredMap
+from triquad_format.mapfile.reader import StoredMap
 started = time.perf_counter()
 with StoredMap.open(sys.argv[1]) as stored:
     stored.box((9.0, -1.0, -0.5), (11.0, 1.0, 1.5))

@@ -15,9 +15,9 @@ from support import servers
 from support.event_loop import connected
 from support.server_records import STATUS
 from triquad_client import AsyncClient, ClosedError
+from triquad_format.mapfile.reader import StoredMap
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import MapInfo, SdfReply
-from triquad_map.stored_map import StoredMap
 
 POSE = np.eye(4)
 AROUND = ((-9, -9, -9), (9, 9, 9))

@@ -11,7 +11,7 @@ from triquad_tools.commands import pack
 
 CODE = """
 import sys
-import triquad_client, triquad_format.mapfile.reader, triquad_map.stored_map
+import triquad_client, triquad_format.mapfile.reader
 heavy = {"torch", "numba", "skimage", "scipy", "triquad_server"}
 heavy |= {"google.protobuf", "foxglove_schemas_protobuf"}
 heavy &= set(sys.modules)

@@ -19,9 +19,8 @@ from triquad_format.mapfile.checkpoint_folder import (
     map_folder,
 )
 from triquad_format.mapfile.index import MAGIC, read_checkpoint
-from triquad_format.mapfile.reader import open_manifest, read_map
+from triquad_format.mapfile.reader import StoredMap, open_manifest, read_map
 from triquad_format.mapfile.writer import write_map
-from triquad_map.stored_map import StoredMap
 from triquad_tools.mapfiles.recovered_map import recover
 from triquad_tools.mapfiles.source import checkpoint_at
 

@@ -30,7 +30,6 @@ from triquad_format.errors import (
     TooLargeMapFileError,
     UnsupportedMapFileError,
 )
-from triquad_format.mapfile.metadata import MapFacts
 from triquad_format.mapfile.parts.pack import pack_part, pack_record
 from triquad_format.mapfile.parts.part import PartKey
 from triquad_format.mapfile.reader import read_map
@@ -175,7 +174,7 @@ def test_unknown_parts_are_skipped_but_checked() -> None:
     part = pack_part(PartKey("/triquad/colours"), {"anything": 1})
     parts = [part, *pack_record(RECORD, "<f2", {})]
     stream = io.BytesIO()
-    write_parts(stream, MapFacts.of(RECORD), parts)
+    write_parts(stream, RECORD.facts, parts)
     data = stream.getvalue()
     assert_same(read_bytes(data), RECORD)
     assert_same(stored_record(data), RECORD)

@@ -8,12 +8,11 @@ from pathlib import Path
 from support.files import golden
 from support.files.checkpoint_folder import write_record
 from support.maps.map_records import random_record, with_integers, with_rays, with_support
-from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.reader import StoredMap, read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import MapProgress, MapRecord
 from triquad_map.preview import previews_of
-from triquad_map.stored_map import StoredMap
 
 TINY = FieldSettings(
     depth=6, feature_levels=1, feature_size=2, frequencies=1, hidden=2, logit_scale_m=0.5

@@ -14,11 +14,9 @@ import numpy as np
 from triquad_format.errors import FormatError, MapFileError
 from triquad_format.mapfile.manifest import Entry, Manifest
 from triquad_format.mapfile.parts.part import EVIDENCE, Part, PartKey
-from triquad_format.mapfile.reader import assemble
+from triquad_format.mapfile.reader import StoredMap, assemble
 from triquad_format.mapfile.writer import write_parts
-from triquad_format.records.record_check import check_record
 from triquad_format.wire.messages import MapInfo
-from triquad_map.stored_map import StoredMap
 
 from triquad_client import checks
 from triquad_client.calls.download import RemoteBytes, map_target, newest_file
@@ -138,7 +136,6 @@ class SyncedMap(MapQueries):
                 }
                 manifest = dataclasses.replace(stored.manifest, entries=wanted)
                 record = assemble(manifest, lambda entry: payloads[entry.key])
-                check_record(record)
                 _write(self._path, manifest, payloads)
             except FormatError as error:
                 raise DownloadError(str(error)) from error

@@ -31,6 +31,7 @@ from triquad_format.mapfile.metadata import (
     check_readable,
     manifest_place,
     utc_time,
+    version_of,
 )
 from triquad_format.mapfile.parts.body import PartBody, unpack_body
 from triquad_format.mapfile.parts.part import (
@@ -190,7 +191,7 @@ class CheckpointIndex:
         self.checkpoint = _checkpoint(self.manifest, body)
         self.size = source.size + self.manifest.stored_bytes  # bytes, with all parts
         self.metadata = {
-            "format_version": f"{self.manifest.facts.version}",
+            "format_version": f"{version_of(self.manifest.facts)}",
             "producer": body.value("producer", str),
         }
         if self.manifest.stamp_ns:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from triquad_format.errors import DamagedMapFileError, FormatError, TooLargeMapFileError
-from triquad_format.mapfile.metadata import MAX_MAP_BYTES, MapFacts, pack_facts, unpack_facts
+from triquad_format.mapfile.metadata import MAX_MAP_BYTES, pack_facts, unpack_facts
 from triquad_format.mapfile.parts.body import PartBody
 from triquad_format.mapfile.parts.pack import pack_part
 from triquad_format.mapfile.parts.part import (
@@ -23,6 +23,7 @@ from triquad_format.mapfile.parts.part import (
     Part,
     PartKey,
 )
+from triquad_format.records.region import MapRecord
 from triquad_format.wire.codec import pack_array
 
 MAX_ENTRIES = 1 << 20
@@ -72,7 +73,7 @@ class Entry:
 class Manifest:
     """All parts of a map at one epoch."""
 
-    facts: MapFacts
+    facts: MapRecord  # without its regions
     stamp_ns: int  # when the epoch was written, nanoseconds since 1970; 0 if not known
     entries: tuple[Entry, ...]  # in the order of the file
 

@@ -8,7 +8,6 @@ import dataclasses
 import re
 import reprlib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from datetime import datetime, timezone
 from typing import Any
 
@@ -23,7 +22,7 @@ from triquad_format.errors import (
 from triquad_format.mapfile.parts.body import PartBody, unpack_body
 from triquad_format.mapfile.parts.part import MANIFEST, MAP
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.records.region import NO_ORIGIN, MapProgress, MapRecord, Region
+from triquad_format.records.region import NO_ORIGIN, MapProgress, MapRecord
 from triquad_format.wire.codec import pack_array
 from triquad_format.wire.keys import check_name
 from triquad_format.wire.limits import MAX_POSITION_M
@@ -41,40 +40,18 @@ MAX_MAP_BYTES = 4 * 2**30
 """Limit on the size of a map file, and on its parts' decompressed size together."""
 
 
-@dataclass(frozen=True)
-class MapFacts:
-    """Name, epoch, settings and progress of a map."""
-
-    name: str
-    epoch: int
-    settings: FieldSettings
-    progress: MapProgress
-    origin_m: tuple[float, float, float] = NO_ORIGIN
-
-    @property
-    def version(self) -> int:
-        """The oldest version of the format that has all of them."""
-        return 1 if self.origin_m == NO_ORIGIN else 2
-
-    @classmethod
-    def of(cls, record: MapRecord) -> "MapFacts":
-        """Return the facts of a record."""
-        return cls(record.name, record.epoch, record.settings, record.progress, record.origin_m)
-
-    def record(self, regions: tuple[Region, ...]) -> MapRecord:
-        """Return the map of these regions."""
-        return MapRecord(
-            self.name, self.epoch, self.settings, regions, self.progress, self.origin_m
-        )
+def version_of(facts: MapRecord) -> int:
+    """Return the oldest version of the format that has all facts of a map."""
+    return 1 if facts.origin_m == NO_ORIGIN else 2
 
 
-def pack_facts(facts: MapFacts) -> dict[str, object]:
-    """Return the facts as a msgpack map."""
+def pack_facts(facts: MapRecord) -> dict[str, object]:
+    """Return the facts of a map as a msgpack map."""
     defaults = dataclasses.asdict(FieldSettings())
     settings = dataclasses.asdict(facts.settings)
-    origin = {} if facts.version == 1 else {"origin": pack_array(np.array(facts.origin_m))}
+    origin = {} if version_of(facts) == 1 else {"origin": pack_array(np.array(facts.origin_m))}
     return {
-        "min_reader_version": facts.version,
+        "min_reader_version": version_of(facts),
         "name": facts.name,
         "epoch": facts.epoch,
         "frame_id": FRAME_ID,
@@ -85,8 +62,8 @@ def pack_facts(facts: MapFacts) -> dict[str, object]:
     }
 
 
-def unpack_facts(body: PartBody) -> MapFacts:
-    """Return the facts in a part.
+def unpack_facts(body: PartBody) -> MapRecord:
+    """Return the facts in a part: a map without its regions.
 
     Raises:
         UnsupportedMapFileError: the part needs a newer reader.
@@ -104,7 +81,7 @@ def unpack_facts(body: PartBody) -> MapFacts:
         progress.check()
     except FormatError as error:
         raise DamagedMapFileError(f"{body.topic}: progress: {error}") from error
-    return MapFacts(name, body.count("epoch"), settings, progress, _origin(body))
+    return MapRecord(name, body.count("epoch"), settings, (), progress, _origin(body))
 
 
 def _origin(body: PartBody) -> tuple[float, float, float]:
@@ -117,7 +94,7 @@ def _origin(body: PartBody) -> tuple[float, float, float]:
     return x, y, z
 
 
-def check_map_part(payload: bytes, facts: MapFacts) -> None:
+def check_map_part(payload: bytes, facts: MapRecord) -> None:
     """Raise :class:`FormatError` unless the part ``/triquad/map`` states the same facts."""
     if unpack_facts(unpack_body(MAP, payload)) != facts:
         raise DamagedMapFileError(f"{MAP} and {MANIFEST} contradict each other")
@@ -137,15 +114,15 @@ def _values(defaults: FieldSettings | MapProgress, packed: Mapping[str, object])
 
 
 def pack_metadata(
-    facts: MapFacts, *, stamp_ns: int | None, offset: int, stored: int
+    facts: MapRecord, *, stamp_ns: int | None, offset: int, stored: int
 ) -> dict[str, str]:
     """Return the metadata of a file, whose manifest is the ``stored`` bytes from ``offset`` on.
 
     ``stamp_ns`` is the time of its epoch, nanoseconds since 1970; ``None``: not known.
     """
     entries = {
-        "format_version": str(facts.version),
-        "min_reader_version": str(facts.version),
+        "format_version": str(version_of(facts)),
+        "min_reader_version": str(version_of(facts)),
         "producer": PRODUCER,
         **_facts_in_metadata(facts),
         "manifest": f"{offset} {stored}",
@@ -160,7 +137,7 @@ def utc_time(stamp_ns: int) -> str:
     return datetime.fromtimestamp(stamp_ns // 10**9, timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
-def _facts_in_metadata(facts: MapFacts) -> dict[str, str]:
+def _facts_in_metadata(facts: MapRecord) -> dict[str, str]:
     return {"map": facts.name, "epoch": str(facts.epoch), "frame_id": FRAME_ID, "units": UNITS}
 
 
@@ -197,7 +174,7 @@ def manifest_place(metadata: dict[str, str]) -> tuple[int, int]:
     return int(offset), int(stored)
 
 
-def check_agreement(metadata: dict[str, str], facts: MapFacts) -> None:
+def check_agreement(metadata: dict[str, str], facts: MapRecord) -> None:
     """Raise :class:`DamagedMapFileError` unless metadata and the manifest's facts are the same."""
     for key, value in _facts_in_metadata(facts).items():
         if metadata.get(key) != value:

@@ -13,7 +13,7 @@ from triquad_format.errors import FormatError
 from triquad_format.mapfile.container import METADATA_NAME
 from triquad_format.mapfile.files import replacing
 from triquad_format.mapfile.manifest import Entry, Manifest, pack_manifest
-from triquad_format.mapfile.metadata import MapFacts, pack_facts, pack_metadata
+from triquad_format.mapfile.metadata import pack_facts, pack_metadata
 from triquad_format.mapfile.parts.pack import check_part, compressed, pack_part, pack_record
 from triquad_format.mapfile.parts.part import (
     MAP,
@@ -75,15 +75,14 @@ def write_map(
     if stamp_ns is not None and not 0 <= stamp_ns < 2**63:
         raise FormatError(f"stamp_ns = {stamp_ns} is out of range: use 0 to 2**63 - 1")
     check_record(record)
-    facts = MapFacts.of(record)
     parts = pack_record(record, feature_dtype, {} if previews is None else previews.parts)
     schema = None if previews is None else previews.schema
-    return write_parts(file, facts, parts, stamp_ns=stamp_ns, preview_schema=schema)
+    return write_parts(file, record.facts, parts, stamp_ns=stamp_ns, preview_schema=schema)
 
 
 def write_parts(
     file: BinaryIO | Path | str,
-    facts: MapFacts,
+    facts: MapRecord,
     parts: Iterable[Part],
     *,
     stamp_ns: int | None = None,
@@ -93,7 +92,7 @@ def write_parts(
 
     Args:
         file: as in :func:`write_map`.
-        facts: what the file says of the whole map.
+        facts: what the file says of the whole map, of which regions are not used.
         parts: what the map consists of.
         stamp_ns: time of its epoch, nanoseconds since 1970; left out, the file has no time.
         preview_schema: that of :class:`Previews`; needed where there are previews among ``parts``.
@@ -133,7 +132,7 @@ class _PartsWriter:
     def __init__(
         self,
         stream: BinaryIO,
-        facts: MapFacts,
+        facts: MapRecord,
         stamp_ns: int,
         preview_schema: bytes | None,
     ) -> None:

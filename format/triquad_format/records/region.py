@@ -6,7 +6,7 @@ level ``l`` a node has side ``2**(depth - l)`` leaves; vertex ``(a, b)`` of a pl
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import reduce
 
 import numpy as np
@@ -173,6 +173,11 @@ class MapRecord:
     progress: MapProgress = MapProgress()
     # [3] of the coordinates that its user gives: from there all else in the record counts
     origin_m: tuple[float, float, float] = NO_ORIGIN
+
+    @property
+    def facts(self) -> "MapRecord":
+        """The map without its regions."""
+        return replace(self, regions=())
 
     @property
     def origin(self) -> Doubles:

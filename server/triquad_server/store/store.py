@@ -22,7 +22,6 @@ from triquad_format.mapfile.checkpoint_folder import (
 )
 from triquad_format.mapfile.index import Checkpoint, Restored, read_checkpoint, write_checkpoint
 from triquad_format.mapfile.manifest import Entry, Manifest
-from triquad_format.mapfile.metadata import MapFacts
 from triquad_format.mapfile.parts.pack import pack_region
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.record_check import check_record
@@ -229,7 +228,7 @@ class Store:
             for part in pack_region(changed[index], record.settings, _FEATURE_DTYPE):
                 entries.append(new.add(part, known.get(part.key)))
         new.commit()
-        return Manifest(MapFacts.of(record), 0, tuple(entries))
+        return Manifest(record.facts, 0, tuple(entries))
 
     def _write(self, manifest: Manifest, undoes: str = "") -> CheckpointInfo:
         """Write the file that makes parts a checkpoint; then delete what need not stay."""

@@ -21,7 +21,6 @@ from triquad_format.errors import DamagedMapFileError, MapFileError
 from triquad_format.mapfile.checkpoint_folder import PartFiles, checkpoint_files
 from triquad_format.mapfile.reader import open_manifest, read_map
 from triquad_format.mapfile.writer import write_map
-from triquad_map.stored_map import StoredMap
 from triquad_server.errors import StoreError
 from triquad_server.settings import StoreSettings
 from triquad_server.store.store import Store
@@ -106,7 +105,7 @@ def test_where_something_is_gone_all_is_written_again(store, harm):
     assert_same(read_map(paths(store)[4]), fourth)
 
 
-@pytest.mark.parametrize("read", [read_map, recover, lambda path: StoredMap.open(path).record()])
+@pytest.mark.parametrize("read", [read_map, recover])
 def test_a_checkpoint_that_is_deleted_while_it_is_read_is_not_called_damaged(
     store, read, monkeypatch
 ):

@@ -7,7 +7,6 @@ from support.maps.map_records import random_record
 from triquad_format.mapfile.checkpoint_folder import NewParts, checkpoint_name
 from triquad_format.mapfile.index import Checkpoint, write_checkpoint
 from triquad_format.mapfile.manifest import Entry, Manifest
-from triquad_format.mapfile.metadata import MapFacts
 from triquad_format.mapfile.parts.pack import pack_record
 from triquad_format.mapfile.parts.part import PartKey
 from triquad_format.records.region import MapRecord
@@ -47,6 +46,6 @@ def write_record(
     new.commit()
     known.update({entry.key: entry for entry in entries})
     path = folder / checkpoint_name(record.epoch)
-    manifest = Manifest(MapFacts.of(record), stamp_ns, tuple(entries))
+    manifest = Manifest(record.facts, stamp_ns, tuple(entries))
     write_checkpoint(path, Checkpoint(manifest, undoes))
     return path

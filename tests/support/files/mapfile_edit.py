@@ -17,16 +17,15 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from numpy.typing import NDArray
 from triquad_format.errors import DamagedMapFileError, MapFileError
-from triquad_format.mapfile.files import check_range
+from triquad_format.mapfile.files import check_range, named
 from triquad_format.mapfile.index import MapIndex
 from triquad_format.mapfile.manifest import Manifest, pack_manifest
 from triquad_format.mapfile.parts.part import MANIFEST
-from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.reader import StoredMap, assemble, read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.region import MapRecord
 from triquad_format.wire.codec import pack_array, unpack_array
 from triquad_map.preview import previews_of
-from triquad_map.stored_map import StoredMap
 
 Edit = Callable[[dict[str, Any]], object]
 """Changes the msgpack map of a part."""
@@ -85,8 +84,8 @@ def stored(data: bytes) -> StoredMap:
 
 def stored_record(data: bytes) -> MapRecord:
     """The record in a file's bytes, part by part."""
-    with stored(data) as map_file:
-        return map_file.record()
+    with stored(data) as map_file, named(map_file.name):
+        return assemble(map_file.manifest, map_file.payload)
 
 
 def assert_refused(data: bytes, text: str | None = None) -> None:

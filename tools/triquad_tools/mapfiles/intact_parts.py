@@ -16,9 +16,10 @@ from triquad_format.mapfile.container import chunk_messages, decompress
 from triquad_format.mapfile.files import FileBytes
 from triquad_format.mapfile.index import CheckpointIndex, is_checkpoint
 from triquad_format.mapfile.manifest import Entry, Manifest, manifest_in, total_limit
-from triquad_format.mapfile.metadata import MAX_MAP_BYTES, MapFacts, unpack_facts
+from triquad_format.mapfile.metadata import MAX_MAP_BYTES, unpack_facts
 from triquad_format.mapfile.parts import part
 from triquad_format.mapfile.parts.body import unpack_body
+from triquad_format.records.region import MapRecord
 
 _LEAST_BUDGET, _BUDGET_RATIO = 2**24, 8
 """Bytes of all places whose contents are tried: a constant, and a multiple of the file's size."""
@@ -36,7 +37,7 @@ _TOPIC = re.compile(rb"[\x80-\x8f]\xa5topic[\xa0-\xbf](/triquad/[a-z]+)")
 class IntactParts:
     """The parts of the field and of training that are intact, and what is known of the others."""
 
-    facts: MapFacts
+    facts: MapRecord  # without its regions
     payloads: Mapping[part.PartKey, bytes]
     manifest: Manifest | None = None  # None: it is lost
 

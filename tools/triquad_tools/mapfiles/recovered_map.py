@@ -97,7 +97,7 @@ def _recovered(found: IntactParts) -> RecoveredMap:
             lost.add(part.PartKey(part.TRAINING, index))
         regions.append(region)
     regions = _masked_where_lost(settings, regions, lost)
-    record = found.facts.record(tuple(regions))
+    record = dataclasses.replace(found.facts, regions=tuple(regions))
     losses = [
         Loss(key, *(record.origin + _status_box(key, settings)))
         for key in sorted(lost, key=lambda key: (key.region, key))

@@ -10,10 +10,9 @@ from pathlib import Path
 
 from triquad_format.errors import MapFileError, TriquadError
 from triquad_format.mapfile.checkpoint_folder import CheckpointFile, checkpoint_files, map_folder
-from triquad_format.mapfile.reader import open_manifest, read_map_file
+from triquad_format.mapfile.reader import StoredMap, open_manifest, read_map_file
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.region import MapRecord
-from triquad_map.stored_map import StoredMap
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress

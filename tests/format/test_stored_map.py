@@ -8,9 +8,8 @@ from support.files.mapfile_edit import edited, file_bytes, set_array, stored
 from support.maps.map_records import SMALL, assert_same, random_record, with_support
 from triquad_format.errors import DamagedMapFileError
 from triquad_format.mapfile.files import FileBytes
-from triquad_format.mapfile.reader import read_map
+from triquad_format.mapfile.reader import StoredMap, read_map
 from triquad_format.mapfile.writer import write_map
-from triquad_map.stored_map import StoredMap
 from triquad_tools.mapfiles.crop import crop_record
 
 WIDE = dataclasses.replace(SMALL, depth=11, feature_levels=4)
@@ -79,7 +78,7 @@ def test_a_deleted_file_answers_on(tmp_path):
     write_map(record, path)
     with StoredMap.open(path) as map_file:
         path.unlink()
-        assert_same(map_file.record(), record)
+        assert_same(map_file.whole().record, record)
     with pytest.raises(FileNotFoundError):
         StoredMap.open(path)
 
@@ -102,7 +101,7 @@ def test_a_checkpoint_holds_what_the_map_in_one_file_does(tmp_path):
     path = checkpoint_folder.write_record(tmp_path, record)
     with StoredMap.open(path) as map_file, stored(file_bytes(record)) as whole:
         assert_same(map_file.box(*FAR), whole.box(*FAR))
-        assert_same(map_file.record(), record)
+        assert_same(map_file.whole().record, record)
 
 
 def test_a_part_deleted_before_it_is_needed(tmp_path):
