@@ -50,51 +50,43 @@ class Rule:
 
 
 @dataclass(frozen=True)
-class Subject:
-    """The other end of a link: all that is given has to match, one of each.
+class Grant:
+    """The rights of the other end of a link. What fits several grants may do what any of them says.
 
-    Where nothing is given, it is everybody.
+    All that is given has to match; where nothing is, it is everybody's.
     """
 
     name: str
-    interfaces: tuple[str, ...] = ()  # of this machine, over which the link comes
-    cert_common_names: tuple[str, ...] = ()  # of the certificate shown, with mTLS
-    usernames: tuple[str, ...] = ()
-
-
-THIS_MACHINE = Subject("this-machine", interfaces=(LOOPBACK,))
-EVERYBODY = Subject("everybody")
-
-
-@dataclass(frozen=True)
-class Grant:
-    """The rights of a subject. What fits several subjects may do what any of them may."""
-
-    subject: Subject
     rules: tuple[Rule, ...]
+    interface: str | None = None  # of this machine, over which the link comes
+    common_name: str | None = None  # of the certificate shown, with mTLS
+
+    @property
+    def subject(self) -> dict[str, Any]:
+        """The other end, as Zenoh writes it."""
+        given = {"interfaces": self.interface, "cert_common_names": self.common_name}
+        return {"id": self.name} | {kind: [one] for kind, one in given.items() if one is not None}
 
 
 def access_control(grants: Sequence[Grant]) -> dict[str, Any]:
     """Return the section ``access_control`` of the configuration of a server or a router.
 
-    The names of subjects have to differ.
+    The names of grants have to differ.
     """
     rules, policies = [], []
     for grant in grants:
         entries = [
             entry
             for number, rule in enumerate(grant.rules)
-            for entry in _entries(f"{grant.subject.name} {number} {rule.verb.name.lower()}", rule)
+            for entry in _entries(f"{grant.name} {number} {rule.verb.name.lower()}", rule)
         ]
         rules += entries
-        policies.append(
-            {"subjects": [grant.subject.name], "rules": [entry["id"] for entry in entries]}
-        )
+        policies.append({"subjects": [grant.name], "rules": [entry["id"] for entry in entries]})
     return {
         "enabled": True,
         "default_permission": "deny",
         "rules": rules,
-        "subjects": [_subject(grant.subject) for grant in grants],
+        "subjects": [grant.subject for grant in grants],
         "policies": policies,
     }
 
@@ -106,7 +98,8 @@ def without_credentials(map_name: str, *, ros2: Sequence[Rule] = ()) -> tuple[Gr
     it and publish scans, and what ``ros2`` allows besides.
     """
     beyond = (*view(map_name), *publish(map_name), *ros2)
-    return Grant(THIS_MACHINE, everything()), Grant(EVERYBODY, beyond)
+    here = Grant("this-machine", everything(), interface=LOOPBACK)
+    return here, Grant("everybody", beyond)
 
 
 def view(map_name: str) -> tuple[Rule, ...]:
@@ -184,12 +177,3 @@ def _entries(name: str, rule: Rule) -> list[dict[str, Any]]:
         }
         for flow, messages in zip(("ingress", "egress"), rule.verb.value, strict=True)
     ]
-
-
-def _subject(subject: Subject) -> dict[str, Any]:
-    given = {
-        "interfaces": subject.interfaces,
-        "cert_common_names": subject.cert_common_names,
-        "usernames": subject.usernames,
-    }
-    return {"id": subject.name} | {kind: list(names) for kind, names in given.items() if names}

@@ -5,7 +5,10 @@ Values go by their paths, such as ``scouting/multicast/enabled``.
 
 import json
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import zenoh
 
 QUIET: Mapping[str, Any] = {
     "scouting/multicast/enabled": False,
@@ -20,33 +23,23 @@ _MADE_UP_OF_ONE = ("access_control", "transport/shared_memory")
 """Sections of which a part makes no sense without the others: a file sets all or nothing."""
 
 
-class ZenohConfig(Protocol):
-    """The methods of ``zenoh.Config`` that are used."""
-
-    def get_json(self, key: str) -> str:
-        """Return the value at a path, as JSON."""
-
-    def insert_json5(self, key: str, value: str) -> None:
-        """Set the value at a path."""
-
-
 def reason(error: Exception) -> str:
     """Return what Zenoh says of an error, on one line, without where in Zenoh it happened."""
     return " ".join(str(error).split(" at /", 1)[0].split())
 
 
-def put(config: ZenohConfig, values: Mapping[str, Any]) -> None:
+def put(config: "zenoh.Config", values: Mapping[str, Any]) -> None:
     """Set values, by path."""
     for path, value in values.items():
         config.insert_json5(path, json.dumps(value))
 
 
-def fill(config: ZenohConfig, values: Mapping[str, Any], unset: ZenohConfig) -> None:
+def fill(config: "zenoh.Config", values: Mapping[str, Any], unset: "zenoh.Config") -> None:
     """Set the values that are not set yet: that are as in ``unset``, a new configuration."""
     put(config, {path: value for path, value in values.items() if not is_set(config, path, unset)})
 
 
-def is_set(config: ZenohConfig, path: str, unset: ZenohConfig) -> bool:
+def is_set(config: "zenoh.Config", path: str, unset: "zenoh.Config") -> bool:
     """Return whether a value differs from that of ``unset``, a new configuration."""
     for section in _MADE_UP_OF_ONE:
         if path.startswith(section):

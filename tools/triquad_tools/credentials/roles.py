@@ -53,10 +53,7 @@ def grants(granting: Holder, holders: Sequence[Holder]) -> tuple[access.Grant, .
         allowed = {holder.common_name: _allowed(holder, domains) for holder in holders}
     else:
         allowed = {holder.common_name: access.everything() for holder in holders if holder.listens}
-    return tuple(
-        access.Grant(access.Subject(name, cert_common_names=(name,)), rules)
-        for name, rules in allowed.items()
-    )
+    return tuple(access.Grant(name, rules, common_name=name) for name, rules in allowed.items())
 
 
 def _allowed(holder: Holder, domains: Sequence[int]) -> tuple[access.Rule, ...]:
