@@ -3,9 +3,9 @@
 from collections import deque
 
 import numpy as np
-from triquad_format.records import agreement
-from triquad_format.records.agreement import ScanView
+from triquad_format.records import plausibility
 from triquad_format.records.arrays import Doubles
+from triquad_format.records.plausibility import ScanView
 
 from triquad_server.intake.rays import ScanRays
 
@@ -56,10 +56,11 @@ class PoseCheck:
             due = self._scans >= _LAG << min(_LEAST, len(self._pairs))
         else:
             apart_m = min(_APART_M, _APART_RANGES * first.range_m)
-            due = agreement.are_apart(first.world_from_sensor, pose[None], apart_m, _APART_RAD)[0]
+            base = first.world_from_sensor
+            due = plausibility.are_apart(base, pose[None], apart_m, _APART_RAD)[0]
         if due:
             self._first, self._scans = self._view(rays, pose), 0
-            if (shares := agreement.shares_before(first, self._first)) is not None:
+            if (shares := plausibility.shares_before(first, self._first)) is not None:
                 self._pairs.append(shares)
             if len(self._hidden) == _JUDGED:
                 self._first, self._scans = None, -_SKIPPED
@@ -74,13 +75,13 @@ class PoseCheck:
         told = self._misreading()
         if told is not None:
             return f"{told[1]}: {_REMEDIES[told[0]]}"
-        begins = agreement.hiding(self._hidden) if len(self._hidden) >= _LEAST else None
+        begins = plausibility.hiding(self._hidden) if len(self._hidden) >= _LEAST else None
         return begins and f"{begins}: {_ORIGIN}"
 
     def _misreading(self) -> tuple[str, str] | None:
-        return agreement.misreading(self._pairs) if len(self._pairs) >= _LEAST else None
+        return plausibility.misreading(self._pairs) if len(self._pairs) >= _LEAST else None
 
     def _view(self, rays: ScanRays, pose: Doubles) -> ScanView:
         points = (rays.ends - rays.origin) @ pose[:3, :3]
-        self._hidden.append(agreement.hidden_share(points[:: max(1, len(points) // _HIDING)]))
-        return agreement.view_of(points, pose)
+        self._hidden.append(plausibility.hidden_share(points[:: max(1, len(points) // _HIDING)]))
+        return plausibility.view_of(points, pose)

@@ -3,8 +3,8 @@
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from triquad_format.records.agreement import are_apart, misreading, shares_before, view_of
 from triquad_format.records.arrays import Doubles
+from triquad_format.records.plausibility import are_apart, misreading, shares_before, view_of
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.folders.point_file import read_points
