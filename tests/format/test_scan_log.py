@@ -12,7 +12,6 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from triquad_format.errors import DamagedMapFileError
 from triquad_format.records.pose import pose_matrices, quaternion_of
 from triquad_format.scan_log.log_folder import Segment, history, segment_name, segments
-from triquad_format.scan_log.reading import read_segment
 from triquad_format.scan_log.ros_messages import (
     CLOUD_TYPE,
     DEFINITIONS,
@@ -25,6 +24,7 @@ from triquad_format.scan_log.segment import (
     LoggedReset,
     LoggedScan,
     SegmentWriter,
+    read_segment,
 )
 
 ROS: Any = get_typestore(Stores.ROS2_HUMBLE)

@@ -8,14 +8,20 @@ directions [M, 3], little-endian float32, on ``/no_return/<source>``; what was r
 poses before it is on ``/corrections/<source>``, as :class:`LoggedCorrection` packs it.
 """
 
+import io
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
+from typing import IO, TypeAlias
 
 import numpy as np
+from mcap.records import Channel, Footer, Message
+from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
+from triquad_format.errors import DamagedMapFileError, FormatError
+from triquad_format.mapfile.files import open_regular
 from triquad_format.records.arrays import Doubles, Floats, Longs
 from triquad_format.scan_log.ros_messages import (
     CLOUD_TYPE,
@@ -24,14 +30,16 @@ from triquad_format.scan_log.ros_messages import (
     Transform,
     pack_cloud,
     pack_transform,
+    unpack_cloud,
+    unpack_transform,
 )
 
 GRAIN_M = 2.0**-8
 """Points are rounded to 4 mm: single precision has that exactly, with zeros that compress."""
 
 _MAP_FRAME = "map"
-TRANSFORMS, RESETS = "/tf", "/resets"
-SCANS, NO_RETURN, CORRECTIONS = "/scans/", "/no_return/", "/corrections/"
+_TRANSFORMS, _RESETS = "/tf", "/resets"
+_SCANS, _NO_RETURN, _CORRECTIONS = "/scans/", "/no_return/", "/corrections/"
 """The topics; the last three before the name of a source."""
 
 _CHUNK_BYTES = 1 << 20
@@ -88,16 +96,20 @@ class LoggedCorrection:
         return cls(source, rows["stamp_ns"].astype(np.int64), moves, until_ns, since)
 
 
+Entry: TypeAlias = LoggedScan | Transform | LoggedReset | LoggedCorrection
+"""What a log has: a scan, the pose of one that was not kept, a reset, or a correction."""
+
+
 class SegmentWriter:
-    """Writes a file as scans come; it is whole once :meth:`finish` was called."""
+    """Writes a file as scans come; it is whole once :meth:`finish` was called.
+
+    Where it cannot be written, any method raises an ``OSError``.
+    """
 
     def __init__(self, path: Path, *, after_loss: bool = False) -> None:
         """Begin a file, in place of what is there.
 
         ``after_loss``: scans or resets before it could not be written.
-
-        Raises:
-            OSError: it cannot be written.
         """
         self.path = path
         self.after_loss = after_loss
@@ -109,53 +121,33 @@ class SegmentWriter:
         self.messages = 0
 
     def add_pose(self, transform: Transform) -> None:
-        """Add the pose of a scan, of which no more is kept.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """Add the pose of a scan, of which no more is kept."""
         stamp_ns, source, pose = transform
         data = pack_transform(stamp_ns, _MAP_FRAME, source, pose)
-        self._put(TRANSFORMS, TRANSFORMS_TYPE, stamp_ns, data)
+        self._put(_TRANSFORMS, TRANSFORMS_TYPE, stamp_ns, data)
 
     def add(self, scan: LoggedScan) -> None:
-        """Add a scan.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """Add a scan."""
         stamp_ns, source = scan.stamp_ns, scan.source
         self.add_pose(Transform(stamp_ns, source, scan.world_from_sensor))
         if len(scan.no_return):
             directions = np.ascontiguousarray(scan.no_return, "<f4").tobytes()
-            self._put(NO_RETURN + source, "", stamp_ns, directions)
+            self._put(_NO_RETURN + source, "", stamp_ns, directions)
         points = (np.round(scan.points / GRAIN_M) * GRAIN_M).astype(np.float32)
-        self._put(SCANS + source, CLOUD_TYPE, stamp_ns, pack_cloud(stamp_ns, source, points))
+        self._put(_SCANS + source, CLOUD_TYPE, stamp_ns, pack_cloud(stamp_ns, source, points))
 
     def add_reset(self, reset: LoggedReset, stamp_ns: int) -> None:
-        """Add that the map forgot a box.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """Add that the map forgot a box."""
         corners = np.concatenate([reset.minimum, reset.maximum]).astype("<f8")
-        self._put(RESETS, "", stamp_ns, corners.tobytes())
+        self._put(_RESETS, "", stamp_ns, corners.tobytes())
 
     def add_correction(self, correction: LoggedCorrection) -> None:
-        """Add that the poses of scans before were corrected.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """Add that the poses of scans before were corrected."""
         data = correction.pack()
-        self._put(CORRECTIONS + correction.source, "", correction.until_ns, data)
+        self._put(_CORRECTIONS + correction.source, "", correction.until_ns, data)
 
     def finish(self) -> None:
-        """End the file.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """End the file."""
         self._mcap.finish()  # type: ignore[no-untyped-call]
         self._stream.close()
 
@@ -179,3 +171,55 @@ class SegmentWriter:
             text = DEFINITIONS[kind].encode()
             self._schemas[kind] = self._mcap.register_schema(kind, "ros2msg", text)
         return self._schemas[kind]
+
+
+def read_segment(path: Path) -> Iterator[Entry]:
+    """Yield what a file of the log has, in the order in which it came.
+
+    Raises:
+        DamagedMapFileError: the file is damaged, or is none of the log.
+        OSError: it cannot be read.
+    """
+    with io.BufferedReader(open_regular(path)) as stream:
+        try:
+            yield from _entries(stream)
+        except Exception as error:  # as the library comes upon what it did not expect
+            raise DamagedMapFileError(f"{path} is damaged: {error!r}") from error
+
+
+def _entries(stream: IO[bytes]) -> Iterator[Entry]:
+    topics: dict[int, str] = {}
+    pose, no_return = None, np.zeros((0, 3), np.float32)  # until the scan comes that they are of
+    is_whole = False
+    for record in StreamReader(stream, validate_crcs=True).records:
+        is_whole |= isinstance(record, Footer)
+        if isinstance(record, Channel):
+            topics[record.id] = record.topic
+        if not isinstance(record, Message):
+            continue
+        topic, data = topics[record.channel_id], record.data
+        if topic.startswith(_NO_RETURN):
+            no_return = np.frombuffer(data, "<f4").reshape(-1, 3)
+        elif topic.startswith(_SCANS):
+            yield _scan(data, pose, no_return)
+            pose, no_return = None, no_return[:0]
+        else:
+            if pose is not None:
+                yield pose
+            pose = unpack_transform(data) if topic == _TRANSFORMS else None
+            if topic == _RESETS:
+                yield LoggedReset(*np.frombuffer(data, "<f8").reshape(2, 3))
+            elif topic.startswith(_CORRECTIONS):
+                yield LoggedCorrection.unpack(topic.removeprefix(_CORRECTIONS), data)
+    if pose is not None:
+        yield pose
+    if not is_whole:
+        raise FormatError("it has no end")
+
+
+def _scan(data: bytes, pose: Transform | None, no_return: Floats) -> LoggedScan:
+    """Return a scan of its cloud and the pose before it."""
+    stamp_ns, source, points = unpack_cloud(data)
+    if pose is None or (pose.stamp_ns, pose.child) != (stamp_ns, source):
+        raise FormatError(f"a scan of {source} has no pose before it")
+    return LoggedScan(source, stamp_ns, pose.pose, points, no_return)

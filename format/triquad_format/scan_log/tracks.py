@@ -7,9 +7,8 @@ import numpy as np
 
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.pose import pose_matrices, quaternion_of, slerp
-from triquad_format.scan_log.reading import Entry
 from triquad_format.scan_log.ros_messages import Transform
-from triquad_format.scan_log.segment import LoggedCorrection, LoggedScan
+from triquad_format.scan_log.segment import Entry, LoggedCorrection, LoggedScan
 
 _AGAIN_NS = 1_000_000_000
 """Where stamps of a source fall by more, its time began again, as with another start of a robot

@@ -10,9 +10,14 @@ from triquad_format.errors import RefusedError
 from triquad_format.mapfile.checkpoint_folder import CheckpointFile, checkpoint_files
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.scan_log.log_folder import Segment, history, of_map, segments
-from triquad_format.scan_log.reading import Entry, read_segment
 from triquad_format.scan_log.ros_messages import Transform
-from triquad_format.scan_log.segment import LoggedCorrection, LoggedReset, LoggedScan
+from triquad_format.scan_log.segment import (
+    Entry,
+    LoggedCorrection,
+    LoggedReset,
+    LoggedScan,
+    read_segment,
+)
 from triquad_format.scan_log.tracks import LogPoses, corrected, motions, source_of
 
 from triquad_server.store.store import Store

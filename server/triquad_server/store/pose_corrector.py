@@ -11,8 +11,7 @@ import numpy as np
 from triquad_format.errors import FormatError, RefusedError
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.pose import pose_matrices
-from triquad_format.scan_log.reading import Entry
-from triquad_format.scan_log.segment import LoggedReset, LoggedScan
+from triquad_format.scan_log.segment import Entry, LoggedReset, LoggedScan
 from triquad_format.wire.limits import MAX_KEYFRAMES
 from triquad_format.wire.source_messages import CorrectPosesReply, CorrectPosesRequest
 

@@ -19,9 +19,9 @@ from triquad_format.mapfile.files import sync_folder
 from triquad_format.mapfile.index import Restored
 from triquad_format.records.arrays import Doubles
 from triquad_format.scan_log.log_folder import LOG_NAME, of_map, segment_name, segments
-from triquad_format.scan_log.reading import Entry
 from triquad_format.scan_log.ros_messages import Transform
 from triquad_format.scan_log.segment import (
+    Entry,
     LoggedCorrection,
     LoggedReset,
     LoggedScan,

@@ -9,8 +9,7 @@ from support.maps.small_world import world
 from support.poses import shifted
 from triquad_format.mapfile.index import Restored
 from triquad_format.scan_log.log_folder import history, segments
-from triquad_format.scan_log.reading import read_segment
-from triquad_format.scan_log.segment import GRAIN_M, LoggedScan
+from triquad_format.scan_log.segment import GRAIN_M, LoggedScan, read_segment
 from triquad_format.wire.messages import Scan
 from triquad_server.intake.rays import usable_rays
 from triquad_server.settings import ScanSettings

@@ -12,8 +12,13 @@ from triquad_format.mapfile.checkpoint_folder import checkpoint_files, map_folde
 from triquad_format.mapfile.index import read_checkpoint
 from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.scan_log.log_folder import LOG_NAME, Segment, history, of_map, segments
-from triquad_format.scan_log.reading import Entry, read_segment
-from triquad_format.scan_log.segment import LoggedCorrection, LoggedReset, LoggedScan
+from triquad_format.scan_log.segment import (
+    Entry,
+    LoggedCorrection,
+    LoggedReset,
+    LoggedScan,
+    read_segment,
+)
 from triquad_format.scan_log.tracks import LogPoses
 
 from triquad_tools.console.command import ToolError

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 from triquad_client import Client, Grid, Status
-from triquad_format.scan_log.cdr import CdrWriter
+from triquad_format.scan_log.ros_messages import CdrWriter
 
 from triquad_tools.ros2.intake.scan_publisher import Place
 from triquad_tools.ros2.options import SliceShape

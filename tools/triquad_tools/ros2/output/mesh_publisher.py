@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from triquad_client import Client, MeshTile, MeshWatch
 from triquad_format.records.arrays import Doubles, Floats
-from triquad_format.scan_log.cdr import CdrWriter
+from triquad_format.scan_log.ros_messages import CdrWriter
 
 from triquad_tools.ros2.intake.scan_publisher import Place
 from triquad_tools.ros2.output.topic_publisher import TopicPublisher
