@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from triquad_format.records.arrays import Doubles
-from triquad_format.wire.places import known_origin
+from triquad_format.wire.codec import known_origin
 
 from triquad_client.calls.changes import ChangeCalls
 from triquad_client.calls.corrections import CorrectionCalls

@@ -11,9 +11,9 @@ import triquad_format
 import zenoh
 from triquad_format.printable import joined_lines
 from triquad_format.wire import codec, keys
+from triquad_format.wire.codec import moved
 from triquad_format.wire.messages import ServerStatus
 from triquad_format.wire.metrics_messages import QueueMetrics, ServerMetrics
-from triquad_format.wire.places import moved
 
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.intake.scan_queue import ScanQueue

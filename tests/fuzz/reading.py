@@ -12,7 +12,7 @@ import numpy as np
 from fuzz.valid_maps import READERS, Results, ValidMap
 from support.maps.map_records import assert_same
 from triquad_format.errors import FormatError
-from triquad_format.records.record_check import check_record
+from triquad_format.mapfile.record_check import check_record
 from triquad_format.records.region import MapRecord
 from triquad_tools.mapfiles.recovered_map import recover
 

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.errors import InvalidInputError, WireError
 from triquad_format.records.arrays import Doubles, Longs
+from triquad_format.wire.codec import known_origin
 from triquad_format.wire.mesh_messages import (
     MeshReply,
     MeshRequest,
     TileChanges,
     TileChangesRequest,
 )
-from triquad_format.wire.places import known_origin
 from triquad_format.wire.tile_codec import TileSurface, decode_tile, decoded_bytes
 from triquad_map.triangles import Triangles, joined
 

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 from triquad_format.records.arrays import Bools, Ints
+from triquad_format.wire.codec import known_origin
 from triquad_format.wire.limits import MAX_FILL_M
 from triquad_format.wire.mesh_messages import MeshReply, MeshRequest, TileListRequest
-from triquad_format.wire.places import known_origin
 from triquad_map.triangles import TileJoin
 
 from triquad_client import checks

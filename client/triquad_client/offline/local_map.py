@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 from triquad_format.errors import RefusedError
 from triquad_format.records.region import MapRecord
-from triquad_format.wire.codec import Request
-from triquad_format.wire.places import asked_from
+from triquad_format.wire.codec import Request, asked_from
 from triquad_map.opening import open_view
 from triquad_map.questions.answers import Answers
 from triquad_map.view import MapView

@@ -24,7 +24,7 @@ from triquad_format.mapfile.parts.part import (
     PartKey,
 )
 from triquad_format.records.region import MapRecord
-from triquad_format.wire.codec import pack_array
+from triquad_format.wire.packing import pack_array
 
 MAX_ENTRIES = 1 << 20
 DIGEST_BYTES = 32

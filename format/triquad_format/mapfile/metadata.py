@@ -23,9 +23,9 @@ from triquad_format.mapfile.parts.body import PartBody, unpack_body
 from triquad_format.mapfile.parts.part import MANIFEST, MAP
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import NO_ORIGIN, MapProgress, MapRecord
-from triquad_format.wire.codec import pack_array
 from triquad_format.wire.keys import check_name
 from triquad_format.wire.limits import MAX_POSITION_M
+from triquad_format.wire.packing import pack_array
 
 FORMAT_VERSION = 2
 

@@ -23,9 +23,9 @@ from triquad_format.mapfile.parts.part import (
     vertex_reach,
 )
 from triquad_format.mapfile.parts.region_parts import RegionParts
+from triquad_format.mapfile.record_check import check_record
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.leaf_box import LeafBox, check_box, leaf_box, whole_region
-from triquad_format.records.record_check import check_record
 from triquad_format.records.region import MapRecord
 
 

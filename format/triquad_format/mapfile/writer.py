@@ -24,8 +24,8 @@ from triquad_format.mapfile.parts.part import (
     Part,
     PartKey,
 )
+from triquad_format.mapfile.record_check import check_record
 from triquad_format.records.field_settings import RegionIndex
-from triquad_format.records.record_check import check_record
 from triquad_format.records.region import FLOATS, MapRecord
 
 

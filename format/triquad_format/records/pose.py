@@ -29,6 +29,13 @@ def is_rigid(pose: Doubles) -> bool:
     return is_rotation(pose) and bool((pose[3] == (0, 0, 0, 1)).all())
 
 
+def moved_pose(pose: Doubles, by: Doubles) -> Doubles:
+    """Return a pose [4, 4] whose position is ``by`` [3] off."""
+    result: Doubles = pose.copy()
+    result[:3, 3] += by
+    return result
+
+
 def orthonormal(pose: Doubles) -> Doubles:
     """Return a rigid pose as a new array, its rotation without the tolerance.
 

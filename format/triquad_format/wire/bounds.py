@@ -9,11 +9,12 @@ import math
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from triquad_format.errors import WireError
+from triquad_format.records.pose import is_rigid
 from triquad_format.wire.codec import Form, Message
 
 MAX_COUNT = 2**53
@@ -21,8 +22,6 @@ MAX_COUNT = 2**53
 
 _ROUNDING = 1e-4
 """The share by which a number may exceed what was asked for: single precision rounds."""
-
-_RIGID_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -45,12 +44,8 @@ class Exchange:
         return getattr(holder, field)
 
 
-@dataclass(frozen=True)
-class Bound:
-    """A bound of a field; an annotation may have several."""
-
-    problem: Callable[[Any, Exchange], str | None]
-    """Returns what is wrong with a value, or ``None``."""
+Bound: TypeAlias = Callable[[Any, Exchange], str | None]
+"""Returns what is wrong with the value of a field, or ``None``; an annotation may have several."""
 
 
 def within(
@@ -80,7 +75,7 @@ def within(
                 return f"{end:g} is not in [{first:g}, {last:g}]"
         return None
 
-    return Bound(problem)
+    return problem
 
 
 def text(most: int, form: str = "") -> Bound:
@@ -93,7 +88,7 @@ def text(most: int, form: str = "") -> Bound:
             return f"{value[:80]!r} is not of the form {form}"
         return None
 
-    return Bound(problem)
+    return problem
 
 
 def asked_by(field: str) -> Bound:
@@ -104,7 +99,7 @@ def asked_by(field: str) -> Bound:
         count = asked if isinstance(asked, int) else len(asked)
         return None if len(value) == count else f"{len(value)} came for {count}"
 
-    return Bound(problem)
+    return problem
 
 
 def at_most_asked(field: str) -> Bound:
@@ -114,7 +109,7 @@ def at_most_asked(field: str) -> Bound:
         most = getattr(exchange.question, field)
         return None if len(value) <= most else f"{len(value)} came, and {most} were asked for"
 
-    return Bound(problem)
+    return problem
 
 
 def shape_asked_by(field: str) -> Bound:
@@ -124,7 +119,7 @@ def shape_asked_by(field: str) -> Bound:
         shape, asked = list(value.shape), getattr(exchange.question, field).tolist()
         return None if shape == asked else f"{shape} came for {asked}"
 
-    return Bound(problem)
+    return problem
 
 
 def same_as_asked(field: str, *, any_for: int | None = 0) -> Bound:
@@ -134,7 +129,7 @@ def same_as_asked(field: str, *, any_for: int | None = 0) -> Bound:
         asked = getattr(exchange.question, field, any_for)
         return f"{value} came for {asked}" if value != asked != any_for else None
 
-    return Bound(problem)
+    return problem
 
 
 def rows_of(field: str, more: int = 0) -> Bound:
@@ -144,7 +139,7 @@ def rows_of(field: str, more: int = 0) -> Bound:
         count = len(exchange.other(field)) + more
         return None if len(value) == count else f"{len(value)} rows do not go with {count}"
 
-    return Bound(problem)
+    return problem
 
 
 def parts_of(field: str) -> Bound:
@@ -154,7 +149,7 @@ def parts_of(field: str) -> Bound:
         parts, count = int(value.sum()), len(exchange.other(field))
         return None if parts == count else f"parts of {parts} rows do not go with {count}"
 
-    return Bound(problem)
+    return problem
 
 
 def rows(least: int, most: int) -> Bound:
@@ -163,7 +158,7 @@ def rows(least: int, most: int) -> Bound:
     def problem(value: Any, _: Exchange) -> str | None:
         return None if least <= len(value) <= most else f"{len(value)} rows: use {least} to {most}"
 
-    return Bound(problem)
+    return problem
 
 
 def corner_above(field: str) -> Bound:
@@ -173,7 +168,7 @@ def corner_above(field: str) -> Bound:
         low = exchange.other(field)
         return None if (low <= value).all() else f"not a box: from {low} to {value}"
 
-    return Bound(problem)
+    return problem
 
 
 def rigid_pose() -> Bound:
@@ -181,14 +176,10 @@ def rigid_pose() -> Bound:
     small = within(-1e12, 1e12)
 
     def problem(value: Any, exchange: Exchange) -> str | None:
-        if too_large := small.problem(value, exchange):
-            return too_large
-        rotation = np.clip(value[:3, :3], -2, 2)
-        off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-        is_proper = np.linalg.det(rotation) > 0 and (value[3] == (0, 0, 0, 1)).all()
-        return None if is_proper and off <= _RIGID_TOLERANCE else "it is no rigid pose"
+        wrong = None if is_rigid(value) else "it is no rigid pose"
+        return small(value, exchange) or wrong
 
-    return Bound(problem)
+    return problem
 
 
 def check_question(question: Message) -> None:
@@ -228,5 +219,5 @@ def _problems_of(
             yield from _problems_of(form.item, f"{name}[{key!r}]", entry, exchange)
     else:
         for extra in form.extras:
-            if isinstance(extra, Bound) and (problem := extra.problem(value, exchange)):
+            if callable(extra) and (problem := extra(value, exchange)):
                 yield name, problem

@@ -1,14 +1,13 @@
-"""Encoding of messages: one generic pair of functions, driven by the dataclasses' annotations.
+"""Messages, encoded, decoded and moved by generic functions that the annotations of fields drive.
 
 A message is a msgpack map that has ``triquad`` (the protocol version), ``kind`` (the name of
-its class) and its fields; an array is one of its dtype, shape and raw little-endian bytes. The
-messages themselves are in :mod:`triquad_format.wire.messages`; ``docs/wire-protocol.md`` is the
-specification.
+its class) and its fields. The places in one can be moved: from where a user's coordinates count to
+where a map's do. The messages themselves are in :mod:`triquad_format.wire.messages`;
+``docs/wire-protocol.md`` is the specification.
 """
 
 import dataclasses
 import functools
-import math
 import types
 import typing
 from collections.abc import Callable, Mapping
@@ -17,25 +16,19 @@ from typing import Any, ClassVar, Generic, TypeVar, get_args, get_origin
 
 import msgpack
 import numpy as np
-from numpy.typing import NDArray
 
 from triquad_format.errors import ProtocolVersionError, WireError
-from triquad_format.wire.unpacking import unpacked
+from triquad_format.records.arrays import Doubles
+from triquad_format.records.pose import moved_pose
+from triquad_format.wire.packing import ArraySpec, pack_array, unpack_array, unpacked
 
 PROTOCOL_VERSION = 1
 MAX_MESSAGE_BYTES = 256 * 2**20
 # To begin with: a refusal for want of memory must not want 256 KiB.
 _BUFFER_BYTES = 4096
 
-_ITEM_BYTES = {
-    name: np.dtype(name).itemsize
-    for name in ("|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f2", "<f4", "<f8")
-}
-"""The dtypes of arrays that travel, and how many bytes an item of each has."""
-
-_ARRAY_KEYS = {"dtype", "shape", "data"}
-_MAX_DIMENSIONS = 4
-_MAX_SIZE = 2**40  # of an array along one axis, and of all axes together
+PLACE = "a place"
+"""Marks a field's annotation: points [3] or [N, 3], or a pose [4, 4], of the map frame."""
 
 MessageT = TypeVar("MessageT", bound="Message")
 ReplyT = TypeVar("ReplyT", bound="Message")
@@ -70,30 +63,6 @@ class Request(Message, Generic[ReplyT]):
         cls.operation, cls.background = operation, background
 
 
-@dataclass(frozen=True)
-class ArraySpec:
-    """The arrays that a message's field accepts: one dtype, and sizes per axis (``None``: any)."""
-
-    dtype: str
-    shape: tuple[int | None, ...]
-
-    def check(self, name: str, array: NDArray[np.generic]) -> None:
-        """Raise :class:`WireError` naming ``name`` where ``array`` does not fit."""
-        if array.dtype.str != self.dtype or not self._fits(array.shape):
-            shape = ", ".join("N" if size is None else str(size) for size in self.shape)
-            raise WireError(
-                f"{name}: expected an array [{shape}] of {self.dtype}, "
-                f"got {list(array.shape)} of {array.dtype.str}"
-            )
-
-    def _fits(self, shape: tuple[int, ...]) -> bool:
-        # Not by all(): every message comes by here, and a generator takes longer than the rest.
-        for want, have in zip(self.shape, shape, strict=False):
-            if want is not None and want != have:
-                return False
-        return len(shape) == len(self.shape)
-
-
 def encode(message: Message) -> bytes:
     """Return the bytes of a message.
 
@@ -126,44 +95,6 @@ def decode(expected: type[MessageT], payload: bytes) -> MessageT:
     if body.get("kind") != expected.__name__:
         raise WireError(f"expected a {expected.__name__}, got {body.get('kind')!r}")
     return _unpack_fields(expected.__name__, expected, body)
-
-
-def pack_array(array: NDArray[np.generic]) -> dict[str, object]:
-    """Return the msgpack form of an array, little endian and C order."""
-    dtype = array.dtype.str
-    if dtype not in _ITEM_BYTES:
-        array = array.astype(array.dtype.newbyteorder("<"))
-        dtype = array.dtype.str
-        if dtype not in _ITEM_BYTES:
-            names = sorted(_ITEM_BYTES)
-            raise WireError(f"arrays of {array.dtype} do not travel; use one of {names}")
-    return {"dtype": dtype, "shape": list(array.shape), "data": array.tobytes()}
-
-
-def unpack_array(name: str, packed: object) -> NDArray[np.generic]:
-    """Return the array of a msgpack form; read-only, sharing the message's bytes.
-
-    Raises:
-        WireError: the form is not complete or its sizes contradict each other. Nothing is
-            allocated for a shape that the bytes do not fill.
-    """
-    if not isinstance(packed, dict) or packed.keys() != _ARRAY_KEYS:
-        raise WireError(f"{name}: expected an array with dtype, shape and data")
-    dtype, shape, data = packed["dtype"], packed["shape"], packed["data"]
-    if not isinstance(dtype, str) or dtype not in _ITEM_BYTES:
-        raise WireError(f"{name}: dtype {dtype!r} is not one of {sorted(_ITEM_BYTES)}")
-    if not isinstance(shape, list) or len(shape) > _MAX_DIMENSIONS:
-        raise WireError(f"{name}: shape {shape!r} is not a list of at most {_MAX_DIMENSIONS} sizes")
-    items = 1  # but for sizes of zero: numpy does not form shapes beyond 64 bits, however empty
-    for size in shape:
-        if type(size) is not int or not 0 <= size < _MAX_SIZE:
-            raise WireError(f"{name}: shape {shape!r} has a size that is not a count")
-        items *= size or 1
-    if items >= _MAX_SIZE:
-        raise WireError(f"{name}: shape {shape!r} has a size that is not a count")
-    if not isinstance(data, bytes) or math.prod(shape) * _ITEM_BYTES[dtype] != len(data):
-        raise WireError(f"{name}: shape {shape!r} of {dtype} does not fill its data")
-    return np.frombuffer(data, dtype).reshape(shape)
 
 
 def _unpack_map(payload: bytes) -> dict[str, object]:
@@ -281,3 +212,37 @@ def _scalar(annotation: Any, name: str, value: object) -> Any:
     if annotation is int and not -(2**63) <= typing.cast("int", value) < 2**63:
         raise WireError(f"{name}: {value} does not fit 64 bits")
     return value
+
+
+def moved(message: MessageT, by: Doubles) -> MessageT:
+    """Return the message with all places in it, those of messages within it too, ``by`` [3] off."""
+    return _moved(message, by) if by.any() else message
+
+
+def known_origin(origin: Doubles | None) -> Doubles:
+    """Return an origin [3] that a message may leave out: then it is 0 0 0."""
+    return np.zeros(3) if origin is None else origin
+
+
+def asked_from(origin: Doubles, answer: Callable[[Any], MessageT], question: Message) -> MessageT:
+    """Return the answer of a map that counts from an ``origin`` [3] of the question's coordinates.
+
+    ``answer`` answers questions about that map, and both are in its own coordinates.
+    """
+    return moved(answer(moved(question, -origin)), origin)
+
+
+def _moved(message: MessageT, by: Doubles) -> MessageT:
+    forms = message.forms().items()
+    there = {name: _moved_value(form, getattr(message, name), by) for name, form in forms}
+    return dataclasses.replace(message, **there)  # type: ignore[type-var]
+
+
+def _moved_value(form: Form, value: Any, by: Doubles) -> Any:
+    if isinstance(value, Message):
+        return _moved(value, by)
+    if isinstance(value, dict) and form.item is not None:
+        return {key: _moved_value(form.item, item, by) for key, item in value.items()}
+    if PLACE not in form.extras or value is None:
+        return value
+    return moved_pose(value, by) if value.shape == (4, 4) else np.asarray(value + by)

@@ -24,9 +24,9 @@ from triquad_format.wire.bounds import (
     text,
     within,
 )
-from triquad_format.wire.codec import ArraySpec, Message, Request, decode
+from triquad_format.wire.codec import PLACE, Message, Request, decode
 from triquad_format.wire.limits import MAX_CHUNK_BYTES, MAX_SEQUENCE
-from triquad_format.wire.places import PLACE
+from triquad_format.wire.packing import ArraySpec
 
 MAX_ORIGIN_BYTES = 1024
 """A longer attachment is not read."""
@@ -34,7 +34,7 @@ MAX_ORIGIN_BYTES = 1024
 Positions = Annotated[NDArray[np.float32], ArraySpec("<f4", (None, 3))]
 Values = Annotated[NDArray[np.float32], ArraySpec("<f4", (None,))]
 StatusCodes = Annotated[NDArray[np.uint8], ArraySpec("|u1", (None,))]
-# Those of the map frame: triquad_format.wire.places.
+# Those of the map frame: triquad_format.wire.codec.
 Point = Annotated[NDArray[np.float64], ArraySpec("<f8", (3,)), PLACE]
 Pose = Annotated[NDArray[np.float64], ArraySpec("<f8", (4, 4)), PLACE]
 TileIndices = Annotated[NDArray[np.int32], ArraySpec("<i4", (None, 3))]

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from triquad_format.wire import keys
 from triquad_format.wire.bounds import MAX_COUNT, rows_of, within
-from triquad_format.wire.codec import ArraySpec, Message, Request
+from triquad_format.wire.codec import Message, Request
 from triquad_format.wire.messages import Count, Duration, Epoch, Integers, Name
+from triquad_format.wire.packing import ArraySpec
 
 Seconds = Annotated[NDArray[np.float64], ArraySpec("<f8", (None,))]
 

@@ -20,7 +20,7 @@ from triquad_format.wire.bounds import (
     shape_asked_by,
     within,
 )
-from triquad_format.wire.codec import ArraySpec, Request
+from triquad_format.wire.codec import Request
 from triquad_format.wire.limits import (
     MAX_DISTANCE_M,
     MAX_ITERATIONS,
@@ -44,6 +44,7 @@ from triquad_format.wire.messages import (
     UpperCorner,
     Values,
 )
+from triquad_format.wire.packing import ArraySpec
 
 Flags = Annotated[NDArray[np.uint8], ArraySpec("|u1", (None,))]
 Volume = Annotated[NDArray[np.float32], ArraySpec("<f4", (None, None, None))]

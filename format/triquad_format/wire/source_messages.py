@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from triquad_format.wire import keys
 from triquad_format.wire.bounds import MAX_COUNT, at_most_asked, rigid_pose, rows_of, text, within
-from triquad_format.wire.codec import ArraySpec, Message, Request
+from triquad_format.wire.codec import Message, Request
 from triquad_format.wire.limits import MAX_SAMPLE_POINTS
 from triquad_format.wire.messages import (
     Count,
@@ -22,6 +22,7 @@ from triquad_format.wire.messages import (
     Pose,
     Ticket,
 )
+from triquad_format.wire.packing import ArraySpec
 
 Quaternions = Annotated[NDArray[np.float64], ArraySpec("<f8", (None, 4)), within(-1.01, 1.01)]
 

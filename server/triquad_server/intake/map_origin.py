@@ -5,8 +5,8 @@ The map computes in single precision around it. Coordinates such as UTM's are to
 
 import numpy as np
 from triquad_format.records.arrays import Doubles
+from triquad_format.records.pose import moved_pose
 from triquad_format.wire.limits import MAX_POSITION_M
-from triquad_format.wire.places import moved_pose
 
 from triquad_server.errors import ScanRefusedError
 

@@ -6,8 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from triquad_format.records.arrays import Doubles, Floats, Longs
-from triquad_format.records.pose import is_rigid, rotation_error
-from triquad_format.wire.places import moved_pose
+from triquad_format.records.pose import is_rigid, moved_pose, rotation_error
 from triquad_map.compiled.kernel import kernel
 from triquad_map.compiled.voxel_index import empty_keys, enter
 

@@ -9,8 +9,8 @@ from typing import TypeVar
 
 from triquad_format.errors import TriquadError
 from triquad_format.records.arrays import Doubles
+from triquad_format.wire.codec import moved
 from triquad_format.wire.messages import Scan
-from triquad_format.wire.places import moved
 from triquad_map.compiled.team import lower_priority
 
 from triquad_server.epochs.epoch import Epoch

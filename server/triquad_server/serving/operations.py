@@ -12,8 +12,8 @@ import zenoh
 from triquad_format.errors import RefusedError
 from triquad_format.records.arrays import Doubles
 from triquad_format.wire import codec, keys
+from triquad_format.wire.codec import asked_from
 from triquad_format.wire.metrics_messages import QueueMetrics
-from triquad_format.wire.places import asked_from
 from triquad_map.compiled.team import lower_priority
 
 from triquad_server.errors import NO_MEMORY, MapperStoppedError

@@ -18,6 +18,7 @@ import numpy as np
 from triquad_format.mapfile.files import sync_folder
 from triquad_format.mapfile.index import Restored
 from triquad_format.records.arrays import Doubles
+from triquad_format.records.pose import moved_pose
 from triquad_format.scan_log.log_folder import LOG_NAME, of_map, segment_name, segments
 from triquad_format.scan_log.ros_messages import Transform
 from triquad_format.scan_log.segment import (
@@ -28,7 +29,6 @@ from triquad_format.scan_log.segment import (
     SegmentWriter,
 )
 from triquad_format.wire.messages import Scan
-from triquad_format.wire.places import moved_pose
 
 from triquad_server.intake.rays import ScanRays
 

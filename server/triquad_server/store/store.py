@@ -23,8 +23,8 @@ from triquad_format.mapfile.checkpoint_folder import (
 from triquad_format.mapfile.index import Checkpoint, Restored, read_checkpoint, write_checkpoint
 from triquad_format.mapfile.manifest import Entry, Manifest
 from triquad_format.mapfile.parts.pack import pack_region
+from triquad_format.mapfile.record_check import check_record
 from triquad_format.records.field_settings import RegionIndex
-from triquad_format.records.record_check import check_record
 from triquad_format.records.region import MapRecord
 from triquad_format.wire.messages import CheckpointInfo
 

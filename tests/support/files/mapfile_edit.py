@@ -24,7 +24,7 @@ from triquad_format.mapfile.parts.part import MANIFEST
 from triquad_format.mapfile.reader import StoredMap, assemble, read_map
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.region import MapRecord
-from triquad_format.wire.codec import pack_array, unpack_array
+from triquad_format.wire.packing import pack_array, unpack_array
 from triquad_map.preview import previews_of
 
 Edit = Callable[[dict[str, Any]], object]

@@ -14,11 +14,11 @@ from triquad_format.errors import FormatError, MapFileError
 from triquad_format.mapfile.files import named
 from triquad_format.mapfile.parts import part
 from triquad_format.mapfile.parts.region_parts import RegionParts
+from triquad_format.mapfile.record_check import check_record
 from triquad_format.records import morton
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.leaf_box import LeafBox
-from triquad_format.records.record_check import check_record
 from triquad_format.records.region import AXES, MapRecord, Region, masked, seen_voxels
 
 from triquad_tools.mapfiles.crop import status_voxels

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.plausibility import hidden_share, hiding, median_range_m, wrong_units
-from triquad_format.wire.places import moved_pose
+from triquad_format.records.pose import moved_pose
 
 from triquad_tools.sensors.sweep import NoScanError, PosedScan
 

@@ -17,8 +17,7 @@ from triquad_format.mapfile.parts.part import (
 )
 from triquad_format.records.arrays import Longs
 from triquad_format.records.field_settings import RegionIndex
-from triquad_format.wire.codec import ArraySpec, unpack_array
-from triquad_format.wire.unpacking import unpacked
+from triquad_format.wire.packing import ArraySpec, unpack_array, unpacked
 
 _MAX_REGION_INDEX = 2**31 - 1
 

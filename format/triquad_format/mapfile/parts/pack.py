@@ -52,7 +52,7 @@ from triquad_format.records.region import (
     surface_counts,
 )
 from triquad_format.records.replay_rays import STEPS, ReplayRays
-from triquad_format.wire.codec import pack_array
+from triquad_format.wire.packing import pack_array
 
 SAMPLES_PER_PART = 1 << 17
 RAYS_PER_PART = 1 << 21

@@ -27,9 +27,9 @@ from triquad_format.records.region import (
     surface_counts,
 )
 from triquad_format.records.replay_rays import STEPS, ReplayRays
-from triquad_format.wire.codec import ArraySpec
 from triquad_format.wire.keys import check_name
 from triquad_format.wire.limits import MAX_POSITION_M
+from triquad_format.wire.packing import ArraySpec
 
 
 def check_record(record: MapRecord) -> None:
