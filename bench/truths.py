@@ -7,7 +7,7 @@ from scipy.stats import spearmanr
 from triquad_format.records.arrays import Bools, Doubles
 from triquad_format.records.region import MapRecord, surface_voxels
 from triquad_format.records.status import Status
-from triquad_map.questions.distance import DistanceOptions, Distances, distances
+from triquad_map.questions.distance import Distances, distances
 from triquad_map.questions.spheres import spheres
 from triquad_map.surface import level_confidence
 from triquad_map.view import MapView
@@ -66,7 +66,7 @@ def _distances(
     inside = (truth <= REACH_M) & (truth > -_BEHIND_M)
     points, truth = points[inside], truth[inside]
     slopes = scene.gradient(points)
-    answer = distances(view, points, DistanceOptions(REACH_M, unknown_distance=True))
+    answer = distances(view, points, REACH_M, unknown_distance=True)
     feet_seen = view.status(points - truth[:, None] * slopes) == Status.SURFACE
     # What a planner can see from the answer itself.
     known = answer.unknown_distance_m >= answer.distance_m
@@ -142,7 +142,7 @@ def _unknown(probes: AnswerProbes, view: MapView) -> list[Figure]:
 def _corridor(probes: AnswerProbes, view: MapView) -> list[Figure]:
     """Return figures of obstacles around the way of the sensor, where there are none."""
     balls = spheres(view, probes.corridor, np.full(len(probes.corridor), _BALL_M))
-    answer = distances(view, probes.corridor, DistanceOptions(REACH_M))
+    answer = distances(view, probes.corridor, REACH_M)
     false = (balls.status == Status.SURFACE) | (answer.distance_m <= 0)
     return [
         Figure(f"{len(probes.corridor)} balls in the corridor: false obstacles",

@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 from triquad_format.mapfile.reader import read_map
 from triquad_format.records.arrays import Doubles
-from triquad_map.questions.distance import DistanceOptions, distances
+from triquad_map.questions.distance import distances
 from triquad_map.view import MapView
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.settings import Settings
@@ -50,11 +50,10 @@ def measure(options: argparse.Namespace) -> list[Figure]:
 
 def _in_process(made: DrivenStreet, view: MapView) -> list[Figure]:
     """Return how soon distances are known, without a network and while nothing else is done."""
-    options = DistanceOptions(REACH_M)
 
     def typical_s(asked: Sequence[Doubles]) -> float:
-        distances(view, asked[0], options)
-        times = [seconds(partial(distances, view, each, options)) for each in asked]
+        distances(view, asked[0], REACH_M)
+        times = [seconds(partial(distances, view, each, REACH_M)) for each in asked]
         return statistics.median(times)
 
     few = _planner_points(made, _ASKED)

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from triquad_client import OfflineMap, open_map
 from triquad_format.records.arrays import Doubles
-from triquad_map.questions.distance import DistanceOptions, distances
+from triquad_map.questions.distance import distances
 from triquad_server.epochs.epoch import Epoch
 
 from bench.figures import Figure, compare, seconds
@@ -36,7 +36,7 @@ def measure_offline(made: DrivenStreet, epoch: Epoch, path: Path) -> list[Figure
 
 def _differences(offline: OfflineMap, epoch: Epoch, points: Doubles) -> list[Figure]:
     field, live_field = offline.query_sdf(points), epoch.query(points)
-    have, want = offline.query_distance(points), distances(epoch, points, DistanceOptions())
+    have, want = offline.query_distance(points), distances(epoch, points)
     sdf_m = np.quantile(np.abs(field.sdf - live_field.sdf), 0.99)
     distance_m = np.quantile(np.abs(have.distance_m - want.distance_m), 0.99)
     equal = np.mean((field.status == live_field.status) & (have.status == want.status))
@@ -53,7 +53,7 @@ def _ratios(offline: OfflineMap, epoch: Epoch, points: Doubles, repeats: int) ->
     sdf = compare(lambda: offline.query_sdf(points), lambda: epoch.query(points), _ROUNDS, repeats)
     distance = compare(
         lambda: offline.query_distance(points),
-        lambda: distances(epoch, points, DistanceOptions()),
+        lambda: distances(epoch, points),
         _ROUNDS,
         repeats,
     )

@@ -20,7 +20,7 @@ import numpy as np
 from triquad_format.records.arrays import Doubles
 from triquad_map.compiled.kernel import CODE_FOLDER, count_compiled
 from triquad_map.field.frozen_field import field_samples
-from triquad_map.questions.distance import DistanceOptions, distances
+from triquad_map.questions.distance import distances
 
 from triquad_server.engine.gradient_sums import GradientSums
 from triquad_server.engine.live_field import Batch, Rates, initial_field
@@ -168,7 +168,7 @@ class _SyntheticMap:
         points = self._directions * self._radius_m
         self._mapper.publish().query(points, gradient=True)
         epoch.query(points, gradient=True)
-        distances(epoch, points, DistanceOptions(unknown_distance=True))
+        distances(epoch, points, unknown_distance=True)
 
     def meshes(self) -> None:
         """Make a tile of its mesh."""

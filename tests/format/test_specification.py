@@ -20,7 +20,7 @@ from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import MapRecord
 from triquad_format.records.replay_rays import are_held_out
 from triquad_map.composition.composed_view import RecordedView
-from triquad_map.evidence.observations import outcome_counts
+from triquad_map.evidence.evidence import outcome_counts
 
 NEIGHBOURS = ((0, 0, 0), (1, 0, 0), (0, -1, 0), (1, -1, 0), (0, 0, 1))
 WIDE = dataclasses.replace(SMALL, depth=10)

@@ -12,7 +12,7 @@ from support.maps.map_records import SMALL
 from triquad_format.records.region import MapRecord
 from triquad_map.composition.composed_view import RecordedView
 from triquad_map.evidence.live_evidence import LiveEvidence
-from triquad_map.questions.distance import DistanceOptions, distances
+from triquad_map.questions.distance import distances
 from triquad_map.surface import DISC_RADIUS, SMOOTHING, SurfelKind, Surfels
 from triquad_map.surfels.surfel_search import find_nearest, no_surfels
 from triquad_map.surfels.surfel_tree import surfel_places, surfel_tree
@@ -127,7 +127,7 @@ def places(count, seed=0):
 
 def test_a_map_of_which_nothing_is_known():
     with closing(RecordedView(MapRecord("empty", 3, SMALL, ()))) as view:
-        answer = distances(view, places(10), DistanceOptions(2.0, unknown_distance=True))
+        answer = distances(view, places(10), 2.0, unknown_distance=True)
         assert view.epoch == 3
         assert not answer.found.any()
         assert not answer.status.any()

@@ -58,7 +58,7 @@ def test_compiled_code_that_is_damaged_is_compiled_again(tmp_path, step, suffix,
 _FIRST_DRIVE = """
 import numpy as np
 from triquad_map.compiled import kernel
-from triquad_map.questions.distance import DistanceOptions, distances
+from triquad_map.questions.distance import distances
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.process.threads import Teams
@@ -79,7 +79,7 @@ for steps in (0, 3):
         mapper.train()
     epoch = mapper.publish()
     epoch.query(points, gradient=True)
-    distances(epoch, points, DistanceOptions(unknown_distance=True))
+    distances(epoch, points, unknown_distance=True)
     cache = TileCache(Settings().mesh, teams.background)
     cache.refresh(epoch)
     cache.make(0, (0, 0, 0))

@@ -42,21 +42,18 @@ _REACH = 2
 
 _PRIOR = 0.5  # hits and misses, scans: Jeffreys' prior of a chance
 
+# The numbers of the model, logarithms of odds.
+_VACANT = 5.0
+"""That nothing is in a voxel of which nothing was seen: 1 in 150 has surface."""
 
-class Belief(NamedTuple):
-    """The numbers of the model, logarithms of odds."""
+_STRAY = 4.0
+"""By how much that falls with each hit: 1 return in 50 comes from where nothing is."""
 
-    vacant: float = 5.0
-    """That nothing is in a voxel of which nothing was seen: 1 in 150 has surface."""
+_LEAVES = -7.0
+"""That a surface has left, however often it was seen: it does once in 1,100 times."""
 
-    stray: float = 4.0
-    """By how much that falls with each hit: 1 return in 50 comes from where nothing is."""
-
-    leaves: float = -7.0
-    """That a surface has left, however often it was seen: it does once in 1,100 times."""
-
-    around: float = 0.3
-    """The share of what each voxel near by says that counts: it is no independent witness."""
+_AROUND = 0.3
+"""The share of what each voxel near by says that counts: it is no independent witness."""
 
 
 class Changes(NamedTuple):
@@ -128,17 +125,17 @@ def _coupling(row: int, other: int, seen: SeenVoxels, observed: Observed) -> flo
 
 
 @inner_kernel()
-def _own_odds(voxel: ObservedVoxel, belief: Belief) -> float:
+def _own_odds(voxel: ObservedVoxel) -> float:
     """Return the logarithm of the odds that a voxel has no surface, by its own record."""
     hits = float(voxel.hits)
     if voxel.company:
         hits = max(hits, 1.0) + 1.0  # a whole one, even if other rays of its scan passed
-    recorded = belief.vacant - belief.stray * hits + _recorded(voxel)
-    return float(max(recorded, belief.leaves) + _missed(voxel))
+    recorded = _VACANT - _STRAY * hits + _recorded(voxel)
+    return float(max(recorded, _LEAVES) + _missed(voxel))
 
 
 @inner_kernel()
-def _odds(row: int, near: Ints, seen: SeenVoxels, observed: Observed, belief: Belief) -> float:
+def _odds(row: int, near: Ints, seen: SeenVoxels, observed: Observed) -> float:
     """Return the same by what rays have shown around it, too, in the rows ``near``."""
     voxel = observed.voxels[row]
     around = 0.0
@@ -155,19 +152,17 @@ def _odds(row: int, near: Ints, seen: SeenVoxels, observed: Observed, belief: Be
             if one.missed_since == one.passed_scan:
                 continue  # a single scan may have a wrong pose: it is one witness for all it misses
             is_gone = not _has_surface(np.int64(other), seen, observed)
-            says = belief.vacant if is_gone else min(_missed(one), belief.vacant)
+            says = _VACANT if is_gone else min(_missed(one), _VACANT)
         elif one.misses == 0 and one.ends > 0 and one.hit_scan >= since:
-            says = -belief.vacant
+            says = -_VACANT
         else:
             continue
-        around += belief.around * _coupling(row, np.int64(other), seen, observed) * says
-    return float(_own_odds(voxel, belief) + max(around, -belief.vacant))
+        around += _AROUND * _coupling(row, np.int64(other), seen, observed) * says
+    return float(_own_odds(voxel) + max(around, -_VACANT))
 
 
 @inner_kernel()
-def _appear(
-    hit: Ints, seen: SeenVoxels, observed: Observed, belief: Belief, come: list[Voxel]
-) -> None:
+def _appear(hit: Ints, seen: SeenVoxels, observed: Observed, come: list[Voxel]) -> None:
     """Let surface come in the rows ``hit`` where it has become probable.
 
     Where it has not, nothing is known: the rays that ended there have not shown that it is free.
@@ -176,7 +171,7 @@ def _appear(
         if row == 0 or _has_surface(row, seen, observed):
             continue
         block, byte, bit = _bit(row, observed)
-        if _own_odds(observed.voxels[row], belief) > 0:
+        if _own_odds(observed.voxels[row]) > 0:
             seen.free[block, byte] &= ~bit
             continue
         seen.surface[block, byte] |= bit
@@ -184,20 +179,18 @@ def _appear(
 
 
 @inner_kernel()
-def _go(
-    waiting: list[int], seen: SeenVoxels, observed: Observed, belief: Belief, gone: list[Voxel]
-) -> None:
+def _go(waiting: list[int], seen: SeenVoxels, observed: Observed, gone: list[Voxel]) -> None:
     """Let surface go in the rows ``waiting``, and in those near by that were not hit since."""
     while len(waiting):
         row = waiting.pop()
         voxel = observed.voxels[row]
         if not _has_surface(row, seen, observed):
             # Nothing is left of what hits said: the next begins anew.
-            if voxel.ends > 0 and _own_odds(voxel, belief) >= belief.vacant:
+            if voxel.ends > 0 and _own_odds(voxel) >= _VACANT:
                 forget_ends(voxel)
             continue
         near = rows_around(row, _REACH, seen, observed)
-        if _odds(row, near, seen, observed, belief) <= 0:
+        if _odds(row, near, seen, observed) <= 0:
             continue
         block, byte, bit = _bit(row, observed)
         seen.surface[block, byte] &= ~bit
@@ -210,9 +203,7 @@ def _go(
 
 
 @kernel()
-def believe(
-    hit: Ints, passed: Ints, seen: SeenVoxels, observed: Observed, belief: Belief
-) -> tuple[Longs, Longs]:
+def believe(hit: Ints, passed: Ints, seen: SeenVoxels, observed: Observed) -> tuple[Longs, Longs]:
     """Let surface come in the rows ``hit`` by the newest scan, and go in those it ``passed``.
 
     Returns the voxels [M, 3] that have surface now, and those [K, 3] that have none any more.
@@ -222,10 +213,10 @@ def believe(
     waiting = [np.int64(0) for _ in range(0)]
     for row in passed:
         # Those that are hardly missed go only after one near by.
-        if _own_odds(observed.voxels[row], belief) > -belief.vacant:
+        if _own_odds(observed.voxels[row]) > -_VACANT:
             waiting.append(np.int64(row))
-    _go(waiting, seen, observed, belief, gone)
-    _appear(hit, seen, observed, belief, come)
+    _go(waiting, seen, observed, gone)
+    _appear(hit, seen, observed, come)
     return _array(come), _array(gone)
 
 

@@ -4,6 +4,10 @@ Three planes alias: where all three projections of an unobserved point are occup
 answers as if it had been seen. Only a 3-D record can distinguish such ghosts from surfaces.
 
 All coordinates here are voxel coordinates of the region (see :mod:`triquad_format.records.region`).
+
+Files have the outcomes of rays at a voxel on a scale of powers of two, which distinguishes a fence,
+hit and missed by turns, from a wall. A wall has the codes 0: it was hit often, and hardly a ray
+passed. So has a voxel of which nothing is known.
 """
 
 from collections.abc import Sequence
@@ -12,7 +16,7 @@ from functools import cached_property
 
 import numpy as np
 from triquad_format.records import morton
-from triquad_format.records.arrays import Bools, Bytes, Doubles, Longs
+from triquad_format.records.arrays import Bools, Bytes, Doubles, Ints, Longs
 from triquad_format.records.region import OUTCOME_BITS, surface_counts
 from triquad_format.records.region import Evidence as EvidenceRecord
 from triquad_format.records.status import Status
@@ -27,12 +31,17 @@ from triquad_map.compiled.voxel_index import (
 )
 from triquad_map.evidence.seen_voxels import SeenVoxels, find_unknown, surface_in_grid
 from triquad_map.evidence.support import (
-    SurfaceEnds,
     margins_that_count,
     near_ends,
 )
 
 _SEEN_STEP_S = 60
+
+_MOST_HITS = 8
+"""A longer record is restored as one of this many hits, which new rays outweigh sooner."""
+
+_LEAST_SHARE_LOG2 = -3  # of passes or misses, for each hit: of one in eight; fewer are none
+_SHARES = (1 << OUTCOME_BITS[1]) - 1
 
 _SURFACE = np.uint8(Status.SURFACE)
 _FREE = np.uint8(Status.FREE)
@@ -75,17 +84,6 @@ def _status(voxels: Doubles, reach: float, seen: SeenVoxels) -> Bytes:
     return status
 
 
-@kernel()
-def _ended_in(voxels: Longs, seen: SeenVoxels) -> Bools:
-    """Return whether rays ended [N] in ``voxels`` [N, 3]."""
-    ended = np.empty(len(voxels), np.bool_)
-    for i in range(len(voxels)):
-        x, y, z = voxels[i, 0], voxels[i, 1], voxels[i, 2]
-        row = find_block(seen.blocks, x, y, z, seen.side)
-        ended[i] = row >= 0 and is_set(seen.surface, row, x, y, z) == 1
-    return ended
-
-
 @dataclass(frozen=True)
 class FrozenEvidence:
     """Evidence that does not change, for any thread."""
@@ -112,7 +110,7 @@ class FrozenEvidence:
         """[S, 6] Quarters of each voxel on each side where the surface ends; 0: it goes on."""
         if self.scans is None:
             return self.beyond
-        return margins_that_count(self.seen, SurfaceEnds(self._firsts, self.scans, self.beyond))
+        return margins_that_count(self.seen, self._firsts, self.scans, self.beyond)
 
     @property
     def cells(self) -> Longs:
@@ -148,7 +146,8 @@ class FrozenEvidence:
 
     def ended_in(self, voxels: Longs) -> Bools:
         """Return whether rays ended in ``voxels`` [N, 3]."""
-        return _ended_in(voxels, self.seen)
+        ended: Bools = self.status((voxels + 0.5).astype(np.float64), reach=0.0) == _SURFACE
+        return ended
 
     def find_unknown(
         self, voxels: Doubles, blocks: range, distances: Doubles, nearest: Doubles
@@ -200,3 +199,25 @@ class FrozenEvidence:
         masks = (np.ascontiguousarray(mask) for mask in (record.surface, record.free))
         seen = SeenVoxels(side, index, *masks)
         return cls(seen, record.levels, scans=None, beyond=record.margins, seen_s=record.seen_s)
+
+
+def outcome_codes(counts: Ints) -> Bytes:
+    """Return codes [N, 3] of ``counts`` [N, 3]: hits, and the passes and misses between them."""
+    hits = counts[:, :1]
+    known = np.maximum(hits, 1)
+    log2_hits = np.rint(np.log2(known))
+    is_short = (hits > 0) & (log2_hits < np.log2(_MOST_HITS))
+    of_hits = np.where(is_short, log2_hits + 1, 0)
+    shares = counts[:, 1:] / known
+    # What is below the least share rounds to 0 or less.
+    log2_shares = np.rint(np.log2(np.maximum(shares, 1e-9))) - _LEAST_SHARE_LOG2
+    of_shares = np.clip(log2_shares + 1, 0, _SHARES)
+    return np.concatenate([of_hits, of_shares], axis=1).astype(np.uint8)
+
+
+def outcome_counts(codes: Bytes) -> Ints:
+    """Return counts [N, 3] of ``codes`` [N, 3]: hits, and the passes and misses between them."""
+    of_hits, of_shares = codes[:, :1].astype(np.float64), codes[:, 1:]
+    hits = np.where(of_hits > 0, np.exp2(of_hits - 1), _MOST_HITS)
+    shares = np.where(of_shares > 0, np.exp2(of_shares - 1.0 + _LEAST_SHARE_LOG2), 0.0)
+    return np.concatenate([hits, hits * shares], axis=1).astype(np.int32)

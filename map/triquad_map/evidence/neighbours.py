@@ -16,7 +16,6 @@ import numpy as np
 from triquad_format.records.arrays import Bools, Doubles, Ints, Longs
 
 from triquad_map.compiled.kernel import inner_kernel, kernel
-from triquad_map.compiled.planes import MOMENTS, add_points
 from triquad_map.compiled.team import Split, in_one
 from triquad_map.compiled.voxel_index import (
     Index,
@@ -28,6 +27,7 @@ from triquad_map.compiled.voxel_index import (
     pack,
 )
 from triquad_map.evidence.observed import FILLED
+from triquad_map.evidence.ray_surfels import MOMENTS, add_points
 
 _SPACINGS = 3.0
 """Spacings of a scan's rays within which two are neighbours: some 28 are, of each."""

@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
-from triquad_format.records.region import BLOCK_BYTES
+from triquad_format.records.region import BLOCK_BYTES, surface_counts, used_blocks
 
 from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.lanes import prefetch_row
+from triquad_map.compiled.team import Split
 from triquad_map.compiled.voxel_index import LOW, SHIFT, byte_of, find_block, is_set, unpack
 from triquad_map.evidence.observed import EIGHTHS, Observed, ObservedVoxel, Voxel
 from triquad_map.evidence.seen_voxels import SeenVoxels
@@ -58,7 +59,7 @@ def _quarters(eighths: int) -> int:
 
 
 @kernel()
-def fill_support(surface: Bytes, observed: Observed, weights: Floats, support: Support) -> None:
+def _fill_support(surface: Bytes, observed: Observed, weights: Floats, support: Support) -> None:
     """Fill in the ``support`` of the voxels of ``surface``, in their order.
 
     ``weights`` [rows, 1] are those of the records in ``observed``, which lie all over the memory.
@@ -88,7 +89,27 @@ def fill_support(surface: Bytes, observed: Observed, weights: Floats, support: S
             at += 1
 
 
+def surface_support(surface: Bytes, observed: Observed, split: Split) -> Support:
+    """Return the support of each voxel set in ``surface`` [blocks, BLOCK_BYTES], in order."""
+    used = used_blocks(surface)
+    surface, places = surface[used], observed.places[used]
+    starts = np.concatenate([[0], np.cumsum(surface_counts(surface))])
+    count = int(starts[-1])
+    beyond = np.empty((count, _SIDES), np.uint8)
+    support = Support(np.empty(count, np.uint8), np.empty(count, np.uint8), beyond)
+    weights = observed.voxels["weight"][:, None]
+
+    def work(first: int, last: int) -> None:
+        part = Support(*(array[starts[first] : starts[last]] for array in support))
+        of_blocks = observed._replace(places=places[first:last])
+        _fill_support(surface[first:last], of_blocks, weights, part)
+
+    split(len(surface), work, least=_LEAST_BLOCKS)
+    return support
+
+
 _SIDES = 6
+_LEAST_BLOCKS = 64  # whose support a thread of its own finds sooner
 _MARGINS = 4  # from 0 on
 
 _CHANCE = 0.1
@@ -108,18 +129,12 @@ _LEAST_SCANS = np.array(
 Scans = NDArray[np.int16]
 
 
-class SurfaceEnds(NamedTuple):
-    """The ends of rays in surface voxels [S], as kernels take them."""
-
-    firsts: Longs  # [B] number of the first surface voxel of each block
-    scans: Bytes  # [S] of which rays ended in each voxel
-    beyond: Bytes  # [S, 6] quarters of it on each side, at the end of which none did
-
-
 @inner_kernel()
-def _add_block(row: int, shift: Voxel, seen: SeenVoxels, ends: SurfaceEnds, around: Scans) -> None:
+def _add_block(
+    row: int, shift: Voxel, seen: SeenVoxels, firsts: Longs, scans: Bytes, around: Scans
+) -> None:
     """Add the voxels of a block that is ``shift`` blocks from the one in ``around``."""
-    number = ends.firsts[row]
+    number = firsts[row]
     for byte in range(BLOCK_BYTES):
         bits = int(seen.surface[row, byte])
         x = (byte >> SHIFT) + shift[0] * BLOCK_VOXELS + 1
@@ -130,13 +145,13 @@ def _add_block(row: int, shift: Voxel, seen: SeenVoxels, ends: SurfaceEnds, arou
                 if bits >> inner & 1:
                     z = inner + shift[2] * BLOCK_VOXELS + 1
                     if 0 <= z < len(around):
-                        around[x, y, z] = 1 + ends.scans[at]
+                        around[x, y, z] = 1 + scans[at]
                     at += 1
         number += _BITS_SET[bits]
 
 
 @inner_kernel()
-def _fill_around(row: int, seen: SeenVoxels, ends: SurfaceEnds, around: Scans) -> None:
+def _fill_around(row: int, seen: SeenVoxels, firsts: Longs, scans: Bytes, around: Scans) -> None:
     """Fill in a block's voxels and those next to it: scans and 1; 0: no surface."""
     around[:] = 0
     x, y, z = unpack(seen.blocks.row_keys[row])
@@ -146,7 +161,7 @@ def _fill_around(row: int, seen: SeenVoxels, ends: SurfaceEnds, around: Scans) -
                 corner = ((x + i) << SHIFT, (y + j) << SHIFT, (z + k) << SHIFT)
                 near = find_block(seen.blocks, corner[0], corner[1], corner[2], seen.side)
                 if near >= 0:
-                    _add_block(near, (i, j, k), seen, ends, around)
+                    _add_block(near, (i, j, k), seen, firsts, scans, around)
 
 
 @inner_kernel()
@@ -176,13 +191,17 @@ def _fill_margins(voxel: Voxel, beyond: Bytes, around: Scans, margins: Bytes) ->
 
 
 @kernel()
-def margins_that_count(seen: SeenVoxels, ends: SurfaceEnds) -> Bytes:
-    """Return the margins [S, 6] of all surface voxels; 0: none counts."""
-    margins = np.zeros((len(ends.beyond), _SIDES), np.uint8)
+def margins_that_count(seen: SeenVoxels, firsts: Longs, scans: Bytes, beyond: Bytes) -> Bytes:
+    """Return the margins [S, 6] of all surface voxels; 0: none counts.
+
+    ``firsts`` [B] are the numbers of the first surface voxel of each block; ``scans`` [S] and
+    ``beyond`` [S, 6] are as of :class:`Support`.
+    """
+    margins = np.zeros((len(beyond), _SIDES), np.uint8)
     side = BLOCK_VOXELS + 2
     around = np.zeros((side, side, side), np.int16)
     for row in range(len(seen.surface)):
-        number = ends.firsts[row]
+        number = firsts[row]
         known = False  # what lies around
         for byte in range(BLOCK_BYTES):
             bits = int(seen.surface[row, byte])
@@ -190,10 +209,10 @@ def margins_that_count(seen: SeenVoxels, ends: SurfaceEnds) -> Bytes:
                 if not bits >> inner & 1:
                     continue
                 if not known:
-                    _fill_around(row, seen, ends, around)
+                    _fill_around(row, seen, firsts, scans, around)
                     known = True
                 voxel = ((byte >> SHIFT) + 1, (byte & LOW) + 1, inner + 1)
-                _fill_margins(voxel, ends.beyond[number], around, margins[number])
+                _fill_margins(voxel, beyond[number], around, margins[number])
                 number += 1
     return margins
 

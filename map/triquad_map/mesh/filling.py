@@ -65,11 +65,9 @@ def filled_voxels(view: ComposedView, low: Doubles, high: Doubles, fill_m: float
         view: the map.
         low: [3] metres, map frame: the box's minimum corner.
         high: [3] the maximum corner.
-        fill_m: how far from seen surface, metres; 0: nowhere.
+        fill_m: how far from seen surface, metres.
     """
     parts = [np.zeros((2, 0, 3), np.int64)]
-    if fill_m == 0:
-        return FilledVoxels(parts[0][0], parts[0][1], fill_m)
     limit = fill_m / view.voxel_m
     steps = math.ceil(limit)
     known = _seen_voxels(view, low, high, margin=steps)
@@ -166,8 +164,6 @@ def on_filled(view: ComposedView, filled: FilledVoxels, points: Doubles, reach_m
     not seen; or so far from a filled voxel on each axis, at most ``fill_m`` from the voxel with
     seen surface at which that began, and not in a ``FREE`` voxel.
     """
-    if filled.fill_m == 0:
-        return np.zeros(len(points), np.bool_)
     found = _beside_filled(filled, points / view.voxel_m, view.voxel_m, reach_m=reach_m)
     found |= view.status(points, reach_m) == Status.SURFACE
     at = np.flatnonzero(found)

@@ -126,16 +126,6 @@ class TileMesh:
     filled: Bools  # [F] which faces fill holes
 
     @property
-    def origin(self) -> Doubles:
-        """The tile's minimum corner [3], metres, map frame."""
-        return np.asarray(self.first * self.cell_m, np.float64)
-
-    @property
-    def vertices(self) -> Floats:
-        """The vertices [V, 3], metres, relative to the origin."""
-        return (self.crossings.places * self.cell_m).astype(np.float32)
-
-    @property
     def faces(self) -> Ints:
         """Three vertices each [F, 3], counter-clockwise seen from free space."""
         return self.crossings.faces
@@ -173,14 +163,18 @@ def mesh_tile(
     first = np.asarray(tile, np.int64) * lattice.cells
     origin = first.astype(np.float64) * lattice.cell_m
     reach_m = lattice.reach_m
-    filled = filled_voxels(view, origin - reach_m, origin + lattice.tile_side_m + reach_m, fill_m)
+    filled = None
+    if fill_m > 0:
+        ends = origin - reach_m, origin + lattice.tile_side_m + reach_m
+        filled = filled_voxels(view, *ends, fill_m)
     cells = _near_cells(view, filled, first, lattice)
     volume, points = _lattice_values(view, cells, first=first, lattice=lattice, around=around)
     found = Crossings(cells, volume)
     middles = centroids((found.places + first) * lattice.cell_m, found.faces)
     kept = _are_seen(view, middles, lattice)
-    continued = ~kept
-    continued[continued] = on_filled(view, filled, middles[continued], reach_m)
+    continued = np.zeros(len(kept), np.bool_)
+    if filled is not None:
+        continued[~kept] = on_filled(view, filled, middles[~kept], reach_m)
     kept |= continued
     found.keep(kept)
     return TileMesh(
@@ -201,12 +195,12 @@ def _are_seen(view: ComposedView, middles: Doubles, lattice: TileLattice) -> Boo
 
 
 def _near_cells(
-    view: ComposedView, filled: FilledVoxels, first: Longs, lattice: TileLattice
+    view: ComposedView, filled: FilledVoxels | None, first: Longs, lattice: TileLattice
 ) -> Longs:
     """Return cells [C, 3] of the tile that may have faces near seen or continued surface."""
     middles = (first[:, None] + np.arange(lattice.cells) + 0.5) * np.float64(lattice.cell_m)
     near = view.surface_in_grid(middles, lattice.cell_m / 2 + lattice.reach_m)
-    if len(filled.voxels):
+    if filled is not None:
         around = cells_around(filled, view.voxel_m, lattice.cell_m, lattice.reach_m) - first
         inside = ((around >= 0) & (around < lattice.cells)).all(axis=1)
         near[tuple(around[inside].T)] = True

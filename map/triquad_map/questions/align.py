@@ -11,7 +11,7 @@ from triquad_format.records.pose import orthonormal
 from triquad_format.records.status import Status
 from triquad_format.wire.limits import MAX_ITERATIONS
 
-from triquad_map.questions.distance import DistanceOptions, distances
+from triquad_map.questions.distance import distances
 from triquad_map.view import REACH_VOXELS, MapView
 
 _COARSE_POINTS = 500
@@ -175,7 +175,7 @@ def _normal(
 ) -> _Normal:
     """Return the normal equations at a pose; their weight is 0 where no point counts."""
     turned = points @ pose[:3, :3].T
-    answer = distances(view, turned + pose[:3, 3], DistanceOptions(max_distance_m))
+    answer = distances(view, turned + pose[:3, 3], max_distance_m)
     distance = answer.distance_m.astype(np.float64)
     if scale == REACH_VOXELS * view.voxel_m:
         spread = np.ones(len(points))
@@ -202,7 +202,7 @@ def _normal(
 def _judged(view: MapView, points: Doubles, found: _Found, max_distance_m: float) -> Alignment:
     """Return the alignment at the pose where the search ended."""
     world = points @ found.pose[:3, :3].T + found.pose[:3, 3]
-    answer = distances(view, world, DistanceOptions(max_distance_m))
+    answer = distances(view, world, max_distance_m)
     inliers = answer.found & (answer.status == Status.SURFACE)
     count = int(inliers.sum())
     share = count / max(int((answer.found | (answer.status != Status.UNKNOWN)).sum()), 1)

@@ -38,7 +38,7 @@ from triquad_format.wire.query_messages import (
 )
 
 from triquad_map.questions.align import align
-from triquad_map.questions.distance import DistanceOptions, distances
+from triquad_map.questions.distance import distances
 from triquad_map.questions.grid import GridShape, grid
 from triquad_map.questions.ground import ground
 from triquad_map.questions.rays import rays
@@ -80,10 +80,13 @@ def _sdf(view: MapView, request: SdfRequest) -> SdfReply:
 
 def _distance(view: MapView, request: DistanceRequest) -> DistanceReply:
     points = _searched("point", request.origin, request.points)
-    options = DistanceOptions(
-        request.max_distance_m, request.surface_point, request.unknown_distance
+    answer = distances(
+        view,
+        points,
+        request.max_distance_m,
+        surface_point=request.surface_point,
+        unknown_distance=request.unknown_distance,
     )
-    answer = distances(view, points, options)
     return _reply(
         DistanceReply,
         answer,

@@ -79,15 +79,6 @@ def are_free(what: str, blocked: Bools, meets: Bools, unknown: UnknownLike) -> B
     return ~blocked if Unknown(unknown) is Unknown.FREE else ~(blocked | meets)
 
 
-@dataclass(frozen=True)
-class DistanceOptions:
-    """The options of a query for distances."""
-
-    max_distance_m: float = 5.0
-    surface_point: bool = False
-    unknown_distance: bool = False
-
-
 @dataclass(frozen=True, repr=False)
 class Distances(Answer):
     """Distances from N points to the nearest seen surface, of one epoch.
@@ -128,9 +119,20 @@ class Distances(Answer):
         return asked("unknown_point", self._unknown_point, "unknown_distance")
 
 
-def distances(view: MapView, points: Doubles, options: DistanceOptions) -> Distances:
-    """Return distances from ``points`` [N, 3], metres, map frame, to the nearest seen surface."""
-    nearest = view.nearest_surface(points, options.max_distance_m)
+def distances(
+    view: MapView,
+    points: Doubles,
+    max_distance_m: float = 5.0,
+    *,
+    surface_point: bool = False,
+    unknown_distance: bool = False,
+) -> Distances:
+    """Return distances from ``points`` [N, 3], metres, map frame, to the nearest seen surface.
+
+    It is searched for up to ``max_distance_m``; its nearest points and the nearest unknown space
+    are part of the answer where they are asked for.
+    """
+    nearest = view.nearest_surface(points, max_distance_m)
     status = view.status(points)
     gradient, distance = nearest.gradient, nearest.distance  # from here on, of the answer
     near = (distance < _SURFEL_VOXELS * view.voxel_m) & (status == _SURFACE) & nearest.found
@@ -138,13 +140,11 @@ def distances(view: MapView, points: Doubles, options: DistanceOptions) -> Dista
     _join_field(view, points, learnt, distance=distance, gradient=gradient)
     _join_rays(view, points, unlearnt, nearest=nearest, distance=distance, gradient=gradient)
     # What the field or the rays say may lie beyond a limit that is close by.
-    np.clip(distance, -options.max_distance_m, options.max_distance_m, out=distance)
+    np.clip(distance, -max_distance_m, max_distance_m, out=distance)
     unknown = None
-    if options.unknown_distance:
-        unknown = view.nearest_unknown(points, options.max_distance_m)
-    surface_point = None
-    if options.surface_point:
-        surface_point = np.where(nearest.found[:, None], nearest.point, points)
+    if unknown_distance:
+        unknown = view.nearest_unknown(points, max_distance_m)
+    met = np.where(nearest.found[:, None], nearest.point, points) if surface_point else None
     return Distances(
         distance_m=distance.astype(np.float32),
         gradient=gradient.astype(np.float32),
@@ -152,7 +152,7 @@ def distances(view: MapView, points: Doubles, options: DistanceOptions) -> Dista
         status=status,
         confidence=np.where(status == _UNKNOWN, np.float32(0), nearest.confidence),
         epoch=view.epoch,
-        _surface_point=surface_point,
+        _surface_point=met,
         _unknown_distance_m=None if unknown is None else unknown.distance.astype(np.float32),
         _unknown_point=None if unknown is None else unknown.point,
     )

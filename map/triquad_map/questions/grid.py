@@ -10,7 +10,7 @@ from triquad_format.records.arrays import Bytes, Doubles, Floats
 from triquad_format.records.status import Status, Statuses
 
 from triquad_map.questions.answer import drawn_on
-from triquad_map.questions.distance import DistanceOptions, distances
+from triquad_map.questions.distance import distances
 from triquad_map.view import MapView
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ class Grid:
 
 def grid(view: MapView, shape: GridShape, max_distance_m: float) -> Grid:
     """Return distance, of at most ``max_distance_m``, and status at the middles of all cells."""
-    answer = distances(view, shape.middles(), DistanceOptions(max_distance_m))
+    answer = distances(view, shape.middles(), max_distance_m)
     return Grid(
         shape,
         distance_m=answer.distance_m.reshape(shape.counts),

@@ -10,7 +10,7 @@ from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats, Longs
 from triquad_format.records.status import Status
 
 from triquad_map.questions.answer import Answer, drawn_on
-from triquad_map.questions.distance import DistanceOptions, distances
+from triquad_map.questions.distance import distances
 from triquad_map.questions.rays import trace
 from triquad_map.view import REACH_VOXELS, MapView
 
@@ -107,7 +107,7 @@ def ground(view: MapView, points: Doubles, max_drop_m: float) -> Ground:
 
 def _stand(view: MapView, answer: Ground, rows: Longs, places: Doubles) -> None:
     """Put the ground into ``rows`` [R] of the answer, where ``places`` [R, 3] on it bear."""
-    here = distances(view, places, DistanceOptions(view.voxel_m))
+    here = distances(view, places, view.voxel_m)
     up = here.gradient[:, 2]
     # Else it is met from behind, or unknown: no ray ended near.
     bears = (up > -_STEEP) & (here.confidence > 0) & _ended_near(view, places)

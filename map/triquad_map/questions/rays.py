@@ -10,7 +10,7 @@ from triquad_format.records.arrays import Bools, Bytes, Doubles, Floats
 from triquad_format.records.status import Status
 
 from triquad_map.questions.answer import Answer
-from triquad_map.questions.distance import DistanceOptions, distances
+from triquad_map.questions.distance import distances
 from triquad_map.view import REACH_VOXELS, MapView
 
 _HIT_VOXELS = 0.025
@@ -70,10 +70,10 @@ def trace(view: MapView, origins: Doubles, directions: Doubles, ranges: Doubles)
     step = np.zeros(len(origins))  # from there
     going = np.arange(len(origins))
     hit_m = _HIT_VOXELS * view.voxel_m
-    ask = DistanceOptions(min(_LOOK_AHEAD_M, float(ranges.max(initial=hit_m))))
+    reach_m = min(_LOOK_AHEAD_M, float(ranges.max(initial=hit_m)))
     while len(going):
         points = origins[going] + at[going, None] * directions[going]
-        distance = distances(view, points, ask).distance_m.astype(np.float64)
+        distance = distances(view, points, reach_m).distance_m.astype(np.float64)
         met = distance <= hit_m
         # The distance goes on to fall about as it did from the last place to this one.
         fall = np.maximum(before[going] - distance, 1e-9)

@@ -11,7 +11,6 @@ from triquad_format.records.arrays import Bools, Doubles, Floats
 
 from triquad_map.questions.answer import Answer
 from triquad_map.questions.distance import (
-    DistanceOptions,
     Unknown,
     UnknownLike,
     are_free,
@@ -83,7 +82,7 @@ def segments(
     step_m = REACH_VOXELS * view.voxel_m
 
     def to_surface(points: Doubles) -> Doubles:
-        return distances(view, points, DistanceOptions(reach_m)).distance_m.astype(np.float64)
+        return distances(view, points, reach_m).distance_m.astype(np.float64)
 
     solid = _march(
         to_surface, starts, directions, lengths, radius_m=radius_m, step_m=step_m, clearance=True

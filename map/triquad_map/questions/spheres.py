@@ -11,7 +11,6 @@ from triquad_format.records.status import Status
 
 from triquad_map.questions.answer import Answer
 from triquad_map.questions.distance import (
-    DistanceOptions,
     Unknown,
     UnknownLike,
     are_free,
@@ -50,7 +49,7 @@ def spheres(view: MapView, centres: Doubles, radii: Doubles) -> Spheres:
     """Return what spheres around ``centres`` [N, 3] of ``radii`` [N] contain, metres, map frame."""
     # A little beyond the largest, so that what touches it is found.
     reach_m = float(radii.max(initial=0.0)) + view.voxel_m
-    answer = distances(view, centres, DistanceOptions(reach_m, unknown_distance=True))
+    answer = distances(view, centres, reach_m, unknown_distance=True)
     status = np.full(len(centres), Status.FREE, np.uint8)
     status[(answer.unknown_distance_m < radii) | (answer.status == Status.UNKNOWN)] = Status.UNKNOWN
     status[answer.found & (answer.distance_m <= radii)] = Status.SURFACE

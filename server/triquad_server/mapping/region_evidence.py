@@ -8,7 +8,6 @@ import numpy as np
 from triquad_format.records.arrays import Bools, Doubles, Ints, Longs
 from triquad_format.records.region import Evidence
 from triquad_map.compiled.voxel_index import empty_keys, thin
-from triquad_map.evidence.belief import Belief
 from triquad_map.evidence.carving import CLEAR_SHORT, FREE_SHORT, Reach
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.evidence.growth import EvidenceSize
@@ -118,7 +117,7 @@ class RegionEvidence:
 
     def believe(self, seen: SeenScan) -> Longs:
         """Let surface come and go, after :meth:`scan_seen`; return the new voxels [M, 3]."""
-        changes = self.live.believe(seen.rows, seen.passed, Belief())
+        changes = self.live.believe(seen.rows, seen.passed)
         if len(changes.removed):
             self._removed.append(changes.removed)
         return changes.new

@@ -8,8 +8,8 @@ from support.maps.watched_evidence import SENSOR, SIDE, Watched
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.region import seen_voxels
 from triquad_format.records.status import Status
+from triquad_map.evidence.evidence import outcome_counts
 from triquad_map.evidence.live_evidence import LiveEvidence
-from triquad_map.evidence.observations import outcome_counts
 from triquad_map.evidence.observed import Sighting, first_seen_since
 from triquad_map.surface import SurfelKind, nothing_shown
 

@@ -9,7 +9,6 @@ from support.maps.seen_scans import end, see
 from triquad_format.records.arrays import Bools, Doubles
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.region import Evidence, seen_voxels
-from triquad_map.evidence.belief import Belief
 from triquad_map.evidence.carving import Reach
 from triquad_map.evidence.evidence import FrozenEvidence
 from triquad_map.evidence.live_evidence import LiveEvidence
@@ -166,7 +165,7 @@ def test_what_was_taken_back_is_forgotten() -> None:
     def scan(number: int, ends: Doubles) -> None:
         rows = end(evidence, ends, Sighting(sensor, 0.2, number, scan=number))
         passed = evidence.carve(sensor, ends, Reach(0.5, 2.5, number))
-        evidence.believe(rows, passed, Belief())
+        evidence.believe(rows, passed)
 
     for number in range(1, 11):
         scan(number, wide.points(rng))

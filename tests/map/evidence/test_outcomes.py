@@ -3,7 +3,7 @@
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from triquad_map.evidence.observations import outcome_codes, outcome_counts
+from triquad_map.evidence.evidence import outcome_codes, outcome_counts
 
 MOST_HITS = 8
 STEP = 2**0.5 + 1e-9  # to the nearest power of two

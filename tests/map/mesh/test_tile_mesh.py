@@ -29,7 +29,7 @@ def tiles(epoch: Epoch) -> dict[tuple[int, int, int], TileMesh]:
 
 
 def test_the_mesh_lies_on_the_surface(tiles: dict[tuple[int, int, int], TileMesh]) -> None:
-    vertices = np.concatenate([tile.vertices + tile.origin for tile in tiles.values()])
+    vertices = np.concatenate([tile.triangles.vertices for tile in tiles.values()])
     assert len(vertices) > 10_000
     distance = np.abs(world(4).scene.sdf(vertices))
     assert np.median(distance) < 0.01
@@ -40,7 +40,7 @@ def test_faces_look_into_free_space(tiles: dict[tuple[int, int, int], TileMesh])
     scene = world(4).scene
     agree = []
     for tile in tiles.values():
-        corners = tile.vertices[tile.faces] + tile.origin
+        corners = tile.triangles.vertices[tile.faces]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         outwards = scene.gradient(corners.mean(axis=1))
         agree.append((normals * outwards).sum(axis=1) > 0)
@@ -79,7 +79,7 @@ def test_holes_of_tiles_are_those_of_the_map_in_one_piece(
 
 
 def _middles(tile: TileMesh) -> NDArray[np.float64]:
-    return tile.origin + tile.vertices.astype(np.float64)[tile.faces].mean(axis=1)
+    return tile.triangles.vertices[tile.faces].mean(axis=1)
 
 
 def test_every_tile_with_faces_is_listed_however_small_tiles_are() -> None:

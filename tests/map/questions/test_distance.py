@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from support.maps.exact_view import ExactView
-from triquad_map.questions.distance import DistanceOptions, distances
+from triquad_map.questions.distance import distances
 from triquad_map.view import FieldAnswer
 from triquad_tools.simulation.scene import Scene
 from triquad_tools.simulation.solids import half_space
@@ -28,7 +28,7 @@ def floor():
 
 @pytest.mark.parametrize("height_m", [0.15, 0.17, 0.19])
 def test_no_place_that_rays_passed_is_behind_a_surface_a_voxel_away(floor, height_m):
-    answer = distances(floor, np.array([[0.0, 0, height_m], [0, 0, -height_m]]), DistanceOptions())
+    answer = distances(floor, np.array([[0.0, 0, height_m], [0, 0, -height_m]]))
     before, behind = answer.distance_m
     assert 0 < before <= height_m
     assert -height_m <= behind < 0

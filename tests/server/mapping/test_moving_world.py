@@ -96,7 +96,7 @@ def mesh_area(epoch: Epoch) -> float:
     low[2] = 0.25
     for x, y, z in lattice.tiles_meeting(low[None], high[None]).tolist():
         tile = mesh_tile(epoch, (x, y, z), lattice)
-        vertices = tile.origin + tile.vertices
+        vertices = tile.triangles.vertices
         middles = centroids(vertices, tile.faces)
         inside = ((middles > low) & (middles < high)).all(axis=1)
         area += Mesh(vertices, tile.faces[inside]).to_trimesh().area

@@ -9,7 +9,7 @@ from support.poses import shifted
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.region import MapRecord
 from triquad_format.records.status import Status
-from triquad_map.questions.distance import DistanceOptions, distances
+from triquad_map.questions.distance import distances
 from triquad_map.questions.ground import ground
 from triquad_map.questions.rays import rays
 from triquad_map.questions.segments import segments
@@ -98,14 +98,14 @@ def test_balls_at_it_meet_it(seen: Seen) -> None:
 def test_distances_are_right_within_half_a_voxel(seen: Seen) -> None:
     for height_m in (0.0, 0.05, 0.1, 0.3, 0.6):
         points = seen.hits + height_m * seen.normals
-        found = distances(seen.epoch, points, DistanceOptions(2.0))
+        found = distances(seen.epoch, points, 2.0)
         error_m = np.abs(found.distance_m - seen.scene.sdf(points))
         assert (error_m < VOXEL_M / 2).mean() > 0.98
         assert np.median(error_m) < 0.02
 
 
 def test_close_behind_it_distances_are_negative(seen: Seen) -> None:
-    behind = distances(seen.epoch, seen.hits - 0.04 * seen.normals, DistanceOptions(2.0))
+    behind = distances(seen.epoch, seen.hits - 0.04 * seen.normals, 2.0)
     assert (behind.distance_m < 0).mean() > 0.85
     towards = (behind.gradient * seen.normals).sum(axis=1)
     assert np.median(towards) > 0.98
@@ -125,7 +125,7 @@ def test_what_is_not_trained_on_is_known_as_well_after_many_scans() -> None:
     errors_m = []
     for seen in (once, often):
         points = once.hits + 0.1 * once.normals
-        found = distances(seen.epoch, points, DistanceOptions(2.0))
+        found = distances(seen.epoch, points, 2.0)
         errors_m.append(np.abs(found.distance_m - once.scene.sdf(points)))
     assert np.median(errors_m[1]) < 0.01
     assert np.quantile(errors_m[1], 0.9) < 1.2 * np.quantile(errors_m[0], 0.9)

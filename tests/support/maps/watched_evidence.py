@@ -2,7 +2,6 @@
 
 import numpy as np
 from triquad_format.records.arrays import Doubles
-from triquad_map.evidence.belief import Belief
 from triquad_map.evidence.carving import CLEAR_SHORT, FREE_SHORT, Reach
 from triquad_map.evidence.live_evidence import LiveEvidence
 from triquad_map.evidence.observed import Sighting
@@ -27,7 +26,7 @@ class Watched:
         search.find(0, len(search.rows))
         passed = self.evidence.carve(sensor, ends, Reach(FREE_SHORT, CLEAR_SHORT, self.scans))
         search.finish()
-        return len(self.evidence.believe(rows, passed, Belief()).removed)
+        return len(self.evidence.believe(rows, passed).removed)
 
     def believed(self, voxels: Doubles) -> float:
         """Share of ``voxels`` [N, 3] that are surface."""
