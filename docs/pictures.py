@@ -24,8 +24,7 @@ from PIL import Image
 from triquad_client import Status, open_map
 from triquad_server import serve
 from triquad_tools.plots.colours import DISTANCES, FREE, UNKNOWN
-from triquad_tools.plots.mesh_view import draw_faces, view_along
-from triquad_tools.plots.picture import BACKGROUND, HEIGHT, WIDTH
+from triquad_tools.plots.picture import BACKGROUND, HEIGHT, WIDTH, draw_faces, view_along
 from triquad_tools.simulation.lidar import SimulatedDrive
 from triquad_tools.simulation.solids import Solid, box
 from triquad_tools.simulation.street import street_drive

@@ -10,7 +10,7 @@ import viser
 import websockets.asyncio.client
 from support.files.changing_store import EMPTY, write_checkpoint
 from triquad_tools.viewer.allowed_origins import refusal
-from triquad_tools.viewer.sources import StoredMap
+from triquad_tools.viewer.sources import FileSource
 from triquad_tools.viewer.viewer import Viewer
 from websockets.datastructures import Headers
 from websockets.exceptions import InvalidStatus
@@ -23,7 +23,7 @@ PLACE = "127.0.0.1:8080"
 @pytest.fixture(scope="module")
 def viewer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Viewer]:
     path = write_checkpoint(tmp_path_factory.mktemp("map"), 1, EMPTY)
-    with closing(Viewer(StoredMap(path, "file"), "127.0.0.1", 0, allowed_hosts=[ALLOWED])) as made:
+    with closing(Viewer(FileSource(path, "file"), "127.0.0.1", 0, allowed_hosts=[ALLOWED])) as made:
         yield made
 
 

@@ -15,7 +15,7 @@ from triquad_format.records.arrays import Doubles
 from triquad_tools.viewer.mesh.mesh_layer import cut_tile, joined_tiles
 from triquad_tools.viewer.mesh.tile_colours import before_tone_mapping, height_colours
 from triquad_tools.viewer.mesh.tiles_in_view import NearTiles, TilesInView
-from triquad_tools.viewer.sources import COARSEST, LiveSource, MapSource, StoredMap
+from triquad_tools.viewer.sources import COARSEST, FileSource, LiveSource, MapSource
 
 
 def test_near_tiles_are_those_of_the_server() -> None:
@@ -49,7 +49,7 @@ def test_near_tiles_are_those_of_the_server() -> None:
 def test_tiles_far_from_zero_are_as_fine(tmp_path: Path) -> None:
     path, far = tmp_path / "far.triquad", (450_000.0, 5_400_000.0, 0.0)
     write_map(replace(exact_map(flat(0.0)), origin_m=far), path)
-    assert_detail_near(StoredMap(path, "here"), np.array(far))
+    assert_detail_near(FileSource(path, "here"), np.array(far))
 
 
 def assert_detail_near(source: MapSource, place: Doubles) -> None:
@@ -68,7 +68,7 @@ def assert_detail_near(source: MapSource, place: Doubles) -> None:
 
 def test_a_mesh_is_cut_and_joined(tmp_path: Path) -> None:
     path = write_checkpoint(tmp_path, 7, box_at(3.0, 3.0))
-    source = StoredMap(path, "here")
+    source = FileSource(path, "here")
     follower = source.follow(0)
     while not follower.complete:
         follower.next(0.0)

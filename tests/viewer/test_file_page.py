@@ -12,7 +12,7 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 from support.files.changing_store import box_at, write_checkpoint
 from triquad_tools.mapfiles.meshfile import read_mesh
-from triquad_tools.viewer.sources import StoredMap
+from triquad_tools.viewer.sources import FileSource
 from triquad_tools.viewer.viewer import Viewer
 
 from bench.clients.browser import drawn_share, wait_until, wait_until_drawn
@@ -23,14 +23,14 @@ SKY = (20, 690)
 
 
 @pytest.fixture(scope="module")
-def source(tmp_path_factory: pytest.TempPathFactory) -> StoredMap:
+def source(tmp_path_factory: pytest.TempPathFactory) -> FileSource:
     path = write_checkpoint(tmp_path_factory.mktemp("map"), 1, box_at(4, 4))
-    return StoredMap(path, "a file")
+    return FileSource(path, "a file")
 
 
 @pytest.fixture(scope="module")
 def page(
-    source: StoredMap, show: Callable[[StoredMap], AbstractContextManager[Page]]
+    source: FileSource, show: Callable[[FileSource], AbstractContextManager[Page]]
 ) -> Iterator[Page]:
     with show(source) as opened:
         wait_until_drawn(opened)
@@ -118,7 +118,7 @@ def test_a_path_is_saved_as_it_was_laid(page: Page, tmp_path: Path) -> None:
 
 
 def test_a_phone_has_its_scene_until_the_controls_are_opened(
-    source: StoredMap, chromium: Browser
+    source: FileSource, chromium: Browser
 ) -> None:
     with closing(Viewer(source, "127.0.0.1", 0)) as viewer:
         phone = chromium.new_page(viewport={"width": 390, "height": 844})

@@ -13,8 +13,8 @@ from triquad_format.errors import DamagedMapFileError
 from triquad_tools.viewer.sources import (
     COARSEST,
     DamagedError,
+    FileSource,
     History,
-    StoredMap,
     StoredTiles,
     moment,
 )
@@ -46,7 +46,7 @@ def test_few_maps_stay_open_but_those_that_are_shown_do(tmp_path: Path) -> None:
 
 
 def test_tiles_of_a_file_are_its_mesh(tmp_path: Path) -> None:
-    source = StoredMap(write_checkpoint(tmp_path, 1, box_at(3, 3)), "file")
+    source = FileSource(write_checkpoint(tmp_path, 1, box_at(3, 3)), "file")
     whole = source.queries.mesh(cell_m=source.sizes.cell_of(COARSEST))
     tiles = completed(source.follow(COARSEST)).tiles
     assert sum(len(tile.faces) for tile in tiles.values()) == len(whole.faces)
@@ -57,7 +57,7 @@ def test_tiles_of_a_file_are_its_mesh(tmp_path: Path) -> None:
 
 
 def test_a_box_has_the_tiles_that_meet_it(tmp_path: Path) -> None:
-    source = StoredMap(write_checkpoint(tmp_path, 1, EMPTY), "file")
+    source = FileSource(write_checkpoint(tmp_path, 1, EMPTY), "file")
     follower = completed(source.follow(0, ((1.0, 1.0, 0.0), (2.0, 2.0, 1.0))))
     assert set(follower.tiles) == {(0, 0, 0)}
     moved = source.follow(0, ((-2.0, 1.0, 0.0), (2.0, 2.0, 1.0)), follower)

@@ -11,8 +11,7 @@ from support.maps.exact_maps import SEEN_M, exact_map, flat
 from triquad_client import OfflineMap, Status
 from triquad_tools.viewer.page.page import Focus, surface_along
 from triquad_tools.viewer.questions.cell_box import CellBox
-from triquad_tools.viewer.questions.clicks import Path
-from triquad_tools.viewer.questions.measure import Measure
+from triquad_tools.viewer.questions.clicks import Measure, Path
 from triquad_tools.viewer.questions.slice import Slice, slider_places
 from triquad_tools.viewer.questions.unknown_space import ask_boundary, border_faces
 from triquad_tools.viewer.view_panel import round_length, turned_back

@@ -16,11 +16,14 @@ from triquad_format.mapfile.writer import write_map
 from triquad_format.records.status import Status
 from triquad_server.mapping.mapper import Mapper
 from triquad_tools.commands.inspect import main
-from triquad_tools.mapfiles.diff import Change, compare, difference, print_diff
-from triquad_tools.mapfiles.object_changes import (
+from triquad_tools.mapfiles.diff import (
     LEAST_POINTS,
+    Change,
     Cluster,
+    compare,
+    difference,
     object_changes,
+    print_diff,
     print_objects,
 )
 from triquad_tools.simulation.lidar import Lidar, drive

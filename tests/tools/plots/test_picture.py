@@ -13,8 +13,15 @@ from triquad_client import Mesh
 from triquad_format.mapfile.writer import write_map
 from triquad_map.height_scale import HEIGHT_STOPS
 from triquad_tools.commands.pack import main
-from triquad_tools.plots.mesh_view import draw_faces, view_along
-from triquad_tools.plots.picture import BACKGROUND, HEIGHT, TOP, WIDTH, draw_mesh
+from triquad_tools.plots.picture import (
+    BACKGROUND,
+    HEIGHT,
+    TOP,
+    WIDTH,
+    draw_faces,
+    draw_mesh,
+    view_along,
+)
 
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
 SQUARE_FACES = np.array([[0, 1, 2], [0, 2, 3]], np.int32)

@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from triquad_client.pose import Pose
 from triquad_tools.sensors.motion.frame_tree import FrameTree
 from triquad_tools.sensors.motion.placing import place
-from triquad_tools.sensors.motion.track import Track
-from triquad_tools.sensors.motion.transform import STATIC, Transform
+from triquad_tools.sensors.motion.track import STATIC, Track, Transform
 from triquad_tools.sensors.sweep import NoTransformError, Sweep
 
 SECOND = 10**9

@@ -6,9 +6,8 @@ from pathlib import Path
 
 from triquad_server.process.installed import DEVICES
 
-from triquad_tools.console.arguments import add_fill, command_parser, not_negative
+from triquad_tools.console.arguments import SUFFIXES, add_fill, command_parser, not_negative
 from triquad_tools.console.command import run_work
-from triquad_tools.console.suffixes import SUFFIXES
 from triquad_tools.recordings.arguments import add_recording
 
 COMMAND = "triquad-map"

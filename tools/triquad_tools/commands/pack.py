@@ -5,9 +5,8 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from triquad_tools.console.arguments import add_fill, command_parser, within
+from triquad_tools.console.arguments import SUFFIXES, add_fill, command_parser, within
 from triquad_tools.console.command import run_work
-from triquad_tools.console.suffixes import SUFFIXES
 
 COMMAND = "triquad-pack"
 _CELL_RANGE_M = (0.01, 10.0)

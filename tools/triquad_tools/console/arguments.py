@@ -17,6 +17,11 @@ DEFAULT_MAP = "default"
 PAGE_PORT = 8080  # of the page that shows a map
 Place = tuple[float, float, float]  # metres
 
+MAP_SUFFIX, PICTURE_SUFFIX = ".triquad", ".png"
+MESH_SUFFIXES = (".ply", ".glb", ".obj", ".stl")
+SUFFIXES = (MAP_SUFFIX, *MESH_SUFFIXES, PICTURE_SUFFIX)
+"""How the names of the files end that commands write."""
+
 _FARTHEST_M = 100.0  # that a sensor sits from the frame of its clouds
 
 
@@ -51,7 +56,7 @@ def within(least: float, most: float | None, text: str) -> float:
 def picture(text: str) -> Path:
     """Return the name of a picture to be written, in a folder that exists."""
     path = Path(text)
-    if path.suffix != ".png":
+    if path.suffix != PICTURE_SUFFIX:
         raise argparse.ArgumentTypeError(f"{text}: its name must end in .png")
     if path.is_dir() or not path.parent.is_dir():
         kind = "it is a folder" if path.is_dir() else "its folder does not exist"

@@ -1,6 +1,7 @@
-"""The sizes of differences of two maps; ``docs/tools.md`` defines every figure."""
+"""The differences of two maps, in figures and as objects; ``docs/tools.md`` defines all of them."""
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -8,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_format.records.arrays import Bytes, Doubles, Floats
 from triquad_format.records.status import Status
+from triquad_map.clusters import clusters
 
 from triquad_tools.console.command import print_line
 from triquad_tools.console.report import print_columns
@@ -25,6 +27,12 @@ their frames differ: in two frames it was 0.37 and 0.5 (a recorded road)."""
 
 _STEPS = 8
 _LEAST_SLOPE = 0.1  # a flatter field says nothing of where its zero is
+
+LEAST_POINTS = 20
+"""Clusters of fewer surface points are left out: noise makes them, too. These are 0.8 square metres
+of surface in leaves of 0.2 m."""
+
+_LISTED = 5  # clusters of a kind, at most: of two drives dozens of places moved by 2 cm
 
 
 @dataclass(frozen=True)
@@ -99,6 +107,25 @@ class Change:
         return bool(only_in_one or self.moved) or self.moved_p95_m >= STILL_M
 
 
+@dataclass(frozen=True)
+class Cluster:
+    """Surface points that lie together, and the box around them."""
+
+    low_m: tuple[float, ...]  # [3] map frame
+    high_m: tuple[float, ...]  # [3]
+    points: int
+
+    @property
+    def middle_m(self) -> Doubles:
+        """[3] of the box."""
+        return np.add(self.low_m, self.high_m) / 2
+
+    @property
+    def size_m(self) -> Doubles:
+        """[3] of the box, along the axes."""
+        return np.subtract(self.high_m, self.low_m)
+
+
 def compare(a: "OfflineMap", b: "OfflineMap") -> Comparison:
     """Return the surface of each of two maps, asked in the other."""
     return Comparison(_sighting(a, b), _sighting(b, a))
@@ -170,6 +197,31 @@ def print_diff(change: Change) -> None:
         )
 
 
+def object_changes(comparison: Comparison) -> dict[str, list[Cluster]]:
+    """Return what changed as a whole between two maps, by kind, that of most points first.
+
+    What moved by more than a voxel vanished in one place and appeared in another.
+    """
+    return {kind: _clusters(found) for kind, found in comparison.changed.items()}
+
+
+def print_objects(changes: Mapping[str, Sequence[Cluster]]) -> None:
+    """Print a table of the largest of each kind, and how many there are besides."""
+    rows = [
+        (kind.replace("_", " "), f"{one.points:,}", *_metres(one.middle_m), *_metres(one.size_m))
+        for kind, found in changes.items()
+        for one in found[:_LISTED]
+    ]
+    if not rows:
+        print_line("  nothing appeared, vanished or moved as a whole")
+        return
+    titles = ("what", "points", "middle x m", "y m", "z m", "size x m", "y m", "z m")
+    print_columns(titles, rows)
+    more = {kind.replace("_", " "): len(found) - _LISTED for kind, found in changes.items()}
+    if smaller := ", ".join(f"{count} {kind}" for kind, count in more.items() if count > 0):
+        print_line(f"  and smaller ones: {smaller}; --json prints all")
+
+
 def _sighting(of: "OfflineMap", by: "OfflineMap") -> Sighting:
     points = surface_points(of)
     answer = by.query_sdf(points)
@@ -182,3 +234,21 @@ def _share(count: int, of: int) -> str:
 
 def _centimetres(metres: float) -> str:
     return "-" if np.isnan(metres) else f"{100 * metres:.2f}"
+
+
+def _clusters(sighting: Sighting) -> list[Cluster]:
+    points = sighting.points
+    groups = clusters(np.floor(points / sighting.leaf_m).astype(np.int64))
+    _, numbers = np.unique(groups, return_inverse=True)
+    order, sizes = np.argsort(numbers, kind="stable"), np.bincount(numbers)
+    found = []
+    for rows in np.split(order, np.cumsum(sizes))[:-1]:
+        if len(rows) >= LEAST_POINTS:
+            ends = points[rows].min(axis=0), points[rows].max(axis=0)
+            low, high = (tuple(end.round(3).tolist()) for end in ends)
+            found.append(Cluster(low, high, len(rows)))
+    return sorted(found, key=lambda cluster: -cluster.points)
+
+
+def _metres(place: Doubles) -> tuple[str, ...]:
+    return tuple(f"{value:.2f}" for value in place)

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from triquad_client import Mesh
 
+from triquad_tools.console.arguments import MESH_SUFFIXES
 from triquad_tools.console.command import ToolError
-from triquad_tools.console.suffixes import MESH_SUFFIXES
 
 # glTF has y up; maps have z up.
 _GLTF_FROM_MAP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])

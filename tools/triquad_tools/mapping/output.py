@@ -11,9 +11,9 @@ from triquad_format.mapfile.metadata import utc_time
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.region import MapRecord
 
+from triquad_tools.console.arguments import MAP_SUFFIX, PICTURE_SUFFIX, SUFFIXES
 from triquad_tools.console.command import ToolError, print_remark
 from triquad_tools.console.progress import progress
-from triquad_tools.console.suffixes import MAP_SUFFIX, PICTURE_SUFFIX, SUFFIXES
 from triquad_tools.mapfiles.crop import without_training
 from triquad_tools.mapfiles.source import Box, NothingLeftError, SourceMap
 

@@ -17,8 +17,7 @@ from matplotlib.patches import Patch, Rectangle
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.status import Status
 
-from triquad_tools.mapfiles.diff import Comparison, Sighting
-from triquad_tools.mapfiles.object_changes import Cluster
+from triquad_tools.mapfiles.diff import Cluster, Comparison, Sighting
 from triquad_tools.plots.colours import (
     APPEARED,
     FREE,

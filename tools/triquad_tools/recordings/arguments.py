@@ -11,7 +11,7 @@ from triquad_tools.sensors.ros.type_store import frame_name
 if TYPE_CHECKING:
     from triquad_client.depth_image import Intrinsics
 
-    from triquad_tools.sensors.motion.transform import Transform
+    from triquad_tools.sensors.motion.track import Transform
 
 WORLD, SENSOR = "world", "sensor"  # the frames in which points may be
 
@@ -82,7 +82,7 @@ def transform(text: str) -> "Transform":
     """Return a transform such as ``base_link lidar 0 0 1.5 0 0 0 1``: position and quaternion."""
     from triquad_client.pose import Pose  # slow to import, as below
 
-    from triquad_tools.sensors.motion.transform import STATIC, Transform
+    from triquad_tools.sensors.motion.track import STATIC, Transform
 
     try:
         parent, child, *numbers = text.split()

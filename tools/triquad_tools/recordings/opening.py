@@ -8,9 +8,8 @@ from functools import partial
 from itertools import islice
 from pathlib import Path
 
-from triquad_tools.console.arguments import Place
+from triquad_tools.console.arguments import MAP_SUFFIX, Place
 from triquad_tools.console.command import ToolError, print_remark
-from triquad_tools.console.suffixes import MAP_SUFFIX
 from triquad_tools.recordings.arguments import WORLD
 from triquad_tools.recordings.cloud import points_in_range
 from triquad_tools.recordings.folders.cloud_folder import is_cloud_folder, read_cloud_folder

@@ -17,7 +17,7 @@ from triquad_tools.recordings.recording import ReadingOptions
 from triquad_tools.recordings.ros_content import RosContent, SeenCloud
 from triquad_tools.sensors.motion.frame_graph import ROOT_NAMES
 from triquad_tools.sensors.motion.frame_tree import FrameTree
-from triquad_tools.sensors.motion.transform import STATIC, Transform
+from triquad_tools.sensors.motion.track import STATIC, Transform
 from triquad_tools.sensors.ros.type_store import ALL_TF, TRANSFORMS
 from triquad_tools.sensors.sweep import NoScanError, NoTransformError, PosedScan, Sweep
 

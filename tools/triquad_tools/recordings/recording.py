@@ -8,7 +8,7 @@ from typing import Literal
 from triquad_client.depth_image import Intrinsics
 
 from triquad_tools.console.arguments import Place
-from triquad_tools.sensors.motion.transform import Transform
+from triquad_tools.sensors.motion.track import Transform
 from triquad_tools.sensors.sweep import NoScanError
 
 DEFAULT_SOURCE = "default"  # of recordings that name no sensor: the client's default, too

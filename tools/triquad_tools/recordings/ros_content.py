@@ -10,8 +10,7 @@ from triquad_format.errors import InvalidInputError
 from triquad_tools.console.progress import progress
 from triquad_tools.recordings.bag import Bag, Channel, Message
 from triquad_tools.sensors.motion.frame_tree import FrameTree
-from triquad_tools.sensors.motion.track import Track
-from triquad_tools.sensors.motion.transform import STATIC, Transform
+from triquad_tools.sensors.motion.track import STATIC, Track, Transform
 from triquad_tools.sensors.ray_check import RayCheck
 from triquad_tools.sensors.ros import type_store
 from triquad_tools.sensors.ros.depth_camera import holds_depth

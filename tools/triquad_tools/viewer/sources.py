@@ -69,7 +69,7 @@ class LiveSource:
         return self.client.watch_mesh(bounds, level, known=known)
 
 
-class StoredMap:
+class FileSource:
     """A map file in memory, with mesh tiles that are made once wanted; for several threads."""
 
     grows = False
@@ -144,7 +144,7 @@ class StoredTiles:
         """Do nothing: there is nothing to release."""
 
 
-MapSource = LiveSource | StoredMap
+MapSource = LiveSource | FileSource
 """A map to show: each has a title, queries, the sizes of its mesh, and tiles to follow."""
 
 TileFollower = MeshWatch | StoredTiles
@@ -163,7 +163,7 @@ class History:
         self.folder = map_folder(store)
         self._damaged: dict[CheckpointFile, str] = {}  # as far as is known, and why
         self._opening = threading.Lock()  # one at a time: it takes all cores
-        self._open = lru_cache(_MAX_OPEN)(lambda path: StoredMap(path, str(self.folder)))
+        self._open = lru_cache(_MAX_OPEN)(lambda path: FileSource(path, str(self.folder)))
 
     def files(self) -> list[CheckpointFile]:
         """Return the checkpoints that can be shown as far as is known, the oldest first.
@@ -181,7 +181,7 @@ class History:
         """Return the errors of those that cannot be shown and are still there."""
         return [why for file, why in sorted(self._damaged.items()) if file.path.exists()]
 
-    def opened(self, file: CheckpointFile) -> StoredMap:
+    def opened(self, file: CheckpointFile) -> FileSource:
         """Return the map as it was.
 
         Raises:
@@ -194,7 +194,7 @@ class History:
             self._damaged[file] = f"{file.path.name} is left out: {error}"
             raise DamagedError(self._damaged[file]) from error
 
-    def newest(self) -> StoredMap:
+    def newest(self) -> FileSource:
         """Return the map as it was at the newest moment that can be shown.
 
         Raises:

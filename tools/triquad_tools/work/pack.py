@@ -11,8 +11,8 @@ from triquad_format.mapfile.parts.part import EVIDENCE, REGION, TRAINING, VERTIC
 from triquad_format.records.region import VertexTable
 
 from triquad_tools.commands.pack import COMMAND
+from triquad_tools.console.arguments import MAP_SUFFIX
 from triquad_tools.console.command import FAILED, OK, ToolError, complain, print_line, refuse
-from triquad_tools.console.suffixes import MAP_SUFFIX
 from triquad_tools.mapfiles.crop import without_training
 from triquad_tools.mapfiles.quantise import quantise
 from triquad_tools.mapfiles.recovered_map import Loss, RecoveredMap, recover

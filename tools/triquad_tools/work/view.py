@@ -10,7 +10,7 @@ from triquad_tools.commands.view import COMMAND
 from triquad_tools.console.arguments import connect_to, server_name
 from triquad_tools.console.command import OK, complain, print_line, refuse
 from triquad_tools.console.progress import progress
-from triquad_tools.viewer.sources import History, LiveSource, MapSource, StoredMap, moment
+from triquad_tools.viewer.sources import FileSource, History, LiveSource, MapSource, moment
 from triquad_tools.viewer.viewer import Viewer
 
 
@@ -36,7 +36,7 @@ def _shown(options: argparse.Namespace) -> Iterator[MapSource | History]:
         yield _store(options.file)
     else:
         with progress(f"opening {options.file}") as report:
-            stored = StoredMap(options.file, options.file.name)
+            stored = FileSource(options.file, options.file.name)
             report(1, _name(stored))
         yield stored
 
@@ -53,5 +53,5 @@ def _store(path: Path) -> History:
     return history
 
 
-def _name(shown: StoredMap) -> str:
+def _name(shown: FileSource) -> str:
     return f"map {shown.queries.name!r}, epoch {shown.queries.epoch}"

@@ -11,7 +11,7 @@ from triquad_client.errors import InvalidScanError
 from triquad_tools.sensors.motion.frame_graph import ROOT_NAMES
 from triquad_tools.sensors.motion.frame_tree import FrameTree
 from triquad_tools.sensors.motion.placing import place
-from triquad_tools.sensors.motion.transform import Transform
+from triquad_tools.sensors.motion.track import Transform
 from triquad_tools.sensors.sweep import NoScanError, NoTransformError, PosedScan, Sweep
 
 _log = logging.getLogger("triquad_ros2")

@@ -6,8 +6,7 @@ import numpy as np
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.pose import pose_matrices
 
-from triquad_tools.sensors.motion.track import Track
-from triquad_tools.sensors.motion.transform import STATIC, Transform
+from triquad_tools.sensors.motion.track import STATIC, Track, Transform
 from triquad_tools.sensors.sweep import NoScanError
 
 _RIVAL_NS = 10 * 10**9  # after which a parent counts no more, of which nothing was heard since

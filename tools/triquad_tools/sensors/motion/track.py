@@ -1,21 +1,52 @@
-"""The poses of one frame in another over time, and what lies between them."""
+"""The pose of one frame in another as robots report it, and over time with what lies between."""
 
 import math
 from array import array
 from bisect import bisect_left
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from triquad_client.pose import Pose
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.plausibility import JUMP_M, jumps
 from triquad_format.records.pose import pose_matrices, slerp
 
 from triquad_tools.sensors.sweep import NoTransformError
 
+STATIC = None  # the stamp of a transform that always holds
 MAX_GAP_S = 2.0  # between poses farther apart nothing is interpolated, unless they only correct
+_NEARLY_UNIT = 1e-6  # the length of a quaternion that is left as it is
 _WIDTH = 7  # numbers of a pose
 _RARER = 3.0  # times, at least, is a correction rarer than the poses that it corrects
 _CORRECTED_M, _CORRECTED_RAD = 0.3, 0.05  # drift; a correction by more, at a loop, comes at once
+
+
+@dataclass(frozen=True)
+class Transform:
+    """The pose of a frame in its parent."""
+
+    parent: str
+    child: str
+    stamp_ns: int | None  # nanoseconds since 1970, or STATIC
+    pose: Pose
+
+    def numbers(self) -> tuple[Sequence[float], Sequence[float]]:
+        """Return the position [3] and the unit quaternion [4].
+
+        Raises:
+            InvalidScanError: its pose is none.
+        """
+        position, turn = self.pose.position_m, self.pose.quaternion_xyzw
+        if (
+            isinstance(position, tuple)  # as transforms come, a thousand a second
+            and isinstance(turn, tuple)
+            and abs(math.hypot(*turn) - 1) < _NEARLY_UNIT
+            and math.isfinite(sum(position))
+        ):
+            return position, turn
+        checked = self.pose.numbers()
+        return checked[0].tolist(), checked[1].tolist()
 
 
 class Track:

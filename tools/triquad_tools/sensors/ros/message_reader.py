@@ -7,7 +7,7 @@ from typing import Any
 
 from triquad_client.pose import Pose
 
-from triquad_tools.sensors.motion.transform import STATIC, Transform
+from triquad_tools.sensors.motion.track import STATIC, Transform
 from triquad_tools.sensors.ros import type_store as types
 from triquad_tools.sensors.ros.depth_camera import camera_topic, sweep_of_depth
 from triquad_tools.sensors.ros.point_cloud import sweep_of_cloud

@@ -14,7 +14,7 @@ from triquad_client.mesh.mesh_files import GlbMesh, glb_bytes
 from triquad_format.records.arrays import Doubles
 from triquad_map.triangles import Triangles, joined
 
-from triquad_tools.plots.mesh_view import view_axes
+from triquad_tools.plots.picture import view_axes
 from triquad_tools.viewer.mesh.tile_colours import (
     confidence_colours,
     height_colours,

@@ -12,7 +12,7 @@ from triquad_format.records.arrays import Doubles
 from triquad_map.height_scale import GAMMA, HeightScale
 
 from triquad_tools.plots.colours import HEIGHTS
-from triquad_tools.plots.mesh_view import vertex_normals
+from triquad_tools.plots.picture import vertex_normals
 from triquad_tools.viewer.page.legends import ColourScale
 
 _TOWARDS_SUN = np.array([-0.50, -0.58, 0.64]) / np.linalg.norm([-0.50, -0.58, 0.64])

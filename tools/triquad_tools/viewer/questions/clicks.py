@@ -1,4 +1,4 @@
-"""Clicks into a scene: they query the map at a point, or along a path of several."""
+"""Clicks into a scene: they query the map at a point or along a path, or measure a length."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -16,12 +16,14 @@ from triquad_tools.plots.colours import BEHIND, UNKNOWN
 from triquad_tools.viewer.page.layer import Answer, Layer, Question
 from triquad_tools.viewer.page.legends import lines_html, table_html, text_html
 from triquad_tools.viewer.page.page import Page, surface_along
-from triquad_tools.viewer.questions.measure import Measure
 
 _POINT_REACH_M = 10.0  # how far around a point surfaces are searched for
 
 _BALL, _ARROW = 0.006, 0.08  # radius and length, as shares of the distance of the eye
 _COLOUR = "#c51b7d"  # no mesh has it
+
+_END = 0.005  # radius, as a share of the distance of the eye; also how far the ground is below
+_LINE_PIXELS = 3.0
 
 _LEAST_REACH_M, _REACH_RADII = 1.0, 3.0  # how far around surfaces are searched for
 _LEAST_WIDTH = 0.004  # of what is drawn, as a share of the distance of the eye
@@ -149,6 +151,42 @@ class Path:
             pieces = np.stack([leg[:-1], leg[1:]], axis=1)
             marks.append(layer.lines(pieces, colour, max(2.0 * self._radius_m, least_m)))
         return marks
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A straight line from one point to another."""
+
+    start: Doubles  # [3] metres, map frame
+    end: Doubles  # [3]
+
+    def html(self) -> str:
+        """Return its length, and how much of it is level and upright."""
+        across = self.end - self.start
+        rows = [
+            ("length", f"{np.linalg.norm(across):.3f} m"),
+            ("level", f"{np.linalg.norm(across[:2]):.3f} m"),
+            ("upright", f"{across[2]:+.3f} m"),
+        ]
+        return table_html(rows)
+
+    def marks(self, layer: Layer) -> list[viser.SceneNodeHandle]:
+        """Draw it a little above the ground, with a ball at each end and its length."""
+        scene, page = layer.page.scene, layer.page
+        ends = np.stack([self.start, self.end])
+        radii_m = _END * np.linalg.norm(ends - page.eye, axis=1)
+        raised = ends + radii_m[:, None] * [0.0, 0.0, 1.0]
+        length = f"{np.linalg.norm(self.end - self.start):.2f} m"
+        return [
+            *(
+                scene.add_icosphere(
+                    layer.node("end"), float(radius_m), to_rgb(_COLOUR), position=page.in_scene(end)
+                )
+                for radius_m, end in zip(radii_m, raised, strict=True)
+            ),
+            layer.lines(raised[None], _COLOUR, _LINE_PIXELS, "screen"),
+            scene.add_label(layer.node("length"), length, position=page.in_scene(raised.mean(0))),
+        ]
 
 
 @dataclass(frozen=True)
