@@ -7,8 +7,8 @@ from scipy.stats import spearmanr
 from triquad_format.records.arrays import Bools, Doubles
 from triquad_format.records.region import MapRecord, surface_voxels
 from triquad_format.records.status import Status
+from triquad_map.questions.bodies import spheres
 from triquad_map.questions.distance import Distances, distances
-from triquad_map.questions.spheres import spheres
 from triquad_map.surface import level_confidence
 from triquad_map.view import MapView
 from triquad_tools.simulation.scene import Scene

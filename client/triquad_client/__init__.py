@@ -27,12 +27,11 @@ from triquad_format.wire.source_messages import (
     SourceReport,
 )
 from triquad_map.questions.align import Alignment
+from triquad_map.questions.bodies import Polyline, Segments, Spheres
 from triquad_map.questions.distance import Distances, Unknown, UnknownSpaceError
 from triquad_map.questions.grid import Grid
 from triquad_map.questions.ground import Ground
 from triquad_map.questions.rays import RayRanges
-from triquad_map.questions.segments import Polyline, Segments
-from triquad_map.questions.spheres import Spheres
 from triquad_map.view import NotAskedError
 
 from triquad_client.async_client import (

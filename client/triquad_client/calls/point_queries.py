@@ -13,9 +13,9 @@ from triquad_format.wire.limits import MAX_QUERY_POINTS, MAX_SEARCHES
 from triquad_format.wire.messages import SdfRequest
 from triquad_format.wire.query_messages import DistanceRequest, GridRequest, SpheresRequest
 from triquad_map.questions.answer import Answer
+from triquad_map.questions.bodies import Spheres
 from triquad_map.questions.distance import Distances, Unknown, UnknownLike, with_unknown
 from triquad_map.questions.grid import Grid
-from triquad_map.questions.spheres import Spheres
 from triquad_map.view import FieldAnswer
 
 from triquad_client import checks

@@ -21,9 +21,9 @@ from triquad_format.wire.query_messages import (
     SegmentsRequest,
 )
 from triquad_map.questions.align import FINE_POINTS, Alignment, thinned
+from triquad_map.questions.bodies import Polyline, Segments, along_polyline
 from triquad_map.questions.ground import Ground
 from triquad_map.questions.rays import RayRanges
-from triquad_map.questions.segments import Polyline, Segments, along_polyline
 
 from triquad_client import checks
 from triquad_client.calls.questions_in_parts import Asking, Part

@@ -38,12 +38,11 @@ from triquad_format.wire.query_messages import (
 )
 
 from triquad_map.questions.align import align
+from triquad_map.questions.bodies import segments, spheres
 from triquad_map.questions.distance import distances
 from triquad_map.questions.grid import GridShape, grid
 from triquad_map.questions.ground import ground
 from triquad_map.questions.rays import rays
-from triquad_map.questions.segments import segments
-from triquad_map.questions.spheres import spheres
 from triquad_map.view import MapView
 
 _DECIMALS = 5  # of positions, metres

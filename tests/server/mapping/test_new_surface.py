@@ -9,11 +9,10 @@ from support.poses import shifted
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.region import MapRecord
 from triquad_format.records.status import Status
+from triquad_map.questions.bodies import segments, spheres
 from triquad_map.questions.distance import distances
 from triquad_map.questions.ground import ground
 from triquad_map.questions.rays import rays
-from triquad_map.questions.segments import segments
-from triquad_map.questions.spheres import spheres
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.mapping.mapper import Mapper
 from triquad_tools.simulation.lidar import Lidar
