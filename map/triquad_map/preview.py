@@ -59,9 +59,7 @@ def preview_schema() -> bytes:
     return data
 
 
-def previews_of(
-    record: MapRecord, view: ComposedView | None = None, stamp_ns: int | None = None
-) -> Previews:
+def previews_of(record: MapRecord, view: ComposedView | None = None, stamp_ns: int = 0) -> Previews:
     """Return the previews of all regions of a map.
 
     Args:
@@ -73,7 +71,7 @@ def previews_of(
         with closing(RecordedView(record)) as opened:
             return previews_of(record, opened, stamp_ns)
     parts = {
-        region.index: preview_part(record, region, view, stamp_ns=stamp_ns or 0)
+        region.index: preview_part(record, region, view, stamp_ns=stamp_ns)
         for region in record.regions
     }
     return Previews(preview_schema(), parts)

@@ -212,4 +212,4 @@ def _kept(path: Path, wanted: Sequence[Entry]) -> dict[PartKey, bytes]:
 def _write(path: Path, manifest: Manifest, payloads: Mapping[PartKey, bytes]) -> None:
     """Replace the file at ``path`` by one of these parts, all of it or nothing."""
     parts = (Part(entry.key, payloads[entry.key]) for entry in manifest.entries)
-    write_parts(path, manifest.facts, parts, stamp_ns=manifest.stamp_ns or None)
+    write_parts(path, manifest.facts, parts, stamp_ns=manifest.stamp_ns)

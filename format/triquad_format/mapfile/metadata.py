@@ -113,12 +113,10 @@ def _values(defaults: FieldSettings | MapProgress, packed: Mapping[str, object])
     return values
 
 
-def pack_metadata(
-    facts: MapRecord, *, stamp_ns: int | None, offset: int, stored: int
-) -> dict[str, str]:
+def pack_metadata(facts: MapRecord, *, stamp_ns: int, offset: int, stored: int) -> dict[str, str]:
     """Return the metadata of a file, whose manifest is the ``stored`` bytes from ``offset`` on.
 
-    ``stamp_ns`` is the time of its epoch, nanoseconds since 1970; ``None``: not known.
+    ``stamp_ns`` is the time of its epoch, nanoseconds since 1970; 0: not known.
     """
     entries = {
         "format_version": str(version_of(facts)),
@@ -127,7 +125,7 @@ def pack_metadata(
         **_facts_in_metadata(facts),
         "manifest": f"{offset} {stored}",
     }
-    if stamp_ns is not None:
+    if stamp_ns:
         entries["created"] = utc_time(stamp_ns)
     return entries
 

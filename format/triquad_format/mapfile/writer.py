@@ -51,7 +51,7 @@ def write_map(
     file: BinaryIO | Path | str,
     *,
     feature_dtype: str = "<f2",
-    stamp_ns: int | None = None,
+    stamp_ns: int = 0,
     previews: Previews | None = None,
 ) -> MapFileInfo:
     """Write a map file.
@@ -63,7 +63,7 @@ def write_map(
         record: the map; it is checked first.
         file: a path, or a binary stream at the place where the file begins.
         feature_dtype: ``"<f2"`` or ``"<f4"``, the precision of features that are not int8.
-        stamp_ns: time of creation, nanoseconds since 1970; left out, the file has no time.
+        stamp_ns: time of creation, nanoseconds since 1970; 0: the file has no time.
         previews: what MCAP viewers are to show; left out, the file has nothing of the kind.
 
     Raises:
@@ -72,7 +72,7 @@ def write_map(
     """
     if feature_dtype not in FLOATS:
         raise FormatError(f"feature_dtype = {feature_dtype!r} is not one of {FLOATS}")
-    if stamp_ns is not None and not 0 <= stamp_ns < 2**63:
+    if not 0 <= stamp_ns < 2**63:
         raise FormatError(f"stamp_ns = {stamp_ns} is out of range: use 0 to 2**63 - 1")
     check_record(record)
     parts = pack_record(record, feature_dtype, {} if previews is None else previews.parts)
@@ -85,7 +85,7 @@ def write_parts(
     facts: MapRecord,
     parts: Iterable[Part],
     *,
-    stamp_ns: int | None = None,
+    stamp_ns: int = 0,
     preview_schema: bytes | None = None,
 ) -> MapFileInfo:
     """Write a map file from parts.
@@ -94,7 +94,7 @@ def write_parts(
         file: as in :func:`write_map`.
         facts: what the file says of the whole map, of which regions are not used.
         parts: what the map consists of.
-        stamp_ns: time of its epoch, nanoseconds since 1970; left out, the file has no time.
+        stamp_ns: time of its epoch, nanoseconds since 1970; 0: the file has no time.
         preview_schema: that of :class:`Previews`; needed where there are previews among ``parts``.
 
     Raises:
@@ -105,8 +105,7 @@ def write_parts(
         replacing(Path(file)) if isinstance(file, (str, Path)) else contextlib.nullcontext(file)
     )
     with opened as stream:
-        writer = _PartsWriter(stream, facts, stamp_ns or 0, preview_schema)
-        return writer.write(parts, stamp_ns)
+        return _PartsWriter(stream, facts, stamp_ns, preview_schema).write(parts)
 
 
 class _Counted:
@@ -145,14 +144,14 @@ class _PartsWriter:
         self._preview_schema = preview_schema
         self._channels: dict[str, int] = {}
 
-    def write(self, parts: Iterable[Part], stamp_ns: int | None) -> MapFileInfo:
-        """Write the file; the metadata has the time ``stamp_ns``, if it is given."""
+    def write(self, parts: Iterable[Part]) -> MapFileInfo:
+        """Write the file."""
         self._mcap.start(library="triquad")
         entries = [self._stored(pack_part(PartKey(MAP), pack_facts(self._facts)))]
         entries.extend(self._stored(part) for part in parts)
         manifest = Manifest(self._facts, self._stamp_ns, tuple(entries))
         offset, stored = self._put(pack_manifest(manifest))
-        metadata = pack_metadata(self._facts, stamp_ns=stamp_ns, offset=offset, stored=stored)
+        metadata = pack_metadata(self._facts, stamp_ns=self._stamp_ns, offset=offset, stored=stored)
         self._mcap.add_metadata(METADATA_NAME, metadata)
         self._mcap.finish()  # type: ignore[no-untyped-call]
         size = self._stream.size

@@ -43,7 +43,7 @@ def file_bytes(
     *,
     preview: bool = False,
     view: Any = None,
-    stamp_ns: int | None = None,
+    stamp_ns: int = 0,
     **options: Any,
 ) -> bytes:
     """A complete map file."""

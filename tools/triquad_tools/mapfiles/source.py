@@ -31,7 +31,7 @@ class SourceMap:
     """A map to be written otherwise."""
 
     record: MapRecord
-    stamp_ns: int | None  # when its epoch was written, nanoseconds since 1970
+    stamp_ns: int  # when its epoch was written, nanoseconds since 1970; 0: not known
 
 
 def chosen_file(path: Path, when: str | None) -> Path:
@@ -96,9 +96,9 @@ def read_source(path: Path, box: Box | None) -> SourceMap:
     """
     if box is None:
         file = read_map_file(path)
-        return SourceMap(file.record, file.manifest.stamp_ns or None)
+        return SourceMap(file.record, file.manifest.stamp_ns)
     with StoredMap.open(path) as stored:
-        return cropped(SourceMap(stored.box(*box), stored.manifest.stamp_ns or None), box)
+        return cropped(SourceMap(stored.box(*box), stored.manifest.stamp_ns), box)
 
 
 def cropped(source: SourceMap, box: Box) -> SourceMap:

@@ -45,7 +45,7 @@ def _show(options: argparse.Namespace) -> int:
     if options.plot:
         from triquad_tools.mapping.output import export  # slow to import
 
-        export(SourceMap(file.record, file.manifest.stamp_ns or None), options.plot)
+        export(SourceMap(file.record, file.manifest.stamp_ns), options.plot)
     if options.json:
         print_line(json_text(summary))
     else:

@@ -133,7 +133,7 @@ def _source(options: argparse.Namespace, path: Path, box: Box | None) -> tuple[S
         return read_source(path, box), True
     recovery = recover(path)
     _print_recovery(recovery)
-    source = SourceMap(recovery.record, recovery.stamp_ns or None)
+    source = SourceMap(recovery.record, recovery.stamp_ns)
     return source if box is None else cropped(source, box), recovery.complete
 
 
