@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial import cKDTree
 from triquad_format.records.arrays import Bools, Doubles, Longs
-from triquad_map.evidence.live_evidence import LiveEvidence
 from triquad_server.engine.gradient_sums import GradientSums
 from triquad_server.engine.memory import memory_on
 from triquad_server.intake.rays import usable_rays
@@ -60,8 +59,7 @@ class Believed:
             sums=GradientSums(),
             team=Teams().mapping,
         )
-        live = LiveEvidence(1 << settings.field.depth)
-        self._region = RegionEvidence(live, self._setup, np.zeros(3), 0)
+        self._region = RegionEvidence(self._setup, np.zeros(3), 0)
 
     def take_in(self, scan: EpisodeScan) -> None:
         """Take in a scan as a map does."""

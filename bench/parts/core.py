@@ -82,7 +82,7 @@ def _training(region: LiveRegion) -> list[Figure]:
     rng = np.random.default_rng(0)
 
     def baseline() -> None:
-        batch = learning.rays.pool.draw(learning.batch, 0)
+        batch = learning.rays.draw(learning.batch, 0)
         order = rng.permutation(learning.batch)  # tensors do not put it in order
         trainer.train(Batch(batch.points[order], batch.labels[order]), rates)
 

@@ -6,11 +6,10 @@ from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.region import Region
 from triquad_map.evidence.belief import have_surface
 from triquad_map.evidence.growth import EvidenceSize, new_blocks, new_ends
-from triquad_map.evidence.live_evidence import LiveEvidence
 from triquad_map.field.frozen_field import field_samples
 
 from triquad_server.engine.field_record import field_from_record, region_record
-from triquad_server.engine.live_field import LiveField, initial_field
+from triquad_server.engine.live_field import initial_field
 from triquad_server.engine.trainer import Loss
 from triquad_server.epochs.epoch import FrozenRegion, buffers_of
 from triquad_server.intake.rays import ScanRays
@@ -18,56 +17,38 @@ from triquad_server.mapping.map_snapshot import RegionSnapshot
 from triquad_server.mapping.memory_budget import RegionSize
 from triquad_server.mapping.region_evidence import RegionEvidence, SeenScan
 from triquad_server.mapping.region_setup import RegionSetup
-from triquad_server.mapping.training.region_training import LEARNT_SCANS, RegionTraining
+from triquad_server.mapping.region_training import LEARNT_SCANS, RegionTraining
 
 
 class LiveRegion:
     """A region that is being mapped, by one thread. Everything public is in the map frame."""
 
     def __init__(
-        self,
-        index: RegionIndex,
-        setup: RegionSetup,
-        field: LiveField,
-        evidence: RegionEvidence,
-        training: RegionTraining,
+        self, index: RegionIndex, setup: RegionSetup, record: Region | None = None
     ) -> None:
-        """Put a region together; :meth:`unseen` and :meth:`restored` make its parts."""
+        """Restore a region, or make one of which nothing is known yet.
+
+        Of a record without training state there is nothing to train on.
+        """
+        seen, state = (None, None) if record is None else (record.evidence, record.training)
+        field_seed, seed = setup.seeds(index)
         self.index = index
         self.centre = setup.field.region_centre(index)
-        self.field = field
-        self.evidence = evidence
-        self.training = training
+        self.field = (
+            initial_field(setup.field, setup.memory, field_seed)
+            if record is None
+            else field_from_record(record, setup.field, setup.memory, field_seed)
+        )
+        self.evidence = RegionEvidence(setup, self.centre, seed, seen)
+        self.training = RegionTraining(self.field, setup, self.centre, seed, state)
         self._setup = setup
         self._published: FrozenRegion | None = None
         self.is_changed = True  # changed since it was published
 
-    @classmethod
-    def unseen(cls, index: RegionIndex, setup: RegionSetup) -> "LiveRegion":
-        """Make a region of which nothing is known yet."""
-        centre, (field_seed, seed) = setup.field.region_centre(index), setup.seeds(index)
-        field = initial_field(setup.field, setup.memory, field_seed)
-        evidence = RegionEvidence(LiveEvidence(1 << setup.field.depth), setup, centre, seed)
-        training = RegionTraining(field, setup, centre, seed)
-        return cls(index, setup, field, evidence, training)
-
-    @classmethod
-    def restored(cls, record: Region, setup: RegionSetup) -> "LiveRegion":
-        """Restore a region from its record; without training state there is nothing to train on."""
-        index = record.index
-        centre, (field_seed, seed) = setup.field.region_centre(index), setup.seeds(index)
-        field = field_from_record(record, setup.field, setup.memory, seed=field_seed)
-        evidence = RegionEvidence.restored(record.evidence, setup, centre, seed)
-        if record.training is None:
-            training = RegionTraining(field, setup, centre, seed)
-        else:
-            training = RegionTraining.restored(record.training, field, setup, centre, seed)
-        return cls(index, setup, field, evidence, training)
-
     @property
     def size(self) -> RegionSize:
         """Return the size of the region."""
-        return RegionSize(self.evidence.size, self.field.vertices)
+        return RegionSize(self.evidence.live.size, self.field.vertices)
 
     def new_voxels(self, rays: ScanRays) -> int:
         """Return in how many voxels rays would end for the first time."""

@@ -14,7 +14,7 @@ from triquad_server.intake.rays import ScanRays
 from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.memory_budget import NO_SIZE, MemoryBudget
 from triquad_server.mapping.region_setup import RegionSetup
-from triquad_server.mapping.training.training_budget import FairShare
+from triquad_server.mapping.training_budget import FairShare
 
 
 def regions_around(
@@ -90,7 +90,7 @@ class LiveRegions:
     def restore(self, records: Iterable[Region]) -> None:
         """Add the regions of a record; :meth:`share_out` sets what they may keep."""
         for record in records:
-            self._regions[record.index] = LiveRegion.restored(record, self._setup)
+            self._regions[record.index] = LiveRegion(record.index, self._setup, record)
 
     def reached_by(self, rays: ScanRays) -> list[LiveRegion]:
         """Return the regions that a scan enters; new ones belong to the map from now on.
@@ -108,8 +108,7 @@ class LiveRegions:
                 f"training.max_regions = {limit}",
             )
         reached = {
-            index: self._regions.get(index) or LiveRegion.unseen(index, self._setup)
-            for index in around
+            index: self._regions.get(index) or LiveRegion(index, self._setup) for index in around
         }
         self._check_memory(rays, list(reached.values()))
         self._regions.update(reached)

@@ -10,7 +10,6 @@ from triquad_format.records.region import Evidence
 from triquad_map.compiled.voxel_index import empty_keys, thin
 from triquad_map.evidence.carving import CLEAR_SHORT, FREE_SHORT, Reach
 from triquad_map.evidence.evidence import FrozenEvidence
-from triquad_map.evidence.growth import EvidenceSize
 from triquad_map.evidence.live_evidence import LiveEvidence
 from triquad_map.evidence.observed import Sighting, first_seen_since
 from triquad_map.evidence.ray_surfels import normals_at
@@ -48,9 +47,12 @@ class PublishedEvidence(NamedTuple):
 class RegionEvidence:
     """The evidence of one region, and how it was published last."""
 
-    def __init__(self, live: LiveEvidence, setup: RegionSetup, centre: Doubles, seed: int) -> None:
-        """Make the evidence; ``centre`` [3] is that of the region, map frame."""
-        self.live = live
+    def __init__(
+        self, setup: RegionSetup, centre: Doubles, seed: int, record: Evidence | None = None
+    ) -> None:
+        """Restore the evidence of a record, or begin; ``centre`` [3] is the region's, map frame."""
+        side = 1 << setup.field.depth
+        self.live = LiveEvidence(side) if record is None else LiveEvidence.from_record(side, record)
         self._setup = setup
         self._centre = centre
         self._random = np.random.default_rng(seed)
@@ -62,22 +64,8 @@ class RegionEvidence:
         self._fitted_to: int | None = None
         """The version of the field to which all surfels are fitted; None: some to earlier ones."""
 
-        self._is_restored = False  # and not yet published: only the field shows where surface lies
-
-    @classmethod
-    def restored(
-        cls, record: Evidence, setup: RegionSetup, centre: Doubles, seed: int
-    ) -> "RegionEvidence":
-        """Restore the evidence of a record."""
-        live = LiveEvidence.from_record(1 << setup.field.depth, record)
-        evidence = cls(live, setup, centre, seed)
-        evidence._is_restored = True
-        return evidence
-
-    @property
-    def size(self) -> EvidenceSize:
-        """Return the size of the evidence."""
-        return self.live.size
+        # Not yet published: only the field shows where surface lies.
+        self._is_restored = record is not None
 
     def voxels(self, points: Doubles) -> Doubles:
         """Return the voxel coordinates [N, 3] of points [N, 3], map frame."""

@@ -9,8 +9,8 @@ from triquad_format.records.replay_rays import HELD_OUT
 from triquad_map.field_fit import in_cube
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.progress import map_fit
-from triquad_server.mapping.replay.held_out import are_held_out, ends_in_steps
 from triquad_server.mapping.replay.ray_table import END
+from triquad_server.mapping.replay.replay_record import are_held_out
 
 FIELD = FieldSettings()
 
@@ -19,7 +19,9 @@ def test_one_ray_in_some_dozens_is_held_out_by_compiled_code_too() -> None:
     rows = np.random.default_rng(0).uniform(-900, 900, (100_000, 4)).astype(np.float32)
     held = are_held_out(rows, FIELD)
     assert held.mean() == pytest.approx(1 / HELD_OUT, rel=0.1)
-    assert (held == replay_rays.are_held_out(ends_in_steps(rows, FIELD))).all()
+    leaves = rows[:, END : END + 3].astype(np.float64) / FIELD.leaf_m + (1 << FIELD.depth)
+    ends = np.floor(leaves * replay_rays.STEPS).astype(np.int64)
+    assert (held == replay_rays.are_held_out(ends)).all()
 
 
 def test_rays_are_held_out_from_training_and_after_a_restart() -> None:

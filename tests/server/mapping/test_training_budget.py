@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from triquad_server.mapping.replay.kept_rays import RAY_BYTES
-from triquad_server.mapping.training.training_budget import FairShare, TrainingBudget
+from triquad_server.mapping.training_budget import FairShare, TrainingBudget
 from triquad_server.settings import TrainingSettings
 
 SETTINGS = TrainingSettings(samples_per_ray=10.0, fresh_share=0.5)

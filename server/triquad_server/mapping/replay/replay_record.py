@@ -1,4 +1,4 @@
-"""Converts the rays of a replay pool to their form in a record, and back.
+"""Converts kept rays to their form in a record, and back; which are held out follows from it.
 
 The file holds ends of rays more finely than any sensor measures, and the angle of incidence at
 the surface. Rounded ends take less room there, and angles implied by the ends around take none: so
@@ -6,8 +6,8 @@ there is room for more rays.
 """
 
 import numpy as np
-from triquad_format.records import morton
-from triquad_format.records.arrays import Bytes, Floats, Ints, Longs
+from triquad_format.records import morton, replay_rays
+from triquad_format.records.arrays import Bools, Bytes, Floats, Ints, Longs
 from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.replay_rays import SLOPE_SCALE, STEPS, ReplayRays
 from triquad_map.compiled.kernel import inner_kernel, kernel
@@ -16,8 +16,7 @@ from triquad_map.evidence.live_evidence import LiveEvidence
 from triquad_map.evidence.observed import Sighting
 from triquad_map.evidence.ray_surfels import normals_at
 
-from triquad_server.mapping.replay.held_out import end_in_steps, is_held_out
-from triquad_server.mapping.replay.ray_table import LEAST_SLOPE, VALUE, RayTable
+from triquad_server.mapping.replay.ray_table import END, LEAST_SLOPE, VALUE, RayTable
 
 _MOST_RAYS = 6_000_000  # this many fit into the parts of a single cube
 
@@ -30,6 +29,43 @@ of noise."""
 _ROUNDED_SLOPES = 8  # of SLOPE_SCALE
 
 _FAR = -1  # the code of what is no ray that ends in the cube
+
+
+@kernel(inline="always")
+def end_in_steps(row: Floats, leaf_m: float, corner: float) -> tuple[int, int, int]:
+    """Return where a ray of a table ends, as in
+    :class:`triquad_format.records.replay_rays.ReplayRays`; the cube's ``corner`` is that many
+    leaves away.
+    """
+    return (
+        np.int64(np.floor((np.float64(row[END]) / leaf_m + corner) * STEPS)),
+        np.int64(np.floor((np.float64(row[END + 1]) / leaf_m + corner) * STEPS)),
+        np.int64(np.floor((np.float64(row[END + 2]) / leaf_m + corner) * STEPS)),
+    )
+
+
+@inner_kernel()
+def is_held_out(x: int, y: int, z: int) -> bool:
+    """Return :func:`triquad_format.records.replay_rays.are_held_out` of one ray."""
+    key = np.uint64(0)
+    for step in (x, y, z):
+        key = key << np.uint64(replay_rays.AXIS_BITS) | np.uint64(step & replay_rays.AXIS_MASK)
+    held: bool = (key * replay_rays.MIXED) >> np.uint64(replay_rays.MIXED_SHIFT) == 0
+    return held
+
+
+@kernel()
+def _held_out(rows: Floats, leaf_m: float, corner: float) -> Bools:
+    held = np.empty(len(rows), np.bool_)
+    for i in range(len(rows)):
+        x, y, z = end_in_steps(rows[i], leaf_m, corner)
+        held[i] = is_held_out(x, y, z)
+    return held
+
+
+def are_held_out(rows: Floats, settings: FieldSettings) -> Bools:
+    """Return which rays are held out."""
+    return _held_out(rows, settings.leaf_m, float(1 << settings.depth))
 
 
 @inner_kernel()

@@ -18,8 +18,7 @@ from triquad_server.intake.rays import ScanRays
 from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.mapping.replay.ray_table import rays_through, samples_alone
 from triquad_server.mapping.replay.region_rays import RegionRays
-from triquad_server.mapping.training.slopes import Slopes
-from triquad_server.mapping.training.training_budget import FairShare, TrainingBudget
+from triquad_server.mapping.training_budget import FairShare, TrainingBudget
 
 _VERTICES_PER_SAMPLE = 14
 """The vertices for each sample of a step: each vertex takes about as many steps in any region. With
@@ -29,6 +28,11 @@ _LEAST_BATCH = 256  # steps of fewer samples take nearly as long
 
 _JUDGED_AFTER_SAMPLES = 8_000_000
 """A field is judged after this many samples, a few seconds, and once it has settled."""
+
+_SLOPES_EVERY_SAMPLES = 1 << 15  # samples after which the field is asked for slopes of rays
+_SLOPES_SHARE = 0.25
+"""The share of the samples that are rays without a normal, whose slope follows the field. Without
+any, a street at 16 beams settles at 0.74 cm instead of 0.60."""
 
 LEARNT_SCANS = 50
 """A surface is new for this many scans: a drive at 1 m a scan leaves it behind earlier."""
@@ -48,45 +52,32 @@ class RegionTraining:
         setup: RegionSetup,
         centre: Doubles,
         seed: int,
-        rays: RegionRays | None = None,
+        state: TrainingState | None = None,
     ) -> None:
-        """Begin with nothing to learn.
+        """Continue as recorded, or begin with nothing to learn.
 
         Args:
             field: what is trained.
             setup: what all regions have in common.
             centre: [3] of the region, map frame.
             seed: of all random choices.
-            rays: those that are kept already, if any.
+            state: that of a record, if any.
         """
         self._field = field
         self._setup = setup
         self._centre = centre
         self._random = np.random.default_rng([seed, 1])  # other numbers than those of the pool
-        self.rays = rays or RegionRays(setup, seed)
+        self.rays = RegionRays(setup, seed, state)
         self.budget = TrainingBudget(setup.training)
         self.fit: PlaceFits | None = None  # to the rays that are held out, as judged last
-        self._slopes = Slopes(field, self.rays.pool)
         self._trainer = trainer_of(field, setup.sums, setup.team)
         self._unjudged_samples = 0  # samples that were trained since it was judged
+        self._unasked_samples = 0  # samples that were trained since slopes were set by the field
         self._unlearnt: Longs = np.zeros(0, np.int64)  # keys of voxels whose surface was removed
         self._new_rays = 0  # that ended on new surface since the last scan that owed training
-
-    @classmethod
-    def restored(
-        cls,
-        state: TrainingState,
-        field: LiveField,
-        setup: RegionSetup,
-        centre: Doubles,
-        seed: int,
-    ) -> "RegionTraining":
-        """Continue as recorded."""
-        rays = RegionRays.restored(state, setup, seed)
-        training = cls(field, setup, centre, seed, rays)
-        training.budget.restore(state.budget_samples, len(rays.pool))
-        training._judge(field.freeze())
-        return training
+        if state is not None:
+            self.budget.restore(state.budget_samples, len(self.rays.pool))
+            self._judge(field.freeze())
 
     @property
     def is_settled(self) -> bool:
@@ -144,12 +135,15 @@ class RegionTraining:
 
     def take_step(self) -> tuple[Loss, int]:
         """Take one optimiser step; return loss and samples. On a GPU, reading the loss waits."""
-        pool = self.rays.pool
-        step = self.budget.next_step(self.batch, len(pool))
-        loss = self._trainer.train(pool.draw(step.samples, step.fresh), step.rates)
+        step = self.budget.next_step(self.batch, len(self.rays.pool))
+        loss = self._trainer.train(self.rays.draw(step.samples, step.fresh), step.rates)
         self.budget.spend(step)
         self._unjudged_samples += step.samples
-        self._slopes.after(step)
+        self._unasked_samples += step.samples
+        if self._unasked_samples >= _SLOPES_EVERY_SAMPLES:
+            count = int(_SLOPES_SHARE * self._unasked_samples)
+            self.rays.set_slopes(self._field, count, count * step.fresh // step.samples)
+            self._unasked_samples = 0
         return loss, step.samples
 
     def published(self, field: FrozenField, surfels: SurfelMap, removed: Longs) -> None:
@@ -188,7 +182,7 @@ class RegionTraining:
         surfels.find_nearest(points, nearest)
         offsets = settings.offsets(points).astype(np.float32)
         samples = samples_alone(offsets, nearest.distances * settings.leaf_m)
-        self.rays.pool.add(samples, fresh=False)
+        self.rays.pool.add(samples)
         self.budget.add_samples(int(training.samples_per_ray * len(points)))
 
     @property

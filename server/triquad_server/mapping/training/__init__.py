@@ -1,1 +1,0 @@
-"""Training: what regions still have to learn, where, and at which rates."""
