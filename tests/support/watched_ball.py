@@ -8,8 +8,11 @@ from triquad_server.settings import MeshSettings
 SETTINGS = servers.SMALL.model_copy(update={"mesh": MeshSettings(tile_cells=16, tolerance_m=0.1)})
 
 
-def digests(watch: MeshWatch | AsyncMeshWatch) -> dict[tuple[int, int, int], str]:
-    return {index: tile.digest for index, tile in watch.tiles.items()}
+def digests(watch: MeshWatch | AsyncMeshWatch) -> dict[tuple[int, int, int], int]:
+    return {
+        index: hash((tile.vertices.tobytes(), tile.faces.tobytes()))
+        for index, tile in watch.tiles.items()
+    }
 
 
 def agree(*watches: MeshWatch) -> bool:

@@ -93,7 +93,7 @@ def test_what_lies_near_a_flat_ground_has_most_of_the_colours() -> None:
     assert "4" in even.scale.html
     for colours, least in (even, 0.0), (stretched, 2.0 * 1.5 / 8.5):
         scale, tile = colours.scale, MeshTile(
-            (0, 0, 0), 1, "", 0, np.zeros(3), np.float32([[0, 0, 0], [0, 0, 1.5], [0, 0, 8]]),
+            (0, 0, 0), 1, np.zeros(3), np.float32([[0, 0, 0], [0, 0, 1.5], [0, 0, 8]]),
             np.int32([[0, 1, 2]]),
         )  # fmt: skip
         places = (colours.values(tile) - scale.low) / (scale.high - scale.low)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,8 +34,6 @@ class MeshTile:
 
     index: TileIndex
     version: int  # epoch of which it is
-    digest: str  # SHA-256 of the bytes as they came, 64 hexadecimal digits
-    size_bytes: int  # as they came
     origin: NDArray[np.float64]  # [3] metres, map frame: the minimum corner
     vertices: NDArray[np.float32]  # [V, 3] metres, relative to the origin
     faces: NDArray[np.int32]  # [F, 3] counter-clockwise seen from free space
@@ -213,17 +209,15 @@ class FollowedMesh:
         """Return the tiles of a reply; errors as of :meth:`TileDecoder.decode`."""
         decoder = TileDecoder(self.max_bytes, sum(tile.nbytes for tile in self.tiles.values()))
         tiles: dict[TileIndex, MeshTile] = {}
-        decoded = decoder.decode(reply.sizes, reply.data)
-        rows = zip(decoded, asked.tiles.tolist(), reply.versions.tolist(), strict=True)
-        for tile, (x, y, z), version in rows:
+        surfaces = decoder.decode(reply.sizes, reply.data)
+        rows = zip(surfaces, asked.tiles.tolist(), reply.versions.tolist(), strict=True)
+        for surface, (x, y, z), version in rows:
             tiles[x, y, z] = MeshTile(
                 index=(x, y, z),
                 version=version,
-                digest=hashlib.sha256(tile.data).hexdigest(),
-                size_bytes=len(tile.data),
                 origin=self.served.origin + np.array((x, y, z)) * self.served.tile_side_m,
-                vertices=tile.surface.positions(self.served.cell_m),
-                faces=tile.surface.faces,
+                vertices=surface.positions(self.served.cell_m),
+                faces=surface.faces,
             )
         return tiles
 
@@ -245,13 +239,6 @@ class FollowedMesh:
         return KnownTiles(served.server, self.level, served.tile_side_m, tiles, served.origin)
 
 
-class DecodedTile(NamedTuple):
-    """A tile, and what it was decoded from."""
-
-    data: bytes
-    surface: TileSurface
-
-
 class TileDecoder:
     """Decodes tiles, which take a given memory and no more, in however many replies they come."""
 
@@ -260,7 +247,7 @@ class TileDecoder:
         self._max_bytes = max_bytes
         self._taken = kept_bytes
 
-    def decode(self, sizes: Longs, data: bytes) -> Iterator[DecodedTile]:
+    def decode(self, sizes: Longs, data: bytes) -> Iterator[TileSurface]:
         """Yield tiles whose ``sizes`` [T] in bytes add up to ``data``, one after the other.
 
         Raises:
@@ -276,6 +263,6 @@ class TileDecoder:
                         f"the mesh takes more than {self._max_bytes} bytes: ask for a smaller box "
                         "or a coarser level, or connect with a larger max_download_bytes"
                     )
-                yield DecodedTile(part, decode_tile(part))
+                yield decode_tile(part)
             except WireError as error:
                 raise BadReplyError(f"a tile of the reply: {error}") from error

@@ -66,7 +66,7 @@ def _decoded(
     """Yield the meshes of the tiles [T, 3] that were asked for, maybe ``filled``."""
     if filled != (reply.filled is not None):
         raise BadReplyError("filled: it came unasked, or did not come although it was asked for")
-    surfaces = [tile.surface for tile in decoder.decode(reply.sizes, reply.data)]
+    surfaces = list(decoder.decode(reply.sizes, reply.data))
     marks = _marks(reply, [len(surface.faces) for surface in surfaces])
     for index, surface, mark in zip(tiles.tolist(), surfaces, marks, strict=True):
         corner = np.array(index) * reply.tile_side_m

@@ -139,7 +139,7 @@ def test_a_watch_of_a_box_has_the_tiles_that_meet_it(learnt: Client) -> None:
 def test_a_cap_makes_replies_small_and_rare(learnt: Client) -> None:
     with learnt.watch_mesh() as free, learnt.watch_mesh(max_bytes_per_s=20_000) as capped:
         free.catch_up()
-        largest = max(tile.size_bytes for tile in free.tiles.values())
+        largest = max(tile.nbytes for tile in free.tiles.values())
         started, sizes = time.monotonic(), []
         while not capped.complete:
             update = capped.next(servers.WAIT_S)

@@ -115,7 +115,7 @@ class FileSource:
         origin = self._tiles[level].origin + np.array(index) * self.sizes.side_of(level)
         vertices = (mesh.vertices - origin).astype(np.float32)
         return MeshTile(
-            index, self.queries.epoch, "", 0, origin=origin, vertices=vertices, faces=mesh.faces
+            index, self.queries.epoch, origin=origin, vertices=vertices, faces=mesh.faces
         )
 
 
