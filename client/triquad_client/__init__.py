@@ -47,7 +47,7 @@ from triquad_client.calls.queries import MapQueries, PinnedMap
 from triquad_client.calls.scans import FlushReport
 from triquad_client.checks import Bounds
 from triquad_client.client import Client, connect
-from triquad_client.depth_image import Intrinsics, depth_points
+from triquad_client.depth_image import Intrinsics, depth_points, empty_returns
 from triquad_client.errors import (
     BadReplyError,
     ClosedError,
@@ -64,7 +64,6 @@ from triquad_client.mesh.mesh import Mesh
 from triquad_client.mesh.mesh_watch import MeshWatch
 from triquad_client.offline.offline_map import OfflineMap, open_map
 from triquad_client.offline.synced_map import SyncedMap, SyncReport
-from triquad_client.organised_cloud import empty_returns
 from triquad_client.pose import Pose, PoseLike
 
 __all__ = [

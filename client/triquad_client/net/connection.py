@@ -222,7 +222,7 @@ class Connection(Answering):
     def _no_reply_error(self, request: Request[Any]) -> Exception:
         """Return the error for a request that got no reply at all."""
         if self.is_closed:
-            return closed_error()
+            return ClosedError("the client is closed")
         available = self.maps()
         info = self._session.info  # last: where a server is killed, its map may go before the link
         if not (info.routers_zid() or info.peers_zid()):
@@ -246,13 +246,8 @@ class Connection(Answering):
 
     def _broken(self, error: Exception) -> Exception:
         if self.is_closed:
-            return closed_error()
+            return ClosedError("the client is closed")
         return ConnectError(f"the connection is broken: {error}")
-
-
-def closed_error() -> ClosedError:
-    """Return the error for what is asked of a closed client."""
-    return ClosedError("the client is closed")
 
 
 def new_ticket() -> int:

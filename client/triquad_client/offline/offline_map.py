@@ -1,31 +1,79 @@
-"""A map file that answers as a server does, without one."""
+"""A map in memory, such as one of a file, that answers as a server does, without one."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from numpy.typing import ArrayLike
+from triquad_format.errors import RefusedError
 from triquad_format.mapfile.checkpoint_folder import checkpoint_files, map_folder
 from triquad_format.mapfile.reader import read_map_file
 from triquad_format.records.arrays import Bools, Doubles
 from triquad_format.records.region import MapRecord, surface_voxels
+from triquad_format.wire.codec import Request, asked_from
 from triquad_format.wire.limits import MAX_FILL_M
+from triquad_map.opening import open_view
+from triquad_map.questions.answers import Answers
+from triquad_map.view import MapView
 
 from triquad_client import checks
 from triquad_client.calls.queries import MapQueries
 from triquad_client.checks import Bounds
-from triquad_client.errors import brief, brief_errors
+from triquad_client.errors import ClosedError, brief, brief_errors
 from triquad_client.mesh.mesh import Mesh
-from triquad_client.offline.local_map import LocalMap
+from triquad_client.net.connection import Answering, ReplyT
 
 if TYPE_CHECKING:
+    from triquad_map.composition.composed_view import RecordedView
+
     from triquad_client.offline.map_mesh import MapTiles, Report
 
 CELL_RANGE_M = (0.005, 10.0)
 _CELL_LEAVES = 0.5
 REACH_LEAVES = 0.1  # how far from a voxel with seen surface the middle of a face may lie
+
+
+class LocalMap(Answering):
+    """Answers requests about the map in a record, as fast as possible here; for several threads."""
+
+    def __init__(self, record: MapRecord, *, local: bool = False) -> None:
+        self._opened: RecordedView | None = open_view(record)
+        self._answers = Answers(self._epoch)
+        self.origin = record.origin * (not local)
+        """[3] from where the map counts, in the coordinates of requests: 0 if those are local."""
+
+    @property
+    def view(self) -> RecordedView:
+        """The map.
+
+        Raises:
+            ClosedError: it was closed.
+        """
+        if self._opened is None:
+            raise ClosedError("the map is closed")
+        return self._opened
+
+    def close(self) -> None:
+        """Release the map; what is asked later raises :class:`ClosedError`."""
+        opened, self._opened = self._opened, None
+        if opened is not None:
+            opened.close()
+
+    def replies(self, requests: Iterable[Request[ReplyT]]) -> Iterator[ReplyT]:
+        """Yield the reply to each request, one after the other."""
+        return (asked_from(self.origin, self._answers.answer, request) for request in requests)
+
+    @contextmanager
+    def _epoch(self, number: int) -> Iterator[MapView]:
+        """Yield the view, where its epoch is asked for, or the newest."""
+        view = self.view
+        if number not in (0, view.epoch):
+            raise RefusedError("epoch_gone", f"epoch {number} is not kept; kept is [{view.epoch}]")
+        yield view
 
 
 @brief_errors

@@ -24,7 +24,7 @@ from triquad_client.calls.queries import MapQueries
 from triquad_client.checks import Bounds
 from triquad_client.errors import DownloadError, EmptierMapError, brief_errors
 from triquad_client.net.connection import Connection, retried
-from triquad_client.offline.local_map import LocalMap
+from triquad_client.offline.offline_map import LocalMap
 
 _EMPTIER_SHARE = 0.5
 """A map that knows less than this of what the copy knows was lost. A server that goes on from its
