@@ -98,7 +98,7 @@ class ServerMetrics(Message):
     bounds_s: Annotated[Seconds, within(0)]
     operations: dict[Name, OperationMetrics]  # by name, such as "query/sdf"
     queues: dict[Name, QueueMetrics]
-    sources: dict[Name, SourceMetrics]  # by name; "*" is of those there are too many of
+    sources: dict[Name, SourceMetrics]  # by name
     scan_bytes_received: Count
     resident_bytes: Count  # memory of the whole process
     mapper_s: dict[Name, Duration]  # how the mapper's thread spent its time, by activity

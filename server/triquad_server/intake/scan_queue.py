@@ -13,6 +13,7 @@ from triquad_format.wire import codec, keys
 from triquad_format.wire.limits import payload_limit
 from triquad_format.wire.messages import Scan
 
+from triquad_server.errors import ScanRefusedError
 from triquad_server.fair_queue import FairQueue, Owner
 from triquad_server.intake.rays import ScanRays
 from triquad_server.intake.source_ledger import SourceLedger
@@ -162,49 +163,50 @@ class ScanIntake:
         self._queue = queue
         self._arrived = arrived
         # Decoded in the network's own threads: who sends too much is slowed down, and no other.
-        receive = zenoh.handlers.Callback(self._receive_safely, indirect=False)
+        receive = zenoh.handlers.Callback(self._receive, indirect=False)
         self._subscriber = session.declare_subscriber(keys.all_scans_key(map_name), receive)
 
     def close(self) -> None:
         """Take no more scans."""
         self._subscriber.undeclare()
 
-    def _receive_safely(self, sample: zenoh.Sample) -> None:
-        """Do as :meth:`_receive`; an internal error must not stop the intake of other scans."""
-        self._queue.receive(len(sample.payload))
+    def _receive(self, sample: zenoh.Sample) -> None:
+        """Queue a scan; an internal error must not stop the intake of others."""
+        key, payload = str(sample.key_expr), sample.payload
+        self._queue.receive(len(payload))
         try:
-            self._receive(str(sample.key_expr), sample.payload)
+            self._queue.put(self._decoded(key, payload))
+        except ScanRefusedError as error:
+            self._drop(error.reason, key, error)
         except MemoryError as error:
-            self._drop("no_memory", str(sample.key_expr), error)
+            self._drop("no_memory", key, error)
         except Exception:
             self._queue.drop("internal")
-            _log.exception("a scan on %s could not be received", sample.key_expr)
+            _log.exception("a scan on %s could not be received", key)
         self._arrived()
 
-    def _receive(self, key: str, payload: zenoh.ZBytes) -> None:
+    def _decoded(self, key: str, payload: zenoh.ZBytes) -> Scan:
+        """Return the scan of a message that was published on a key.
+
+        Raises:
+            ScanRefusedError: it is none, or not that of the source that the key names.
+        """
         if len(payload) > self._max_bytes:
-            self._drop("too_large", key, f"{len(payload)} bytes exceed {self._max_bytes}")
-            return
+            text = f"{len(payload)} bytes exceed {self._max_bytes}"
+            raise ScanRefusedError("too_large", text)
         try:
             scan = codec.decode(Scan, payload.to_bytes())
         except ProtocolVersionError as error:
-            self._drop("bad_version", key, error)
+            raise ScanRefusedError("bad_version", str(error)) from error
         except WireError as error:
-            self._drop("decode", key, error)
-        else:
-            self._enter(key, scan)
-
-    def _enter(self, key: str, scan: Scan) -> None:
-        """Put a decoded scan into the queue, if it is accepted."""
+            raise ScanRefusedError("decode", str(error)) from error
         if key.rpartition("/")[2] != scan.source:
-            self._drop("key_source_mismatch", key, f"its source is {scan.source!r:.80}")
-            return
+            raise ScanRefusedError("key_source_mismatch", f"its source is {scan.source!r:.80}")
         try:
             keys.check_name("source", scan.source)
         except FormatError as error:
-            self._drop("bad_source", key, error)
-            return
-        self._queue.put(scan)
+            raise ScanRefusedError("bad_source", str(error)) from error
+        return scan
 
     def _drop(self, reason: str, key: str, cause: object) -> None:
         self._queue.drop(reason)

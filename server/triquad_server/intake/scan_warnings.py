@@ -53,12 +53,10 @@ class _Points:
 
 @dataclass
 class _Warning:
-    """A warning as it was last reported."""
+    """A warning as its cause was last met."""
 
     text: str
-    reported: int  # scans reported so far, where it is about scans
-    seen: int  # scans known so far
-    due_s: float  # monotonic: not again before
+    due_s: float  # monotonic: not logged again before
     pause_s: float
     met_s: float  # when its cause was last met
 
@@ -75,6 +73,7 @@ class ScanWarnings:
         self._now = now
         self._lock = threading.Lock()
         self._points: OrderedDict[str, _Points] = OrderedDict()
+        self._counted: dict[tuple[str, str], int] = {}  # scans so far, by source and cause
         # By source and cause, the newest last.
         self._warnings: OrderedDict[tuple[str, str], _Warning] = OrderedDict()
 
@@ -134,34 +133,32 @@ class ScanWarnings:
         return joined_lines(*texts[-_MAX_SHOWN:])
 
     def _check_scans(self) -> None:
-        ledger = self._scans.ledger
         thin_m, leaf_m = self._settings.scan.thin_m, self._settings.field.leaf_m
-        for source, counts in ledger.by_source().items():
-            self._count(
-                source,
-                "never arrived",
-                counts.never_arrived,
-                "of its scans never arrived: the link broke, or they were published before this "
-                "server started",
-            )
-            self._count(
-                source,
-                "lost",
-                counts.pushed_out,
-                f"of its scans were lost, since the server does not keep up: publish fewer, or "
-                f"fewer points a scan, or set a larger scan.thin_m (it is {thin_m:g}) or, for a "
-                f"new map, field.leaf_m (it is {leaf_m:g})",
-            )
-            text = f"of its scans were refused, the last since {counts.last_refusal}"
-            self._count(source, "refused", counts.refused, text)
-
-    def _count(self, source: str, cause: str, count: int, text: str) -> None:
-        """Warn of ``count`` scans so far, if they became more."""
-        before = self._warnings.get((source, cause))
-        reported, seen = (before.reported, before.seen) if before else (0, 0)
-        if count > reported:
-            met_s = self._now() if before is None or count > seen else before.met_s
-            self._warn(source, cause, f"{count - reported} {text}", scans=count, met_s=met_s)
+        before, self._counted = self._counted, {}
+        for source, counts in self._scans.ledger.by_source().items():
+            for cause, count, text in (
+                (
+                    "never arrived",
+                    counts.never_arrived,
+                    "of its scans never arrived: the link broke, or they were published before "
+                    "this server started",
+                ),
+                (
+                    "lost",
+                    counts.pushed_out,
+                    f"of its scans were lost, since the server does not keep up: publish fewer, or "
+                    f"fewer points a scan, or set a larger scan.thin_m (it is {thin_m:g}) or, for "
+                    f"a new map, field.leaf_m (it is {leaf_m:g})",
+                ),
+                (
+                    "refused",
+                    counts.refused,
+                    f"of its scans were refused, the last since {counts.last_refusal}",
+                ),
+            ):
+                self._counted[source, cause] = count
+                if count > before.get((source, cause), 0):
+                    self._warn(source, cause, f"{count} {text}")
 
     def _check_ranges(self, source: str, points: _Points) -> None:
         own = self._settings.sources.get(source, ANY_SOURCE)
@@ -204,9 +201,8 @@ class ScanWarnings:
     def _check_units(self, source: str, points: _Points) -> bool:
         """Return whether points or poses are not in metres, where all else would mislead."""
         range_m = float(np.median(points.sent_ranges_m))
-        if (
-            told := wrong_units(range_m, np.array([place for _, place in points.places]))
-        ) is not None:
+        told = wrong_units(range_m, np.array([place for _, place in points.places]))
+        if told is not None:
             self._warn(source, "units", told)
         return told is not None
 
@@ -222,25 +218,17 @@ class ScanWarnings:
                 "sensors scans of this name: stop one, or give each a source of its own",
             )
 
-    def _warn(
-        self, source: str, cause: str, text: str, *, scans: int = 0, met_s: float | None = None
-    ) -> None:
-        """Report a warning, unless it was reported not long ago.
-
-        Its cause was met at ``met_s``, or just now.
-        """
-        now, before = self._now(), self._warnings.get((source, cause))
-        met_s = now if met_s is None else met_s
-        if before is not None:
-            before.met_s, before.seen = met_s, scans
-            if now < before.due_s:
-                return
-        pause_s = _FIRST_PAUSE_S if before is None else min(2 * before.pause_s, _LONGEST_PAUSE_S)
+    def _warn(self, source: str, cause: str, text: str) -> None:
+        """Report that the cause of a warning was met just now; log it if it was not lately."""
+        now, key = self._now(), (source, cause)
         text = f"source {source!r}: {text}"
-        self._warnings[source, cause] = _Warning(
-            text, reported=scans, seen=scans, due_s=now + pause_s, pause_s=pause_s, met_s=met_s
-        )
-        self._warnings.move_to_end((source, cause))
+        before = self._warnings.get(key)
+        if before is not None and now < before.due_s:
+            before.met_s, before.text = now, text
+            return
+        pause_s = _FIRST_PAUSE_S if before is None else min(2 * before.pause_s, _LONGEST_PAUSE_S)
+        self._warnings[key] = _Warning(text, now + pause_s, pause_s, met_s=now)
+        self._warnings.move_to_end(key)
         if len(self._warnings) > _MAX_WARNINGS:
             self._warnings.popitem(last=False)
         _log.warning("%s", text)

@@ -12,9 +12,8 @@ from triquad_format.wire.messages import FlushReply, FlushRequest, Scan
 from triquad_format.wire.metrics_messages import SourceMetrics
 
 MAX_SESSIONS = 1024
-"""The number of publishers' sessions that are kept; the one heard of longest ago is removed."""
-
-MAX_SOURCES_LISTED = 64
+"""The number of publishers' sessions that are kept; the one heard of longest ago is removed, with
+its counts."""
 
 MAX_LEAP = 1_000_000
 """The most by which a sequence may lie above the last of its session: half a day of lost scans. One
@@ -23,9 +22,6 @@ that lies farther ahead is forged or corrupt, and must not make those that follo
 ARRIVAL_GRACE_S = 2.0
 """A scan that has not arrived this many seconds after the first flush request, which travels the
 same way behind it, is lost."""
-
-FORGOTTEN = "*"
-"""The name that stands for all forgotten sources where losses are listed."""
 
 _MAX_COUNT = 2**63 - 1
 
@@ -96,7 +92,6 @@ class SourceLedger:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._sessions: OrderedDict[tuple[str, int], _Session] = OrderedDict()
-        self._forgotten = ScanCounts(sessions=0)
 
     def arrive(self, scan: Scan) -> str | None:
         """Record a scan's arrival; return the reason if its sequence or stamp refuses it."""
@@ -203,22 +198,15 @@ class SourceLedger:
             for (source, _), session in reversed(self._sessions.items()):
                 known = found.get(source, ScanCounts(sessions=0))
                 found[source] = known.plus(session.counts)
-            if self._forgotten.lost:
-                found[FORGOTTEN] = self._forgotten
             return found
 
     def metrics(self) -> dict[str, SourceMetrics]:
-        """Return the scans of each source; of many, those heard of longest ago are merged."""
-        listed: dict[str, ScanCounts] = {}
-        for source, counts in self.by_source().items():
-            if source == FORGOTTEN:
-                continue
-            name = source if len(listed) < MAX_SOURCES_LISTED else FORGOTTEN
-            listed[name] = listed.get(name, ScanCounts(sessions=0)).plus(counts)
+        """Return the scans of each source, as far as its sessions are remembered."""
+        sources = self.by_source().items()
         now = time.monotonic()  # not before a scan that arrived meanwhile
         return {
             name: SourceMetrics(one.sessions, one.taken, one.refused, one.lost, now - one.heard_s)
-            for name, one in listed.items()
+            for name, one in sources
         }
 
     def _leave_queue(self, scan: Scan) -> _Session:
@@ -235,8 +223,7 @@ class SourceLedger:
         session = self._sessions.setdefault(key, _Session(counts))
         self._sessions.move_to_end(key)
         if len(self._sessions) > MAX_SESSIONS:
-            _, forgotten = self._sessions.popitem(last=False)
-            self._forgotten = self._forgotten.plus(forgotten.counts)
+            self._sessions.popitem(last=False)
         return session
 
 

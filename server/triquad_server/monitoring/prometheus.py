@@ -22,7 +22,7 @@ gauge     triquad_uptime_seconds               metrics.uptime_s                 
 gauge     triquad_sessions                     sessions.{kind}                                      Zenoh sessions that are connected, by kind: client, peer or router
 counter   triquad_scans_received_bytes_total   metrics.scan_bytes_received                          Bytes of scans that arrived over Zenoh
 counter   triquad_scans_dropped_total          status.scans_dropped.{reason}                        Scans that were refused, by reason
-counter   triquad_source_scans_total           metrics.sources.{source}.{outcome:taken+refused+lost} Scans of each source by outcome; beyond 64 sources, those silent for longest are together, as *
+counter   triquad_source_scans_total           metrics.sources.{source}.{outcome:taken+refused+lost} Scans of each source by outcome, of the 1024 publishers heard of last
 gauge     triquad_source_age_seconds           metrics.sources.{source}.age_s                       Time since a scan of each source arrived
 counter   triquad_points_dropped_total         status.points_dropped.{reason}                       Points and rays of taken scans that are not used, by reason
 histogram triquad_request_duration_seconds     operations.{operation}.answers                       Time of answered requests, from arrival until the reply was sent

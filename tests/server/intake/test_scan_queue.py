@@ -107,12 +107,12 @@ def test_sequences_out_of_range_or_order_are_refused_and_change_nothing():
     assert (reply.taken, reply.refused, reply.lost) == (1, 0, 4)
 
 
-def test_sessions_remembered_are_bounded_and_losses_are_not_forgotten(monkeypatch):
+def test_sessions_remembered_are_bounded(monkeypatch):
     monkeypatch.setattr(source_ledger, "MAX_SESSIONS", 3)
     ledger = SourceLedger()
     for session in range(10):
         ledger.arrive(servers.scan(1, session=session))
-    assert ledger.lost() == {"*": 7, "lidar": 3}
+    assert ledger.lost() == {"lidar": 3}
     assert not ledger.outcome("lidar", 0, 1).done
 
 
@@ -126,19 +126,18 @@ def test_losses_of_a_hostile_publisher_still_fit_a_message(monkeypatch):
     assert max(ledger.lost().values()) < 2**63
 
 
-def test_sources_that_are_listed_are_bounded_and_the_others_are_put_together(monkeypatch):
-    monkeypatch.setattr(source_ledger, "MAX_SOURCES_LISTED", 2)
+def test_the_sessions_of_a_source_are_counted_together():
     ledger = SourceLedger()
-    for session, source in enumerate(["old", "older", "front", "rear", "front"]):
+    for session, source in enumerate(["front", "rear", "front"]):
         scan = servers.scan(3, source=source, session=session)
         ledger.arrive(scan)
         ledger.take(scan)
     sources = ledger.metrics()
-    assert set(sources) == {"front", "rear", "*"}
-    front, others = sources["front"], sources["*"]
+    assert set(sources) == {"front", "rear"}
+    front, rear = sources["front"], sources["rear"]
     assert (front.sessions, front.taken, front.lost) == (2, 2, 6)
-    assert (others.sessions, others.taken, others.lost) == (2, 2, 6)
-    assert 0 <= front.age_s <= sources["rear"].age_s <= others.age_s
+    assert (rear.sessions, rear.taken, rear.lost) == (1, 1, 3)
+    assert 0 <= front.age_s <= rear.age_s
 
 
 def test_a_full_queue_pushes_out_the_oldest_scan_and_counts_it():

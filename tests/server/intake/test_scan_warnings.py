@@ -122,7 +122,7 @@ def test_what_is_near_for_the_leaf_is_told_with_a_leaf_and_a_preset_that_suit() 
     assert "--preset indoor, or field.leaf_m = 0.05" in text
 
 
-def test_lost_scans_are_told_once_in_a_while_with_those_since() -> None:
+def test_lost_scans_are_told_with_how_many_they_are_by_now() -> None:
     scans, clock = ScanQueue(2), Clock()
     warnings = ScanWarnings(scans, SETTINGS, clock)
     for sequence in range(5):
@@ -133,12 +133,12 @@ def test_lost_scans_are_told_once_in_a_while_with_those_since() -> None:
     assert "scan.thin_m (it is 0.05)" in first
     for sequence in range(5, 9):
         scans.put(servers.scan(sequence))
-    assert warnings.of("lidar") == first
-    clock.now_s += 31.0
     second = warnings.of("lidar")
     assert second is not None
-    assert second.startswith("source 'lidar': 4 of its scans were lost")
-    clock.now_s += 31.0  # a minute after the last was lost
+    assert second.startswith("source 'lidar': 7 of its scans were lost")
+    clock.now_s += 59.0
+    assert warnings.of("lidar") == second
+    clock.now_s += 2.0
     assert warnings.of("lidar") is None
 
 
