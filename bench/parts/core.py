@@ -11,7 +11,7 @@ import numpy as np
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.status import Status
 from triquad_map.mesh.tile_mesh import mesh_tile
-from triquad_server.engine.live_field import Batch, Rates
+from triquad_server.engine.live_field import Batch
 from triquad_server.engine.tensor_field import TensorField, tensors_of
 from triquad_server.engine.tensor_trainer import TensorTrainer
 from triquad_server.epochs.epoch import Epoch
@@ -47,7 +47,7 @@ def measure(options: argparse.Namespace) -> list[Figure]:
             mapper.train()
         epoch = mapper.publish()
         points = seen_points(epoch, made, np.random.default_rng(0))
-        region = max(mapper.regions, key=lambda region: region.field.parameters)
+        region = max(mapper.regions, key=lambda region: region.field.vertices)
         report(1, "training")
         figures = _training(region)
         report(2, "queries")
@@ -78,13 +78,12 @@ def seen_points(epoch: Epoch, made: DrivenStreet, rng: np.random.Generator) -> D
 def _training(region: LiveRegion) -> list[Figure]:
     learning = region.training
     trainer = TensorTrainer(region.field)
-    rates = Rates(_RATE)
     rng = np.random.default_rng(0)
 
     def baseline() -> None:
         batch = learning.rays.draw(learning.batch, 0)
         order = rng.permutation(learning.batch)  # tensors do not put it in order
-        trainer.train(Batch(batch.points[order], batch.labels[order]), rates)
+        trainer.train(Batch(batch.points[order], batch.labels[order]), _RATE)
 
     step = compare(region.take_step, baseline, _ROUNDS, repeats=15)
     return [

@@ -8,7 +8,11 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from typing import TYPE_CHECKING
 
+import zenoh
 from triquad_format.errors import SettingsError
+from triquad_format.records.region import MapRecord
+from triquad_format.wire import codec, keys
+from triquad_format.wire.messages import ErrorReply
 
 from triquad_server.launch_options import LaunchOptions
 from triquad_server.mapping.mapper import Mapper
@@ -18,10 +22,8 @@ from triquad_server.process.resources import allow_open_files, give_back_early
 from triquad_server.process.service_manager import ServiceManager
 from triquad_server.process.stop import Stop, Stops, wait_for_stop
 from triquad_server.process.threads import Teams
-from triquad_server.service import ServedMap, Service
-from triquad_server.serving.refusals import StartingNotice
+from triquad_server.service import Service
 from triquad_server.settings import Settings
-from triquad_server.store.restore import ValidCheckpoint
 from triquad_server.store.store import Store
 from triquad_server.warm_up import warm_up
 
@@ -122,8 +124,9 @@ def _open(options: LaunchOptions, stops: Stops, starting: Report, stack: ExitSta
             notice.stage = stage
             starting(stage)
 
-        served, settings = _restored_map(options, stops, begins, stack)
-        service = Service(session, served, settings, failed=stops.put)
+        store = _open_store(options, begins, stack)
+        mapper, settings = _restored_map(store, options, stops, begins, stack)
+        service = Service(session, mapper, settings, store, failed=stops.put)
         stack.enter_context(closing(service))
     if monitoring is not None:
         stack.enter_context(monitoring.showing(service.health))
@@ -133,14 +136,17 @@ def _open(options: LaunchOptions, stops: Stops, starting: Report, stack: ExitSta
 
 
 def _restored_map(
-    options: LaunchOptions, stops: Stops, starting: Report, stack: ExitStack
-) -> tuple[ServedMap, Settings]:
+    store: Store | None, options: LaunchOptions, stops: Stops, starting: Report, stack: ExitStack
+) -> tuple[Mapper, Settings]:
     """Return the map as its store has it, or an empty one, and the settings that hold for it."""
-    settings = options.settings
-    store = _open_store(options, starting, stack)
-    restored = None if store is None else _restored(store, options, starting)
-    if restored is not None:
-        settings = _settings_of(restored, settings)
+    settings, record = options.settings, None
+    if store is not None:
+        starting("restoring the newest checkpoint")
+        restored = store.newest()
+        if restored is not None:
+            record = restored.record
+            _log.info("restoring epoch %d from %s", record.epoch, restored.path)
+            settings = _settings_of(record, options)
     teams = stack.enter_context(closing(Teams()))
     warm_up(settings, options.device, teams, _before_each_step(stops, starting))
     starting("opening the map")
@@ -148,19 +154,12 @@ def _restored_map(
         options.map_name,
         settings,
         options.device,
-        record=restored.record if restored else None,
+        record=record,
         teams=teams,
     )
     if store is not None:
         store.log_scans(settings.field.leaf_m)
-    served = ServedMap(
-        name=options.map_name,
-        mapper=mapper,
-        device=options.device,
-        store=store,
-        teams=teams,
-    )
-    return served, settings
+    return mapper, settings
 
 
 def _open_monitoring(settings: Settings, stack: ExitStack) -> "MonitoringServer | None":
@@ -185,26 +184,15 @@ def _open_store(options: LaunchOptions, starting: Report, stack: ExitStack) -> S
     return store
 
 
-def _restored(store: Store, options: LaunchOptions, starting: Report) -> ValidCheckpoint | None:
-    """Return the checkpoint from which the map goes on, if there is one."""
-    starting("restoring the newest checkpoint")
-    restored = store.newest()
-    if restored is None:
-        return None
-    record = restored.record
-    _log.info("restoring epoch %d from %s", record.epoch, restored.path)
-    if record.name != options.map_name:
-        _log.warning("the checkpoint is of a map named '%s'", record.name)
-    return restored
-
-
-def _settings_of(restored: ValidCheckpoint, settings: Settings) -> Settings:
+def _settings_of(record: MapRecord, options: LaunchOptions) -> Settings:
     """Return the settings for a restored map, which keeps its own field.
 
     Raises:
         SettingsError: lengths that are given do not agree with it.
     """
-    record = restored.record
+    settings = options.settings
+    if record.name != options.map_name:
+        _log.warning("the checkpoint is of a map named '%s'", record.name)
     if record.settings == settings.field:
         return settings
     _log.warning("the restored map keeps its own [field] settings: %s", record.settings)
@@ -257,3 +245,24 @@ def _log_ready(options: LaunchOptions, network: Configuration, epoch: int) -> No
         options.device,
         options.store or "none",
     )
+
+
+class StartingNotice:
+    """Tells clients, until it is closed, that the server of a map is there but not ready."""
+
+    def __init__(self, session: zenoh.Session, map_name: str) -> None:
+        """Begin to refuse questions."""
+        self.stage = "it has just begun"
+        # Zenoh's own thread answers: the others may be compiling.
+        self._queryable = session.declare_queryable(
+            keys.all_queries_key(map_name), zenoh.handlers.Callback(self._refuse, indirect=False)
+        )
+
+    def close(self) -> None:
+        """Refuse no more."""
+        self._queryable.undeclare()
+
+    def _refuse(self, query: zenoh.Query) -> None:
+        reply = codec.encode(ErrorReply("starting", self.stage))
+        with query:
+            query.reply_err(reply, encoding=keys.encoding(ErrorReply))

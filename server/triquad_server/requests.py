@@ -1,5 +1,7 @@
 """The requests of clients: which part of the server answers each kind, and in which lane."""
 
+from functools import partial
+
 from triquad_format.wire.limits import MAX_KEYFRAMES, MAX_QUERY_POINTS, payload_limit
 from triquad_format.wire.mesh_messages import MeshRequest, TileChangesRequest, TileListRequest
 from triquad_format.wire.messages import (
@@ -20,7 +22,7 @@ from triquad_server.intake.source_trails import SourceTrails
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.mesh.tile_queries import TileQueries
 from triquad_server.server_status import Health
-from triquad_server.serving.lanes import Lane
+from triquad_server.serving.operations import Lane
 from triquad_server.store.download import MapDownloads
 from triquad_server.store.pose_corrector import PoseCorrector
 
@@ -47,11 +49,15 @@ def answer_requests(
     serve(TileChangesRequest, mesh.changes, Lane.MESH)
     serve(MeshRequest, mesh.mesh, Lane.MESH)
 
-    ledger, soon, warnings = parts.scans.ledger, parts.mapper.publish_soon, parts.warnings.of
     lane = Lane.ADMINISTRATION
+    flushed = partial(
+        parts.scans.ledger.answer,
+        publish_soon=parts.mapper.publish_soon,
+        warnings=parts.warnings.of,
+    )
     serve(StatusRequest, lambda _: parts.status(), lane)
     serve(MetricsRequest, lambda _: parts.metrics(), lane)
-    serve(FlushRequest, lambda request: ledger.answer(request, soon, warnings), lane)
+    serve(FlushRequest, flushed, lane)
 
     checkpoints = parts.checkpoints
     downloads = MapDownloads(parts.mapper, parts.epochs, parts.server)

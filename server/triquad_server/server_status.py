@@ -81,7 +81,7 @@ class Health:
             warnings=joined_lines(self.checkpoints.warning, self.warnings.all()),
             map_max_bytes=self.map_max_bytes,
             fit=progress.fit,
-            origin_m=self.mapper.origin,
+            origin_m=epoch.origin,
             **vars(progress.map),
         )
 
@@ -189,7 +189,7 @@ class Heartbeat:
                 self._health.mapper.wake()  # as a sign of life, even where there is nothing to do
                 self._health.warnings.check()
                 status = self._health.status()
-                self._publisher.put(codec.encode(moved(status, self._health.mapper.origin)))
+                self._publisher.put(codec.encode(moved(status, self._health.epochs.origin())))
             except MemoryError:
                 _log.error("the status could not be published: there is no memory")
                 continue

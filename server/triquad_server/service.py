@@ -3,7 +3,6 @@
 import secrets
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, field
 
 import zenoh
 from triquad_format.wire import keys
@@ -17,7 +16,6 @@ from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.process.stop import Stop
-from triquad_server.process.threads import Teams
 from triquad_server.requests import answer_requests
 from triquad_server.server_status import Health, Heartbeat
 from triquad_server.serving.operations import Operations
@@ -26,43 +24,42 @@ from triquad_server.store.checkpoint_writer import CheckpointWriter
 from triquad_server.store.store import Store
 
 
-@dataclass(frozen=True)
-class ServedMap:
-    """A map that is handed over to a service; nothing else may use it from then on."""
-
-    name: str
-    mapper: Mapper
-    device: str  # device of the mapper
-    store: Store | None = None  # store of its checkpoints
-    teams: Teams = field(default_factory=Teams)  # teams that make mesh tiles
-
-
 class Service:
     """Serves one map until it is closed; the caller closes session and store after it."""
 
     def __init__(
         self,
         session: zenoh.Session,
-        served: ServedMap,
+        mapper: Mapper,
         settings: Settings,
+        store: Store | None = None,
         failed: Callable[[Stop], None] = lambda _: None,
     ) -> None:
-        """Begin to serve; ``failed`` is called with the reason if an error ends mapping."""
+        """Begin to serve.
+
+        Args:
+            session: that clients reach.
+            mapper: the map; nothing else may use it from now on.
+            settings: of the service.
+            store: of its checkpoints; ``None``: they are not kept.
+            failed: called with the reason if an error ends mapping.
+        """
         self.session = session
-        self._served = served
+        self._map = mapper
+        self._store = store
         self._settings = settings
         self._scans = ScanQueue(settings.service.scan_queue)
-        self._operations = Operations(
-            session,
-            served.name,
-            settings.service,
-            give_way=self._scans.give_way,
-            origin=lambda: self._mapper.origin,
-        )
         self._warnings = ScanWarnings(self._scans, settings)
-        first = served.mapper.publish()
+        first = mapper.publish()
         self._epochs = EpochHistory(
             first, settings.service, older_bytes=settings.memory.epochs_bytes
+        )
+        self._operations = Operations(
+            session,
+            mapper.name,
+            settings.service,
+            give_way=self._scans.give_way,
+            origin=self._epochs.origin,
         )
         self._surface = SurfaceHistory(first, CHANGES_KEPT)
         self._name = secrets.token_hex(8)  # of this process
@@ -91,11 +88,11 @@ class Service:
         """Open the parts, in the reverse of the order in which they have to be closed."""
         self._parts.callback(self._operations.close)
         self._mapper = self._open_mapper(failed)
-        checkpoints = CheckpointWriter(self._mapper, self._served.store, self._settings.store)
+        checkpoints = CheckpointWriter(self._mapper, self._store, self._settings.store)
         self.health = health = Health(
-            map_name=self._served.name,
+            map_name=self._map.name,
             server=self._name,
-            device=self._served.device,
+            device=self._map.device,
             session=self.session,
             operations=self._operations,
             scans=self._scans,
@@ -105,7 +102,7 @@ class Service:
             checkpoints=checkpoints,
             map_max_bytes=self._settings.memory.max_bytes,
         )
-        tiles = TileCache(self._settings.mesh, self._served.teams.background)
+        tiles = TileCache(self._settings.mesh, self._map.teams.background)
         checkpoints.start()
         self._parts.callback(checkpoints.close)
         answer_requests(health, tiles, self._surface, self._trails)
@@ -123,9 +120,9 @@ class Service:
         self._parts.callback(self.session.liveliness().declare_token(alive).undeclare)
 
     def _open_mapper(self, failed: Callable[[Stop], None]) -> MapperThread:
-        warnings, trails, store = self._warnings, self._trails, self._served.store
+        warnings, trails, store = self._warnings, self._trails, self._store
         mapper = MapperThread(
-            self._served.mapper,
+            self._map,
             self._scans,
             self._epochs,
             self._settings.service.publish_period_s,
@@ -144,7 +141,7 @@ class Service:
     def _open_intake(self) -> None:
         intake = ScanIntake(
             self.session,
-            self._served.name,
+            self._map.name,
             self._scans,
             max_points=self._settings.scan.max_points,
             arrived=self._mapper.wake,

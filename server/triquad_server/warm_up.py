@@ -22,10 +22,10 @@ from triquad_map.compiled.kernel import CODE_FOLDER, count_compiled
 from triquad_map.field.frozen_field import field_samples
 from triquad_map.questions.distance import distances
 
+from triquad_server.engine.compiled_trainer import trainer_of
 from triquad_server.engine.gradient_sums import GradientSums
-from triquad_server.engine.live_field import Batch, Rates, initial_field
+from triquad_server.engine.live_field import Batch, initial_field
 from triquad_server.engine.memory import memory_on
-from triquad_server.engine.trainer import trainer_of
 from triquad_server.intake.rays import ScanRays
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mesh.tile_cache import TileCache
@@ -115,7 +115,7 @@ def _compile_field() -> None:
     field.grow(generator.integers(0, 1 << settings.depth, (_DIRECTIONS, 3)))
     points = generator.normal(size=(_DIRECTIONS, 3)).astype(np.float32)
     trainer = trainer_of(field, GradientSums(), teams.mapping)
-    trainer.train(Batch(points, points[:, 0]), Rates(0.01))
+    trainer.train(Batch(points, points[:, 0]), 0.01)
     field_samples(field.freeze(), settings, teams.mapping.split)(points.astype(float))
     field.live_view().evaluate_in_grid(points.T.copy(), np.zeros((1, 3), np.int64))
 

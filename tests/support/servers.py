@@ -20,7 +20,7 @@ from triquad_format.wire.messages import ErrorReply, FlushReply, FlushRequest, S
 from triquad_format.wire.zenoh_config import QUIET, put
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.network import NetworkOptions, configuration, open_session
-from triquad_server.service import ServedMap, Service
+from triquad_server.service import Service
 from triquad_server.settings import Settings
 from triquad_server.settings.loading import load_settings
 from triquad_server.store.restore import ValidCheckpoint
@@ -108,7 +108,7 @@ def running_service(
         opened.log_scans(settings.field.leaf_m)
     session = open_session(network)
     try:
-        with closing(Service(session, ServedMap(map_name, mapper, "cpu", opened), settings)):
+        with closing(Service(session, mapper, settings, opened)):
             yield endpoint
     finally:
         session.close()

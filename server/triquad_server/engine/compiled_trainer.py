@@ -12,11 +12,10 @@ Steps are counted row by row, so that the moments of a row that is new or seldom
 corrected for its own age. A row's learning rate falls with its age, too: what is learnt hardens.
 """
 
-from functools import lru_cache
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from triquad_format.records.arrays import Doubles, Floats, Ints
+from triquad_format.records.arrays import Floats, Ints
 from triquad_map.compiled.kernel import inner_kernel, kernel
 from triquad_map.compiled.lanes import prefetch_row
 from triquad_map.compiled.team import THREADS, Team, share
@@ -34,12 +33,26 @@ from triquad_map.field.field import (
 )
 
 from triquad_server.engine.gradient_sums import GradientSums, Touched
-from triquad_server.engine.live_field import LAST_AGE, Batch, LiveField, Parameter, Rates
+from triquad_server.engine.live_field import (
+    LAST_AGE,
+    MEAN_DECAY,
+    VARIANCE_DECAY,
+    Batch,
+    LiveField,
+    Parameter,
+    rate_share,
+)
+from triquad_server.engine.memory import Memory
+
+if TYPE_CHECKING:
+    from triquad_server.engine.tensor_trainer import TensorTrainer
+
+Loss = Any
+"""A number that a GPU may still be computing; reading it as a float waits for that."""
 
 EPSILON = 1e-10
 
-_NEGLIGIBLE = 1e-8
-_MAX_CORRECTED = 1 << 20
+_AGES = np.arange(1.0, LAST_AGE + 1)
 _AHEAD = 12  # rows that are fetched into the cache in advance
 
 
@@ -52,24 +65,15 @@ class ParameterRows(NamedTuple):
     steps: Ints  # [rows]
 
 
-class CompiledRates(NamedTuple):
-    """Rates with their corrections by age, in the form that kernels take."""
+class Rates(NamedTuple):
+    """The learning rate, and what it and the variance are to be multiplied by at each age."""
 
-    mean_decay: float
-    variance_decay: float
-    mean_scales: Floats
-    """[n] The correction of the mean after 1, 2, ... steps, times the learning rate; the last one
-    applies to more steps."""
+    learning_rate: float
+    mean_scales: Floats = (rate_share(_AGES) / (1 - MEAN_DECAY**_AGES)).astype(np.float32)
+    """[n] The share of the rate after 1, 2, ... steps, with the correction of the mean; the last
+    one applies to more steps."""
 
-    variance_scales: Floats  # [n] the same of the variance
-
-    @classmethod
-    def of(cls, rates: Rates) -> "CompiledRates":
-        """Return these rates at all ages."""
-        mean_decay, variance_decay = rates.mean_decay, rates.variance_decay
-        ages, mean_scales, variance_scales = _corrections(mean_decay, variance_decay)
-        learning_rates = rates.by_age(ages).astype(np.float32)
-        return cls(mean_decay, variance_decay, learning_rates * mean_scales, variance_scales)
+    variance_scales: Floats = (1 / (1 - VARIANCE_DECAY**_AGES)).astype(np.float32)  # [n]
 
 
 def _parameter_rows(parameter: Parameter) -> ParameterRows:
@@ -83,21 +87,8 @@ def _parameter_rows(parameter: Parameter) -> ParameterRows:
     )
 
 
-@lru_cache(maxsize=4)
-def _corrections(mean_decay: float, variance_decay: float) -> tuple[Doubles, Floats, Floats]:
-    """Return the ages, and the scales of mean and variance at each, until they no longer change."""
-    slowest = max(mean_decay, variance_decay)
-    count = min(_MAX_CORRECTED, 1 + int(np.log(_NEGLIGIBLE) / np.log(slowest)))
-    ages = np.arange(1.0, max(count, LAST_AGE) + 1)
-    return (
-        ages,
-        (1 / (1 - mean_decay**ages)).astype(np.float32),
-        (1 / (1 - variance_decay**ages)).astype(np.float32),
-    )
-
-
 @kernel(fastmath=True, inline="always")
-def _step_row(row: int, gradients: Floats, parameter: ParameterRows, rates: CompiledRates) -> None:
+def _step_row(row: int, gradients: Floats, parameter: ParameterRows, rates: Rates) -> None:
     """Take one step of a row along its gradient, and clear the gradient."""
     parameter.steps[row] += 1
     age = min(parameter.steps[row], len(rates.mean_scales)) - 1
@@ -107,8 +98,8 @@ def _step_row(row: int, gradients: Floats, parameter: ParameterRows, rates: Comp
         parameter.means,
         parameter.variances,
         row,
-        (np.float32(1 - rates.mean_decay), np.float32(1 - rates.variance_decay)),
-        (rates.mean_scales[age], rates.variance_scales[age]),
+        (np.float32(1 - MEAN_DECAY), np.float32(1 - VARIANCE_DECAY)),
+        (np.float32(rates.learning_rate) * rates.mean_scales[age], rates.variance_scales[age]),
         np.float32(EPSILON),
     )
 
@@ -121,7 +112,7 @@ def _step_touched(
     touched: tuple[Touched, ...],
     sums: tuple[Floats, ...],
     parameter: ParameterRows,
-    rates: CompiledRates,
+    rates: Rates,
 ) -> None:
     """Apply Adam to the ``count`` rows that the thread ``part`` touched, and clear their sums.
 
@@ -235,7 +226,7 @@ class CompiledTrainer:
         self._sums = sums
         self._team = team
 
-    def train(self, batch: Batch, rates: Rates) -> float:
+    def train(self, batch: Batch, rate: float) -> float:
         """Take one optimiser step; return the loss before it."""
         points = batch.points
         wanted = batch.labels / np.float32(self._field.settings.logit_scale_m)
@@ -261,13 +252,12 @@ class CompiledTrainer:
             )
 
         self._team.each(work)
-        self._step(counts, mlp_sums, rates)
+        self._step_mlp(mlp_sums, rate)
+        self._step_features(counts, rate)
         return sum(losses)
 
-    def _step(self, counts: list[int], mlp_sums: list[Mlp], rates: Rates) -> None:
-        """Apply Adam to the MLP and to the touched rows, ``counts`` of them by each thread."""
-        compiled = CompiledRates.of(rates)
-        self._step_mlp(mlp_sums, compiled)
+    def _step_features(self, counts: list[int], rate: float) -> None:
+        """Apply Adam to the touched rows, ``counts`` of them by each thread."""
         sums, features = self._sums, _parameter_rows(self._field.features)
 
         def work(part: int) -> None:
@@ -278,15 +268,25 @@ class CompiledTrainer:
                 sums.touched,
                 sums.features,
                 parameter=features,
-                rates=compiled,
+                rates=Rates(rate),
             )
 
         self._team.each(work)
 
-    def _step_mlp(self, sums: list[Mlp], rates: CompiledRates) -> None:
+    def _step_mlp(self, sums: list[Mlp], rate: float) -> None:
         """Apply Adam to the MLP, by the gradients of each thread."""
-        share = np.float32(self._field.next_mlp_share())
-        of_mlp = rates._replace(mean_scales=share * rates.mean_scales)
+        rates = Rates(self._field.next_mlp_share() * rate)
         for part, parameter in enumerate(self._field.mlp):
             gradient = np.sum([thread[part] for thread in sums], axis=0).reshape(1, -1)
-            _step_row(0, gradient, _parameter_rows(parameter), of_mlp)
+            _step_row(0, gradient, _parameter_rows(parameter), rates)
+
+
+def trainer_of(
+    field: LiveField, sums: GradientSums, team: Team
+) -> "CompiledTrainer | TensorTrainer":
+    """Return the trainer of a field; ``sums`` and ``team`` are for compiled code."""
+    if type(field.memory) is Memory:
+        return CompiledTrainer(field, sums, team)
+    from triquad_server.engine.tensor_trainer import TensorTrainer
+
+    return TensorTrainer(field)

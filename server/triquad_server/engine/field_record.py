@@ -18,9 +18,11 @@ def region_record(
     index: RegionIndex,
     field: LiveField | FrozenField,
     evidence: FrozenEvidence | LiveEvidence,
-    training: TrainingState | None,
 ) -> Region:
-    """Return a region as plain arrays that share nothing with ``field`` and ``evidence``."""
+    """Return a region as plain arrays that share nothing with ``field`` and ``evidence``.
+
+    It has no training state.
+    """
     arrays = field.arrays
     tables = []
     for plane in range(len(AXES)):
@@ -34,7 +36,7 @@ def region_record(
         mlp=Mlp(tuple(mlp[0::2]), tuple(mlp[1::2])),
         tables=tuple(tables),
         evidence=evidence.record(),
-        training=training,
+        training=None,
     )
 
 

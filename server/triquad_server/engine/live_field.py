@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from triquad_format.records.arrays import Floats, Ints, Longs
@@ -87,26 +86,19 @@ class Batch:
     labels: Rows  # [B] signed distances, metres
 
 
-class Rates(NamedTuple):
-    """The rates at which values and moments follow the gradients."""
-
-    learning_rate: float
-    mean_decay: float = 0.9  # beta1 of Adam, in [0, 1), as is the next
-    variance_decay: float = 0.99  # beta2
-
-    def by_age(self, ages: Rows) -> Rows:
-        """Return learning rates, shaped as ``ages``, of rows that took that many steps: one at
-        least.
-        """
-        return self.learning_rate * (_SOFT_STEPS / ages).clip(_HARDEST, 1)
-
-
 _SOFT_STEPS, _HARDEST = 800, 0.1
 """The steps for which a row of features learns at the full rate (after n times as many, at an n-th
 of it), and the least share of the rate. So learnt values move little where others are trained. Of
 the MLP, which all places of a region share, it is the square."""
 
 LAST_AGE = int(_SOFT_STEPS / _HARDEST)  # from here on, no rate falls any more
+
+MEAN_DECAY, VARIANCE_DECAY = 0.9, 0.99  # beta1 and beta2 of Adam
+
+
+def rate_share(ages: Rows) -> Rows:
+    """Return the share of the learning rate of rows that took ``ages`` steps, one at least."""
+    return (_SOFT_STEPS / ages).clip(_HARDEST, 1)
 
 
 class LiveField:
@@ -153,12 +145,6 @@ class LiveField:
     def vertices(self) -> int:
         """The number of vertices on all planes and levels."""
         return len(self.features) - 1
-
-    @property
-    def parameters(self) -> int:
-        """The number of learnable numbers."""
-        features = self.vertices * self.settings.feature_size
-        return int(features + sum(math.prod(part.values.shape) for part in self.mlp))
 
     @property
     def numbers(self) -> FieldNumbers:

@@ -1,6 +1,6 @@
 """The memory of the numbers of a field: arrays of this process, or tensors on a device."""
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -23,47 +23,31 @@ class FieldNumbers(NamedTuple):
     frequencies: Rows  # [m] of Fourier features, on coordinates normalised to [-1, 1]
 
 
-class Memory(Protocol):
-    """Makes and copies what the numbers of fields are in."""
+class Memory:
+    """Makes and copies what the numbers of fields are in: arrays, which compiled code trains."""
 
-    @property
-    def device(self) -> str:
-        """The device of the memory: ``cpu``, or another device of torch."""
+    device = "cpu"  # or another device of torch
 
     def put(self, array: Array) -> Rows:
-        """Return a copy of an array."""
-
-    def room(self, count: int, like: Rows) -> Rows:
-        """Return ``count`` rows shaped as those of ``like``, not initialised."""
-
-    def array(self, rows: Rows) -> Array:
-        """Return rows as an array, which may share memory with them."""
-
-
-class ArrayMemory:
-    """Keeps numbers in arrays, which compiled code trains."""
-
-    device = "cpu"
-
-    def put(self, array: Array) -> Array:
         """Return a copy of an array."""
         copied = _empty(array.shape, array.dtype)
         copied[...] = array
         return copied
 
-    def room(self, count: int, like: Array) -> Array:
+    def room(self, count: int, like: Rows) -> Rows:
         """Return ``count`` rows shaped as those of ``like``, not initialised."""
         return _empty((count, *like.shape[1:]), like.dtype)
 
-    def array(self, rows: Array) -> Array:
-        """Return the rows themselves."""
-        return rows
+    def array(self, rows: Rows) -> Array:
+        """Return rows as an array, which may share memory with them."""
+        array: Array = rows
+        return array
 
 
 def memory_on(device: str) -> Memory:
     """Return the memory of the fields that are trained on a device, ``cpu`` or another of torch."""
     if device == "cpu":
-        return ArrayMemory()
+        return Memory()
     from triquad_server.engine.tensor_field import TensorMemory  # its import takes 200 MB
 
     return TensorMemory(device)

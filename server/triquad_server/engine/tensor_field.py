@@ -25,7 +25,7 @@ from triquad_map.field.quadtree import (
 from triquad_map.surface import FieldValues
 
 from triquad_server.engine.live_field import LiveField
-from triquad_server.engine.memory import Array, FieldNumbers
+from triquad_server.engine.memory import Array, FieldNumbers, Memory
 
 _CHUNK = 131_072  # points that tensors are made for at a time
 
@@ -195,7 +195,7 @@ class TensorField:
         return FieldValues(value.cpu().numpy(), np.zeros((0, 3), np.float32))
 
 
-class TensorMemory:
+class TensorMemory(Memory):
     """Keeps numbers in tensors on one device."""
 
     def __init__(self, device: str) -> None:

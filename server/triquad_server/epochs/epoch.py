@@ -33,8 +33,6 @@ class FrozenRegion:
     engine: FrozenField
     evidence: FrozenEvidence
     surfels: SurfelMap
-    vertices: int
-    parameters: int
     changed: int  # epoch of its last change
     buffers: Buffers  # memory of this one; other epochs may share it
 
@@ -43,9 +41,20 @@ class FrozenRegion:
         """The field as it is shown while it is trained."""
         return ShownField(self.engine, self.surfels.planes)
 
+    @property
+    def vertices(self) -> int:
+        """The number of quadtree vertices, on all planes and levels."""
+        return len(self.engine.arrays.features) - 1  # the first row is of absent vertices
+
+    @property
+    def parameters(self) -> int:
+        """The number of learnable numbers."""
+        features, mlp, _ = self.engine.arrays
+        return int(features[1:].size + sum(part.size for part in mlp))
+
     def record(self) -> Region:
         """Return the region as a map file holds it, without training state."""
-        return region_record(self.index, self.engine, self.evidence, training=None)
+        return region_record(self.index, self.engine, self.evidence)
 
 
 class Epoch(ComposedView):
@@ -64,23 +73,23 @@ class Epoch(ComposedView):
         """Make an epoch of the map called ``name``; ``split`` runs the work of its answers.
 
         ``progress`` is how far the map had come; ``None``: it was just begun. ``origin`` [3] is
-        from where it counts, in the user's coordinates.
+        from where it counts, in the user's coordinates: 0 0 0 until the first scan chooses it,
+        from then on another object, the same in all epochs.
         """
         super().__init__(number, settings, regions, split=split)
         self.number = number
         self.field_settings = settings
         self.frozen_regions = regions
         self.progress = progress or MapProgress()
-        x, y, z = origin.tolist()
-        self.origin_m = x, y, z
+        self.origin = origin
         self._name = name
 
-    def with_split(self, split: Split = in_one) -> ComposedView:
-        """Return the same map, whose answers ``split`` runs: by default, the caller's thread alone.
+    def in_one_thread(self) -> ComposedView:
+        """Return the same map, whose answers the caller's thread finds alone.
 
         It is for callers that give way to queries, which have threads of their own.
         """
-        return ComposedView(self.number, self.field_settings, self.frozen_regions, split=split)
+        return ComposedView(self.number, self.field_settings, self.frozen_regions, split=in_one)
 
     @property
     def regions(self) -> int:
@@ -109,8 +118,9 @@ class Epoch(ComposedView):
         """
         if regions is None:
             regions = tuple(region.record() for region in self.frozen_regions)
+        x, y, z = self.origin.tolist()
         return MapRecord(
-            self._name, self.number, self.field_settings, regions, self.progress, self.origin_m
+            self._name, self.number, self.field_settings, regions, self.progress, (x, y, z)
         )
 
 

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from typing import NamedTuple
 
 from triquad_format.errors import RefusedError
+from triquad_format.records.arrays import Doubles
 
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.settings import MemorySettings, ServiceSettings
@@ -83,6 +84,10 @@ class EpochHistory:
             epochs = tuple(self._epochs.values())
             age_s = self._clock() - self._published_s
         return KeptEpochs(epochs, max(0, len(epochs) - self._settings.epochs_kept), age_s)
+
+    def origin(self) -> Doubles:
+        """Return from where the map counts: see :class:`Epoch`."""
+        return self.newest.origin
 
     def get(self, number: int) -> Epoch:
         """Return the epoch of that number, or the newest for 0.

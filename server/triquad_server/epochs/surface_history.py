@@ -3,7 +3,6 @@
 import threading
 from collections import deque
 from dataclasses import dataclass
-from itertools import takewhile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,22 +29,13 @@ _LONGEST_VOXELS = 32  # 6.4 m with the default leaf
 class VoxelChanges:
     """The voxels in which surface appeared or vanished."""
 
-    voxels: Longs  # [N, 3] of the map's lattice: a voxel ``v`` reaches from v to v + 1 leaves
+    voxels: Ints  # [N, 3] of the map's lattice: a voxel ``v`` reaches from v to v + 1 leaves
     appeared: Bools  # [N] else it vanished
     epochs: Longs  # [N] of the newest change of each
 
-    def part(self, chosen: Bools) -> "VoxelChanges":
-        """Return the voxels that are ``chosen`` [N]."""
+    def part(self, chosen: Bools | Longs) -> "VoxelChanges":
+        """Return the voxels that are ``chosen``: [N] of all, or their rows."""
         return VoxelChanges(self.voxels[chosen], self.appeared[chosen], self.epochs[chosen])
-
-
-@dataclass(frozen=True)
-class _EpochChanges:
-    """The changes of one epoch from the one before."""
-
-    epoch: int
-    voxels: Ints  # [N, 3]
-    appeared: Bools  # [N]
 
 
 @dataclass(frozen=True)
@@ -79,10 +69,10 @@ class _Surface:
 
 
 CHANGES_KEPT = 1_000_000
-"""The number of changes of voxels' surface that are kept, for clients that request them: 13 bytes
+"""The number of changes of voxels' surface that are kept, for clients that request them: 21 bytes
 each."""
 
-_NO_VOXELS = np.zeros((0, 3), np.int32)
+_NO_CHANGES = VoxelChanges(np.zeros((0, 3), np.int32), np.zeros(0, np.bool_), np.zeros(0, np.int64))
 
 
 class SurfaceHistory:
@@ -97,7 +87,7 @@ class SurfaceHistory:
         self._limit = limit
         self._lock = threading.Lock()
         self._oldest = first.number  # changes after it are known
-        self._changes: deque[_EpochChanges] = deque()  # oldest first, none of them empty
+        self._changes: deque[VoxelChanges] = deque()  # by epoch, the oldest first; none is empty
         self._voxels = 0  # of all changes
 
     def add(self, epoch: Epoch) -> None:
@@ -111,7 +101,7 @@ class SurfaceHistory:
             while self._voxels > self._limit:
                 forgotten = self._changes.popleft()
                 self._voxels -= len(forgotten.voxels)
-                self._oldest = forgotten.epoch
+                self._oldest = int(forgotten.epochs[0])
 
     def between(self, since: int, until: int) -> VoxelChanges:
         """Return what differs between the epochs ``since`` and ``until``.
@@ -130,37 +120,37 @@ class SurfaceHistory:
                 f"oldest to ask from is {oldest}; ask for the map again, then for changes since "
                 f"its epoch",
             )
-        newest_first = reversed([changes for changes in kept if changes.epoch <= until])
-        return _net(list(takewhile(lambda changes: changes.epoch > since, newest_first)))
+        return _net([one for one in reversed(kept) if since < one.epochs[0] <= until])
 
 
-def _net(changes: list[_EpochChanges]) -> VoxelChanges:
+def _net(changes: list[VoxelChanges]) -> VoxelChanges:
     """Return the net changes, given the newest first: a voxel's alternate, so pairs cancel."""
-    voxels = np.concatenate([_NO_VOXELS, *(one.voxels for one in changes)]).astype(np.int64)
-    appeared = np.concatenate([np.zeros(0, np.bool_), *(one.appeared for one in changes)])
-    numbers = np.array([one.epoch for one in changes], np.int64)
-    epochs = np.repeat(numbers, np.array([len(one.voxels) for one in changes], np.int64))
-    first, number = same_cells(voxels)
-    balance = np.bincount(number, np.where(appeared, 1, -1), minlength=len(first))
-    rows = first[balance != 0]
-    return VoxelChanges(voxels[rows], appeared[rows], epochs[rows])
+    every = _joined(changes)
+    first, number = same_cells(every.voxels.astype(np.int64))
+    balance = np.bincount(number, np.where(every.appeared, 1, -1), minlength=len(first))
+    return every.part(first[balance != 0])
 
 
-def _changes(before: Epoch, now: Epoch) -> _EpochChanges:
+def _joined(changes: list[VoxelChanges]) -> VoxelChanges:
+    columns = zip(*(vars(one).values() for one in (_NO_CHANGES, *changes)), strict=True)
+    return VoxelChanges(*map(np.concatenate, columns))
+
+
+def _changes(before: Epoch, now: Epoch) -> VoxelChanges:
     """Return how ``now`` differs from ``before``."""
     old = {region.index: region for region in before.frozen_regions}
     new = {region.index: region for region in now.frozen_regions}
-    voxels, appeared = [_NO_VOXELS], [np.zeros(0, np.bool_)]
+    found = []
     for index in old | new:
         one, other = old.get(index), new.get(index)
         if one and other and one.evidence is other.evidence:
             continue
         was, has = _Surface.of(one), _Surface.of(other)
         for changed, is_new in ((has.without(was), True), (was.without(has), False)):
-            found = _map_voxels(index, changed, now.field_settings)
-            voxels.append(found)
-            appeared.append(np.full(len(found), is_new))
-    return _EpochChanges(now.number, np.concatenate(voxels), np.concatenate(appeared))
+            voxels = _map_voxels(index, changed, now.field_settings)
+            epochs = np.full(len(voxels), now.number)
+            found.append(VoxelChanges(voxels, np.full(len(voxels), is_new), epochs))
+    return _joined(found)
 
 
 def _differing_rows(one: Bytes, other: Bytes) -> NDArray[np.intp]:
@@ -230,7 +220,10 @@ def _boxes_around(kinds: list[VoxelChanges]) -> list[Boxes]:
     """Return boxes, few enough, around the voxels of each kind."""
     scale = 1
     while True:
-        boxes = [tight_boxes(kind.voxels, _LONGEST_VOXELS, scale=scale) for kind in kinds]
+        boxes = [
+            tight_boxes(kind.voxels.astype(np.int64), _LONGEST_VOXELS, scale=scale)
+            for kind in kinds
+        ]
         if sum(len(one.low) for one in boxes) <= MAX_BOXES:
             return boxes
         scale *= 2

@@ -1,23 +1,63 @@
 """One region of the live map: its field, its evidence and its training."""
 
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
 import numpy as np
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.field_settings import RegionIndex
-from triquad_format.records.region import Region
+from triquad_format.records.region import Region, TrainingState
 from triquad_map.evidence.belief import have_surface
 from triquad_map.evidence.growth import EvidenceSize, new_blocks, new_ends
 from triquad_map.field.frozen_field import field_samples
 
+from triquad_server.engine.compiled_trainer import Loss
 from triquad_server.engine.field_record import field_from_record, region_record
 from triquad_server.engine.live_field import initial_field
-from triquad_server.engine.trainer import Loss
 from triquad_server.epochs.epoch import FrozenRegion, buffers_of
 from triquad_server.intake.rays import ScanRays
-from triquad_server.mapping.map_snapshot import RegionSnapshot
-from triquad_server.mapping.memory_budget import RegionSize
 from triquad_server.mapping.region_evidence import RegionEvidence, SeenScan
 from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.mapping.region_training import LEARNT_SCANS, RegionTraining
+from triquad_server.mapping.replay.ray_table import RayTable, draw_ordered_samples
+from triquad_server.mapping.replay.replay_record import recorded_rays
+
+
+class RegionSize(NamedTuple):
+    """The size of what a region holds, or would hold in addition."""
+
+    evidence: EvidenceSize
+    vertices: int  # of its quadtrees
+
+
+@dataclass(frozen=True)
+class RegionSnapshot:
+    """A copy of what a record needs of a region.
+
+    Finding the rays that a file holds, and their order, takes ten times as long as copying them.
+    """
+
+    region: Region  # without a training state
+    training: TrainingState  # without rays and samples
+    table: RayTable  # all kept rays: those to train on, then those that are held out
+    trained: int  # how many are to train on
+    setup: RegionSetup
+
+    def record(self) -> Region:
+        """Return the region with all of its training state as plain arrays."""
+        setup = self.setup
+        rays, others = recorded_rays(self.table, setup.field)
+        others = others[others < self.trained]  # samples are for training
+        rng = np.random.default_rng(len(others))
+        # In place of what is no ray that ends in the cube.
+        samples = draw_ordered_samples(self.table, others, setup.placement, rng, setup.team)
+        training = replace(
+            self.training,
+            rays=rays,
+            sample_points=samples.points,
+            sample_labels=samples.labels.astype(np.float16),
+        )
+        return replace(self.region, training=training)
 
 
 class LiveRegion:
@@ -113,8 +153,6 @@ class LiveRegion:
             engine=field,
             evidence=evidence,
             surfels=surfels,
-            vertices=self.field.vertices,
-            parameters=self.field.parameters,
             changed=epoch,
             buffers=buffers_of((field, evidence, surfels)),
         )
@@ -125,7 +163,7 @@ class LiveRegion:
         """Return a copy of the region as it is now."""
         live = self.evidence.live
         return RegionSnapshot(
-            region=region_record(self.index, self.field, live, training=None),
+            region=region_record(self.index, self.field, live),
             training=self.training.state(),
             table=self.training.rays.table,
             trained=len(self.training.rays.pool),

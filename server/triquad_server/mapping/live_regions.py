@@ -3,18 +3,116 @@
 import itertools
 import math
 from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from triquad_format.records.arrays import Doubles
-from triquad_format.records.field_settings import FieldSettings, RegionIndex
-from triquad_format.records.region import Region
+from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings, RegionIndex
+from triquad_format.records.region import BLOCK_BYTES, Region
+from triquad_format.wire.messages import FieldFit
+from triquad_map import field_fit
+from triquad_map.evidence.growth import EvidenceSize
+from triquad_map.evidence.observed import OBSERVED_VOXEL
 
 from triquad_server.errors import ScanRefusedError
 from triquad_server.intake.rays import ScanRays
-from triquad_server.mapping.live_region import LiveRegion
-from triquad_server.mapping.memory_budget import NO_SIZE, MemoryBudget
+from triquad_server.mapping.live_region import LiveRegion, RegionSize
 from triquad_server.mapping.region_setup import RegionSetup
-from triquad_server.mapping.training_budget import FairShare
+from triquad_server.mapping.replay.kept_rays import RAY_BYTES
+from triquad_server.settings import TrainingSettings
+
+_RAYS_STEP = 1.1
+"""The factor between the possible numbers of rays per voxel: changing it is expensive, so it is
+done seldom."""
+
+_MOST_PER_RAY = 20.0
+"""Samples that may be left, for each ray that the map is to keep."""
+
+_ROOM = 1.15
+"""The ratio of allocated to used memory: spare room to grow, and pieces between arrays."""
+
+_REGION_BYTES = 600_000  # of a region in which nothing is known yet
+_SLOT_BYTES = 3 * 12  # of an index, for each cell: two to four slots of a key and a row
+_SURFEL_BYTES = 80  # with its place and its confidence
+_BLOCK_BOX_BYTES = 32  # of a block with surfels
+_VERTEX_ENTRIES = 4  # entries of a vertex, in the blocks of the tree that it lies in
+_NUMBER_BYTES = 4  # of each trained number
+_MOST_VERTICES = 12  # most new ones on each level, of a new voxel
+
+_NO_SIZE = RegionSize(EvidenceSize(0, 0, 0), 0)  # of a region in which nothing is known
+
+
+class MemoryBudget:
+    """Estimates the bytes that regions take: live, and in the newest epoch."""
+
+    def __init__(self, limit: int, field: FieldSettings) -> None:
+        """Let regions of such a ``field`` take at most ``limit`` bytes."""
+        self.limit = limit
+        self._block_m = BLOCK_VOXELS * field.leaf_m
+        levels = 0 if field.encoding == "fourier" else field.feature_levels
+        self._most_vertices = _MOST_VERTICES * levels  # of a new voxel
+        masks = 2 * BLOCK_BYTES + 8 + _SLOT_BYTES
+        self._block_bytes = 2 * masks + 24
+        # The row of each voxel, in the live region only.
+        self._surface_block_bytes = BLOCK_VOXELS**3 * _NUMBER_BYTES + 8 + _BLOCK_BOX_BYTES
+        self._voxel_bytes = OBSERVED_VOXEL.itemsize + _SURFEL_BYTES
+        # Values, with the optimiser's two moments and its steps; and values again.
+        features = (3 * field.feature_size + 1 + field.feature_size) * _NUMBER_BYTES
+        self._vertex_bytes = features + 9 + 2 * _VERTEX_ENTRIES * _NUMBER_BYTES
+
+    def bytes_of(self, regions: Iterable[RegionSize]) -> int:
+        """Return the bytes that regions take, with the newest epoch of them."""
+        return sum(_REGION_BYTES + self.grown(region) for region in regions)
+
+    def grown(self, by: RegionSize) -> int:
+        """Return the additional bytes that a region takes when it grows."""
+        (blocks, surface_blocks, voxels), vertices = by
+        used = blocks * self._block_bytes + surface_blocks * self._surface_block_bytes
+        used += voxels * self._voxel_bytes + vertices * self._vertex_bytes
+        return int(_ROOM * used)
+
+    def most_added(self, rays: ScanRays, new_voxels: Iterable[int]) -> int:
+        """Return the most bytes that a scan may add to regions with these numbers of new voxels.
+
+        It is found from the box around the scan's rays alone.
+        """
+        corners = np.concatenate([rays.origin[None], rays.ends, rays.free_corners])
+        # Axis by axis: numpy is slow along rows of three.
+        extent_m = np.ptp(np.ascontiguousarray(corners.T), axis=1)
+        blocks = int(np.prod(extent_m / self._block_m + 2))
+        return self.bytes_of(
+            RegionSize(EvidenceSize(blocks, min(blocks, new), new), self._most_vertices * new)
+            for new in new_voxels
+        )
+
+    def refusal(self, used: int, needed: int) -> ScanRefusedError:
+        """Return the refusal of a scan that needs ``needed`` bytes more than the ``used`` ones."""
+        return ScanRefusedError(
+            "map_full",
+            f"the map takes {used / 1e6:.0f} MB and the scan would add some {needed / 1e6:.1f} MB, "
+            f"more than memory.max_bytes = {self.limit} allows: raise it, reset what is no longer "
+            "needed, or use a larger field.leaf_m for a new map",
+        )
+
+
+@dataclass(frozen=True)
+class FairShare:
+    """The share of a voxel with surface, the same everywhere: all places are learnt alike."""
+
+    rays: float  # rays that are kept
+    samples: float  # samples that may be left to train on
+    rays_share: float  # share of `training.rays_per_voxel` that memory has room for
+
+    @classmethod
+    def of(cls, voxels: int, training: TrainingSettings) -> "FairShare":
+        """Return the share in a map of ``voxels`` voxels with surface."""
+        wanted = training.rays_per_voxel
+        kept = min(wanted, training.pool_bytes / RAY_BYTES / max(1, voxels))
+        return cls(
+            rays=_RAYS_STEP ** math.floor(math.log(kept, _RAYS_STEP)),
+            samples=_MOST_PER_RAY * wanted,
+            rays_share=kept / wanted,
+        )
 
 
 def regions_around(
@@ -82,6 +180,12 @@ class LiveRegions:
         return self._share.rays_share
 
     @property
+    def fit(self) -> FieldFit | None:
+        """How well regions fit the held-out rays, as they were judged last; ``None``: none was."""
+        fits = [(r.centre, r.training.fit) for r in self if r.training.fit is not None]
+        return field_fit.map_fit(fits)
+
+    @property
     def next_to_learn(self) -> LiveRegion | None:
         """Return the region with most samples per vertex to train on; None: all have settled."""
         region = max(self, key=lambda r: r.training.samples_per_vertex, default=None)
@@ -119,7 +223,9 @@ class LiveRegions:
         voxels = [(region, region.evidence.live.surface_voxels) for region in self]
         self._share = FairShare.of(sum(count for _, count in voxels), self._setup.training)
         for region, count in voxels:
-            region.training.limit(self._share, count)
+            region.training.limit(
+                max(1, int(self._share.rays * count)), int(self._share.samples * count)
+            )
 
     def forget(self, minimum: Doubles, maximum: Doubles) -> None:
         """Forget what lies between two corners [3], map frame, and all regions that lie there."""
@@ -143,7 +249,7 @@ class LiveRegions:
             return
         if used + budget.most_added(rays, [r.new_voxels(rays) for r in reached]) <= budget.limit:
             return
-        unseen = budget.bytes_of(NO_SIZE for r in reached if r.index not in self._regions)
+        unseen = budget.bytes_of(_NO_SIZE for r in reached if r.index not in self._regions)
         needed = unseen + sum(budget.grown(region.growth_by(rays)) for region in reached)
         if needed and used + needed > budget.limit:
             raise budget.refusal(used, needed)

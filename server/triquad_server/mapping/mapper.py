@@ -2,21 +2,21 @@
 
 import logging
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from triquad_format.records.arrays import Doubles, Floats
+from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.region import MapProgress, MapRecord
 
+from triquad_server.engine.compiled_trainer import Loss
 from triquad_server.engine.gradient_sums import GradientSums
 from triquad_server.engine.memory import memory_on
-from triquad_server.engine.trainer import Loss
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.errors import NO_MEMORY, ScanRefusedError
 from triquad_server.intake.rays import ScanRays, usable_rays
-from triquad_server.mapping.live_region import LiveRegion
+from triquad_server.mapping.live_region import LiveRegion, RegionSnapshot
 from triquad_server.mapping.live_regions import LiveRegions
-from triquad_server.mapping.map_snapshot import MapSnapshot
-from triquad_server.mapping.progress import MapFigures
 from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.process.threads import Teams
 from triquad_server.settings import ANY_SOURCE, Settings
@@ -25,7 +25,38 @@ _log = logging.getLogger(__name__)
 
 _LOSS_MEMORY = 0.95
 
-_NOWHERE_YET = np.zeros(3)  # the same object each time: who asked sees whether it was chosen since
+_NOWHERE_YET = np.zeros(3)
+
+
+@dataclass(frozen=True)
+class MapFigures:
+    """The figures of a live map, by their names in the status."""
+
+    scans_taken: int = 0  # also those before a restart
+    samples_trained: int = 0  # also those before a restart
+    samples_left: int = 0
+    samples_discarded: int = 0  # so far, beyond the limit of what may be left
+    rays_kept: int = 0  # to train on; one that crosses regions counts in each
+    rays_discarded: int = 0  # so far, that were replaced by others, or were too many
+    replay_share: float = 1.0  # kept, of the rays that each place is to keep
+    map_bytes: int = 0  # bytes of the map and its newest epoch, without rays; an estimate
+
+
+@dataclass(frozen=True)
+class MapSnapshot:
+    """The map as it was at a moment: of the regions that changed since another, what they hold."""
+
+    changed: tuple[RegionSnapshot, ...]
+    epoch: Epoch  # the same state, for queries
+
+    @property
+    def regions(self) -> tuple[RegionIndex, ...]:
+        """All regions of the map."""
+        return tuple(region.index for region in self.epoch.frozen_regions)
+
+    def record(self) -> MapRecord:
+        """Return the changed regions with training state: a second for 100 m of a street."""
+        return self.epoch.record(tuple(region.record() for region in self.changed))
 
 
 class Mapper:
@@ -40,10 +71,10 @@ class Mapper:
         teams: Teams | None = None,
     ) -> None:
         """Make a map that goes on from ``record``; without ``teams`` it has threads of its own."""
-        self._name = name
-        self._teams = teams or Teams()
+        self.name = name
+        self.teams = teams or Teams()
         self._settings = settings
-        self._device = device
+        self.device = device
         self._setup = RegionSetup(
             field=record.settings if record else settings.field,
             scan=settings.scan,
@@ -51,7 +82,7 @@ class Mapper:
             training=settings.training,
             memory=memory_on(device),
             sums=GradientSums(),
-            team=self._teams.mapping,
+            team=self.teams.mapping,
         )
         self.regions = LiveRegions(self._setup, settings.memory.max_bytes)
         self._number = record.epoch if record else 0
@@ -208,11 +239,11 @@ class Mapper:
         if self._epoch is not None or not self._number:
             self._number += 1
         self._epoch = Epoch(
-            name=self._name,
+            name=self.name,
             number=self._number,
             settings=self._setup.field,
             regions=tuple(region.publish(self._number) for region in self.regions),
-            split=self._teams.answer,
+            split=self.teams.answer,
             progress=self.progress,
             origin=self.origin,
         )
@@ -238,7 +269,7 @@ class Mapper:
 
         Without one it begins with nothing. Another thread may own it.
         """
-        other = Mapper(self._name, self._settings, self._device, record, self._teams)
+        other = Mapper(self.name, self._settings, self.device, record, self.teams)
         other._origin = self._origin
         return other
 
@@ -256,11 +287,6 @@ class Mapper:
         Other threads may make the record of it.
         """
         newest = self.publish()
-        changed = {
-            frozen.index
-            for frozen in newest.frozen_regions
-            if epoch is None or frozen.changed > epoch
-        }
-        snapshots = tuple(r.snapshot() for r in self.regions if r.index in changed)
-        indices = tuple(region.index for region in self.regions)
-        return MapSnapshot(snapshots, indices, newest)
+        last_changed = {frozen.index: frozen.changed for frozen in newest.frozen_regions}
+        changed = [r for r in self.regions if epoch is None or last_changed[r.index] > epoch]
+        return MapSnapshot(tuple(region.snapshot() for region in changed), newest)

@@ -1,28 +1,29 @@
 """The thread that owns the live map: it takes scans, trains in slices, and publishes epochs."""
 
 import logging
+import math
+import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import TypeVar
+from concurrent.futures import Future
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Any, TypeVar
 
 from triquad_format.errors import TriquadError
-from triquad_format.records.arrays import Doubles
 from triquad_format.wire.codec import moved
-from triquad_format.wire.messages import Scan
+from triquad_format.wire.messages import FieldFit, Scan
 from triquad_map.compiled.team import lower_priority
 
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.history import EpochHistory
-from triquad_server.errors import NO_MEMORY, ScanRefusedError
+from triquad_server.errors import NO_MEMORY, MapperStoppedError, ScanRefusedError
 from triquad_server.intake.rays import ScanRays
 from triquad_server.intake.scan_queue import ScanQueue
-from triquad_server.mapping.command_queue import Command, CommandQueue
-from triquad_server.mapping.mapper import Mapper
-from triquad_server.mapping.progress import Progress, map_fit
-from triquad_server.mapping.publish_schedule import PublishSchedule
-from triquad_server.mapping.thread_time import Activity, ThreadTime
+from triquad_server.mapping.mapper import MapFigures, Mapper
+from triquad_server.mapping.thread_time import Activity, PublishSchedule, ThreadTime
 from triquad_server.process.stop import Stop
 from triquad_server.process.threads import NICENESS
 
@@ -39,6 +40,24 @@ three clients ask for too much, a lidar loses 2 to 8 of 100 scans with 2, and no
 (``make bench PART=server``)."""
 
 ResultT = TypeVar("ResultT")
+
+
+@dataclass(frozen=True)
+class Progress:
+    """The work of the mapper's thread, as of its last slice."""
+
+    settled: bool = True  # nothing is left to learn, and the newest epoch shows all
+    own_samples_trained: int = 0  # by this process
+    step_s: float = math.inf  # seconds that the last step of training took
+    loss: float = 0.0  # as of the newest epoch
+    fit: FieldFit | None = None  # of the newest epoch, to the rays that are held out
+    map: MapFigures = MapFigures()
+
+
+class _Phase(Enum):
+    MAPPING = 1
+    PAUSED = 2  # commands are carried out, and nothing else
+    ENDING = 3
 
 
 class MapperThread:
@@ -73,24 +92,15 @@ class MapperThread:
         self._scan_taken = scan_taken
         self._published = published
         self.time = ThreadTime()
-        self._commands = CommandQueue()
+        self.ended: str | None = None  # why the thread takes no more commands
+        self._commands: queue.SimpleQueue[tuple[Callable[[Mapper], Any], Future[Any]]]
+        self._commands = queue.SimpleQueue()
         self._wake = threading.Event()
-        self._paused = threading.Event()
-        self._stopping = threading.Event()
+        self._phase = _Phase.MAPPING
         self._schedule = PublishSchedule(period_s)
-        self.progress = Progress(loss=mapper.loss, fit=map_fit(mapper.regions))
+        self.progress = Progress(loss=mapper.loss, fit=mapper.regions.fit)
         self._record_progress()
         self._thread = threading.Thread(target=self._run, name="mapper")
-
-    @property
-    def origin(self) -> Doubles:
-        """[3] from where the map counts; another object once a scan has chosen it."""
-        return self._mapper.origin
-
-    @property
-    def ended(self) -> str | None:
-        """Return why the thread takes no more commands; ``None`` while it does."""
-        return self._commands.ended
 
     def start(self) -> None:
         """Start the thread."""
@@ -98,15 +108,15 @@ class MapperThread:
 
     def pause(self) -> None:
         """Take no more scans and train no more, but go on carrying out commands."""
-        self._paused.set()
+        self._phase = _Phase.PAUSED
         self._wake.set()
 
     def close(self) -> None:
         """End after the current slice; pending commands are still carried out."""
-        self._stopping.set()
+        self._phase = _Phase.ENDING
         self._wake.set()
         if self._thread.ident is None:
-            self._commands.end("the mapper was never started")
+            self._end_commands("the mapper was never started")
         else:
             self._thread.join()
 
@@ -128,8 +138,11 @@ class MapperThread:
             MapperStoppedError: the thread has ended, or ends before it comes to the command.
             TriquadError: the command refused; any other exception of it ends the thread as well.
         """
-        result = self._commands.add(command)
+        result: Future[ResultT] = Future()
+        self._commands.put((command, result))
         self._wake.set()
+        if self.ended is not None:  # it may have come after the last one that was carried out
+            self._end_commands(self.ended)
         return result.result()
 
     def _run(self) -> None:
@@ -137,7 +150,7 @@ class MapperThread:
         ended = "the mapper has stopped"
         try:
             else_s = 0.0
-            while not self._stopping.is_set():
+            while self._phase is not _Phase.ENDING:
                 else_s = self._turn(else_s)
                 self._wake.clear()  # before what it told of is looked at, the end among it
             self._run_commands()
@@ -151,7 +164,7 @@ class MapperThread:
             _log.exception("the mapper was stopped by an internal error")
             self._failed(Stop.INTERNAL_ERROR)
         finally:
-            self._commands.end(ended)
+            self._end_commands(ended)
 
     def _turn(self, else_s: float) -> float:
         """Run one round: commands, scans, a slice of training, an epoch if one is due.
@@ -160,13 +173,13 @@ class MapperThread:
         """
         self._epochs.remove_expired()
         self._run_commands()
-        if self._paused.is_set():
+        if self._phase is not _Phase.MAPPING:
             self.time.begin(Activity.IDLE)
             self._wake.wait()
             return else_s
         took_scans = self._ingest_scans(max(_SCANS_S, _SCANS_SHARE * else_s))
         ingested_s = time.monotonic()
-        if not (self._mapper.settled or self._commands):
+        if not self._mapper.settled and self._commands.empty():
             self._train()
         if self._schedule.take_due():
             self._publish()
@@ -192,22 +205,27 @@ class MapperThread:
         self._schedule.is_changed = True
 
     def _run_commands(self) -> None:
-        while (command := self._commands.take()) is not None:
+        while not self._commands.empty():
+            command, result = self._commands.get()
             self.time.begin(Activity.COMMANDS)
             try:
-                self._run_command(command)
+                returned = command(self._mapper)
+                self._publish()  # first: the caller may ask for its epoch, and what is to be learnt
+                self._record_progress()
+                result.set_result(returned)
             except TriquadError as error:
                 self._schedule.is_changed = True
-                command.result.set_exception(error)
+                result.set_exception(error)
             except BaseException as error:
-                command.result.set_exception(error)
+                result.set_exception(error)
                 raise
 
-    def _run_command(self, command: Command) -> None:
-        result = command.run(self._mapper)
-        self._publish()  # first: the caller may request its epoch, and how much is left to learn
-        self._record_progress()
-        command.result.set_result(result)
+    def _end_commands(self, why: str) -> None:
+        """Take no more commands; those that wait fail with :class:`MapperStoppedError`."""
+        self.ended = why
+        with suppress(queue.Empty):
+            while True:
+                self._commands.get_nowait()[1].set_exception(MapperStoppedError(why))
 
     def _ingest_scans(self, for_s: float) -> bool:
         """Take in the oldest scan of each source, for a moment; return False where none waits.
@@ -219,7 +237,7 @@ class MapperThread:
         while (scan := self._scans.take(sources)) is not None:
             sources.add(scan.source)
             self._ingest(scan)
-            if self._commands or time.monotonic() > ends_s:
+            if not self._commands.empty() or time.monotonic() > ends_s:
                 break  # a command is at most a scan late: checkpoints begin when they are due
         return bool(sources)
 
@@ -238,6 +256,8 @@ class MapperThread:
             self._scans.reject(scan, error.reason, str(error))
             _log.debug("scan %d of %s refused: %s", scan.sequence, scan.source, error)
             return
+        if self._mapper.origin is not self._epochs.newest.origin:
+            self._publish()  # what is told of the scan counts from the origin that it chose
         seen = moved(scan, -rays.map_origin)
         for listener in self._scan_taken:
             listener(seen, rays)
@@ -251,8 +271,7 @@ class MapperThread:
         if epoch is not self._epochs.newest:
             self._published(epoch)
             self._epochs.add(epoch)
-        fit = map_fit(self._mapper.regions)
-        self.progress = replace(self.progress, loss=self._mapper.loss, fit=fit)
+        self.progress = replace(self.progress, loss=self._mapper.loss, fit=self._mapper.regions.fit)
         self._schedule.published(took_s=time.monotonic() - started)
         self._scans.ledger.publish()
 

@@ -36,14 +36,6 @@ class SeenScan(NamedTuple):
     passed: Ints  # [P] of voxels that they may have crossed
 
 
-class PublishedEvidence(NamedTuple):
-    """The evidence of a region as an epoch shows it."""
-
-    evidence: FrozenEvidence
-    surfels: SurfelMap
-    removed: Longs  # [M, 3] voxels whose surface was removed since the epoch before
-
-
 class RegionEvidence:
     """The evidence of one region, and how it was published last."""
 
@@ -116,13 +108,15 @@ class RegionEvidence:
 
     def published(
         self, samples: SampleField, version: int, epoch: int, *, is_settled: bool
-    ) -> PublishedEvidence:
-        """Return the evidence as it is now, to be published with ``epoch``.
+    ) -> tuple[FrozenEvidence, SurfelMap, Longs]:
+        """Return the evidence as it is now, its surfels, and the voxels that lost their surface.
+
+        These are the [M, 3] since the epoch before.
 
         Args:
             samples: the field, in voxels.
             version: of the field.
-            epoch: number of the epoch.
+            epoch: number of the epoch that it is published with.
             is_settled: there is nothing to train on.
         """
         evidence = self.live.freeze(self._setup.team.split)
@@ -140,7 +134,7 @@ class RegionEvidence:
         self._removed.clear()
         if len(removed):
             removed = removed[~evidence.ended_in(removed)]  # nothing ended there since
-        return PublishedEvidence(evidence, surfels, removed)
+        return evidence, surfels, removed
 
     def forget(self, low: Doubles, high: Doubles) -> None:
         """Forget what lies between two corners [3], map frame."""

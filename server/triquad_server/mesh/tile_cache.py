@@ -117,7 +117,7 @@ class TileCache:
         with self._lock:
             if epoch.number > self.epoch:
                 self._record_changes(epoch)
-                self._view = epoch.with_split()
+                self._view = epoch.in_one_thread()
 
     def changed(self, level: int, low: Doubles, high: Doubles, since: int) -> dict[TileIndex, int]:
         """Return :meth:`TileLevel.changed_since` of a level, as of the last refresh."""

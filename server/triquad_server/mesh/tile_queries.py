@@ -100,7 +100,7 @@ class TileQueries:
         if request.epoch == 0:
             return self._reply(request, self._cache.epoch, self._followed(request.level, indices))
         epoch = self._epochs.get(request.epoch)
-        view = epoch.with_split()
+        view = epoch.in_one_thread()
         tiles = self._cache.of_epoch(view, request.level, indices, request.fill_m)
         return self._reply(request, epoch.number, tiles)
 

@@ -4,7 +4,6 @@ import contextlib
 import ctypes
 import os
 import resource
-import sys
 from pathlib import Path
 
 # Options of glibc's mallopt(3), and what they are set to.
@@ -16,12 +15,8 @@ _STATM = Path("/proc/self/statm")
 
 
 def resident_bytes() -> int:
-    """Return the resident memory, or where the system does not report it, the largest so far."""
-    try:
-        return int(_STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except (OSError, ValueError, IndexError):
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        return peak if sys.platform == "darwin" else peak * 1024
+    """Return the resident memory."""
+    return int(_STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def give_back_early() -> None:
@@ -30,8 +25,6 @@ def give_back_early() -> None:
     By default it keeps arrays of up to 32 MB for later, for each of some 30 threads apart: with
     100 m of street, at rest after its mesh was fetched, a server took 628 instead of 437 MB.
     """
-    if sys.platform != "linux":
-        return
     with contextlib.suppress(OSError, AttributeError):
         options = ctypes.CDLL(None).mallopt
         options(_M_ARENA_MAX, _ARENAS)
@@ -45,9 +38,8 @@ def give_back_free() -> None:
     Small arrays of many threads lie side by side. At rest with 100 m of street a server kept 80 of
     520 MB for nothing.
     """
-    if sys.platform == "linux":
-        with contextlib.suppress(OSError, AttributeError):
-            ctypes.CDLL(None).malloc_trim(0)
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def allow_open_files() -> None:

@@ -1,10 +1,14 @@
-"""The operations that a server answers: each has a key, and is answered in a lane."""
+"""The operations that a server answers: each has a key, and is answered in a lane.
+
+What is in one lane waits in one queue, and the same threads work at it.
+"""
 
 import logging
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from enum import Enum
 from functools import partial
 from typing import Any
 
@@ -14,22 +18,74 @@ from triquad_format.records.arrays import Doubles
 from triquad_format.wire import codec, keys
 from triquad_format.wire.codec import asked_from
 from triquad_format.wire.metrics_messages import QueueMetrics
-from triquad_map.compiled.team import lower_priority
+from triquad_map.compiled.team import THREADS, lower_priority
 
 from triquad_server.errors import NO_MEMORY, MapperStoppedError
 from triquad_server.process.threads import NICENESS, submit
-from triquad_server.serving.lanes import LANES, Lane, lane_of
 from triquad_server.serving.long_work import LongWork
-from triquad_server.serving.refusals import RefusalSender
-from triquad_server.serving.request import OperationCounts, Request, payload_size
-from triquad_server.serving.request_queue import MOST_SENDING, ClientSessions, RequestQueue
+from triquad_server.serving.request import (
+    ClientSessions,
+    OperationCounts,
+    Request,
+    payload_size,
+)
+from triquad_server.serving.request_queue import MOST_SENDING, RequestQueue
 from triquad_server.settings import ServiceSettings
 
 _log = logging.getLogger(__name__)
 
 _QUEUE_BYTES = 64_000_000  # of the requests of all clients that wait in a lane
 _PLAIN_BYTES = 16_384  # of a request that holds neither points nor tiles
+_LARGE_BYTES = 65_536  # of a request whose refusal the network's own thread sends
+_REFUSING_THREADS = 2
 _STOPPING = "the server is stopping"
+
+_LONG_BYTES = 32_768
+"""A question of more bytes is long: some 2,700 points, which take a server 10 ms."""
+
+
+class Lane(Enum):
+    """The operations that share a queue and its workers."""
+
+    QUESTIONS = "questions"
+    LONG_QUESTIONS = "long_questions"
+    """The lane of questions about many places, which take a tenth of a second: short ones, such as
+    a planner's, do not wait for them, and mapping is not slowed down."""
+
+    ADMINISTRATION = "administration"
+    """The lane of what takes no time: it is answered however many queries wait."""
+
+    MESH = "mesh"
+    """The lane of the mesh: requests come one after the other, and all cores make their tiles."""
+
+    FILES = "files"
+    """The lane of checkpoints and map files, which take long, one after the other: its workers
+    wait for what :class:`LongWork` does."""
+
+
+@dataclass(frozen=True)
+class _Workers:
+    threads: int  # for questions, one for each core
+    niceness: int = 0  # that of mapping where the work is long
+    gives_way_s: float | None = None
+    """The seconds for which scans of a source that is about to lose some have to wait before these
+    workers give way: a planner does not wait for a source that floods, a long question does.
+    ``None``: they never do."""
+
+
+_WORKERS = {
+    Lane.QUESTIONS: _Workers(max(2, THREADS), gives_way_s=1.0),
+    Lane.LONG_QUESTIONS: _Workers(max(2, THREADS), NICENESS, gives_way_s=0.0),
+    Lane.ADMINISTRATION: _Workers(2),
+    Lane.MESH: _Workers(1, NICENESS),
+    Lane.FILES: _Workers(2),
+}
+
+
+def _lane_of(lane: Lane, nbytes: int) -> Lane:
+    """Return the lane of a request of some bytes, for an operation of this lane."""
+    is_long = lane is Lane.QUESTIONS and nbytes > _LONG_BYTES
+    return Lane.LONG_QUESTIONS if is_long else lane
 
 
 @dataclass(frozen=True)
@@ -60,7 +116,7 @@ class Operations:
         self._give_way = give_way
         self._origin = origin
         self._sessions = ClientSessions(session)
-        self._refusals = RefusalSender()
+        self._refusals = ThreadPoolExecutor(_REFUSING_THREADS, "refusals")
         self._long_work = LongWork(NICENESS)
         self._operations: dict[str, _Operation] = {}  # by key
         self._queryables: list[zenoh.Queryable[Any]] = []
@@ -110,7 +166,7 @@ class Operations:
         self.is_stopping = True
         for queue in self._queues.values():
             for request in queue.clear():
-                self._refusals.send(request, "busy", _STOPPING)
+                self._refuse(request, "busy", _STOPPING)
 
     def close(self) -> None:
         """Do as :meth:`stop`; return once all work is answered. Closing twice does no harm."""
@@ -124,7 +180,7 @@ class Operations:
         self._long_work.close()
         for pool in self._pools:
             pool.shutdown()
-        self._refusals.close()
+        self._refusals.shutdown()
 
     def _answered(
         self,
@@ -142,9 +198,9 @@ class Operations:
             if self._origin() is origin:
                 return reply  # else the map's first scan came meanwhile
 
-    def _queue(self, lane: Lane, requests_each: int) -> RequestQueue[Request]:
+    def _queue(self, lane: Lane, requests_each: int) -> RequestQueue:
         """Return a queue with workers, whose threads are started when they are needed."""
-        workers = LANES[lane]
+        workers = _WORKERS[lane]
         pool = ThreadPoolExecutor(
             workers.threads + MOST_SENDING, lane.value, lower_priority, (workers.niceness,)
         )
@@ -171,22 +227,32 @@ class Operations:
         """Queue a request, or refuse it."""
         operation = self._operations[key]
         source = self._sessions.source(query)
-        queue = self._queues[lane_of(operation.lane, payload_size(query))]
+        queue = self._queues[_lane_of(operation.lane, payload_size(query))]
         request = Request(query, key, operation.counts, source, queue.send)
         if request.size > operation.max_bytes:
             text = f"{request.size} bytes exceed the limit of {operation.max_bytes}: split it"
-            self._refusals.send(request, "too_large", text)
+            self._refuse(request, "too_large", text)
         elif self.is_stopping:
-            self._refusals.send(request, "busy", _STOPPING)
+            self._refuse(request, "busy", _STOPPING)
         else:
             for excess in queue.put(request, request.size):
                 text = "too many requests wait already, most of them of this client; try later"
-                self._refusals.send(excess, "busy", text)
+                self._refuse(excess, "busy", text)
+
+    def _refuse(self, request: Request, code: str, text: str) -> None:
+        """Refuse a request, in a thread for that: a client may delay the reply for seconds.
+
+        A large one is refused at once, so that its sender waits for it and it takes no memory.
+        """
+        if request.size > _LARGE_BYTES:
+            request.refuse(code, text)
+        else:
+            submit(self._refusals, request.refuse, code, text)
 
     def _work(self, lane: Lane, request: Request) -> None:
         try:
             request.begin()
-            waited_s = LANES[lane].gives_way_s
+            waited_s = _WORKERS[lane].gives_way_s
             if waited_s is not None:
                 self._give_way(waited_s)
             self._check(request)

@@ -1,10 +1,11 @@
-"""A request, until it is answered; and the counts of each operation's results and times."""
+"""A request, who sent it, and its answer; and the counts of each operation's results and times."""
 
 import logging
 import threading
 import time
 from bisect import bisect_left
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import zenoh
@@ -12,10 +13,11 @@ from triquad_format.errors import ProtocolVersionError, RefusedError, WireError
 from triquad_format.wire import codec, keys
 from triquad_format.wire.bounds import check_question
 from triquad_format.wire.codec import Message, MessageT
-from triquad_format.wire.messages import ErrorReply
+from triquad_format.wire.limits import MAX_WAIT_S
+from triquad_format.wire.messages import ErrorReply, read_origin
 from triquad_format.wire.metrics_messages import OperationMetrics, TimeHistogram
 
-from triquad_server.serving.request_queue import Source
+from triquad_server.fair_queue import Owner
 
 _log = logging.getLogger(__name__)
 
@@ -23,6 +25,13 @@ BOUNDS_S = tuple(
     round(step * 10.0**power, 6) for power in range(-4, 2) for step in (1, 1.8, 3.2, 5.6)
 )
 """The upper bounds of the buckets: four a decade, 0.1 ms to 56 s."""
+
+_UNLINKED = ""
+"""The group of all clients that are not linked to the server itself: they take one turn together,
+since any name can be invented."""
+
+_GRACE_S = 0.5  # a request is handled for this much longer: its client's own time-out comes first
+_FRESH_S = 1.0  # so long a session may have left unnoticed
 
 
 class Times:
@@ -95,6 +104,53 @@ class OperationCounts:
                 received_bytes=self._received_bytes,
                 sent_bytes=self._sent_bytes,
             )
+
+
+@dataclass(frozen=True)
+class Source:
+    """The owner of a request, and what its sender says of it."""
+
+    owner: Owner
+    deadline_s: float  # monotonic: until then the answer is waited for
+    local: bool = False  # places count from the map's origin
+
+
+class ClientSessions:
+    """Finds the session of a request; safe for any thread.
+
+    A client that is linked and names itself has turns of its own. Those that come through a
+    router, or give no name, share turns: Zenoh does not show from which link a request
+    came, but invented names are no links.
+    """
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._info = session.info
+        self._linked = frozenset[str]()  # Zenoh ids at the other ends of links
+        self._read_s = 0.0  # when that was, monotonic
+
+    def source(self, query: zenoh.Query) -> Source:
+        """Return a request's owner and deadline; no longer wait than ``MAX_WAIT_S`` is believed."""
+        attachment = query.attachment
+        origin = None if attachment is None else read_origin(attachment.to_bytes())
+        now = time.monotonic()
+        if origin is None:
+            return Source(Owner(_UNLINKED), now + MAX_WAIT_S)
+        # Written so that NaN counts as not given.
+        wait_s = origin.timeout_s if 0 <= origin.timeout_s <= MAX_WAIT_S else MAX_WAIT_S
+        group = origin.client if self._is_linked(origin.client) else _UNLINKED
+        return Source(Owner(group, origin.client), now + wait_s + _GRACE_S, origin.local)
+
+    def have_left(self, owner: Owner) -> bool:
+        """Return whether the link to the client that sent a request is closed."""
+        return owner.group != _UNLINKED and not self._is_linked(owner.group)
+
+    def _is_linked(self, name: str) -> bool:
+        now = time.monotonic()
+        # A new client may send requests at once.
+        if name not in self._linked or now > self._read_s + _FRESH_S:
+            ids = (str(transport.zid) for transport in self._info.transports())
+            self._linked, self._read_s = frozenset(ids), now
+        return name in self._linked
 
 
 def payload_size(query: zenoh.Query) -> int:

@@ -23,8 +23,7 @@ from triquad_server.errors import (
     StoreError,
 )
 from triquad_server.intake.source_trails import SourceTrails
-from triquad_server.mapping.map_snapshot import MapSnapshot
-from triquad_server.mapping.mapper import Mapper
+from triquad_server.mapping.mapper import Mapper, MapSnapshot
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.settings import StoreSettings
 from triquad_server.store.scrub import Scrubber
@@ -60,7 +59,7 @@ class CheckpointWriter:
     ) -> None:
         """Make the writer; ``settings`` say how often the store is written, and checked."""
         self._mapper = mapper
-        self._store = store
+        self.store = store
         self._period_s = settings.period_s
         self._scrub_h = settings.scrub_h
         self._scrubber: Scrubber | None = None
@@ -75,21 +74,16 @@ class CheckpointWriter:
     @property
     def last(self) -> CheckpointInfo | None:
         """The newest checkpoint; it may be the one that the map was restored from."""
-        return None if self._store is None else self._store.last
-
-    @property
-    def store(self) -> Store | None:
-        """The store; ``None``: the map is not kept."""
-        return self._store
+        return None if self.store is None else self.store.last
 
     def start(self) -> None:
         """Begin to write checkpoints, while the map changes and on request, and to check them."""
-        if self._store is None:
+        if self.store is None:
             return
         if self._period_s > 0:
             self._timer.start()
         if self._scrub_h > 0:
-            self._scrubber = Scrubber(self._store.folder, self._scrub_h, self._found_damaged)
+            self._scrubber = Scrubber(self.store.folder, self._scrub_h, self._found_damaged)
 
     def metrics(self) -> CheckpointMetrics:
         """Return how many checkpoints were written, and how long the last took."""
@@ -99,7 +93,7 @@ class CheckpointWriter:
     @property
     def late_s(self) -> float:
         """Return for how long more is unsaved than there may be; 0: no longer than two periods."""
-        if self._store is None or self._period_s == 0:
+        if self.store is None or self._period_s == 0:
             return 0.0
         return max(0.0, time.monotonic() - self._saved_s - _LATE_PERIODS * self._period_s)
 
@@ -108,7 +102,7 @@ class CheckpointWriter:
         """Return that checkpoints are late, and what helps, or why scans are not kept."""
         late_s = self.late_s
         if late_s == 0:
-            return None if self._store is None else self._store.scans.error
+            return None if self.store is None else self.store.scans.error
         unsaved_s = late_s + _LATE_PERIODS * self._period_s
         return (
             f"checkpoints are late: what was mapped in the last {unsaved_s:.0f} s is on no disk, "
@@ -127,7 +121,7 @@ class CheckpointWriter:
         self._stopping.set()
         if self._timer.ident is not None:
             self._timer.join()
-        if self._store is None:
+        if self.store is None:
             return
         try:
             info = self.write()
@@ -162,9 +156,9 @@ class CheckpointWriter:
 
         def forget(mapper: Mapper) -> int:
             mapper.reset(request.minimum, request.maximum)
-            if self._store is not None:
+            if self.store is not None:
                 corners = request.minimum + mapper.origin, request.maximum + mapper.origin
-                self._store.scans.add_reset(*corners)
+                self.store.scans.add_reset(*corners)
             trails.forget(request.minimum, request.maximum)
             return mapper.publish().number
 
@@ -186,11 +180,11 @@ class CheckpointWriter:
             StoreError: it cannot be written, for lack of memory too, or there is no store.
             MapperStoppedError: mapping has ended.
         """
-        if self._store is None:
+        if self.store is None:
             raise StoreError(_NO_STORE)
         with self._writing:
             try:
-                return self._write(self._store, undoes, at_cut)
+                return self._write(self.store, undoes, at_cut)
             except Exception as error:
                 self._metrics = replace(self._metrics, failed=self._metrics.failed + 1)
                 if isinstance(error, StoreError):
@@ -205,7 +199,7 @@ class CheckpointWriter:
             StoreError: it cannot be written, or there is no store.
         """
         with self._writing:
-            kept = None if self._store is None else self._store.keep_newest(undoes)
+            kept = None if self.store is None else self.store.keep_newest(undoes)
             return kept or self.write(undoes)
 
     def _keep(self) -> tuple[int | None, str]:
@@ -214,8 +208,8 @@ class CheckpointWriter:
         Raises:
             RefusedError: it cannot be written.
         """
-        if self._store is None or self._store.keep_resets == 0:
-            why = "store.keep_resets = 0" if self._store else "the server has no store"
+        if self.store is None or self.store.keep_resets == 0:
+            why = "store.keep_resets = 0" if self.store else "the server has no store"
             return None, f"the map before was not kept: {why}"
         try:
             kept = self.write("a reset").epoch
@@ -276,7 +270,7 @@ class CheckpointWriter:
     def _found_damaged(self, name: str) -> None:
         """Write all of the map again, if the newest checkpoint needs the file ``name``."""
         with self._writing:
-            if self._store is not None and self._store.forget_base(name):
+            if self.store is not None and self.store.forget_base(name):
                 _log.warning(
                     "the newest checkpoint needs %s: all of the map is written again", name
                 )

@@ -1,8 +1,7 @@
 """Serves map files that clients fetch in chunks."""
 
 import io
-import threading
-from collections import OrderedDict
+from collections import deque
 from dataclasses import dataclass
 
 from triquad_format.errors import RefusedError
@@ -28,24 +27,21 @@ class _MapBytes:
 
 
 class MapDownloads:
-    """Serialises epochs on request; the files requested last are kept."""
+    """Serialises epochs on request; the files made last are kept."""
 
     def __init__(self, mapper: MapperThread, epochs: EpochHistory, server: str = "") -> None:
         """Make the handler; ``server`` is a name of this process."""
         self._epochs = epochs
         self._server = server
         self._mapper = mapper
-        self._lock = threading.Lock()
-        self._files: OrderedDict[str, _MapBytes] = OrderedDict()
+        self._files: deque[_MapBytes] = deque(maxlen=FILES_KEPT)
 
     def info(self, request: MapInfoRequest) -> MapInfo:
         """Return size and digest of the newest epoch's file, which is made unless it is there."""
         newest = self._epochs.newest
-        with self._lock:
-            for file in self._files.values():
-                if file.info.epoch == newest.number and file.training == request.training:
-                    self._files.move_to_end(file.info.sha256)
-                    return file.info
+        for file in tuple(self._files):
+            if (file.info.epoch, file.training) == (newest.number, request.training):
+                return file.info
         if request.training:
             snapshot = self._mapper.call(lambda mapper: mapper.snapshot_since(None))
             record, newest = snapshot.record(), snapshot.epoch
@@ -61,10 +57,7 @@ class MapDownloads:
             chunk_bytes=CHUNK_BYTES,
             server=self._server,
         )
-        with self._lock:
-            self._files[info.sha256] = _MapBytes(info, request.training, buffer.getvalue())
-            while len(self._files) > FILES_KEPT:
-                self._files.popitem(last=False)
+        self._files.append(_MapBytes(info, request.training, buffer.getvalue()))
         return info
 
     def chunk(self, request: MapChunkRequest) -> MapChunk:
@@ -73,9 +66,8 @@ class MapDownloads:
         Raises:
             RefusedError: the file is not kept, or the bytes do not lie in it.
         """
-        with self._lock:
-            file = self._files.get(request.sha256)
-        if file is None:
+        found = (file for file in tuple(self._files) if file.info.sha256 == request.sha256)
+        if (file := next(found, None)) is None:
             raise RefusedError("chunk_gone", "this map file is not kept; ask for its info again")
         if not 0 <= request.offset < len(file.data) or request.length < 1:
             raise RefusedError(

@@ -77,7 +77,7 @@ class PoseCorrector:
                 f"it takes a second map of {used / 1e6:.0f} MB for a while, and memory.max_bytes = "
                 f"{self._max_bytes} has no room for that: start the server with more",
             )
-        wanted = _wanted(request, self._mapper.origin)
+        wanted = _wanted(request, self._mapper.call(lambda mapper: mapper.origin))
         followed = deque[Entry]()
         try:
             # So that the log has all until there.

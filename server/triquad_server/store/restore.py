@@ -21,8 +21,6 @@ from triquad_server.errors import StoreError
 
 _log = logging.getLogger(__name__)
 
-_READ_BYTES = 2**20
-
 MAX_EPOCH = 2**52
 """A map goes on from epochs below this: at a million a second, that is enough for 140 years. Those
 above were not counted by any server, and would end where no client takes numbers any more."""
@@ -139,15 +137,11 @@ def _set_aside(damaged: list[Path]) -> None:
 
 
 def _valid(path: Path, file: MapFile) -> ValidCheckpoint:
-    digest = hashlib.sha256()
-    with path.open("rb") as source:
-        while block := source.read(_READ_BYTES):
-            digest.update(block)
     info = CheckpointInfo(
         path=str(path),
         bytes=file.size,
         epoch=file.record.epoch,
-        sha256=digest.hexdigest(),
+        sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
         stamp_ns=file.manifest.stamp_ns,
     )
     return ValidCheckpoint(path, file, read_checkpoint(path), info)

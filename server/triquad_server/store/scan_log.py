@@ -11,7 +11,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -42,14 +41,6 @@ _BEYOND = 1.01  # times the range of a source: where points beyond it are put
 _UNFINISHED = ".unfinished-{}.mcap"
 
 
-@dataclass(frozen=True)
-class _Kept:
-    """The last scan of a source that was kept."""
-
-    stamp_ns: int
-    world_from_sensor: Doubles  # [4, 4] from the map's origin
-
-
 class ScanLog:
     """The log of one map. The mapper's thread adds and cuts; who writes checkpoints keeps."""
 
@@ -70,7 +61,7 @@ class ScanLog:
         self.error: str | None = None
         self._max_bytes = max_bytes
         self.apart_m = _APART_VOXELS * leaf_m
-        self._kept: dict[str, _Kept] = {}
+        self._kept: dict[str, Transform] = {}  # the last scan of each source that was kept
         self._followed: deque[Entry] | None = None
         self._writer: SegmentWriter | None = None
         self._opened = 0  # files
@@ -113,8 +104,8 @@ class ScanLog:
         if not self.is_kept:
             return
         pose = moved_pose(scan.world_from_sensor, rays.map_origin)
-        if not self._is_apart(scan):
-            transform = Transform(scan.stamp_ns, scan.source, pose)
+        transform = Transform(scan.stamp_ns, scan.source, pose)
+        if not self._is_apart(transform):
             self._put(transform, lambda writer: writer.add_pose(transform))
             return
         rotation, position = scan.world_from_sensor[:3, :3], scan.world_from_sensor[:3, 3]
@@ -129,7 +120,7 @@ class ScanLog:
             points.astype(np.float32),
             (no_return / np.maximum(lengths, 1e-9)).astype(np.float32),
         )
-        self._kept[scan.source] = _Kept(scan.stamp_ns, scan.world_from_sensor)
+        self._kept[scan.source] = transform
         self._put(logged, lambda writer: writer.add(logged))
 
     def add_reset(self, minimum: Doubles, maximum: Doubles) -> None:
@@ -182,11 +173,11 @@ class ScanLog:
         written, self._writer = self._writer, None
         return written
 
-    def _is_apart(self, scan: Scan) -> bool:
-        kept, pose = self._kept.get(scan.source), scan.world_from_sensor
-        if kept is None or scan.stamp_ns - kept.stamp_ns >= _APART_S * 1e9:
+    def _is_apart(self, taken: Transform) -> bool:
+        kept = self._kept.get(taken.child)
+        if kept is None or taken.stamp_ns - kept.stamp_ns >= _APART_S * 1e9:
             return True
-        moved = np.linalg.inv(kept.world_from_sensor) @ pose
+        moved = np.linalg.inv(kept.pose) @ taken.pose
         turned = math.degrees(math.acos(min(1.0, max(-1.0, (np.trace(moved[:3, :3]) - 1) / 2))))
         return float(np.linalg.norm(moved[:3, 3])) >= self.apart_m or turned >= _APART_DEG
 

@@ -58,7 +58,7 @@ class Store:
         self.folder = root / map_name
         self.keep_resets = settings.keep_resets
         self._newest: Manifest | None = None  # from which later ones take what did not change
-        self._restored: Restored | None = None  # the last time that the map was restored
+        self.restored: Restored | None = None  # the last time to an older checkpoint
         self._settings = settings
         # That the map takes in, from :meth:`log_scans` on.
         self.scans = ScanLog(self.folder, 0, leaf_m=1.0, epoch=0, restored=None)
@@ -76,7 +76,7 @@ class Store:
     def log_scans(self, leaf_m: float) -> None:
         """Keep scans, too, from the newest checkpoint on; ``leaf_m`` is the side of a voxel."""
         most = self._settings.log_max_bytes
-        self.scans = ScanLog(self.folder, most, leaf_m, self.epoch, self._restored)
+        self.scans = ScanLog(self.folder, most, leaf_m, self.epoch, self.restored)
 
     def close(self) -> None:
         """Release the folder."""
@@ -87,11 +87,6 @@ class Store:
     def epoch(self) -> int:
         """The epoch of the newest checkpoint; 0: there is none."""
         return 0 if self._newest is None else self._newest.facts.epoch
-
-    @property
-    def restored(self) -> Restored | None:
-        """When the map went back to an older checkpoint, the last time; ``None``: never."""
-        return self._restored
 
     @property
     def base_epoch(self) -> int | None:
@@ -121,7 +116,7 @@ class Store:
         self.last = None if newest is None else newest.info
         if newest is not None and newest.checkpoint is not None:
             self._newest = newest.checkpoint.manifest
-            self._restored = newest.checkpoint.restored
+            self.restored = newest.checkpoint.restored
         return newest
 
     def write(
@@ -194,7 +189,7 @@ class Store:
             if newest is not None:
                 marked = dataclasses.replace(newest, undoes=f"restoring epoch {epoch}")
                 write_checkpoint(files[0].path, marked)
-            self._restored = Restored(epoch, again.facts.epoch)
+            self.restored = Restored(epoch, again.facts.epoch)
             self._write(again)
         _log.warning(
             "the map is that of epoch %d again, as epoch %d; what it was is kept as epoch %d",
@@ -234,7 +229,7 @@ class Store:
         """Write the file that makes parts a checkpoint; then delete what need not stay."""
         path = self.folder / checkpoint_name(manifest.facts.epoch)
         manifest = dataclasses.replace(manifest, stamp_ns=stamp_now_ns())
-        written = write_checkpoint(path, Checkpoint(manifest, undoes, self._restored))
+        written = write_checkpoint(path, Checkpoint(manifest, undoes, self.restored))
         info = CheckpointInfo(
             path=str(path),
             bytes=written.bytes + manifest.stored_bytes,

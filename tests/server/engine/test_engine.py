@@ -14,8 +14,8 @@ from triquad_map.field.frozen_field import in_grid
 from triquad_server.engine.compiled_trainer import CompiledTrainer
 from triquad_server.engine.field_record import field_from_record, region_record
 from triquad_server.engine.gradient_sums import GradientSums
-from triquad_server.engine.live_field import Batch, LiveField, Parameter, Rates, initial_field
-from triquad_server.engine.memory import ArrayMemory, memory_on
+from triquad_server.engine.live_field import Batch, LiveField, Parameter, initial_field
+from triquad_server.engine.memory import Memory, memory_on
 from triquad_server.engine.tensor_field import TensorField, tensors_of
 from triquad_server.engine.tensor_trainer import (
     ParameterTensors,
@@ -25,8 +25,8 @@ from triquad_server.engine.tensor_trainer import (
 )
 from triquad_server.process.threads import Teams
 
-ARRAYS = ArrayMemory()
-RATES = Rates(learning_rate=0.01)
+ARRAYS = Memory()
+RATE = 0.01
 TEAM = Teams().mapping
 CASES = [
     FieldSettings(depth=8, frequencies=4),
@@ -43,7 +43,7 @@ def trained(settings: FieldSettings) -> LiveField:
     field.grow(leaves(settings, batch))
     trainer = TensorTrainer(field)
     for _ in range(3):
-        trainer.train(batch, RATES)
+        trainer.train(batch, RATE)
     return field
 
 
@@ -83,8 +83,8 @@ def test_a_training_step_is_equal(settings: FieldSettings) -> None:
     batch = samples(settings, 4096, seed=2)
     reference, trainer = TensorTrainer(slow), CompiledTrainer(fast, GradientSums(), TEAM)
     for step in range(3):
-        loss = float(reference.train(batch, RATES))
-        assert trainer.train(batch, RATES) == pytest.approx(loss, rel=1e-4), step
+        loss = float(reference.train(batch, RATE))
+        assert trainer.train(batch, RATE) == pytest.approx(loss, rel=1e-4), step
     np.testing.assert_array_equal(fast.features.steps, slow.features.steps)
     # The gradient's moments are what the step is made of.
     scale = float(np.abs(slow.features.means).max())
@@ -153,8 +153,8 @@ def test_a_step_over_all_rows_is_that_of_the_chosen() -> None:
         mask = torch.rand(50, generator=generator) < 0.4
         gradient = torch.randn((50, 8), generator=generator)
         rows = mask.nonzero()[:, 0]
-        step_rows(chosen, rows, gradient[rows], RATES)
-        step_where(masked, mask, gradient, RATES)
+        step_rows(chosen, rows, gradient[rows], RATE)
+        step_where(masked, mask, gradient, RATE)
     assert torch.equal(chosen.steps, masked.steps)
     for name in ("values", "means", "variances"):
         torch.testing.assert_close(getattr(masked, name), getattr(chosen, name))
@@ -191,11 +191,11 @@ def test_a_mapper_learns_on_the_gpu() -> None:
 def test_the_gpu_gives_the_same_values() -> None:
     settings = CASES[0]
     field, nothing = trained(settings), LiveEvidence(1 << settings.depth).freeze()
-    record = region_record((0, 0, 0), field, nothing, training=None)
+    record = region_record((0, 0, 0), field, nothing)
     other = field_from_record(record, settings, memory_on("cuda"), seed=0)
     points = samples(settings, 500, seed=1).points
     expected, values = (each.freeze().evaluate(points, gradient=True) for each in (field, other))
     np.testing.assert_allclose(values.sdf, expected.sdf, atol=1e-5)
-    again = region_record((0, 0, 0), other.freeze(), nothing, training=None)
+    again = region_record((0, 0, 0), other.freeze(), nothing)
     for table, same in zip(record.tables, again.tables, strict=True):
         np.testing.assert_array_equal(table.features, same.features)

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from triquad_format.records.field_settings import FieldSettings
 from triquad_server.engine.initial_mlp import random_mlp
-from triquad_server.engine.live_field import Batch, LiveField, Rates, initial_field
-from triquad_server.engine.memory import ArrayMemory
+from triquad_server.engine.live_field import Batch, LiveField, initial_field
+from triquad_server.engine.memory import Memory
 from triquad_server.engine.tensor_trainer import TensorTrainer
 
-ARRAYS = ArrayMemory()
+ARRAYS = Memory()
 DEFAULT = FieldSettings(depth=8)
-RATES = Rates(learning_rate=0.01)
+RATE = 0.01
 RADIUS = 9.0  # of the ball that is learnt, leaves
 
 
@@ -56,7 +56,7 @@ def error_leaves(field: LiveField) -> float:
         points = near_the_ball(rng, 1024)
         labels = np.linalg.norm(points, axis=1) - RADIUS
         samples = (np.column_stack([points, labels]) * leaf_m).astype(np.float32)
-        trainer.train(Batch(samples[:, :3], samples[:, 3]), RATES)
+        trainer.train(Batch(samples[:, :3], samples[:, 3]), RATE)
     points = near_the_ball(rng, 4096)
     return float(np.abs(leaves_at(field, points) - np.linalg.norm(points, axis=1) + RADIUS).mean())
 

@@ -4,19 +4,19 @@ import numpy as np
 import pytest
 from support.maps import small_world
 from triquad_format.records.field_settings import FieldSettings
+from triquad_server.engine.compiled_trainer import trainer_of
 from triquad_server.engine.gradient_sums import GradientSums
-from triquad_server.engine.live_field import Batch, LiveField, Parameter, Rates, initial_field
-from triquad_server.engine.memory import ArrayMemory, Memory
+from triquad_server.engine.live_field import Batch, LiveField, Parameter, initial_field
+from triquad_server.engine.memory import Memory
 from triquad_server.engine.tensor_field import TensorMemory
-from triquad_server.engine.trainer import trainer_of
 from triquad_server.epochs.epoch import buffers_of
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.process.threads import Teams
 
 SETTINGS = FieldSettings(depth=8, frequencies=4)
-RATES = Rates(learning_rate=0.01)
+RATE = 0.01
 IN_TENSORS = "cpu:0"  # as on a GPU, but where there is none
-MEMORIES = (ArrayMemory(), TensorMemory(IN_TENSORS))
+MEMORIES = (Memory(), TensorMemory(IN_TENSORS))
 PARTS = ("values", "means", "variances", "steps")
 POINTS = np.random.default_rng(0).uniform(-12, 12, (2000, 3)).astype(np.float32)
 TEAM = Teams().mapping
@@ -33,7 +33,7 @@ def grown(memory: Memory) -> LiveField:
 
 def train(field: LiveField) -> None:
     batch = Batch(POINTS, 0.3 * np.sin(POINTS).sum(axis=1))
-    float(trainer_of(field, GradientSums(), TEAM).train(batch, RATES))
+    float(trainer_of(field, GradientSums(), TEAM).train(batch, RATE))
 
 
 def parts(field: LiveField) -> dict[str, np.ndarray]:

@@ -8,7 +8,6 @@ from triquad_format.records.field_settings import FieldSettings
 from triquad_format.records.replay_rays import HELD_OUT
 from triquad_map.field_fit import in_cube
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mapping.progress import map_fit
 from triquad_server.mapping.replay.ray_table import END
 from triquad_server.mapping.replay.replay_record import are_held_out
 
@@ -45,7 +44,7 @@ def test_a_region_is_not_judged_by_rays_that_end_beside_it() -> None:
     ends = [region.training.rays.held_out.table.rows[:, END : END + 3] for region in mapper.regions]
     inside = sum(in_cube(of_region, chosen.field).sum() for of_region in ends)
     assert inside < 0.95 * sum(map(len, ends))
-    fit = map_fit(mapper.regions)
+    fit = mapper.regions.fit
     assert fit is not None
     assert fit.rays == inside
 

@@ -21,7 +21,6 @@ from triquad_format.records.replay_rays import no_rays
 from triquad_format.records.status import Status
 from triquad_map.field_fit import in_cube
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mapping.progress import map_fit
 from triquad_server.mapping.replay.kept_rays import RAY_BYTES
 from triquad_server.mapping.replay.ray_table import END
 from triquad_server.settings import Settings
@@ -95,11 +94,11 @@ def test_a_restarted_map_tells_what_it_was_made_of_until_all_of_it_is_reset(
 
 def test_what_the_field_forgets_after_a_restart_is_told(mapped: Mapper) -> None:
     restarted = Mapper("test", settings(), "cpu", mapped.snapshot_since(None).record())
-    before, before_m = map_fit(restarted.regions), surface_error(restarted.publish(), world())
+    before, before_m = restarted.regions.fit, surface_error(restarted.publish(), world())
     damage(restarted)
     settle(restarted)
     assert surface_error(restarted.publish(), world()) > 1.2 * before_m
-    assert map_fit(restarted.regions).median_m > 1.2 * before.median_m
+    assert restarted.regions.fit.median_m > 1.2 * before.median_m
 
 
 def test_the_records_of_a_moment_are_the_same_however_the_map_goes_on() -> None:

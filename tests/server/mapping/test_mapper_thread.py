@@ -22,10 +22,10 @@ from triquad_server.intake.rays import ScanRays
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.mapping import mapper as mapper_module
 from triquad_server.mapping import mapper_thread as mapper_thread_module
-from triquad_server.mapping import publish_schedule
+from triquad_server.mapping import thread_time
 from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.mapping.mapper_thread import MapperThread
+from triquad_server.mapping.mapper_thread import MapperThread, _Phase
 from triquad_server.process.stop import Stop, Stops
 from triquad_server.settings import ServiceSettings, StoreSettings
 from triquad_server.store.checkpoint_writer import CheckpointWriter
@@ -122,7 +122,7 @@ def test_an_end_that_comes_as_a_turn_begins_is_not_slept_through(
         mapping.thread.pause()
         closing_thread = threading.Thread(target=mapping.thread.close, daemon=True)
         closing_thread.start()
-        while not mapping.thread._stopping.is_set():
+        while mapping.thread._phase is not _Phase.ENDING:
             time.sleep(0.01)
         time.sleep(0.1)
         asked.set()
@@ -131,7 +131,7 @@ def test_an_end_that_comes_as_a_turn_begins_is_not_slept_through(
 
 
 def test_however_much_is_flushed_epochs_keep_a_distance(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(publish_schedule, "_SOONEST_PUBLISH_S", NEVER_S)
+    monkeypatch.setattr(thread_time, "_SOONEST_PUBLISH_S", NEVER_S)
     mapper = learning_mapper(CountedMapper)
     with running(mapper) as mapping:
         mapping.thread.call(lambda mapper: mapper.settled)

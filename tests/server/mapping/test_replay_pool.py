@@ -1,6 +1,6 @@
 import numpy as np
 from triquad_server.engine.gradient_sums import GradientSums
-from triquad_server.engine.memory import ArrayMemory
+from triquad_server.engine.memory import Memory
 from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.mapping.replay.ray_table import VALUE, RayTable, samples_alone
 from triquad_server.mapping.replay.region_rays import RegionRays
@@ -17,7 +17,7 @@ def new_rays(capacity: int) -> RegionRays:
         of.scan,
         of.change,
         of.training,
-        memory=ArrayMemory(),
+        memory=Memory(),
         sums=GradientSums(),
         team=Teams().mapping,
     )

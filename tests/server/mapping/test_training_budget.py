@@ -3,8 +3,9 @@
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from triquad_server.mapping.live_regions import FairShare
+from triquad_server.mapping.region_training import TrainingBudget
 from triquad_server.mapping.replay.kept_rays import RAY_BYTES
-from triquad_server.mapping.training_budget import FairShare, TrainingBudget
 from triquad_server.settings import TrainingSettings
 
 SETTINGS = TrainingSettings(samples_per_ray=10.0, fresh_share=0.5)
@@ -21,7 +22,7 @@ def test_what_is_gone_is_unlearnt_while_there_is_more_to_learn_and_wakes_no_sett
     budget = budget_of(100)
     budget.add_samples(50)
     assert budget.samples == 1050
-    budget.clear()
+    budget.samples = 0
     budget.add_samples(50)
     assert budget.samples == 0
 
@@ -59,8 +60,8 @@ def test_the_rate_begins_high_and_ends_low_however_little_may_be_learnt() -> Non
     budget.limit(int(share.samples * 500))
     budget.add(10 * rays)
     first = budget.next_step(100, kept_rays=rays)
-    assert first.rates.learning_rate == training.learning_rate
+    assert first.learning_rate == training.learning_rate
     while budget.samples > 1000:
         budget.spend(budget.next_step(100, kept_rays=rays))
     last = budget.next_step(100, kept_rays=rays)
-    assert last.rates.learning_rate < 0.2 * training.learning_rate
+    assert last.learning_rate < 0.2 * training.learning_rate

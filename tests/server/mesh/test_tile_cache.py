@@ -144,7 +144,7 @@ def test_tiles_whose_bytes_went_are_made_again_and_stay_the_same() -> None:
 
 def test_tiles_of_an_epoch_are_kept_apart_from_those_that_are_followed() -> None:
     cache = TileCache(MESH, TEAM)
-    view = ground(flat(0.3)).with_split()
+    view = ground(flat(0.3)).in_one_thread()
     first = cache.of_epoch(view, 0, [(0, 0, 0), (1, 0, 0)], 0.0)
     again = cache.of_epoch(view, 0, [(1, 0, 0), (0, 0, 0)], 0.0)
     assert [id(tile) for tile in again] == [id(tile) for tile in first[::-1]]

@@ -12,9 +12,7 @@ from support.servers import MAP, WAIT_S, RawPeer, free_endpoint, raw_session
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import ErrorReply, SdfReply, SdfRequest
 from triquad_server.errors import MapperStoppedError
-from triquad_server.serving import refusals as module
 from triquad_server.serving.operations import Operations
-from triquad_server.serving.refusals import RefusalSender
 from triquad_server.settings import ServiceSettings
 
 LONG, SHORT = 4_000, 100
@@ -87,29 +85,14 @@ def test_who_is_not_answered_is_told_why_and_defects_alone_leave_a_traceback(
     assert ("Traceback" in caplog.text) == (code == "internal")
 
 
-class Request:
-    """Is refused once its client reads."""
-
-    def __init__(self, size, reads):
-        self.size = size
-        self.refused_by = None
-        self._reads = reads
-
-    def refuse(self, code, text):
-        self._reads.wait(WAIT_S)
-        self.refused_by = threading.current_thread()
-
-
-def test_large_requests_that_are_refused_do_not_pile_up_behind_who_reads_nothing():
-    reads, at_once = threading.Event(), threading.Event()
-    at_once.set()
-    sender = RefusalSender()
-    stuck = [Request(100, reads) for _ in range(module._REFUSING_THREADS)]
-    large = [Request(module._REFUSED_BYTES // 2 + 1, at_once) for _ in range(10)]
-    for request in (*stuck, *large):
-        sender.send(request, "too_large", "")
-    assert sum(request.refused_by is None for request in large) == 1
-    assert large[-1].refused_by is threading.current_thread()
-    reads.set()
-    sender.close()
-    assert all(request.refused_by for request in (*stuck, *large))
+def test_large_requests_that_are_refused_do_not_pile_up() -> None:
+    """More of them than there are threads that refuse: all senders get their answer."""
+    endpoint = free_endpoint()
+    with (
+        raw_session("peer", listen=endpoint) as session,
+        closing(Operations(session, MAP, ServiceSettings(), *ALONE)) as operations,
+        raw_session(connect=endpoint) as client,
+    ):
+        operations.serve(SdfRequest, lambda _: answer(0))
+        refusals = [RawPeer(client).refusal(keys.SDF, bytes(size)) for size in (20_000, 10**6) * 8]
+    assert refusals == ["too_large"] * 16

@@ -12,12 +12,12 @@ from support.servers import WAIT_S, free_endpoint, raw_session, until
 from triquad_format.wire import codec
 from triquad_format.wire.messages import RequestOrigin
 from triquad_server.fair_queue import Owner
+from triquad_server.serving.request import ClientSessions
 from triquad_server.serving.request_queue import (
     _REPLY_BYTES,
     _SENDING_EACH,
     _SMALL_REPLY_BYTES,
     MOST_SENDING,
-    ClientSessions,
     RequestQueue,
 )
 
