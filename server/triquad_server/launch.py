@@ -4,7 +4,7 @@ import gc
 import logging
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from typing import TYPE_CHECKING
 
@@ -25,7 +25,7 @@ from triquad_server.process.threads import Teams
 from triquad_server.service import Service
 from triquad_server.settings import Settings
 from triquad_server.store.store import Store
-from triquad_server.warm_up import warm_up
+from triquad_server.warm_up import Report, warm_up
 
 if TYPE_CHECKING:
     from triquad_server.monitoring.http_server import MonitoringServer
@@ -35,10 +35,6 @@ _log = logging.getLogger("triquad_server")
 _SWITCH_INTERVAL_S = 0.0005
 """The time for which a thread may keep the interpreter while another waits: a query is to be
 answered in a few milliseconds, which is Python's default for a single turn."""
-
-
-Report = Callable[[str], None]
-"""Receives the name of each stage of the start before it begins."""
 
 
 class StoppedEarlyError(Exception):
@@ -221,7 +217,6 @@ def _before_each_step(stops: Stops, starting: Report) -> Report:
 
 
 def _log_who_gets_in(network: Configuration) -> None:
-    """Log whom the network lets in, and what they may do."""
     if not network.own_access_control:
         _log.info("access: as the Zenoh configuration says")
     elif network.listens_beyond or network.connect:

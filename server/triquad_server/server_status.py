@@ -57,7 +57,7 @@ class Health:
         progress = self.mapper.progress
         refused: Counter[str] = Counter()  # of all operations, by error code
         for counts in self.operations.counts.copy().values():
-            refused.update(counts.refused())
+            refused.update(counts.metrics().refused)
         return ServerStatus(
             map_name=self.map_name,
             server=self.server,

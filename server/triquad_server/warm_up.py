@@ -43,15 +43,13 @@ _RADIUS_M = 3.0  # of the sphere that it sees
 _log = logging.getLogger("triquad_server")
 
 Report = Callable[[str], None]
+"""Receives the name of each step before it begins."""
 
 
 def warm_up(
     settings: Settings, device: str, teams: Teams | None = None, report: Report = lambda _: None
 ) -> None:
-    """Compile all kernels, or load what was compiled before.
-
-    ``report`` is called with the name of each step before it begins; what it raises ends the work.
-    """
+    """Compile all kernels, or load compiled ones; what ``report`` raises ends the work."""
     _log.info("preparing compiled code")
     if CODE_FOLDER is not None and not (CODE_FOLDER / _DONE).exists():
         _compile_apart(report)

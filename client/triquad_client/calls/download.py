@@ -117,7 +117,6 @@ class DownloadCalls:
 
 
 def _fetch(connection: Connection, path: Path, training: bool) -> MapInfo:
-    """Write the newest map to ``path``."""
     info = newest_file(connection, training)
     _check_space(path, info.bytes)
     remote = RemoteBytes(connection, info)

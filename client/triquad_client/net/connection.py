@@ -220,7 +220,6 @@ class Connection(Answering):
         )
 
     def _no_reply_error(self, request: Request[Any]) -> Exception:
-        """Return the error for a request that got no reply at all."""
         if self.is_closed:
             return ClosedError("the client is closed")
         available = self.maps()

@@ -146,7 +146,6 @@ class EpochHistory:
         return epoch
 
     def _pin(self, number: int) -> None:
-        """Record that an epoch was requested now."""
         self._pins.pop(number, None)
         self._pins[number] = self._clock()
 

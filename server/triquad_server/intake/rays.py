@@ -72,7 +72,6 @@ class ScanRays:
 
 
 def _check_pose(world_from_sensor: Doubles) -> None:
-    """Refuse a pose [4, 4] that is not finite or not rigid."""
     pose = world_from_sensor
     if pose.shape != (4, 4):
         raise ScanRefusedError("pose_shape", f"the pose is {list(pose.shape)}, not [4, 4]")
@@ -89,7 +88,6 @@ def _check_pose(world_from_sensor: Doubles) -> None:
 
 
 def _check_shapes(points: Floats, no_return: Floats) -> None:
-    """Refuse points or directions that are not [N, 3]."""
     for what, array in (("points", points), ("no_return", no_return)):
         if array.ndim != 2 or array.shape[1] != 3:
             raise ScanRefusedError(f"{what}_shape", f"{what}: {list(array.shape)}, not [N, 3]")
@@ -142,7 +140,6 @@ class _Selection(NamedTuple):
 
 @kernel(inline="always")
 def _is_within(x: float, y: float, z: float, low: Doubles, high: Doubles) -> bool:
-    """Return whether a point lies between two corners."""
     within: bool = low[0] <= x <= high[0] and low[1] <= y <= high[1] and low[2] <= z <= high[2]
     return within
 
@@ -161,7 +158,6 @@ def _is_first(keys: Longs, x: float, y: float, z: float, distance: float, limits
 
 @kernel()
 def _select(points: Floats, limits: _Limits, keys: Longs) -> _Selection:
-    """Select the points that are used."""
     kept, beyond = np.empty((len(points), 3)), np.empty((len(points), 3))
     count = not_finite = no_range = on_robot = too_near = too_far = 0
     for i in range(len(points)):

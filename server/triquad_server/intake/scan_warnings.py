@@ -40,8 +40,6 @@ _TABLETOP_LEAF_M = 0.035  # finer leaves than this are those of the preset table
 
 @dataclass
 class _Points:
-    """The points of some scans of one source."""
-
     scans: int = 0
     sent: int = 0
     dropped: dict[str, int] = field(default_factory=lambda: {"too_near": 0, "too_far": 0})
@@ -53,8 +51,6 @@ class _Points:
 
 @dataclass
 class _Warning:
-    """A warning as its cause was last met."""
-
     text: str
     due_s: float  # monotonic: not logged again before
     pause_s: float

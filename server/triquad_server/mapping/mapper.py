@@ -213,7 +213,6 @@ class Mapper:
             raise ScanRefusedError("internal", text) from error
 
     def _take_in(self, rays: ScanRays, regions: list[LiveRegion], stamp_s: int) -> None:
-        """Have regions take in a scan."""
         seen = [region.scan_seen(rays, stamp_s) for region in regions]
         for region, shown in zip(regions, seen, strict=True):
             region.believe(shown)

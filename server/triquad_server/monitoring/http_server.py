@@ -104,8 +104,6 @@ class MonitoringServer(socketserver.ThreadingTCPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Answers one request."""
-
     server: MonitoringServer
 
     def setup(self) -> None:

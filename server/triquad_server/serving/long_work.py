@@ -36,8 +36,6 @@ ResultT = TypeVar("ResultT")
 
 @dataclass(frozen=True)
 class _Task:
-    """Some work, and its result once it is done."""
-
     result: Future[object]
     begun_s: float = field(default_factory=time.monotonic)
 

@@ -224,7 +224,6 @@ class Operations:
             _log.exception("a request on %s could not be received", key)
 
     def _take(self, key: str, query: zenoh.Query) -> None:
-        """Queue a request, or refuse it."""
         operation = self._operations[key]
         source = self._sessions.source(query)
         queue = self._queues[_lane_of(operation.lane, payload_size(query))]

@@ -88,11 +88,6 @@ class OperationCounts:
             self._pending -= 1
             self._refused[code] = self._refused.get(code, 0) + 1
 
-    def refused(self) -> dict[str, int]:
-        """Return the number of refused requests, by error code."""
-        with self._lock:
-            return dict(self._refused)
-
     def metrics(self) -> OperationMetrics:
         """Return the counts so far."""
         with self._lock:

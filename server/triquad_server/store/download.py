@@ -19,8 +19,6 @@ FILES_KEPT = 2
 
 @dataclass(frozen=True)
 class _MapBytes:
-    """A map file in memory."""
-
     info: MapInfo
     training: bool
     data: bytes

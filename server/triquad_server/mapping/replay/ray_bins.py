@@ -102,7 +102,6 @@ def put_rays(
 
 @kernel(inline="always")
 def _voxel(row: Floats, leaf_m: float, middle: float) -> tuple[int, int, int]:
-    """Return the voxel in which a ray ends."""
     return (
         int(np.floor(row[END] / leaf_m + middle)),
         int(np.floor(row[END + 1] / leaf_m + middle)),
