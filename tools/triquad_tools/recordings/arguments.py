@@ -36,6 +36,8 @@ def _add_choice(add: _Add) -> None:
     poses = "of the sensor (default: a file with a usual name; those of a bag)"
     add("--trajectory", type=Path, metavar="FILE", help=poses)
     add("--odometry", action="store_true", help="find the poses of a lidar by its clouds alone")
+    alike = "where places look alike: let --odometry take none for another"
+    add("--no-loops", dest="loops", action="store_false", help=alike)
     begin = "where rays begin, metres, in the frame of the clouds (default: 0,0,0, and checked)"
     add("--ray-origin", type=place, metavar="X,Y,Z", help=begin)
 

@@ -39,16 +39,17 @@ _DEEP = "*", "*/*", "*/*/*"  # where recordings in a folder are searched for
 
 _ORIGIN = 0.0, 0.0, 0.0
 
-_FLAGS = {"transforms": "--transform", "deskew": "--no-deskew"}
+_FLAGS = {"transforms": "--transform", "deskew": "--no-deskew", "loops": "--no-loops"}
 """The flags whose names are not those of the choices that they set."""
 
 _OF_BAGS = {
     "topics", "poses", "map_frame", "body_frame", "transforms", "recorder_clock", "stride",
     "points_in", "ray_origin", "deskew", "units_per_metre", "trajectory", "quaternion", "odometry",
+    "loops",
 }  # fmt: skip
 _OF_DEPTH = {"trajectory", "quaternion", "intrinsics", "units_per_metre", "stride"}
 _OF_CLOUDS = {
-    "trajectory", "odometry", "quaternion", "points_in", "columns", "ray_origin", "deskew",
+    "trajectory", "odometry", "loops", "quaternion", "points_in", "columns", "ray_origin", "deskew",
 }  # fmt: skip
 """The choices that mean something for each kind of recording."""
 
@@ -105,6 +106,8 @@ def _refuse_contradictions(options: ReadingOptions) -> None:
         raise ToolError(
             "--odometry needs points in the frame of their sensor, not --points-in world"
         )
+    if not (options.odometry or options.loops):
+        raise ToolError("--no-loops says how --odometry finds the poses: give that, too")
     if options.trajectory and options.poses:
         raise ToolError("--trajectory and --poses both say which poses to take: leave one out")
 

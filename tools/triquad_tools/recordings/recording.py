@@ -51,6 +51,7 @@ class ReadingOptions:
     recorder_clock: bool = False  # stamps are when a message was recorded
     trajectory: Path | None = None  # the file of poses; else that with a usual name, or of the bag
     odometry: bool = False  # find the poses by the clouds alone
+    loops: bool = True  # and by the places that they come back to
     quaternion: Literal["xyzw", "wxyz"] | None = None  # order in it; else as its form has it
     points_in: Literal["sensor", "world"] | None = None  # frame of clouds; else sensor, and checked
     ray_origin: Place | None = None  # of clouds, in their frame; else its origin, and checked

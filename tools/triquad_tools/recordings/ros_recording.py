@@ -151,7 +151,8 @@ class RosRecording:
         if options.trajectory is not None:
             found = read_trajectory(options.trajectory, options.quaternion)
         else:
-            found = find_trajectory(self._sweeps(clouds), len(clouds))
+            sweeps = self._sweeps(clouds)
+            found = find_trajectory(sweeps, len(clouds), close_loops=options.loops)
         return pose_source.poses_of_trajectory(self._content, clouds, found, options)
 
     def _sweeps(self, clouds: Sequence[SeenCloud]) -> Iterator[Sweep]:

@@ -12,10 +12,10 @@ from triquad_tools.console.arguments import connect_to
 from triquad_tools.console.command import FAILED, OK, print_line
 from triquad_tools.console.progress import progress
 from triquad_tools.console.report import print_columns
-from triquad_tools.recordings.cloud import reach_m
 from triquad_tools.recordings.opening import entries_of, length_s, open_recording, open_selected
 from triquad_tools.recordings.publishing import FLUSH_TIMEOUT_S, publish_all, wait_until_settled
 from triquad_tools.recordings.recording import ScanEntry, options_of
+from triquad_tools.sensors.reach import reach_m
 
 _SOME = 8  # scans tell how far a sensor sees
 _INDOOR_REACH_M = 12.5  # of the preset

@@ -58,7 +58,7 @@ def read_cloud_folder(folder: Path, options: ReadingOptions | None = None) -> Sc
         )
         in_time = sorted(zip(stamps, paths, strict=False))
         sweeps = (_sweep(path, stamp, options) for stamp, path in in_time)
-        found = find_trajectory(sweeps, len(paths))
+        found = find_trajectory(sweeps, len(paths), close_loops=options.loops)
     placed = place_files(folder, options, paths, stamps, found)
     columns = options.columns or point_file.KITTI_COLUMNS
     if not sum(checked(paths, partial(point_file.check_points, columns=columns))):

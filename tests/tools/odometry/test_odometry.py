@@ -1,0 +1,74 @@
+"""A lidar that comes back to a place, or that nothing holds along its way."""
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from triquad_tools.odometry.odometry import Odometry
+from triquad_tools.sensors.sweep import NoScanError, PosedScan, Sweep
+from triquad_tools.simulation.lidar import Lidar, SimulatedDrive
+from triquad_tools.simulation.scene import Scene
+from triquad_tools.simulation.solids import box, half_space
+
+from bench.scenes.block import block_drive
+
+LIDAR = Lidar(beams=16, columns=720, noise_m=0.02)
+PERIOD_NS = 10**8
+
+
+@cache
+def around() -> tuple[Sequence[PosedScan], NDArray[np.float64]]:
+    """A drive around a small block, and 10 m on, with a lidar of few beams."""
+    drive = block_drive(41, 44.0, 266, 0.7, LIDAR)
+    return list(drive), drive.poses
+
+
+def followed(scans: Sequence[PosedScan], *, close_loops: bool = True) -> Odometry:
+    sweeps = [Sweep(scan.points, "lidar", n * PERIOD_NS) for n, scan in enumerate(scans)]
+    odometry = Odometry(sweeps[:8], close_loops=close_loops)
+    for sweep in sweeps:
+        odometry.add(sweep)
+    return odometry
+
+
+def off_m(odometry: Odometry, true: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How far the poses that were found lie from the true ones, both as seen from the first."""
+    found = odometry.trajectory()[1]
+    there = np.linalg.inv(true[0]) @ true
+    return np.linalg.norm(found[:, :3, 3] - there[:, :3, 3], axis=1)
+
+
+def test_a_loop_takes_the_drift_out() -> None:
+    scans, true = around()
+    adrift, closed = (followed(scans, close_loops=loops) for loops in (False, True))
+    assert adrift.loops == 0 < closed.loops
+    assert off_m(closed, true)[-15:].max() < 0.1
+    assert off_m(closed, true).mean() < off_m(adrift, true).mean()
+    assert closed.trajectory()[2] > 0.5 * off_m(adrift, true)[-1]
+
+
+def test_a_way_goes_on_where_nothing_holds_it() -> None:
+    shell = [box((60.0, y, 1.5), (30.0, 0.2, 1.5)) for y in (-2.2, 2.2)]
+    shell += [box((60.0, 0.0, z), (30.0, 3.0, 0.2)) for z in (-0.2, 3.2)]
+    front = [
+        box((x, 3.0 * side, 1.0), (0.4, 0.3, 1.0)) for x in range(0, 30, 3) for side in (-1, 1)
+    ]
+    ground = [half_space(-0.4)]
+    tunnel = Scene((*shell, *front, *ground), np.array([[-9.0, -9, -1], [99.0, 9, 9]]))
+    poses = np.tile(np.eye(4), (45, 1, 1))
+    poses[:, 0, 3], poses[:, 2, 3] = 5.0 + np.arange(45), 1.5
+    scans = list(SimulatedDrive(tunnel, Lidar(beams=32, columns=512, range_max_m=12.0), poses))
+    odometry = followed(scans)
+    assert odometry.loose
+    assert off_m(odometry, poses).max() < 3.0
+
+
+def test_a_scan_of_another_place_is_left_out() -> None:
+    scans, _ = around()
+    odometry = followed(scans[:6])
+    with pytest.raises(NoScanError, match=r"\d+% of its points lie where"):
+        odometry.add(Sweep(scans[100].points, "lidar", 6 * PERIOD_NS))
+    odometry.add(Sweep(scans[6].points, "lidar", 6 * PERIOD_NS))
+    assert len(odometry.trajectory()[1]) == 7
