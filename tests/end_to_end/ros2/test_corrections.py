@@ -16,6 +16,7 @@ from support.ros.ros_bridge import MAST, Bridged, bridging
 from support.ros.ros_robot import Robot, robot, stamp
 from support.ros_messages import PATH
 from triquad_server.settings import Settings
+from triquad_tools.ros2.intake.source_poses import Jump
 
 
 def body(number: int) -> NDArray[np.float64]:
@@ -120,3 +121,31 @@ def test_a_path_by_which_nothing_can_be_corrected_is_told(
         bridged.wait_for(lambda: "no pose was corrected" in caplog.text)
         assert re.search(told, caplog.text), caplog.text
         assert bridged.taken == 4
+
+
+def test_scans_before_a_jump_of_odometry_move_with_it(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    bodies = [body(number) for number in range(SCANS)]
+    place = np.eye(4)
+    place[:3, 3] = bodies[4][:3, 3]
+    jump = Jump(0, place @ off() @ np.linalg.inv(place))
+    shares = np.minimum(np.arange(SCANS) / 4, 1.0)
+    adrift = np.linalg.inv(jump.parts(shares, place[:3, 3])) @ bodies
+    with (
+        servers.running_service(SETTINGS, store=tmp_path / "store") as endpoint,
+        bridging(endpoint, "--corrections", "tf", "--wait-s", "1") as bridged,
+        robot(endpoint) as r2,
+    ):
+        r2.tf(0, ("base_link", "lidar", MAST), static=True)
+        for number, pose in enumerate(adrift):
+            map_from_odom = np.eye(4) if number < 5 else jump.move
+            for second in (number, number + 0.5):
+                r2.tf(second, ("map", "odom", map_from_odom), ("odom", "base_link", pose))
+            r2.cloud(number, world(SCANS).scans[number].points)
+        bridged.wait_for(lambda: bridged.taken == SCANS)
+        bridged.wait_for(lambda: len(moved_with_the_path(caplog)) > 0)
+        assert trail_error_m(bridged) < 0.02
+        bridged.client.flush()
+        assert shared(surface(bridged.client, tmp_path), truth()) > SAME

@@ -63,7 +63,8 @@ def _add_topics(add: Callable[..., argparse.Action]) -> None:
     poses = "of odometry, poses, transforms or a path (default: /tf)"
     add("--poses", type=_topic, default=ALL_TF, metavar="TOPIC", help=poses)
     add("--body-frame", type=frame_name, default="base_link", metavar="NAME", help="of these poses")
-    path = "a path of keyframes as a SLAM has them by now: where it changes, scans are moved"
+    path = "a path of keyframes as a SLAM has them by now: where it changes, scans are moved; tf: "
+    path += "where the frame odom jumps"
     add("--corrections", type=_topic, metavar="TOPIC", help=path)
     to_map_in = "(default: map, odom or world, the first that there is)"
     add("--map-frame", type=frame_name, default="", metavar="NAME", help=to_map_in)

@@ -121,7 +121,7 @@ def _small_moves(twists: Doubles) -> Doubles:
 
 def _products(moves: Doubles) -> Doubles:
     """Return the product [N, 4, 4] of each move with all before it."""
-    products = moves.copy()
+    products: Doubles = moves.copy()
     for number in range(1, len(moves)):
         products[number] = products[number - 1] @ moves[number]
     return products

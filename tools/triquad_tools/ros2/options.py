@@ -64,7 +64,7 @@ class TopicChoice:
     clouds: tuple[str, ...] = ()  # (): all that there are, or none where there are depth images
     depth: tuple[str, ...] = ()
     poses: str | None = None  # None: from transforms
-    corrections: str | None = None  # a path of poses as they are known by now
+    corrections: str | None = None  # a path of poses as they are known by now, or ALL_TF: jumps
 
     @property
     def takes_any_cloud(self) -> bool:
@@ -114,7 +114,7 @@ class TopicChoice:
             Role.CAMERA_INFO: tuple(dict.fromkeys(infos)),
             Role.TF_STATIC: (f"{self.prefix}/tf_static",),
         }
-        if self.corrections is not None:
+        if self.corrections not in (None, types.ALL_TF):
             names[Role.CORRECTION] = (self.corrections,)
         if self.poses is None:
             return {**names, Role.TF: (f"{self.prefix}/tf",)}

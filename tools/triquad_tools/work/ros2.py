@@ -99,6 +99,11 @@ def _connected(options: argparse.Namespace, server: ServerProcess | None) -> Cli
     return None
 
 
+def _of_transforms(topic: str) -> str:
+    """Return what stands for all transforms if a topic does, else nothing."""
+    return ALL_TF if topic.strip("/") == ALL_TF else ""
+
+
 def bridge_options(options: argparse.Namespace) -> BridgeOptions:
     """Return what the arguments ask of the bridge.
 
@@ -117,13 +122,20 @@ def bridge_options(options: argparse.Namespace) -> BridgeOptions:
             "be used with it"
         )
     prefix = full_name("", options.namespace or "").rstrip("/")
+
+    poses, corrections = (
+        topic if topic is None else _of_transforms(topic) or full_name(prefix, topic)
+        for topic in (options.poses, options.corrections)
+    )
+    if corrections == ALL_TF != poses:
+        raise ToolError("--corrections tf follows transforms, so --poses cannot be used with it")
     topics = TopicChoice(
         options.domain,
         prefix,
         clouds=tuple(full_name(prefix, name) for name in options.clouds),
         depth=tuple(full_name(prefix, name) for name in options.depth),
-        corrections=options.corrections and full_name(prefix, options.corrections),
-        poses=None if options.poses.strip("/") == ALL_TF else full_name(prefix, options.poses),
+        corrections=corrections,
+        poses=None if poses == ALL_TF else poses,
     )
     origins = {full_name(prefix, name): place for name, place in options.ray_origin}
     others = {field.name for field in fields(BridgeOptions)} - {"topics", "grid", "ray_origins"}

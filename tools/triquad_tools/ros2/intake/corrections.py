@@ -1,8 +1,9 @@
-"""Corrections of poses: the path that a SLAM publishes, which changes where it closes a loop."""
+"""Corrections of poses, where a SLAM closes a loop: its path changes, or odometry's frame jumps."""
 
 import logging
 import threading
 import time
+from collections import deque
 from typing import NamedTuple
 
 import numpy as np
@@ -14,12 +15,14 @@ from triquad_format.records.pose import pose_matrices
 from triquad_format.wire.limits import MAX_KEYFRAMES
 
 from triquad_tools.ros2.intake.drop_log import DropLog
+from triquad_tools.ros2.intake.frame_jumps import FrameJumps
 from triquad_tools.ros2.intake.placement import Placed
-from triquad_tools.ros2.intake.source_poses import Poses, SourcePoses
+from triquad_tools.ros2.intake.source_poses import Jump, Poses, SourcePoses
 from triquad_tools.sensors.motion.frame_tree import FrameTree
+from triquad_tools.sensors.motion.transform import Transform
 from triquad_tools.sensors.ros.from_bytes import decode_cdr
 from triquad_tools.sensors.ros.message_reader import MessageReader
-from triquad_tools.sensors.ros.type_store import PATH, source_of_topic
+from triquad_tools.sensors.ros.type_store import ALL_TF, PATH, source_of_topic
 from triquad_tools.sensors.sweep import NoScanError, PosedScan
 
 _log = logging.getLogger("triquad_ros2")
@@ -41,8 +44,13 @@ class _Arrived(NamedTuple):
 class Corrections:
     """Has the server correct the poses of scans where the newest path has others."""
 
-    def __init__(self, client: Client, drops: DropLog, frames: FrameTree, body_frame: str) -> None:
-        """``frames`` tell where ``body_frame`` was, whose poses paths have."""
+    def __init__(
+        self, client: Client, drops: DropLog, frames: FrameTree, body_frame: str, wait_s: float
+    ) -> None:
+        """``frames`` tell where ``body_frame`` was, whose poses paths have.
+
+        ``wait_s`` is for how long scans wait until they are published.
+        """
         self._client = client
         self._drops = drops
         self._frames = frames
@@ -53,6 +61,10 @@ class Corrections:
         self._body_from_sensor: dict[str, Doubles] = {}
         self._map_frame = ""
         self._arrived: _Arrived | None = None  # the newest that was not read
+        self._frame_jumps = FrameJumps()
+        self._jumps = deque[tuple[float, Jump]]()  # and when all scans before are published
+        self._wait_s = wait_s + _PERIOD_S
+        self._map_from_robot: Doubles | None = None
         self._stopping = threading.Event()
         # It waits for the server for as long as a correction takes.
         self._thread = threading.Thread(target=self._run, name="ros2-corrections", daemon=True)
@@ -81,6 +93,17 @@ class Corrections:
             source.add(stamp_ns, scan.world_from_sensor)
             self._body_from_sensor[name] = np.linalg.inv(map_from_body) @ scan.world_from_sensor
             self._map_frame = map_frame
+            self._map_from_robot = scan.world_from_sensor
+
+    def take_jumps(self, transforms: list[Transform]) -> None:
+        """Go on with transforms, by one of which the frame of odometry may jump."""
+        for transform in transforms:
+            if self._map_from_robot is None or transform.parent != self._map_frame:
+                continue
+            jump = self._frame_jumps.add(transform, self._map_from_robot)
+            if jump is not None:
+                with self._lock:
+                    self._jumps.append((time.monotonic() + self._wait_s, jump))
 
     def receive(self, topic_name: str, payload: zenoh.ZBytes) -> None:
         """Take a path; the one before is dropped if it was not read yet."""
@@ -93,20 +116,33 @@ class Corrections:
         while not self._stopping.wait(pause_s):
             with self._lock:
                 arrived, self._arrived = self._arrived, None
-            if arrived is None:
-                continue
             began_s = time.monotonic()
+            jumped = self._jump(began_s)
+            if arrived is None and not jumped:
+                continue
             try:
-                self._follow(arrived)
+                if arrived is not None:
+                    self._follow(arrived)
                 self._correct()
                 # At most half of the time the server makes its map again.
                 pause_s = max(_PERIOD_S, time.monotonic() - began_s)
             except Exception as error:  # whatever numbers came
                 told = error if isinstance(error, NoScanError | TriquadError) else repr(error)
-                self._drops.remark(arrived.topic_name, f"no pose was corrected: {told}", _REFUSED)
+                name = ALL_TF if arrived is None else arrived.topic_name
+                self._drops.remark(name, f"no pose was corrected: {told}", _REFUSED)
                 pause_s = _RETRY_S
                 with self._lock:
                     self._arrived = self._arrived or arrived
+
+    def _jump(self, now_s: float) -> bool:
+        """Want scans where the jumps that are due move them; return whether there are any."""
+        with self._lock:
+            due = [jump for due_s, jump in self._jumps if due_s <= now_s]
+            for jump in due:
+                self._jumps.popleft()
+                for source in self._sources.values():
+                    source.jump(jump)
+        return bool(due)
 
     def _follow(self, arrived: _Arrived) -> None:
         """Want scans where a path has them.

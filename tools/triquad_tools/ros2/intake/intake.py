@@ -24,6 +24,7 @@ from triquad_tools.ros2.options import TYPES, BridgeOptions, Role
 from triquad_tools.ros2.topics import SequenceGaps
 from triquad_tools.sensors.ros.from_bytes import decode_cdr
 from triquad_tools.sensors.ros.message_reader import MessageReader
+from triquad_tools.sensors.ros.type_store import ALL_TF
 from triquad_tools.sensors.sweep import NoScanError, Sweep
 
 _log = logging.getLogger("triquad_ros2")
@@ -69,10 +70,11 @@ class Intake:
         self._first_scan = FirstScan(options.topics, time.monotonic())
         self._check_s = time.monotonic() + LOG_PERIOD_S  # when the transforms are checked next
         self._corrections = (
-            Corrections(client, self.drops, self._motion.frames, options.body_frame)
+            Corrections(client, self.drops, self._motion.frames, options.body_frame, options.wait_s)
             if options.topics.corrections
             else None
         )
+        self._jumps_correct = options.topics.corrections == ALL_TF
         self._stopping = threading.Event()
         self._listener = TopicListener(session, options.topics, node, self._receive)
         self._thread = threading.Thread(target=self._run, name="ros2-intake")
@@ -171,6 +173,8 @@ class Intake:
             static = role is Role.TF_STATIC
             found = self._reader.transforms(kind, message, came_ns, static=static)
             self._motion.add(found, is_body=role is Role.POSE)
+            if self._corrections is not None and self._jumps_correct:
+                self._corrections.take_jumps(found)
 
     def _place(self, topic_name: str, sweep: Sweep) -> None:
         if self.scans.time_went_back(topic_name, sweep.stamp_ns):

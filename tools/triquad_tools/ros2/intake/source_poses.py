@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 from triquad_format.records.arrays import Doubles, Longs
+from triquad_format.records.pose import pose_matrices, quaternion_of, slerp
 from triquad_format.scan_log.segment import LoggedCorrection
 from triquad_format.scan_log.tracks import Motion, corrected, motions
 from triquad_format.wire.limits import MAX_KEYFRAMES
@@ -19,6 +20,8 @@ APART_M = 0.1
 
 _RECENT = 200  # scans, 20 s at 10 Hz: a path waits for a correction that is under way
 
+_JUMPS = 50  # of which the times are kept
+
 _NEW = 1000  # poses that wait, at most, to be put among the others
 
 
@@ -27,6 +30,25 @@ class Poses(NamedTuple):
 
     stamps_ns: Longs  # [K] rising
     world_from_sensor: Doubles  # [K, 4, 4]
+
+
+class Jump(NamedTuple):
+    """A move of the frame in which odometry goes on, where a SLAM has closed a loop."""
+
+    until_ns: int  # when the frame was last where it had been
+    move: Doubles  # [4, 4] of what was in the map before
+
+    def parts(self, shares: Doubles, place: Doubles) -> Doubles:
+        """Return shares [N] of the move as moves [N, 4, 4]; it turns about a place [3]."""
+        about, back = np.eye(4), np.eye(4)
+        about[:3, 3], back[:3, 3] = place, -place
+        local = back @ self.move @ about
+        turns = slerp(
+            np.tile(quaternion_of(np.eye(3)), (len(shares), 1)),
+            np.tile(quaternion_of(local[:3, :3]), (len(shares), 1)),
+            shares[:, None],
+        )
+        return about @ pose_matrices(shares[:, None] * local[:3, 3], turns) @ back
 
 
 class SourcePoses:
@@ -38,6 +60,7 @@ class SourcePoses:
         self._stamps_ns: Longs = np.zeros(0, np.int64)  # [N] rising, of those that are kept
         self._served: Doubles = np.zeros((0, 4, 4))  # [N, 4, 4] where the server has them
         self._wanted = self._served
+        self._jumps_ns: list[int] = []  # when the newest jumps were
         self._new: list[tuple[int, Doubles]] = []  # that are not among these yet
 
     @property
@@ -67,16 +90,30 @@ class SourcePoses:
         correction = LoggedCorrection("", stamps_ns, moves, until_ns)
         wanted = corrected(correction, self._stamps_ns, self._wanted)
         if len(self._moved(wanted)):
-            # What lies between a scan that moves and one that stays moves halfway: so the last that
-            # moves is kept, and the first that stays.
-            at = sum(stamp_ns <= until_ns for stamp_ns, _ in self._recent)
-            for stamp_ns, pose in list(self._recent)[max(at - 1, 0) : at + 1]:
-                if stamp_ns not in self._stamps_ns:
-                    self._keep(stamp_ns, pose)
-            self._put_in_order()
+            self._keep_end(until_ns)
             wanted = corrected(correction, self._stamps_ns, self._wanted)
         self._wanted = wanted
         return True
+
+    def jump(self, jump: Jump) -> None:
+        """Want scans moved by a jump, each by the share of the way since the jump before.
+
+        Jumps that follow each other within 10 m of way are one, in parts.
+        """
+        self._put_in_order()
+        self._keep_end(jump.until_ns)
+        stamps_ns, places = self._stamps_ns, self._wanted[:, :3, 3]
+        way_m = np.cumsum(np.linalg.norm(np.diff(places, axis=0, prepend=places[:1]), axis=1))
+        last = int(np.searchsorted(stamps_ns, jump.until_ns, side="right")) - 1
+        if last < 0:
+            return
+        rows = np.searchsorted(stamps_ns, self._jumps_ns, side="right")
+        before = [int(row) for row in rows if way_m[last] - way_m[max(row - 1, 0)] > AT_M]
+        moved = slice(max(before, default=0), last + 1)
+        begin_m = way_m[moved.start]
+        share = (way_m[moved] - begin_m) / max(way_m[last] - begin_m, 1e-9)
+        self._wanted[moved] = jump.parts(share, places[last]) @ self._wanted[moved]
+        self._jumps_ns = [*self._jumps_ns[-_JUMPS:], jump.until_ns]
 
     def to_correct(self) -> Poses | None:
         """Return where scans should be, from the first to the last that are not there; None: none.
@@ -94,6 +131,17 @@ class SourcePoses:
         """Record that the server has scans where :meth:`to_correct` said."""
         there = np.isin(self._stamps_ns, poses.stamps_ns)
         self._served[there] = poses.world_from_sensor[np.isin(poses.stamps_ns, self._stamps_ns)]
+
+    def _keep_end(self, until_ns: int) -> None:
+        """Keep the last scan up to a time, and the first after it.
+
+        What lies between a scan that moves and one that stays would move halfway.
+        """
+        at = sum(stamp_ns <= until_ns for stamp_ns, _ in self._recent)
+        for stamp_ns, pose in list(self._recent)[max(at - 1, 0) : at + 1]:
+            if stamp_ns not in self._stamps_ns:
+                self._keep(stamp_ns, pose)
+        self._put_in_order()
 
     def _keep(self, stamp_ns: int, pose: Doubles) -> None:
         """Keep the pose of a scan, as it was published."""
