@@ -5,7 +5,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from triquad_tools.console.arguments import SUFFIXES, add_fill, command_parser, within
+from triquad_tools.console.arguments import SCANS_SUFFIX, SUFFIXES, add_fill, command_parser, within
 from triquad_tools.console.command import run_work
 
 COMMAND = "triquad-pack"
@@ -31,7 +31,9 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_source(add: _Add) -> None:
     add("input", type=Path, metavar="IN", help="map file, or folder of checkpoints")
-    add("output", type=Path, metavar="OUT", help="its name ends in " + ", ".join(SUFFIXES))
+    ends = ", ".join(SUFFIXES)
+    scans = f"its name ends in {ends}, or {SCANS_SUFFIX}: the scans that a server kept in IN"
+    add("output", type=Path, metavar="OUT", help=scans)
     at = "take the newest checkpoint of the folder IN that is not after this, such as 120 or "
     at += "2026-01-31T12:00:00Z (default: the newest of all)"
     add("--at", metavar="EPOCH_OR_TIME", help=at)

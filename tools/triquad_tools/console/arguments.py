@@ -17,7 +17,7 @@ DEFAULT_MAP = "default"
 PAGE_PORT = 8080  # of the page that shows a map
 Place = tuple[float, float, float]  # metres
 
-MAP_SUFFIX, PICTURE_SUFFIX = ".triquad", ".png"
+MAP_SUFFIX, PICTURE_SUFFIX, SCANS_SUFFIX = ".triquad", ".png", ".mcap"
 MESH_SUFFIXES = (".ply", ".glb", ".obj", ".stl")
 SUFFIXES = (MAP_SUFFIX, *MESH_SUFFIXES, PICTURE_SUFFIX)
 """How the names of the files end that commands write."""

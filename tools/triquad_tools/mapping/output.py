@@ -3,6 +3,7 @@
 import errno
 import os
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from triquad_client import OfflineMap
@@ -26,14 +27,14 @@ def why(error: OSError) -> str:
     return f"the disk is full ({error})" if full else str(error)
 
 
-def check_target(path: Path, *, force: bool) -> None:
-    """Refuse a target that cannot be written, or that exists, without ``force``.
+def check_target(path: Path, *, force: bool, suffixes: Sequence[str] = SUFFIXES) -> None:
+    """Refuse a target that has another suffix, cannot be written, or exists, without ``force``.
 
     Raises:
         ToolError: with what to do instead.
     """
-    if path.suffix not in SUFFIXES:
-        raise ToolError(f"{path}: use a name that ends in {', '.join(SUFFIXES)}")
+    if path.suffix not in suffixes:
+        raise ToolError(f"{path}: use a name that ends in {', '.join(suffixes)}")
     if path.is_dir():
         raise ToolError(f"{path} is a folder; give the name of a file")
     if os.path.lexists(path) and not force:

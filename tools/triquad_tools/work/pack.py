@@ -11,11 +11,12 @@ from triquad_format.mapfile.parts.part import EVIDENCE, REGION, TRAINING, VERTIC
 from triquad_format.records.region import VertexTable
 
 from triquad_tools.commands.pack import COMMAND
-from triquad_tools.console.arguments import MAP_SUFFIX
+from triquad_tools.console.arguments import MAP_SUFFIX, SCANS_SUFFIX, SUFFIXES
 from triquad_tools.console.command import FAILED, OK, ToolError, complain, print_line, refuse
 from triquad_tools.mapfiles.crop import without_training
 from triquad_tools.mapfiles.quantise import quantise
 from triquad_tools.mapfiles.recovered_map import Loss, RecoveredMap, recover
+from triquad_tools.mapfiles.scan_export import export_scans
 from triquad_tools.mapfiles.source import (
     Box,
     SourceMap,
@@ -34,6 +35,10 @@ _MARGIN_CELLS = 16  # or of larger ones
 def work(options: argparse.Namespace) -> int:
     """Write a map file, a mesh or a picture of a map."""
     _check_usage(options)
+    if options.output.suffix == SCANS_SUFFIX:
+        check_target(options.output, force=options.force, suffixes=(SCANS_SUFFIX,))
+        print_line(f"{options.output}: {export_scans(options.input, options.output)}")
+        return OK
     path = chosen_file(options.input, options.at)
     _check_target(path, options.output, options.force)
     if path != options.input:
@@ -60,6 +65,10 @@ def _check_usage(options: argparse.Namespace) -> None:
         ),
         f"--max-error is of map files: {suffix} has none": options.max_error and not is_map,
         "--cell is of meshes: a map file has none": options.cell and is_map,
+        f"{suffix} has scans: --at, --recover, --crop and --cell are of maps": (
+            suffix == SCANS_SUFFIX
+            and bool(options.at or options.recover or options.crop or options.cell)
+        ),
     }
     refuse(problems)
     check_fill(options.output, options.fill)
@@ -72,7 +81,7 @@ def _check_target(source: Path, target: Path, force: bool) -> None:
         raise ToolError(f"{target} would pass for a checkpoint of {folder}; give another name")
     if source.exists() and target.exists() and target.samefile(source):
         raise ToolError(f"{target} is the input; write to another file")
-    check_target(target, force=force)
+    check_target(target, force=force, suffixes=(*SUFFIXES, SCANS_SUFFIX))
 
 
 def _pack_map(options: argparse.Namespace, path: Path) -> int:
