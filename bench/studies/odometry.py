@@ -93,9 +93,13 @@ def _of_drive(simulated: SimulatedDrive) -> list[Figure]:
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure streets and recorded folders, and print the figures."""
     parser = argparse.ArgumentParser(prog="odometry", description=__doc__)
+    only = "of the simulated drives, those whose names have this"
+    parser.add_argument("--only", default="", metavar="TEXT", help=only)
     parser.add_argument("folders", nargs="*", type=Path, metavar="FOLDER")
     options = parser.parse_args(argv)
     for name, simulated in _drives():
+        if options.only not in name:
+            continue
         print_rows(name, [Row(one.name, one.shown) for one in _of_drive(simulated)])
     for folder in options.folders:
         recording = read_cloud_folder(folder)
