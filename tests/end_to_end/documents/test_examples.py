@@ -240,6 +240,24 @@ def test_poses_that_drift_are_corrected(run: Run, tmp_path: Path) -> None:
     )
 
 
+def test_a_second_robot_finds_its_place_and_is_corrected_alone(run: Run, tmp_path: Path) -> None:
+    settings = Settings(
+        store=StoreSettings(log_max_bytes=1_000_000_000), training=SETTINGS.training
+    )
+    with (
+        servers.running_service(settings, store=tmp_path) as endpoint,
+        triquad_client.connect(endpoint) as client,
+    ):
+        output = run("two_robots.py", "--connect", endpoint)
+        trail = client.sources().sources["first"].trail
+    (off_cm,) = map(float, re.findall(r"([\d.]+) cm off", output))
+    assert off_cm < 5
+    assert "\n14 scans of the second robot moved" in output
+    np.testing.assert_allclose(trail, [(5 + x, 6, 1.5) for x in range(15)], atol=1e-6)
+    (distance_m,) = map(float, re.findall(r"the wall is ([\d.]+) m away", output))
+    assert abs(distance_m - 2.0) < 0.05
+
+
 def test_a_scan_finds_its_place_in_a_file(endpoint: str, ask: Run, tmp_path: Path) -> None:
     with triquad_client.connect(endpoint, "demo") as client:
         client.download_map(tmp_path / "demo.triquad")
