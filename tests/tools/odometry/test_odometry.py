@@ -6,7 +6,8 @@ from functools import cache
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from triquad_tools.odometry.odometry import Odometry
+from triquad_tools.odometry.way import Way
+from triquad_tools.sensors.reach import reach_m
 from triquad_tools.sensors.sweep import NoScanError, PosedScan, Sweep
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive
 from triquad_tools.simulation.scene import Scene
@@ -25,17 +26,17 @@ def around() -> tuple[Sequence[PosedScan], NDArray[np.float64]]:
     return list(drive), drive.poses
 
 
-def followed(scans: Sequence[PosedScan], *, close_loops: bool = True) -> Odometry:
+def followed(scans: Sequence[PosedScan], *, close_loops: bool = True) -> Way:
     sweeps = [Sweep(scan.points, "lidar", n * PERIOD_NS) for n, scan in enumerate(scans)]
-    odometry = Odometry(sweeps[:8], close_loops=close_loops)
+    way = Way(reach_m([sweep.points for sweep in sweeps[:8]]), close_loops=close_loops)
     for sweep in sweeps:
-        odometry.add(sweep)
-    return odometry
+        way.add(sweep)
+    return way
 
 
-def off_m(odometry: Odometry, true: NDArray[np.float64]) -> NDArray[np.float64]:
+def off_m(way: Way, true: NDArray[np.float64]) -> NDArray[np.float64]:
     """How far the poses that were found lie from the true ones, both as seen from the first."""
-    found = odometry.trajectory()[1]
+    found = way.trajectory()[1]
     there = np.linalg.inv(true[0]) @ true
     return np.linalg.norm(found[:, :3, 3] - there[:, :3, 3], axis=1)
 
@@ -46,7 +47,7 @@ def test_a_loop_takes_the_drift_out() -> None:
     assert adrift.loops == 0 < closed.loops
     assert off_m(closed, true)[-15:].max() < 0.1
     assert off_m(closed, true).mean() < off_m(adrift, true).mean()
-    assert closed.trajectory()[2] > 0.5 * off_m(adrift, true)[-1]
+    assert closed.moved_m > 0.5 * off_m(adrift, true)[-1]
 
 
 def test_a_way_goes_on_where_nothing_holds_it() -> None:
@@ -60,15 +61,15 @@ def test_a_way_goes_on_where_nothing_holds_it() -> None:
     poses = np.tile(np.eye(4), (45, 1, 1))
     poses[:, 0, 3], poses[:, 2, 3] = 5.0 + np.arange(45), 1.5
     scans = list(SimulatedDrive(tunnel, Lidar(beams=32, columns=512, range_max_m=12.0), poses))
-    odometry = followed(scans)
-    assert odometry.loose
-    assert off_m(odometry, poses).max() < 3.0
+    way = followed(scans)
+    assert way.loose
+    assert off_m(way, poses).max() < 3.0
 
 
 def test_a_scan_of_another_place_is_left_out() -> None:
     scans, _ = around()
-    odometry = followed(scans[:6])
+    way = followed(scans[:6])
     with pytest.raises(NoScanError, match=r"\d+% of its points lie where"):
-        odometry.add(Sweep(scans[100].points, "lidar", 6 * PERIOD_NS))
-    odometry.add(Sweep(scans[6].points, "lidar", 6 * PERIOD_NS))
-    assert len(odometry.trajectory()[1]) == 7
+        way.add(Sweep(scans[100].points, "lidar", 6 * PERIOD_NS))
+    way.add(Sweep(scans[6].points, "lidar", 6 * PERIOD_NS))
+    assert len(way.trajectory()[1]) == 7

@@ -3,6 +3,7 @@
 What was seen is kept as Gaussians in cells (VGICP: Koide et al., ICRA 2021).
 """
 
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,6 +29,20 @@ was 0.75 at least where the way was right, and 0.6 at most in some scan where it
 _HELD = 0.06
 """How well a cloud is held along one direction, as a share of another, below which it may slide, so
 that it goes on there as before in part: 0.12 at least on streets and in rooms, 0.02 in a tunnel."""
+
+
+def library() -> ModuleType:
+    """Return small_gicp.
+
+    Raises:
+        ToolError: it is not installed.
+    """
+    try:
+        import small_gicp
+    except ModuleNotFoundError as error:
+        raise ToolError("--odometry needs small_gicp: pip install 'triquad[tools]'") from error
+    found: ModuleType = small_gicp
+    return found
 
 
 class Fit(NamedTuple):
@@ -57,11 +72,7 @@ class Registration:
         Raises:
             ToolError: small_gicp is not installed.
         """
-        try:
-            import small_gicp
-        except ModuleNotFoundError as error:
-            raise ToolError("--odometry needs small_gicp: pip install 'triquad[tools]'") from error
-        self._library = small_gicp
+        self._library = library()
         self.range_m = float(np.clip(_RANGES * reach_m, _NEAREST_M, _FARTHEST_M))
 
     def thinned(self, points: NDArray[np.floating]) -> Floats:

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
-from triquad_tools.odometry.odometry import Odometry
+from triquad_tools.odometry.way import Way
 from triquad_tools.recordings.folders.trajectory import Trajectory, timed
+from triquad_tools.sensors.reach import reach_m
 from triquad_tools.sensors.sweep import NoScanError, Sweep
 
 _FIRST = 8  # sweeps, which tell how far the sensor sees
@@ -28,37 +29,37 @@ def find_trajectory(sweeps: Iterable[Sweep], count: int, *, close_loops: bool = 
     """
     sweeps = iter(sweeps)
     first = list(islice(sweeps, _FIRST))
-    odometry = Odometry(first, close_loops=close_loops)
+    way = Way(reach_m([sweep.points for sweep in first]), close_loops=close_loops)
     with progress("odometry", count) as report:
         for number, sweep in enumerate(chain(first, sweeps), start=1):
             try:
-                odometry.add(sweep)
+                way.add(sweep)
             except NoScanError as error:
                 raise ToolError(
                     f"--odometry lost its way at scan {number}: {error}: the sensor moves too far "
                     "from one to the next (map all of them), or sees too little; or give its poses"
                 ) from error
             report(number, f"{number} of {count} scans")
-    if not odometry.stamps_ns:
+    if not len(way):
         raise ToolError("--odometry: no scan has any points")
-    stamps_ns, poses, moved_m = odometry.trajectory()
+    stamps_ns, poses = way.trajectory()
     found = timed(Path("odometry"), "VGICP", poses, stamps_ns)
-    return replace(found, remarks=tuple(_remarks(odometry, count, moved_m)))
+    return replace(found, remarks=tuple(_remarks(way, count)))
 
 
-def _remarks(odometry: Odometry, count: int, moved_m: float) -> list[str]:
+def _remarks(way: Way, count: int) -> list[str]:
     """Return how far the poses are to be trusted."""
-    way = f"poses are those of odometry, along {odometry.way_m:.1f} m"
-    if odometry.loops:
+    told = f"poses are those of odometry, along {way.length_m:.1f} m"
+    if way.loops:
         remarks = [
-            f"{way}: it came back to known places, {odometry.loops} times, which moved poses by "
-            f"{moved_m:.2g} m at most (where these are places that merely look alike: --no-loops)"
+            f"{told}: it came back to known places, {way.loops} times, which moved poses by "
+            f"{way.moved_m:.2g} m at most (if these merely look alike: --no-loops)"
         ]
     else:
-        remarks = [f"{way}: it drifts, and came back to no place that it knew"]
-    if odometry.loose:
+        remarks = [f"{told}: it drifts, and came back to no place that it knew"]
+    if way.loose:
         remarks.append(
-            f"{len(odometry.loose)} of {count} scans, from number {odometry.loose[0] + 1} on, see "
+            f"{len(way.loose)} of {count} scans, from number {way.loose[0] + 1} on, see "
             "hardly anything that holds them along one direction, as in a tunnel: the way may be "
             "wrong there, too short above all"
         )

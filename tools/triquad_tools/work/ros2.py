@@ -129,11 +129,20 @@ def bridge_options(options: argparse.Namespace) -> BridgeOptions:
     )
     if corrections == ALL_TF != poses:
         raise ToolError("--corrections tf follows transforms, so --poses cannot be used with it")
+    odometry = options.odometry and full_name(prefix, options.odometry)
+    if odometry and (poses != ALL_TF or corrections):
+        raise ToolError("--odometry finds the poses: leave out --poses and --corrections")
+    clouds = tuple(full_name(prefix, name) for name in options.clouds)
+    if odometry and clouds and odometry not in clouds:
+        raise ToolError(f"--odometry {odometry} is of clouds that are taken: name it in --clouds")
+    if odometry and not clouds:
+        clouds = (odometry,)
     topics = TopicChoice(
         options.domain,
         prefix,
-        clouds=tuple(full_name(prefix, name) for name in options.clouds),
+        clouds=clouds,
         depth=tuple(full_name(prefix, name) for name in options.depth),
+        odometry=odometry,
         corrections=corrections,
         poses=None if poses == ALL_TF else poses,
     )

@@ -16,6 +16,7 @@ from triquad_format.wire.limits import MAX_KEYFRAMES
 
 from triquad_tools.ros2.intake.corrections import Corrections
 from triquad_tools.ros2.intake.drop_log import LOG_PERIOD_S, DropLog, FirstScan
+from triquad_tools.ros2.intake.live_odometry import LiveOdometry
 from triquad_tools.ros2.intake.placement import Motion, Placed, Placement
 from triquad_tools.ros2.intake.scan_publisher import Place, ScanPublisher
 from triquad_tools.ros2.intake.topic_listener import Arrival, Limits, MessageQueue, TopicListener
@@ -36,6 +37,7 @@ _SCANS_UNREAD = Limits(16, 256_000_000)
 _OTHERS_UNREAD = Limits(4096, 16_000_000)  # 4 s of transforms at 1 kHz
 _WAITING_BYTES = 512_000_000  # of sweeps that wait for their transforms
 _TICK_S = 0.2
+_ODOMETRY_FRAME = "odom"  # in which odometry's poses are, where no other was chosen
 _PATH_POSES = 100  # of a path, whose messages have all of them again and again
 
 
@@ -50,7 +52,12 @@ class Intake:
         self._start = Place(frame, np.zeros(3), stamp_ns=0) if frame else None
         self.drops = DropLog()
         self.scans = ScanPublisher(client, options.ray_origins)
-        self._motion = Motion(from_topic=options.topics.poses is not None, map_frame=frame)
+        found_by = options.topics.odometry
+        from_topic = bool(options.topics.poses or found_by)
+        self._motion = Motion(from_topic=from_topic, map_frame=frame)
+        self._odometry = found_by and LiveOdometry(
+            found_by, self._motion.frames, options.body_frame, frame or _ODOMETRY_FRAME
+        )
         self._reader = MessageReader(
             stride=options.depth_stride,
             body_frame=options.body_frame,
@@ -168,6 +175,9 @@ class Intake:
         elif role.brings_scans:
             sweep = self._reader.sweep(topic_name, kind, message, came_ns)
             self.scans.see(topic_name, sweep, is_depth=role is Role.DEPTH)
+            if self._odometry and topic_name == self._odometry.topic_name:
+                for moved in self._odometry.take(sweep):
+                    self._motion.add([moved], is_body=True)
             self._place(topic_name, sweep)
         else:
             static = role is Role.TF_STATIC
