@@ -7,7 +7,7 @@ from triquad_client import Pose
 from triquad_format.records.pose import quaternion_of
 from triquad_tools.ros2.intake.frame_jumps import FrameJumps
 from triquad_tools.ros2.intake.source_poses import Jump, SourcePoses
-from triquad_tools.sensors.motion.transform import STATIC, Transform
+from triquad_tools.sensors.motion.track import STATIC, Transform
 
 S = 10**9
 Matrix = NDArray[np.float64]

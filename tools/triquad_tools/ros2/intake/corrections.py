@@ -19,7 +19,7 @@ from triquad_tools.ros2.intake.frame_jumps import FrameJumps
 from triquad_tools.ros2.intake.placement import Placed
 from triquad_tools.ros2.intake.source_poses import Jump, Poses, SourcePoses
 from triquad_tools.sensors.motion.frame_tree import FrameTree
-from triquad_tools.sensors.motion.transform import Transform
+from triquad_tools.sensors.motion.track import Transform
 from triquad_tools.sensors.ros.from_bytes import decode_cdr
 from triquad_tools.sensors.ros.message_reader import MessageReader
 from triquad_tools.sensors.ros.type_store import ALL_TF, PATH, source_of_topic

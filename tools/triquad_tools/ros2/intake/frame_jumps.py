@@ -6,7 +6,7 @@ from triquad_format.records.pose import pose_matrices
 from triquad_format.scan_log.tracks import motions
 
 from triquad_tools.ros2.intake.source_poses import AT_M, Jump
-from triquad_tools.sensors.motion.transform import STATIC, Transform
+from triquad_tools.sensors.motion.track import STATIC, Transform
 
 _JUMP_M = 0.2
 """What moves anything within 10 m of the robot by less is how a SLAM follows it, scan by scan: each

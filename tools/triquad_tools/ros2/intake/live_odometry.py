@@ -10,7 +10,7 @@ from triquad_format.records.pose import quaternion_of
 from triquad_tools.odometry.odometry import Odometry
 from triquad_tools.odometry.registration import Registration, library
 from triquad_tools.sensors.motion.frame_tree import FrameTree
-from triquad_tools.sensors.motion.transform import Transform
+from triquad_tools.sensors.motion.track import Transform
 from triquad_tools.sensors.reach import reach_m
 from triquad_tools.sensors.sweep import NoScanError, Sweep
 
