@@ -151,8 +151,7 @@ class RosRecording:
         if options.trajectory is not None:
             found = read_trajectory(options.trajectory, options.quaternion)
         else:
-            sweeps = self._sweeps(clouds)
-            found = find_trajectory(sweeps, len(clouds), close_loops=options.loops)
+            found = find_trajectory(self._sweeps(clouds), len(clouds), close_loops=options.loops)
         return pose_source.poses_of_trajectory(self._content, clouds, found, options)
 
     def _sweeps(self, clouds: Sequence[SeenCloud]) -> Iterator[Sweep]:
