@@ -61,9 +61,9 @@ class CorrectionCalls(ScanCalls):
             InvalidScanError: the times do not rise, or a pose is none.
             RefusedError: ``bad_request``, where no scan of the source is kept, or points fit each
                 other clearly better by the inverses or by another reading; ``store``, where
-                what is needed is not kept; ``timeout``, as of :meth:`flush`. The map stays as it
-                is.
-            RequestTimeoutError: not done after ``timeout_s``; the server goes on with it.
+                what is needed is not kept. The map stays as it is.
+            RequestTimeoutError: not done after ``timeout_s``; the server goes on with it, unless
+                it had not come to all scans before.
         """
         stamps_ns, poses = _keyframes(stamps_s, world_from_sensor)
         deadline_s = checks.deadline(timeout_s)

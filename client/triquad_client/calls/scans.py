@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from triquad_format.errors import FormatError, RefusedError
+from triquad_format.errors import FormatError
 from triquad_format.printable import printable
 from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.wire import keys
@@ -156,7 +156,7 @@ class ScanCalls:
             What became of the scans so far.
 
         Raises:
-            RefusedError: ``timeout``, where that was not long enough.
+            RequestTimeoutError: that was not long enough; the text says what is known by then.
         """
         wait_s = checks.within("timeout_s", timeout_s, checks.LONGEST_S, least=0.0)
         ahead = checks.count("pending", pending, MAX_COUNT)
@@ -235,9 +235,7 @@ class ScanCalls:
         wait_s = min(max(deadline - time.monotonic(), 0.0), _SETTLE_FLUSH_S)
         try:
             self.flush(wait_s)
-        except RefusedError as error:
-            if error.code != "timeout":
-                raise
+        except RequestTimeoutError:
             return False
         return True
 
@@ -245,27 +243,26 @@ class ScanCalls:
         """Return the last reply about each source, once all their scans are dealt with.
 
         Raises:
-            RefusedError: ``timeout``: some are not, after ``timeout_s``.
+            RequestTimeoutError: some are not, after ``timeout_s``.
         """
         started = time.monotonic()
         pause_s, longest_s = _FLUSH_PAUSES_S
-        done: dict[str, FlushReply] = {}
+        known: dict[str, FlushReply] = {}
         while True:
             waited_s = time.monotonic() - started
             asked = (replace(request, waited_s=waited_s) for request in requests)
             replies = list(self._connection.replies(asked))
-            for request, reply in zip(requests, replies, strict=True):
-                if reply.done:
-                    done[request.source] = reply
-            requests = [request for request in requests if request.source not in done]
+            known.update((one.source, reply) for one, reply in zip(requests, replies, strict=True))
+            requests = [request for request in requests if not known[request.source].done]
             if not requests:
-                return done
+                return known
             if waited_s >= timeout_s:
-                first = requests[0]
-                raise RefusedError(
-                    "timeout",
+                first, so_far = requests[0], known.values()
+                raise RequestTimeoutError(
                     f"scan {first.sequence} of source {first.source!r} is not in the map after "
-                    f"{timeout_s:g} s",
+                    f"{timeout_s:g} s; so far {sum(one.taken for one in so_far)} scans were taken, "
+                    f"{sum(one.refused for one in so_far)} refused, "
+                    f"{sum(one.lost for one in so_far)} lost"
                 )
             time.sleep(min(pause_s, max(0.0, timeout_s - waited_s)))
             pause_s = min(2 * pause_s, longest_s)
