@@ -44,6 +44,17 @@ def test_another_drive_begins_with_no_jump() -> None:
     assert jumps.add(transform(3.0, np.eye(4)), here) is None
 
 
+def test_a_slam_that_follows_tracks_which_slip_in_a_turn_closes_no_loop() -> None:
+    jumps, odom = FrameJumps(), np.eye(4)
+    for number in range(40):
+        slipped = turned(-0.6 * number)  # of each turn by 3 degrees
+        found = jumps.add(transform(0.1 * number, odom), odom @ turned(3.0 * number))
+        assert found is None, number
+        odom = slipped if number % 8 == 7 else odom
+    found = jumps.add(transform(4.1, turned(15.0) @ odom), odom @ turned(120.0))
+    assert found is not None
+
+
 def driven(count: int = 41) -> SourcePoses:
     """A robot that went 40 m along x, a metre each second."""
     poses = SourcePoses()
