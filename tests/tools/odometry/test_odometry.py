@@ -6,7 +6,13 @@ from functools import cache
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support.poses import shifted
+from triquad_client import Pose
 from triquad_tools.odometry.way import Way
+from triquad_tools.recordings.odometry import find_trajectory
+from triquad_tools.ros2.intake.live_odometry import LiveOdometry
+from triquad_tools.sensors.motion.frame_tree import FrameTree
+from triquad_tools.sensors.motion.track import Transform
 from triquad_tools.sensors.reach import reach_m
 from triquad_tools.sensors.sweep import NoScanError, PosedScan, Sweep
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive
@@ -14,6 +20,7 @@ from triquad_tools.simulation.scene import Scene
 from triquad_tools.simulation.solids import box, half_space
 
 from bench.scenes.block import block_drive
+from bench.scenes.room import room_by_lidar
 
 LIDAR = Lidar(beams=16, columns=720, noise_m=0.02)
 PERIOD_NS = 10**8
@@ -73,3 +80,34 @@ def test_a_scan_of_another_place_is_left_out() -> None:
         way.add(Sweep(scans[100].points, "lidar", 6 * PERIOD_NS))
     way.add(Sweep(scans[6].points, "lidar", 6 * PERIOD_NS))
     assert len(way.trajectory()[1]) == 7
+
+
+def test_clouds_without_points_do_not_say_how_far_it_sees() -> None:
+    drive = room_by_lidar(12, 24)
+    clouds = [np.full((9, 3), np.nan)] * 12 + [scan.points[::2] for scan in drive]
+    sweeps = [Sweep(points, "lidar", number * PERIOD_NS) for number, points in enumerate(clouds)]
+    there = (np.linalg.inv(drive.poses[0]) @ drive.poses)[:, :3, 3]
+    found = find_trajectory(sweeps, len(sweeps)).poses[-len(drive) :, :3, 3]
+    assert np.abs(found - there).max() < 0.05
+    moved = followed_live(sweeps, FrameTree(), "lidar")
+    assert np.abs(moved - there).max() < 0.05
+
+
+def test_what_sits_still_on_a_robot_may_be_published_late_with_all_that_moves() -> None:
+    scans, true = around()
+    sweeps = [Sweep(scan.points, "lidar", n * PERIOD_NS) for n, scan in enumerate(scans[:14])]
+    frames = FrameTree()
+    mast = Pose((0.0, 0.0, 0.5), (0.0, 0.0, 0.0, 1.0))
+    for stamp_ns in (PERIOD_NS // 2, 8 * PERIOD_NS):
+        frames.add(Transform("base_link", "lidar", stamp_ns, mast))
+    moved = followed_live(sweeps, frames, "base_link")
+    there = np.linalg.inv(true[0]) @ true[:14] @ shifted(z=-0.5)
+    assert np.abs(moved - there[:, :3, 3]).max() < 0.1
+
+
+def followed_live(sweeps: list[Sweep], frames: FrameTree, body: str) -> NDArray[np.float64]:
+    """The places [N, 3] of a robot's body, as they are found while sweeps come."""
+    live = LiveOdometry("/points", frames, body, "odom")
+    moves = [move for sweep in sweeps for move in live.take(sweep)]
+    assert {move.child for move in moves} == {body}
+    return np.array([move.pose.position_m for move in moves])

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import replace
-from itertools import chain, islice
+from itertools import chain, dropwhile, islice
 from pathlib import Path
 
 from triquad_tools.console.command import ToolError
@@ -12,7 +12,7 @@ from triquad_tools.recordings.folders.trajectory import Trajectory, timed
 from triquad_tools.sensors.reach import reach_m
 from triquad_tools.sensors.sweep import NoScanError, Sweep
 
-_FIRST = 8  # sweeps, which tell how far the sensor sees
+_FIRST = 8  # sweeps from the first with points on, which tell how far the sensor sees
 
 
 def find_trajectory(sweeps: Iterable[Sweep], count: int, *, close_loops: bool = True) -> Trajectory:
@@ -27,11 +27,11 @@ def find_trajectory(sweeps: Iterable[Sweep], count: int, *, close_loops: bool = 
         ToolError: small_gicp is not installed, there are no points, or a scan does not fit those
             before it.
     """
-    sweeps = iter(sweeps)
-    first = list(islice(sweeps, _FIRST))
-    way = Way(reach_m([sweep.points for sweep in first]), close_loops=close_loops)
+    numbered = dropwhile(lambda each: not each[1].has_points, enumerate(sweeps, start=1))
+    first = list(islice(numbered, _FIRST))
+    way = Way(reach_m([sweep.points for _, sweep in first]), close_loops=close_loops)
     with progress("odometry", count) as report:
-        for number, sweep in enumerate(chain(first, sweeps), start=1):
+        for number, sweep in chain(first, numbered):
             try:
                 way.add(sweep)
             except NoScanError as error:

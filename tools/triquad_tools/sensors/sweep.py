@@ -26,6 +26,11 @@ class Sweep:
         return self.stamp_ns + round(first * 1e9), self.stamp_ns + round(last * 1e9)
 
     @property
+    def has_points(self) -> bool:
+        """Whether some point is finite."""
+        return bool(np.isfinite(self.points).all(axis=1).any())
+
+    @property
     def memory_bytes(self) -> int:
         """The bytes of its arrays."""
         return self.points.nbytes + (0 if self.offsets_s is None else self.offsets_s.nbytes)

@@ -12,11 +12,11 @@ from triquad_tools.odometry.registration import Registration, library
 from triquad_tools.sensors.motion.frame_tree import FrameTree
 from triquad_tools.sensors.motion.track import Transform
 from triquad_tools.sensors.reach import reach_m
-from triquad_tools.sensors.sweep import NoScanError, Sweep
+from triquad_tools.sensors.sweep import NoScanError, NoTransformError, Sweep
 
 _BEGIN_S = 1.0
-"""For so long sweeps are gathered at first, which tell how far the sensor sees; by then it is known
-where it sits on the robot, if that is published at all."""
+"""For so long sweeps are gathered, from the first with points on, which tell how far the sensor
+sees; by then it is known where it sits on the robot, if that is published at all."""
 
 
 class LiveOdometry:
@@ -42,7 +42,8 @@ class LiveOdometry:
         """Yield where the body was in a sweep, and in those that were gathered before the first.
 
         Raises:
-            NoScanError: it does not fit what was seen before, or is of another drive.
+            NoScanError: it does not fit what was seen before, or is of another drive, or it is not
+                known where the sensor sat on the body in the first ones.
         """
         if sweep.stamp_ns < self._newest_ns:
             raise NoScanError(
@@ -52,23 +53,40 @@ class LiveOdometry:
             )
         self._newest_ns = sweep.stamp_ns
         if self._odometry is None:
+            if not self._gathered and not sweep.has_points:
+                return
             self._gathered.append(sweep)
             if sweep.stamp_ns - self._gathered[0].stamp_ns < _BEGIN_S * 1e9:
                 return
-            self._begin(sweep)
-        waiting, self._gathered = self._gathered or [sweep], []
+            waiting, self._gathered = self._gathered, []
+            self._begin(waiting)
+        else:
+            waiting = [sweep]
         for each in waiting:
             yield from self._moved(each)
 
-    def _begin(self, sweep: Sweep) -> None:
-        reach = reach_m([each.points for each in self._gathered])
-        self._odometry = Odometry(Registration(reach))
-        if self._body_frame in self._frames.path(sweep.frame):
-            at = np.array([sweep.stamp_ns], np.int64)
-            body_from_sensor = self._frames.poses(self._body_frame, sweep.frame, at)[0]
-            self._sensor_from_body = np.linalg.inv(body_from_sensor)
+    def _begin(self, gathered: list[Sweep]) -> None:
+        frame = gathered[0].frame
+        if self._body_frame in self._frames.path(frame):
+            self._sensor_from_body = self._mounted(frame, gathered)
         else:
-            self._body_frame = sweep.frame
+            self._body_frame = frame
+        self._odometry = Odometry(Registration(reach_m([each.points for each in gathered])))
+
+    def _mounted(self, frame: str, gathered: list[Sweep]) -> Doubles:
+        """Return the body as the sensor sees it [4, 4], at the newest sweep that has a transform.
+
+        Some robots publish what never moves with all that does, and a little late.
+        """
+        refusal = None
+        for each in reversed(gathered):
+            at = np.array([each.stamp_ns], np.int64)
+            try:
+                return np.array(self._frames.poses(frame, self._body_frame, at)[0])
+            except NoTransformError as error:
+                refusal = refusal or error
+        assert refusal is not None
+        raise refusal
 
     def _moved(self, sweep: Sweep) -> Iterator[Transform]:
         """Yield where the body was when half of a sweep was taken, if it has any points."""
