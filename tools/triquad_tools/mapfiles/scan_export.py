@@ -11,7 +11,7 @@ from triquad_tools.recordings.scan_log import find_scan_log, read_scan_log
 
 
 def export_scans(store: Path, output: Path) -> str:
-    """Write the scans that are in a map now as a bag of ROS 2; return what it is.
+    """Write the scans that are in a map now as a bag of ROS 2; return what it is, and lacks.
 
     Poses are as they were corrected last, and what was reset is left out.
 
@@ -42,4 +42,5 @@ def export_scans(store: Path, output: Path) -> str:
         writer.discard()
         raise
     sources = len(recording.streams)
-    return f"{output.stat().st_size:,} bytes, {len(entries)} scans of {sources} sources"
+    told = f"{output.stat().st_size:,} bytes, {len(entries)} scans of {sources} sources"
+    return "; ".join([told, *recording.remarks])
