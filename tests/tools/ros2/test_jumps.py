@@ -46,6 +46,7 @@ def test_another_drive_begins_with_no_jump() -> None:
 
 def test_a_slam_that_follows_tracks_which_slip_in_a_turn_closes_no_loop() -> None:
     jumps, odom = FrameJumps(), np.eye(4)
+    jumps.add(transform(-0.1, shifted(x=0.01)), odom)
     for number in range(40):
         slipped = turned(-0.6 * number)  # of each turn by 3 degrees
         found = jumps.add(transform(0.1 * number, odom), odom @ turned(3.0 * number))
@@ -53,6 +54,13 @@ def test_a_slam_that_follows_tracks_which_slip_in_a_turn_closes_no_loop() -> Non
         odom = slipped if number % 8 == 7 else odom
     found = jumps.add(transform(4.1, turned(15.0) @ odom), odom @ turned(120.0))
     assert found is not None
+
+
+def test_a_loop_may_be_closed_soon_by_what_does_not_follow() -> None:
+    jumps = FrameJumps()
+    for number in range(5):
+        assert jumps.add(transform(number, np.eye(4)), shifted(x=float(number))) is None
+    assert jumps.add(transform(5.0, shifted(y=1.0)), shifted(x=5.0)) is not None
 
 
 def driven(count: int = 41) -> SourcePoses:

@@ -27,7 +27,7 @@ _ODOMETRY = "odom"  # REP 105; behind the name of a robot, too
 class _Frame(NamedTuple):
     stamp_ns: int
     map_from_frame: Doubles  # [4, 4]
-    robot: Doubles  # [4, 4] where it was in the frame when that moved last
+    robot: Doubles | None  # [4, 4] where it was in the frame when that moved last, if it did
 
 
 class FrameJumps:
@@ -46,14 +46,16 @@ class FrameJumps:
             return None
         now = pose_matrices(*(np.array([part]) for part in transform.numbers()))[0]
         before = self._last.get(name)
-        robot = np.linalg.inv(before.map_from_frame if before else now) @ map_from_robot
         if before is None or stamp_ns < before.stamp_ns:  # another drive begins
-            self._last[name] = _Frame(stamp_ns, now, robot)
+            self._last[name] = _Frame(stamp_ns, now, None)
             return None
+        robot = np.linalg.inv(before.map_from_frame) @ map_from_robot
         move = now @ np.linalg.inv(before.map_from_frame)
         moved_m = motions(map_from_robot[None], (move @ map_from_robot)[None], AT_M)[0]
-        driven_m = motions(before.robot[None], robot[None], AT_M)[0]
         since = robot if moved_m > _STILL_M else before.robot
         self._last[name] = _Frame(stamp_ns, now, since)
-        slip_m = _SLIP * driven_m if driven_m < AT_M else 0.0
+        slip_m = 0.0
+        if before.robot is not None:
+            driven_m = motions(before.robot[None], robot[None], AT_M)[0]
+            slip_m = _SLIP * driven_m if driven_m < AT_M else 0.0
         return Jump(before.stamp_ns, move) if moved_m > max(_JUMP_M, slip_m) else None
