@@ -125,6 +125,16 @@ def test_resets_come_back(tmp_path) -> None:
         np.testing.assert_array_equal(box, (reset.minimum, reset.maximum))
 
 
+def test_a_file_of_which_a_chunk_is_no_chunk_any_more_is_refused(tmp_path) -> None:
+    path = written(tmp_path / "whole.mcap", scan(0), scan(1, misses=2))
+    data = bytearray(path.read_bytes())
+    at = next(at for at in range(30, 60) if data[at] == 6)  # the code of a chunk
+    data[at] ^= 0x55
+    path.write_bytes(data)
+    with pytest.raises(DamagedMapFileError, match="it has 0 messages, of 5"):
+        list(read_segment(path))
+
+
 @settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_a_damaged_file_is_refused_or_reads_as_it_was(tmp_path_factory, data) -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import IO, TypeAlias
 
 import numpy as np
-from mcap.records import Channel, Footer, Message
+from mcap.records import Channel, Footer, Message, Statistics
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
@@ -190,13 +190,16 @@ def read_segment(path: Path) -> Iterator[Entry]:
 def _entries(stream: IO[bytes]) -> Iterator[Entry]:
     topics: dict[int, str] = {}
     pose, no_return = None, np.zeros((0, 3), np.float32)  # until the scan comes that they are of
-    is_whole = False
+    is_whole, read, written = False, 0, -1  # messages: a chunk whose kind is damaged is skipped
     for record in StreamReader(stream, validate_crcs=True).records:
         is_whole |= isinstance(record, Footer)
+        if isinstance(record, Statistics):
+            written = record.message_count
         if isinstance(record, Channel):
             topics[record.id] = record.topic
         if not isinstance(record, Message):
             continue
+        read += 1
         topic, data = topics[record.channel_id], record.data
         if topic.startswith(_NO_RETURN):
             no_return = np.frombuffer(data, "<f4").reshape(-1, 3)
@@ -215,6 +218,8 @@ def _entries(stream: IO[bytes]) -> Iterator[Entry]:
         yield pose
     if not is_whole:
         raise FormatError("it has no end")
+    if read != written:
+        raise FormatError(f"it has {read} messages, of {written}")
 
 
 def _scan(data: bytes, pose: Transform | None, no_return: Floats) -> LoggedScan:

@@ -34,9 +34,7 @@ from triquad_map.field.field import (
 
 from triquad_server.engine.gradient_sums import GradientSums, Touched
 from triquad_server.engine.live_field import (
-    LAST_AGE,
-    MEAN_DECAY,
-    VARIANCE_DECAY,
+    AGES,
     Batch,
     LiveField,
     Parameter,
@@ -50,9 +48,8 @@ if TYPE_CHECKING:
 Loss = Any
 """A number that a GPU may still be computing; reading it as a float waits for that."""
 
-EPSILON = 1e-10
+MEAN_DECAY, VARIANCE_DECAY, EPSILON = 0.9, 0.99, 1e-10  # beta1, beta2 and epsilon of Adam
 
-_AGES = np.arange(1.0, LAST_AGE + 1)
 _AHEAD = 12  # rows that are fetched into the cache in advance
 
 
@@ -69,11 +66,11 @@ class Rates(NamedTuple):
     """The learning rate, and what it and the variance are to be multiplied by at each age."""
 
     learning_rate: float
-    mean_scales: Floats = (rate_share(_AGES) / (1 - MEAN_DECAY**_AGES)).astype(np.float32)
+    mean_scales: Floats = (rate_share(AGES) / (1 - MEAN_DECAY**AGES)).astype(np.float32)
     """[n] The share of the rate after 1, 2, ... steps, with the correction of the mean; the last
     one applies to more steps."""
 
-    variance_scales: Floats = (1 / (1 - VARIANCE_DECAY**_AGES)).astype(np.float32)  # [n]
+    variance_scales: Floats = (1 / (1 - VARIANCE_DECAY**AGES)).astype(np.float32)  # [n]
 
 
 def _parameter_rows(parameter: Parameter) -> ParameterRows:

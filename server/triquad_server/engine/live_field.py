@@ -92,8 +92,7 @@ of it), and the least share of the rate. So learnt values move little where othe
 the MLP, which all places of a region share, it is the square."""
 
 LAST_AGE = int(_SOFT_STEPS / _HARDEST)  # from here on, no rate falls any more
-
-MEAN_DECAY, VARIANCE_DECAY = 0.9, 0.99  # beta1 and beta2 of Adam
+AGES = np.arange(1.0, LAST_AGE + 1)
 
 
 def rate_share(ages: Rows) -> Rows:

@@ -6,11 +6,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from triquad_server.engine.compiled_trainer import EPSILON
+from triquad_server.engine.compiled_trainer import EPSILON, MEAN_DECAY, VARIANCE_DECAY
 from triquad_server.engine.live_field import (
     LAST_AGE,
-    MEAN_DECAY,
-    VARIANCE_DECAY,
     Batch,
     LiveField,
     Parameter,
