@@ -5,6 +5,7 @@ import os
 import pty
 import re
 import select
+import signal
 import struct
 import sys
 import termios
@@ -26,6 +27,7 @@ class Terminal:
     process: int
     device: int
     shown: str = ""
+    has_ended: bool = False
     _waiting_from: int = 0  # characters that were shown before
 
     @property
@@ -53,6 +55,7 @@ class Terminal:
         end_s = time.monotonic() + WAIT_S
         while self._read(end_s):
             assert time.monotonic() < end_s, f"it has not ended:\n{self.page}"
+        self.has_ended = True
         return os.waitstatus_to_exitcode(os.waitpid(self.process, 0)[1])
 
     def _read(self, end_s: float) -> bool:
@@ -82,3 +85,6 @@ def terminal(
         yield opened
     finally:
         os.close(device)
+        if not opened.has_ended:  # under nohup it would outlive its terminal
+            os.kill(process, signal.SIGKILL)
+            os.waitpid(process, 0)
