@@ -4,9 +4,8 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from triquad_format.records.arrays import Doubles
-from triquad_tools.simulation.lidar import Lidar, SimulatedDrive
+from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, poses_along
 from triquad_tools.simulation.scene import Scene
 from triquad_tools.simulation.solids import Solid, half_space
 from triquad_tools.simulation.street import street
@@ -15,7 +14,6 @@ _CROSSING_M = 40.0  # of each side, at its ends, is free of what stands along it
 _CORNER_M = 6.0  # radius of the way around a corner
 _HEIGHT_M = 1.8  # of the sensor above the road
 _WEAVE_M = 0.3
-_TILT_RAD = math.radians(1.0)
 _AROUND_M, _DEEP_M, _TOP_M = 24.0, 0.5, 13.0  # bounds beyond the streets, below and above the road
 
 
@@ -42,11 +40,7 @@ def block_drive(
     yaw = np.arctan2(*(ahead - places)[:, 1::-1].T)
     weave = _WEAVE_M * np.sin(0.17 * travelled)
     places += np.column_stack([-np.sin(yaw) * weave, np.cos(yaw) * weave, 0.0 * weave])
-    roll, pitch = np.sin(0.31 * travelled), np.sin(0.23 * travelled + 1.0)
-    angles = np.column_stack([_TILT_RAD * roll, _TILT_RAD * pitch, yaw])
-    poses = np.tile(np.eye(4), (scans, 1, 1))
-    poses[:, :3, :3] = Rotation.from_euler("xyz", angles).as_matrix()
-    poses[:, :3, 3] = places
+    poses = poses_along(travelled, places, yaw)
     return SimulatedDrive(block(seed, side_m), lidar, poses, seed=seed)
 
 

@@ -117,10 +117,17 @@ def drive(scene: Scene, n_scans: int, step_m: float) -> Doubles:
     travelled = np.arange(n_scans, dtype=np.float64) * step_m
     positions = _positions(travelled, scene.drive_length_m)
     ahead = _positions(travelled + 0.05, scene.drive_length_m) - positions
-    yaw = np.arctan2(ahead[:, 1], ahead[:, 0])
+    return poses_along(travelled, positions, np.arctan2(ahead[:, 1], ahead[:, 0]))
+
+
+def poses_along(travelled: Doubles, positions: Doubles, yaw: Doubles) -> Doubles:
+    """Return poses ``[n, 4, 4]`` at positions ``[n, 3]`` and headings ``[n]``, radians.
+
+    They roll and pitch by about a degree with the way ``[n]`` that was travelled.
+    """
     roll = _TILT_RAD * np.sin(travelled * 0.31)
     pitch = _TILT_RAD * np.sin(travelled * 0.23 + 1.0)
-    poses = np.tile(np.eye(4), (n_scans, 1, 1))
+    poses = np.tile(np.eye(4), (len(travelled), 1, 1))
     # Roll about x, then pitch about y, then yaw about z.
     angles = np.column_stack([roll, pitch, yaw])
     poses[:, :3, :3] = Rotation.from_euler("xyz", angles).as_matrix()
