@@ -1,5 +1,6 @@
 """The scans that a server kept, in one file."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,7 @@ def export_scans(store: Path, output: Path) -> str:
         )
     recording = read_scan_log(log)
     entries = recording.entries
-    writer = SegmentWriter(output)
+    writer = SegmentWriter(output.with_name(f".{output.name}.unfinished"))
     try:
         with progress("writing scans", len(entries)) as report:
             scans = recording.read(range(len(entries)))
@@ -38,6 +39,7 @@ def export_scans(store: Path, output: Path) -> str:
                 writer.add(LoggedScan(entry.source, entry.stamp_ns, pose, points, missed))
                 report(number, f"{number} of {len(entries)} scans")
         writer.finish()
+        os.replace(writer.path, output)
     except BaseException:
         writer.discard()
         raise
