@@ -63,7 +63,7 @@ def _add_topics(add: Callable[..., argparse.Action]) -> None:
     poses = "of odometry, poses, transforms or a path (default: /tf)"
     add("--poses", type=_topic, default=ALL_TF, metavar="TOPIC", help=poses)
     add("--body-frame", type=frame_name, default="base_link", metavar="NAME", help="of these poses")
-    alone = "clouds of a lidar by which the pose of the body is found, where nothing publishes it"
+    alone = "clouds of a lidar that tell where the body is, where nothing publishes its pose"
     add("--odometry", type=_topic, metavar="TOPIC", help=alone)
     path = "a path of keyframes as a SLAM has them by now: where it changes, scans are moved; tf: "
     path += "where the frame odom jumps"

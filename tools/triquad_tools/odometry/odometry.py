@@ -99,7 +99,7 @@ class Odometry:
 
 
 def moved_on(before: Doubles, after: Doubles, times: float) -> Doubles:
-    """Return the pose [4, 4] so many times as far behind another as that is behind one before."""
+    """Return the pose [4, 4] that goes on from another, ``times`` as far as that from its last."""
     step, further = np.linalg.inv(before) @ after, np.eye(4)
     turn = Rotation.from_matrix(step[:3, :3]).as_rotvec()
     further[:3, :3] = Rotation.from_rotvec(times * turn).as_matrix()

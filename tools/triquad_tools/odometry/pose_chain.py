@@ -43,7 +43,8 @@ def closed(chain: Doubles, loops: list[Loop]) -> Doubles:
     undone, steps = np.linalg.inv(chain[after]), np.zeros((len(chain), 6))
     moves, weights = np.tile(np.eye(4), (len(chain), 1, 1)), np.ones(len(loops))
     for number in range(_ROUNDS):
-        off = _twists(np.linalg.inv(moves[after]) @ (moves @ chain)[before] @ measured @ undone)
+        there = moves[before] @ chain[before] @ measured
+        off = _twists(np.linalg.inv(moves[after]) @ there @ undone)
         if number:
             at_places = (to_places @ off[:, :, None])[:, :, 0]
             weights = 1 / (1 + _squares(at_places) / _CONTRADICTED**2)

@@ -64,7 +64,7 @@ class TopicChoice:
     clouds: tuple[str, ...] = ()  # (): all that there are, or none where there are depth images
     depth: tuple[str, ...] = ()
     poses: str | None = None  # None: from transforms
-    odometry: str | None = None  # of clouds by which poses are found
+    odometry: str | None = None  # of clouds that poses are found from
     corrections: str | None = None  # a path of poses as they are known by now, or ALL_TF: jumps
 
     @property

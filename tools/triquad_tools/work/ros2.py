@@ -99,9 +99,9 @@ def _connected(options: argparse.Namespace, server: ServerProcess | None) -> Cli
     return None
 
 
-def _of_transforms(topic: str) -> str:
-    """Return what stands for all transforms if a topic does, else nothing."""
-    return ALL_TF if topic.strip("/") == ALL_TF else ""
+def _poses_topic(prefix: str, topic: str) -> str:
+    """Return the full name of a topic with poses, or what stands for all transforms."""
+    return ALL_TF if topic.strip("/") == ALL_TF else full_name(prefix, topic)
 
 
 def bridge_options(options: argparse.Namespace) -> BridgeOptions:
@@ -122,11 +122,8 @@ def bridge_options(options: argparse.Namespace) -> BridgeOptions:
             "be used with it"
         )
     prefix = full_name("", options.namespace or "").rstrip("/")
-
-    poses, corrections = (
-        topic if topic is None else _of_transforms(topic) or full_name(prefix, topic)
-        for topic in (options.poses, options.corrections)
-    )
+    poses = _poses_topic(prefix, options.poses)
+    corrections = options.corrections and _poses_topic(prefix, options.corrections)
     if corrections == ALL_TF != poses:
         raise ToolError("--corrections tf follows transforms, so --poses cannot be used with it")
     odometry = options.odometry and full_name(prefix, options.odometry)

@@ -1,4 +1,4 @@
-"""Jumps of the frame of odometry in the map, by which a SLAM closes a loop."""
+"""Jumps of the frame of odometry in the map, where a SLAM closes a loop."""
 
 from typing import NamedTuple
 
