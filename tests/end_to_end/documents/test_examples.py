@@ -15,6 +15,7 @@ from PIL import Image
 from scipy.spatial import cKDTree
 from support import servers
 from support.poses import shifted
+from support.ros.ros_bridge import bridging
 from triquad_server.settings import Settings, StoreSettings, TrainingSettings
 from triquad_tools.mapfiles.meshfile import read_mesh
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive, drive
@@ -262,3 +263,15 @@ def test_a_scan_finds_its_place_in_a_file(endpoint: str, ask: Run, tmp_path: Pat
     with triquad_client.connect(endpoint, "demo") as client:
         client.download_map(tmp_path / "demo.triquad")
     assert "\nbelieve it" in ask("localise.py", "--file", tmp_path / "demo.triquad")
+
+
+def test_a_lidar_without_poses_is_mapped_by_its_bytes(run: Run) -> None:
+    with (
+        servers.running_service(SETTINGS) as endpoint,
+        bridging(endpoint, "--odometry", "points") as bridged,
+    ):
+        printed = run("lidar_without_poses.py", "--connect", endpoint)
+        assert not bridged.bridge.dropped
+    went_m, below_m = map(float, re.findall(r"(\d+\.\d+) m", printed))
+    assert abs(went_m - 8.7) < 0.05
+    assert abs(below_m - 1.5) < 0.05

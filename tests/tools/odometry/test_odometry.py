@@ -8,6 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from support.poses import shifted
 from triquad_client import Pose
+from triquad_tools.commands.ros2 import parser
 from triquad_tools.odometry.way import Way
 from triquad_tools.recordings.odometry import find_trajectory
 from triquad_tools.ros2.intake.live_odometry import LiveOdometry
@@ -18,6 +19,7 @@ from triquad_tools.sensors.sweep import NoScanError, PosedScan, Sweep
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive
 from triquad_tools.simulation.scene import Scene
 from triquad_tools.simulation.solids import box, half_space
+from triquad_tools.work.ros2 import bridge_options
 
 from bench.scenes.block import block_drive
 from bench.scenes.room import room_by_lidar
@@ -107,7 +109,9 @@ def test_what_sits_still_on_a_robot_may_be_published_late_with_all_that_moves() 
 
 def followed_live(sweeps: list[Sweep], frames: FrameTree, body: str) -> NDArray[np.float64]:
     """The places [N, 3] of a robot's body, as they are found while sweeps come."""
-    live = LiveOdometry("/points", frames, body, "odom")
-    moves = [move for sweep in sweeps for move in live.take(sweep)]
-    assert {move.child for move in moves} == {body}
+    options = bridge_options(parser().parse_args(["--odometry", "/points", "--body-frame", body]))
+    live = LiveOdometry("/points", frames, options, "map")
+    found = [found for sweep in sweeps for found in live.take(sweep)]
+    moves = [one for one in found if isinstance(one, Transform) and one.child == body]
+    assert live.body_frame == body
     return np.array([move.pose.position_m for move in moves])

@@ -10,6 +10,7 @@ from rosbags.typesys import Stores
 from support.ros_messages import CLOUD, RosMessages
 from triquad_tools.sensors.ros.from_bytes import decode, decode_cdr
 from triquad_tools.sensors.ros.point_cloud import sweep_of_cloud
+from triquad_tools.sensors.ros.type_store import LIVOX
 from triquad_tools.sensors.sweep import NoScanError
 
 ROS = RosMessages()
@@ -96,6 +97,13 @@ def test_the_times_of_points_are_understood(
         assert sweep.note == f"point times: {name}, 0.1 s"
         assert sweep.offsets_s is not None
         assert np.abs(sweep.offsets_s - expected_s).max() < 2e-6
+
+
+@pytest.mark.parametrize("kind", LIVOX)
+def test_a_cloud_is_not_taken_for_a_livox_message_without_points(kind: str) -> None:
+    payload = ROS.encode(ROS.cloud(points(), STAMP_NS), CLOUD)
+    with pytest.raises(NoScanError, match="no livox"):
+        decode_cdr(payload, kind)
 
 
 @pytest.mark.parametrize("release", [Stores.ROS2_JAZZY, Stores.ROS1_NOETIC])

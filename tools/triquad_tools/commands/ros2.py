@@ -65,6 +65,8 @@ def _add_topics(add: Callable[..., argparse.Action]) -> None:
     add("--body-frame", type=frame_name, default="base_link", metavar="NAME", help="of these poses")
     alone = "clouds of a lidar that tell where the body is, where nothing publishes its pose"
     add("--odometry", type=_topic, metavar="TOPIC", help=alone)
+    alike = "have --odometry take no place for one that it came back to"
+    add("--no-loops", dest="close_loops", action="store_false", help=alike)
     path = "a path of keyframes as a SLAM has them by now: where it changes, scans are moved; tf: "
     path += "where the frame odom jumps"
     add("--corrections", type=_topic, metavar="TOPIC", help=path)

@@ -4,8 +4,9 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from triquad_format.records.arrays import Doubles, Floats
+from triquad_format.records.arrays import Doubles, Floats, Longs
 
+from triquad_tools.odometry.odometry import Step
 from triquad_tools.odometry.pose_chain import Loop, closed, is_news, surprise
 from triquad_tools.odometry.registration import Registration
 
@@ -22,6 +23,7 @@ _SURPRISE = 10.0
 
 _MOST = 300  # loops; where there are more, every second one stays
 _KEPT = 64  # clouds with Gaussians, 2 MB each
+_MOST_PLACES = 4000  # whose points are kept, 0.2 MB each: 16 km of a lidar that sees 50 m far
 
 
 class LoopClosure:
@@ -30,9 +32,10 @@ class LoopClosure:
     def __init__(self, registration: Registration) -> None:
         self._registration = registration
         self._apart_m = _APART * registration.range_m
-        self._odometry: list[Doubles] = []  # [4, 4] of each keyframe
-        self._way_m: list[float] = []  # to each
-        self._points: list[Floats] = []
+        self._stamps_ns: list[int] = []  # of each keyframe
+        self._odometry: list[Doubles] = []  # its pose [4, 4]
+        self._way_m: list[float] = []  # to it
+        self._points: dict[int, Floats] = {}  # of those at places that were not known before
         self._closed: Doubles = np.zeros((0, 4, 4))  # the poses of keyframes as they are by now
         self._loops: list[Loop] = []
         self._apart_loops = 1  # keyframes
@@ -43,57 +46,72 @@ class LoopClosure:
         """The number of loops."""
         return len(self._loops)
 
-    def add(self, thinned: Floats, pose: Doubles) -> bool:
-        """Add a scan; return whether it is a keyframe: it is far enough from the one before.
+    @property
+    def correction(self) -> Doubles:
+        """The move [4, 4] by which poses of odometry are right by now; there must be a keyframe."""
+        correction: Doubles = self._closed[-1] @ np.linalg.inv(self._odometry[-1])
+        return correction
 
-        Args:
-            thinned: its points [M, 3], sensor frame.
-            pose: [4, 4] as odometry has it.
-        """
-        step_m = 0.0
+    def add(self, step: Step) -> bool:
+        """Add a scan; return whether by it those before lie elsewhere: a loop was closed."""
+        step_m, pose = 0.0, step.pose
         if self._odometry:
             step_m = float(np.linalg.norm(pose[:3, 3] - self._odometry[-1][:3, 3]))
             if step_m < self._apart_m:
                 return False
         self._way_m.append(step_m + (self._way_m[-1] if self._way_m else 0.0))
-        before = self._odometry[-1] if self._odometry else pose
-        last = self._closed[-1] if len(self._closed) else before
-        self._closed = np.concatenate([self._closed, (last @ np.linalg.inv(before) @ pose)[None]])
+        here = self.correction @ pose if self._odometry else pose
+        self._closed = np.concatenate([self._closed, here[None]])
+        self._stamps_ns.append(step.stamp_ns)
         self._odometry.append(pose)
-        self._points.append(thinned)
-        self._close(len(self._odometry) - 1)
-        return True
+        after = len(self._odometry) - 1
+        self._points[after] = step.thinned
+        if len(self._points) > _MOST_PLACES:
+            del self._points[min(self._points)]
+        before = self._near(after)
+        return before is not None and self._comes_back(before, after)
 
-    def poses(self) -> Doubles:
-        """Return the poses [K, 4, 4] of the keyframes, with all loops closed."""
+    def close(self) -> None:
+        """Have the keyframes where they are with all loops closed, also those that say little."""
         if self._loops:
             self._closed = closed(np.array(self._odometry), self._loops)
-        return self._closed
 
-    def _close(self, after: int) -> None:
-        """Find out whether the newest keyframe is where an earlier one was."""
-        if self._loops and after - self._loops[-1].after < self._apart_loops:
-            return
-        before = self._near(after)
-        if before is None:
-            return
-        loop = self._fitted(before, after)
-        if loop is None or surprise(self._closed, loop) > _SURPRISE:
-            return
+    def keyframes(self) -> tuple[Longs, Doubles]:
+        """Return the stamps [K] of the keyframes, and where they are by now [K, 4, 4]."""
+        return np.array(self._stamps_ns, np.int64), self._closed
+
+    def _comes_back(self, before: int, after: int) -> bool:
+        """Find out whether the newest keyframe is where an earlier one was; return as add."""
+        moves = False
+        if not self._loops or after - self._loops[-1].after >= self._apart_loops:
+            loop = self._fitted(before, after)
+            if loop is not None and surprise(self._closed, loop) <= _SURPRISE:
+                moves = is_news(self._closed, loop)
+                self._take(loop)
+                if moves:
+                    self.close()
+        away_m = np.linalg.norm(self._closed[after, :3, 3] - self._closed[before, :3, 3])
+        since = after - self._loops[-1].after if self._loops else after
+        if since < self._apart_loops and away_m < self._apart_m:
+            del self._points[after]
+        return moves
+
+    def _take(self, loop: Loop) -> None:
         self._loops.append(loop)
         if len(self._loops) > _MOST:
             del self._loops[::2]
             self._apart_loops *= 2
-        if is_news(self._closed, loop):
-            self.poses()
 
     def _near(self, after: int) -> int | None:
-        """Return the nearest keyframe that lies a whole range back along the way."""
+        """Return the nearest keyframe with points that lies a whole range back along the way."""
         range_m, way_m = self._registration.range_m, np.array(self._way_m)
-        away_m = np.linalg.norm(self._closed[:, :3, 3] - self._closed[after, :3, 3], axis=1)
-        away_m[way_m[after] - way_m < range_m] = np.inf
+        places = np.array(list(self._points))
+        places = places[way_m[after] - way_m[places] >= range_m]
+        if not len(places):
+            return None
+        away_m = np.linalg.norm(self._closed[places, :3, 3] - self._closed[after, :3, 3], axis=1)
         nearest = int(away_m.argmin())
-        return nearest if away_m[nearest] < _NEAR * range_m else None
+        return int(places[nearest]) if away_m[nearest] < _NEAR * range_m else None
 
     def _fitted(self, before: int, after: int) -> Loop | None:
         """Return the loop from a keyframe to another, if that fits what was seen there."""
@@ -110,8 +128,9 @@ class LoopClosure:
         along_m = np.abs(way_m - way_m[keyframe])
         seen = self._registration.nothing_seen(scale)
         here = np.linalg.inv(self._odometry[keyframe])
-        for other in np.flatnonzero(along_m <= _SUBMAP * self._registration.range_m):
-            seen.insert(self._cloud(int(other)), here @ self._odometry[other])
+        for other in np.flatnonzero(along_m <= _SUBMAP * self._registration.range_m).tolist():
+            if other in self._points:
+                seen.insert(self._cloud(other), here @ self._odometry[other])
         return seen
 
     def _make_cloud(self, keyframe: int) -> Any:

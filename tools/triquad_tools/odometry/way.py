@@ -23,7 +23,6 @@ class Way:
         registration = Registration(reach_m)
         self._odometry = Odometry(registration)
         self._loops = LoopClosure(registration) if close_loops else None
-        self._keyframes: list[int] = []  # numbers of sweeps
         self._stamps_ns: list[int] = []
         self._poses: list[Doubles] = []  # [4, 4] as odometry has them
         self._span_ns: tuple[int, int] | None = None  # from the first point of all to the last
@@ -55,8 +54,8 @@ class Way:
             return
         if not step.is_held:
             self.loose.append(len(self))
-        if self._loops is not None and self._loops.add(step.thinned, step.pose):
-            self._keyframes.append(len(self))
+        if self._loops is not None:
+            self._loops.add(step)
         self._stamps_ns.append(step.stamp_ns)
         self._poses.append(step.pose)
         first_ns, last_ns = sweep.span_ns
@@ -67,8 +66,9 @@ class Way:
         stamps_ns, poses = np.array(self._stamps_ns, np.int64), np.array(self._poses)
         assert self._span_ns is not None
         if self._loops is not None and self._loops.count:
-            keyframes_ns = stamps_ns[self._keyframes]
-            moves = Motion(stamps_ns, poses).moves(keyframes_ns, self._loops.poses())[1]
+            self._loops.close()
+            keyframes_ns, there = self._loops.keyframes()
+            moves = Motion(stamps_ns, poses).moves(keyframes_ns, there)[1]
             correction = LoggedCorrection("", keyframes_ns, moves, self._span_ns[1])
             closed = corrected(correction, stamps_ns, poses)
             self.moved_m = float(np.linalg.norm((closed - poses)[:, :3, 3], axis=1).max())

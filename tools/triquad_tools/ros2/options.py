@@ -159,5 +159,6 @@ class BridgeOptions:
     map_frame: str  # "": map, odom or world, the first that the transforms have
     clock: str  # stamps are when messages arrived ("arrival"), or those of their "header"
     wait_s: float  # for how long a scan waits for its transforms
+    close_loops: bool  # odometry takes into account that it comes back to places
     mesh_level: int  # of detail: cells are twice as large at each
     mesh_bytes_per_s: int  # of markers, at most

@@ -130,6 +130,8 @@ def bridge_options(options: argparse.Namespace) -> BridgeOptions:
     if odometry and (poses != ALL_TF or corrections):
         raise ToolError("--odometry finds the poses: leave out --poses and --corrections")
     clouds = tuple(full_name(prefix, name) for name in options.clouds)
+    if not (odometry or options.close_loops):
+        raise ToolError("--no-loops says how --odometry finds the poses: give that, too")
     if odometry and clouds and odometry not in clouds:
         raise ToolError(f"--odometry {odometry} is of clouds that are taken: name it in --clouds")
     if odometry and not clouds:

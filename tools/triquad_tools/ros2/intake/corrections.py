@@ -1,16 +1,18 @@
-"""Corrections of poses, where a SLAM closes a loop: its path changes, or odometry's frame jumps."""
+"""Corrections of poses, where a loop is closed: a path changes, or odometry's frame jumps."""
 
 import logging
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import zenoh
 from triquad_client import Client
 from triquad_format.errors import TriquadError
-from triquad_format.records.arrays import Doubles
+from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.pose import pose_matrices
 from triquad_format.wire.limits import MAX_KEYFRAMES
 
@@ -33,29 +35,34 @@ _REFUSED = "not_corrected"
 _LEAVE_S = 1.0  # for a correction to end, once the bridge does; the server goes on with it
 
 
+class BodyPath(NamedTuple):
+    """Where the robot's body was, as is known by now."""
+
+    parent: str  # the frame that the poses are in
+    stamps_ns: Longs  # [K] rising
+    parent_from_body: Doubles  # [K, 4, 4]
+
+
 class _Arrived(NamedTuple):
     """A path as it arrived, and the newest scan of each source before it."""
 
     topic_name: str
-    payload: zenoh.ZBytes
+    read: Callable[[], BodyPath | None]
     until_ns: dict[str, int]
 
 
 class Corrections:
     """Has the server correct the poses of scans where the newest path has others."""
 
-    def __init__(
-        self, client: Client, drops: DropLog, frames: FrameTree, body_frame: str, wait_s: float
-    ) -> None:
-        """``frames`` tell where ``body_frame`` was, whose poses paths have.
+    def __init__(self, client: Client, drops: DropLog, frames: FrameTree, wait_s: float) -> None:
+        """``frames`` tell where the robot's body was, whose poses paths have.
 
         ``wait_s`` is for how long scans wait until they are published.
         """
         self._client = client
         self._drops = drops
         self._frames = frames
-        self._body_frame = body_frame
-        self._reader = MessageReader(body_frame=body_frame, path_poses=MAX_KEYFRAMES)
+        self._reader = MessageReader(path_poses=MAX_KEYFRAMES)
         self._lock = threading.Lock()
         self._sources: dict[str, SourcePoses] = {}
         self._body_from_sensor: dict[str, Doubles] = {}
@@ -75,12 +82,12 @@ class Corrections:
         self._stopping.set()
         self._thread.join(_LEAVE_S)
 
-    def published(self, placed: Placed, scan: PosedScan, map_frame: str) -> None:
+    def published(self, placed: Placed, scan: PosedScan, map_frame: str, body_frame: str) -> None:
         """Take the pose of a sweep that was published as a scan."""
         stamp_ns = placed.sweep.stamp_ns
         try:
             at = np.array([stamp_ns], np.int64)
-            map_from_body = self._frames.poses(map_frame, self._body_frame, at)[0]
+            map_from_body = self._frames.poses(map_frame, body_frame, at)[0]
         except NoScanError as error:
             text = f"its scans cannot be corrected: {error}: --body-frame names that of the path"
             self._drops.remark(placed.topic_name, text, _REFUSED)
@@ -106,10 +113,32 @@ class Corrections:
                     self._jumps.append((time.monotonic() + self._wait_s, jump))
 
     def receive(self, topic_name: str, payload: zenoh.ZBytes) -> None:
-        """Take a path; the one before is dropped if it was not read yet."""
+        """Take the message of a path; the one before is dropped if it was not read yet."""
+        self._take(topic_name, partial(self._read, payload))
+
+    def follow(self, topic_name: str, path: BodyPath) -> None:
+        """Take a path that the clouds of a topic have told, as :meth:`receive` does."""
+        self._take(topic_name, lambda: path)
+
+    def _take(self, topic_name: str, read: Callable[[], BodyPath | None]) -> None:
         with self._lock:
             until_ns = {name: poses.newest_ns for name, poses in self._sources.items()}
-            self._arrived = _Arrived(topic_name, payload, until_ns)
+            self._arrived = _Arrived(topic_name, read, until_ns)
+
+    def _read(self, payload: zenoh.ZBytes) -> BodyPath | None:
+        """Return the path of a message; None where it has no poses yet.
+
+        Raises:
+            NoScanError: it cannot be read.
+            InvalidScanError: one of its poses is none.
+        """
+        found = self._reader.transforms(PATH, decode_cdr(payload.to_bytes(), PATH), 0)
+        if not found:
+            return None
+        numbers = [each.numbers() for each in found]
+        stamps_ns, first = np.unique([each.stamp_ns for each in found], return_index=True)
+        positions, turns = (np.array(part)[first] for part in zip(*numbers, strict=True))
+        return BodyPath(found[0].parent, stamps_ns, pose_matrices(positions, turns))
 
     def _run(self) -> None:
         pause_s = _PERIOD_S
@@ -151,24 +180,20 @@ class Corrections:
             NoScanError: it cannot be read, is in another frame than the map, or of other times.
             InvalidScanError: one of its poses is none.
         """
-        message = decode_cdr(arrived.payload.to_bytes(), PATH)
-        found = self._reader.transforms(PATH, message, 0)
-        numbers = [each.numbers() for each in found]
-        if not found or not arrived.until_ns:
+        path = arrived.read()
+        if path is None or not arrived.until_ns:
             return
-        stamps_ns, first = np.unique([each.stamp_ns for each in found], return_index=True)
-        positions, turns = (np.array(part)[first] for part in zip(*numbers, strict=True))
-        world_from_body = pose_matrices(positions, turns)
+        stamps_ns, parent_from_body = path.stamps_ns, path.parent_from_body
         with self._lock:
-            if found[0].parent != self._map_frame:
+            if path.parent != self._map_frame:
                 raise NoScanError(
                     "other_frame",
-                    f"the path is in {found[0].parent!r}, and the map is made in "
+                    f"the path is in {path.parent!r}, and the map is made in "
                     f"{self._map_frame!r}: map in the frame of the path with --map-frame",
                 )
             known = [
                 self._sources[name].follow(
-                    Poses(stamps_ns, world_from_body @ self._body_from_sensor[name]), until_ns
+                    Poses(stamps_ns, parent_from_body @ self._body_from_sensor[name]), until_ns
                 )
                 for name, until_ns in arrived.until_ns.items()
             ]

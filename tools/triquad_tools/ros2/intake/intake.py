@@ -23,6 +23,7 @@ from triquad_tools.ros2.intake.topic_listener import Arrival, Limits, MessageQue
 from triquad_tools.ros2.node import Node
 from triquad_tools.ros2.options import TYPES, BridgeOptions, Role
 from triquad_tools.ros2.topics import SequenceGaps
+from triquad_tools.sensors.motion.track import Transform
 from triquad_tools.sensors.ros.from_bytes import decode_cdr
 from triquad_tools.sensors.ros.message_reader import MessageReader
 from triquad_tools.sensors.ros.type_store import ALL_TF
@@ -37,7 +38,7 @@ _SCANS_UNREAD = Limits(16, 256_000_000)
 _OTHERS_UNREAD = Limits(4096, 16_000_000)  # 4 s of transforms at 1 kHz
 _WAITING_BYTES = 512_000_000  # of sweeps that wait for their transforms
 _TICK_S = 0.2
-_ODOMETRY_FRAME = "odom"  # in which odometry's poses are, where no other was chosen
+_ODOMETRY_MAP = "map"  # the frame that odometry's poses are in, where no other was chosen
 _PATH_POSES = 100  # of a path, whose messages have all of them again and again
 
 
@@ -48,16 +49,15 @@ class Intake:
         self, session: zenoh.Session, client: Client, options: BridgeOptions, node: Node
     ) -> None:
         """Begin to receive messages."""
-        frame = options.map_frame
+        self._options = options
+        topics, found_by = options.topics, options.topics.odometry
+        frame = options.map_frame or (_ODOMETRY_MAP if found_by else "")
         self._start = Place(frame, np.zeros(3), stamp_ns=0) if frame else None
         self.drops = DropLog()
         self.scans = ScanPublisher(client, options.ray_origins)
-        found_by = options.topics.odometry
-        from_topic = bool(options.topics.poses or found_by)
-        self._motion = Motion(from_topic=from_topic, map_frame=frame)
-        self._odometry = found_by and LiveOdometry(
-            found_by, self._motion.frames, options.body_frame, frame or _ODOMETRY_FRAME
-        )
+        self._motion = Motion(from_topic=bool(topics.poses or found_by), map_frame=frame)
+        frames = self._motion.frames
+        self._odometry = LiveOdometry(found_by, frames, options, frame) if found_by else None
         self._reader = MessageReader(
             stride=options.depth_stride,
             body_frame=options.body_frame,
@@ -77,11 +77,10 @@ class Intake:
         self._first_scan = FirstScan(options.topics, time.monotonic())
         self._check_s = time.monotonic() + LOG_PERIOD_S  # when the transforms are checked next
         self._corrections = (
-            Corrections(client, self.drops, self._motion.frames, options.body_frame, options.wait_s)
-            if options.topics.corrections
+            Corrections(client, self.drops, frames, options.wait_s)
+            if topics.corrections or (found_by and options.close_loops)
             else None
         )
-        self._jumps_correct = options.topics.corrections == ALL_TF
         self._stopping = threading.Event()
         self._listener = TopicListener(session, options.topics, node, self._receive)
         self._thread = threading.Thread(target=self._run, name="ros2-intake")
@@ -150,7 +149,8 @@ class Intake:
         frame = self._placement.map_frame
         scan = self.scans.publish(name, placed.outcome, stamp_ns, frame)
         if self._corrections is not None:
-            self._corrections.published(placed, scan, frame)
+            body = self._odometry.body_frame if self._odometry else self._options.body_frame
+            self._corrections.published(placed, scan, frame, body)
 
     def _guard(self, topic_name: str, step: Callable[[], None]) -> None:
         """Do something with a message; no bytes may stop the intake."""
@@ -176,15 +176,21 @@ class Intake:
             sweep = self._reader.sweep(topic_name, kind, message, came_ns)
             self.scans.see(topic_name, sweep, is_depth=role is Role.DEPTH)
             if self._odometry and topic_name == self._odometry.topic_name:
-                for moved in self._odometry.take(sweep):
-                    self._motion.add([moved], is_body=True)
+                self._follow_odometry(self._odometry, sweep)
             self._place(topic_name, sweep)
         else:
             static = role is Role.TF_STATIC
             found = self._reader.transforms(kind, message, came_ns, static=static)
             self._motion.add(found, is_body=role is Role.POSE)
-            if self._corrections is not None and self._jumps_correct:
+            if self._corrections is not None and self._options.topics.corrections == ALL_TF:
                 self._corrections.take_jumps(found)
+
+    def _follow_odometry(self, odometry: LiveOdometry, sweep: Sweep) -> None:
+        for found in odometry.take(sweep):
+            if isinstance(found, Transform):
+                self._motion.add([found], is_body=found.child == odometry.body_frame)
+            elif self._corrections is not None:
+                self._corrections.follow(odometry.topic_name, found)
 
     def _place(self, topic_name: str, sweep: Sweep) -> None:
         if self.scans.time_went_back(topic_name, sweep.stamp_ns):

@@ -51,8 +51,10 @@ def _livox(data: bytes, is_ros_1: bool) -> Sweep:
     at += 0 if is_ros_1 else -(at - 4) % 8
     base_ns, _, _, count = _LIVOX.unpack_from(data, at)
     dtype = np.dtype([("t", "<u4"), ("xyz", "<f4", 3), ("more", "u1", 3 if is_ros_1 else 4)])
-    table = data[at + _LIVOX.size :] + bytes(0 if is_ros_1 else 1)  # the last is not padded
-    if len(table) != count * dtype.itemsize and count:
+    table = data[at + _LIVOX.size :]
+    if count and not is_ros_1:
+        table += bytes(1)  # the last is not padded
+    if len(table) != count * dtype.itemsize:
         raise ValueError(f"{len(table)} bytes are not {count} points")
     rows = np.frombuffer(table, dtype, count)
     rows = rows[np.isfinite(rows["xyz"]).all(axis=1) & rows["xyz"].any(axis=1)]  # 0: no return
