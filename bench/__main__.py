@@ -19,7 +19,7 @@ from triquad_tools.console.command import run
 from triquad_tools.console.progress import progress
 from triquad_tools.console.report import Row, print_rows
 
-from bench.results import RESULTS, Result, machine, write_page
+from bench.results_page import RESULTS, Result, machine, write_page
 
 PARTS = ("core", "server", "answers", "file", "moving", "poses", "presets", "start", "viewer")
 """The modules of ``bench.parts`` that measure, each imported in its turn: one needs a browser."""

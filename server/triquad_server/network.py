@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import zenoh
-from triquad_format.wire.access_control import access_control, without_credentials
 from triquad_format.wire.endpoints import DEFAULT_ENDPOINT, is_of_this_machine
 from triquad_format.wire.limits import MAX_QUERY_POINTS, payload_limit
+from triquad_format.wire.zenoh_access import access_control, without_credentials
 from triquad_format.wire.zenoh_config import QUIET, fill, is_set, put, reason
 
 from triquad_server.errors import ListenError, ServerError

@@ -16,7 +16,7 @@ from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.mesh.tile_cache import TileCache
 from triquad_server.process.stop import Stop
-from triquad_server.requests import answer_requests
+from triquad_server.routes import answer_requests
 from triquad_server.server_status import Health, Heartbeat
 from triquad_server.serving.operations import Operations
 from triquad_server.settings import Settings

@@ -6,7 +6,7 @@ import pytest
 
 from bench import __main__ as bench
 from bench.figures import Figure
-from bench.results import PAGE, RESULTS, Result, page
+from bench.results_page import PAGE, RESULTS, Result, page
 
 MEASURED = Result(
     "core",

@@ -21,7 +21,7 @@ from triquad_format.mapfile.checkpoint_folder import (
 from triquad_format.mapfile.index import MAGIC, read_checkpoint
 from triquad_format.mapfile.reader import StoredMap, open_manifest, read_map
 from triquad_format.mapfile.writer import write_map
-from triquad_tools.mapfiles.recovered_map import recover
+from triquad_tools.mapfiles.recovery import recover
 from triquad_tools.mapfiles.source import checkpoint_at
 
 NOON_NS = 1_767_268_800 * 10**9  # 2026-01-01T12:00:00Z

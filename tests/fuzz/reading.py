@@ -14,7 +14,7 @@ from support.maps.map_records import assert_same
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.record_check import check_record
 from triquad_format.records.region import MapRecord
-from triquad_tools.mapfiles.recovered_map import recover
+from triquad_tools.mapfiles.recovery import recover
 
 REFUSED = "refused"
 _LIMIT_BYTES = 64 * 2**20

@@ -24,7 +24,7 @@ from triquad_format.mapfile.writer import write_map
 from triquad_server.errors import StoreError
 from triquad_server.settings import StoreSettings
 from triquad_server.store.store import Store
-from triquad_tools.mapfiles.recovered_map import recover
+from triquad_tools.mapfiles.recovery import recover
 
 
 @pytest.fixture

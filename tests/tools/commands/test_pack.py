@@ -14,7 +14,7 @@ from triquad_format.mapfile.writer import write_map
 from triquad_format.records.region import MapProgress
 from triquad_tools.commands.pack import main
 from triquad_tools.mapfiles.crop import crop_record, without_training
-from triquad_tools.mapfiles.recovered_map import recover
+from triquad_tools.mapfiles.recovery import recover
 
 CUBE = tuple(itertools.product((0, 1), repeat=3))
 

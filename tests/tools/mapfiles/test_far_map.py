@@ -19,7 +19,7 @@ from triquad_map.preview import previews_of
 from triquad_tools.commands import inspect, pack
 from triquad_tools.mapfiles.crop import crop_record
 from triquad_tools.mapfiles.meshfile import read_mesh
-from triquad_tools.mapfiles.recovered_map import recover
+from triquad_tools.mapfiles.recovery import recover
 
 FAR = (450_000.0, 5_400_000.0, 400.0)
 

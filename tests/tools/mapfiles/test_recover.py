@@ -43,7 +43,7 @@ from triquad_format.records.status import Status
 from triquad_map.composition.composed_view import RecordedView
 from triquad_map.view import FieldAnswer
 from triquad_tools.mapfiles.crop import without_training
-from triquad_tools.mapfiles.recovered_map import RecoveredMap, recover
+from triquad_tools.mapfiles.recovery import RecoveredMap, recover
 
 SQUARES = dataclasses.replace(SMALL, depth=9)
 """A region of 128 m, of 2 x 2 squares."""

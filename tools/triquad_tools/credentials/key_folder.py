@@ -19,8 +19,8 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from triquad_format.mapfile.files import replacing
-from triquad_format.wire.access_control import access_control
 from triquad_format.wire.endpoints import full_endpoint
+from triquad_format.wire.zenoh_access import access_control
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.credentials.certificates import LOCAL_HOSTS, Certificate, new_authority

@@ -7,8 +7,8 @@ rest is denied. Clients keep one of their own: they take nothing but from a serv
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from triquad_format.wire import access_control as access
 from triquad_format.wire import keys
+from triquad_format.wire import zenoh_access as access
 
 LISTENING = SERVER, ROUTER = "server", "router"  # roles of those who listen, and their names
 VIEWER, ROBOT, ADMIN = "viewer", "robot", "admin"

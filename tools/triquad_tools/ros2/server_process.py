@@ -13,12 +13,12 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from triquad_format.wire.access_control import (
+from triquad_format.wire.endpoints import DEFAULT_ENDPOINT, full_endpoint
+from triquad_format.wire.zenoh_access import (
     access_control,
     take_part_in_ros2,
     without_credentials,
 )
-from triquad_format.wire.endpoints import DEFAULT_ENDPOINT, full_endpoint
 
 from triquad_tools.console.arguments import DEFAULT_MAP
 from triquad_tools.ros2.options import TopicChoice

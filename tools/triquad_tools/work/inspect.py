@@ -10,6 +10,7 @@ from triquad_tools.console.arguments import DEFAULT_MAP
 from triquad_tools.console.command import FAILED, OK, ToolError, complain, print_line, refuse
 from triquad_tools.console.progress import progress
 from triquad_tools.console.report import json_text
+from triquad_tools.mapfiles.checkpoint_history import print_log, read_log
 from triquad_tools.mapfiles.diff import (
     compare,
     difference,
@@ -18,7 +19,6 @@ from triquad_tools.mapfiles.diff import (
     print_objects,
 )
 from triquad_tools.mapfiles.source import SourceMap, is_endpoint, map_file
-from triquad_tools.mapfiles.store_log import print_log, read_log
 from triquad_tools.mapfiles.summary import print_summary, summarise
 
 

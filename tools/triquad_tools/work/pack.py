@@ -15,7 +15,7 @@ from triquad_tools.console.arguments import MAP_SUFFIX, SCANS_SUFFIX, SUFFIXES
 from triquad_tools.console.command import FAILED, OK, ToolError, complain, print_line, refuse
 from triquad_tools.mapfiles.crop import without_training
 from triquad_tools.mapfiles.quantise import quantise
-from triquad_tools.mapfiles.recovered_map import Loss, RecoveredMap, recover
+from triquad_tools.mapfiles.recovery import Loss, RecoveredMap, recover
 from triquad_tools.mapfiles.scan_export import export_scans
 from triquad_tools.mapfiles.source import (
     Box,
