@@ -21,7 +21,6 @@ from triquad_format.wire.messages import (
     ResetRequest,
     Scan,
     SdfRequest,
-    StatusRequest,
 )
 from triquad_format.wire.metrics_messages import MetricsRequest
 from triquad_format.wire.query_messages import (
@@ -35,6 +34,7 @@ from triquad_format.wire.query_messages import (
     SpheresRequest,
 )
 from triquad_format.wire.source_messages import CorrectPosesRequest, SourcesRequest
+from triquad_format.wire.status_messages import StatusRequest
 
 NUMBERS = (0, 1, -1, 2, 7, 2**15, 2**31, -(2**31), 2**53, 2**62, 2**63 - 1, -(2**63), 2**64 - 1)
 _VALUES: tuple[Any, ...] = (

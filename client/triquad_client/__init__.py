@@ -11,7 +11,7 @@ with triquad.connect("tcp/127.0.0.1:7447") as client:
 from triquad_format import __version__
 from triquad_format.errors import InvalidInputError, MapFileError, RefusedError, TriquadError
 from triquad_format.records.status import Status, Statuses
-from triquad_format.wire.messages import CheckpointInfo, FieldFit, MapInfo, ResetReply, ServerStatus
+from triquad_format.wire.messages import CheckpointInfo, MapInfo, ResetReply
 from triquad_format.wire.metrics_messages import (
     CheckpointMetrics,
     OperationMetrics,
@@ -26,6 +26,7 @@ from triquad_format.wire.source_messages import (
     ScanSource,
     SourceReport,
 )
+from triquad_format.wire.status_messages import FieldFit, KeptScans, ServerStatus
 from triquad_map.questions.align import Alignment
 from triquad_map.questions.bodies import Polyline, Segments, Spheres
 from triquad_map.questions.distance import Distances, Unknown, UnknownSpaceError
@@ -119,6 +120,7 @@ __all__ = [
     "Segments",
     "ServerMetrics",
     "FieldFit",
+    "KeptScans",
     "ServerStatus",
     "SourceMetrics",
     "SourceReport",

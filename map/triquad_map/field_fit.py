@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from triquad_format.records.arrays import Bools, Doubles, Floats, Longs
 from triquad_format.records.cells import same_cells
 from triquad_format.records.field_settings import FieldSettings
-from triquad_format.wire.messages import FieldFit
+from triquad_format.wire.status_messages import FieldFit
 
 _PLACE_LEAVES = 32.0  # side of a place
 _WORST = 5  # places that are reported

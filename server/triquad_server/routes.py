@@ -10,11 +10,11 @@ from triquad_format.wire.messages import (
     MapChunkRequest,
     MapInfoRequest,
     ResetRequest,
-    StatusRequest,
 )
 from triquad_format.wire.metrics_messages import MetricsRequest
 from triquad_format.wire.query_messages import ChangesRequest, GridRequest
 from triquad_format.wire.source_messages import CorrectPosesRequest, SourcesRequest
+from triquad_format.wire.status_messages import StatusRequest
 from triquad_map.questions.answers import QUESTIONS, Answers
 
 from triquad_server.epochs.surface_history import SurfaceHistory, changes_reply

@@ -12,8 +12,8 @@ import zenoh
 from triquad_format.printable import joined_lines
 from triquad_format.wire import codec, keys
 from triquad_format.wire.codec import moved
-from triquad_format.wire.messages import ServerStatus
 from triquad_format.wire.metrics_messages import QueueMetrics, ServerMetrics
+from triquad_format.wire.status_messages import ServerStatus
 
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.intake.scan_queue import ScanQueue
@@ -78,6 +78,7 @@ class Health:
             uptime_s=time.monotonic() - self.started_s,
             last_checkpoint=self.checkpoints.last,
             store_error=self.checkpoints.error,
+            kept_scans=self.checkpoints.kept_scans,
             warnings=joined_lines(self.checkpoints.warning, self.warnings.all()),
             map_max_bytes=self.map_max_bytes,
             fit=progress.fit,

@@ -23,6 +23,7 @@ ANY_VALUE = {
     "/tiles, shorter",
     "/stamp_ns",
     "/last_checkpoint/stamp_ns",
+    "/kept_scans/since_ns",
     "/sources/default/newest/stamp_ns",
     "/sources/default/newest/points, shorter",
 }

@@ -14,7 +14,7 @@ from support.operations import OPERATIONS
 from triquad_format.wire import codec, keys
 from triquad_format.wire.limits import MAX_SEQUENCE
 from triquad_format.wire.mesh_messages import MeshRequest, TileListRequest
-from triquad_format.wire.messages import FlushRequest, ResetRequest, SdfRequest, StatusRequest
+from triquad_format.wire.messages import FlushRequest, ResetRequest, SdfRequest
 from triquad_format.wire.query_messages import (
     ChangesRequest,
     DistanceRequest,
@@ -23,6 +23,7 @@ from triquad_format.wire.query_messages import (
     SegmentsRequest,
 )
 from triquad_format.wire.source_messages import SourcesRequest
+from triquad_format.wire.status_messages import StatusRequest
 
 ORIGIN = np.zeros(3)
 ONE_POINT = np.zeros((1, 3), np.float32)

@@ -123,3 +123,59 @@ def test_scans_that_are_kept_no_more_stay_where_a_correction_has_put_them(tmp_pa
             client.correct_poses("roof", *corrections(0, 4), onward=True)
         assert client.correct_poses("roof", *corrections(4), onward=True).scans_moved == 2
         assert shared(surface(client, tmp_path), truth()) > SAME
+
+
+def since_s(client: Client) -> float | None:
+    """From when on poses can be corrected, as the status says."""
+    kept = client.status().kept_scans
+    assert kept is not None
+    return None if kept.since_ns is None else kept.since_ns / 1e9
+
+
+def in_checkpoints(client: Client, *numbers: int) -> None:
+    """Have some scans mapped, a checkpoint each."""
+    for number in numbers:
+        publish(client, number, off())
+        client.flush()
+        client.checkpoint()
+
+
+def delete_the_oldest(store: Path) -> None:
+    """Delete a file of the log, as where it has no room for more."""
+    min(store.glob("*/scans/*.mcap")).unlink()
+
+
+def test_the_status_tells_how_much_is_kept_and_since_when(tmp_path: Path) -> None:
+    with servers.service_and_client(SETTINGS, tmp_path) as client:
+        assert since_s(client) is None
+        in_checkpoints(client, 0, 1)
+        assert since_s(client) == FIRST_S
+        kept = client.status().kept_scans
+        files = list(tmp_path.glob("*/scans/*.mcap"))
+        assert kept.bytes == sum(file.stat().st_size for file in files) > 1000
+        assert kept.max_bytes == SETTINGS.store.log_max_bytes
+        assert repr(client.status()).endswith("; poses since 1000000000.000 s can be corrected)")
+    settings = SETTINGS.model_copy(update={"store": servers.SMALL.store})
+    with servers.service_and_client(settings, tmp_path) as client:
+        assert client.status().kept_scans is None
+
+
+def test_poses_can_be_corrected_from_when_the_status_says_and_none_before(tmp_path: Path) -> None:
+    with servers.service_and_client(SETTINGS, tmp_path) as client:
+        in_checkpoints(client, 0, 1, 2, 3, 4)
+    delete_the_oldest(tmp_path)
+    with servers.service_and_client(SETTINGS, tmp_path) as client:
+        assert since_s(client) == FIRST_S + 1
+        with pytest.raises(RefusedError, match="not kept any more"):
+            client.correct_poses("roof", *corrections(0, 1), onward=True)
+        assert client.correct_poses("roof", *corrections(1), onward=True).scans_moved == 4
+        assert since_s(client) == FIRST_S + 1
+        delete_the_oldest(tmp_path)
+        in_checkpoints(client, 5)
+        assert since_s(client) == FIRST_S + 5, "what was corrected together cannot be again"
+    with servers.service_and_client(SETTINGS, tmp_path) as client:
+        assert since_s(client) == FIRST_S + 5
+        wrong = [pose @ off() for pose in corrections(4)[1]]
+        with pytest.raises(RefusedError, match="not kept any more"):
+            client.correct_poses("roof", corrections(4)[0], wrong)
+        assert client.correct_poses("roof", *corrections(5)).scans_moved == 1

@@ -8,7 +8,7 @@ import triquad_client
 from support import servers
 from triquad_client import Status
 from triquad_format.wire import codec, keys
-from triquad_format.wire.messages import ServerStatus
+from triquad_format.wire.status_messages import ServerStatus
 from triquad_server.settings import ServiceSettings
 
 POSE = np.eye(4)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from triquad_format.wire.messages import CheckpointInfo, ServerStatus
+from triquad_format.wire.messages import CheckpointInfo
 from triquad_format.wire.metrics_messages import (
     CheckpointMetrics,
     OperationMetrics,
@@ -14,6 +14,7 @@ from triquad_format.wire.metrics_messages import (
     SourceMetrics,
     TimeHistogram,
 )
+from triquad_format.wire.status_messages import KeptScans, ServerStatus
 from triquad_tools.work.top import Sample
 
 BOUNDS_S = np.array([0.001, 0.01, 0.1, 1.0, 10.0])
@@ -50,6 +51,7 @@ STATUS = ServerStatus(
     last_checkpoint=CHECKPOINT,
     store_error=None,
     samples_left=3_100_000,
+    kept_scans=KeptScans(bytes=412_000_000, max_bytes=10**9, since_ns=10**18 + 5 * 10**8),
 )
 
 

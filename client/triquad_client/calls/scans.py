@@ -16,13 +16,8 @@ from triquad_format.printable import printable
 from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.wire import keys
 from triquad_format.wire.bounds import MAX_COUNT
-from triquad_format.wire.messages import (
-    FlushReply,
-    FlushRequest,
-    Scan,
-    ServerStatus,
-    StatusRequest,
-)
+from triquad_format.wire.messages import FlushReply, FlushRequest, Scan
+from triquad_format.wire.status_messages import ServerStatus, StatusRequest
 
 from triquad_client import checks
 from triquad_client.depth_image import Intrinsics, depth_points

@@ -12,11 +12,10 @@ from triquad_format.wire.messages import (
     CheckpointRequest,
     ResetReply,
     ResetRequest,
-    ServerStatus,
-    StatusRequest,
 )
 from triquad_format.wire.metrics_messages import MetricsRequest, ServerMetrics
 from triquad_format.wire.source_messages import SourceReport, SourcesRequest
+from triquad_format.wire.status_messages import ServerStatus, StatusRequest
 
 from triquad_client import checks
 from triquad_client.checks import Bounds

@@ -16,7 +16,8 @@ from triquad_format.printable import printable
 from triquad_format.wire import codec, keys
 from triquad_format.wire.bounds import check_answers
 from triquad_format.wire.codec import Message, Request
-from triquad_format.wire.messages import ErrorReply, RequestOrigin, StatusRequest
+from triquad_format.wire.messages import ErrorReply, RequestOrigin
+from triquad_format.wire.status_messages import StatusRequest
 
 from triquad_client import checks
 from triquad_client.errors import (

@@ -10,12 +10,13 @@ poses before it is on ``/corrections/<source>``, as :class:`LoggedCorrection` pa
 
 import io
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TypeAlias
 
 import numpy as np
+from mcap.reader import SeekingReader
 from mcap.records import Channel, Footer, Message, Statistics
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
@@ -75,12 +76,14 @@ class LoggedCorrection:
     moves: Doubles  # [K, 4, 4] at these times; scans after the last move as that
     until_ns: int  # the stamp of the last scan that moves
     since: int = 0  # how often the source's time began again, after the scans that move
+    first_epoch: int = 0  # with which the file ends that has the first scan that moves
 
     def pack(self) -> bytes:
         """Return it without the source."""
         rows = np.zeros(len(self.moves), _MOVES)
         rows["stamp_ns"], rows["move"] = self.stamps_ns, self.moves[:, :3]
-        return np.array([self.until_ns, self.since], "<i8").tobytes() + rows.tobytes()
+        head = np.array([self.until_ns, self.since, self.first_epoch], "<i8")
+        return head.tobytes() + rows.tobytes()
 
     @classmethod
     def unpack(cls, source: str, data: bytes) -> "LoggedCorrection":
@@ -89,11 +92,11 @@ class LoggedCorrection:
         Raises:
             ValueError: it is something else.
         """
-        until_ns, since = np.frombuffer(data, "<i8", 2).tolist()
-        rows = np.frombuffer(data, _MOVES, offset=16)
+        until_ns, since, first_epoch = np.frombuffer(data, "<i8", 3).tolist()
+        rows = np.frombuffer(data, _MOVES, offset=24)
         moves = np.zeros((len(rows), 4, 4))
         moves[:, :3], moves[:, 3, 3] = rows["move"], 1.0
-        return cls(source, rows["stamp_ns"].astype(np.int64), moves, until_ns, since)
+        return cls(source, rows["stamp_ns"].astype(np.int64), moves, until_ns, since, first_epoch)
 
 
 Entry: TypeAlias = LoggedScan | Transform | LoggedReset | LoggedCorrection
@@ -119,6 +122,7 @@ class SegmentWriter:
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self.messages = 0
+        self.corrections: list[LoggedCorrection] = []  # that were added
 
     def add_pose(self, transform: Transform) -> None:
         """Add the pose of a scan, of which no more is kept."""
@@ -145,6 +149,7 @@ class SegmentWriter:
         """Add that the poses of scans before were corrected."""
         data = correction.pack()
         self._put(_CORRECTIONS + correction.source, "", correction.until_ns, data)
+        self.corrections.append(correction)
 
     def finish(self) -> None:
         """End the file."""
@@ -180,9 +185,38 @@ def read_segment(path: Path) -> Iterator[Entry]:
         DamagedMapFileError: the file is damaged, or is none of the log.
         OSError: it cannot be read.
     """
+    with _opened(path) as stream:
+        yield from _entries(stream)
+
+
+def read_corrections(path: Path) -> list[LoggedCorrection]:
+    """Return the corrections that a file of the log has, without reading its scans.
+
+    Raises:
+        DamagedMapFileError: the file is damaged, or is none of the log.
+        OSError: it cannot be read.
+    """
+    with _opened(path) as stream:
+        reader = SeekingReader(stream, validate_crcs=True)
+        summary = reader.get_summary()
+        if summary is None:
+            raise FormatError("it has no end")
+        topics = [one.topic for one in summary.channels.values()]
+        found = [topic for topic in topics if topic.startswith(_CORRECTIONS)]
+        if not found:
+            return []
+        return [
+            LoggedCorrection.unpack(channel.topic.removeprefix(_CORRECTIONS), message.data)
+            for _, channel, message in reader.iter_messages(found, log_time_order=False)
+        ]
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[IO[bytes]]:
+    """Open a file to read it; an error by what is in it says which file is damaged."""
     with io.BufferedReader(open_regular(path)) as stream:
         try:
-            yield from _entries(stream)
+            yield stream
         except Exception as error:  # as the library comes upon what it did not expect
             raise DamagedMapFileError(f"{path} is damaged: {error!r}") from error
 

@@ -87,13 +87,6 @@ class LogPoses:
                 return one, since
         return motions[0], 0
 
-    def begin_amid(self, correction: LoggedCorrection) -> bool:
-        """Return whether a correction may have moved scans before the first that are here."""
-        starts = self._rows[correction.source]
-        at = len(starts) - 1 - correction.since
-        first_ns = min(self._stamps_ns[row] for row in starts[0]) if starts else 0
-        return at < 0 or (at == 0 and bool(correction.stamps_ns[0] < first_ns))
-
     def of(self, source: str) -> Doubles:
         """Return all poses [N, 4, 4] of a source, in the order in which they came."""
         rows = [row for rows in self._rows[source] for row in rows]

@@ -9,7 +9,7 @@ import numpy as np
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings, RegionIndex
 from triquad_format.records.region import BLOCK_BYTES, Region
-from triquad_format.wire.messages import FieldFit
+from triquad_format.wire.status_messages import FieldFit
 from triquad_map import field_fit
 from triquad_map.evidence.growth import EvidenceSize
 from triquad_map.evidence.observed import OBSERVED_VOXEL

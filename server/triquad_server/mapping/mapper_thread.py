@@ -14,7 +14,8 @@ from typing import Any, TypeVar
 
 from triquad_format.errors import TriquadError
 from triquad_format.wire.codec import moved
-from triquad_format.wire.messages import FieldFit, Scan
+from triquad_format.wire.messages import Scan
+from triquad_format.wire.status_messages import FieldFit
 from triquad_map.compiled.team import lower_priority
 
 from triquad_server.epochs.epoch import Epoch

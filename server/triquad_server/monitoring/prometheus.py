@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from prometheus_client import core, generate_latest
 from prometheus_client.registry import Collector
-from triquad_format.wire.messages import ServerStatus
 from triquad_format.wire.metrics_messages import OperationMetrics, ServerMetrics, TimeHistogram
+from triquad_format.wire.status_messages import ServerStatus
 
 # Type, name, place in Figures, and meaning; a test compares docs/metrics.md with it. In a place,
 # {label} stands for the keys of a dictionary, and {label:a+b} for fields of a record: they become

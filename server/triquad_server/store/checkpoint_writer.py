@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
-from triquad_format.errors import RefusedError
+from triquad_format.errors import FormatError, RefusedError
 from triquad_format.scan_log.segment import SegmentWriter
 from triquad_format.wire.messages import (
     CheckpointInfo,
@@ -15,6 +15,7 @@ from triquad_format.wire.messages import (
     ResetRequest,
 )
 from triquad_format.wire.metrics_messages import CheckpointMetrics
+from triquad_format.wire.status_messages import KeptScans
 
 from triquad_server.errors import (
     NO_MEMORY,
@@ -26,6 +27,7 @@ from triquad_server.intake.source_trails import SourceTrails
 from triquad_server.mapping.mapper import Mapper, MapSnapshot
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.settings import StoreSettings
+from triquad_server.store.corrected_log import kept_scans
 from triquad_server.store.scrub import Scrubber
 from triquad_server.store.store import Store
 
@@ -70,6 +72,7 @@ class CheckpointWriter:
         self._timer = threading.Thread(target=self._write_regularly, name="checkpoints")
         self._writing = threading.RLock()  # locked while anything is written
         self.error = None if store else _NO_STORE
+        self.kept_scans: KeptScans | None = None  # as of the newest checkpoint
 
     @property
     def last(self) -> CheckpointInfo | None:
@@ -80,6 +83,7 @@ class CheckpointWriter:
         """Begin to write checkpoints, while the map changes and on request, and to check them."""
         if self.store is None:
             return
+        self._survey_scans(self.store)
         if self._period_s > 0:
             self._timer.start()
         if self._scrub_h > 0:
@@ -241,6 +245,7 @@ class CheckpointWriter:
             info = store.write(record, regions, undoes)
         except MemoryError as error:
             raise StoreError(f"a checkpoint was not written: {NO_MEMORY}") from error
+        self._survey_scans(store)
         if (warning := self.warning) is not None:
             _log.warning("%s", warning)
         self.error, self._saved_s, self._ended_s = None, asked_s, time.monotonic()
@@ -251,6 +256,13 @@ class CheckpointWriter:
         )
         _log.info("checkpoint %s: epoch %d, %d bytes", info.path, info.epoch, info.bytes)
         return info
+
+    def _survey_scans(self, store: Store) -> None:
+        """See how far back poses can be corrected, so that no status has to read files for it."""
+        try:
+            self.kept_scans = kept_scans(store)
+        except (FormatError, OSError) as error:
+            _log.warning("how far back poses can be corrected is not known: %s", error)
 
     def _write_regularly(self) -> None:
         due_s = time.monotonic() + self._period_s

@@ -3,6 +3,7 @@
 from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ from triquad_format.scan_log.segment import (
     read_segment,
 )
 from triquad_format.scan_log.tracks import LogPoses, corrected, motions, source_of
+from triquad_format.wire.status_messages import KeptScans
 
 from triquad_server.store.store import Store
 
@@ -86,13 +88,6 @@ class CorrectedLog:
         return replace(self.correction, since=since)
 
 
-class _Earlier(NamedTuple):
-    """A correction that stands in the log."""
-
-    file: int
-    first_moved: int  # the file with the first scan that it moved; -1: it is not kept any more
-
-
 def corrected_log(
     store: Store, newest: int, wanted: WantedPoses, *, onward: bool
 ) -> CorrectedLog | None:
@@ -108,25 +103,45 @@ def corrected_log(
     files = history(of_map(segments(store.scans.folder), newest, store.restored))
     apart_m = store.scans.apart_m
     is_whole = not files or files[0].after == 0
-    poses, first_rows, earlier = LogPoses(), list[int](), list[_Earlier]()
-    for number, segment in enumerate(files):
+    poses, first_rows = LogPoses(), list[int]()
+    for segment in files:
         first_rows.append(len(poses.poses))
         for entry in read_segment(segment.path):
-            if isinstance(entry, LoggedCorrection):
-                rows = _moved(poses.correct(entry), apart_m)
-                if not is_whole and poses.begin_amid(entry):
-                    earlier.append(_Earlier(number, -1))
-                elif len(rows):
-                    earlier.append(_Earlier(number, _file(first_rows, rows.min())))
-            else:
-                poses.take(entry)
+            poses.take(entry)
     correction, start = _correction(wanted, poses, onward=onward, is_whole=is_whole)
     rows = _moved(poses.correct(correction), apart_m)
     if not len(rows):
         return None
-    number, base = _base(_file(first_rows, rows.min()), files, earlier, store)
+    first = files[bisect_right(first_rows, rows.min()) - 1]
+    base = _base(first, files, store)
+    number = 0 if base is None else bisect_right(files, base.epoch, key=lambda one: one.epoch)
     return CorrectedLog(
-        correction, start, base, files[number:], first_rows[number], poses, len(rows)
+        replace(correction, first_epoch=first.epoch),
+        *(start, base, files[number:], first_rows[number], poses, len(rows)),
+    )
+
+
+def kept_scans(store: Store) -> KeptScans | None:
+    """Return what is kept of scans, and since when all can be corrected; ``None``: none are kept.
+
+    Raises:
+        FormatError: a file is damaged.
+        OSError: it cannot be read.
+    """
+    if not store.scans.is_kept:
+        return None
+    found = segments(store.scans.folder)
+    files = history(of_map(found, store.epoch, store.restored))
+    if files and files[0].after > 0:
+        base = min(_bases(files, store), default=None)
+        files = [] if base is None else [one for one in files if one.epoch > base.epoch]
+    entries = chain.from_iterable(read_segment(one.path) for one in files)
+    scans = (one for one in entries if isinstance(one, LoggedScan | Transform))
+    first = next(scans, None)
+    return KeptScans(
+        bytes=sum(one.path.stat().st_size for one in found),
+        max_bytes=store.scans.max_bytes,
+        since_ns=None if first is None else first.stamp_ns,
     )
 
 
@@ -167,36 +182,35 @@ def _correction(
     return LoggedCorrection(source, known_ns, moves, until_ns, since), start
 
 
-def _base(
-    first: int, files: list[Segment], earlier: list[_Earlier], store: Store
-) -> tuple[int, CheckpointFile | None]:
-    """Return the newest checkpoint that has nothing of file ``first``, and the file after it.
+def _base(first: Segment, files: list[Segment], store: Store) -> CheckpointFile | None:
+    """Return the newest checkpoint from which scans of ``first``, one of the files, can be moved.
 
-    Nor may it have scans where they were before a correction that came after it.
+    Raises:
+        RefusedError: there is none, and the files do not go back to an empty map.
+    """
+    bases = [one for one in _bases(files, store) if one.epoch < first.epoch]
+    if not bases and files[0].after > 0:
+        raise RefusedError(
+            "store",
+            f"scans before epoch {files[0].after} are not kept any more (store.log_max_bytes), and "
+            "no checkpoint of before the first scan that moves is left (store.keep): the map "
+            "cannot be made again without losing what only they have shown",
+        )
+    return max(bases, default=None)
+
+
+def _bases(files: list[Segment], store: Store) -> list[CheckpointFile]:
+    """Return the checkpoints from which the map can go on with files of the log.
+
+    They have no scan where it was before a correction that came later.
     """
     least = 0 if store.restored is None else store.restored.as_epoch
-    checkpoints = [one for one in checkpoint_files(store.folder) if one.epoch >= least]
-    for number in range(first, -1, -1):
-        if any(one.first_moved < number <= one.file for one in earlier):
-            continue
-        since, until = files[number].after, files[number].epoch
-        bases = [one for one in checkpoints if since <= one.epoch < until]
-        if bases:
-            base = max(bases, key=lambda one: one.epoch)
-            return number, base
-    if files[0].after == 0:
-        return 0, None
-    raise RefusedError(
-        "store",
-        f"scans before epoch {files[0].after} are not kept any more (store.log_max_bytes), and no "
-        "checkpoint of before the first scan that moves is left (store.keep): the map cannot be "
-        "made again without losing what only they have shown",
-    )
-
-
-def _file(first_rows: list[int], row: int) -> int:
-    """Return the number of the file that has a row."""
-    return bisect_right(first_rows, row) - 1
+    return [
+        one
+        for one in checkpoint_files(store.folder)
+        if one.epoch >= max(least, files[0].after)
+        and not any(one.epoch in epochs for epochs in store.scans.outdated)
+    ]
 
 
 def _moved(corrected: tuple[Longs, Doubles, Doubles], apart_m: float) -> Longs:

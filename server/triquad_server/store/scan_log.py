@@ -10,10 +10,11 @@ import os
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
+from triquad_format.errors import FormatError
 from triquad_format.mapfile.files import sync_folder
 from triquad_format.mapfile.index import Restored
 from triquad_format.records.arrays import Doubles
@@ -26,6 +27,7 @@ from triquad_format.scan_log.segment import (
     LoggedReset,
     LoggedScan,
     SegmentWriter,
+    read_corrections,
 )
 from triquad_format.wire.messages import Scan
 
@@ -59,7 +61,7 @@ class ScanLog:
         """
         self.folder = folder / LOG_NAME
         self.error: str | None = None
-        self._max_bytes = max_bytes
+        self.max_bytes = max_bytes
         self.apart_m = _APART_VOXELS * leaf_m
         self._kept: dict[str, Transform] = {}  # the last scan of each source that was kept
         self._followed: deque[Entry] | None = None
@@ -67,6 +69,8 @@ class ScanLog:
         self._opened = 0  # files
         self._lost = False  # what was added could not be written; of the mapper's thread
         self._newest: int | None = 0  # epoch with which the newest file ends; None: it was lost
+        # Epochs of which checkpoints have scans where they were before a correction.
+        self.outdated: list[range] = []
         if max_bytes == 0:
             return
         with self._telling("cannot be opened"):
@@ -83,6 +87,9 @@ class ScanLog:
             if restored is not None and restored.as_epoch == epoch > newest:
                 goes_on = newest == restored.epoch
             self._newest = newest if goes_on else None
+            for segment in segments(self.folder):
+                with suppress(FormatError):  # who corrects poses is told of it
+                    self._outdate(read_corrections(segment.path), segment.epoch)
             if newest < epoch:
                 # An empty file marks that what came since is lost, or in the map no more.
                 self.keep(self.cut(), epoch)
@@ -90,7 +97,7 @@ class ScanLog:
     @property
     def is_kept(self) -> bool:
         """Return whether any scans are kept."""
-        return self._max_bytes > 0
+        return self.max_bytes > 0
 
     def follow(self, followed: "deque[Entry] | None") -> None:
         """Add to a queue, too, what is added from now on; ``None``: to none any more."""
@@ -162,12 +169,16 @@ class ScanLog:
             os.replace(written.path, self.folder / segment_name(after, epoch))
             sync_folder(self.folder)
             self._newest = epoch
+            self._outdate(written.corrections, epoch)
             self._make_room()
 
     def close(self) -> None:
         """Give up what was added since the last time, for the map has it in no checkpoint."""
         if (written := self._taken()) is not None:
             written.discard()
+
+    def _outdate(self, corrections: list[LoggedCorrection], epoch: int) -> None:
+        self.outdated += [range(one.first_epoch, epoch) for one in corrections]
 
     def _taken(self) -> SegmentWriter | None:
         written, self._writer = self._writer, None
@@ -207,7 +218,7 @@ class ScanLog:
         files = [(one.path, one.path.stat().st_size) for one in segments(self.folder)]
         total = sum(size for _, size in files)
         for path, size in files[:-1]:
-            if total <= self._max_bytes:
+            if total <= self.max_bytes:
                 return
             path.unlink()
             total -= size

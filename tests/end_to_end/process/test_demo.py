@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from triquad_format.mapfile.reader import read_map
-from triquad_format.wire.messages import FieldFit
+from triquad_format.wire.status_messages import FieldFit
 from triquad_tools.commands import demo
 from triquad_tools.demo import steps
 from triquad_tools.demo.probe import ProbeReport

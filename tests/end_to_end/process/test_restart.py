@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support import servers
 from triquad_client import ServerStatus
-from triquad_format.wire.messages import FieldFit
+from triquad_format.wire.status_messages import FieldFit
 from triquad_tools.commands.inspect import main
 
 SCANS = 5

@@ -17,7 +17,7 @@ import triquad_client
 from support import servers
 from support.servers import ServerProcess
 from triquad_format.wire import codec, keys
-from triquad_format.wire.messages import ServerStatus, StatusRequest
+from triquad_format.wire.status_messages import ServerStatus, StatusRequest
 from triquad_server.process.service_manager import ServiceManager
 
 WATCHDOG_S = 2

@@ -14,7 +14,7 @@ from support.ros.ros_bridge import stand
 from support.ros.ros_robot import robot
 from triquad_client import NoReplyError
 from triquad_format.wire import codec, keys
-from triquad_format.wire.messages import StatusRequest
+from triquad_format.wire.status_messages import StatusRequest
 
 
 @contextmanager

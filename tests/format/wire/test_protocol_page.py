@@ -7,7 +7,14 @@ from pathlib import Path
 import pytest
 from support.operations import OPERATIONS
 from triquad_format.errors import ERROR_CODES
-from triquad_format.wire import mesh_messages, messages, metrics_messages, query_messages
+from triquad_format.wire import (
+    mesh_messages,
+    messages,
+    metrics_messages,
+    query_messages,
+    source_messages,
+    status_messages,
+)
 from triquad_format.wire.codec import Message
 
 PAGE = (Path(__file__).parents[3] / "docs" / "wire-protocol.md").read_text(encoding="utf-8")
@@ -15,10 +22,16 @@ PASSAGES = re.split(r"^(?:#{2,3} |(?=`[A-Z]\w+`))", PAGE, flags=re.MULTILINE)
 """From each heading, and from each line that begins with the name of a message."""
 
 
+MODULES = (
+    *(mesh_messages, messages, metrics_messages),
+    *(query_messages, source_messages, status_messages),
+)
+
+
 def all_messages():
     kinds = {
         kind
-        for module in (mesh_messages, messages, metrics_messages, query_messages)
+        for module in MODULES
         for kind in vars(module).values()
         if isinstance(kind, type) and issubclass(kind, Message) and not kind.__subclasses__()
     }

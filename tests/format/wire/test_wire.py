@@ -15,9 +15,9 @@ from triquad_format.wire.messages import (
     Scan,
     SdfReply,
     SdfRequest,
-    StatusRequest,
 )
 from triquad_format.wire.packing import unpacked
+from triquad_format.wire.status_messages import StatusRequest
 
 POSE = np.array([[0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]], np.float64)
 POINTS = np.array([[1, 2, 3], [4, 5, 6]], np.float32)

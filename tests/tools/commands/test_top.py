@@ -96,7 +96,7 @@ def test_the_page_tells_rates_counts_and_times_on_any_width(width):
         r"scans taken +12\.4 k +10\.0|samples trained +1\.24 G +812 k|samples left +3\.10 M|"
         r"epoch +1,236, 0\.4 s old|query/distance +123 +24\.0 +55\.0 +99\.1|"
         r"queue of scans +3 of 10|memory of process +612 MB|last checkpoint +epoch 1,200, 32 s ago"
-        r"|"
+        r"|kept scans +412 MB since 1000000000\.500 s|"
         r"source camera +heard 0\.2 s ago|points dropped: too_near +5,000 +0"
     )
     assert [line for line in lines.split("|") if not re.search(line, text)] == []

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from triquad_client import Client
-from triquad_format.wire.messages import FieldFit
+from triquad_format.wire.status_messages import FieldFit
 
 from triquad_tools.console.amounts import millimetres
 from triquad_tools.console.progress import progress

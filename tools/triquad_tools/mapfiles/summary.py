@@ -19,7 +19,7 @@ from triquad_format.records.region import (
     surface_counts,
 )
 from triquad_format.records.replay_rays import are_held_out
-from triquad_format.wire.messages import FieldFit
+from triquad_format.wire.status_messages import FieldFit
 from triquad_map.field_fit import PlaceFits, in_cube, map_fit
 from triquad_map.opening import open_view
 

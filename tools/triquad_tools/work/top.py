@@ -160,6 +160,9 @@ def _rows(sample: Sample) -> Iterator[Sequence[str]]:
         age_s = metrics.checkpoints.age_s
         ago = "" if age_s is None else f", {duration(age_s)} ago"
         yield "last checkpoint", f"epoch {status.last_checkpoint.epoch:,}{ago}"
+    if (kept := status.kept_scans) is not None:
+        since = "" if kept.since_ns is None else f" since {kept.since_ns / 1e9:.3f} s"
+        yield "kept scans", size(kept.bytes) + since
     per_s = sample.per_s
     for name, number in sample.counts.items():
         if number:
