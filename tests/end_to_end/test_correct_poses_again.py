@@ -1,5 +1,6 @@
 """Corrections of a map that has a past: scans of before keep their places, whatever came since."""
 
+import logging
 import shutil
 from pathlib import Path
 
@@ -179,3 +180,26 @@ def test_poses_can_be_corrected_from_when_the_status_says_and_none_before(tmp_pa
         with pytest.raises(RefusedError, match="not kept any more"):
             client.correct_poses("roof", corrections(4)[0], wrong)
         assert client.correct_poses("roof", *corrections(5)).scans_moved == 1
+
+
+def test_a_checkpoint_that_is_deleted_once_a_correction_goes_on_from_it_is_not_missed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "triquad_server")
+    with servers.service_and_client(SETTINGS, tmp_path) as client:
+        in_checkpoints(client, *range(SCANS))
+
+        def delete(record: logging.LogRecord) -> bool:
+            if "the map is made again" in record.getMessage():
+                for path in tmp_path.glob("*/epoch-*"):
+                    path.unlink()
+            return True
+
+        server = logging.getLogger("triquad_server.store.pose_corrector")
+        server.addFilter(delete)
+        try:
+            reply = client.correct_poses("roof", *corrections(SCANS - 1))
+        finally:
+            server.removeFilter(delete)
+        assert (reply.scans_moved, reply.scans_learnt) == (1, 1)
+        assert not list(tmp_path.glob(f"*/epoch-{reply.kept_epoch:09d}.*")), "none was deleted"

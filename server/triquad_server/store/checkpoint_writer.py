@@ -70,7 +70,7 @@ class CheckpointWriter:
         self._saved_s = time.monotonic()  # when the map was as the newest checkpoint has it
         self._ended_s: float | None = None  # when the last was written, monotonic
         self._timer = threading.Thread(target=self._write_regularly, name="checkpoints")
-        self._writing = threading.RLock()  # locked while anything is written
+        self.writing = threading.RLock()  # locked while anything is written, or deleted
         self.error = None if store else _NO_STORE
         self.kept_scans: KeptScans | None = None  # as of the newest checkpoint
 
@@ -186,7 +186,7 @@ class CheckpointWriter:
         """
         if self.store is None:
             raise StoreError(_NO_STORE)
-        with self._writing:
+        with self.writing:
             try:
                 return self._write(self.store, undoes, at_cut)
             except Exception as error:
@@ -202,7 +202,7 @@ class CheckpointWriter:
         Raises:
             StoreError: it cannot be written, or there is no store.
         """
-        with self._writing:
+        with self.writing:
             kept = None if self.store is None else self.store.keep_newest(undoes)
             return kept or self.write(undoes)
 
@@ -281,7 +281,7 @@ class CheckpointWriter:
 
     def _found_damaged(self, name: str) -> None:
         """Write all of the map again, if the newest checkpoint needs the file ``name``."""
-        with self._writing:
+        with self.writing:
             if self.store is not None and self.store.forget_base(name):
                 _log.warning(
                     "the newest checkpoint needs %s: all of the map is written again", name

@@ -82,24 +82,30 @@ class PoseCorrector:
         try:
             # So that the log has all until there.
             newest = self._checkpoints.write(at_cut=lambda: store.scans.follow(followed)).epoch
-            log = corrected_log(store, newest, wanted, onward=request.onward)
-            if log is None:
-                return CorrectPosesReply(newest, scans_moved=0, scans_learnt=0)
-            kept = self._checkpoints.keep_newest("correcting poses").epoch
-            return self._correct(store, log, followed, kept)
+            with self._checkpoints.writing:  # which deletes checkpoints, too
+                log = corrected_log(store, newest, wanted, onward=request.onward)
+                if log is None:
+                    return CorrectPosesReply(newest, scans_moved=0, scans_learnt=0)
+                kept = self._checkpoints.keep_newest("correcting poses").epoch
+                again = _MapAgain(self._mapper.call(lambda mapper: mapper), log)
+            return self._correct(store, log, again, followed, kept)
         except (StoreError, FormatError, OSError) as error:
             raise RefusedError("store", f"no pose was corrected: {error}") from error
         finally:
             store.scans.follow(None)
 
     def _correct(
-        self, store: Store, log: CorrectedLog, followed: "deque[Entry]", kept: int
+        self,
+        store: Store,
+        log: CorrectedLog,
+        again: "_MapAgain",
+        followed: "deque[Entry]",
+        kept: int,
     ) -> CorrectPosesReply:
         """Make the map again, and have it in place of the one before."""
         began_s = time.monotonic()
         source = log.correction.source
         _log.info("%d scans of %s have better poses: the map is made again", log.moved, source)
-        again = _MapAgain(self._mapper.call(lambda mapper: mapper), log)
         for entry in chain(log.entries(), map(log.late, _until_few_are_left(followed))):
             if self._is_stopping():
                 raise RefusedError("busy", "the server is stopping: no pose was corrected")

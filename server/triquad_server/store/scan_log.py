@@ -100,7 +100,10 @@ class ScanLog:
         return self.max_bytes > 0
 
     def follow(self, followed: "deque[Entry] | None") -> None:
-        """Add to a queue, too, what is added from now on; ``None``: to none any more."""
+        """Add to a queue, too, what is added from now on; ``None``: to none any more.
+
+        Meanwhile all files stay: who follows reads them.
+        """
         self._followed = followed
 
     def add(self, scan: Scan, rays: ScanRays) -> None:
@@ -170,7 +173,8 @@ class ScanLog:
             sync_folder(self.folder)
             self._newest = epoch
             self._outdate(written.corrections, epoch)
-            self._make_room()
+            if self._followed is None:
+                self._make_room()
 
     def close(self) -> None:
         """Give up what was added since the last time, for the map has it in no checkpoint."""

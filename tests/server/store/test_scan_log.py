@@ -2,6 +2,7 @@
 
 import math
 import shutil
+from collections import deque
 
 import numpy as np
 import pytest
@@ -137,6 +138,17 @@ def test_the_oldest_files_go_that_there_is_no_room_for(tmp_path) -> None:
     for epoch in range(2, 7):
         write(scans, epoch)
     assert [segment.epoch for segment in segments(scans.folder)] == [4, 5, 6]
+
+
+def test_no_file_goes_while_poses_are_corrected(tmp_path) -> None:
+    scans = log(tmp_path, most=1)
+    scans.follow(deque())
+    for epoch in (1, 2, 3):
+        write(scans, epoch)
+    assert [segment.epoch for segment in segments(scans.folder)] == [1, 2, 3]
+    scans.follow(None)
+    write(scans, 4)
+    assert [segment.epoch for segment in segments(scans.folder)] == [4]
 
 
 def test_a_disk_that_fails_stops_nothing_and_is_told_until_it_works(tmp_path) -> None:
