@@ -21,10 +21,5 @@ def printable_lines(text: str) -> str:
     return "\n".join(map(printable, text.split("\n")))
 
 
-def joined_lines(*texts: str | None) -> str | None:
-    """Return the texts that there are, a line each; ``None`` where there is none."""
-    return "\n".join(filter(None, texts)) or None
-
-
 def _escape(character: str) -> str:
     return character.encode("unicode_escape").decode("ascii")

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 import numpy as np
 import triquad_format
 import zenoh
-from triquad_format.printable import joined_lines
 from triquad_format.wire import codec, keys
 from triquad_format.wire.codec import moved
 from triquad_format.wire.metrics_messages import QueueMetrics, ServerMetrics
@@ -79,7 +78,7 @@ class Health:
             last_checkpoint=self.checkpoints.last,
             store_error=self.checkpoints.error,
             kept_scans=self.checkpoints.kept_scans,
-            warnings=joined_lines(self.checkpoints.warning, self.warnings.all()),
+            warnings=(*filter(None, [self.checkpoints.warning]), *self.warnings.all()),
             map_max_bytes=self.map_max_bytes,
             fit=progress.fit,
             origin_m=epoch.origin,

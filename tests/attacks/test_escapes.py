@@ -88,7 +88,7 @@ def test_words_of_a_server(harmless: Callable[[Main, list[str]], str]) -> None:
         server.lie = told(
             keys.STATUS,
             lambda body: body.update(
-                device=SENT, version=SENT, store_error=SENT, warnings=SENT, scans_lost={SENT: 3}
+                device=SENT, version=SENT, store_error=SENT, warnings=[SENT], scans_lost={SENT: 3}
             ),
         )
         shown = harmless(top.main, ["--connect", server.endpoint, "--once"])

@@ -178,7 +178,7 @@ def test_a_publisher_learns_what_a_setting_takes_of_its_scans_and_is_told_once(
     (text,) = reports[0].warnings
     assert text.startswith("source 'cam': range_min_m = 1.5 drops 50 % of its points: set ")
     assert reports[1].warnings == (text,)
-    assert status.warnings == text
+    assert status.warnings == (text,)
     assert status.scans_taken == 24
     for logger in ("triquad_client", "triquad_server.intake.scan_warnings"):
         assert [r.getMessage() for r in caplog.records if r.name == logger] == [text]

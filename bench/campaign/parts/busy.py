@@ -79,7 +79,7 @@ def _watch(endpoint: str, watched: _Watched, over: threading.Event) -> None:
         while not over.wait(_SCAN_S):
             status = client.status()
             watched.first_seen_s.setdefault(status.epoch, time.monotonic())
-            watched.warned |= "checkpoints are late" in (status.warnings or "")
+            watched.warned |= "checkpoints are late" in " ".join(status.warnings)
 
 
 @contextmanager

@@ -162,7 +162,7 @@ class ScanCalls:
             for source, reply in done.items()
             if reply.last_refusal is not None
         ]
-        warnings = tuple(line for reply in replies for line in (reply.warnings or "").splitlines())
+        warnings = tuple(line for reply in replies for line in reply.warnings)
         self._log_new(warnings)
         return FlushReport(
             taken=sum(reply.taken for reply in replies),

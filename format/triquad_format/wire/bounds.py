@@ -213,6 +213,9 @@ def _problems_of(
         return
     if isinstance(value, Message):
         yield from _problems(value, exchange.question, exchange.around)
+    elif form.item is not None and form.key is None:
+        for at, entry in enumerate(value):
+            yield from _problems_of(form.item, f"{name}[{at}]", entry, exchange)
     elif form.key is not None and form.item is not None:
         for key, entry in value.items():
             yield from _problems_of(form.key, f"{name} key", key, exchange)

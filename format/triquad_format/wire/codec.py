@@ -116,8 +116,8 @@ class Form:
     scalar: type | None = None
     array: ArraySpec | None = None
     message: type[Message] | None = None
-    key: "Form | None" = None  # of a map, and the form of its items
-    item: "Form | None" = None
+    key: "Form | None" = None  # of a map
+    item: "Form | None" = None  # of a map or a list
     optional: bool = False
     extras: tuple[object, ...] = ()  # what else the annotation has, such as bounds
 
@@ -154,9 +154,14 @@ class Form:
     def _plain(
         self, name: str, value: Any, way: Callable[["Form"], Callable[[str, Any], Any]]
     ) -> Any:
-        """Return a number, a text or a map, which travel as they are but for a map's items."""
-        if self.key is None or self.item is None:
+        """Return a number or a text, which travel as they are, or a list or map with its items."""
+        if self.item is None:
             return _scalar(self.scalar, name, value)
+        if self.key is None:
+            if not isinstance(value, list | tuple):
+                raise WireError(f"{name}: expected list, got {type(value).__name__}")
+            item_way = way(self.item)
+            return tuple(item_way(f"{name}[{at}]", item) for at, item in enumerate(value))
         if not isinstance(value, dict):
             raise WireError(f"{name}: expected dict, got {type(value).__name__}")
         key_way, item_way = way(self.key), way(self.item)
@@ -177,6 +182,8 @@ def _form(annotation: Any) -> Form:
     if isinstance(annotation, type) and issubclass(annotation, Message):
         return Form(message=annotation)
     choices = get_args(annotation)
+    if get_origin(annotation) is tuple:
+        return Form(item=_form(choices[0]))
     if get_origin(annotation) is dict:
         return Form(key=_form(choices[0]), item=_form(choices[1]))
     if get_origin(annotation) in (types.UnionType, typing.Union):

@@ -126,7 +126,7 @@ class FlushReply(Message):
     refused: Count
     lost: Count
     last_refusal: str | None
-    warnings: str | None = None  # about this source, as in the status
+    warnings: tuple[str, ...] = ()  # about this source, as in the status
 
 
 @dataclass(frozen=True)

@@ -86,7 +86,7 @@ class ServerStatus(Message):
     uptime_s: Duration
     last_checkpoint: CheckpointInfo | None
     store_error: str | None  # why the map is not durable, None if it is
-    warnings: str | None = None  # what goes wrong with scans, and what helps: a line each
+    warnings: tuple[str, ...] = ()  # what goes wrong with scans, and what helps
     samples_left: Count = 0  # training samples until nothing is left to learn
     map_bytes: Count = 0  # memory of the map with its newest epoch
     map_max_bytes: Count = 0  # beyond which scans are refused as map_full; 0: not known

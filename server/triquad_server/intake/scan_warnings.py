@@ -8,7 +8,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from triquad_format.printable import joined_lines
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.plausibility import jumps, median_range_m, wrong_units
 from triquad_format.wire.messages import Scan
@@ -109,16 +108,16 @@ class ScanWarnings:
                     self._warn(source, "poses", told)
                     self._points[source].poses = PoseCheck()  # these may be right from now on
 
-    def of(self, source: str) -> str | None:
-        """Return the current warnings about a source, a line each."""
+    def of(self, source: str) -> tuple[str, ...]:
+        """Return the current warnings about a source."""
         self.check()
-        return self._lines(lambda of_source: of_source == source)
+        return self._current(lambda of_source: of_source == source)
 
-    def all(self) -> str | None:
-        """Return all current warnings, a line each."""
-        return self._lines(lambda _: True)
+    def all(self) -> tuple[str, ...]:
+        """Return all current warnings."""
+        return self._current(lambda _: True)
 
-    def _lines(self, wanted: Callable[[str], bool]) -> str | None:
+    def _current(self, wanted: Callable[[str], bool]) -> tuple[str, ...]:
         with self._lock:
             since_s = self._now() - _STANDS_S
             texts = [
@@ -126,7 +125,7 @@ class ScanWarnings:
                 for (source, _), warning in self._warnings.items()
                 if wanted(source) and warning.met_s >= since_s
             ]
-        return joined_lines(*texts[-_MAX_SHOWN:])
+        return tuple(texts[-_MAX_SHOWN:])
 
     def _check_scans(self) -> None:
         thin_m, leaf_m = self._settings.scan.thin_m, self._settings.field.leaf_m

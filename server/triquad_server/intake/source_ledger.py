@@ -6,7 +6,6 @@ from collections import OrderedDict, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-from triquad_format.printable import joined_lines
 from triquad_format.wire.limits import MAX_SEQUENCE
 from triquad_format.wire.messages import FlushReply, FlushRequest, Scan
 from triquad_format.wire.metrics_messages import SourceMetrics
@@ -172,7 +171,7 @@ class SourceLedger:
         self,
         request: FlushRequest,
         publish_soon: Callable[[], None],
-        warnings: Callable[[str], str | None],
+        warnings: Callable[[str], tuple[str, ...]],
     ) -> FlushReply:
         """Return what became of the scans of a session, at once: who is not done asks again.
 
@@ -185,7 +184,7 @@ class SourceLedger:
             if self.is_settled(*scan):
                 publish_soon()
             return reply
-        return replace(reply, warnings=joined_lines(reply.warnings, warnings(request.source)))
+        return replace(reply, warnings=reply.warnings + warnings(request.source))
 
     def lost(self) -> dict[str, int]:
         """Return the number of lost scans, by source."""
@@ -235,7 +234,9 @@ def _of_stranger(source: str, sequence: int) -> FlushReply:
         refused=0,
         lost=sequence + 1,
         last_refusal=None,
-        warnings=f"source {source!r}: none of this client's scans arrived: access control does "
-        "not let it publish as this source (a role names its sources), or the server was started "
-        "again since",
+        warnings=(
+            f"source {source!r}: none of this client's scans arrived: access control does not let "
+            "it publish as this source (a role names its sources), or the server was started again "
+            "since",
+        ),
     )

@@ -13,7 +13,7 @@ def ledger():
 @pytest.fixture
 def flush(ledger):
     return lambda request, publish_soon=lambda: None: ledger.answer(
-        request, publish_soon, lambda _: None
+        request, publish_soon, lambda _: ()
     )
 
 
@@ -30,7 +30,7 @@ def none_arrived(scans):
         "source 'lidar': none of this client's scans arrived: access control does not let it "
         "publish as this source (a role names its sources), or the server was started again since"
     )
-    return FlushReply(True, 0, 0, scans, None, why)
+    return FlushReply(True, 0, 0, scans, None, (why,))
 
 
 def test_a_scan_that_may_still_arrive_is_not_done_and_lost_later(flush, ledger):

@@ -39,7 +39,7 @@ class TrailLayer(Layer):
         """Ask for what is new, and draw all where anything is."""
         report = self._report = self._client.sources(since=self._report, max_points=_SCAN_POINTS)
         status = self._client.status()
-        problems = (problem_html(text or "") for text in (status.store_error, status.warnings))
+        problems = map(problem_html, (status.store_error or "", *status.warnings))
         lines = (_line(name, source) for name, source in report.sources.items())
         self.page.entitle(_state(status), *lines)
         self.tell("".join(problems))

@@ -123,7 +123,7 @@ def problems(sample: Sample) -> Iterator[str]:
     for name, age_s in ages_s.items():
         if age_s >= _SILENT_S > min(ages_s.values()):
             yield f"source {name} is silent for {duration(age_s)}"
-    yield from (status.warnings or "").splitlines()
+    yield from status.warnings
     for name, number in per_s.items():
         if number > 0.0 and name.startswith(("scans refused", "scans lost")):
             yield f"{name}, {rate(number)} a second"
