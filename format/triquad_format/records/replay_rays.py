@@ -75,8 +75,11 @@ class ReplayRays:
 
     def ends_m(self, settings: FieldSettings) -> Doubles:
         """Return the ends [R, 3], metres from the region's centre: the middles of the steps."""
-        leaves = (self.ends + 0.5) / STEPS - (1 << settings.depth)
-        return np.asarray(leaves * settings.leaf_m, np.float64)
+        step_m, middle = settings.leaf_m / STEPS, 0.5 - STEPS * (1 << settings.depth)
+        ends_m: Doubles = self.ends.astype(np.float64)
+        ends_m += middle
+        ends_m *= step_m
+        return ends_m
 
     def chosen(self, rows: NDArray[np.intp]) -> "ReplayRays":
         """Return some of the rays, with the origins that they have."""

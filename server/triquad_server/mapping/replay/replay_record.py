@@ -16,7 +16,7 @@ from triquad_map.evidence.live_evidence import LiveEvidence
 from triquad_map.evidence.observed import Sighting
 from triquad_map.evidence.ray_surfels import normals_at
 
-from triquad_server.mapping.replay.ray_table import END, LEAST_SLOPE, VALUE, RayTable
+from triquad_server.mapping.replay.ray_table import COLUMNS, END, LEAST_SLOPE, VALUE, RayTable
 
 _MOST_RAYS = 6_000_000  # this many fit into the parts of a single cube
 
@@ -27,6 +27,8 @@ _ROUNDED_STEPS = 3
 of noise."""
 
 _ROUNDED_SLOPES = 8  # of SLOPE_SCALE
+
+_AT_ONCE = 1 << 14  # rays, which fit into the cache: a quarter of the time that all together take
 
 _FAR = -1  # the code of what is no ray that ends in the cube
 
@@ -164,11 +166,13 @@ def restored_rays(rays: ReplayRays, settings: FieldSettings, team: Team) -> RayT
     search = evidence.outdated_normals(places, sighting.unlearnt_since)
     team.split(len(search.rows), search.find)
     search.finish()
-    normals = normals_at(voxels, places, evidence.observed)
-    ways = ends - rays.origins[rays.origin_of]
-    cosines = (ways * normals).sum(axis=1) / np.maximum(np.linalg.norm(ways, axis=1), 1e-9)
-    slopes = np.maximum(np.abs(cosines), LEAST_SLOPE)
-    is_unsure = np.isnan(slopes)
-    slopes[is_unsure] = -rays.slopes[is_unsure].astype(np.float64) / SLOPE_SCALE
-    rows = np.column_stack([ends, slopes]).astype(np.float32)
+    rows = np.empty((len(rays), COLUMNS), np.float32)
+    for first in range(0, len(rays), _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        normals = normals_at(voxels[some], places[some], evidence.observed)
+        ways = ends[some] - rays.origins[rays.origin_of[some]]
+        cosines = (ways * normals).sum(axis=1) / np.maximum(np.linalg.norm(ways, axis=1), 1e-9)
+        told = -rays.slopes[some].astype(np.float64) / SLOPE_SCALE
+        slopes = np.where(np.isnan(cosines), told, np.maximum(np.abs(cosines), LEAST_SLOPE))
+        rows[some, END : END + 3], rows[some, VALUE] = ends[some], slopes
     return RayTable(rows, rays.origin_of, rays.origins)
