@@ -1,6 +1,7 @@
 """A lidar that comes back to a place, or that nothing holds along its way."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -11,6 +12,7 @@ from triquad_client import Pose
 from triquad_tools.commands.ros2 import parser
 from triquad_tools.odometry.way import Way
 from triquad_tools.recordings.odometry import find_trajectory
+from triquad_tools.ros2.intake.corrections import BodyPath
 from triquad_tools.ros2.intake.live_odometry import LiveOdometry
 from triquad_tools.sensors.motion.frame_tree import FrameTree
 from triquad_tools.sensors.motion.track import Transform
@@ -105,6 +107,18 @@ def test_what_sits_still_on_a_robot_may_be_published_late_with_all_that_moves() 
     moved = followed_live(sweeps, frames, "base_link")
     there = np.linalg.inv(true[0]) @ true[:14] @ shifted(z=-0.5)
     assert np.abs(moved - there[:, :3, 3]).max() < 0.1
+
+
+def test_the_times_of_a_path_rise_whatever_stamps_came() -> None:
+    sweeps = [Sweep(scan.points, "lidar", n * PERIOD_NS) for n, scan in enumerate(around()[0])]
+    for number in range(20, 160, 11):
+        sweeps[number] = replace(sweeps[number], stamp_ns=sweeps[number].stamp_ns + 10**12)
+    options = bridge_options(parser().parse_args(["--odometry", "/points"]))
+    live = LiveOdometry("/points", FrameTree(), options, "map")
+    found = [found for sweep in sweeps for found in live.take(sweep)]
+    paths = [one for one in found if isinstance(one, BodyPath)]
+    assert paths
+    assert all((np.diff(path.stamps_ns) > 0).all() for path in paths)
 
 
 def followed_live(sweeps: list[Sweep], frames: FrameTree, body: str) -> NDArray[np.float64]:

@@ -126,7 +126,10 @@ class LiveOdometry:
         if self._loops is not None and self._loops.add(step):
             yield _transform(self._map_frame, _FRAME, STATIC, self._loops.correction)
             stamps_ns, there = self._loops.keyframes()
-            yield BodyPath(self._map_frame, stamps_ns, there @ self._sensor_from_body)
+            # A wrong stamp may have been far ahead.
+            rise = stamps_ns <= np.minimum.accumulate(stamps_ns[::-1])[::-1]
+            poses = there[rise] @ self._sensor_from_body
+            yield BodyPath(self._map_frame, stamps_ns[rise], poses)
 
 
 def _transform(parent: str, child: str, stamp_ns: int | None, pose: Doubles) -> Transform:
