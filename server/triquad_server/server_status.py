@@ -78,6 +78,7 @@ class Health:
             last_checkpoint=self.checkpoints.last,
             store_error=self.checkpoints.error,
             kept_scans=self.checkpoints.kept_scans,
+            correcting=self.checkpoints.correcting,
             warnings=(*filter(None, [self.checkpoints.warning]), *self.warnings.all()),
             map_max_bytes=self.map_max_bytes,
             fit=progress.fit,

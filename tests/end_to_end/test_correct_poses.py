@@ -7,6 +7,7 @@ import threading
 import numpy as np
 import pytest
 import triquad_client
+from scipy.spatial import cKDTree
 from support import servers
 from support.maps.drifted import SAME, SCANS, SETTINGS, off, shared, surface, truth
 from support.maps.small_world import world
@@ -42,8 +43,12 @@ def test_the_map_is_as_the_corrected_poses_would_have_made_it(tmp_path):
         assert reply.epoch > before
         assert not client.status().settled  # it has to learn again
         assert shared(surface(client, tmp_path), truth()) > SAME
-        trail = client.sources().sources["roof"].trail
-        np.testing.assert_allclose(trail[-1], corrections(SCANS - 1)[1][0][:3, 3], atol=1e-3)
+        source, pose = client.sources().sources["roof"], corrections(SCANS - 1)[1][0]
+        np.testing.assert_allclose(source.trail[-1], pose[:3, 3], atol=1e-3)
+        np.testing.assert_allclose(source.newest.world_from_sensor, pose, atol=1e-6)
+        in_sensor = (source.newest.points_m - pose[:3, 3]) @ pose[:3, :3]
+        away_m = cKDTree(world(SCANS).scans[-1].points).query(in_sensor)[0]
+        assert away_m.max() < 1e-3, "what the sensor saw last moves with it"
     with servers.service_and_client(SETTINGS, tmp_path / "store") as client:
         assert shared(surface(client, tmp_path), truth()) > SAME
     recording = open_recording(tmp_path / "store", ReadingOptions())

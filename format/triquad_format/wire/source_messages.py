@@ -61,6 +61,7 @@ class ScanSource(Message):
     # [N] the piece of the trail each is part of: rises where the sensor jumped
     pieces: Annotated[Integers, within(0, MAX_COUNT), rows_of("trail")]
     newest: NewestScan | None  # None: a reset forgot it, and no scan has come since
+    corrections: Count = 0  # of its trail, since the server heard of the source
 
     def __repr__(self) -> str:
         return f"ScanSource({self.scans} scans, {len(self.trail)} places of its trail)"

@@ -56,6 +56,7 @@ class _Source:
     scans: int = 0
     newest: NewestScan | None = None
     trail: list[_Place] = field(default_factory=list)  # oldest first
+    corrections: int = 0  # of the trail
 
     @property
     def positions(self) -> Doubles:
@@ -71,9 +72,15 @@ class _Source:
         self.newest = taken
         self._go(position, jumped=jumped)
 
-    def retrace(self, positions: Doubles, jump_m: float) -> None:
-        """Have been at positions [N, 3], one after the other, and nowhere else."""
+    def retrace(self, poses: Doubles, jump_m: float) -> None:
+        """Have been at poses [N, 4, 4], one after the other and the newest scan last."""
+        self.corrections += 1
+        if (newest := self.newest) is not None:
+            turn = poses[-1, :3, :3] @ newest.world_from_sensor[:3, :3].T
+            points = (newest.points @ turn.T).astype(np.float32)
+            self.newest = replace(newest, world_from_sensor=poses[-1], points=points)
         self.trail.clear()
+        positions = poses[:, :3, 3]
         steps_m = np.linalg.norm(np.diff(positions, axis=0), axis=1)
         for position, step_m in zip(positions, [0.0, *steps_m.tolist()], strict=True):
             self._go(position, jumped=step_m > jump_m)
@@ -114,7 +121,7 @@ class _Source:
         if newest is not None:
             newest = replace(newest, points=evenly(newest.points, max_points))
         pieces = np.array([place.piece for place in self.trail], np.int64)
-        return ScanSource(self.scans, self.positions, pieces, newest)
+        return ScanSource(self.scans, self.positions, pieces, newest, self.corrections)
 
 
 class SourceTrails:
@@ -155,12 +162,12 @@ class SourceTrails:
                 if source.newest is None and not source.trail:
                     del self._sources[name]
 
-    def retrace(self, name: str, positions: Doubles) -> None:
-        """Have a source been at positions [N, 3], map frame, whose poses were corrected."""
+    def retrace(self, name: str, poses: Doubles) -> None:
+        """Have a source been at poses [N, 4, 4], map frame, which were corrected."""
         with self._lock:
             self.revision += 1
             if (source := self._sources.get(name)) is not None:
-                source.retrace(positions, self._jump_m)
+                source.retrace(poses, self._jump_m)
 
     def answer(self, request: SourcesRequest) -> SourceReport:
         """Return all sources, if anything of them is new since the reply before."""

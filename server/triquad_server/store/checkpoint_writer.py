@@ -73,6 +73,7 @@ class CheckpointWriter:
         self.writing = threading.RLock()  # locked while anything is written, or deleted
         self.error = None if store else _NO_STORE
         self.kept_scans: KeptScans | None = None  # as of the newest checkpoint
+        self.correcting = 0  # scans whose poses are being corrected
 
     @property
     def last(self) -> CheckpointInfo | None:

@@ -86,6 +86,7 @@ class PoseCorrector:
                 log = corrected_log(store, newest, wanted, onward=request.onward)
                 if log is None:
                     return CorrectPosesReply(newest, scans_moved=0, scans_learnt=0)
+                self._checkpoints.correcting = log.moved
                 kept = self._checkpoints.keep_newest("correcting poses").epoch
                 again = _MapAgain(self._mapper.call(lambda mapper: mapper), log)
             return self._correct(store, log, again, followed, kept)
@@ -93,6 +94,7 @@ class PoseCorrector:
             raise RefusedError("store", f"no pose was corrected: {error}") from error
         finally:
             store.scans.follow(None)
+            self._checkpoints.correcting = 0
 
     def _correct(
         self,
@@ -118,7 +120,9 @@ class PoseCorrector:
                 again.take(log.late(followed.popleft()))
             mapper.become(again.map)
             store.scans.add_correction(log.logged())
-            self._trails.retrace(source, log.poses.of(source)[:, :3, 3] - mapper.origin)
+            poses = log.poses.of(source)
+            poses[:, :3, 3] -= mapper.origin
+            self._trails.retrace(source, poses)
             return mapper.publish().number
 
         epoch = self._mapper.call(change)
