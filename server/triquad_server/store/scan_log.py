@@ -219,13 +219,15 @@ class ScanLog:
 
     def _make_room(self) -> None:
         """Delete the oldest files while all take more than they may."""
-        files = [(one.path, one.path.stat().st_size) for one in segments(self.folder)]
+        files = [(one, one.path.stat().st_size) for one in segments(self.folder)]
         total = sum(size for _, size in files)
-        for path, size in files[:-1]:
+        for segment, size in files[:-1]:
             if total <= self.max_bytes:
                 return
-            path.unlink()
+            segment.path.unlink()
             total -= size
+            # No checkpoint before its end serves any more.
+            self.outdated = [one for one in self.outdated if one.stop > segment.epoch]
 
     @contextmanager
     def _telling(self, what: str, written: SegmentWriter | None = None) -> Iterator[None]:

@@ -10,7 +10,12 @@ from support.maps.small_world import world
 from support.poses import shifted
 from triquad_format.mapfile.index import Restored
 from triquad_format.scan_log.log_folder import history, segments
-from triquad_format.scan_log.segment import GRAIN_M, LoggedScan, read_segment
+from triquad_format.scan_log.segment import (
+    GRAIN_M,
+    LoggedCorrection,
+    LoggedScan,
+    read_segment,
+)
 from triquad_format.wire.messages import Scan
 from triquad_server.intake.rays import usable_rays
 from triquad_server.settings import ScanSettings
@@ -138,6 +143,20 @@ def test_the_oldest_files_go_that_there_is_no_room_for(tmp_path) -> None:
     for epoch in range(2, 7):
         write(scans, epoch)
     assert [segment.epoch for segment in segments(scans.folder)] == [4, 5, 6]
+
+
+def test_outdated_checkpoints_are_known_as_long_as_the_log_goes_back_before_them(tmp_path) -> None:
+    scans = log(tmp_path)
+    write(scans, 1)
+    stamps_ns = np.array([10**9])
+    correction = LoggedCorrection("roof", stamps_ns, np.eye(4)[None], 10**9, first_epoch=1)
+    scans.add_correction(correction)
+    write(scans, 2)
+    write(scans, 3)
+    assert scans.outdated == log(tmp_path, epoch=3).outdated == [range(1, 2)]
+    again = log(tmp_path, epoch=3, most=1)
+    write(again, 4)
+    assert again.outdated == log(tmp_path, epoch=4).outdated == []
 
 
 def test_no_file_goes_while_poses_are_corrected(tmp_path) -> None:
