@@ -69,8 +69,7 @@ class ScanLog:
         self._opened = 0  # files
         self._lost = False  # what was added could not be written; of the mapper's thread
         self._newest: int | None = 0  # epoch with which the newest file ends; None: it was lost
-        # Epochs of which checkpoints have scans where they were before a correction.
-        self.outdated: list[range] = []
+        self.outdated: list[range] = []  # epochs whose checkpoints lack a correction of their scans
         if max_bytes == 0:
             return
         with self._telling("cannot be opened"):
@@ -81,15 +80,15 @@ class ScanLog:
             for segment in found:
                 if segment.epoch > epoch:
                     segment.path.unlink()
+                    continue
+                with suppress(FormatError):  # who corrects poses is told of it
+                    self._outdate(read_corrections(segment.path), segment.epoch)
             newest = max((one.epoch for one in of_map(found, epoch, restored)), default=0)
             # Each checkpoint has its file: else what came before it was lost, or not kept.
             goes_on = newest == epoch
             if restored is not None and restored.as_epoch == epoch > newest:
                 goes_on = newest == restored.epoch
             self._newest = newest if goes_on else None
-            for segment in segments(self.folder):
-                with suppress(FormatError):  # who corrects poses is told of it
-                    self._outdate(read_corrections(segment.path), segment.epoch)
             if newest < epoch:
                 # An empty file marks that what came since is lost, or in the map no more.
                 self.keep(self.cut(), epoch)
