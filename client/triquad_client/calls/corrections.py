@@ -47,23 +47,22 @@ class CorrectionCalls(ScanCalls):
             stamps_s: [K] rising, seconds since 1970: those of scans, or between them.
             world_from_sensor: the corrected poses of the sensor at these times, such as of
                 keyframes: [K, 4, 4], or a list of :class:`Pose`.
-            onward: scans after the last of the poses move as that, those that were published
-                before this call, as when a SLAM corrects where the robot is. Else scans before and
-                after these poses stay.
+            onward: scans after the last of the poses, published before this call, move as that, as
+                when a SLAM corrects where the robot is; else those before and after stay.
             timeout_s: how long to wait for that, at most.
 
         Returns:
-            ``epoch``: the first of the corrected map. ``scans_moved``: scans whose pose
-            changed. ``scans_learnt``: kept ones of which the map was made again. ``kept_epoch`` and
-            ``undo``: as of :meth:`reset`.
+            ``epoch``: the first of the corrected map. ``scans_moved``: scans whose pose changed.
+            ``scans_learnt``: those of which the map was made again. ``kept_epoch`` and ``undo``: as
+            of :meth:`reset`.
 
         Raises:
             InvalidScanError: the times do not rise, or a pose is none.
             RefusedError: ``bad_request``, where no scan of the source is kept, or points fit each
-                other clearly better by the inverses or by another reading; ``store``, where
-                what is needed is not kept. The map stays as it is.
-            RequestTimeoutError: not done after ``timeout_s``; the server goes on with it, unless
-                it had not come to all scans before.
+                other clearly better by another reading; ``store``, where what is needed is not
+                kept. The map stays as it is.
+            RequestTimeoutError: not done after ``timeout_s``; the server goes on with it, unless it
+                had not come to all scans before.
         """
         stamps_ns, poses = _keyframes(stamps_s, world_from_sensor)
         deadline_s = checks.deadline(timeout_s)

@@ -70,28 +70,8 @@ class ScanLog:
         self._lost = False  # what was added could not be written; of the mapper's thread
         self._newest: int | None = 0  # epoch with which the newest file ends; None: it was lost
         self.outdated: list[range] = []  # epochs whose checkpoints lack a correction of their scans
-        if max_bytes == 0:
-            return
-        with self._telling("cannot be opened"):
-            self.folder.mkdir(exist_ok=True)
-            found = segments(self.folder)
-            for path in self.folder.glob(_UNFINISHED.format("*")):
-                path.unlink()
-            for segment in found:
-                if segment.epoch > epoch:
-                    segment.path.unlink()
-                    continue
-                with suppress(FormatError):  # who corrects poses is told of it
-                    self._outdate(read_corrections(segment.path), segment.epoch)
-            newest = max((one.epoch for one in of_map(found, epoch, restored)), default=0)
-            # Each checkpoint has its file: else what came before it was lost, or not kept.
-            goes_on = newest == epoch
-            if restored is not None and restored.as_epoch == epoch > newest:
-                goes_on = newest == restored.epoch
-            self._newest = newest if goes_on else None
-            if newest < epoch:
-                # An empty file marks that what came since is lost, or in the map no more.
-                self.keep(self.cut(), epoch)
+        if max_bytes > 0:
+            self._go_on(epoch, restored)
 
     @property
     def is_kept(self) -> bool:
@@ -182,6 +162,29 @@ class ScanLog:
 
     def _outdate(self, corrections: list[LoggedCorrection], epoch: int) -> None:
         self.outdated += [range(one.first_epoch, epoch) for one in corrections]
+
+    def _go_on(self, epoch: int, restored: Restored | None) -> None:
+        """Go on with the files that are there, up to a checkpoint's epoch."""
+        with self._telling("cannot be opened"):
+            self.folder.mkdir(exist_ok=True)
+            found = segments(self.folder)
+            for path in self.folder.glob(_UNFINISHED.format("*")):
+                path.unlink()
+            for segment in found:
+                if segment.epoch > epoch:
+                    segment.path.unlink()
+                    continue
+                with suppress(FormatError):  # who corrects poses is told of it
+                    self._outdate(read_corrections(segment.path), segment.epoch)
+            newest = max((one.epoch for one in of_map(found, epoch, restored)), default=0)
+            # Each checkpoint has its file: else what came before it was lost, or not kept.
+            goes_on = newest == epoch
+            if restored is not None and restored.as_epoch == epoch > newest:
+                goes_on = newest == restored.epoch
+            self._newest = newest if goes_on else None
+            if newest < epoch:
+                # An empty file marks that what came since is lost, or in the map no more.
+                self.keep(self.cut(), epoch)
 
     def _taken(self) -> SegmentWriter | None:
         written, self._writer = self._writer, None

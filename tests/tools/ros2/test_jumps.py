@@ -25,8 +25,28 @@ def turned(degrees: float, x: float = 0.0, y: float = 0.0) -> Matrix:
     return pose
 
 
+class Jumps:
+    """What is found with each transform, at once."""
+
+    def __init__(self) -> None:
+        self._found = FrameJumps(wait_s=0.0)
+
+    def add(self, transform: Transform, map_from_robot: Matrix) -> Jump | None:
+        self._found.add(transform, map_from_robot, now_s=0.0)
+        return next(iter(self._found.due(now_s=0.0)), None)
+
+
+def test_a_jump_waits_until_scans_of_before_are_published() -> None:
+    jumps = FrameJumps(wait_s=2.0)
+    for number in range(2):
+        jumps.add(transform(number, shifted(x=5.0 * number)), shifted(x=30.0), now_s=10.0 + number)
+    assert not jumps.due(12.9)
+    assert len(jumps.due(13.0)) == 1
+    assert not jumps.due(14.0)
+
+
 def test_a_jump_is_found_and_what_follows_a_robot_is_not() -> None:
-    jumps, here = FrameJumps(), shifted(x=30.0)
+    jumps, here = Jumps(), shifted(x=30.0)
     assert jumps.add(transform(None, shifted(x=9.0)), here) is None
     for number in range(10):
         assert jumps.add(transform(0.1 * number, shifted(x=0.02 * number)), here) is None
@@ -39,13 +59,13 @@ def test_a_jump_is_found_and_what_follows_a_robot_is_not() -> None:
 
 
 def test_another_drive_begins_with_no_jump() -> None:
-    jumps, here = FrameJumps(), np.eye(4)
+    jumps, here = Jumps(), np.eye(4)
     jumps.add(transform(100.0, shifted(x=5.0)), here)
     assert jumps.add(transform(3.0, np.eye(4)), here) is None
 
 
 def test_a_slam_that_follows_tracks_which_slip_in_a_turn_closes_no_loop() -> None:
-    jumps, odom = FrameJumps(), np.eye(4)
+    jumps, odom = Jumps(), np.eye(4)
     jumps.add(transform(-0.1, shifted(x=0.01)), odom)
     for number in range(40):
         slipped = turned(-0.6 * number)  # of each turn by 3 degrees
@@ -57,7 +77,7 @@ def test_a_slam_that_follows_tracks_which_slip_in_a_turn_closes_no_loop() -> Non
 
 
 def test_a_loop_may_be_closed_soon_by_what_does_not_follow() -> None:
-    jumps = FrameJumps()
+    jumps = Jumps()
     for number in range(5):
         assert jumps.add(transform(number, np.eye(4)), shifted(x=float(number))) is None
     assert jumps.add(transform(5.0, shifted(y=1.0)), shifted(x=5.0)) is not None

@@ -3,7 +3,6 @@
 import logging
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
@@ -19,7 +18,7 @@ from triquad_format.wire.limits import MAX_KEYFRAMES
 from triquad_tools.ros2.intake.drop_log import DropLog
 from triquad_tools.ros2.intake.frame_jumps import FrameJumps
 from triquad_tools.ros2.intake.placement import Placed
-from triquad_tools.ros2.intake.source_poses import Jump, Poses, SourcePoses
+from triquad_tools.ros2.intake.source_poses import Poses, SourcePoses
 from triquad_tools.sensors.motion.frame_tree import FrameTree
 from triquad_tools.sensors.motion.track import Transform
 from triquad_tools.sensors.ros.from_bytes import decode_cdr
@@ -68,9 +67,7 @@ class Corrections:
         self._body_from_sensor: dict[str, Doubles] = {}
         self._map_frame = ""
         self._arrived: _Arrived | None = None  # the newest that was not read
-        self._frame_jumps = FrameJumps()
-        self._jumps = deque[tuple[float, Jump]]()  # and when all scans before are published
-        self._wait_s = wait_s + _PERIOD_S
+        self._frame_jumps = FrameJumps(wait_s + _PERIOD_S)
         self._map_from_robot: Doubles | None = None
         self._stopping = threading.Event()
         # It waits for the server for as long as a correction takes.
@@ -104,13 +101,11 @@ class Corrections:
 
     def take_jumps(self, transforms: list[Transform]) -> None:
         """Go on with transforms, by one of which the frame of odometry may jump."""
+        if self._map_from_robot is None:
+            return
         for transform in transforms:
-            if self._map_from_robot is None or transform.parent != self._map_frame:
-                continue
-            jump = self._frame_jumps.add(transform, self._map_from_robot)
-            if jump is not None:
-                with self._lock:
-                    self._jumps.append((time.monotonic() + self._wait_s, jump))
+            if transform.parent == self._map_frame:
+                self._frame_jumps.add(transform, self._map_from_robot, time.monotonic())
 
     def receive(self, topic_name: str, payload: zenoh.ZBytes) -> None:
         """Take the message of a path; the one before is dropped if it was not read yet."""
@@ -165,10 +160,9 @@ class Corrections:
 
     def _jump(self, now_s: float) -> bool:
         """Want scans where the jumps that are due move them; return whether there are any."""
+        due = self._frame_jumps.due(now_s)
         with self._lock:
-            due = [jump for due_s, jump in self._jumps if due_s <= now_s]
             for jump in due:
-                self._jumps.popleft()
                 for source in self._sources.values():
                     source.jump(jump)
         return bool(due)

@@ -1,5 +1,6 @@
 """Jumps of the frame of odometry in the map, where a SLAM closes a loop."""
 
+from collections import deque
 from typing import NamedTuple
 
 import numpy as np
@@ -33,14 +34,29 @@ class _Frame(NamedTuple):
 class FrameJumps:
     """Finds where the frame of odometry jumps in the map frame, among transforms as they come."""
 
-    def __init__(self) -> None:
+    def __init__(self, wait_s: float) -> None:
+        """Jumps are due after a while: until then scans of before may be published."""
+        self._wait_s = wait_s
         self._last: dict[str, _Frame] = {}  # by the name of each such frame
+        self._found = deque[tuple[float, Jump]]()  # and when each is due
 
-    def add(self, transform: Transform, map_from_robot: Doubles) -> Jump | None:
-        """Go on with a transform from the map frame; return the jump that it ends, if it does.
+    def due(self, now_s: float) -> list[Jump]:
+        """Take the jumps that are due; another thread than that of :meth:`add` may."""
+        jumps = []
+        while self._found and self._found[0][0] <= now_s:
+            jumps.append(self._found.popleft()[1])
+        return jumps
+
+    def add(self, transform: Transform, map_from_robot: Doubles, now_s: float) -> None:
+        """Go on with a transform from the map frame, which may end a jump.
 
         ``map_from_robot`` [4, 4] is where the robot was last.
         """
+        jump = self._ended(transform, map_from_robot)
+        if jump is not None:
+            self._found.append((now_s + self._wait_s, jump))
+
+    def _ended(self, transform: Transform, map_from_robot: Doubles) -> Jump | None:
         name, stamp_ns = transform.child, transform.stamp_ns
         if stamp_ns is STATIC or name.rpartition("/")[2] != _ODOMETRY:
             return None

@@ -8,7 +8,6 @@ from contextlib import suppress
 from functools import partial
 from typing import Any
 
-import numpy as np
 import zenoh
 from triquad_client import Client, InvalidScanError
 from triquad_format.errors import TriquadError
@@ -52,9 +51,8 @@ class Intake:
         self._options = options
         topics, found_by = options.topics, options.topics.odometry
         frame = options.map_frame or (_ODOMETRY_MAP if found_by else "")
-        self._start = Place(frame, np.zeros(3), stamp_ns=0) if frame else None
         self.drops = DropLog()
-        self.scans = ScanPublisher(client, options.ray_origins)
+        self.scans = ScanPublisher(client, options.ray_origins, frame)
         self._motion = Motion(from_topic=bool(topics.poses or found_by), map_frame=frame)
         frames = self._motion.frames
         self._odometry = LiveOdometry(found_by, frames, options, frame) if found_by else None
@@ -81,7 +79,6 @@ class Intake:
             if topics.corrections or (found_by and options.close_loops)
             else None
         )
-        self._stopping = threading.Event()
         self._listener = TopicListener(session, options.topics, node, self._receive)
         self._thread = threading.Thread(target=self._run, name="ros2-intake")
         self._thread.start()
@@ -99,12 +96,11 @@ class Intake:
     @property
     def place(self) -> Place | None:
         """The place of the newest scan; None before there is one, and no map frame is set."""
-        return self.scans.newest or self._start
+        return self.scans.newest
 
     def close(self) -> None:
         """Take no more messages."""
         self._listener.close()
-        self._stopping.set()
         self._queue.close()
         self._thread.join()
         if self._corrections is not None:
@@ -128,7 +124,7 @@ class Intake:
             self._queue.put(arrival)
 
     def _run(self) -> None:
-        while not self._stopping.is_set():
+        while not self._queue.is_closed:
             arrival = self._queue.take(_TICK_S)
             if arrival is not None:
                 self._guard(arrival.topic_name, partial(self._read, arrival))

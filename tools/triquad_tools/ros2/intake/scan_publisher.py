@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
 from triquad_client import Client
 from triquad_format.records.arrays import Doubles
 
@@ -35,9 +36,13 @@ class _Source:
 class ScanPublisher:
     """Publishes scans to the map server, those of a topic in the order of their stamps."""
 
-    def __init__(self, client: Client, ray_origins: Mapping[str, Origin]) -> None:
-        """``ray_origins`` [3] say by topic where rays begin, in its frame; others are checked."""
-        self.newest: Place | None = None  # where the newest scan was taken
+    def __init__(self, client: Client, ray_origins: Mapping[str, Origin], map_frame: str) -> None:
+        """``ray_origins`` [3] say by topic where rays begin, in its frame; others are checked.
+
+        ``map_frame`` is the one that was chosen; "": none was.
+        """
+        # Where the newest scan was taken; before there is one, the middle of a frame that is known.
+        self.newest = Place(map_frame, np.zeros(3), stamp_ns=0) if map_frame else None
         self.count = 0  # scans that were published
         self._client = client
         self._rays = RayCheck()

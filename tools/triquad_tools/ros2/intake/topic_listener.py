@@ -87,6 +87,11 @@ class MessageQueue:
         self._bytes[is_scan] -= arrival.nbytes
         return arrival
 
+    @property
+    def is_closed(self) -> bool:
+        """Whether no more messages are given out."""
+        return self._closed
+
     def close(self) -> None:
         """Give out no more messages."""
         with self._changed:
