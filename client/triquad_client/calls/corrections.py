@@ -37,16 +37,14 @@ class CorrectionCalls(ScanCalls):
     ) -> CorrectPosesReply:
         """Have the map be as better poses of a source's scans would have made it.
 
-        The server makes it again from the scans that it keeps (``store.log_max_bytes``), which
-        takes a fraction of the drive, and goes on with the map of before meanwhile. A scan between
-        two of the poses moves, in its own frame, by what lies between their moves. It waits first
-        until what this client published is dealt with.
+        The server makes it again from the scans that it keeps (``store.log_max_bytes``), and goes
+        on with the map of before meanwhile. A scan between two of the poses moves, in its own
+        frame, by what lies between their moves. First all that was published is dealt with.
 
         Args:
             source: whose scans they are; those of others stay where they are.
             stamps_s: [K] rising, seconds since 1970: those of scans, or between them.
-            world_from_sensor: the corrected poses of the sensor at these times, such as of
-                keyframes: [K, 4, 4], or a list of :class:`Pose`.
+            world_from_sensor: [K, 4, 4] or a list of :class:`Pose`, the poses at these times.
             onward: scans after the last of the poses, published before this call, move as that, as
                 when a SLAM corrects where the robot is; else those before and after stay.
             timeout_s: how long to wait for that, at most.
