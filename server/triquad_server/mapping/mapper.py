@@ -88,6 +88,7 @@ class Mapper:
         self._number = record.epoch if record else 0
         self._epoch: Epoch | None = None
         self._structure_changed = True
+        self.rests = False  # it is not trained: another map is to come in place of this one
         # Chosen by the first scan, and kept as long as this process runs: what was known before a
         # reset counts from there as well.
         is_begun = record is not None and (record.regions or record.progress.scans_taken)

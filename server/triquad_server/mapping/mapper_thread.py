@@ -5,9 +5,9 @@ import math
 import queue
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any, TypeVar
@@ -107,6 +107,16 @@ class MapperThread:
         """Start the thread."""
         self._thread.start()
 
+    @contextmanager
+    def without_training(self) -> Iterator[None]:
+        """Train nothing while the context is open: another map is to come in place of this one."""
+        self._mapper.rests = True
+        try:
+            yield
+        finally:
+            self._mapper.rests = False
+            self._wake.set()
+
     def pause(self) -> None:
         """Take no more scans and train no more, but go on carrying out commands."""
         self._phase = _Phase.PAUSED
@@ -180,13 +190,14 @@ class MapperThread:
             return else_s
         took_scans = self._ingest_scans(max(_SCANS_S, _SCANS_SHARE * else_s))
         ingested_s = time.monotonic()
-        if not self._mapper.settled and self._commands.empty():
+        rests = self._mapper.rests
+        if not (self._mapper.settled or rests) and self._commands.empty():
             self._train()
         if self._schedule.take_due():
             self._publish()
         self._record_progress()
         else_s = time.monotonic() - ingested_s
-        if self._mapper.settled and not took_scans:
+        if (self._mapper.settled or rests) and not took_scans:
             self.time.begin(Activity.IDLE)
             if not self._epochs.is_recent:
                 self._mapper.release()

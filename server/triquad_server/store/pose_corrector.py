@@ -89,7 +89,9 @@ class PoseCorrector:
                 self._checkpoints.correcting = log.moved
                 kept = self._checkpoints.keep_newest("correcting poses").epoch
                 again = _MapAgain(self._mapper.call(lambda mapper: mapper), log)
-            return self._correct(store, log, again, followed, kept)
+            # The cores are for the other map: what this one learnt meanwhile would be lost.
+            with self._mapper.without_training():
+                return self._correct(store, log, again, followed, kept)
         except (StoreError, FormatError, OSError) as error:
             raise RefusedError("store", f"no pose was corrected: {error}") from error
         finally:

@@ -106,6 +106,17 @@ def test_a_command_returns_its_result_or_raises_its_error() -> None:
         assert "internal error" in mapping.ended(), "what else it left undone, nobody knows"
 
 
+def test_without_training_scans_are_taken_in_and_nothing_is_learnt() -> None:
+    with running(learning_mapper()) as mapping:
+        with mapping.thread.without_training():
+            before = mapping.thread.call(lambda mapper: mapper.samples_trained)
+            mapping.scans.put(servers.scan())
+            mapping.thread.wake()
+            servers.until(lambda: mapping.thread.call(lambda mapper: mapper.scans_taken) == 2)
+            assert mapping.thread.call(lambda mapper: mapper.samples_trained) == before
+        servers.until(lambda: mapping.thread.progress.own_samples_trained > before)
+
+
 def test_an_end_that_comes_as_a_turn_begins_is_not_slept_through(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
