@@ -1,7 +1,8 @@
 """A robot with ROS 2 that has a lidar and nothing that says where it is."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -27,6 +28,19 @@ KEPT = Settings.model_validate(
 )
 
 
+@contextmanager
+def bridged_robot(
+    settings: Settings = servers.SMALL, store: Path | None = None
+) -> Iterator[tuple[Bridged, Robot]]:
+    """A server, a bridge that finds poses by the clouds of a robot, and that robot."""
+    with (
+        servers.running_service(settings, store=store) as endpoint,
+        bridging(endpoint, "--odometry", "points") as bridged,
+        robot(endpoint) as r2,
+    ):
+        yield bridged, r2
+
+
 def send(bridged: Bridged, r2: Robot, clouds: Sequence[tuple[float, NDArray[np.floating]]]) -> None:
     """Publish clouds with their seconds, no faster than they are read."""
     for number, (second, points) in enumerate(clouds, start=1):
@@ -45,11 +59,7 @@ def drifted_m(bridged: Bridged, first: int) -> NDArray[np.float64]:
 
 
 def test_its_map_is_made_by_its_clouds_alone() -> None:
-    with (
-        servers.running_service() as endpoint,
-        bridging(endpoint, "--odometry", "points") as bridged,
-        robot(endpoint) as r2,
-    ):
+    with bridged_robot() as (bridged, r2):
         r2.tf(0, ("base_link", "lidar", MAST), static=True)
         for number, scan in enumerate(world(SCANS, STEP_M).scans):
             r2.tf(number, ("odom", "base_link", np.eye(4)))  # a driver that knows nothing
@@ -61,11 +71,7 @@ def test_its_map_is_made_by_its_clouds_alone() -> None:
 
 def test_a_scan_of_another_place_is_dropped_and_it_goes_on() -> None:
     scans = world(SCANS, STEP_M).scans
-    with (
-        servers.running_service() as endpoint,
-        bridging(endpoint, "--odometry", "points") as bridged,
-        robot(endpoint) as r2,
-    ):
+    with bridged_robot() as (bridged, r2):
         clouds = [(0.1 * number, scans[number].points) for number in range(20)]
         clouds[15] = clouds[15][0], clouds[15][1][:, [2, 0, 1]]
         send(bridged, r2, clouds)
@@ -76,11 +82,7 @@ def test_a_scan_of_another_place_is_dropped_and_it_goes_on() -> None:
 
 def test_a_wrong_stamp_and_a_late_cloud_hold_up_no_others() -> None:
     scans = world(SCANS, STEP_M).scans
-    with (
-        servers.running_service() as endpoint,
-        bridging(endpoint, "--odometry", "points") as bridged,
-        robot(endpoint) as r2,
-    ):
+    with bridged_robot() as (bridged, r2):
         wrong_s = {14: -0.15, 17: 3600.0}
         seconds = [0.1 * number + wrong_s.get(number, 0.0) for number in range(22)]
         send(bridged, r2, [(at, scans[number].points) for number, at in enumerate(seconds)])
@@ -97,11 +99,7 @@ def test_where_it_comes_back_to_a_place_all_that_was_mapped_since_moves(
     caplog.set_level(logging.INFO)
     drive = block_drive(41, 44.0, 179, 1.0, Lidar(beams=16, columns=360, noise_m=0.05))
     there = np.linalg.inv(drive.poses[0]) @ drive.poses
-    with (
-        servers.running_service(KEPT, store=tmp_path / "store") as endpoint,
-        bridging(endpoint, "--odometry", "points") as bridged,
-        robot(endpoint) as r2,
-    ):
+    with bridged_robot(KEPT, tmp_path / "store") as (bridged, r2):
         send(bridged, r2, [(0.1 * number, scan.points) for number, scan in enumerate(drive)])
         bridged.wait_for(lambda: "scans moved with the path" in caplog.text)
         assert bridged.taken == len(drive), bridged.bridge.dropped

@@ -48,7 +48,7 @@ class LoopClosure:
 
     @property
     def correction(self) -> Doubles:
-        """The move [4, 4] by which poses of odometry are right by now; there must be a keyframe."""
+        """The move [4, 4] of poses of odometry to where they are now; there must be a keyframe."""
         correction: Doubles = self._closed[-1] @ np.linalg.inv(self._odometry[-1])
         return correction
 
@@ -82,19 +82,22 @@ class LoopClosure:
 
     def _comes_back(self, before: int, after: int) -> bool:
         """Find out whether the newest keyframe is where an earlier one was; return as add."""
-        moves = False
-        if not self._loops or after - self._loops[-1].after >= self._apart_loops:
+        moves, is_known = False, self._is_soon(after)
+        if not is_known:
             loop = self._fitted(before, after)
             if loop is not None and surprise(self._closed, loop) <= _SURPRISE:
-                moves = is_news(self._closed, loop)
+                moves, is_known = is_news(self._closed, loop), True
                 self._take(loop)
                 if moves:
                     self.close()
         away_m = np.linalg.norm(self._closed[after, :3, 3] - self._closed[before, :3, 3])
-        since = after - self._loops[-1].after if self._loops else after
-        if since < self._apart_loops and away_m < self._apart_m:
+        if is_known and away_m < self._apart_m:
             del self._points[after]
         return moves
+
+    def _is_soon(self, after: int) -> bool:
+        """Return whether the last loop is too near for another."""
+        return bool(self._loops) and after - self._loops[-1].after < self._apart_loops
 
     def _take(self, loop: Loop) -> None:
         self._loops.append(loop)

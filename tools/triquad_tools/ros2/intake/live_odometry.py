@@ -11,7 +11,7 @@ from triquad_tools.odometry.loop_closure import LoopClosure
 from triquad_tools.odometry.odometry import Odometry
 from triquad_tools.odometry.registration import Registration, library
 from triquad_tools.ros2.intake.corrections import BodyPath
-from triquad_tools.ros2.intake.scan_publisher import RESTART_NS
+from triquad_tools.ros2.intake.scan_publisher import refuse_late
 from triquad_tools.ros2.options import BridgeOptions
 from triquad_tools.sensors.motion.frame_tree import FrameTree
 from triquad_tools.sensors.motion.track import STATIC, Transform
@@ -21,7 +21,6 @@ from triquad_tools.sensors.sweep import NoScanError, NoTransformError, Sweep
 _BEGIN_S = 1.0
 """For so long sweeps are gathered, from the first with points on, which tell how far the sensor
 sees; by then it is known where it sits on the robot, if that is published at all."""
-
 
 _FRAME = "triquad_odometry"
 """In which the body moves without jumps. It is moved in the map where a loop is closed, and with it
@@ -76,9 +75,7 @@ class LiveOdometry:
 
     def _check_time(self, stamp_ns: int) -> None:
         """Go on to the stamp of a sweep; one wrong stamp far ahead of all others holds up none."""
-        back_ns = self._newest_ns - stamp_ns
-        if 0 < back_ns <= RESTART_NS:
-            raise NoScanError("time_backwards", f"{back_ns / 1e9:.3g} s before the scan before")
+        refuse_late(self._newest_ns - stamp_ns)
         if stamp_ns < self._before_ns:
             raise NoScanError(
                 "restarted",

@@ -14,7 +14,7 @@ from triquad_tools.sensors.sweep import NoScanError, PosedScan, Sweep
 
 MAX_TOPICS = 64  # topics of which scans are made at most
 _NOWHERE_ELSE = 0.0, 0.0, 0.0
-RESTART_NS = 10**9  # stamps that go back by more start again: a wrong one silences for no longer
+_RESTART_NS = 10**9  # stamps that go back by more start again: a wrong one silences for no longer
 
 
 @dataclass(frozen=True)
@@ -24,6 +24,16 @@ class Place:
     map_frame: str
     position_m: Doubles  # [3] map frame
     stamp_ns: int
+
+
+def refuse_late(back_ns: int) -> None:
+    """Refuse a sweep that is so far before the one before, where that is no other start.
+
+    Raises:
+        NoScanError: it is a little before.
+    """
+    if 0 < back_ns <= _RESTART_NS:
+        raise NoScanError("time_backwards", f"{back_ns / 1e9:.3g} s before the scan before")
 
 
 @dataclass
@@ -62,8 +72,7 @@ class ScanPublisher:
                 raise NoScanError("too_many_topics", others)
             source = self._sources[topic_name] = _Source(source_of_topic(topic_name), stamp_ns)
         back_ns, source.read_ns = source.read_ns - stamp_ns, max(source.read_ns, stamp_ns)
-        if 0 < back_ns <= RESTART_NS:
-            raise NoScanError("time_backwards", f"{back_ns / 1e9:.3g} s before the scan before")
+        refuse_late(back_ns)
         source.read_ns = stamp_ns
         return back_ns > 0
 
