@@ -56,9 +56,9 @@ docs: $(INSTALLED)
 	$(BIN)/python docs/numbers_table.py
 
 pictures: $(INSTALLED)
-	$(BIN)/python docs/pictures.py
-	$(BIN)/python docs/top_picture.py
-	$(BIN)/python docs/viewer_pictures.py
+	PYTHONPATH=. $(BIN)/python docs/pictures.py
+	PYTHONPATH=. $(BIN)/python docs/top_picture.py
+	PYTHONPATH=. $(BIN)/python docs/viewer_pictures.py
 
 bench: $(INSTALLED)
 	$(BIN)/python -m bench $(PART) $(BENCH_FLAGS)
@@ -75,11 +75,11 @@ check: $(INSTALLED)
 $(INSTALLED_DEMO): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(call pip_install,demo)
-	touch $@
+	@touch $@
 
 $(INSTALLED): $(INSTALLED_DEMO)
 	$(call pip_install,dev)
-	touch $@
+	@touch $@
 
 # What is in the wheel, and nothing of this folder, maps a few scans in an environment of its own.
 wheel:

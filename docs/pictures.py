@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
@@ -22,12 +23,17 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from PIL import Image
 from triquad_client import Status, open_map
+from triquad_format.records.arrays import Bytes
 from triquad_server import serve
+from triquad_server.settings.loading import load_settings
 from triquad_tools.plots.colours import DISTANCES, FREE, UNKNOWN
 from triquad_tools.plots.picture import BACKGROUND, HEIGHT, WIDTH, draw_faces, view_along
-from triquad_tools.simulation.lidar import SimulatedDrive
+from triquad_tools.simulation.lidar import Lidar, SimulatedDrive
 from triquad_tools.simulation.solids import Solid, box
 from triquad_tools.simulation.street import street_drive
+
+from bench.parts.poses import drifting
+from bench.scenes.block import block_drive
 
 IMAGES = Path(__file__).with_name("images")
 ROOT = IMAGES.parents[1]
@@ -35,7 +41,10 @@ ROOT = IMAGES.parents[1]
 _WIDTH, _COLOURS = 1200, 256
 _CELL_M, _MAX_DISTANCE_M = 0.1, 3.0  # of the slice
 _DEMO, _STREET, _SCANS = "demo-out", 1, 25
+_KINDS = {Status.FREE: FREE, Status.SURFACE: "#a3341f", Status.UNKNOWN: UNKNOWN}
 _AROUND_M = ((-1.0, -8.0, -1.0), (24.0, 8.0, 4.0))
+_BLOCK, _SIDE_M, _AROUND_SCANS = 36, 60.0, 254  # its streets are 60 m long
+_BLOCK_M = ((-45.0, -45.0, 1.0), (45.0, 45.0, 1.0))
 _BOX_HALF_M = (0.6, 0.5, 0.9)
 _MONDAY = [(6.0, 2.0), (11.0, 1.2), (15.0, 2.5)]  # boxes on the road, x and y
 _TUESDAY = [(7.5, 2.0), (15.0, 2.5), (19.0, 1.0)]  # one moved, one gone, one more
@@ -56,16 +65,14 @@ def height_slice(out: Path) -> None:
     with open_map(ROOT / _DEMO / "map.triquad") as opened:
         found = opened.query_grid(((0, -12, 1), (40, 12, 1)), _CELL_M, _MAX_DISTANCE_M)
     distance_m, status = found.distance_m[:, :, 0].T, found.status[:, :, 0].T
-    kinds = {Status.FREE: FREE, Status.SURFACE: "#a3341f", Status.UNKNOWN: UNKNOWN}
     figure = Figure((12, 11), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True)
     extent, known = (0, 40, -12, 12), np.where(status == Status.UNKNOWN, np.nan, distance_m)
     upper.set_facecolor(UNKNOWN)
     shown = upper.imshow(known, DISTANCES, vmin=0, vmax=3, extent=extent, origin="lower")
     figure.colorbar(shown, ax=[upper, lower], label="m to the nearest surface, 3 or more")
-    lower.imshow(status, ListedColormap([kinds[kind] for kind in sorted(kinds)]),
-                 extent=extent, origin="lower", interpolation="none")  # fmt: skip
-    patches = [Patch(facecolor=kinds[kind], edgecolor="k", label=kind.name) for kind in kinds]
+    _draw_status(lower, status, extent)
+    patches = [Patch(facecolor=_KINDS[kind], edgecolor="k", label=kind.name) for kind in _KINDS]
     lower.legend(handles=patches, loc="upper left", bbox_to_anchor=(0, -0.12), ncols=3)
     lower.set(xlabel="x in m", ylabel="y in m")
     upper.set_ylabel("y in m")
@@ -80,6 +87,30 @@ def difference(out: Path) -> None:
             boxes = [box((x, y, _BOX_HALF_M[2]), _BOX_HALF_M) for x, y in places]
             _map_of(_with_boxes(boxes), Path(folder) / name)
         _run("triquad-inspect", *files, "--diff", "--plot", out, folder=Path(folder))
+
+
+def corrected(out: Path) -> None:
+    """A map around a block made with poses that drift, and after these were corrected."""
+    drive = block_drive(_BLOCK, _SIDE_M, _AROUND_SCANS, 1.0, Lidar(columns=1024))
+    stamps_s = np.arange(1.0, 1.0 + _AROUND_SCANS)
+    settings = load_settings(assignments=["store.log_max_bytes=1000000000"])
+    with (
+        tempfile.TemporaryDirectory() as store,
+        serve(map="block", store=store, settings=settings) as server,
+        server.client() as client,
+    ):
+        for scan, pose, stamp_s in zip(drive, drifting(drive.poses), stamps_s, strict=True):
+            client.publish_scan(scan.points, pose, stamp_s, source="lidar")
+            client.flush()
+        shown = {"as published": client.query_grid(_BLOCK_M, _CELL_M)}
+        client.correct_poses("lidar", stamps_s, drive.poses)
+        shown["corrected"] = client.query_grid(_BLOCK_M, _CELL_M)
+    figure = Figure((12, 6.4), layout="constrained")
+    (x, y, _), (far_x, far_y, _) = _BLOCK_M
+    for axes, (title, found) in zip(figure.subplots(1, 2, sharey=True), shown.items(), strict=True):
+        _draw_status(axes, found.status[:, :, 0].T, (x, far_x, y, far_y))
+        axes.set(title=title, xlabel="x in m")
+    figure.savefig(out)
 
 
 def preview(out: Path) -> None:
@@ -107,10 +138,17 @@ PICTURES: dict[str, Callable[[Path], None]] = {
     "map.png": map_from_above,
     "slice.png": height_slice,
     "difference.png": difference,
+    "corrected.png": corrected,
     "preview.png": preview,
     "tradeoffs.png": tradeoffs,
 }
 """What makes each: it is given the path to write to."""
+
+
+def _draw_status(axes: Axes, status: Bytes, extent: tuple[float, float, float, float]) -> None:
+    """Draw the status [Y, X] of the cells of a plane."""
+    colours = ListedColormap([_KINDS[kind] for kind in sorted(_KINDS)])
+    axes.imshow(status, colours, extent=extent, origin="lower", interpolation="none")
 
 
 def _with_boxes(boxes: list[Solid]) -> SimulatedDrive:
