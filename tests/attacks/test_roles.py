@@ -15,8 +15,8 @@ import zenoh
 from support.attackers.role_files import free_tls_endpoint, opened, showing
 from support.attackers.role_matrix import OTHERS, OWN, achieved, expected
 from support.ros.ros_bridge import MAST, bridging, stand
-from support.ros.ros_messages import RosMessages
 from support.ros.ros_robot import RmwZenoh, Robot
+from support.ros_messages import RosMessages
 from support.servers import SMALL_FILE, WAIT_S, server_process, sphere
 from triquad_client.errors import ConnectError, NoReplyError, UnknownMapError
 from triquad_format.wire import keys

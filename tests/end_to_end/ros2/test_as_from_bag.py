@@ -11,8 +11,8 @@ from support import servers
 from support.poses import shifted
 from support.recordings.bags import Recorded, messages_for, write_bag
 from support.ros.ros_bridge import bridging
-from support.ros.ros_messages import CAMERA_INFO, CLOUD, COMPRESSED_IMAGE, IMAGE, TF
 from support.ros.ros_robot import T0, robot
+from support.ros_messages import CAMERA_INFO, CLOUD, COMPRESSED_IMAGE, IMAGE, TF
 from triquad_format.wire import codec
 from triquad_format.wire.messages import Scan
 from triquad_tools.recordings.opening import Selection, open_recording

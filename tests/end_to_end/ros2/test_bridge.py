@@ -8,8 +8,8 @@ import pytest
 from support import servers
 from support.poses import shifted
 from support.ros.ros_bridge import AT, MAST, Bridged, bridging, stand
-from support.ros.ros_messages import CLOUD, PATH
 from support.ros.ros_robot import T0, robot, stamp
+from support.ros_messages import CLOUD, PATH
 from triquad_client import Client, Status
 from triquad_server.settings import SourceSettings
 from triquad_tools.ros2.intake import drop_log, intake

@@ -13,8 +13,8 @@ from support import servers
 from support.maps.drifted import SAME, SCANS, SETTINGS, off, shared, surface, truth
 from support.maps.small_world import world
 from support.ros.ros_bridge import MAST, Bridged, bridging
-from support.ros.ros_messages import PATH
 from support.ros.ros_robot import Robot, robot, stamp
+from support.ros_messages import PATH
 from triquad_server.settings import Settings
 from triquad_tools.ros2.intake.source_poses import Jump
 

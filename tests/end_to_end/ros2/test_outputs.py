@@ -17,8 +17,8 @@ from scipy.spatial import cKDTree
 from support import servers
 from support.poses import shifted
 from support.ros.ros_bridge import bridging
-from support.ros.ros_messages import RosMessages
 from support.ros.ros_robot import robot
+from support.ros_messages import RosMessages
 from triquad_client import Client, MeshWatch, Status
 from triquad_server.settings import MeshSettings
 from triquad_tools.commands import ros2

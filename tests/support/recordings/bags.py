@@ -10,7 +10,7 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores
-from support.ros.ros_messages import CLOUD, ODOMETRY, TF, RosMessages
+from support.ros_messages import CLOUD, ODOMETRY, TF, RosMessages
 
 BagKind = Literal["mcap", "sqlite3", "ros1"]
 KINDS: tuple[BagKind, ...] = ("mcap", "sqlite3", "ros1")

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import zenoh
 import zenoh.ext
 from numpy.typing import NDArray
-from support.ros.ros_messages import (
+from support.ros_messages import (
     CAMERA_INFO,
     CLOUD,
     COMPRESSED_IMAGE,

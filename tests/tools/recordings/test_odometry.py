@@ -12,7 +12,7 @@ from support.recordings.bags import Recorded, messages_for, write_bag
 from support.recordings.kitti_folder import write_folder
 from support.recordings.point_files import columns, write_ply
 from support.recordings.trajectories import write_tum
-from support.ros.ros_messages import CLOUD
+from support.ros_messages import CLOUD
 from triquad_client import Pose
 from triquad_format.records.pose import quaternion_of
 from triquad_tools.console.command import ToolError

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from support import hall
 from support.poses import shifted
 from support.recordings.bags import Recorded, messages_for, write_bag
-from support.ros.ros_messages import CLOUD, TF
+from support.ros_messages import CLOUD, TF
 from triquad_format.records.plausibility import hidden_share
 from triquad_tools.console.command import ToolError
 from triquad_tools.recordings.arguments import add_recording

@@ -10,7 +10,7 @@ import pytest
 from support.poses import shifted
 from support.recordings import trajectories
 from support.recordings.bags import KINDS, BagKind, Recorded, drive, messages_for, write_bag
-from support.ros.ros_messages import (
+from support.ros_messages import (
     CAMERA_INFO,
     CLOUD,
     IMAGE,

@@ -7,8 +7,8 @@ import pytest
 from support import servers
 from support.poses import shifted
 from support.ros.ros_bridge import bridging
-from support.ros.ros_messages import CAMERA_INFO, CLOUD, IMAGE, ODOMETRY, TF, RosMessages
 from support.ros.ros_robot import robot
+from support.ros_messages import CAMERA_INFO, CLOUD, IMAGE, ODOMETRY, TF, RosMessages
 
 MESSAGES = RosMessages()
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support.ros.ros_messages import RosMessages
+from support.ros_messages import RosMessages
 from triquad_tools.commands.ros2 import parser
 from triquad_tools.ros2.options import Role, TopicChoice
 from triquad_tools.ros2.output.mesh_publisher import ADD, marker_message

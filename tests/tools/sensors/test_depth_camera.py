@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.ros.ros_messages import IMAGE, RosMessages
+from support.ros_messages import IMAGE, RosMessages
 from triquad_tools.sensors.ros.depth_camera import camera_topic, sweep_of_depth
 from triquad_tools.sensors.ros.from_bytes import decode_cdr
 from triquad_tools.sensors.sweep import NoScanError

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores
-from support.ros.ros_messages import CLOUD, RosMessages
+from support.ros_messages import CLOUD, RosMessages
 from triquad_tools.sensors.ros.from_bytes import decode, decode_cdr
 from triquad_tools.sensors.ros.point_cloud import sweep_of_cloud
 from triquad_tools.sensors.ros.type_store import LIVOX

@@ -1,4 +1,7 @@
-"""Messages of ROS as robots send them, built with the types of a release."""
+"""Messages of ROS as robots send them, built with the types of a release.
+
+Scripts outside of the project import this module: its place and :class:`RosMessages` stay.
+"""
 
 import io
 from collections.abc import Mapping, Sequence
