@@ -36,7 +36,7 @@ _LONG_M, _LONG_SCANS = 245.0, 500  # of the long way
 _AMID, _AFTER, _LAST = 225, 275, 450
 """The first scan that is off amid the long way, the first after these, and the first of the last
 tenth."""
-_RAISED_M = 0.2  # by which all scans of the long way are moved at last
+_RAISED_M = 0.2  # how far up all scans of the long way are moved at last
 _OFF_M, _OFF_DEG = 0.3, 1.0
 _DRIFT_SHARE, _DRIFT_DEG_PER_M = 0.005, 0.03
 _FIRST_S = 1_700_000_000  # when the drive begins; a scan each second
@@ -139,8 +139,9 @@ def _settled_mesh(client: Client) -> Mesh:
 def _long_figures(seed: int) -> list[Figure]:
     """Correct some scans amid a long way, the last ones, and all, as soon as it is driven."""
     drive = street_drive(seed, _LONG_SCANS, 1.0, _LONG_M, _SENSOR)
-    true, off, end = drive.poses, _off(drive.poses, _AMID), _off(drive.poses, _LAST)
-    wrong = np.concatenate([true[:_AMID], off[_AMID:_AFTER], true[_AFTER:_LAST], end[_LAST:]])
+    true, wrong = drive.poses, drive.poses.copy()
+    wrong[_AMID:_AFTER] = _off(true, _AMID)[_AMID:_AFTER]
+    wrong[_LAST:] = _off(true, _LAST)[_LAST:]
     raised = true.copy()
     raised[:, 2, 3] += _RAISED_M
     scans, began_s = list(drive), time.monotonic()
