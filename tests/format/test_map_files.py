@@ -83,7 +83,7 @@ def test_empty_map() -> None:
 
 @pytest.mark.parametrize("integers", [True, False])
 def test_regions_are_split_into_squares_and_cubes(integers: bool) -> None:
-    record = random_record(2, settings=FieldSettings(), points=350)
+    record = random_record(2, settings=FieldSettings(depth=12), points=350)
     record = with_integers(record) if integers else record
     (region,) = record.regions
     places = {

@@ -21,17 +21,17 @@ Show = Callable[[LiveSource], AbstractContextManager[Page]]
 
 SCANS, APART_M, OFF_M = 3, 2.0, 3.0
 STAMPS_S = [1e9 + number for number in range(SCANS)]
-CORRECTING = f"correcting {SCANS} scans: the map is made again"
+CORRECTING = f"correcting {SCANS} scans: regions are made again"
 BEFORE = "trail before the correction"
 
 
 @contextmanager
 def correction_held(client: Client) -> Iterator[None]:
-    """Have all scans moved to y = 0; the map is made again once the context ends."""
+    """Have all scans moved to y = 0; regions are made again once the context ends."""
     log, go_on = logging.getLogger("triquad_server.store.pose_corrector"), threading.Event()
 
     def held(record: logging.LogRecord) -> bool:
-        return "the map is made again" not in record.getMessage() or go_on.wait(servers.WAIT_S)
+        return "regions are made again" not in record.getMessage() or go_on.wait(servers.WAIT_S)
 
     poses = [shifted(APART_M * number) for number in range(SCANS)]
     log.addFilter(held)

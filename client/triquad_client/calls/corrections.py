@@ -51,8 +51,8 @@ class CorrectionCalls(ScanCalls):
 
         Returns:
             ``epoch``: the first of the corrected map. ``scans_moved``: scans whose pose changed.
-            ``scans_learnt``: those of which the map was made again. ``kept_epoch`` and ``undo``: as
-            of :meth:`reset`.
+            ``scans_learnt``: those of which regions were made again. ``kept_epoch`` and ``undo``:
+            as of :meth:`reset`.
 
         Raises:
             InvalidScanError: the times do not rise, or a pose is none.

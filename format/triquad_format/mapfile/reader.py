@@ -1,7 +1,7 @@
 """Reading map files and checkpoints, whole or in part: nothing of them is used before its check."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -90,6 +90,18 @@ class StoredMap:
             self._index.check_unread()
             record = assemble(self.manifest, self._index.payload)
         return MapFile(record, self._index.metadata, self._index.size, self.manifest)
+
+    def regions(self, wanted: Collection[RegionIndex]) -> MapRecord:
+        """Return those regions of the map that are ``wanted``, whole; those it lacks are left out.
+
+        Raises:
+            MapFileError: a part of them is missing or damaged.
+        """
+        entries = tuple(one for one in self.manifest.entries if one.key.region in wanted)
+        with named(self.name):
+            return assemble(
+                dataclasses.replace(self.manifest, entries=entries), self._index.payload
+            )
 
     def box(self, minimum: ArrayLike, maximum: ArrayLike) -> MapRecord:
         """Return the part of the map that answers in a box, without training state.

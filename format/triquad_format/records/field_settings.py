@@ -55,8 +55,8 @@ class FieldSettings:
     leaf_m: float = _ranged(0.2, 0.01, 10.0)
     """r: side of a leaf."""
 
-    depth: int = _ranged(12, 6, 15)
-    """L_max: depth of the quadtrees."""
+    depth: int = _ranged(10, 6, 15)
+    """L_max: depth of the quadtrees, and so the side of a region: 12 in the paper."""
 
     feature_levels: int = _ranged(3, 1, 4)
     """H: the deepest levels carry features, so many of them."""

@@ -1,6 +1,7 @@
 """The poses of all scans of a log, as they were corrected last."""
 
 from collections import defaultdict
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,10 @@ from triquad_format.scan_log.segment import Entry, LoggedCorrection, LoggedScan
 _AGAIN_NS = 1_000_000_000
 """Where stamps of a source fall by more, its time began again, as with another start of a robot
 whose clock does not go on: the same stamps are those of other scans from then on."""
+
+_TOLERANCE, _AT = 0.02, 40.0
+"""A scan has moved if anything within 100 voxels of its sensor has, by a twentieth of a voxel: in
+units of how far kept scans are apart."""
 
 
 class Motion(NamedTuple):
@@ -40,8 +45,11 @@ class Motion(NamedTuple):
 class LogPoses:
     """The poses of the scans of a log, kept or not, a row each in the order in which they came."""
 
-    def __init__(self) -> None:
+    def __init__(self, apart_m: float = 0.0) -> None:
+        """Begin; kept scans are ``apart_m`` apart, by which it goes how far is far."""
         self.poses: list[Doubles] = []
+        self._apart_m = apart_m
+        self._mapped: list[Doubles] = []  # the poses with which they were learnt from
         self._stamps_ns: list[int] = []
         # Of each source, and each time that its time began, the last one last.
         self._rows = defaultdict[str, list[list[int]]](list)
@@ -63,18 +71,26 @@ class LogPoses:
         elif isinstance(entry, LoggedCorrection):
             self.correct(entry)
 
-    def correct(self, correction: LoggedCorrection) -> tuple[Longs, Doubles, Doubles]:
-        """Move poses; return their rows [N], and what they were and are [N, 4, 4]."""
+    def correct(self, correction: LoggedCorrection) -> dict[int, Doubles]:
+        """Move poses; return what those were, by row, from which they have moved by too much.
+
+        Corrections that each move a scan by less add up until they do.
+        """
         starts = self._rows[correction.source]
         if correction.since >= len(starts):  # they are kept no more
-            return np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.zeros((0, 4, 4))
+            return {}
         rows = starts[-1 - correction.since]
         before = np.array([self.poses[row] for row in rows])
         stamps_ns = np.array([self._stamps_ns[row] for row in rows], np.int64)
         after = corrected(correction, stamps_ns, before)
-        for row, pose in zip(rows, after, strict=True):
+        mapped = np.array([self._mapped[row] for row in rows])
+        has_moved = motions(mapped, after, _AT * self._apart_m) > _TOLERANCE * self._apart_m
+        moved: dict[int, Doubles] = {}
+        for row, pose, was, far in zip(rows, after, mapped, has_moved.tolist(), strict=True):
             self.poses[row] = pose
-        return np.array(rows, np.int64), before, after
+            if far:
+                moved[row], self._mapped[row] = was, pose
+        return moved
 
     def motion(self, source: str, first_ns: int, last_ns: int) -> tuple[Motion, int]:
         """Return the last motion of a source that lies amid two times, or its last one.
@@ -102,6 +118,7 @@ class LogPoses:
             starts.append([])
         starts[-1].append(len(self.poses))
         self.poses.append(pose)
+        self._mapped.append(pose)
         self._stamps_ns.append(stamp_ns)
 
     def _motion(self, rows: list[int]) -> Motion:
@@ -113,6 +130,13 @@ class LogPoses:
 def source_of(entry: LoggedScan | Transform) -> str:
     """Return of which source a pose is."""
     return entry.source if isinstance(entry, LoggedScan) else entry.child
+
+
+def with_pose(entry: LoggedScan | Transform, pose: Doubles) -> LoggedScan | Transform:
+    """Return the same with another pose [4, 4]."""
+    if isinstance(entry, LoggedScan):
+        return replace(entry, world_from_sensor=pose)
+    return entry._replace(pose=pose)
 
 
 def corrected(correction: LoggedCorrection, stamps_ns: Longs, poses: Doubles) -> Doubles:

@@ -98,7 +98,7 @@ class CorrectPosesReply(Message):
 
     epoch: Epoch  # the first of the corrected map
     scans_moved: Count  # scans whose pose changed by more than a twentieth of a voxel
-    scans_learnt: Count  # kept scans of which the map was made again
+    scans_learnt: Count  # kept scans of which regions were made again
     kept_epoch: Epoch | None = None  # as which the map of before stays on disk; None: it does not
     undo: Annotated[str, text(4096)] | None = None  # how to go back to it, or why one cannot
 

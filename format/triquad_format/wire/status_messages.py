@@ -98,7 +98,7 @@ class ServerStatus(Message):
     samples_discarded: Count = 0  # above the limit of a region's training budget
     origin_m: Origin | None = None  # [3] from where the map itself counts; None: from 0 0 0
     kept_scans: KeptScans | None = None  # None: none are kept
-    correcting: Count = 0  # scans whose poses are being corrected: the map is made again
+    correcting: Count = 0  # scans whose poses are being corrected: regions are made again
 
     def __repr__(self) -> str:
         told = f"{self.scans_taken} scans, {self.learnt_percent} % learnt; epoch {self.epoch}"

@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from triquad_format.errors import RefusedError
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings, RegionIndex
 from triquad_format.records.region import BLOCK_BYTES, Region
@@ -115,6 +116,21 @@ class FairShare:
         )
 
 
+def regions_between(
+    corners: Doubles, field: FieldSettings, reach_m: float = 0.0
+) -> tuple[range, range, range]:
+    """Return the indices, along each axis, of regions whose cubes meet the box of points [N, 3].
+
+    The box is ``reach_m`` larger on each side.
+    """
+    half, pitch = field.region_side_m / 2 + reach_m, field.region_pitch_m
+    x, y, z = (
+        range(math.floor((along.min() - half) / pitch) + 1, math.ceil((along.max() + half) / pitch))
+        for along in np.ascontiguousarray(corners.T)  # each axis for itself, which is faster
+    )
+    return x, y, z
+
+
 def regions_around(
     rays: ScanRays, there: Collection[RegionIndex], field: FieldSettings
 ) -> list[RegionIndex]:
@@ -123,24 +139,19 @@ def regions_around(
     Rays that met nothing, and the robot, make no region: they are recorded in existing ones.
     """
     half = field.region_side_m / 2
-    pitch = field.region_pitch_m
-
-    def spanned(column: Doubles) -> range:
-        low, high = column.min() - half, column.max() + half
-        return range(math.floor(low / pitch) + 1, math.ceil(high / pitch))
-
-    columns = [np.append(rays.ends[:, axis], rays.origin[axis]) for axis in range(3)]
-    x, y, z = map(spanned, columns)
-    around = list(itertools.product(x, y, z))
+    points = np.concatenate([rays.ends, rays.origin[None]])
+    axes = np.ascontiguousarray(points.T)
+    around = list(itertools.product(*regions_between(points, field)))
 
     def holds_any(index: RegionIndex) -> bool:
-        near = [np.abs(column - i * pitch) < half for column, i in zip(columns, index, strict=True)]
+        near = [
+            np.abs(x - at) < half for x, at in zip(axes, field.region_centre(index), strict=True)
+        ]
         return bool((near[0] & near[1] & near[2]).any())
 
     if len(around) > 1:
         around = [index for index in around if index in there or holds_any(index)]
-    free = rays.free_corners
-    reached = [spanned(np.append(columns[axis], free[:, axis])) for axis in range(3)]
+    reached = regions_between(np.concatenate([points, rays.free_corners]), field)
     return around + [
         index
         for index in there
@@ -151,18 +162,29 @@ def regions_around(
 class LiveRegions:
     """Holds all regions of a map; only the thread that owns the map may use them."""
 
-    def __init__(self, setup: RegionSetup, max_bytes: int) -> None:
-        """Begin without regions; they may take ``max_bytes``, with the newest epoch of them."""
+    def __init__(
+        self, setup: RegionSetup, max_bytes: int, only: frozenset[RegionIndex] | None = None
+    ) -> None:
+        """Begin without regions; they may take ``max_bytes``, with the newest epoch of them.
+
+        What enters others than ``only`` some is left out there; ``None``: any may be made.
+        """
         self._setup = setup
         self._budget = MemoryBudget(max_bytes, setup.field)
         self._regions: dict[RegionIndex, LiveRegion] = {}
         self._share = FairShare.of(0, setup.training)
+        self._only = only
 
     def __len__(self) -> int:
         return len(self._regions)
 
     def __iter__(self) -> Iterator[LiveRegion]:
         return iter(self._regions.values())
+
+    @property
+    def field(self) -> FieldSettings:
+        """The settings of all fields."""
+        return self._setup.field
 
     @property
     def bytes_used(self) -> int:
@@ -203,6 +225,8 @@ class LiveRegions:
             ScanRefusedError: the map would have too many regions, or take too much memory.
         """
         around = regions_around(rays, self._regions, self._setup.field)
+        if self._only is not None:
+            around = [index for index in around if index in self._only]
         limit = self._setup.training.max_regions
         count = len(self._regions.keys() | set(around))
         if count > limit:
@@ -217,6 +241,30 @@ class LiveRegions:
         self._check_memory(rays, list(reached.values()))
         self._regions.update(reached)
         return list(reached.values())
+
+    def bytes_of(self, indices: Collection[RegionIndex]) -> int:
+        """Return the memory that some regions take, with the newest epoch of them; an estimate."""
+        return self._budget.bytes_of(region.size for region in self if region.index in indices)
+
+    def replace(self, others: "LiveRegions") -> None:
+        """Have what another map has of the regions that it may have, in place of those here.
+
+        Raises:
+            RefusedError: ``busy``; there would be too many, or they would take too much memory.
+        """
+        only = others._only or frozenset()
+        left = {index: one for index, one in self._regions.items() if index not in only}
+        regions = left | others._regions
+        used, most = self._budget.bytes_of(one.size for one in regions.values()), self._budget.limit
+        if used > most or len(regions) > self._setup.training.max_regions:
+            raise RefusedError(
+                "busy",
+                f"the map would have {len(regions)} regions and take {used / 1e6:.0f} MB, more than"
+                f" training.max_regions = {self._setup.training.max_regions} or memory.max_bytes ="
+                f" {most} allows: start the server with more",
+            )
+        self._regions = regions
+        self.share_out()
 
     def share_out(self) -> None:
         """Let all places keep as many rays, and be trained on as many samples at most."""

@@ -73,7 +73,7 @@ class Mapper:
         """Make a map that goes on from ``record``; without ``teams`` it has threads of its own."""
         self.name = name
         self.teams = teams or Teams()
-        self._settings = settings
+        self.settings = settings
         self.device = device
         self._setup = RegionSetup(
             field=record.settings if record else settings.field,
@@ -88,7 +88,7 @@ class Mapper:
         self._number = record.epoch if record else 0
         self._epoch: Epoch | None = None
         self._structure_changed = True
-        self.rests = False  # it is not trained: another map is to come in place of this one
+        self.rests = False  # it is not trained: regions are made again, which takes the cores
         # Chosen by the first scan, and kept as long as this process runs: what was known before a
         # reset counts from there as well.
         is_begun = record is not None and (record.regions or record.progress.scans_taken)
@@ -198,8 +198,8 @@ class Mapper:
         origin: Doubles | None,
     ) -> ScanRays:
         """Return a scan's usable rays. A defect due to its numbers must not stop the mapping."""
-        of_source = self._settings.sources.get(source, ANY_SOURCE)
-        settings = self._settings.scan_of(of_source)
+        of_source = self.settings.sources.get(source, ANY_SOURCE)
+        settings = self.settings.scan_of(of_source)
         try:
             return usable_rays(
                 points, pose, settings, source=of_source, no_return=no_return, map_origin=origin
@@ -264,21 +264,25 @@ class Mapper:
             self.scans_taken, self.samples_trained, self._loss = 0, 0, None
         self._structure_changed = True
 
-    def other(self, record: MapRecord | None) -> "Mapper":
-        """Return another map with these settings, name and origin, which goes on from a record.
+    def other(self, record: MapRecord | None, regions: frozenset[RegionIndex]) -> "Mapper":
+        """Return another map that has some regions only, with these settings, name and origin.
 
-        Without one it begins with nothing. Another thread may own it.
+        It goes on from a record, or begins with nothing. Another thread may own it.
         """
-        other = Mapper(self.name, self._settings, self.device, record, self.teams)
-        other._origin = self._origin
+        other = Mapper(self.name, self.settings, self.device, teams=self.teams)
+        other._setup, other._origin = self._setup, self._origin
+        other.regions = LiveRegions(self._setup, self.settings.memory.max_bytes, only=regions)
+        if record is not None:
+            other.regions.restore(record.regions)
+            other.regions.share_out()
         return other
 
     def become(self, other: "Mapper") -> None:
-        """Have all that another map has learnt in place of what this one has.
+        """Have what another map has learnt of its regions in place of what this one has.
 
         The other one must not be used any more. Epochs, scans and samples are counted on.
         """
-        self._setup, self.regions, self._loss = other._setup, other.regions, other._loss
+        self.regions.replace(other.regions)
         self._structure_changed = True
 
     def snapshot_since(self, epoch: int | None) -> MapSnapshot:

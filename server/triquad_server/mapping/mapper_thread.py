@@ -109,7 +109,7 @@ class MapperThread:
 
     @contextmanager
     def without_training(self) -> Iterator[None]:
-        """Train nothing while the context is open: another map is to come in place of this one."""
+        """Train nothing while the context is open: who makes regions again takes the cores."""
         self._mapper.rests = True
         try:
             yield

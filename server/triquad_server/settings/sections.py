@@ -178,7 +178,7 @@ class TrainingSettings(BaseModel):
     samples_per_ray: Annotated[float, Field(ge=0, le=1000)] = 48.0
     """Samples by which each new ray raises the training budget of its region."""
 
-    max_regions: Annotated[int, Field(ge=1, le=1_000_000)] = 256
+    max_regions: Annotated[int, Field(ge=1, le=1_000_000)] = 4096
     """Regions of the map; a scan that would need more is refused."""
 
     seed: Annotated[int, Field(ge=0, le=2**31)] = 42

@@ -2,7 +2,7 @@
 
 from bisect import bisect_right
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import NamedTuple
 
@@ -19,14 +19,12 @@ from triquad_format.scan_log.segment import (
     LoggedScan,
     read_segment,
 )
-from triquad_format.scan_log.tracks import LogPoses, corrected, motions, source_of
+from triquad_format.scan_log.tracks import LogPoses, corrected, source_of, with_pose
 from triquad_format.wire.status_messages import KeptScans
 
 from triquad_server.store.store import Store
 
-_TOLERANCE, _AT = 0.02, 40.0
-"""A scan has moved if anything within 100 voxels of its sensor has, by a twentieth of a voxel: in
-units of how far kept scans are apart."""
+_SAME = 1e-9  # of numbers of a pose: rounding moves nothing
 
 
 class WantedPoses(NamedTuple):
@@ -39,7 +37,7 @@ class WantedPoses(NamedTuple):
 
 @dataclass(frozen=True)
 class CorrectedLog:
-    """What a map is to be made of again."""
+    """What regions of a map are to be made of again."""
 
     correction: LoggedCorrection
     start: int  # of the source's times, from 0 on: whose scans move
@@ -47,45 +45,67 @@ class CorrectedLog:
     files: list[Segment]  # of the log, with all that came after that
     first_row: int  # with which these begin
     poses: LogPoses
-    moved: int  # the number of scans that move
+    before: dict[int, Doubles]  # poses [4, 4] of the scans that move, by row, as they were
+    came: list[Entry] = field(default_factory=list)  # meanwhile, with corrected poses
 
-    def entries(self) -> Iterator[LoggedScan | LoggedReset]:
-        """Yield kept scans, with corrected poses, and resets, in their order.
+    def moves(self) -> Iterator[LoggedScan | Transform]:
+        """Yield the scans that move, each as it was and as it is.
 
         Raises:
             FormatError: a file is damaged.
             OSError: it cannot be read.
         """
-        row = self.first_row
-        for segment in self.files:
-            for entry in read_segment(segment.path):
-                if isinstance(entry, LoggedScan):
-                    yield replace(entry, world_from_sensor=self.poses.poses[row])
-                elif isinstance(entry, LoggedReset):
-                    yield entry
-                row += isinstance(entry, LoggedScan | Transform)
+        last = max(self.before)
+        for row, entry in self._logged():
+            if row > last:
+                return
+            if row in self.before and isinstance(entry, LoggedScan | Transform):
+                yield with_pose(entry, self.before[row])
+                yield with_pose(entry, self.poses.poses[row])
+
+    def entries(self) -> Iterator[Entry]:
+        """Yield kept scans, with corrected poses, and resets, in their order, then what came late.
+
+        Errors are those of :meth:`moves`.
+        """
+        for row, entry in self._logged():
+            if isinstance(entry, LoggedScan):
+                yield with_pose(entry, self.poses.poses[row])
+            elif isinstance(entry, LoggedReset):
+                yield entry
+        yield from self.came
 
     def late(self, entry: Entry) -> Entry:
         """Return what came meanwhile as the log will have it: before the correction, so it moves.
 
-        The poses have it, too, from then on.
+        What does not is returned as it is. The poses and the entries have it, too, from then on.
         """
         source = self.correction.source
         self.poses.take(entry)
-        if isinstance(entry, LoggedReset | LoggedCorrection):
-            return entry
-        poses = self.poses.poses
-        if source_of(entry) == source and self.poses.starts(source) - 1 == self.start:
-            stamps_ns = np.array([entry.stamp_ns])
-            poses[-1] = corrected(self.correction, stamps_ns, poses[-1][None])[0]
-        if isinstance(entry, LoggedScan):
-            return replace(entry, world_from_sensor=poses[-1])
+        if (
+            isinstance(entry, LoggedScan | Transform)
+            and source_of(entry) == source
+            and self.poses.starts(source) - 1 == self.start
+        ):
+            before = self.poses.poses[-1]
+            after = corrected(self.correction, np.array([entry.stamp_ns]), before[None])[0]
+            if not np.allclose(after, before, rtol=0.0, atol=_SAME):
+                self.poses.poses[-1], entry = after, with_pose(entry, after)
+        self.came.append(entry)
         return entry
 
     def logged(self) -> LoggedCorrection:
         """Return the correction as it stands in the log after what came meanwhile."""
         since = self.poses.starts(self.correction.source) - 1 - self.start
         return replace(self.correction, since=since)
+
+    def _logged(self) -> Iterator[tuple[int, Entry]]:
+        """Yield what the files have, as it stands there, each with the row of the next pose."""
+        row = self.first_row
+        for segment in self.files:
+            for entry in read_segment(segment.path):
+                yield row, entry
+                row += isinstance(entry, LoggedScan | Transform)
 
 
 def corrected_log(
@@ -101,23 +121,22 @@ def corrected_log(
         OSError: it cannot be read.
     """
     files = history(of_map(segments(store.scans.folder), newest, store.restored))
-    apart_m = store.scans.apart_m
     is_whole = not files or files[0].after == 0
-    poses, first_rows = LogPoses(), list[int]()
+    poses, first_rows = LogPoses(store.scans.apart_m), list[int]()
     for segment in files:
         first_rows.append(len(poses.poses))
         for entry in read_segment(segment.path):
             poses.take(entry)
     correction, start = _correction(wanted, poses, onward=onward, is_whole=is_whole)
-    rows = _moved(poses.correct(correction), apart_m)
-    if not len(rows):
+    before = poses.correct(correction)
+    if not before:
         return None
-    first = files[bisect_right(first_rows, rows.min()) - 1]
+    first = files[bisect_right(first_rows, min(before)) - 1]
     base = _base(first, files, store)
     number = 0 if base is None else bisect_right(files, base.epoch, key=lambda one: one.epoch)
     return CorrectedLog(
         replace(correction, first_epoch=first.epoch),
-        *(start, base, files[number:], first_rows[number], poses, len(rows)),
+        *(start, base, files[number:], first_rows[number], poses, before),
     )
 
 
@@ -211,10 +230,3 @@ def _bases(files: list[Segment], store: Store) -> list[CheckpointFile]:
         if one.epoch >= max(least, files[0].after)
         and not any(one.epoch in epochs for epochs in store.scans.outdated)
     ]
-
-
-def _moved(corrected: tuple[Longs, Doubles, Doubles], apart_m: float) -> Longs:
-    """Return the rows [M] of those poses [N, 4, 4] that differ by more than the tolerance."""
-    rows, before, after = corrected
-    moved: Longs = rows[motions(before, after, _AT * apart_m) > _TOLERANCE * apart_m]
-    return moved

@@ -1,4 +1,4 @@
-"""Makes the map again from the scans that were kept, where better poses of them come."""
+"""Makes regions of the map again from scans that were kept, where better poses of them come."""
 
 import logging
 import time
@@ -10,7 +10,9 @@ from itertools import chain
 import numpy as np
 from triquad_format.errors import FormatError, RefusedError
 from triquad_format.records.arrays import Doubles
+from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.pose import pose_matrices
+from triquad_format.scan_log.ros_messages import Transform
 from triquad_format.scan_log.segment import Entry, LoggedReset, LoggedScan
 from triquad_format.wire.limits import MAX_KEYFRAMES
 from triquad_format.wire.source_messages import CorrectPosesReply, CorrectPosesRequest
@@ -22,7 +24,8 @@ from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.store.checkpoint_writer import CheckpointWriter, way_back
 from triquad_server.store.corrected_log import CorrectedLog, WantedPoses, corrected_log
-from triquad_server.store.restore import valid_checkpoint
+from triquad_server.store.restore import regions_of
+from triquad_server.store.scan_reach import ScanReach
 from triquad_server.store.store import Store
 
 _log = logging.getLogger(__name__)
@@ -31,11 +34,13 @@ _LAST_SCANS = 2  # that came meanwhile
 
 _UNIT_TOLERANCE = 1e-3  # of the length of a quaternion
 
+_MOST_BEGUN = 3  # times that a correction begins, where scans that move come meanwhile
+
 _OFTEN = {"map_full", "no_memory", "too_many_regions"}  # reasons for which all else is refused, too
 
 
 class PoseCorrector:
-    """Corrects the poses of kept scans. While the map is made again, it goes on as it was."""
+    """Corrects the poses of kept scans. While regions are made again, the map goes on as it was."""
 
     def __init__(
         self,
@@ -61,7 +66,7 @@ class PoseCorrector:
         Raises:
             RefusedError: ``bad_request``, also where the poses seem to be meant otherwise;
                 ``store`` where what is needed for it is not kept; ``busy`` where there is no room
-                for a second map. The map stays as it is.
+                for regions that are made again. The map stays as it is.
         """
         store = self._checkpoints.store
         if store is None or not store.scans.is_kept:
@@ -70,14 +75,8 @@ class PoseCorrector:
                 "poses are corrected by making the map again from its scans, and they are not "
                 "kept: start the server with --store, and store.log_max_bytes above 0",
             )
-        used = self._mapper.progress.map.map_bytes
-        if 2 * used > self._max_bytes:
-            raise RefusedError(
-                "busy",
-                f"it takes a second map of {used / 1e6:.0f} MB for a while, and memory.max_bytes = "
-                f"{self._max_bytes} has no room for that: start the server with more",
-            )
-        wanted = _wanted(request, self._mapper.call(lambda mapper: mapper.origin))
+        live = self._mapper.call(lambda mapper: mapper)
+        wanted = _wanted(request, live.origin)
         followed = deque[Entry]()
         try:
             # So that the log has all until there.
@@ -86,10 +85,12 @@ class PoseCorrector:
                 log = corrected_log(store, newest, wanted, onward=request.onward)
                 if log is None:
                     return CorrectPosesReply(newest, scans_moved=0, scans_learnt=0)
-                self._checkpoints.correcting = log.moved
+                self._checkpoints.correcting = len(log.before)
+                again = _MapAgain(live, log, self._is_stopping)
+                self._check_room(again)
+                again.begin()
                 kept = self._checkpoints.keep_newest("correcting poses").epoch
-                again = _MapAgain(self._mapper.call(lambda mapper: mapper), log)
-            # The cores are for the other map: what this one learnt meanwhile would be lost.
+            # The cores are for the regions that are made again.
             with self._mapper.without_training():
                 return self._correct(store, log, again, followed, kept)
         except (StoreError, FormatError, OSError) as error:
@@ -97,6 +98,17 @@ class PoseCorrector:
         finally:
             store.scans.follow(None)
             self._checkpoints.correcting = 0
+
+    def _check_room(self, again: "_MapAgain") -> None:
+        """Raise :class:`RefusedError` where there is no room for regions that are made again."""
+        used = self._mapper.progress.map.map_bytes
+        needed = self._mapper.call(lambda mapper: mapper.regions.bytes_of(again.touched))
+        if used + needed > self._max_bytes:
+            raise RefusedError(
+                "busy",
+                f"it takes another {needed / 1e6:.0f} MB for a while, and memory.max_bytes = "
+                f"{self._max_bytes} has no room for that: start the server with more",
+            )
 
     def _correct(
         self,
@@ -106,20 +118,16 @@ class PoseCorrector:
         followed: "deque[Entry]",
         kept: int,
     ) -> CorrectPosesReply:
-        """Make the map again, and have it in place of the one before."""
+        """Make regions again, and have them in place of those before."""
         began_s = time.monotonic()
-        source = log.correction.source
-        _log.info("%d scans of %s have better poses: the map is made again", log.moved, source)
-        for entry in chain(log.entries(), map(log.late, _until_few_are_left(followed))):
-            if self._is_stopping():
-                raise RefusedError("busy", "the server is stopping: no pose was corrected")
-            again.take(entry)
-        if (told := again.check.misreading()) is not None:
-            raise RefusedError("bad_request", f"no pose was corrected: {told}")
+        moved, source = len(log.before), log.correction.source
+        _log.info("%d scans of %s have better poses: regions are made again", moved, source)
 
-        def change(mapper: Mapper) -> int:
+        def change(mapper: Mapper) -> int | None:
             while followed:
-                again.take(log.late(followed.popleft()))
+                again.take_late(followed.popleft())
+            if not again.has_all:
+                return None
             mapper.become(again.map)
             store.scans.add_correction(log.logged())
             poses = log.poses.of(source)
@@ -127,28 +135,79 @@ class PoseCorrector:
             self._trails.retrace(source, poses)
             return mapper.publish().number
 
-        epoch = self._mapper.call(change)
+        self._make(again, followed)
+        while (epoch := self._mapper.call(change)) is None:
+            self._check_room(again)
+            with self._checkpoints.writing:  # which deletes checkpoints, too
+                again.begin()
+            self._make(again, followed)
         with suppress(StoreError):  # which the log and the status tell
             self._checkpoints.write()  # else a server that is killed would have the map of before
         took_s, undo = time.monotonic() - began_s, way_back(kept)
         _log.warning(
             "%d scans of %s were corrected as of epoch %d, after %.1f s: %s",
-            *(log.moved, source, epoch, took_s, undo),
+            *(moved, source, epoch, took_s, undo),
         )
         if store.keep_resets == 0:
-            return CorrectPosesReply(epoch, log.moved, again.scans)
-        return CorrectPosesReply(epoch, log.moved, again.scans, kept, undo)
+            return CorrectPosesReply(epoch, moved, again.scans)
+        return CorrectPosesReply(epoch, moved, again.scans, kept, undo)
+
+    def _make(self, again: "_MapAgain", followed: "deque[Entry]") -> None:
+        """Take in all but the last few scans, for which mapping waits."""
+        late = map(again.take_late, _until_few_are_left(followed))
+        for _ in chain(map(again.take, again.log.entries()), late):
+            again.check_goes_on()
+        if (told := again.check.misreading()) is not None:
+            raise RefusedError("bad_request", f"no pose was corrected: {told}")
 
 
 class _MapAgain:
-    """A map that is made again."""
+    """The regions that scans which move reach, made again."""
 
-    def __init__(self, live: Mapper, log: CorrectedLog) -> None:
-        base = log.base
-        self.map = live.other(None if base is None else valid_checkpoint(base).record)
+    def __init__(self, live: Mapper, log: CorrectedLog, is_stopping: Callable[[], bool]) -> None:
+        self.log = log
+        self._is_stopping = is_stopping
+        self._begun = 0  # times
+        self._live = live
+        self._reach = ScanReach(live)
+        self.touched = frozenset[RegionIndex]()
+        for scan in log.moves():
+            self.check_goes_on()
+            self.touched |= self._reach.of(scan)
+
+    def check_goes_on(self) -> None:
+        """Raise :class:`RefusedError` once the server is stopping."""
+        if self._is_stopping():
+            raise RefusedError("busy", "the server is stopping: no pose was corrected")
+
+    def begin(self) -> None:
+        """Begin, or begin again, with what the base of the log has of the regions.
+
+        Raises:
+            RefusedError: scans that move went on to reach other regions.
+        """
+        self._begun += 1
+        if self._begun > _MOST_BEGUN:
+            raise RefusedError("busy", "scans that move went on to come: correct the poses again")
+        base = self.log.base
+        self._regions = self.touched
+        record = None if base is None else regions_of(base, self._regions)
+        self.map = self._live.other(record, self._regions)
         self.scans = 0  # that were taken in
         self.check = PoseCheck()  # of those that the correction is about
-        self._correction = log.correction
+
+    @property
+    def has_all(self) -> bool:
+        """Whether no scan that moves, and came meanwhile, reaches other regions."""
+        return self.touched == self._regions
+
+    def take_late(self, entry: Entry) -> None:
+        """Take in what came meanwhile; errors are those of :meth:`take`."""
+        moved = self.log.late(entry)
+        if moved is not entry:
+            scans = (one for one in (entry, moved) if isinstance(one, LoggedScan | Transform))
+            self.touched |= self._reach.of_all(scans)
+        self.take(moved)
 
     def take(self, entry: Entry) -> None:
         """Take in a scan, or forget what was reset.
@@ -168,6 +227,8 @@ class _MapAgain:
                 _log.warning("a kept scan of %s is left out: %s", entry.source, error)
 
     def _take_scan(self, scan: LoggedScan) -> None:
+        if self._regions.isdisjoint(self._reach.of(scan)):
+            return
         rays = self.map.ingest(
             scan.points,
             scan.world_from_sensor,
@@ -176,7 +237,7 @@ class _MapAgain:
             no_return=scan.no_return,
         )
         self.scans += 1
-        about = self._correction
+        about = self.log.correction
         if scan.source == about.source and about.stamps_ns[0] <= scan.stamp_ns <= about.until_ns:
             self.check.see(rays, scan.world_from_sensor[:3, :3])
 

@@ -2,6 +2,7 @@
 
 import hashlib
 import logging
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +14,8 @@ from triquad_format.errors import (
 from triquad_format.mapfile.checkpoint_folder import CheckpointFile, checkpoint_files
 from triquad_format.mapfile.files import DAMAGED_SUFFIX
 from triquad_format.mapfile.index import Checkpoint, read_checkpoint
-from triquad_format.mapfile.reader import MapFile, read_map_file
+from triquad_format.mapfile.reader import MapFile, StoredMap, read_map_file
+from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.region import MapRecord
 from triquad_format.wire.messages import CheckpointInfo
 
@@ -86,6 +88,20 @@ def valid_checkpoint(checkpoint: CheckpointFile) -> ValidCheckpoint:
             "saves what is intact"
         )
     return _valid(checkpoint.path, file)
+
+
+def regions_of(checkpoint: CheckpointFile, wanted: Collection[RegionIndex]) -> MapRecord:
+    """Read some regions of a chosen checkpoint; those that it lacks are left out.
+
+    Raises:
+        FormatError: it is damaged.
+        StoreError: it holds another epoch than its name says.
+        OSError: it cannot be read.
+    """
+    with StoredMap.open(checkpoint.path) as stored:
+        if (epoch := stored.manifest.facts.epoch) != checkpoint.epoch:
+            raise StoreError(f"checkpoint {checkpoint.path} holds epoch {epoch}")
+        return stored.regions(wanted)
 
 
 def check_countable(path: Path, epoch: int) -> None:

@@ -61,10 +61,10 @@ def drifted_m(bridged: Bridged, first: int) -> NDArray[np.float64]:
 def test_its_map_is_made_by_its_clouds_alone() -> None:
     with bridged_robot() as (bridged, r2):
         r2.tf(0, ("base_link", "lidar", MAST), static=True)
-        for number, scan in enumerate(world(SCANS, STEP_M).scans):
-            r2.tf(number, ("odom", "base_link", np.eye(4)))  # a driver that knows nothing
-            r2.cloud(0.1 * number, scan.points)
-        bridged.wait_for(lambda: bridged.accounted == SCANS)
+        clouds = [(0.1 * n, scan.points) for n, scan in enumerate(world(SCANS, STEP_M).scans)]
+        for second, _ in clouds:
+            r2.tf(second, ("odom", "base_link", np.eye(4)))  # a driver that knows nothing
+        send(bridged, r2, clouds)
         assert bridged.taken == SCANS, bridged.bridge.dropped
         assert drifted_m(bridged, 0).max() < 0.1
 

@@ -11,7 +11,7 @@ from triquad_map.compiled.team import Team
 from triquad_server.mapping.replay.ray_table import COLUMNS, NO_ORIGIN, VALUE, RayTable
 from triquad_server.mapping.replay.replay_record import recorded_rays, restored_rays
 
-FIELD = FieldSettings()
+FIELD = FieldSettings(depth=12)  # 819 m: all rays but one end in the cube
 RAYS = 20_000
 ON_FLOOR = slice(5_000)  # the others end alone, and no normal is told there
 UNTOLD = slice(RAYS - 300, RAYS)  # of these: the field told their slopes no more than a normal did

@@ -68,7 +68,7 @@ def test_errors_of_a_source_name_the_place_of_that_key(tmp_path: Path) -> None:
             "field.leaf_m=0.01;field.depth=6;scan.range_max_m=5.0",
             ["--set: scan.range_max_m = 5 reaches", "leaf_m = 0.01", "depth", "at most 3.84"],
         ),
-        ("scan.thin_m=0.001;scan.range_max_m=2000.0", ["thin_m", "range_max_m"]),
+        ("scan.thin_m=0.001;scan.range_max_m=1500.0", ["thin_m", "range_max_m"]),
         ("field.leaf_m=0.05;mesh.cell_m=0.5", ["cell_m", "leaf_m"]),
     ],
 )

@@ -1,5 +1,8 @@
 """A short drive whose poses are off, and the map that the true ones make."""
 
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
@@ -49,3 +52,27 @@ def shared(found: Array, expected: Array) -> float:
     """The share of voxels that are within one of the others, the lesser of both ways."""
     ways = [(found, expected), (expected, found)]
     return min(float((cKDTree(there).query(here)[0] < 0.21).mean()) for here, there in ways)
+
+
+@contextmanager
+def once_it_begins(action: Callable[[], object]) -> Iterator[None]:
+    """Do something once the map of a server in this process begins to be made again."""
+    logger, begins = logging.getLogger("triquad_server"), _Begins(action)
+    logger.addHandler(begins)
+    try:
+        yield
+    finally:
+        logger.removeHandler(begins)
+    assert begins.is_done
+
+
+class _Begins(logging.Handler):
+    def __init__(self, action: Callable[[], object]) -> None:
+        super().__init__(logging.INFO)
+        self._action = action
+        self.is_done = False
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if not self.is_done and "regions are made again" in record.getMessage():
+            self.is_done = True
+            self._action()

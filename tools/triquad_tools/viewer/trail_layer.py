@@ -115,7 +115,7 @@ def _state(status: ServerStatus) -> Iterator[str]:
     learnt = f"{status.learnt_percent} % learnt" if status.scans_taken else "nothing to learn yet"
     yield f"{status.scans_taken:,} scans{unusual}; {learnt}; epoch {status.epoch}"
     if status.correcting:
-        yield f"correcting {status.correcting:,} scans: the map is made again"
+        yield f"correcting {status.correcting:,} scans: regions are made again"
 
 
 def _line(name: str, source: ScanSource) -> str:

@@ -190,7 +190,7 @@ def test_a_checkpoint_that_is_deleted_once_a_correction_goes_on_from_it_is_not_m
         in_checkpoints(client, *range(SCANS))
 
         def delete(record: logging.LogRecord) -> bool:
-            if "the map is made again" in record.getMessage():
+            if "regions are made again" in record.getMessage():
                 for path in tmp_path.glob("*/epoch-*"):
                     path.unlink()
             return True

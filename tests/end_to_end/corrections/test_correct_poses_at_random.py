@@ -4,7 +4,7 @@ import shutil
 from collections.abc import Callable
 from contextlib import ExitStack
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from support.poses import shifted
 from triquad_client import RefusedError
 from triquad_format.scan_log.log_folder import segments
 from triquad_server.mapping.mapper import Mapper
+from triquad_server.settings import Settings
 from triquad_server.store.store import Store
 from triquad_tools.recordings.opening import open_recording
 from triquad_tools.recordings.recording import ReadingOptions
@@ -26,6 +27,7 @@ ALIKE = 0.93  # walls in two places vanish a little otherwise where a map was re
 BOX = (np.array([-3.0, -20.0, -5.0]), np.array([3.0, 20.0, 9.0]))
 SOURCES = "roof", "front"
 RIGHT = shifted()
+SMALL_REGIONS = replace(SETTINGS.field, depth=8)  # of 51 m
 
 
 @dataclass
@@ -62,8 +64,8 @@ class Model:
             elif onward and one.stamp_s > stamps_s[-1]:
                 one.pose = one.pose @ end
 
-    def surface(self) -> Array:
-        mapper = Mapper("truth", SETTINGS, "cpu")
+    def surface(self, settings: Settings) -> Array:
+        mapper = Mapper("truth", settings, "cpu")
         for one in self.events:
             if isinstance(one, TakenScan):
                 scan = world(SCANS).scans[one.number]
@@ -78,6 +80,8 @@ class Life:
     """A map to which things happen, and what it should be."""
 
     def __init__(self, folder: Path, seed: int) -> None:
+        # In every other life the map has several regions, and a correction makes some of them.
+        self.settings = SETTINGS if seed % 2 else SETTINGS.with_field(SMALL_REGIONS)
         self.rng = np.random.default_rng(seed)
         self.folder, self.lives = folder, 0
         self.model = Model()
@@ -101,7 +105,9 @@ class Life:
         self.saved[max(self.epochs(), default=0)] = deepcopy(self.model)
 
     def open(self) -> None:
-        self.client = self.stack.enter_context(servers.service_and_client(SETTINGS, self.store))
+        self.client = self.stack.enter_context(
+            servers.service_and_client(self.settings, self.store)
+        )
 
     def publish(self) -> None:
         source = str(self.rng.choice(SOURCES))
@@ -192,7 +198,7 @@ class Life:
         self.close()
         epochs = [epoch for epoch in self.epochs() if epoch != self.restored]
         epoch = self.restored = int(self.rng.choice(epochs))
-        store = Store(self.store, servers.MAP, SETTINGS.store)
+        store = Store(self.store, servers.MAP, self.settings.store)
         store.restore(epoch)
         store.close()
         self.go_back(epoch)
@@ -214,7 +220,7 @@ class Life:
     def check(self) -> None:
         """Hold the map, and the poses that the server has kept, against what they should be."""
         self.checkpoint()
-        found, expected = surface(self.client, self.folder), self.model.surface()
+        found, expected = surface(self.client, self.folder), self.model.surface(self.settings)
         share = shared(found, expected) if len(found) and len(expected) else 0.0
         told = "\n".join([*self.told, f"{share:.4f}"])
         assert share > ALIKE or len(found) == len(expected) == 0, told

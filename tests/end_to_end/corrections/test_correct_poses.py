@@ -9,7 +9,7 @@ import pytest
 import triquad_client
 from scipy.spatial import cKDTree
 from support import servers
-from support.maps.drifted import SAME, SCANS, SETTINGS, off, shared, surface, truth
+from support.maps.drifted import SAME, SCANS, SETTINGS, off, once_it_begins, shared, surface, truth
 from support.maps.small_world import world
 from triquad_client import InvalidScanError, RefusedError, TriquadError
 from triquad_tools.recordings.opening import open_recording
@@ -119,13 +119,8 @@ def test_a_scan_that_comes_later_than_its_correction_moves_with_the_others(tmp_p
     with servers.service_and_client(SETTINGS, tmp_path / "store") as client:
         for number in range(SCANS - 1):
             publish(client, number, off())
-        late = _WhenItBegins(lambda: publish(client, SCANS - 1, off()))
-        logging.getLogger("triquad_server").addHandler(late)
-        try:
+        with once_it_begins(lambda: publish(client, SCANS - 1, off())):
             client.correct_poses("roof", *corrections(*range(SCANS)))
-        finally:
-            logging.getLogger("triquad_server").removeHandler(late)
-        assert late.is_done
         assert shared(surface(client, tmp_path), truth()) > SAME
         trail = client.sources().sources["roof"].trail
         there = world(SCANS).scans[-1].world_from_sensor[:3, 3]
@@ -134,20 +129,6 @@ def test_a_scan_that_comes_later_than_its_correction_moves_with_the_others(tmp_p
     recording = open_recording(tmp_path / "store", ReadingOptions())
     for scan, pose in zip(recording.read(range(SCANS)), corrections(*range(SCANS))[1], strict=True):
         np.testing.assert_allclose(scan.world_from_sensor, pose, atol=1e-6)
-
-
-class _WhenItBegins(logging.Handler):
-    """Does something once the map begins to be made again."""
-
-    def __init__(self, action):
-        super().__init__(logging.INFO)
-        self._action = action
-        self.is_done = False
-
-    def emit(self, record):
-        if not self.is_done and "the map is made again" in record.getMessage():
-            self.is_done = True
-            self._action()
 
 
 def test_the_way_back_is_told(tmp_path):
@@ -216,7 +197,7 @@ def test_a_server_that_ends_amid_a_correction_has_the_map_of_before(tmp_path, en
             )
         )
         correcting.start()
-        server.wait_for("the map is made again")
+        server.wait_for("regions are made again")
         server.process.send_signal(end)
         server.process.wait()
         correcting.join()
