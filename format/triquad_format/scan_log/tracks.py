@@ -46,7 +46,7 @@ class LogPoses:
     """The poses of the scans of a log, kept or not, a row each in the order in which they came."""
 
     def __init__(self, apart_m: float = 0.0) -> None:
-        """Begin; kept scans are ``apart_m`` apart, by which it goes how far is far."""
+        """Begin; kept scans are ``apart_m`` apart: a share of that is how far a scan has moved."""
         self.poses: list[Doubles] = []
         self._apart_m = apart_m
         self._mapped: list[Doubles] = []  # the poses with which they were learnt from

@@ -206,7 +206,7 @@ class _MapAgain:
         moved = self.log.late(entry)
         if moved is not entry:
             scans = (one for one in (entry, moved) if isinstance(one, LoggedScan | Transform))
-            self.touched |= self._reach.of_all(scans)
+            self.touched = self.touched.union(*map(self._reach.of, scans))
         self.take(moved)
 
     def take(self, entry: Entry) -> None:

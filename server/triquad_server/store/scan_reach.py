@@ -1,7 +1,6 @@
 """The regions that scans of a log enter, or would enter with other poses."""
 
 import itertools
-from collections.abc import Iterable
 
 import numpy as np
 from triquad_format.records.field_settings import RegionIndex
@@ -9,8 +8,8 @@ from triquad_format.scan_log.ros_messages import Transform
 from triquad_format.scan_log.segment import LoggedScan
 from triquad_format.scan_log.tracks import source_of
 
-from triquad_server.mapping.live_regions import regions_between
 from triquad_server.mapping.mapper import Mapper
+from triquad_server.mapping.region_reach import regions_between
 from triquad_server.settings import ANY_SOURCE
 
 _BEYOND = 1.05  # times the range of a source: points beyond it are kept a little farther away
@@ -25,10 +24,6 @@ class ScanReach:
         """Tell it of a live map, which has its origin."""
         self._settings, self._field = mapper.settings, mapper.regions.field
         self._origin = mapper.origin
-
-    def of_all(self, entries: Iterable[LoggedScan | Transform]) -> frozenset[RegionIndex]:
-        """Return the regions of scans, and of some of which only the pose was kept."""
-        return frozenset[RegionIndex]().union(*map(self.of, entries))
 
     def of(self, entry: LoggedScan | Transform) -> frozenset[RegionIndex]:
         """Return the regions that meet the box of a scan.
