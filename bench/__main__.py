@@ -21,7 +21,18 @@ from triquad_tools.console.report import Row, print_rows
 
 from bench.results_page import RESULTS, Result, machine, write_page
 
-PARTS = ("core", "server", "answers", "file", "moving", "poses", "presets", "start", "viewer")
+PARTS = (
+    "core",
+    "server",
+    "answers",
+    "file",
+    "moving",
+    "poses",
+    "city",
+    "presets",
+    "start",
+    "viewer",
+)
 """The modules of ``bench.parts`` that measure, each imported in its turn: one needs a browser."""
 
 

@@ -91,7 +91,7 @@ def _checkpoint(mapper: Mapper, store: Store) -> _Cost:
     before = _stored_bytes(store.folder)
     started = time.perf_counter()
     snapshot = mapper.snapshot_since(store.base_epoch)
-    store.write(snapshot.record(), snapshot.regions)
+    store.write(snapshot.epoch.record(()), snapshot.records(), snapshot.facts)
     seconds = time.perf_counter() - started
     return _Cost(_stored_bytes(store.folder) - before, seconds)
 

@@ -32,3 +32,7 @@ class ScanRefusedError(TriquadError):
     def __init__(self, reason: str, text: str) -> None:
         super().__init__(text)
         self.reason = reason
+
+
+class NoRoomYetError(Exception):
+    """A scan for which there is room once a checkpoint lets regions leave memory."""

@@ -2,6 +2,7 @@
 
 import gc
 import logging
+import math
 import sys
 import threading
 from collections.abc import Iterator
@@ -18,12 +19,14 @@ from triquad_server.launch_options import LaunchOptions
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.network import Configuration, configuration, open_session
 from triquad_server.process.installed import check_device
-from triquad_server.process.resources import allow_open_files, give_back_early
+from triquad_server.process.memory_parts import MemoryParts
+from triquad_server.process.resources import allow_open_files, give_back_early, resident_bytes
 from triquad_server.process.service_manager import ServiceManager
 from triquad_server.process.stop import Stop, Stops, wait_for_stop
 from triquad_server.process.threads import Teams
 from triquad_server.service import Service
 from triquad_server.settings import Settings
+from triquad_server.store.restore import ValidCheckpoint
 from triquad_server.store.store import Store
 from triquad_server.warm_up import Report, warm_up
 
@@ -35,6 +38,11 @@ _log = logging.getLogger("triquad_server")
 _SWITCH_INTERVAL_S = 0.0005
 """The time for which a thread may keep the interpreter while another waits: a query is to be
 answered in a few milliseconds, which is Python's default for a single turn."""
+
+
+_LATER_BYTES = 50_000_000  # of the program, for what it loads and buffers once it serves
+
+_LEAST_ROOM_BYTES = 150_000_000  # for a map: 100 m of a street
 
 
 class StoppedEarlyError(Exception):
@@ -55,7 +63,7 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
         _log.warning("no --store: the map is not kept when the server stops")
     manager = ServiceManager()
     try:
-        with opened(options, stops, manager.starting) as service:
+        with opened(options, stops, manager.starting, owns_process=True) as service:
             # A quarter of a million objects, most of them numba's, stay: a collection that goes
             # through them stops all threads for a tenth of a second.
             gc.collect()
@@ -83,7 +91,11 @@ def _stop_where_a_thread_ends(stops: Stops) -> None:
 
 @contextmanager
 def opened(
-    options: LaunchOptions, stops: Stops, starting: Report = lambda _: None
+    options: LaunchOptions,
+    stops: Stops,
+    starting: Report = lambda _: None,
+    *,
+    owns_process: bool = False,
 ) -> Iterator[Service]:
     """Yield a server; after the context, it has written a last checkpoint and is closed.
 
@@ -93,6 +105,7 @@ def opened(
         options: what the server is started with.
         stops: where it may be asked to stop before it has started.
         starting: is told the stages of the start.
+        owns_process: the process does nothing else: its memory is the server's.
 
     Raises:
         ServerError: the server cannot start; its subclasses name the cause.
@@ -100,14 +113,16 @@ def opened(
     """
     try:
         with ExitStack() as stack:
-            yield _open(options, stops, starting, stack)
+            yield _open(options, stops, starting, stack, owns_process=owns_process)
     except StoppedEarlyError:
         _log.info("stopped")
         raise
     _log.info("stopped")
 
 
-def _open(options: LaunchOptions, stops: Stops, starting: Report, stack: ExitStack) -> Service:
+def _open(
+    options: LaunchOptions, stops: Stops, starting: Report, stack: ExitStack, *, owns_process: bool
+) -> Service:
     """Open all parts of a server, to be closed by ``stack``."""
     check_device(options.device)
     settings = options.settings
@@ -120,9 +135,24 @@ def _open(options: LaunchOptions, stops: Stops, starting: Report, stack: ExitSta
             notice.stage = stage
             starting(stage)
 
-        store = _open_store(options, begins, stack)
-        mapper, settings = _restored_map(store, options, stops, begins, stack)
-        service = Service(session, mapper, settings, store, failed=stops.put)
+        teams = stack.enter_context(closing(Teams()))
+        store = _open_store(options, begins, stack, teams)
+        before = resident_bytes()
+        restored, settings = _restored(store, options, begins)
+        restored_bytes = resident_bytes() - before  # of the map, where it is read whole
+        warm_up(settings, options.device, teams, _before_each_step(stops, begins))
+        begins("opening the map")
+        program = resident_bytes() - restored_bytes if owns_process else 0
+        parts = _memory_parts(settings, program)
+        record = None if restored is None else restored.record
+        del restored
+        cold = {} if store is None else store.regions.known
+        mapper = Mapper(
+            options.map_name, settings, options.device, record, teams, cold=cold, beside=parts.total
+        )
+        if store is not None:
+            store.log_scans(settings.field.leaf_m)
+        service = Service(session, mapper, settings, store, parts, failed=stops.put)
         stack.enter_context(closing(service))
     if monitoring is not None:
         stack.enter_context(monitoring.showing(service.health))
@@ -131,31 +161,35 @@ def _open(options: LaunchOptions, stops: Stops, starting: Report, stack: ExitSta
     return service
 
 
-def _restored_map(
-    store: Store | None, options: LaunchOptions, stops: Stops, starting: Report, stack: ExitStack
-) -> tuple[Mapper, Settings]:
-    """Return the map as its store has it, or an empty one, and the settings that hold for it."""
-    settings, record = options.settings, None
-    if store is not None:
-        starting("restoring the newest checkpoint")
-        restored = store.newest()
-        if restored is not None:
-            record = restored.record
-            _log.info("restoring epoch %d from %s", record.epoch, restored.path)
-            settings = _settings_of(record, options)
-    teams = stack.enter_context(closing(Teams()))
-    warm_up(settings, options.device, teams, _before_each_step(stops, starting))
-    starting("opening the map")
-    mapper = Mapper(
-        options.map_name,
-        settings,
-        options.device,
-        record=record,
-        teams=teams,
-    )
-    if store is not None:
-        store.log_scans(settings.field.leaf_m)
-    return mapper, settings
+def _restored(
+    store: Store | None, options: LaunchOptions, starting: Report
+) -> tuple[ValidCheckpoint | None, Settings]:
+    """Return the newest checkpoint, if there is one, and the settings that hold for its map."""
+    if store is None:
+        return None, options.settings
+    starting("restoring the newest checkpoint")
+    restored = store.newest()
+    if restored is None:
+        return None, options.settings
+    _log.info("restoring epoch %d from %s", restored.record.epoch, restored.path)
+    return restored, _settings_of(restored.record, options)
+
+
+def _memory_parts(settings: Settings, program: int) -> MemoryParts:
+    """Return what takes memory besides the map: of a process of its own, the ``program`` as well.
+
+    Raises:
+        SettingsError: it leaves no room for a map.
+    """
+    if not program:
+        return MemoryParts()
+    most, least = settings.memory.max_bytes, program + _LATER_BYTES + _LEAST_ROOM_BYTES
+    if most < least:
+        raise SettingsError(
+            f"memory.max_bytes = {most}: the program alone takes {program / 1e6:.0f} MB; give the "
+            f"server at least {math.ceil(least / 1e6)}_000_000"
+        )
+    return MemoryParts(program + _LATER_BYTES)
 
 
 def _open_monitoring(settings: Settings, stack: ExitStack) -> "MonitoringServer | None":
@@ -168,11 +202,15 @@ def _open_monitoring(settings: Settings, stack: ExitStack) -> "MonitoringServer 
     return stack.enter_context(closing(MonitoringServer(settings.metrics)))
 
 
-def _open_store(options: LaunchOptions, starting: Report, stack: ExitStack) -> Store | None:
+def _open_store(
+    options: LaunchOptions, starting: Report, stack: ExitStack, teams: Teams
+) -> Store | None:
     """Open the store, if there is one, restored to an older checkpoint if one is asked for."""
     if options.store is None:
         return None
-    store = Store(options.store, options.map_name, options.settings.store)
+    settings, root = options.settings, options.store
+    shelf_bytes = settings.memory.shelf_bytes
+    store = Store(root, options.map_name, settings.store, shelf_bytes, teams.answer)
     stack.enter_context(closing(store))
     if options.restore is not None:
         starting(f"taking the map back to epoch {options.restore}")

@@ -25,6 +25,7 @@ from triquad_server.server_status import Health
 from triquad_server.serving.operations import Lane
 from triquad_server.store.download import MapDownloads
 from triquad_server.store.pose_corrector import PoseCorrector
+from triquad_server.store.resets import Resets
 
 _KEYFRAME_BYTES = 80  # of a time, a position and a quaternion, with room
 
@@ -60,9 +61,9 @@ def answer_requests(
     serve(FlushRequest, flushed, lane)
 
     checkpoints = parts.checkpoints
-    downloads = MapDownloads(parts.mapper, parts.epochs, parts.server)
+    downloads = MapDownloads(parts.mapper, parts.epochs, parts.server, parts.map_max_bytes)
     serve(CheckpointRequest, checkpoints.answer, Lane.FILES)
-    serve(ResetRequest, lambda request: checkpoints.reset(request, trails), Lane.FILES)
+    serve(ResetRequest, Resets(parts.mapper, checkpoints, trails).answer, Lane.FILES)
     corrector = PoseCorrector(
         parts.mapper,
         checkpoints,

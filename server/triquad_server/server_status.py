@@ -18,6 +18,7 @@ from triquad_server.epochs.history import EpochHistory
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper_thread import MapperThread
+from triquad_server.process.memory_parts import MemoryParts
 from triquad_server.process.resources import give_back_free, resident_bytes
 from triquad_server.serving.operations import Operations
 from triquad_server.serving.request import BOUNDS_S
@@ -30,6 +31,7 @@ STUCK_S = 120.0  # longer waits of the mapper's thread are a fault
 ENDLESS_S = 1800.0  # longer than the checkpoint of a large map takes
 
 _BEATS_PER_LOG_LINE = 5
+_NEARLY_FULL = 0.8  # of the memory that there may be: what is free is returned to the system
 _MAX_SESSIONS = 1024  # that are listed
 
 
@@ -47,7 +49,8 @@ class Health:
     mapper: MapperThread
     epochs: EpochHistory
     checkpoints: CheckpointWriter
-    map_max_bytes: int  # memory limit of the map
+    memory: MemoryParts
+    map_max_bytes: int  # memory limit of the server
     started_s: float = field(default_factory=time.monotonic)  # monotonic
 
     def status(self) -> ServerStatus:
@@ -81,10 +84,17 @@ class Health:
             correcting=self.checkpoints.correcting,
             warnings=(*filter(None, [self.checkpoints.warning]), *self.warnings.all()),
             map_max_bytes=self.map_max_bytes,
+            memory_parts=self._memory_parts(progress.map.map_bytes),
+            regions_cold=epoch.cold_regions,
             fit=progress.fit,
             origin_m=epoch.origin,
             **vars(progress.map),
         )
+
+    def _memory_parts(self, map_bytes: int) -> dict[str, int]:
+        """Return what takes the memory; the rest is what is in work, or free between the others."""
+        parts = {"map": map_bytes, **self.memory.bytes()}
+        return {**parts, "rest": max(0, resident_bytes() - sum(parts.values()))}
 
     def metrics(self) -> ServerMetrics:
         """Return the figures as they are now."""
@@ -198,7 +208,7 @@ class Heartbeat:
                 _log.exception("the status could not be published")
                 continue
             if beat % _BEATS_PER_LOG_LINE == 0:
-                if status.settled:
+                if status.settled or status.memory_bytes > _NEARLY_FULL * status.map_max_bytes:
                     give_back_free()
                 self._log_progress(status)
 

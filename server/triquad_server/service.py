@@ -15,6 +15,7 @@ from triquad_server.intake.source_trails import SourceTrails
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.mesh.tile_cache import TileCache
+from triquad_server.process.memory_parts import MemoryParts
 from triquad_server.process.stop import Stop
 from triquad_server.routes import answer_requests
 from triquad_server.server_status import Health, Heartbeat
@@ -33,6 +34,7 @@ class Service:
         mapper: Mapper,
         settings: Settings,
         store: Store | None = None,
+        memory: MemoryParts | None = None,
         failed: Callable[[Stop], None] = lambda _: None,
     ) -> None:
         """Begin to serve.
@@ -42,6 +44,7 @@ class Service:
             mapper: the map; nothing else may use it from now on.
             settings: of the service.
             store: of its checkpoints; ``None``: they are not kept.
+            memory: where it is counted what takes memory besides the map.
             failed: called with the reason if an error ends mapping.
         """
         self.session = session
@@ -51,9 +54,8 @@ class Service:
         self._scans = ScanQueue(settings.service.scan_queue)
         self._warnings = ScanWarnings(self._scans, settings)
         first = mapper.publish()
-        self._epochs = EpochHistory(
-            first, settings.service, older_bytes=settings.memory.epochs_bytes
-        )
+        older_bytes = min(settings.memory.epochs_bytes, settings.memory.kept_bytes)
+        self._epochs = EpochHistory(first, settings.service, older_bytes=older_bytes)
         self._operations = Operations(
             session,
             mapper.name,
@@ -66,7 +68,7 @@ class Service:
         self._trails = SourceTrails(first.field_settings.leaf_m, self._name)
         self._parts = ExitStack()  # closed in reverse order of opening
         try:
-            self._open(failed)
+            self._open(failed, memory or MemoryParts())
         except BaseException:
             self._parts.close()
             raise
@@ -84,7 +86,7 @@ class Service:
         """
         self._parts.close()
 
-    def _open(self, failed: Callable[[Stop], None]) -> None:
+    def _open(self, failed: Callable[[Stop], None], memory: MemoryParts) -> None:
         """Open the parts, in the reverse of the order in which they have to be closed."""
         self._parts.callback(self._operations.close)
         self._mapper = self._open_mapper(failed)
@@ -100,9 +102,12 @@ class Service:
             mapper=self._mapper,
             epochs=self._epochs,
             checkpoints=checkpoints,
+            memory=memory,
             map_max_bytes=self._settings.memory.max_bytes,
         )
-        tiles = TileCache(self._settings.mesh, self._map.teams.background)
+        kept_bytes = self._settings.memory.kept_bytes
+        tiles = TileCache(self._settings.mesh, self._map.teams.background, kept_bytes)
+        self._count(memory, tiles)
         checkpoints.start()
         self._parts.callback(checkpoints.close)
         answer_requests(health, tiles, self._surface, self._trails)
@@ -112,6 +117,14 @@ class Service:
         self._open_intake()
         self._announce(health)
         self._parts.callback(self._operations.stop)  # before anything is waited for
+
+    def _count(self, memory: MemoryParts, tiles: TileCache) -> None:
+        """Have counted what takes memory besides the map."""
+        memory.add("older epochs", lambda: self._epochs.older_bytes)
+        memory.add("mesh tiles", lambda: tiles.nbytes)
+        if self._store is not None:
+            shelf = self._store.regions.shelf
+            memory.add("regions read to answer", lambda: shelf.bytes)
 
     def _announce(self, health: Health) -> None:
         """Say that the server is there, until it closes."""

@@ -94,7 +94,9 @@ def test_the_nearest_surface_is_that_of_the_region_where_it_is_nearest(
         alone = RecordedView(dataclasses.replace(record, regions=(region,)))
         corner = record.settings.region_corner(region.index)
         nearest = no_surfels(np.full(len(points), 1e4))
-        alone.region_views[0].surfels.find_nearest((points - corner) / leaf_m, nearest)
+        everywhere = np.full(3, -np.inf), np.full(3, np.inf)
+        for surfels in alone.region_views[0].surfels_between(*everywhere):
+            surfels.find_nearest((points - corner) / leaf_m, nearest)
         best = np.minimum(best, nearest.distances * leaf_m)
     np.testing.assert_allclose(found.distance, best, atol=1e-9)
     np.testing.assert_array_equal(found.found, best < 9.0)

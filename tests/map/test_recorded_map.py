@@ -10,7 +10,9 @@ from hypothesis import strategies as st
 from support.maps.exact_maps import exact_map, flat
 from support.maps.map_records import SMALL
 from triquad_format.records.region import MapRecord
-from triquad_map.composition.composed_view import RecordedView
+from triquad_map.compiled.team import in_one
+from triquad_map.composition.composed_view import ComposedView, RecordedView
+from triquad_map.composition.recorded_region import RecordedRegion
 from triquad_map.evidence.live_evidence import LiveEvidence
 from triquad_map.questions.distance import distances
 from triquad_map.surface import DISC_RADIUS, SMOOTHING, SurfelKind, Surfels
@@ -164,6 +166,23 @@ def test_surfels_are_fitted_once_however_many_threads_ask():
     asked: list[MapView] = [view] * 8
     with ThreadPoolExecutor(8) as threads:
         answers = list(threads.map(lambda v: v.nearest_surface(points, 3.0), asked))
-    assert len({id(region.surfels) for region in view.region_views}) == 1
+    everywhere = np.full(3, -np.inf), np.full(3, np.inf)
+    (region,) = view.region_views
+    first, again = (region.surfels_between(*everywhere) for _ in range(2))
+    assert list(map(id, first)) == list(map(id, again))
     for answer in answers[1:]:
         np.testing.assert_array_equal(answer.distance, answers[0].distance)
+
+
+def test_it_makes_no_difference_in_what_cubes_surfels_are_fitted():
+    points, record = places(3000), exact_map(flat(0.02))
+    (region,) = record.regions
+    whole, cubes = (RecordedRegion(record, region, in_one, side) for side in (None, 16))
+    views = [ComposedView(1, record.settings, [one]) for one in (whole, cubes)]
+    everywhere = np.full(3, -np.inf), np.full(3, np.inf)
+    assert len(whole.surfels_between(*everywhere)) == 1
+    near = cubes.surfels_between(np.full(3, -0.5), np.full(3, 0.5))
+    assert 0 < len(near) < len(cubes.surfels_between(*everywhere))
+    want, have = (view.nearest_surface(points, 3.0) for view in views)
+    for name in ("found", "distance", "confidence", "learnt"):
+        np.testing.assert_array_equal(getattr(have, name), getattr(want, name))

@@ -103,7 +103,8 @@ def running_service(
     network = configuration(NetworkOptions((endpoint,), connect), map_name, settings)
     opened = Store(store, map_name, settings.store) if store else None
     restored: ValidCheckpoint | None = opened.newest() if opened else None
-    mapper = Mapper(map_name, settings, "cpu", restored.record if restored else None)
+    record, cold = restored.record if restored else None, opened.regions.known if opened else {}
+    mapper = Mapper(map_name, settings, "cpu", record, cold=cold)
     if opened:
         opened.log_scans(settings.field.leaf_m)
     session = open_session(network)

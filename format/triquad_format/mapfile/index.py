@@ -42,11 +42,19 @@ from triquad_format.mapfile.parts.part import (
     REGION_TOPICS,
     PartKey,
 )
+from triquad_format.mapfile.region_facts import (
+    FactsByRegion,
+    pack_region_facts,
+    region_facts_in,
+)
 from triquad_format.mapfile.writer import MapFileInfo
 
 _BLOCK_BYTES = 1 << 20
 
 MAGIC = b"triquad checkpoint\n"
+
+MAX_CHECKPOINT_BYTES = 2**48
+"""Limit on the parts of a checkpoint together, whose regions are read one by one."""
 
 _LEVEL = 3  # of zstd; digests do not shrink
 
@@ -68,6 +76,7 @@ class Checkpoint:
     """What going back to it undoes, such as a reset: so it stays longer. Empty: nothing."""
 
     restored: Restored | None = None  # the last time that the map was restored
+    regions: FactsByRegion | None = None  # None: an earlier release wrote it, and told none
 
 
 def write_checkpoint(path: Path, checkpoint: Checkpoint) -> MapFileInfo:
@@ -77,10 +86,13 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> MapFileInfo:
         FormatError: it lists more than it may, or the map is too large to be read.
         OSError: it cannot be written.
     """
-    checkpoint.manifest.check_total(checkpoint.manifest.stored_bytes)
+    manifest = checkpoint.manifest
+    manifest.check_total(manifest.stored_bytes, MAX_CHECKPOINT_BYTES)
     more: dict[str, object] = {"producer": PRODUCER, "undoes": checkpoint.undoes}
     if checkpoint.restored is not None:
         more["restored"] = vars(checkpoint.restored)
+    if checkpoint.regions is not None:
+        more["regions"] = pack_region_facts(checkpoint.regions)
     part = pack_manifest(checkpoint.manifest, more)
     frame = zstandard.ZstdCompressor(level=_LEVEL).compress(part.payload)
     data = MAGIC + hashlib.sha256(frame).digest() + frame
@@ -187,7 +199,7 @@ class CheckpointIndex:
             raise DamagedMapFileError("the list of its parts fails its checksum")
         body = unpack_body(MANIFEST, decompress(frame))
         self.manifest = manifest_in(body, source.size)
-        self.manifest.check_total(self.manifest.stored_bytes)
+        self.manifest.check_total(self.manifest.stored_bytes, MAX_CHECKPOINT_BYTES)
         self.checkpoint = _checkpoint(self.manifest, body)
         self.size = source.size + self.manifest.stored_bytes  # bytes, with all parts
         self.metadata = {
@@ -250,4 +262,7 @@ def _checkpoint(manifest: Manifest, body: PartBody) -> Checkpoint:
     if body.has("restored"):
         last = PartBody(MANIFEST, body.mapping("restored"))
         restored = Restored(last.count("epoch"), last.count("as_epoch"))
-    return Checkpoint(manifest, body.value("undoes", str), restored)
+    regions = region_facts_in(body, "regions") if body.has("regions") else None
+    if regions is not None and regions.keys() != manifest.regions:
+        raise DamagedMapFileError(f"{MANIFEST}: it tells of other regions than it lists")
+    return Checkpoint(manifest, body.value("undoes", str), restored, regions)

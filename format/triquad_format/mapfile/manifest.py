@@ -23,6 +23,7 @@ from triquad_format.mapfile.parts.part import (
     Part,
     PartKey,
 )
+from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.region import MapRecord
 from triquad_format.wire.packing import pack_array
 
@@ -82,15 +83,33 @@ class Manifest:
         """Return the bytes that all parts take where they are stored."""
         return sum(entry.stored for entry in self.entries)
 
-    def check_total(self, stored_bytes: int) -> None:
-        """Refuse parts that unpack to too much, at all or for so few stored bytes.
+    @property
+    def regions(self) -> frozenset[RegionIndex]:
+        """The regions of the map."""
+        return frozenset(entry.key.region for entry in self.entries if entry.key.topic == REGION)
+
+    def of_regions(self) -> dict[RegionIndex, list[Entry]]:
+        """Return the parts of each region, in the order of the parts :data:`REGION`."""
+        parts: dict[RegionIndex, list[Entry]] = {
+            entry.key.region: [] for entry in self.entries if entry.key.topic == REGION
+        }
+        for entry in self.entries:
+            if entry.key.topic in REGION_TOPICS:
+                parts[entry.key.region].append(entry)
+        return parts
+
+    def check_total(self, stored_bytes: int, most: int | None = None) -> None:
+        """Refuse parts that unpack to more than ``most``, or to too much for so few stored bytes.
+
+        ``None``: what a map file may have.
 
         Raises:
             TooLargeMapFileError, DamagedMapFileError: they do.
         """
+        most = MAX_MAP_BYTES if most is None else most
         total = sum(entry.size for entry in self.entries)
-        if max(total, stored_bytes) > MAX_MAP_BYTES:
-            raise TooLargeMapFileError(f"it exceeds the limit of {MAX_MAP_BYTES} bytes")
+        if max(total, stored_bytes) > most:
+            raise TooLargeMapFileError(f"it exceeds the limit of {most} bytes")
         if total > total_limit(stored_bytes):
             raise DamagedMapFileError(
                 f"{MANIFEST}: parts of {total} bytes in a file of {stored_bytes}"

@@ -16,7 +16,6 @@ from triquad_format.mapfile.manifest import Entry, Manifest
 from triquad_format.mapfile.parts.part import (
     FIELD_TOPICS,
     REGION,
-    REGION_TOPICS,
     VERTICES,
     PartKey,
     extent,
@@ -87,6 +86,7 @@ class StoredMap:
             MapFileError: something of it is damaged.
         """
         with named(self.name):
+            self.manifest.check_total(self._index.size)  # a checkpoint may have more
             self._index.check_unread()
             record = assemble(self.manifest, self._index.payload)
         return MapFile(record, self._index.metadata, self._index.size, self.manifest)
@@ -184,15 +184,8 @@ def assemble(manifest: Manifest, payload_of: Callable[[Entry], bytes]) -> MapRec
         FormatError: a part is missing, malformed or does not fit the others.
     """
     facts = manifest.facts
-    by_region: dict[RegionIndex, list[Entry]] = {}
-    for entry in manifest.entries:
-        if entry.key.topic == REGION:
-            by_region[entry.key.region] = []
-    for entry in manifest.entries:
-        if entry.key.topic in REGION_TOPICS:
-            by_region[entry.key.region].append(entry)
     regions = []
-    for index, entries in by_region.items():
+    for index, entries in manifest.of_regions().items():
         parts = RegionParts(index, facts.settings)
         for entry in entries:
             parts.add(entry.key, payload_of(entry))

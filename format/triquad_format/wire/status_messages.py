@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 from triquad_format.wire import keys
@@ -88,9 +88,9 @@ class ServerStatus(Message):
     store_error: str | None  # why the map is not durable, None if it is
     warnings: tuple[str, ...] = ()  # what goes wrong with scans, and what helps
     samples_left: Count = 0  # training samples until nothing is left to learn
-    map_bytes: Count = 0  # memory of the map with its newest epoch
-    map_max_bytes: Count = 0  # beyond which scans are refused as map_full; 0: not known
-    fit: FieldFit | None = None  # as it was judged last, None: not yet
+    map_bytes: Count = 0  # memory of the map with its rays and its newest epoch, an estimate
+    map_max_bytes: Count = 0  # that the server may take in all; 0: not known
+    fit: FieldFit | None = None  # of regions in memory, as judged last; None: none was
     rays_discarded: Count = 0  # that gave way to others, since the server started
     replay_share: Annotated[float, within(0, 1)] = 1.0
     """The share of the rays that each place is to keep for which memory has room."""
@@ -98,6 +98,8 @@ class ServerStatus(Message):
     samples_discarded: Count = 0  # above the limit of a region's training budget
     origin_m: Origin | None = None  # [3] from where the map itself counts; None: from 0 0 0
     kept_scans: KeptScans | None = None  # None: none are kept
+    memory_parts: dict[Name, Count] = field(default_factory=dict)  # bytes, by what takes them
+    regions_cold: Count = 0  # of the regions, those that are read from the store where needed
     correcting: Count = 0  # scans whose poses are being corrected: regions are made again
 
     def __repr__(self) -> str:

@@ -2,20 +2,19 @@
 
 import itertools
 import logging
-import threading
 from collections.abc import Iterator, Sequence
+from functools import partial
 
 import numpy as np
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
-from triquad_format.records.region import MapRecord, Region
+from triquad_format.records.region import MapRecord
 
 from triquad_map.compiled.kernel import is_first_use
 from triquad_map.compiled.team import Split, Team, in_one
 from triquad_map.composition.field_view import FieldView, MapRegion, Owners
-from triquad_map.evidence.evidence import FrozenEvidence
-from triquad_map.field.frozen_field import field_samples, recorded_field
-from triquad_map.surfels.surfel_map import RegionFrame, SurfelMap, first_surfels
+from triquad_map.composition.recorded_region import RecordedRegion
+from triquad_map.surfels.surfel_map import RegionFrame, SurfelMap
 from triquad_map.view import NearestSurface, NearestUnknown
 
 _log = logging.getLogger(__name__)
@@ -38,7 +37,7 @@ class ComposedView(FieldView):
         """Compose regions; ``split`` shares the work of a question among threads."""
         super().__init__(settings, regions, split)
         self.epoch = epoch
-        self._newest_s = max((region.evidence.newest_s for region in regions), default=0)
+        self._newest_s = max((region.newest_s for region in regions), default=0)
 
     @property
     def voxel_m(self) -> float:
@@ -57,19 +56,14 @@ class ComposedView(FieldView):
             learnt=np.ones(count, np.bool_),
             normal=np.zeros((count, 3), np.float32),
         )
-        # Here, not in the threads of the split: to make surfels may take all of these.
-        near = [
-            (region.surfels, self._frame(region))
-            for region in self._regions_near(points, max_distance_m)
-            if len(region.surfels)
-        ]
-
-        def work(first: int, last: int) -> None:
-            mine = NearestSurface._make(array[first:last] for array in nearest)
-            for surfels, frame in near:
-                surfels.improve(mine, points[first:last], frame)
-
-        self._split(count, work, _LEAST_SEARCHES)
+        if not count:
+            return nearest
+        low, high = _box_around(points, max_distance_m)
+        # One after the other: each may have to be read, and all together may be too much.
+        for region in self._regions_between(low, high):
+            # Here, not in the threads of the split: to make surfels may take all of these.
+            near, frame = region.surfels_between(low, high), self._frame(region)
+            self._split(count, partial(_improve, nearest, points, near, frame), _LEAST_SEARCHES)
         return nearest
 
     def nearest_unknown(self, points: Doubles, max_distance_m: float) -> NearestUnknown:
@@ -90,11 +84,8 @@ class ComposedView(FieldView):
         self._for_owners(points, work, _LEAST_SEARCHES)
         return nearest
 
-    def _regions_near(self, points: Doubles, reach_m: float) -> Iterator[MapRegion]:
-        """Yield regions that come within ``reach_m`` of the box around the points [N, 3]."""
-        if not len(points):
-            return
-        low, high = _box_around(points, reach_m)
+    def _regions_between(self, low: Doubles, high: Doubles) -> Iterator[MapRegion]:
+        """Yield the regions that meet the box between two corners [3]."""
         half = self._settings.region_side_m / 2
         for region in self.region_views:
             if (region.centre - half <= high).all() and (region.centre + half >= low).all():
@@ -170,27 +161,18 @@ class RecordedView(ComposedView):
         self._team.close()
 
 
-class RecordedRegion:
-    """A region as a file has it, whose surfels are fitted when they are first asked for."""
-
-    def __init__(self, record: MapRecord, region: Region, split: Split) -> None:
-        settings = record.settings
-        self.index = region.index
-        self.centre = settings.region_centre(region.index)
-        self.field = recorded_field(settings, region)
-        self.evidence = FrozenEvidence.from_record(1 << settings.depth, region.evidence)
-        self._samples = field_samples(self.field, settings, split)
-        self._epoch = record.epoch
-        self._fitting = threading.Lock()
-        self._surfels: SurfelMap | None = None
-
-    @property
-    def surfels(self) -> SurfelMap:
-        """The surfels of its surface; the first who asks waits until all are fitted."""
-        with self._fitting:
-            if self._surfels is None:
-                self._surfels = first_surfels(self.evidence, self._samples, self._epoch)
-            return self._surfels
+def _improve(
+    nearest: NearestSurface,
+    points: Doubles,
+    near: Sequence[SurfelMap],
+    frame: RegionFrame,
+    first: int,
+    last: int,
+) -> None:
+    """Improve ``nearest`` where surfels lie nearer to some of the points [N, 3]."""
+    mine = NearestSurface._make(array[first:last] for array in nearest)
+    for surfels in near:
+        surfels.improve(mine, points[first:last], frame)
 
 
 def _box_around(points: Doubles, reach_m: float) -> tuple[Doubles, Doubles]:

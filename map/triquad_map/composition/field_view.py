@@ -45,8 +45,11 @@ class MapRegion(Protocol):
         """The space that rays have shown of it."""
 
     @property
-    def surfels(self) -> SurfelMap:
-        """The surfels of its surface. They must not be asked for within a :class:`Split`."""
+    def newest_s(self) -> int:
+        """When a ray last ended anywhere in it, seconds since 1970; 0: never, or not known."""
+
+    def surfels_between(self, low: Doubles, high: Doubles) -> Sequence[SurfelMap]:
+        """Return at least its surfels between two corners [3]; not within a :class:`Split`."""
 
 
 @dataclass(frozen=True)

@@ -163,6 +163,20 @@ class FrozenEvidence:
         """Return blocks [B, 3], in units of blocks, that contain any seen surface."""
         return self.cells[self.surface.any(axis=1)]
 
+    def part(self, rows: Longs) -> "FrozenEvidence":
+        """Return the evidence of some blocks alone, by their rows [P], increasing."""
+        seen = self.seen
+        index = VoxelIndex.of_cells(self.cells[rows]).freeze()
+        counts = surface_counts(self.surface)
+        chosen = np.isin(np.repeat(np.arange(len(counts)), counts), rows)
+        return FrozenEvidence(
+            SeenVoxels(seen.side, index, seen.surface[rows], seen.free[rows]),
+            self.levels[chosen],
+            scans=None if self.scans is None else self.scans[chosen],
+            beyond=self.beyond[chosen],
+            seen_s=self.seen_s[rows],
+        )
+
     def record(self, outcomes: Bytes | None = None) -> EvidenceRecord:
         """Return the evidence as the map file has it; empty blocks are left out.
 

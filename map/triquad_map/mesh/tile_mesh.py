@@ -81,6 +81,11 @@ class TileBorder:
     points: NDArray[np.int16]  # [P, 3] lattice points of the tile
     values: Floats  # [P] metres
 
+    @property
+    def nbytes(self) -> int:
+        """The bytes of memory that it takes."""
+        return self.points.nbytes + self.values.nbytes
+
     @classmethod
     def of_tile(cls, points: Longs, volume: Floats) -> "TileBorder":
         """Return the lattice points [P, 3] of a tile that lie on its faces."""

@@ -211,12 +211,19 @@ class SurfelMap:
 
 
 def first_surfels(
-    evidence: FrozenEvidence, field: SampleField, epoch: int, by_rays: ShownByRays = nothing_shown
+    evidence: FrozenEvidence,
+    field: SampleField,
+    epoch: int,
+    by_rays: ShownByRays = nothing_shown,
+    around: FrozenEvidence | None = None,
 ) -> SurfelMap:
-    """Return the surfels of all seen voxels, for an epoch."""
+    """Return the surfels of all seen voxels, for an epoch.
+
+    The evidence may be a part of what is ``around``.
+    """
     fitted = _nothing_in(surfel_places(evidence.cells, evidence.surface))
     voxels = fitted.places.voxels()
-    fitted.fit(np.arange(len(voxels)), voxels, evidence, field, by_rays)
+    fitted.fit(np.arange(len(voxels)), voxels, around or evidence, field, by_rays)
     fitted.epochs[:] = epoch
     return SurfelMap(evidence, fitted, voxels)
 

@@ -1,9 +1,7 @@
-"""A published state of the map: what it answers, and the memory that it takes."""
+"""A published state of the map."""
 
 from collections import ChainMap
-from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from triquad_format.records.arrays import Doubles
@@ -17,9 +15,8 @@ from triquad_map.surfels.ray_planes import ShownField
 from triquad_map.surfels.surfel_map import SurfelMap
 
 from triquad_server.engine.field_record import region_record
-
-Buffers = Mapping[int, int]
-"""The bytes of pieces of memory, by start address: arrays that share one count once."""
+from triquad_server.epochs.buffers import Buffers
+from triquad_server.epochs.cold_region import ColdRegion
 
 _NO_ORIGIN = np.zeros(3)
 
@@ -42,6 +39,19 @@ class FrozenRegion:
         return ShownField(self.engine, self.surfels.planes)
 
     @property
+    def newest_s(self) -> int:
+        """When a ray last ended anywhere in it, seconds since 1970; 0: never, or not known."""
+        return self.evidence.newest_s
+
+    def read_evidence(self) -> FrozenEvidence:
+        """Return the space that rays have shown of it: there is nothing to read."""
+        return self.evidence
+
+    def surfels_between(self, _low: Doubles, _high: Doubles) -> tuple[SurfelMap]:
+        """Return all its surfels."""
+        return (self.surfels,)
+
+    @property
     def vertices(self) -> int:
         """The number of quadtree vertices, on all planes and levels."""
         return len(self.engine.arrays.features) - 1  # the first row is of absent vertices
@@ -57,6 +67,10 @@ class FrozenRegion:
         return region_record(self.index, self.engine, self.evidence)
 
 
+EpochRegion = FrozenRegion | ColdRegion
+"""A region of an epoch: as it was published, or as its checkpoint has it."""
+
+
 class Epoch(ComposedView):
     """An immutable map: every answer comes from the same state. Safe to read from any thread."""
 
@@ -65,7 +79,7 @@ class Epoch(ComposedView):
         name: str,
         number: int,
         settings: FieldSettings,
-        regions: tuple[FrozenRegion, ...],
+        regions: tuple[EpochRegion, ...],
         split: Split,
         progress: MapProgress | None = None,
         origin: Doubles = _NO_ORIGIN,
@@ -97,6 +111,11 @@ class Epoch(ComposedView):
         return len(self.frozen_regions)
 
     @property
+    def cold_regions(self) -> int:
+        """The number of those that are not in memory."""
+        return sum(isinstance(region, ColdRegion) for region in self.frozen_regions)
+
+    @property
     def vertices(self) -> int:
         """The number of quadtree vertices of all regions."""
         return sum(region.vertices for region in self.frozen_regions)
@@ -122,45 +141,3 @@ class Epoch(ComposedView):
         return MapRecord(
             self._name, self.number, self.field_settings, regions, self.progress, (x, y, z)
         )
-
-
-def buffers_of(part: object) -> dict[int, int]:
-    """Return the memory of all arrays and tensors that a part of the program leads to.
-
-    It is an object, or containers of some, which must not change meanwhile; only those of classes
-    of this program are searched.
-    """
-    found: dict[int, int] = {}
-    visited: set[int] = set()
-    open_parts: list[Any] = [part]
-    while open_parts:
-        part = open_parts.pop()
-        if id(part) in visited:
-            continue
-        visited.add(id(part))
-        if isinstance(part, np.ndarray):
-            root = _root(part)
-            found[root.ctypes.data] = root.nbytes
-        elif hasattr(part, "untyped_storage"):  # a tensor, without need for torch
-            storage = part.untyped_storage()
-            found[storage.data_ptr()] = storage.nbytes()
-        else:
-            open_parts.extend(_within(part))
-    return found
-
-
-def _root(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    while isinstance(array.base, np.ndarray):
-        array = array.base
-    return array
-
-
-def _within(part: object) -> Iterable[object]:
-    """List the parts of a container or of an object of this program."""
-    if isinstance(part, (tuple, list)):
-        return part
-    if isinstance(part, dict):
-        return list(part.values())
-    if type(part).__module__.startswith("triquad_"):
-        return list(getattr(part, "__dict__", {}).values())
-    return ()

@@ -47,10 +47,11 @@ class EpochHistory:
             older_bytes: memory of older epochs, beyond what they share with newer ones.
         """
         self.newest = first  # the epoch published last
+        self.older_bytes = 0  # of older ones, beyond what they share with it
         self._lock = threading.Condition()
         self._settings = settings
         self._clock = clock
-        self._older_bytes = older_bytes
+        self._most_older_bytes = older_bytes
         self._published_s = clock()  # when the newest was
         self._recent_s = _RECENT_PERIODS * settings.publish_period_s
         self._epochs = {first.number: first}  # oldest first
@@ -164,10 +165,11 @@ class EpochHistory:
                 continue
             buffers = self._epochs[number].buffers
             own = {start: size for start, size in buffers.items() if start not in counted}
-            if used + sum(own.values()) <= self._older_bytes:
+            if used + sum(own.values()) <= self._most_older_bytes:
                 used += sum(own.values())
                 counted.update(own)
                 stay.add(number)
                 older += number not in recent
+        self.older_bytes = used
         self._epochs = {number: epoch for number, epoch in self._epochs.items() if number in stay}
         self._pins = {number: at_s for number, at_s in self._pins.items() if number in stay}

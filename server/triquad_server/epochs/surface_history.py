@@ -1,5 +1,6 @@
 """Records where surface appeared and vanished, epoch by epoch, and tells it as boxes."""
 
+import logging
 import threading
 from collections import deque
 from dataclasses import dataclass
@@ -15,7 +16,10 @@ from triquad_format.wire.query_messages import ChangesReply, ChangesRequest
 from triquad_map.clusters import Boxes, tight_boxes
 from triquad_map.compiled.voxel_index import cells_of
 
-from triquad_server.epochs.epoch import Epoch, FrozenRegion
+from triquad_server.epochs.cold_region import ColdRegion
+from triquad_server.epochs.epoch import Epoch, EpochRegion, FrozenRegion
+
+_log = logging.getLogger(__name__)
 
 MAX_BOXES = 256
 """The most boxes of one reply. Where there would be more, voxels twice as far apart share one, and
@@ -46,11 +50,15 @@ class _Surface:
     masks: Bytes  # [B, BLOCK_BYTES]
 
     @staticmethod
-    def of(region: FrozenRegion | None) -> "_Surface":
+    def of(region: EpochRegion | None) -> "_Surface":
         """Return the surface of a region; none where there is no region."""
         if region is None:
             return _Surface(np.zeros(0, np.int64), np.zeros((0, BLOCK_BYTES), np.uint8))
-        seen = region.evidence.seen
+        try:
+            seen = region.read_evidence().seen
+        except RefusedError as error:
+            _log.error("what was seen in region %s before is not told: %s", region.index, error)
+            return _Surface.of(None)
         return _Surface(seen.blocks.row_keys, seen.surface)
 
     def without(self, other: "_Surface") -> "_Surface":
@@ -143,7 +151,9 @@ def _changes(before: Epoch, now: Epoch) -> VoxelChanges:
     found = []
     for index in old | new:
         one, other = old.get(index), new.get(index)
-        if one and other and one.evidence is other.evidence:
+        if one is other or (one and isinstance(other, ColdRegion)):
+            continue  # it left memory as it was
+        if isinstance(one, FrozenRegion) and other and one.evidence is other.evidence:
             continue
         was, has = _Surface.of(one), _Surface.of(other)
         for changed, is_new in ((has.without(was), True), (was.without(has), False)):

@@ -1,9 +1,12 @@
 """One region of the live map: its field, its evidence and its training."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
+from weakref import WeakSet
 
 import numpy as np
+from triquad_format.mapfile.region_facts import RegionFacts
 from triquad_format.records.arrays import Doubles
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.region import Region, TrainingState
@@ -14,7 +17,8 @@ from triquad_map.field.frozen_field import field_samples
 from triquad_server.engine.compiled_trainer import Loss
 from triquad_server.engine.field_record import field_from_record, region_record
 from triquad_server.engine.live_field import initial_field
-from triquad_server.epochs.epoch import FrozenRegion, buffers_of
+from triquad_server.epochs.buffers import buffers_of
+from triquad_server.epochs.epoch import FrozenRegion
 from triquad_server.intake.rays import ScanRays
 from triquad_server.mapping.region_evidence import RegionEvidence, SeenScan
 from triquad_server.mapping.region_setup import RegionSetup
@@ -28,6 +32,7 @@ class RegionSize(NamedTuple):
 
     evidence: EvidenceSize
     vertices: int  # of its quadtrees
+    rays: int = 0  # that are kept of it
 
 
 @dataclass(frozen=True)
@@ -60,6 +65,29 @@ class RegionSnapshot:
         return replace(self.region, training=training)
 
 
+class OwedCopy:
+    """A copy of a region as it was at a moment: made when it is taken, or before a change.
+
+    All is for the thread that owns the map. If nobody refers to it any more it is never made.
+    """
+
+    def __init__(self, copy: Callable[[], RegionSnapshot]) -> None:
+        self._copy: Callable[[], RegionSnapshot] | None = copy
+        self._made: RegionSnapshot | None = None
+
+    def make(self) -> None:
+        """Make the copy, unless it is made."""
+        if self._copy is not None:
+            self._made, self._copy = self._copy(), None
+
+    def take(self) -> RegionSnapshot:
+        """Return the copy, which can be taken once."""
+        self.make()
+        taken, self._made = self._made, None
+        assert taken is not None, "it was taken before"
+        return taken
+
+
 class LiveRegion:
     """A region that is being mapped, by one thread. Everything public is in the map frame."""
 
@@ -84,11 +112,32 @@ class LiveRegion:
         self._setup = setup
         self._published: FrozenRegion | None = None
         self.is_changed = True  # changed since it was published
+        self._owed: WeakSet[OwedCopy] = WeakSet()  # that are made before the next change
 
     @property
     def size(self) -> RegionSize:
         """Return the size of the region."""
-        return RegionSize(self.evidence.live.size, self.field.vertices)
+        rays = self.training.rays
+        kept = len(rays.pool) + len(rays.held_out)
+        return RegionSize(self.evidence.live.size, self.field.vertices, kept)
+
+    def facts(self, memory_bytes: int) -> RegionFacts:
+        """Return what a checkpoint tells of the region, as it was published last."""
+        published = self._published
+        assert published is not None, "it is published before it is stored"
+        return RegionFacts(
+            vertices=published.vertices,
+            parameters=published.parameters,
+            rays=len(self.training.rays.pool),
+            samples_left=self.training.budget.samples,
+            newest_s=published.newest_s,
+            memory_bytes=memory_bytes,
+        )
+
+    def is_as_of(self, epoch: int) -> bool:
+        """Return whether it has not changed since an epoch."""
+        published = self._published
+        return published is not None and not self.is_changed and published.changed <= epoch
 
     def new_voxels(self, rays: ScanRays) -> int:
         """Return in how many voxels rays would end for the first time."""
@@ -101,11 +150,12 @@ class LiveRegion:
         ways = voxels(np.concatenate([rays.ends, rays.free_corners]))
         blocks = new_blocks(voxels(rays.origin[None])[0], ways, seen)
         size = EvidenceSize(blocks, new.blocks, len(new.voxels))
-        return RegionSize(size, self.field.growth_by(new.voxels))
+        kept = int(self._setup.training.rays_per_voxel * len(new.voxels))
+        return RegionSize(size, self.field.growth_by(new.voxels), kept)
 
     def scan_seen(self, rays: ScanRays, stamp_s: int) -> SeenScan:
         """Record what the rays of a scan show."""
-        self.is_changed = True
+        self._begin_change()
         return self.evidence.scan_seen(rays, stamp_s)
 
     def believe(self, seen: SeenScan) -> None:
@@ -126,15 +176,14 @@ class LiveRegion:
 
     def take_step(self) -> tuple[Loss, int]:
         """Take one optimiser step; return loss and samples. On a GPU, reading the loss waits."""
-        taken = self.training.take_step()
-        self.is_changed = True
-        return taken
+        self._begin_change()
+        return self.training.take_step()
 
     def forget(self, low: Doubles, high: Doubles) -> None:
         """Forget evidence and samples between two corners [3]."""
+        self._begin_change()
         self.evidence.forget(low, high)
         self.training.forget(low, high)
-        self.is_changed = True
 
     def publish(self, epoch: int) -> FrozenRegion:
         """Return the region as it is now, for ``epoch``; the last one again if nothing changed."""
@@ -159,8 +208,24 @@ class LiveRegion:
         self.is_changed = False
         return self._published
 
-    def snapshot(self) -> RegionSnapshot:
-        """Return a copy of the region as it is now."""
+    @property
+    def is_owed(self) -> bool:
+        """Whether somebody waits for a copy of it as it is."""
+        return len(self._owed) > 0
+
+    def owe(self) -> OwedCopy:
+        """Return a copy of the region as it is now, which is made as late as can be."""
+        owed = OwedCopy(self._snapshot)
+        self._owed.add(owed)
+        return owed
+
+    def _begin_change(self) -> None:
+        for owed in self._owed:
+            owed.make()
+        self._owed.clear()
+        self.is_changed = True
+
+    def _snapshot(self) -> RegionSnapshot:
         live = self.evidence.live
         return RegionSnapshot(
             region=region_record(self.index, self.field, live),

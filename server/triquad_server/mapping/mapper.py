@@ -2,7 +2,9 @@
 
 import logging
 import math
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 
 import numpy as np
 from triquad_format.records.arrays import Doubles, Floats
@@ -12,11 +14,14 @@ from triquad_format.records.region import MapProgress, MapRecord
 from triquad_server.engine.compiled_trainer import Loss
 from triquad_server.engine.gradient_sums import GradientSums
 from triquad_server.engine.memory import memory_on
+from triquad_server.epochs.cold_region import ColdRegion
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.errors import NO_MEMORY, ScanRefusedError
 from triquad_server.intake.rays import ScanRays, usable_rays
-from triquad_server.mapping.live_region import LiveRegion, RegionSnapshot
+from triquad_server.mapping.live_region import LiveRegion
 from triquad_server.mapping.live_regions import LiveRegions
+from triquad_server.mapping.map_snapshot import MapFigures, MapSnapshot
+from triquad_server.mapping.memory_budget import MemoryBudget
 from triquad_server.mapping.region_setup import RegionSetup
 from triquad_server.process.threads import Teams
 from triquad_server.settings import ANY_SOURCE, Settings
@@ -26,37 +31,6 @@ _log = logging.getLogger(__name__)
 _LOSS_MEMORY = 0.95
 
 _NOWHERE_YET = np.zeros(3)
-
-
-@dataclass(frozen=True)
-class MapFigures:
-    """The figures of a live map, by their names in the status."""
-
-    scans_taken: int = 0  # also those before a restart
-    samples_trained: int = 0  # also those before a restart
-    samples_left: int = 0
-    samples_discarded: int = 0  # so far, beyond the limit of what may be left
-    rays_kept: int = 0  # to train on; one that crosses regions counts in each
-    rays_discarded: int = 0  # so far, that were replaced by others, or were too many
-    replay_share: float = 1.0  # kept, of the rays that each place is to keep
-    map_bytes: int = 0  # bytes of the map and its newest epoch, without rays; an estimate
-
-
-@dataclass(frozen=True)
-class MapSnapshot:
-    """The map as it was at a moment: of the regions that changed since another, what they hold."""
-
-    changed: tuple[RegionSnapshot, ...]
-    epoch: Epoch  # the same state, for queries
-
-    @property
-    def regions(self) -> tuple[RegionIndex, ...]:
-        """All regions of the map."""
-        return tuple(region.index for region in self.epoch.frozen_regions)
-
-    def record(self) -> MapRecord:
-        """Return the changed regions with training state: a second for 100 m of a street."""
-        return self.epoch.record(tuple(region.record() for region in self.changed))
 
 
 class Mapper:
@@ -69,8 +43,14 @@ class Mapper:
         device: str,
         record: MapRecord | None = None,
         teams: Teams | None = None,
+        cold: Mapping[RegionIndex, ColdRegion] = MappingProxyType({}),
+        beside: Callable[[], int] = lambda: 0,
     ) -> None:
-        """Make a map that goes on from ``record``; without ``teams`` it has threads of its own."""
+        """Make a map that goes on from ``record``; without ``teams`` it has threads of its own.
+
+        ``cold`` are regions that are not in the record, to be read when they are needed. What is
+        ``beside`` the map takes so many bytes of ``memory.max_bytes``.
+        """
         self.name = name
         self.teams = teams or Teams()
         self.settings = settings
@@ -84,13 +64,14 @@ class Mapper:
             sums=GradientSums(),
             team=self.teams.mapping,
         )
-        self.regions = LiveRegions(self._setup, settings.memory.max_bytes)
+        most = settings.memory.max_bytes
+        budget = MemoryBudget(most, self._setup.field, settings.training, beside)
+        self.regions = LiveRegions(self._setup, budget)
         self._number = record.epoch if record else 0
         self._epoch: Epoch | None = None
-        self._structure_changed = True
+        self._version: int | None = None  # of the regions, as they were published last
         self.rests = False  # it is not trained: regions are made again, which takes the cores
-        # Chosen by the first scan, and kept as long as this process runs: what was known before a
-        # reset counts from there as well.
+        # Chosen by the first scan, and kept as long as this process runs, also after a reset.
         is_begun = record is not None and (record.regions or record.progress.scans_taken)
         self._origin = record.origin if record is not None and is_begun else None
         # Of the map: a restart goes on counting.
@@ -100,6 +81,7 @@ class Mapper:
         self._loss: Loss | None = progress.loss or None
         if record is not None:
             self.regions.restore(record.regions)
+            self.regions.all.restore_cold(cold)
             self.regions.share_out()
 
     @property
@@ -115,12 +97,7 @@ class Mapper:
     @property
     def samples_left(self) -> int:
         """The number of training samples that are still to be trained on, of all regions."""
-        return self.regions.samples_left
-
-    @property
-    def rays_kept(self) -> int:
-        """The number of rays that are kept to train on; one that crosses regions counts in each."""
-        return sum(len(region.training.rays.pool) for region in self.regions)
+        return self.regions.all.samples_left
 
     @property
     def loss(self) -> float:
@@ -138,14 +115,13 @@ class Mapper:
 
     def figures(self) -> MapFigures:
         """Return the figures of the map as it is now."""
-        training = [region.training for region in self.regions]
         return MapFigures(
             scans_taken=self.scans_taken,
             samples_trained=self.samples_trained,
             samples_left=self.samples_left,
-            samples_discarded=sum(one.budget.discarded for one in training),
-            rays_kept=self.rays_kept,
-            rays_discarded=sum(one.rays.pool.discarded for one in training),
+            samples_discarded=self.regions.all.samples_discarded,
+            rays_kept=self.regions.all.rays_kept,
+            rays_discarded=self.regions.all.rays_discarded,
             replay_share=self.regions.rays_share,
             map_bytes=self.regions.bytes_used,
         )
@@ -175,17 +151,17 @@ class Mapper:
             return are not.
 
         Raises:
-            ScanRefusedError: the scan cannot be used; the map is unchanged. After any other
+            ScanRefusedError: the scan cannot be used; the map is unchanged.
+            NoRoomYetError: it has to wait while there is no room; likewise. After any other
                 exception a part of the scan is in the map, which must not be used any more.
         """
         origin = np.zeros(3) if local else self._origin
         rays = self._usable_rays(points, world_from_sensor, source, no_return, origin)
-        count = len(self.regions)
         reached = self.regions.reached_by(rays)
         if self._origin is None:
             self._origin = rays.map_origin
         self._take_in(rays, reached, stamp_s)
-        self._structure_changed |= len(self.regions) > count
+        self.regions.room.make()
         self.scans_taken += 1
         return rays
 
@@ -233,7 +209,8 @@ class Mapper:
 
     def publish(self) -> Epoch:
         """Return the newest epoch: a new one if the map changed since the last."""
-        changed = self._structure_changed or any(region.is_changed for region in self.regions)
+        changed = self._version != self.regions.all.version
+        changed = changed or any(region.is_changed for region in self.regions)
         if self._epoch is not None and not changed:
             return self._epoch
         if self._epoch is not None or not self._number:
@@ -242,12 +219,12 @@ class Mapper:
             name=self.name,
             number=self._number,
             settings=self._setup.field,
-            regions=tuple(region.publish(self._number) for region in self.regions),
+            regions=self.regions.all.publish(self._number),
             split=self.teams.answer,
             progress=self.progress,
             origin=self.origin,
         )
-        self._structure_changed = False
+        self._version = self.regions.all.version
         return self._epoch
 
     def release(self) -> None:
@@ -262,7 +239,6 @@ class Mapper:
         self.regions.forget(minimum, maximum)
         if not self.regions:
             self.scans_taken, self.samples_trained, self._loss = 0, 0, None
-        self._structure_changed = True
 
     def other(self, record: MapRecord | None, regions: frozenset[RegionIndex]) -> "Mapper":
         """Return another map that has some regions only, with these settings, name and origin.
@@ -271,7 +247,7 @@ class Mapper:
         """
         other = Mapper(self.name, self.settings, self.device, teams=self.teams)
         other._setup, other._origin = self._setup, self._origin
-        other.regions = LiveRegions(self._setup, self.settings.memory.max_bytes, only=regions)
+        other.regions = self.regions.beginning(regions)
         if record is not None:
             other.regions.restore(record.regions)
             other.regions.share_out()
@@ -283,14 +259,19 @@ class Mapper:
         The other one must not be used any more. Epochs, scans and samples are counted on.
         """
         self.regions.replace(other.regions)
-        self._structure_changed = True
+
+    def snapshot_of_leaving(self) -> MapSnapshot:
+        """Return the newest epoch, and the regions that leave memory once they are stored."""
+        newest = self.publish()
+        owed = deque(region.owe() for region in self.regions.room.leaving)
+        return MapSnapshot(owed, newest, self.regions.all.facts())
 
     def snapshot_since(self, epoch: int | None) -> MapSnapshot:
-        """Return the newest epoch, and the regions changed after ``epoch``; ``None``: all regions.
+        """Return the newest epoch, and the regions changed after ``epoch``; ``None``: all.
 
-        Other threads may make the record of it.
+        Those that are not in memory have not changed since they were stored.
         """
         newest = self.publish()
-        last_changed = {frozen.index: frozen.changed for frozen in newest.frozen_regions}
-        changed = [r for r in self.regions if epoch is None or last_changed[r.index] > epoch]
-        return MapSnapshot(tuple(region.snapshot() for region in changed), newest)
+        changed = (one for one in self.regions if epoch is None or not one.is_as_of(epoch))
+        owed = deque(region.owe() for region in changed)
+        return MapSnapshot(owed, newest, self.regions.all.facts())

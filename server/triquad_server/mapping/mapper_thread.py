@@ -1,29 +1,34 @@
 """The thread that owns the live map: it takes scans, trains in slices, and publishes epochs."""
 
 import logging
-import math
-import queue
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 from enum import Enum
-from typing import Any, TypeVar
+from typing import TypeVar
 
-from triquad_format.errors import TriquadError
+from triquad_format.records.field_settings import RegionIndex
 from triquad_format.wire.codec import moved
 from triquad_format.wire.messages import Scan
-from triquad_format.wire.status_messages import FieldFit
 from triquad_map.compiled.team import lower_priority
 
+from triquad_server.epochs.cold_region import ColdRegion
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.history import EpochHistory
-from triquad_server.errors import NO_MEMORY, MapperStoppedError, ScanRefusedError
+from triquad_server.errors import (
+    NO_MEMORY,
+    NoRoomYetError,
+    ScanRefusedError,
+)
 from triquad_server.intake.rays import ScanRays
 from triquad_server.intake.scan_queue import ScanQueue
-from triquad_server.mapping.mapper import MapFigures, Mapper
+from triquad_server.mapping.commands import Commands
+from triquad_server.mapping.live_region import OwedCopy, RegionSnapshot
+from triquad_server.mapping.mapper import Mapper
+from triquad_server.mapping.progress import Progress
 from triquad_server.mapping.thread_time import Activity, PublishSchedule, ThreadTime
 from triquad_server.process.stop import Stop
 from triquad_server.process.threads import NICENESS
@@ -41,18 +46,6 @@ three clients ask for too much, a lidar loses 2 to 8 of 100 scans with 2, and no
 (``make bench PART=server``)."""
 
 ResultT = TypeVar("ResultT")
-
-
-@dataclass(frozen=True)
-class Progress:
-    """The work of the mapper's thread, as of its last slice."""
-
-    settled: bool = True  # nothing is left to learn, and the newest epoch shows all
-    own_samples_trained: int = 0  # by this process
-    step_s: float = math.inf  # seconds that the last step of training took
-    loss: float = 0.0  # as of the newest epoch
-    fit: FieldFit | None = None  # of the newest epoch, to the rays that are held out
-    map: MapFigures = MapFigures()
 
 
 class _Phase(Enum):
@@ -93,15 +86,20 @@ class MapperThread:
         self._scan_taken = scan_taken
         self._published = published
         self.time = ThreadTime()
-        self.ended: str | None = None  # why the thread takes no more commands
-        self._commands: queue.SimpleQueue[tuple[Callable[[Mapper], Any], Future[Any]]]
-        self._commands = queue.SimpleQueue()
+        self._stored: deque[Mapping[RegionIndex, ColdRegion] | None] = deque(maxlen=1)
         self._wake = threading.Event()
+        self._commands = Commands(self._wake.set)
+        self._waiting: Scan | None = None  # for room in the map
         self._phase = _Phase.MAPPING
         self._schedule = PublishSchedule(period_s)
         self.progress = Progress(loss=mapper.loss, fit=mapper.regions.fit)
         self._record_progress()
         self._thread = threading.Thread(target=self._run, name="mapper")
+
+    @property
+    def ended(self) -> str | None:
+        """Why the thread takes no more commands; ``None``: it does."""
+        return self._commands.ended
 
     def start(self) -> None:
         """Start the thread."""
@@ -117,6 +115,14 @@ class MapperThread:
             self._mapper.rests = False
             self._wake.set()
 
+    def stored(self, regions: Mapping[RegionIndex, ColdRegion] | None) -> None:
+        """Tell what the store has of the regions, so that those that wait for it leave memory.
+
+        ``None``: it cannot be written to.
+        """
+        self._stored.append(regions)
+        self._wake.set()
+
     def pause(self) -> None:
         """Take no more scans and train no more, but go on carrying out commands."""
         self._phase = _Phase.PAUSED
@@ -127,7 +133,7 @@ class MapperThread:
         self._phase = _Phase.ENDING
         self._wake.set()
         if self._thread.ident is None:
-            self._end_commands("the mapper was never started")
+            self._commands.end("the mapper was never started")
         else:
             self._thread.join()
 
@@ -143,18 +149,13 @@ class MapperThread:
     def call(self, command: Callable[[Mapper], ResultT]) -> ResultT:
         """Run ``command`` on the mapper thread, between slices, and return its result.
 
-        Once it returns, an epoch shows what it did to the map.
-
-        Raises:
-            MapperStoppedError: the thread has ended, or ends before it comes to the command.
-            TriquadError: the command refused; any other exception of it ends the thread as well.
+        Once it returns, an epoch shows what it did. Errors: :meth:`Commands.carried_out`.
         """
-        result: Future[ResultT] = Future()
-        self._commands.put((command, result))
-        self._wake.set()
-        if self.ended is not None:  # it may have come after the last one that was carried out
-            self._end_commands(self.ended)
-        return result.result()
+        return self._commands.carried_out(command, changes=True)
+
+    def taken(self, owed: OwedCopy) -> RegionSnapshot:
+        """Return the copy of a region, taken by the thread; errors are those of :meth:`call`."""
+        return self._commands.carried_out(lambda _: owed.take(), changes=False)
 
     def _run(self) -> None:
         lower_priority(NICENESS)
@@ -175,7 +176,7 @@ class MapperThread:
             _log.exception("the mapper was stopped by an internal error")
             self._failed(Stop.INTERNAL_ERROR)
         finally:
-            self._end_commands(ended)
+            self._commands.end(ended)
 
     def _turn(self, else_s: float) -> float:
         """Run one round: commands, scans, a slice of training, an epoch if one is due.
@@ -183,6 +184,8 @@ class MapperThread:
         ``else_s`` is the time of all but scans in the last round; return the same of this one.
         """
         self._epochs.remove_expired()
+        if self._stored:
+            self._mapper.regions.room.stored(self._stored.pop())
         self._run_commands()
         if self._phase is not _Phase.MAPPING:
             self.time.begin(Activity.IDLE)
@@ -190,19 +193,31 @@ class MapperThread:
             return else_s
         took_scans = self._ingest_scans(max(_SCANS_S, _SCANS_SHARE * else_s))
         ingested_s = time.monotonic()
-        rests = self._mapper.rests
-        if not (self._mapper.settled or rests) and self._commands.empty():
-            self._train()
+        learnt = not self._mapper.rests and self._learn(idle=not took_scans)
         if self._schedule.take_due():
             self._publish()
         self._record_progress()
         else_s = time.monotonic() - ingested_s
-        if (self._mapper.settled or rests) and not took_scans:
+        if not (learnt or took_scans):
             self.time.begin(Activity.IDLE)
             if not self._epochs.is_recent:
                 self._mapper.release()
             self._wake.wait(self._schedule.left_s)
         return else_s
+
+    def _learn(self, idle: bool) -> bool:
+        """Take one step of training; return False where there is nothing to learn.
+
+        Where the thread is ``idle``, a region that left memory before it had settled comes back.
+        """
+        if not self._commands.is_empty:
+            return True
+        if self._mapper.regions.next_to_learn is None:
+            self.time.begin(Activity.TRAINING)
+            is_full = self._mapper.regions.room.is_full
+            return idle and not is_full and self._mapper.regions.fetch_unsettled()
+        self._train()
+        return True
 
     def _train(self) -> None:
         """Take one step of training, which gives way to queries for a third of its time at most."""
@@ -217,27 +232,11 @@ class MapperThread:
         self._schedule.is_changed = True
 
     def _run_commands(self) -> None:
-        while not self._commands.empty():
-            command, result = self._commands.get()
+        while not self._commands.is_empty:
             self.time.begin(Activity.COMMANDS)
-            try:
-                returned = command(self._mapper)
-                self._publish()  # first: the caller may ask for its epoch, and what is to be learnt
-                self._record_progress()
-                result.set_result(returned)
-            except TriquadError as error:
+            if not self._commands.run_next(self._mapper, self._publish):
                 self._schedule.is_changed = True
-                result.set_exception(error)
-            except BaseException as error:
-                result.set_exception(error)
-                raise
-
-    def _end_commands(self, why: str) -> None:
-        """Take no more commands; those that wait fail with :class:`MapperStoppedError`."""
-        self.ended = why
-        with suppress(queue.Empty):
-            while True:
-                self._commands.get_nowait()[1].set_exception(MapperStoppedError(why))
+            self._record_progress()
 
     def _ingest_scans(self, for_s: float) -> bool:
         """Take in the oldest scan of each source, for a moment; return False where none waits.
@@ -246,10 +245,12 @@ class MapperThread:
         """
         ends_s = time.monotonic() + for_s
         sources: set[str] = set()
-        while (scan := self._scans.take(sources)) is not None:
+        room = self._mapper.regions.room
+        while not room.is_full and (scan := self._waiting or self._scans.take(sources)):
+            self._waiting = None
             sources.add(scan.source)
             self._ingest(scan)
-            if not self._commands.empty() or time.monotonic() > ends_s:
+            if not self._commands.is_empty or time.monotonic() > ends_s:
                 break  # a command is at most a scan late: checkpoints begin when they are due
         return bool(sources)
 
@@ -264,6 +265,9 @@ class MapperThread:
                 no_return=scan.no_return,
                 local=scan.local,
             )
+        except NoRoomYetError:
+            self._waiting = scan
+            return
         except ScanRefusedError as error:
             self._scans.reject(scan, error.reason, str(error))
             _log.debug("scan %d of %s refused: %s", scan.sequence, scan.source, error)
@@ -288,5 +292,10 @@ class MapperThread:
         self._scans.ledger.publish()
 
     def _record_progress(self) -> None:
-        settled = self._mapper.settled and not self._schedule.is_changed
-        self.progress = replace(self.progress, settled=settled, map=self._mapper.figures())
+        has_all = self._waiting is None and not self._schedule.is_changed
+        self.progress = replace(
+            self.progress,
+            settled=has_all and self._mapper.settled,
+            map=self._mapper.figures(),
+            waits_for_store=self._mapper.regions.room.waits_for_store,
+        )

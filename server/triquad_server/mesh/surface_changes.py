@@ -1,28 +1,36 @@
-"""Finds where the surface of a map changed, and which mesh tiles are out of date by it."""
+"""Finds where the surface of a map changed."""
 
 import itertools
+import logging
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from triquad_format.errors import RefusedError
 from triquad_format.records.arrays import Bools, Doubles, Floats, Ints, Longs
-from triquad_format.records.field_settings import FieldSettings, RegionIndex
+from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings, RegionIndex
 from triquad_map.compiled.team import Team
 from triquad_map.evidence.evidence import FrozenEvidence
-from triquad_map.mesh.tile_mesh import TileBorder, TileIndex, TileLattice
+from triquad_map.field.frozen_field import FrozenField
 from triquad_map.surface import MARGIN_STEP
 from triquad_map.surfels.ray_planes import ShownField
 from triquad_map.surfels.surfel_tree import surfel_voxels
 from triquad_map.view import REACH_VOXELS
 
-from triquad_server.epochs.epoch import FrozenRegion
+from triquad_server.epochs.cold_region import ColdRegion
+from triquad_server.epochs.epoch import EpochRegion, FrozenRegion
 
-_AROUND = [
-    (x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) != (0, 0, 0)
-]
+_log = logging.getLogger(__name__)
 
 _KEY_BITS = 20  # bits of each coordinate of a voxel, or of a group, in its region
+
+RegionField = FrozenField | ShownField
+
+_NO_PLACES = np.zeros((0, 3))
+
+_CORNERS = (BLOCK_VOXELS - 1) * np.array(list(itertools.product((0, 1), repeat=3)))
+"""The voxels in the corners of a block. No tile is so small that it lies between them."""
 
 _FARTHER = REACH_VOXELS / MARGIN_STEP  # the growth of what was seen of a voxel to be reported
 
@@ -50,11 +58,28 @@ class _Recorded:
     """The surface of a region when its changes were last reported."""
 
     centre: Doubles  # [3] of the region, map frame
-    field: ShownField
+    field: RegionField
     evidence: FrozenEvidence
     voxels: _Voxels
     offsets: Floats  # [V] metres from each voxel's centre to the surface
     margins: NDArray[np.int8]  # [V, 6] of the voxels
+
+
+@dataclass(frozen=True)
+class _Stored:
+    """A region that is not in memory, when its changes were last reported."""
+
+    region: ColdRegion
+    blocks: Longs  # [B, 3] of BLOCK_VOXELS**3 voxels, with seen surface
+
+    @classmethod
+    def of(cls, region: ColdRegion) -> "_Stored":
+        """Record a region; where it cannot be read, as one without surface."""
+        try:
+            return cls(region, region.read_evidence().surface_cells())
+        except RefusedError as error:
+            _log.error("region %s is left out of the tiles: %s", region.index, error)
+            return cls(region, np.zeros((0, 3), np.int64))
 
 
 class SurfaceChanges:
@@ -75,34 +100,52 @@ class SurfaceChanges:
         self._tolerance_m = tolerance_m
         self._group_m = group_m
         self._team = team
-        self._recorded: dict[RegionIndex, _Recorded] = {}
+        self._recorded: dict[RegionIndex, _Recorded | _Stored] = {}
 
-    def since_last(self, regions: tuple[FrozenRegion, ...]) -> Changes:
-        """Return what changed since the last call."""
+    def since_last(self, regions: tuple[EpochRegion, ...]) -> Iterator[Changes]:
+        """Yield what changed since the last call, region by region; take all of it.
+
+        A region that left memory is shown as its parts have it, rounded: all of it changes then,
+        and again once it is back.
+        """
         before, self._recorded = self._recorded, {}
-        nothing = np.zeros((0, 3))
-        found = [Changes(nothing, nothing)]
         for region in regions:
             old = before.pop(region.index, None)
+            if isinstance(region, ColdRegion):
+                if not (isinstance(old, _Stored) and old.region is region):
+                    self._recorded[region.index] = stored = _Stored.of(region)
+                    yield from self._all_of(old)
+                    yield from self._all_of(stored)
+                else:
+                    self._recorded[region.index] = old
+                continue
+            if isinstance(old, _Stored):
+                yield from self._all_of(old)
+                old = None
             if old and old.field == region.field and old.evidence is region.evidence:
                 self._recorded[region.index] = old
             else:
                 self._recorded[region.index], changes = self._compare(old, region)
-                found.append(changes)
+                yield changes
         for gone in before.values():
-            found.append(Changes(self._centres(gone.centre, gone.voxels.keys), nothing))
-        return Changes(
-            np.concatenate([changes.places for changes in found]),
-            np.concatenate([changes.drifted for changes in found]),
-        )
+            yield from self._all_of(gone)
+
+    def _all_of(self, recorded: _Recorded | _Stored | None) -> Iterator[Changes]:
+        """Yield all places of a region."""
+        if isinstance(recorded, _Recorded):
+            yield Changes(self._centres(recorded.centre, recorded.voxels.keys), _NO_PLACES)
+        elif recorded is not None:
+            corners = (recorded.blocks[:, None] * BLOCK_VOXELS + _CORNERS).reshape(-1, 3)
+            yield Changes(self._centres(recorded.region.centre, _key(corners)), _NO_PLACES)
 
     def _compare(self, old: _Recorded | None, region: FrozenRegion) -> tuple[_Recorded, Changes]:
         """Return what is to be recorded, and what changed; without ``old``, all is new."""
-        if old is not None and old.evidence is region.evidence:
+        field, evidence = region.field, region.evidence
+        if old is not None and old.evidence is evidence:
             voxels = old.voxels
         else:
-            voxels = self._voxels(region)
-        now = self._offsets(region, voxels.keys)
+            voxels = self._voxels(region.centre, evidence)
+        now = self._offsets(region.centre, field, voxels.keys)
         before = np.full(len(voxels.keys), np.nan, np.float32)
         margins, gone = voxels.margins.copy(), np.zeros(0, np.int64)
         if old is not None:
@@ -127,21 +170,20 @@ class SurfaceChanges:
         keys = np.concatenate([gone, voxels.keys[is_new]])
         recorded = _Recorded(
             region.centre,
-            region.field,
-            region.evidence,
+            field,
+            evidence,
             voxels,
             offsets=offsets,
             margins=margins,
         )
         return recorded, Changes(self._centres(region.centre, keys), voxels.groups[drifted])
 
-    def _voxels(self, region: FrozenRegion) -> _Voxels:
-        evidence = region.evidence
-        voxels = surfel_voxels(evidence.cells, evidence.surface, len(region.surfels))
+    def _voxels(self, centre: Doubles, evidence: FrozenEvidence) -> _Voxels:
+        voxels = _seen_voxels(evidence)
         keys = _key(voxels)
         order = np.argsort(keys)
         keys = keys[order]
-        cells = np.floor(self._centres(region.centre, keys) / self._group_m).astype(np.int64)
+        cells = np.floor(self._centres(centre, keys) / self._group_m).astype(np.int64)
         low = cells.min(axis=0, initial=0)
         _, first, group = np.unique(_key(cells - low), return_index=True, return_inverse=True)
         groups = ((cells[first] + 0.5) * self._group_m).astype(np.float64)
@@ -153,19 +195,19 @@ class SurfaceChanges:
         corner = centre - self._settings.region_side_m / 2
         return corner + (_cells(keys) + 0.5) * self._settings.leaf_m
 
-    def _offsets(self, region: FrozenRegion, keys: Longs) -> Floats:
+    def _offsets(self, centre: Doubles, field: RegionField, keys: Longs) -> Floats:
         """Return the distance [V] from voxel centres to the surface, a voxel at most.
 
         Farther surfaces are in other voxels.
         """
-        centres = self._centres(region.centre, keys)
+        centres = self._centres(centre, keys)
         offsets = np.empty(len(centres), np.float32)
         leaf_m = self._settings.leaf_m
 
         def work(first: int, last: int) -> None:
             part = slice(first, last)
-            local = (centres[part] - region.centre).astype(np.float32)
-            values = region.field.evaluate(local, True)
+            local = (centres[part] - centre).astype(np.float32)
+            values = field.evaluate(local, True)
             slope = np.maximum(np.linalg.norm(values.gradient, axis=1), 0.1)
             offsets[part] = np.clip(values.sdf / slope, -leaf_m, leaf_m)
 
@@ -173,88 +215,9 @@ class SurfaceChanges:
         return offsets
 
 
-@dataclass(frozen=True)
-class CachedTile:
-    """A tile that was made; its bytes may be dropped, what neighbours need of it never is."""
-
-    made: int  # epoch of which it is
-    empty: bool  # without faces
-    border: TileBorder
-
-
-class TileChange(NamedTuple):
-    """When the surface of a tile changed last."""
-
-    epoch: int
-    revision: int  # its number among all changes of the level: there are several in an epoch
-
-
-_NEVER = TileChange(0, 0)
-
-
-class TileLevel:
-    """Keeps the tiles of one level of detail, and when the surface of each changed."""
-
-    def __init__(self, lattice: TileLattice) -> None:
-        self.lattice = lattice
-        self.tiles: dict[TileIndex, CachedTile] = {}  # as they were last made
-        self.changed: dict[TileIndex, TileChange] = {}  # the last one of each
-        self.revision = 0  # number of the newest change
-
-    def clean(self, index: TileIndex) -> CachedTile | None:
-        """Return the tile if it shows the current surface; None if it has to be made."""
-        tile = self.tiles.get(index)
-        return None if tile is None or tile.made < self.changed.get(index, _NEVER).epoch else tile
-
-    def touch(self, index: TileIndex, epoch: int) -> None:
-        """Record that the surface of a tile changed in ``epoch``."""
-        self.changed.pop(index, None)
-        self.revision += 1
-        self.changed[index] = TileChange(epoch, self.revision)  # the newest is last
-
-    def record(self, changes: Changes, half_m: float, epoch: int) -> None:
-        """Record what changed in ``epoch``; voxels have sides of twice ``half_m``."""
-        low, high = changes.places - half_m, changes.places + half_m
-        touched = [
-            *self.lattice.tiles_meeting(low, high, self.lattice.margin_m).tolist(),
-            *self.lattice.tiles_meeting(changes.drifted, changes.drifted).tolist(),
-        ]
-        for x, y, z in touched:
-            self.touch((x, y, z), epoch)
-
-    def changed_since(self, low: Doubles, high: Doubles, since: int) -> dict[TileIndex, int]:
-        """Return the epoch in which the surface of each tile changed, after revision ``since``.
-
-        They meet a box with the corners ``low`` and ``high`` [3], metres, map frame. Since 0,
-        those that are known to have no faces are left out.
-        """
-        newest_first = itertools.takewhile(
-            lambda index: self.changed[index].revision > since, reversed(self.changed)
-        )
-        found = [index for index in newest_first if since or not self._is_empty(index)]
-        inside = self.lattice.meets(np.array(found, np.int64).reshape(-1, 3), low, high)
-        return {index: self.changed[index].epoch for index in itertools.compress(found, inside)}
-
-    def _is_empty(self, index: TileIndex) -> bool:
-        tile = self.clean(index)
-        return tile is not None and tile.empty
-
-    def borders_around(self, index: TileIndex) -> dict[TileIndex, TileBorder]:
-        """Return the borders with which a tile has to agree, by their tiles, in its own lattice.
-
-        That is its own border if only its bytes were dropped, and those of all neighbours that show
-        the current surface: these agree with each other. The others will be made to fit it.
-        """
-        found: dict[TileIndex, TileBorder] = {}
-        own = self.clean(index)
-        if own is not None:
-            found[index] = own.border
-        for offset in _AROUND:
-            x, y, z = (a + b for a, b in zip(index, offset, strict=True))
-            neighbour = self.clean((x, y, z))
-            if neighbour is not None:
-                found[x, y, z] = neighbour.border.seen_from(offset, self.lattice.cells)
-        return found
+def _seen_voxels(evidence: FrozenEvidence) -> Longs:
+    """Return the voxels [V, 3] with seen surface."""
+    return surfel_voxels(evidence.cells, evidence.surface, len(evidence.levels))
 
 
 def _key(cells: Longs) -> Longs:

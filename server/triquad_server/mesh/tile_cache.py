@@ -15,7 +15,8 @@ from triquad_map.composition.composed_view import ComposedView
 from triquad_map.mesh.tile_mesh import TileBorder, TileIndex, TileLattice, TileMesh, mesh_tile
 
 from triquad_server.epochs.epoch import Epoch
-from triquad_server.mesh.surface_changes import CachedTile, SurfaceChanges, TileLevel
+from triquad_server.mesh.surface_changes import SurfaceChanges
+from triquad_server.mesh.tile_level import CachedTile, TileLevel
 from triquad_server.settings import MeshSettings
 
 FOLLOWED = 0
@@ -94,8 +95,8 @@ class TileCache:
     team.
     """
 
-    def __init__(self, settings: MeshSettings, team: Team) -> None:
-        """Begin with no tiles; ``team`` shares the work of making tiles."""
+    def __init__(self, settings: MeshSettings, team: Team, max_bytes: int = 2**40) -> None:
+        """Begin with no tiles, of which ``max_bytes`` are kept; ``team`` shares the work."""
         self._lock = threading.Lock()
         self._team = team
         self._settings = settings
@@ -103,7 +104,12 @@ class TileCache:
         self._changes: SurfaceChanges | None = None
         self.epoch = -1  # number of the epoch of the last refresh
         self._view: ComposedView | None = None  # epoch from which tiles are made
-        self._shown = ShownTiles(settings.cache_bytes)
+        self._shown = ShownTiles(min(settings.cache_bytes, max_bytes))
+
+    @property
+    def nbytes(self) -> int:
+        """The bytes of the tiles that are kept in transmitted form, and of the borders of all."""
+        return self._shown.size + sum(level.nbytes for level in self._levels)
 
     def lattice(self, level: int) -> TileLattice:
         """Return where the tiles of a level lie."""
@@ -193,7 +199,7 @@ class TileCache:
         mesh = mesh_tile(view, index, tiles.lattice, around=around)
         shown = _shown(mesh, view, marked=False)
         with self._lock:
-            tiles.tiles[index] = CachedTile(view.epoch, len(mesh.faces) == 0, mesh.border)
+            tiles.put(index, CachedTile(view.epoch, len(mesh.faces) == 0, mesh.border))
             self._shown.put(TileKey(level, index), shown)
         return shown
 
@@ -205,9 +211,9 @@ class TileCache:
                 group_m=self.lattice(0).tile_side_m,
                 team=self._team,
             )
-        changes = self._changes.since_last(epoch.frozen_regions)
-        for level in self._levels:
-            level.record(changes, epoch.field_settings.leaf_m / 2, epoch.number)
+        for changes in self._changes.since_last(epoch.frozen_regions):
+            for level in self._levels:
+                level.record(changes, epoch.field_settings.leaf_m / 2, epoch.number)
         self.epoch = epoch.number
 
     def _agreeing(

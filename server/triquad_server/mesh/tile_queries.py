@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 from triquad_format.errors import RefusedError
-from triquad_format.records.arrays import Ints
+from triquad_format.records.arrays import Doubles, Ints
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.wire.mesh_messages import (
     MeshReply,
@@ -24,6 +24,8 @@ MAX_TILES = 1_000_000
 """The most tiles of one list."""
 
 _ORIGIN = np.zeros(3)  # from where tiles count, which is told in the client's coordinates
+
+_EVERYWHERE = np.full(3, np.inf)
 
 _GIVE_WAY_S = 0.1  # seconds that the making of tiles waits for queries before each, at most
 _MAX_REFRESH_SHARE = 4
@@ -52,7 +54,9 @@ class TileQueries:
         """
         epoch = self._epochs.get(request.epoch)
         lattice = self._cache.lattice(request.level)
-        tiles = surface_tiles(epoch, lattice, request.fill_m)
+        tiles = surface_tiles(
+            epoch, lattice, request.fill_m, low=request.minimum, high=request.maximum
+        )
         tiles = tiles[lattice.meets(tiles, request.minimum, request.maximum)]
         if len(tiles) > MAX_TILES:
             raise RefusedError("too_large", f"{len(tiles)} tiles: ask for a smaller box")
@@ -135,17 +139,26 @@ class TileQueries:
         )
 
 
-def surface_tiles(epoch: Epoch, lattice: TileLattice, fill_m: float = 0.0) -> Ints:
+def surface_tiles(
+    epoch: Epoch,
+    lattice: TileLattice,
+    fill_m: float = 0.0,
+    low: Doubles = -_EVERYWHERE,
+    high: Doubles = _EVERYWHERE,
+) -> Ints:
     """Return the tiles [T, 3], sorted, that meet a block with seen surface, or the mesh around it.
 
-    There are more if the surface is continued up to ``fill_m``.
+    There are more if the surface is continued up to ``fill_m``. Those of regions far away from a
+    box with the corners ``low`` and ``high`` [3] are left out.
     """
     settings = epoch.field_settings
-    side_m = BLOCK_VOXELS * settings.leaf_m
+    side_m, half_m = BLOCK_VOXELS * settings.leaf_m, settings.region_side_m / 2
+    margin_m = lattice.reach_m + fill_m
+    far_m = half_m + margin_m + lattice.tile_side_m
     corners = [np.zeros((0, 3))]
     for region in epoch.frozen_regions:
-        origin = region.centre - settings.region_side_m / 2
-        corners.append(region.evidence.surface_cells() * side_m + origin)
-    low = np.concatenate(corners)
-    margin_m = lattice.reach_m + fill_m
-    return lattice.tiles_meeting(low, low + side_m, margin_m).astype(np.int32)
+        if ((region.centre > low - far_m) & (region.centre < high + far_m)).all():
+            cells = region.read_evidence().surface_cells()
+            corners.append(cells * side_m + region.centre - half_m)
+    blocks = np.concatenate(corners)
+    return lattice.tiles_meeting(blocks, blocks + side_m, margin_m).astype(np.int32)

@@ -38,6 +38,7 @@ gauge     triquad_epoch_age_seconds            metrics.epoch_age_s              
 gauge     triquad_epochs_kept                  metrics.epochs_kept                                  Epochs that can be asked for by number
 gauge     triquad_epochs_pinned                metrics.epochs_pinned                                Those of them that stay because they were asked for by number
 gauge     triquad_regions                      status.regions                                       Regions of the map
+gauge     triquad_regions_cold                 status.regions_cold                                  Of the regions, those that are read from the store where they are needed
 gauge     triquad_vertices                     status.vertices                                      Quadtree vertices
 gauge     triquad_parameters                   status.parameters                                    Learnable numbers
 gauge     triquad_rays_kept                    status.rays_kept                                     Rays in the replay pools
@@ -50,8 +51,8 @@ gauge     triquad_held_out_median_metres       status.fit.median_m              
 gauge     triquad_settled                      status.settled                                       1 where nothing is left to learn and the newest epoch shows all; else 0
 gauge     triquad_loss                         status.loss                                          Recent training loss
 counter   triquad_mapper_seconds_total         metrics.mapper_s.{activity}                          Time of the thread that maps, by activity
-gauge     triquad_map_memory_bytes             status.map_bytes                                     Memory of the map with its newest epoch
-gauge     triquad_map_memory_limit_bytes       status.map_max_bytes                                 Beyond this, scans are refused as map_full
+gauge     triquad_map_memory_bytes             status.map_bytes                                     Memory of the regions in it, with their rays and the newest epoch
+gauge     triquad_map_memory_limit_bytes       status.map_max_bytes                                 Memory that the server may take in all
 gauge     triquad_resident_memory_bytes        metrics.resident_bytes                               Memory of the process, with its libraries
 counter   triquad_checkpoints_total            metrics.checkpoints.{outcome:written+failed}         Checkpoints by outcome
 gauge     triquad_checkpoint_duration_seconds  metrics.checkpoints.last_duration_s                  How long writing the last checkpoint took

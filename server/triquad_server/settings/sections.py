@@ -170,7 +170,8 @@ class TrainingSettings(BaseModel):
     training budget is at most 20 samples for each."""
 
     pool_bytes: Annotated[int, Field(ge=10_000, le=2**50)] = 500_000_000
-    """Bytes of all rays that are kept; a map too large for that keeps fewer for each voxel."""
+    """Bytes of all rays in memory, and at most a quarter of `memory.max_bytes`; where there are too
+    many voxels for that, fewer are kept for each."""
 
     fresh_share: Annotated[float, Field(ge=0, le=1)] = 0.25
     """Share of a batch that is drawn from the newest scans while they stream in."""
@@ -204,7 +205,8 @@ class MeshSettings(BaseModel):
     """A tile changes where its surface moved by more."""
 
     cache_bytes: Annotated[int, Field(ge=0, le=2**40)] = 200_000_000
-    """Bytes of encoded tiles that are cached; others are made again when they are asked for."""
+    """Bytes of encoded tiles that are cached, and at most a tenth of `memory.max_bytes`; others are
+    made again when they are asked for."""
 
 
 class StoreSettings(BaseModel):
@@ -260,17 +262,29 @@ class ServiceSettings(BaseModel):
 
 
 class MemorySettings(BaseModel):
-    """How much memory the map may take."""
+    """How much memory the server may take."""
 
     model_config = SECTION
 
     max_bytes: Annotated[int, Field(ge=1_000_000, le=2**50)] = 2_000_000_000
-    """Of the live map with its newest epoch. A scan that would make it larger is refused as
-    `map_full`; one that shows nothing new is taken on, and all else goes on too."""
+    """Of the process in all; of a server within a program, of what it holds. Before more is needed,
+    regions that no scan has reached for longest leave memory, and are read from the store where
+    they are needed. Without a store a scan that would make the map larger is refused as `map_full`;
+    one that shows nothing new is taken on, and all else goes on too."""
 
     epochs_bytes: Annotated[int, Field(ge=0, le=2**50)] = 300_000_000
-    """Of older epochs that can be asked for by number, beyond what they share with newer ones;
-    those that were asked for last stay first."""
+    """Of older epochs that can be asked for by number, beyond what they share with newer ones, and
+    at most a tenth of `max_bytes`; those that were asked for last stay first."""
+
+    @property
+    def kept_bytes(self) -> int:
+        """What older epochs may take at most, and what encoded tiles may."""
+        return self.max_bytes // 10
+
+    @property
+    def shelf_bytes(self) -> int:
+        """What regions may take that were read to answer: of 2 GB, six of 205 m of a street."""
+        return self.max_bytes // 8
 
 
 class MetricsSettings(BaseModel):

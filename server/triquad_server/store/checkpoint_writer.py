@@ -1,9 +1,11 @@
 """Writes checkpoints from time to time, on request, before each reset, and at the end."""
 
 import logging
+import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 from triquad_format.errors import FormatError, RefusedError
@@ -11,8 +13,6 @@ from triquad_format.scan_log.segment import SegmentWriter
 from triquad_format.wire.messages import (
     CheckpointInfo,
     CheckpointRequest,
-    ResetReply,
-    ResetRequest,
 )
 from triquad_format.wire.metrics_messages import CheckpointMetrics
 from triquad_format.wire.status_messages import KeptScans
@@ -23,8 +23,8 @@ from triquad_server.errors import (
     MapperStoppedError,
     StoreError,
 )
-from triquad_server.intake.source_trails import SourceTrails
-from triquad_server.mapping.mapper import Mapper, MapSnapshot
+from triquad_server.mapping.map_snapshot import MapSnapshot
+from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.settings import StoreSettings
 from triquad_server.store.corrected_log import kept_scans
@@ -33,17 +33,11 @@ from triquad_server.store.store import Store
 
 _log = logging.getLogger(__name__)
 
+_LOOK_S = 0.5  # after which it is looked again whether regions wait to leave memory
+
 _LATE_PERIODS = 2.0  # after so many, what is mapped should be on the disk
 
 _NO_STORE = "the server was started without a store: the map is not kept"
-
-
-def way_back(kept: int) -> str:
-    """Return how to go back to the map before, which is kept as epoch ``kept``."""
-    return (
-        f"epoch {kept}, the map before, is kept; to go back to it, stop the server and start "
-        f"it with --restore {kept}"
-    )
 
 
 class CheckpointWriter:
@@ -85,8 +79,8 @@ class CheckpointWriter:
         if self.store is None:
             return
         self._survey_scans(self.store)
-        if self._period_s > 0:
-            self._timer.start()
+        self._mapper.stored(self.store.regions.known)
+        self._timer.start()
         if self._scrub_h > 0:
             self._scrubber = Scrubber(self.store.folder, self._scrub_h, self._found_damaged)
 
@@ -149,32 +143,6 @@ class CheckpointWriter:
         except StoreError as error:
             raise RefusedError("store", str(error)) from error
 
-    def reset(self, request: ResetRequest, trails: SourceTrails) -> ResetReply:
-        """Forget what lies in the request's box, and reply once an epoch shows it.
-
-        The map as it was stays on disk, so that nothing is lost by mistake. Where sources have been
-        in the box is removed from ``trails``.
-
-        Raises:
-            RefusedError: the map as it is could not be kept, and was not reset.
-        """
-
-        def forget(mapper: Mapper) -> int:
-            mapper.reset(request.minimum, request.maximum)
-            if self.store is not None:
-                corners = request.minimum + mapper.origin, request.maximum + mapper.origin
-                self.store.scans.add_reset(*corners)
-            trails.forget(request.minimum, request.maximum)
-            return mapper.publish().number
-
-        emptied = self._mapper.call(lambda mapper: None if mapper.regions else forget(mapper))
-        if emptied is not None:
-            return ResetReply(emptied, undo="the map was empty before")
-        kept, undo = self._keep()
-        epoch = self._mapper.call(forget)
-        _log.warning("the map was reset as of epoch %d: %s", epoch, undo)
-        return ResetReply(epoch, kept, undo)
-
     def write(self, undoes: str = "", at_cut: Callable[[], None] = lambda: None) -> CheckpointInfo:
         """Write what changed since the last checkpoint, and return that one if nothing did.
 
@@ -187,15 +155,9 @@ class CheckpointWriter:
         """
         if self.store is None:
             raise StoreError(_NO_STORE)
-        with self.writing:
-            try:
-                return self._write(self.store, undoes, at_cut)
-            except Exception as error:
-                self._metrics = replace(self._metrics, failed=self._metrics.failed + 1)
-                if isinstance(error, StoreError):
-                    self.error = str(error)
-                    _log.error("%s", self.error)
-                raise
+        store = self.store
+        with self._told():
+            return self._write(store, undoes, at_cut)
 
     def keep_newest(self, undoes: str) -> CheckpointInfo:
         """Let the newest checkpoint stay as one that ``undoes`` something; write it if it is lost.
@@ -207,22 +169,33 @@ class CheckpointWriter:
             kept = None if self.store is None else self.store.keep_newest(undoes)
             return kept or self.write(undoes)
 
-    def _keep(self) -> tuple[int | None, str]:
-        """Write the map to a checkpoint that stays; return its epoch, and how to go back to it.
+    @contextmanager
+    def _told(self) -> Iterator[None]:
+        """Write to the store; who else writes waits, and the status tells of a failure."""
+        with self.writing:
+            try:
+                yield
+            except Exception as error:
+                self._metrics = replace(self._metrics, failed=self._metrics.failed + 1)
+                if isinstance(error, StoreError):
+                    self._mapper.stored(None)
+                    self.error = str(error)
+                    _log.error("%s", self.error)
+                raise
 
-        Raises:
-            RefusedError: it cannot be written.
-        """
-        if self.store is None or self.store.keep_resets == 0:
-            why = "store.keep_resets = 0" if self.store else "the server has no store"
-            return None, f"the map before was not kept: {why}"
-        try:
-            kept = self.write("a reset").epoch
-        except StoreError as error:
-            raise RefusedError(
-                "store", f"nothing was reset, for the map as it is could not be kept: {error}"
-            ) from error
-        return kept, way_back(kept)
+    def _let_regions_leave(self) -> None:
+        """Write the regions that wait for it to leave memory."""
+        store = self.store
+        if store is None:
+            return
+        with self._told():
+            try:
+                leaving = self._mapper.call(lambda mapper: mapper.snapshot_of_leaving())
+                changed = leaving.records(self._mapper.taken)
+                store.put(leaving.epoch.record(()), changed, leaving.facts)
+            except MemoryError as error:
+                raise StoreError(f"no region can leave memory: {NO_MEMORY}") from error
+            self._mapper.stored(store.regions.known)
 
     def _write(self, store: Store, undoes: str, at_cut: Callable[[], None]) -> CheckpointInfo:
         """Do as :meth:`write`; an error is not recorded yet."""
@@ -241,9 +214,9 @@ class CheckpointWriter:
                 self._saved_s = asked_s
                 return last
             started = time.monotonic()
-            record, regions = snapshot.record(), snapshot.regions
-            del snapshot  # the record has all of it, and memory is shortest now
-            info = store.write(record, regions, undoes)
+            changed = snapshot.records(self._mapper.taken)
+            info = store.write(snapshot.epoch.record(()), changed, snapshot.facts, undoes)
+            self._mapper.stored(store.regions.known)
         except MemoryError as error:
             raise StoreError(f"a checkpoint was not written: {NO_MEMORY}") from error
         self._survey_scans(store)
@@ -266,19 +239,23 @@ class CheckpointWriter:
             _log.warning("how far back poses can be corrected is not known: %s", error)
 
     def _write_regularly(self) -> None:
-        due_s = time.monotonic() + self._period_s
-        while not self._stopping.wait(max(0.0, due_s - time.monotonic())):
-            due_s = time.monotonic() + self._period_s  # from the beginning of one to the next
-            self._write_if_changed()
+        period_s = self._period_s or math.inf
+        due_s = time.monotonic() + period_s
+        while not self._stopping.wait(min(_LOOK_S, max(0.0, due_s - time.monotonic()))):
+            if self._mapper.progress.waits_for_store:
+                self._try(self._let_regions_leave)
+            if time.monotonic() >= due_s:
+                due_s = time.monotonic() + period_s  # from the beginning of one to the next
+                self._try(self.write)
 
-    def _write_if_changed(self) -> None:
+    def _try(self, write: Callable[[], object]) -> None:
         try:
-            self.write()
+            write()
         except (StoreError, MapperStoppedError):
             return  # the status and the log report it
         except Exception:
             self.error = "an internal error of the server; its log has the details"
-            _log.exception("a checkpoint met an internal error")
+            _log.exception("the store met an internal error")
 
     def _found_damaged(self, name: str) -> None:
         """Write all of the map again, if the newest checkpoint needs the file ``name``."""
@@ -287,4 +264,4 @@ class CheckpointWriter:
                 _log.warning(
                     "the newest checkpoint needs %s: all of the map is written again", name
                 )
-                self._write_if_changed()
+                self._try(self.write)

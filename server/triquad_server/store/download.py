@@ -6,11 +6,15 @@ from dataclasses import dataclass
 
 from triquad_format.errors import RefusedError
 from triquad_format.mapfile.writer import write_map
+from triquad_format.records.region import MapRecord
 from triquad_format.wire.messages import MapChunk, MapChunkRequest, MapInfo, MapInfoRequest
 from triquad_map.preview import previews_of
 
+from triquad_server.epochs.cold_region import ColdRegion
+from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.mapping.mapper_thread import MapperThread
+from triquad_server.settings import MemorySettings
 from triquad_server.store.store import stamp_now_ns
 
 CHUNK_BYTES = 2**20
@@ -27,8 +31,15 @@ class _MapBytes:
 class MapDownloads:
     """Serialises epochs on request; the files made last are kept."""
 
-    def __init__(self, mapper: MapperThread, epochs: EpochHistory, server: str = "") -> None:
-        """Make the handler; ``server`` is a name of this process."""
+    def __init__(
+        self,
+        mapper: MapperThread,
+        epochs: EpochHistory,
+        server: str = "",
+        max_bytes: int = MemorySettings().max_bytes,
+    ) -> None:
+        """Make the handler; ``server`` is a name of this process, which may take ``max_bytes``."""
+        self._max_bytes = max_bytes
         self._epochs = epochs
         self._server = server
         self._mapper = mapper
@@ -37,12 +48,12 @@ class MapDownloads:
     def info(self, request: MapInfoRequest) -> MapInfo:
         """Return size and digest of the newest epoch's file, which is made unless it is there."""
         newest = self._epochs.newest
+        self._check_size(newest)
         for file in tuple(self._files):
             if (file.info.epoch, file.training) == (newest.number, request.training):
                 return file.info
         if request.training:
-            snapshot = self._mapper.call(lambda mapper: mapper.snapshot_since(None))
-            record, newest = snapshot.record(), snapshot.epoch
+            record, newest = self._whole()
         else:
             record = newest.record()
         buffer, stamp_ns = io.BytesIO(), stamp_now_ns()
@@ -57,6 +68,27 @@ class MapDownloads:
         )
         self._files.append(_MapBytes(info, request.training, buffer.getvalue()))
         return info
+
+    def _check_size(self, epoch: Epoch) -> None:
+        """Raise :class:`RefusedError` for a map that is too large to be made a file in memory.
+
+        In a file regions have a fourth of the bytes that they take while they are mapped.
+        """
+        cold = (one for one in epoch.frozen_regions if isinstance(one, ColdRegion))
+        if sum(one.facts.memory_bytes for one in cold) > self._max_bytes:
+            raise RefusedError(
+                "too_large",
+                "the map is larger than the server's memory has room for: make a file of it where "
+                "its store is, by triquad-pack",
+            )
+
+    def _whole(self) -> tuple[MapRecord, Epoch]:
+        """Return the map with its training state, and its epoch."""
+        snapshot = self._mapper.call(lambda mapper: mapper.snapshot_since(None))
+        epoch = snapshot.epoch
+        live = snapshot.records(self._mapper.taken)
+        cold = (one.whole() for one in epoch.frozen_regions if isinstance(one, ColdRegion))
+        return epoch.record((*live, *cold)), epoch
 
     def chunk(self, request: MapChunkRequest) -> MapChunk:
         """Return bytes of a file, at most ``CHUNK_BYTES``.

@@ -22,8 +22,9 @@ from triquad_server.intake.pose_check import PoseCheck
 from triquad_server.intake.source_trails import SourceTrails
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
-from triquad_server.store.checkpoint_writer import CheckpointWriter, way_back
+from triquad_server.store.checkpoint_writer import CheckpointWriter
 from triquad_server.store.corrected_log import CorrectedLog, WantedPoses, corrected_log
+from triquad_server.store.resets import way_back
 from triquad_server.store.restore import regions_of
 from triquad_server.store.scan_reach import ScanReach
 from triquad_server.store.store import Store
@@ -101,9 +102,12 @@ class PoseCorrector:
 
     def _check_room(self, again: "_MapAgain") -> None:
         """Raise :class:`RefusedError` where there is no room for regions that are made again."""
-        used = self._mapper.progress.map.map_bytes
-        needed = self._mapper.call(lambda mapper: mapper.regions.bytes_of(again.touched))
-        if used + needed > self._max_bytes:
+
+        def lacking(mapper: Mapper) -> int:
+            needed = mapper.regions.all.bytes_of(again.touched)
+            return 0 if mapper.regions.room.has(needed) else needed
+
+        if needed := self._mapper.call(lacking):
             raise RefusedError(
                 "busy",
                 f"it takes another {needed / 1e6:.0f} MB for a while, and memory.max_bytes = "

@@ -1,7 +1,7 @@
 """Retention: which checkpoints of a map are kept, and what is deleted once one was written."""
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -65,8 +65,15 @@ def files_of(checkpoints: Iterable[StoredCheckpoint]) -> dict[str, int]:
     return files
 
 
-def delete_unneeded(folder: Path, settings: StoreSettings, newest: int | None = None) -> None:
+def delete_unneeded(
+    folder: Path,
+    settings: StoreSettings,
+    newest: int | None = None,
+    also_needed: Collection[str] = (),
+) -> None:
     """Delete unfinished files, checkpoints that need not stay, and parts that none names any more.
+
+    Parts that are ``also_needed`` stay, too, by their names.
 
     Without ``newest`` all checkpoints stay. Else those up to this epoch are counted and deleted: a
     file with a higher number is damaged, or not this server's, and must not push out a valid
@@ -86,7 +93,7 @@ def delete_unneeded(folder: Path, settings: StoreSettings, newest: int | None = 
             # Else a power cut could leave a checkpoint whose parts are deleted.
             sync_folder(folder)
         needed = files_of([*stored.values(), *aside])
-        unneeded_parts = parts.names() - needed.keys()
+        unneeded_parts = parts.names() - needed.keys() - set(also_needed)
     except (FormatError, OSError) as error:
         _log.warning("checkpoints and parts in %s stay, needed or not: %s", folder, error)
         return

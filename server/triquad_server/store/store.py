@@ -8,13 +8,13 @@ import dataclasses
 import hashlib
 import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.checkpoint_folder import (
-    NewParts,
     PartFiles,
     checkpoint_files,
     checkpoint_name,
@@ -22,11 +22,12 @@ from triquad_format.mapfile.checkpoint_folder import (
 )
 from triquad_format.mapfile.index import Checkpoint, Restored, read_checkpoint, write_checkpoint
 from triquad_format.mapfile.manifest import Entry, Manifest
-from triquad_format.mapfile.parts.pack import pack_region
 from triquad_format.mapfile.record_check import check_record
+from triquad_format.mapfile.region_facts import FactsByRegion
 from triquad_format.records.field_settings import RegionIndex
-from triquad_format.records.region import MapRecord
+from triquad_format.records.region import MapRecord, Region
 from triquad_format.wire.messages import CheckpointInfo
+from triquad_map.compiled.team import Split, in_one
 
 from triquad_server.errors import StoreError
 from triquad_server.settings import StoreSettings
@@ -34,23 +35,32 @@ from triquad_server.store.lock import StoreLock
 from triquad_server.store.restore import (
     ValidCheckpoint,
     check_countable,
+    maps_beside,
     newest_valid,
     valid_checkpoint,
 )
 from triquad_server.store.retention import delete_unneeded
 from triquad_server.store.scan_log import ScanLog
+from triquad_server.store.stored_regions import StoredRegions, write_regions
 
 _log = logging.getLogger(__name__)
-
-_FEATURE_DTYPE = "<f2"
-_MAPS_NAMED = 8  # maps of a store that are named where an epoch is not found
 
 
 class Store:
     """Manages the checkpoints of one map, for one thread; one server at a time locks the folder."""
 
-    def __init__(self, root: Path, map_name: str, settings: StoreSettings) -> None:
+    def __init__(
+        self,
+        root: Path,
+        map_name: str,
+        settings: StoreSettings,
+        shelf_bytes: int = 0,
+        split: Split = in_one,
+    ) -> None:
         """Lock ``root/map_name``, which is made if need be; delete unfinished files in it.
+
+        Regions that are read to answer questions take ``shelf_bytes``, and ``split`` shares the
+        work of it.
 
         Raises:
             StoreError: the folder cannot be written to, or another server has locked it.
@@ -58,6 +68,9 @@ class Store:
         self.folder = root / map_name
         self.keep_resets = settings.keep_resets
         self._newest: Manifest | None = None  # from which later ones take what did not change
+        self._facts: FactsByRegion | None = {}  # of its regions; None: it tells of none
+        self.regions = StoredRegions(self.folder, shelf_bytes, split)
+        self._is_whole = True  # of the newest; else what is in memory of it is written again
         self.restored: Restored | None = None  # the last time to an older checkpoint
         self._settings = settings
         # That the map takes in, from :meth:`log_scans` on.
@@ -96,7 +109,7 @@ class Store:
         there.
         """
         newest, info = self._newest, self.last
-        if newest is None or info is None:
+        if newest is None or info is None or not self._is_whole:
             return None
         try:
             data = Path(info.path).read_bytes()
@@ -116,16 +129,22 @@ class Store:
         self.last = None if newest is None else newest.info
         if newest is not None and newest.checkpoint is not None:
             self._newest = newest.checkpoint.manifest
+            self._facts = newest.regions
+            if self._facts is not None:
+                self.regions.put(newest.record, self._newest.of_regions(), self._facts)
             self.restored = newest.checkpoint.restored
         return newest
 
     def write(
-        self, record: MapRecord, regions: tuple[RegionIndex, ...], undoes: str = ""
+        self, record: MapRecord, changed: Iterable[Region], facts: FactsByRegion, undoes: str = ""
     ) -> CheckpointInfo:
         """Write a checkpoint of what changed since :attr:`base_epoch`; delete what need not stay.
 
-        ``record`` has the regions that changed, ``regions`` names all there are. One that
-        ``undoes`` something, such as a reset, stays for longer.
+        Args:
+            record: the map, without regions.
+            changed: the regions that changed; each is made when it is written.
+            facts: of all regions of the map.
+            undoes: what it undoes, such as a reset: it stays for longer. Empty: nothing.
 
         Raises:
             StoreError: it could not be written; the older ones are untouched.
@@ -133,7 +152,19 @@ class Store:
         path = self.folder / checkpoint_name(record.epoch)
         with self._writing(f"checkpoint {path} cannot be written"):
             check_record(record)
-            return self._write(self._manifest(record, regions), undoes)
+            written = self._parts_of(record, changed)
+            manifest = Manifest(record.facts, 0, self._entries(facts, written))
+            info = self._write(manifest, facts, undoes)
+            self.regions.put(record, written, facts, only=facts)
+            return info
+
+    def put(self, record: MapRecord, changed: Iterable[Region], facts: FactsByRegion) -> None:
+        """Write regions that are to leave memory; the next checkpoint names them.
+
+        Arguments and errors are those of :meth:`write`.
+        """
+        with self._writing(f"regions in {self.folder} cannot be written"):
+            self.regions.put(record, self._parts_of(record, changed), facts)
 
     def keep_newest(self, undoes: str) -> CheckpointInfo | None:
         """Let the newest checkpoint stay for longer, as one that ``undoes`` something.
@@ -147,17 +178,21 @@ class Store:
         if newest is None or self.base_epoch is None:
             return None
         with self._writing(f"epoch {newest.facts.epoch} cannot be kept"):
-            return self._write(newest, undoes)
+            return self._write(newest, self._facts, undoes)
 
     def forget_base(self, name: str) -> bool:
-        """Write all of the map next time, if the newest checkpoint needs the file ``name``."""
+        """Write what is in memory next time, if the newest checkpoint needs the file ``name``.
+
+        A region that is not in memory is taken from an older checkpoint.
+        """
         newest = self._newest
         if newest is None:
             return False
         names = {entry.name for entry in newest.entries}
         if name not in names | {checkpoint_name(newest.facts.epoch)}:
             return False
-        self._newest = None
+        self._is_whole = False
+        self.regions.mend(name)
         return True
 
     def restore(self, epoch: int) -> None:
@@ -170,7 +205,8 @@ class Store:
         Raises:
             StoreError: there is no such checkpoint, it is not valid, or it cannot be written again.
         """
-        with self._writing(f"epoch {epoch} cannot be restored", hint=self._maps_beside):
+        hint = partial(maps_beside, self.folder)
+        with self._writing(f"epoch {epoch} cannot be restored", hint):
             files = checkpoint_files(self.folder)
             newest = _readable(files[0].path) if files else None
             done = None if newest is None else newest.restored
@@ -185,12 +221,13 @@ class Store:
             if chosen.epoch == files[0].epoch:
                 return
             check_countable(files[0].path, files[0].epoch + 1)
-            again = self._manifest_again(valid_checkpoint(chosen), files[0].epoch + 1)
+            found = valid_checkpoint(chosen)
+            again = self._manifest_again(found, files[0].epoch + 1)
             if newest is not None:
                 marked = dataclasses.replace(newest, undoes=f"restoring epoch {epoch}")
                 write_checkpoint(files[0].path, marked)
             self.restored = Restored(epoch, again.facts.epoch)
-            self._write(again)
+            self._write(again, found.regions)
         _log.warning(
             "the map is that of epoch %d again, as epoch %d; what it was is kept as epoch %d",
             *(epoch, again.facts.epoch, files[0].epoch),
@@ -198,48 +235,53 @@ class Store:
 
     def _manifest_again(self, found: ValidCheckpoint, epoch: int) -> Manifest:
         """Return the list of a checkpoint's parts, all in the store, under another epoch."""
-        manifest = found.file.manifest
+        manifest, regions = found.manifest, found.record.regions
         if found.checkpoint is None:  # a map file: its parts are not in the store
-            indices = tuple(region.index for region in found.record.regions)
-            manifest = self._manifest(found.record, indices)
+            written = self._parts_of(found.record, regions)
+            manifest = dataclasses.replace(manifest, entries=self._entries(written, written))
         return dataclasses.replace(manifest, facts=dataclasses.replace(manifest.facts, epoch=epoch))
 
-    def _manifest(self, record: MapRecord, regions: tuple[RegionIndex, ...]) -> Manifest:
-        """Write the parts of a record that are not there yet; return the list of all, without time.
+    def _parts_of(
+        self, record: MapRecord, regions: Iterable[Region]
+    ) -> dict[RegionIndex, list[Entry]]:
+        """Write those parts of regions that are not there yet; return all of each."""
+        newest = self._newest if self._is_whole else None  # else what is there is looked at
+        before = {} if newest is None else newest.of_regions()
+        return write_regions(self.folder, record, regions, before)
 
-        Those of ``regions`` that are not in the record are in the newest checkpoint.
-        """
-        before: dict[RegionIndex, list[Entry]] = {}
-        for entry in self._newest.entries if self._newest else ():
-            before.setdefault(entry.key.region, []).append(entry)
-        changed = {region.index: region for region in record.regions}
-        new = NewParts(self.folder, record.epoch)
-        entries: list[Entry] = []
-        for index in regions:
-            if index not in changed:
-                entries += before[index]
-                continue
-            known = {entry.key: entry for entry in before.get(index, ())}
-            for part in pack_region(changed[index], record.settings, _FEATURE_DTYPE):
-                entries.append(new.add(part, known.get(part.key)))
-        new.commit()
-        return Manifest(record.facts, 0, tuple(entries))
+    def _entries(
+        self, indices: Iterable[RegionIndex], written: Mapping[RegionIndex, Sequence[Entry]]
+    ) -> tuple[Entry, ...]:
+        """Return the parts of regions: those that were written, else those that are there."""
+        newest = {} if self._newest is None else self._newest.of_regions()
+        known = {index: region.entries for index, region in self.regions.known.items()}
+        parts = {**newest, **known, **written}
+        return tuple(entry for index in indices for entry in parts[index])
 
-    def _write(self, manifest: Manifest, undoes: str = "") -> CheckpointInfo:
+    def _write(
+        self,
+        manifest: Manifest,
+        facts: FactsByRegion | None,
+        undoes: str = "",
+    ) -> CheckpointInfo:
         """Write the file that makes parts a checkpoint; then delete what need not stay."""
         path = self.folder / checkpoint_name(manifest.facts.epoch)
         manifest = dataclasses.replace(manifest, stamp_ns=stamp_now_ns())
-        written = write_checkpoint(path, Checkpoint(manifest, undoes, self.restored))
+        file = write_checkpoint(path, Checkpoint(manifest, undoes, self.restored, facts))
         info = CheckpointInfo(
             path=str(path),
-            bytes=written.bytes + manifest.stored_bytes,
-            epoch=written.epoch,
-            sha256=written.sha256,
+            bytes=file.bytes + manifest.stored_bytes,
+            epoch=file.epoch,
+            sha256=file.sha256,
             stamp_ns=manifest.stamp_ns,
         )
-        self._newest, self.last = manifest, info
-        delete_unneeded(self.folder, self._settings, info.epoch)
+        self._newest, self._facts, self._is_whole = manifest, facts, True
+        self.last = info
+        self._tidy(info.epoch)
         return info
+
+    def _tidy(self, newest: int | None = None) -> None:
+        delete_unneeded(self.folder, self._settings, newest, also_needed=self.regions.part_names)
 
     @contextmanager
     def _writing(self, failure: str, hint: Callable[[], str] = lambda: "") -> Iterator[None]:
@@ -252,20 +294,8 @@ class Store:
             self._lock.renew()
             yield
         except (FormatError, OSError) as error:
-            delete_unneeded(self.folder, self._settings)
+            self._tidy()
             raise StoreError(f"{failure}: {error}{hint()}") from error
-
-    def _maps_beside(self) -> str:
-        """Return which other maps of the store have checkpoints, where this one has none."""
-        try:
-            if checkpoint_files(self.folder):
-                return ""
-            folders = sorted(path for path in self.folder.parent.iterdir() if path.is_dir())
-            names = [path.name for path in folders if checkpoint_files(path)]
-        except OSError:
-            return ""
-        listed = ", ".join(names[:_MAPS_NAMED]) + (", ..." if len(names) > _MAPS_NAMED else "")
-        return f"; the store has checkpoints of {listed}: name the map by --map" if names else ""
 
 
 def _readable(path: Path) -> Checkpoint | None:

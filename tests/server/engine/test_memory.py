@@ -9,7 +9,7 @@ from triquad_server.engine.gradient_sums import GradientSums
 from triquad_server.engine.live_field import Batch, LiveField, Parameter, initial_field
 from triquad_server.engine.memory import Memory
 from triquad_server.engine.tensor_field import TensorMemory
-from triquad_server.epochs.epoch import buffers_of
+from triquad_server.epochs.buffers import buffers_of
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.process.threads import Teams
 

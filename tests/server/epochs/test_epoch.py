@@ -3,7 +3,8 @@ import pytest
 import torch
 from support.maps.small_world import mapper_of, settings, settled_mapper, world
 from triquad_map.composition.composed_view import RecordedView
-from triquad_server.epochs.epoch import Epoch, buffers_of
+from triquad_server.epochs.buffers import buffers_of
+from triquad_server.epochs.epoch import Epoch
 
 RNG = np.random.default_rng(0)
 

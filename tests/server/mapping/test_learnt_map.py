@@ -86,5 +86,5 @@ def test_a_place_left_behind_is_not_forgotten() -> None:
         for _ in range(10):
             mapper.train()
     settle(mapper)
-    assert mapper.rays_kept <= 75_000
+    assert mapper.regions.all.rays_kept <= 75_000
     assert surface_error(mapper.publish(), here) < before + 0.006

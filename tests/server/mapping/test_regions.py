@@ -111,10 +111,10 @@ def test_the_replay_pool_is_bounded_after_a_restart_and_after_a_reset() -> None:
     assert len(record.regions) > 1
     bounded = settings(pool_bytes=4000 * RAY_BYTES)
     restarted = Mapper("test", bounded, "cpu", record)
-    assert restarted.rays_kept <= 4000
+    assert restarted.regions.all.rays_kept <= 4000
     restarted.reset(np.array([5.0, -np.inf, -np.inf]), np.full(3, np.inf))
     take_in(restarted, *world(2).scans)
-    assert 1000 < restarted.rays_kept <= 4000
+    assert 1000 < restarted.regions.all.rays_kept <= 4000
 
 
 def test_all_regions_keep_as_many_rays_for_each_voxel_and_tell_what_they_discarded() -> None:
@@ -126,7 +126,7 @@ def test_all_regions_keep_as_many_rays_for_each_voxel_and_tell_what_they_discard
     densities = [rays / voxels for rays, voxels in sizes if voxels > 100]
     assert len(densities) > 1
     assert max(densities) < 1.2 * min(densities)
-    assert mapper.rays_kept <= 20_000
+    assert mapper.regions.all.rays_kept <= 20_000
     assert mapper.figures().rays_discarded > 20_000
 
 

@@ -17,7 +17,7 @@ from support.files.growing_store import (
     paths,
 )
 from support.maps.map_records import assert_same, random_record
-from triquad_format.errors import DamagedMapFileError, MapFileError
+from triquad_format.errors import DamagedMapFileError, MapFileError, RefusedError
 from triquad_format.mapfile.checkpoint_folder import PartFiles, checkpoint_files
 from triquad_format.mapfile.reader import open_manifest, read_map
 from triquad_format.mapfile.writer import write_map
@@ -64,7 +64,7 @@ def test_a_restarted_store_goes_on_from_the_newest(store, tmp_path):
         assert again.base_epoch is None
         restored = again.newest()
         assert restored is not None
-        assert_same(restored.record, records[3])
+        assert_same(read_map(restored.path), records[3])
         assert again.base_epoch == 3
         fourth = grown(4, 4, records[3], ROW[:1])
         info = again.write(*changes(fourth, ROW[:1]))
@@ -76,11 +76,11 @@ def test_a_backup_is_restored_and_gone_on_from(store):
     write_map(first, store.folder / "epoch-000000007.triquad")
     restored = store.newest()
     assert restored is not None
-    assert_same(restored.record, first)
+    assert_same(read_map(restored.path), first)
     assert store.base_epoch is None, "its parts are not in the store"
     store.write(*changes(grown(2, 8)))
     store.restore(7)
-    assert_same(store.newest().record, dataclasses.replace(first, epoch=9))
+    assert_same(read_map(store.newest().path), dataclasses.replace(first, epoch=9))
     assert store.base_epoch == 9
 
 
@@ -141,24 +141,75 @@ def test_another_part_under_a_name_is_found_out(store):
         read_map(paths(store)[2])
 
 
-@pytest.mark.parametrize("harm", [rot, Path.unlink], ids=["rotten", "missing"])
-def test_an_older_checkpoint_serves_where_a_part_of_the_newest_is_damaged(store, harm, caplog):
+def test_an_older_checkpoint_serves_where_the_newest_is_damaged(store, caplog):
     records = drive(store, 2)
-    part = part_of(paths(store)[3], ROW[3])
-    harm(part)
+    paths(store)[3].write_bytes(b"not a checkpoint")
     with caplog.at_level(logging.WARNING):
         restored = store.newest()
     assert restored is not None
-    assert_same(restored.record, records[2])
-    assert f"parts/{part.name}" in caplog.text
+    assert_same(read_map(restored.path), records[2])
     assert "epoch-000000002.checkpoint is used instead" in caplog.text
     store.write(*changes(records[3]))
     assert_same(read_map(paths(store)[3]), records[3])
 
 
+def test_where_all_parts_are_gone_a_checkpoint_is_damaged(store):
+    drive(store, 2)
+    for part in parts_of(paths(store)[3]) | parts_of(paths(store)[1]) | parts_of(paths(store)[2]):
+        part.unlink()
+    with pytest.raises(StoreError, match="all 3 checkpoints .* are damaged"):
+        store.newest()
+
+
+def test_no_part_of_a_region_is_read_before_it_is_asked_about(store, monkeypatch):
+    """So the start takes as long for any map."""
+    drive(store, 2)
+    monkeypatch.setattr(PartFiles, "payload", None)
+    restored = store.newest()
+    assert restored.record.regions == ()
+    assert store.regions.known.keys() == restored.regions.keys() == set(ROW)
+
+
+@pytest.mark.parametrize("harm", [rot, Path.unlink], ids=["rotten", "missing"])
+def test_a_region_is_read_from_an_older_checkpoint_where_a_part_is_damaged(store, harm, caplog):
+    """And the next checkpoint has it like that."""
+    records = drive(store, 3)
+    harm(part_of(paths(store)[4], ROW[3]))  # which changed in epoch 3
+    store.newest()
+    older, intact = (store.regions.known[index].whole() for index in (ROW[3], ROW[4]))
+    assert_same(older, records[2].regions[3])
+    assert_same(intact, records[4].regions[4])
+    assert f"region {ROW[3]} is used as of epoch 2 instead" in caplog.text
+    fifth = dataclasses.replace(records[4], epoch=5)
+    info = store.write(*changes(fifth, ROW[:1]))
+    regions = [older if one.index == ROW[3] else one for one in fifth.regions]
+    assert_same(read_map(info.path), dataclasses.replace(fifth, regions=tuple(regions)))
+
+
+def test_an_old_state_of_a_region_is_not_taken_for_a_newer_one(store):
+    records = drive(store, 1)
+    store.newest()
+    old = store.regions.known[ROW[2]]
+    store.write(*changes(grown(3, 3, records[2], ROW[2:3]), ROW[2:3]))
+    for entry in set(old.entries) - set(store.regions.known[ROW[2]].entries):
+        (store.folder / "parts" / entry.name).unlink()
+    with pytest.raises(RefusedError, match="epoch_gone"):
+        old.whole()
+
+
+def test_a_region_of_which_all_states_are_rotten_is_refused_by_name(store):
+    drive(store, 1)
+    rot(part_of(paths(store)[2], ROW[3]))  # of both checkpoints
+    store.newest()
+    with pytest.raises(RefusedError, match=r"region \(3, 0, 0\) cannot be read.*reset its box"):
+        store.regions.known[ROW[3]].whole()
+    assert store.regions.known[ROW[2]].evidence.levels.size
+
+
 def test_what_was_set_aside_can_still_be_recovered(store):
     records = drive(store, 2)
-    rot(part_of(paths(store)[3], ROW[3], "/triquad/region"))
+    part_of(paths(store)[3], ROW[3], "/triquad/region").unlink()
+    paths(store)[3].rename(f"{paths(store)[3]}.damaged")
     assert store.newest().record.epoch == 2
     for epoch in (4, 5):
         store.write(*changes(grown(epoch, epoch)))
@@ -174,7 +225,7 @@ def test_what_could_not_be_read_again_is_not_written(store, monkeypatch):
     before = sorted(store.folder.rglob("*"))
     manifests = [open_manifest(file) for file in checkpoint_files(store.folder)]
     most = max(sum(entry.size for entry in one.entries) for one in manifests) + 1000
-    monkeypatch.setattr("triquad_format.mapfile.manifest.MAX_MAP_BYTES", most)
+    monkeypatch.setattr("triquad_format.mapfile.index.MAX_CHECKPOINT_BYTES", most)
     larger = dataclasses.replace(random_record(3, indices=ROW, name="lab", points=300), epoch=3)
     message = f"000000003.checkpoint cannot be written: .* limit of {most} bytes"
     with pytest.raises(StoreError, match=message):

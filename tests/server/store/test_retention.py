@@ -108,14 +108,14 @@ def test_a_map_that_was_restored_can_be_restored_back(tmp_path, caplog):
     records = drive(store, 2)
     store.restore(1)
     restored = store.newest()
-    assert_same(restored.record, dataclasses.replace(records[1], epoch=4))
+    assert_same(read_map(restored.path), dataclasses.replace(records[1], epoch=4))
     assert restored.checkpoint.restored.epoch == 1
     assert parts_of(paths(store)[4]) == parts_of(paths(store)[1])
     store.restore(1)  # as a service does that is started again
     assert "to go back there again, use --restore 4" in caplog.text
     assert sorted(paths(store)) == [1, 2, 3, 4]
     store.restore(3)
-    assert_same(store.newest().record, dataclasses.replace(records[3], epoch=5))
+    assert_same(read_map(store.newest().path), dataclasses.replace(records[3], epoch=5))
     store.close()
 
 
@@ -128,4 +128,4 @@ def test_a_map_that_was_restored_can_be_restored_once_more(tmp_path, caplog):
         store.restore(1)
         assert "to go back there again, use --restore 3" in caplog.text
         store.restore(3)
-        assert_same(store.newest().record, dataclasses.replace(records[1], epoch=8))
+        assert_same(read_map(store.newest().path), dataclasses.replace(records[1], epoch=8))

@@ -17,7 +17,7 @@ from triquad_server.store.store import Store
 
 
 def record(epoch):
-    return MapRecord("lab", epoch, servers.SMALL.field, ()), ()
+    return MapRecord("lab", epoch, servers.SMALL.field, ()), (), {}
 
 
 @pytest.fixture
@@ -76,7 +76,7 @@ def test_a_valid_checkpoint_that_cannot_be_read_now_is_not_demoted(store, monkey
     def fail(path):
         raise error
 
-    monkeypatch.setattr(restore, "read_map_file", fail)
+    monkeypatch.setattr(restore, "read_checkpoint", fail)
     with pytest.raises(StoreError, match="000000002.checkpoint cannot be read"):
         store.newest()
     assert names(store) == before

@@ -47,7 +47,7 @@ def test_whenever_the_writer_is_killed_all_that_was_acknowledged_is_there(tmp_pa
         epoch = restored.record.epoch if restored else 0
         assert epoch >= acknowledged
         if restored:
-            assert_same(restored.record, record_at(epoch))
+            assert_same(read_map(restored.path), record_at(epoch))
     assert epoch >= KILLS
     older = files[:KEPT]
     assert len(older) == KEPT

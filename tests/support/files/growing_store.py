@@ -6,6 +6,7 @@ from functools import cache, partial
 from support.maps.map_records import random_record
 from triquad_format.mapfile.checkpoint_folder import PartFiles, checkpoint_files
 from triquad_format.mapfile.reader import read_map_file
+from triquad_format.mapfile.region_facts import RegionFacts
 from triquad_format.records.field_settings import RegionIndex
 
 ROW: tuple[RegionIndex, ...] = tuple((x, 0, 0) for x in range(6))
@@ -27,8 +28,8 @@ def grown(seed, epoch, before=None, only=ROW):
 def changes(record, only=ROW):
     """What the mapper hands over where the regions ``only`` changed."""
     changed = tuple(region for region in record.regions if region.index in only)
-    indices = tuple(region.index for region in record.regions)
-    return dataclasses.replace(record, regions=changed), indices
+    facts = {region.index: RegionFacts(1, 1, 0, 0, 0, 1000) for region in record.regions}
+    return record.facts, changed, facts
 
 
 def drive(store, epochs, rows=ROW):

@@ -109,7 +109,7 @@ def test_the_page_tells_rates_counts_and_times_on_any_width(width):
     [
         ({}, {"problem": "mapping makes no progress"}, "mapping makes no progress"),
         ({}, {"queues": {"scans": QueueMetrics(10, 10)}}, "the queue of scans is full"),
-        ({"map_bytes": 95, "map_max_bytes": 100}, {}, "the map nears 100 B"),
+        ({"memory_bytes": 95, "map_max_bytes": 100}, {}, "memory nears 100 B"),
         ({"warnings": (CAUSE,)}, {}, CAUSE[:60]),
         ({"scans_dropped": {"empty": 2}}, {}, "scans refused: empty, 2.00 a second"),
         ({"scans_lost": {"roof": 3, "camera": 12}}, {}, "scans lost of: roof, 3.00 a second"),

@@ -117,8 +117,9 @@ def problems(sample: Sample) -> Iterator[str]:
     for name, queue in metrics.queues.items():
         if queue.waiting >= queue.limit > 0:
             yield f"the queue of {name} is full: {count(queue.waiting)} wait"
-    if status.map_bytes >= _NEARLY_FULL * status.map_max_bytes > 0:
-        yield f"the map nears {size(status.map_max_bytes)}: beyond, scans are refused"
+    most = status.map_max_bytes
+    if status.memory_bytes >= _NEARLY_FULL * most > 0 and status.regions_cold == 0:
+        yield f"memory nears {size(most)}: beyond, scans are refused where regions cannot leave it"
     ages_s = {name: source.age_s for name, source in metrics.sources.items()}
     for name, age_s in ages_s.items():
         if age_s >= _SILENT_S > min(ages_s.values()):
@@ -173,7 +174,9 @@ def _rows(sample: Sample) -> Iterator[Sequence[str]]:
         if queue.waiting:
             yield f"queue of {name}", f"{count(queue.waiting)} of {count(queue.limit)}"
     yield "memory of process", size(status.memory_bytes)
-    yield "memory of map", size(status.map_bytes)
+    for name, nbytes in status.memory_parts.items():
+        if nbytes:
+            yield f"memory of {name}", size(nbytes)
 
 
 def _times(sample: Sample, name: str) -> Iterator[str]:
