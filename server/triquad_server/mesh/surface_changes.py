@@ -12,7 +12,6 @@ from triquad_format.records.arrays import Bools, Doubles, Floats, Ints, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings, RegionIndex
 from triquad_map.compiled.team import Team
 from triquad_map.evidence.evidence import FrozenEvidence
-from triquad_map.field.frozen_field import FrozenField
 from triquad_map.surface import MARGIN_STEP
 from triquad_map.surfels.ray_planes import ShownField
 from triquad_map.surfels.surfel_tree import surfel_voxels
@@ -24,8 +23,6 @@ from triquad_server.epochs.epoch import EpochRegion, FrozenRegion
 _log = logging.getLogger(__name__)
 
 _KEY_BITS = 20  # bits of each coordinate of a voxel, or of a group, in its region
-
-RegionField = FrozenField | ShownField
 
 _NO_PLACES = np.zeros((0, 3))
 
@@ -58,7 +55,7 @@ class _Recorded:
     """The surface of a region when its changes were last reported."""
 
     centre: Doubles  # [3] of the region, map frame
-    field: RegionField
+    field: ShownField
     evidence: FrozenEvidence
     voxels: _Voxels
     offsets: Floats  # [V] metres from each voxel's centre to the surface
@@ -195,7 +192,7 @@ class SurfaceChanges:
         corner = centre - self._settings.region_side_m / 2
         return corner + (_cells(keys) + 0.5) * self._settings.leaf_m
 
-    def _offsets(self, centre: Doubles, field: RegionField, keys: Longs) -> Floats:
+    def _offsets(self, centre: Doubles, field: ShownField, keys: Longs) -> Floats:
         """Return the distance [V] from voxel centres to the surface, a voxel at most.
 
         Farther surfaces are in other voxels.
