@@ -209,8 +209,8 @@ def _open_store(
     if options.store is None:
         return None
     settings, root = options.settings, options.store
-    shelf_bytes = settings.memory.shelf_bytes
-    store = Store(root, options.map_name, settings.store, shelf_bytes, teams.answer)
+    cache_bytes = settings.memory.cache_bytes
+    store = Store(root, options.map_name, settings.store, cache_bytes, teams.answer)
     stack.enter_context(closing(store))
     if options.restore is not None:
         starting(f"taking the map back to epoch {options.restore}")

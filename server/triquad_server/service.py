@@ -123,8 +123,8 @@ class Service:
         memory.add("older epochs", lambda: self._epochs.older_bytes)
         memory.add("mesh tiles", lambda: tiles.nbytes)
         if self._store is not None:
-            shelf = self._store.regions.shelf
-            memory.add("regions read to answer", lambda: shelf.bytes)
+            cache = self._store.regions.cache
+            memory.add("regions read to answer", lambda: cache.bytes)
 
     def _announce(self, health: Health) -> None:
         """Say that the server is there, until it closes."""

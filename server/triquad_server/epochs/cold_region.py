@@ -39,18 +39,18 @@ class ColdRegion:
     facts: RegionFacts
     epoch: int  # of the checkpoint: it has not changed since
     entries: tuple[Entry, ...]  # of its parts; of older ones, where one was found damaged
-    shelf: "RegionShelf"
+    cache: "RegionCache"
     reading: threading.Lock = field(default_factory=threading.Lock)
 
     @property
     def field(self) -> FrozenField:
         """Its field, as the parts have it."""
-        return self.shelf.get(self).field
+        return self.cache.get(self).field
 
     @property
     def evidence(self) -> FrozenEvidence:
         """The space that rays have shown of it."""
-        return self.shelf.get(self).evidence
+        return self.cache.get(self).evidence
 
     @property
     def newest_s(self) -> int:
@@ -74,24 +74,24 @@ class ColdRegion:
 
     def surfels_between(self, low: Doubles, high: Doubles) -> Sequence[SurfelMap]:
         """Return the surfels that may lie between two corners [3], map frame, and some around."""
-        return self.shelf.get(self).surfels_between(low, high)
+        return self.cache.get(self).surfels_between(low, high)
 
     def read_evidence(self) -> FrozenEvidence:
         """Read the space that rays have shown of it alone: a seventh of the time of all."""
-        record = self.shelf.read(self, (REGION, EVIDENCE))
+        record = self.cache.read(self, (REGION, EVIDENCE))
         side = 1 << record.settings.depth
         return FrozenEvidence.from_record(side, record.regions[0].evidence)
 
     def record(self) -> Region:
         """Return the region as a map file holds it, without training state."""
-        return self.shelf.read(self, FIELD_TOPICS).regions[0]
+        return self.cache.read(self, FIELD_TOPICS).regions[0]
 
     def whole(self) -> Region:
         """Return the region with its training state."""
-        return self.shelf.read(self, REGION_TOPICS).regions[0]
+        return self.cache.read(self, REGION_TOPICS).regions[0]
 
 
-class RegionShelf:
+class RegionCache:
     """Keeps regions that were read lately; those asked about longest ago give way."""
 
     def __init__(self, read: ReadParts, limit: int, split: Split) -> None:

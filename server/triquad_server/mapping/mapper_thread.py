@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from enum import Enum
-from typing import TypeVar
 
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.wire.codec import moved
@@ -25,7 +24,7 @@ from triquad_server.errors import (
 )
 from triquad_server.intake.rays import ScanRays
 from triquad_server.intake.scan_queue import ScanQueue
-from triquad_server.mapping.commands import Commands
+from triquad_server.mapping.commands import Commands, ResultT
 from triquad_server.mapping.live_region import OwedCopy, RegionSnapshot
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.progress import Progress
@@ -44,8 +43,6 @@ _SCANS_SHARE = 6.0
 """The time for which scans are taken in where many wait, as a multiple of what all else took. While
 three clients ask for too much, a lidar loses 2 to 8 of 100 scans with 2, and none to 4 with 6
 (``make bench PART=server``)."""
-
-ResultT = TypeVar("ResultT")
 
 
 class _Phase(Enum):

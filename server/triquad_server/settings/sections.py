@@ -282,7 +282,7 @@ class MemorySettings(BaseModel):
         return self.max_bytes // 10
 
     @property
-    def shelf_bytes(self) -> int:
+    def cache_bytes(self) -> int:
         """What regions may take that were read to answer: of 2 GB, six of 205 m of a street."""
         return self.max_bytes // 8
 

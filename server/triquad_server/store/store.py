@@ -54,12 +54,12 @@ class Store:
         root: Path,
         map_name: str,
         settings: StoreSettings,
-        shelf_bytes: int = 0,
+        cache_bytes: int = 0,
         split: Split = in_one,
     ) -> None:
         """Lock ``root/map_name``, which is made if need be; delete unfinished files in it.
 
-        Regions that are read to answer questions take ``shelf_bytes``, and ``split`` shares the
+        Regions that are read to answer questions take ``cache_bytes``, and ``split`` shares the
         work of it.
 
         Raises:
@@ -69,7 +69,7 @@ class Store:
         self.keep_resets = settings.keep_resets
         self._newest: Manifest | None = None  # from which later ones take what did not change
         self._facts: FactsByRegion | None = {}  # of its regions; None: it tells of none
-        self.regions = StoredRegions(self.folder, shelf_bytes, split)
+        self.regions = StoredRegions(self.folder, cache_bytes, split)
         self._is_whole = True  # of the newest; else what is in memory of it is written again
         self.restored: Restored | None = None  # the last time to an older checkpoint
         self._settings = settings

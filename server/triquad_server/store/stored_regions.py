@@ -16,7 +16,7 @@ from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.region import MapRecord, Region
 from triquad_map.compiled.team import Split
 
-from triquad_server.epochs.cold_region import ColdRegion, RegionShelf
+from triquad_server.epochs.cold_region import ColdRegion, RegionCache
 
 _log = logging.getLogger(__name__)
 
@@ -30,12 +30,12 @@ class StoredRegions:
     checkpoint names it.
     """
 
-    def __init__(self, folder: Path, shelf_bytes: int, split: Split) -> None:
-        """Begin with none; of those that are read, ``shelf_bytes`` stay in memory."""
+    def __init__(self, folder: Path, cache_bytes: int, split: Split) -> None:
+        """Begin with none; of those that are read, ``cache_bytes`` stay in memory."""
         self._folder = folder
         self._parts = PartFiles(folder)
         self._map = MapRecord("none", 0, FieldSettings(), ())  # without regions
-        self.shelf = RegionShelf(self._read, shelf_bytes, split)
+        self.cache = RegionCache(self._read, cache_bytes, split)
         self.known: Mapping[RegionIndex, ColdRegion] = {}
 
     @property
@@ -58,13 +58,13 @@ class StoredRegions:
         centre = record.settings.region_centre
         written = {
             index: ColdRegion(
-                index, centre(index), facts[index], record.epoch, tuple(entries), self.shelf
+                index, centre(index), facts[index], record.epoch, tuple(entries), self.cache
             )
             for index, entries in parts.items()
         }
         known = {**self.known, **written}
         self.known = known if only is None else {i: r for i, r in known.items() if i in only}
-        self.shelf.drop_all_but(self.known)
+        self.cache.drop_all_but(self.known)
 
     def mend(self, name: str) -> None:
         """Take older parts of a region whose part ``name`` is damaged, if there are any."""

@@ -17,7 +17,7 @@ from triquad_format.errors import RefusedError
 from triquad_format.records.region import MapRecord
 from triquad_format.records.status import Status
 from triquad_map.compiled.team import in_one
-from triquad_server.epochs.cold_region import ColdRegion, RegionShelf
+from triquad_server.epochs.cold_region import ColdRegion, RegionCache
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.surface_history import CHANGES_KEPT, SurfaceHistory
 from triquad_server.errors import NoRoomYetError, ScanRefusedError
@@ -26,7 +26,7 @@ from triquad_server.settings import MemorySettings, StoreSettings
 from triquad_server.store.store import Store
 
 APART_M = 60.0  # places, of which each is in a region of its own
-SHELF_BYTES = 100_000_000
+CACHE_BYTES = 100_000_000
 LITTLE_BYTES = 12_000_000  # room for two places
 NOWHERE = np.full(3, -np.inf), np.full(3, np.inf)
 
@@ -37,7 +37,7 @@ class KeptMap:
     def __init__(self, folder: Path, max_bytes: int = 10**9) -> None:
         memory = MemorySettings(max_bytes=max_bytes)
         chosen = settings().model_copy(update={"memory": memory})
-        self.store = Store(folder, "test", StoreSettings(), SHELF_BYTES)
+        self.store = Store(folder, "test", StoreSettings(), CACHE_BYTES)
         newest = self.store.newest()
         record = None if newest is None else newest.record
         self.mapper = Mapper("test", chosen, "cpu", record, cold=self.store.regions.known)
@@ -257,7 +257,7 @@ def test_a_copy_that_nobody_waits_for_any_more_holds_up_nothing(kept: KeptMap) -
     assert kept.mapper.regions.next_to_learn
 
 
-def test_a_shelf_keeps_to_its_bytes_and_reads_each_region_once(kept: KeptMap) -> None:
+def test_a_cache_keeps_to_its_bytes_and_reads_each_region_once(kept: KeptMap) -> None:
     kept.visit(0, 1, 2)
     kept.checkpoint()
     kept.leave()
@@ -266,9 +266,9 @@ def test_a_shelf_keeps_to_its_bytes_and_reads_each_region_once(kept: KeptMap) ->
 
     def read(region: ColdRegion, topics: Collection[str]) -> MapRecord:
         reads.append(region)
-        return regions.shelf.read(region, topics)
+        return regions.cache.read(region, topics)
 
-    counted = RegionShelf(read, 10**9, in_one)
+    counted = RegionCache(read, 10**9, in_one)
     index, *_ = regions.known
     region = regions.known[index]
     begin = threading.Barrier(6)
@@ -281,7 +281,7 @@ def test_a_shelf_keeps_to_its_bytes_and_reads_each_region_once(kept: KeptMap) ->
         got = list(threads.map(ask, range(6)))
     assert len({id(one) for one in got}) == 1
     assert len(reads) == 1
-    small = RegionShelf(regions.shelf.read, 1, in_one)
+    small = RegionCache(regions.cache.read, 1, in_one)
     for one in regions.known.values():
         small.get(one)
     assert 0 < small.bytes < counted.bytes * len(regions.known), "the one read last alone"
