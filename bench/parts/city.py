@@ -18,21 +18,18 @@ import numpy as np
 from triquad_client import Client, connect
 from triquad_format.records.arrays import Doubles
 from triquad_tools.console.progress import progress
-from triquad_tools.evaluation.metrics import ScoreSettings, score_mesh
-from triquad_tools.recordings.cloud import merged
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive
-from triquad_tools.simulation.scene import Scene
 from triquad_tools.simulation.street import street_drive
 
 from bench.clients.served import MAP, around
 from bench.clients.server_process import ServerProcess, server_process
 from bench.figures import Figure
+from bench.street_pieces import PIECE_M, REACH_M, mean_f_score
 
 _STEP_M, _RATE_HZ = 2.0, 5.0
 _SENSOR = Lidar(columns=720)
-_REACH_M = 60.0  # beyond a place, for what is seen from there
-_SCORED_M, _PIECE_M = 1000.0, 200.0  # of the way, and of it at once
-_VOXEL_M = 0.05
+_SCORED_M = 1000.0  # of the way: a piece of it each 200 m
+_EACH_M = 200.0
 _MOST_WAITING = 16  # scans, before the car waits
 _SHARE = 0.1  # of the way, at its start and its end, for the time that scans take
 _PLACES = 100
@@ -121,9 +118,10 @@ def _watched(server: ServerProcess) -> Iterator[_Peak]:
 
 def _driven(way: _Way, drive: SimulatedDrive, client: Client) -> list[Figure]:
     """Drive all of a way; return how it went."""
-    scored_m = min(_SCORED_M, way.length_m - 2 * _REACH_M)
+    scored_m = min(_SCORED_M, way.length_m - 2 * REACH_M)
     last, tenth = len(drive), int(_SHARE * len(drive))
-    seen = int((scored_m + _REACH_M) / _STEP_M)
+    pieces = np.arange(0.0, scored_m - PIECE_M, _EACH_M).tolist()
+    seen = int((scored_m + REACH_M) / _STEP_M)
     scans_s: dict[int, float] = {}  # that scans had taken, by the number of scans
     f_driven = float("nan")
     with progress(f"driving {way.name}", last) as report:
@@ -139,12 +137,12 @@ def _driven(way: _Way, drive: SimulatedDrive, client: Client) -> list[Figure]:
                 client.flush(_TIMEOUT_S)
                 scans_s[number] = client.metrics().mapper_s["scans"]
             if number == seen:
-                f_driven = _f_score(drive, client, scored_m)
+                f_driven = mean_f_score(drive, client.mesh, pieces)
             report(number, f"{number * _STEP_M:.0f} m")
     flushed = client.flush(_TIMEOUT_S)
     at_end_s = client.metrics().mapper_s["scans"]
     status, metrics = client.status(), client.metrics()
-    f_at_end = _f_score(drive, client, scored_m)
+    f_at_end = mean_f_score(drive, client.mesh, pieces)
     first = scans_s[tenth] / (tenth + 1)
     end = (at_end_s - scans_s[last - tenth]) / (tenth - 1)
     lost = len(drive) - flushed.taken
@@ -161,41 +159,10 @@ def _driven(way: _Way, drive: SimulatedDrive, client: Client) -> list[Figure]:
     ]
 
 
-def _f_score(drive: SimulatedDrive, client: Client, length_m: float) -> float:
-    """Return the mean F-score of the way's first pieces."""
-    scores = []
-    for first_m in np.arange(0.0, length_m - 1.0, _PIECE_M):
-        scene = _piece(drive.scene, first_m)
-        scans = range(
-            max(0, int((first_m - _REACH_M) / _STEP_M)),
-            min(len(drive), int((first_m + _PIECE_M + _REACH_M) / _STEP_M)),
-        )
-        low, high = scene.bounds
-        hits = (drive.scan(number).true_hits for number in scans)
-        inside = (some[((some >= low) & (some <= high)).all(axis=1)] for some in hits)
-        visible = merged(inside, _VOXEL_M)
-        mesh = client.mesh(scene.box)
-        scores.append(score_mesh(mesh, visible, ScoreSettings(), scene.sdf).f_score)
-    return statistics.mean(scores)
-
-
-def _piece(scene: Scene, first_m: float) -> Scene:
-    """Return a piece of a street, with what is around it."""
-    low, high = scene.bounds.copy()
-    low[0], high[0] = first_m, first_m + _PIECE_M
-    solids = tuple(
-        solid
-        for solid in scene.solids
-        if low[0] - _REACH_M < solid.centre[0] + solid.bound_m
-        and solid.centre[0] - solid.bound_m < high[0] + _REACH_M
-    )
-    return Scene(solids, np.array([low, high]))
-
-
 def _cold(way: _Way, drive: SimulatedDrive, client: Client) -> list[Figure]:
     """Return how soon places are answered that nobody asked about since the start."""
     rng = np.random.default_rng(0)
-    count = min(_PLACES, int(way.length_m / _PIECE_M))
+    count = min(_PLACES, int(way.length_m / _EACH_M))
     numbers = np.linspace(0, len(drive) - 1, count + 2).astype(int)[1:-1]
     rng.shuffle(numbers)
     first, again = [], []

@@ -128,6 +128,8 @@ class AsyncClient(AsyncMapQueries):
     correct_poses = awaited(Client.correct_poses)
     download_map = awaited(Client.download_map)
     maps = awaited(Client.maps)
+    create_map = awaited(Client.create_map)
+    drop_map = awaited(Client.drop_map)
 
     @property
     def map_name(self) -> str:

@@ -82,6 +82,8 @@ def _exit_code(options: argparse.Namespace) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     require_libraries()
+    from triquad_format.wire.keys import DEFAULT_MAP
+
     from triquad_server.launch_options import LaunchOptions
     from triquad_server.network import NetworkOptions
     from triquad_server.process.stop import Stop, Stops
@@ -101,7 +103,7 @@ def _run(options: argparse.Namespace) -> int:
         multicast_scouting=options.multicast_scouting,
     )
     launch = LaunchOptions(
-        map_name=options.map,
+        map_names=tuple(options.map) or (DEFAULT_MAP,),
         network=network,
         settings=settings,
         store=options.store,
@@ -143,7 +145,13 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("--map", default="default", metavar="NAME", help="name of the map (default: default)")
+    add(
+        "--map",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="name of a map, repeatable (default: default)",
+    )
     add(
         "--store",
         type=Path,

@@ -100,7 +100,7 @@ class Server:
     def __init__(self, options: "LaunchOptions") -> None:
         """Start a server, and return once it has started; use :func:`serve` instead."""
         (self.endpoint,) = options.network.listen
-        self.map_name = options.map_name
+        self.map_name = options.map_names[0]
         self._clients: weakref.WeakSet[Client] = weakref.WeakSet()
         self._run = _Run()
         self._ask_to_stop = weakref.finalize(self, self._run.stops.put, Stop.ASKED)
@@ -197,7 +197,7 @@ def serve(
     folder = None if store is None else Path(store)
     with _free_endpoint() if listen is None else nullcontext(full_endpoint(listen)) as endpoint:
         network = NetworkOptions(listen=(endpoint,))
-        options = LaunchOptions(map, network, loaded, store=folder, device=device, restore=restore)
+        options = LaunchOptions((map,), network, loaded, folder, device, restore)
         return Server(options)
 
 

@@ -2,32 +2,29 @@
 
 import gc
 import logging
-import math
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from typing import TYPE_CHECKING
 
 import zenoh
 from triquad_format.errors import SettingsError
-from triquad_format.records.region import MapRecord
 from triquad_format.wire import codec, keys
 from triquad_format.wire.messages import ErrorReply
 
+from triquad_server.errors import StoreError
 from triquad_server.launch_options import LaunchOptions
-from triquad_server.mapping.mapper import Mapper
+from triquad_server.maps import Maps, created_maps
 from triquad_server.network import Configuration, configuration, open_session
 from triquad_server.process.installed import check_device
-from triquad_server.process.memory_parts import MemoryParts
+from triquad_server.process.memory_share import ServerMemory
 from triquad_server.process.resources import allow_open_files, give_back_early, resident_bytes
 from triquad_server.process.service_manager import ServiceManager
 from triquad_server.process.stop import Stop, Stops, wait_for_stop
 from triquad_server.process.threads import Teams
-from triquad_server.service import Service
 from triquad_server.settings import Settings
-from triquad_server.store.restore import ValidCheckpoint
-from triquad_server.store.store import Store
+from triquad_server.store.found_map import FoundMap, find_map
 from triquad_server.warm_up import Report, warm_up
 
 if TYPE_CHECKING:
@@ -38,11 +35,6 @@ _log = logging.getLogger("triquad_server")
 _SWITCH_INTERVAL_S = 0.0005
 """The time for which a thread may keep the interpreter while another waits: a query is to be
 answered in a few milliseconds, which is Python's default for a single turn."""
-
-
-_LATER_BYTES = 50_000_000  # of the program, for what it loads and buffers once it serves
-
-_LEAST_ROOM_BYTES = 150_000_000  # for a map: 100 m of a street
 
 
 class StoppedEarlyError(Exception):
@@ -63,14 +55,13 @@ def run_server(options: LaunchOptions, stops: Stops) -> Stop:
         _log.warning("no --store: the map is not kept when the server stops")
     manager = ServiceManager()
     try:
-        with opened(options, stops, manager.starting, owns_process=True) as service:
+        with opened(options, stops, manager.starting, owns_process=True) as maps:
             # A quarter of a million objects, most of them numba's, stay: a collection that goes
             # through them stops all threads for a tenth of a second.
             gc.collect()
             gc.freeze()
-            health = service.health
-            manager.notify("READY=1", status=health.summary())
-            why = wait_for_stop(stops, lambda: manager.serving(health.summary, health.stuck))
+            manager.notify("READY=1", status=maps.summary())
+            why = wait_for_stop(stops, lambda: manager.serving(maps.summary, maps.stuck))
             manager.stopping()
     except StoppedEarlyError:
         why = stops.get()
@@ -96,8 +87,8 @@ def opened(
     starting: Report = lambda _: None,
     *,
     owns_process: bool = False,
-) -> Iterator[Service]:
-    """Yield a server; after the context, it has written a last checkpoint and is closed.
+) -> Iterator[Maps]:
+    """Yield a server; after the context, it has written last checkpoints and is closed.
 
     Signals, and what else belongs to the process as a whole, are left as they are.
 
@@ -122,74 +113,74 @@ def opened(
 
 def _open(
     options: LaunchOptions, stops: Stops, starting: Report, stack: ExitStack, *, owns_process: bool
-) -> Service:
+) -> Maps:
     """Open all parts of a server, to be closed by ``stack``."""
     check_device(options.device)
     settings = options.settings
-    network = configuration(options.network, options.map_name, settings)
+    network = configuration(options.network, settings)
     monitoring = _open_monitoring(settings, stack)
     session = stack.enter_context(closing(open_session(network)))
-    with closing(StartingNotice(session, options.map_name)) as notice:
+    created = [] if options.store is None else created_maps(options.store, options.map_names[0])
+    names = tuple(dict.fromkeys([*options.map_names, *created]))
+    with closing(StartingNotice(session, names)) as notice:
 
         def begins(stage: str) -> None:
             notice.stage = stage
             starting(stage)
 
         teams = stack.enter_context(closing(Teams()))
-        store = _open_store(options, begins, stack, teams)
-        before = resident_bytes()
-        restored, settings = _restored(store, options, begins)
-        restored_bytes = resident_bytes() - before  # of the map, where it is read whole
-        warm_up(settings, options.device, teams, _before_each_step(stops, begins))
+        before, memory = resident_bytes(), ServerMemory(settings.memory.max_bytes)
+        begins("restoring the newest checkpoint")
+        found = _found(names, options, memory, teams, stack)
+        restored_bytes = resident_bytes() - before  # of maps that are read whole
+        for own in {one.settings.field: one.settings for one in found}.values():
+            warm_up(own, options.device, teams, _before_each_step(stops, begins))
         begins("opening the map")
-        program = resident_bytes() - restored_bytes if owns_process else 0
-        parts = _memory_parts(settings, program)
-        record = None if restored is None else restored.record
-        del restored
-        cold = {} if store is None else store.regions.known
-        mapper = Mapper(
-            options.map_name, settings, options.device, record, teams, cold=cold, beside=parts.total
-        )
-        if store is not None:
-            store.log_scans(settings.field.leaf_m)
-        service = Service(session, mapper, settings, store, parts, failed=stops.put)
-        stack.enter_context(closing(service))
+        if owns_process:
+            memory.count_program(resident_bytes() - restored_bytes)
+        memory.check(len(options.map_names))
+        maps = Maps(session, options, teams, memory, failed=stops.put)
+        stack.enter_context(closing(maps))
+        maps.begin(found)
     if monitoring is not None:
-        stack.enter_context(monitoring.showing(service.health))
+        stack.enter_context(monitoring.showing(lambda: maps.healths))
     _log_who_gets_in(network)
-    _log_ready(options, network, service.epoch)
-    return service
+    _log_ready(options, network, maps)
+    return maps
 
 
-def _restored(
-    store: Store | None, options: LaunchOptions, starting: Report
-) -> tuple[ValidCheckpoint | None, Settings]:
-    """Return the newest checkpoint, if there is one, and the settings that hold for its map."""
-    if store is None:
-        return None, options.settings
-    starting("restoring the newest checkpoint")
-    restored = store.newest()
-    if restored is None:
-        return None, options.settings
-    _log.info("restoring epoch %d from %s", restored.record.epoch, restored.path)
-    return restored, _settings_of(restored.record, options)
+def _found(
+    names: Sequence[str],
+    options: LaunchOptions,
+    memory: ServerMemory,
+    teams: Teams,
+    stack: ExitStack,
+) -> list[FoundMap]:
+    """Find the maps of a server, to be closed by ``stack``.
 
-
-def _memory_parts(settings: Settings, program: int) -> MemoryParts:
-    """Return what takes memory besides the map: of a process of its own, the ``program`` as well.
-
-    Raises:
-        SettingsError: it leaves no room for a map.
+    One that a client has created, and that cannot be opened, does not keep the others from it.
     """
-    if not program:
-        return MemoryParts()
-    most, least = settings.memory.max_bytes, program + _LATER_BYTES + _LEAST_ROOM_BYTES
-    if most < least:
-        raise SettingsError(
-            f"memory.max_bytes = {most}: the program alone takes {program / 1e6:.0f} MB; give the "
-            f"server at least {math.ceil(least / 1e6)}_000_000"
-        )
-    return MemoryParts(program + _LATER_BYTES)
+    found = []
+    for name in names:
+        is_named = name in options.map_names
+        restore = options.restore if is_named else None
+        try:
+            one = find_map(
+                name,
+                options.settings,
+                options.store,
+                memory=memory,
+                split=teams.answer,
+                restore=restore,
+            )
+        except (StoreError, SettingsError) as error:
+            if is_named:
+                raise
+            _log.error("map '%s', which a client has created, is not opened: %s", name, error)
+            continue
+        stack.enter_context(one.opened)
+        found.append(one)
+    return found
 
 
 def _open_monitoring(settings: Settings, stack: ExitStack) -> "MonitoringServer | None":
@@ -200,47 +191,6 @@ def _open_monitoring(settings: Settings, stack: ExitStack) -> "MonitoringServer 
     from triquad_server.monitoring.http_server import MonitoringServer
 
     return stack.enter_context(closing(MonitoringServer(settings.metrics)))
-
-
-def _open_store(
-    options: LaunchOptions, starting: Report, stack: ExitStack, teams: Teams
-) -> Store | None:
-    """Open the store, if there is one, restored to an older checkpoint if one is asked for."""
-    if options.store is None:
-        return None
-    settings, root = options.settings, options.store
-    cache_bytes = settings.memory.cache_bytes
-    store = Store(root, options.map_name, settings.store, cache_bytes, teams.answer)
-    stack.enter_context(closing(store))
-    if options.restore is not None:
-        starting(f"taking the map back to epoch {options.restore}")
-        store.restore(options.restore)
-    return store
-
-
-def _settings_of(record: MapRecord, options: LaunchOptions) -> Settings:
-    """Return the settings for a restored map, which keeps its own field.
-
-    Raises:
-        SettingsError: lengths that are given do not agree with it.
-    """
-    settings = options.settings
-    if record.name != options.map_name:
-        _log.warning("the checkpoint is of a map named '%s'", record.name)
-    if record.settings == settings.field:
-        return settings
-    _log.warning("the restored map keeps its own [field] settings: %s", record.settings)
-    try:
-        kept = settings.with_field(record.settings)
-    except SettingsError as error:
-        raise SettingsError(f"for the restored map: {error}") from error
-    if record.settings.leaf_m != settings.field.leaf_m:
-        _log.warning(
-            "lengths that are not set follow its leaf_m = %g, not the %g that is set",
-            record.settings.leaf_m,
-            settings.field.leaf_m,
-        )
-    return kept
 
 
 def _before_each_step(stops: Stops, starting: Report) -> Report:
@@ -268,32 +218,35 @@ def _log_who_gets_in(network: Configuration) -> None:
         _log.info("access: programs of this machine; --listen tcp/0.0.0.0:7447 lets others connect")
 
 
-def _log_ready(options: LaunchOptions, network: Configuration, epoch: int) -> None:
+def _log_ready(options: LaunchOptions, network: Configuration, maps: Maps) -> None:
     endpoints = ", ".join(network.listen) or f"a {network.mode} of {', '.join(network.connect)}"
-    _log.info(
-        "ready: map '%s' on %s, epoch %d, %s, store %s",
-        options.map_name,
-        endpoints,
-        epoch,
-        options.device,
-        options.store or "none",
-    )
+    for health in maps.healths:
+        _log.info(
+            "ready: map '%s' on %s, epoch %d, %s, store %s",
+            health.map_name,
+            endpoints,
+            health.epochs.newest.number,
+            options.device,
+            options.store or "none",
+        )
 
 
 class StartingNotice:
-    """Tells clients, until it is closed, that the server of a map is there but not ready."""
+    """Tells clients, until it is closed, that the server of maps is there but not ready."""
 
-    def __init__(self, session: zenoh.Session, map_name: str) -> None:
+    def __init__(self, session: zenoh.Session, map_names: Sequence[str]) -> None:
         """Begin to refuse questions."""
         self.stage = "it has just begun"
         # Zenoh's own thread answers: the others may be compiling.
-        self._queryable = session.declare_queryable(
-            keys.all_queries_key(map_name), zenoh.handlers.Callback(self._refuse, indirect=False)
-        )
+        refuse = zenoh.handlers.Callback(self._refuse, indirect=False)
+        self._queryables = [
+            session.declare_queryable(keys.all_queries_key(name), refuse) for name in map_names
+        ]
 
     def close(self) -> None:
         """Refuse no more."""
-        self._queryable.undeclare()
+        for queryable in self._queryables:
+            queryable.undeclare()
 
     def _refuse(self, query: zenoh.Query) -> None:
         reply = codec.encode(ErrorReply("starting", self.stage))

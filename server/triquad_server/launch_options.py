@@ -14,20 +14,28 @@ from triquad_server.settings import Settings
 class LaunchOptions:
     """The options that a server is started with."""
 
-    map_name: str
+    map_names: tuple[str, ...]  # at least one; those that its clients create come to these
     network: NetworkOptions
     settings: Settings
     store: Path | None
     device: str  # "cpu" or "cuda"
-    restore: int | None = None  # the epoch that the map is restored to; None: the newest
+    restore: int | None = None  # the epoch that the only map is restored to; None: the newest
 
     def __post_init__(self) -> None:
-        """Refuse a bad name, and to restore without a store.
+        """Refuse bad names, and to restore without a store, or which of several maps is not clear.
 
         Raises:
-            FormatError: the map cannot have this name.
-            ServerError: there is no store.
+            FormatError: a map cannot have this name.
+            ServerError: there is no store; or a map is named twice.
         """
-        check_name("map", self.map_name)
+        for name in self.map_names:
+            check_name("map", name)
+            if self.map_names.count(name) > 1:
+                raise ServerError(f"--map {name} is given twice")
         if self.restore is not None and self.store is None:
             raise ServerError("--restore needs the --store that the map is taken from")
+        if self.restore is not None and len(self.map_names) > 1:
+            raise ServerError(
+                "--restore is for one map: start the server with that --map alone, stop it, and "
+                "start it with all of them"
+            )

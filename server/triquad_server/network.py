@@ -91,8 +91,8 @@ class Configuration:
         return tuple(endpoints)
 
 
-def configuration(options: NetworkOptions, map_name: str, settings: Settings) -> Configuration:
-    """Return the configuration of the server of a map.
+def configuration(options: NetworkOptions, settings: Settings) -> Configuration:
+    """Return the configuration of a server.
 
     What the options leave out is as the file has it; what both leave out is safe: a router
     that only this machine reaches, that neither looks for others nor is found, and that takes no
@@ -102,7 +102,7 @@ def configuration(options: NetworkOptions, map_name: str, settings: Settings) ->
         ServerError: the file cannot be read, or a value is not valid.
     """
     try:
-        return _configuration(options, _safe(map_name, settings))
+        return _configuration(options, _safe(settings))
     except (zenoh.ZError, ValueError, OSError) as error:
         file = "" if options.config_file is None else f" {options.config_file}"
         raise ServerError(f"Zenoh configuration{file}: {reason(error)}") from error
@@ -141,13 +141,13 @@ def _of_options(options: NetworkOptions) -> dict[str, Any]:
     return given
 
 
-def _safe(map_name: str, settings: Settings) -> dict[str, Any]:
+def _safe(settings: Settings) -> dict[str, Any]:
     """Return what holds where neither options nor a file set something else."""
     return {
         **QUIET,
         **_LINKS,
         "transport/link/rx/max_message_size": _max_message_bytes(settings.scan.max_points),
-        "access_control": access_control(without_credentials(map_name)),
+        "access_control": access_control(without_credentials()),
     }
 
 

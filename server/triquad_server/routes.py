@@ -61,14 +61,13 @@ def answer_requests(
     serve(FlushRequest, flushed, lane)
 
     checkpoints = parts.checkpoints
-    downloads = MapDownloads(parts.mapper, parts.epochs, parts.server, parts.map_max_bytes)
+    downloads = MapDownloads(parts.mapper, parts.epochs, parts.memory, parts.server)
     serve(CheckpointRequest, checkpoints.answer, Lane.FILES)
     serve(ResetRequest, Resets(parts.mapper, checkpoints, trails).answer, Lane.FILES)
     corrector = PoseCorrector(
         parts.mapper,
         checkpoints,
         trails,
-        max_bytes=parts.map_max_bytes,
         is_stopping=lambda: parts.operations.is_stopping,
     )
     serve(CorrectPosesRequest, corrector.answer, Lane.FILES, _KEYFRAME_BYTES * MAX_KEYFRAMES)

@@ -18,7 +18,7 @@ from triquad_server.epochs.history import EpochHistory
 from triquad_server.intake.scan_queue import ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper_thread import MapperThread
-from triquad_server.process.memory_parts import MemoryParts
+from triquad_server.process.memory_share import MemoryShare
 from triquad_server.process.resources import give_back_free, resident_bytes
 from triquad_server.serving.operations import Operations
 from triquad_server.serving.request import BOUNDS_S
@@ -40,7 +40,7 @@ class Health:
     """Collects the status and the figures of the server from its parts."""
 
     map_name: str
-    server: str  # a name of this process
+    server: str  # a name of this map, as this process has it
     device: str
     session: zenoh.Session
     operations: Operations
@@ -49,8 +49,7 @@ class Health:
     mapper: MapperThread
     epochs: EpochHistory
     checkpoints: CheckpointWriter
-    memory: MemoryParts
-    map_max_bytes: int  # memory limit of the server
+    memory: MemoryShare
     started_s: float = field(default_factory=time.monotonic)  # monotonic
 
     def status(self) -> ServerStatus:
@@ -83,17 +82,17 @@ class Health:
             kept_scans=self.checkpoints.kept_scans,
             correcting=self.checkpoints.correcting,
             warnings=(*filter(None, [self.checkpoints.warning]), *self.warnings.all()),
-            map_max_bytes=self.map_max_bytes,
-            memory_parts=self._memory_parts(progress.map.map_bytes),
+            map_max_bytes=self.memory.server.limit,
+            memory_parts=self._memory_parts(),
             regions_cold=epoch.cold_regions,
             fit=progress.fit,
             origin_m=epoch.origin,
             **vars(progress.map),
         )
 
-    def _memory_parts(self, map_bytes: int) -> dict[str, int]:
+    def _memory_parts(self) -> dict[str, int]:
         """Return what takes the memory; the rest is what is in work, or free between the others."""
-        parts = {"map": map_bytes, **self.memory.bytes()}
+        parts = self.memory.parts()
         return {**parts, "rest": max(0, resident_bytes() - sum(parts.values()))}
 
     def metrics(self) -> ServerMetrics:
@@ -218,9 +217,11 @@ class Heartbeat:
         now = (status.epoch, status.scans_taken, dropped, lost)
         if now != self._logged:
             self._logged = now
+            several = len(self._health.memory.server.shares) > 1
             _log.info(
-                "epoch %d%s: %d scans taken, %d dropped, %d lost, %d waiting; %.1f M samples "
+                "%sepoch %d%s: %d scans taken, %d dropped, %d lost, %d waiting; %.1f M samples "
                 "trained, loss %.4f; %d regions, %d vertices; %.0f MB",
+                f"map '{status.map_name}': " if several else "",
                 *(status.epoch, " (settled)" if status.settled else ""),
                 *(status.scans_taken, dropped, lost, status.scans_waiting),
                 *(status.samples_trained / 1e6, status.loss, status.regions, status.vertices),

@@ -15,7 +15,6 @@ from triquad_server.intake.source_trails import SourceTrails
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.mesh.tile_cache import TileCache
-from triquad_server.process.memory_parts import MemoryParts
 from triquad_server.process.stop import Stop
 from triquad_server.routes import answer_requests
 from triquad_server.server_status import Health, Heartbeat
@@ -34,7 +33,6 @@ class Service:
         mapper: Mapper,
         settings: Settings,
         store: Store | None = None,
-        memory: MemoryParts | None = None,
         failed: Callable[[Stop], None] = lambda _: None,
     ) -> None:
         """Begin to serve.
@@ -44,7 +42,6 @@ class Service:
             mapper: the map; nothing else may use it from now on.
             settings: of the service.
             store: of its checkpoints; ``None``: they are not kept.
-            memory: where it is counted what takes memory besides the map.
             failed: called with the reason if an error ends mapping.
         """
         self.session = session
@@ -54,9 +51,12 @@ class Service:
         self._scans = ScanQueue(settings.service.scan_queue)
         self._warnings = ScanWarnings(self._scans, settings)
         first = mapper.publish()
-        older_bytes = min(settings.memory.epochs_bytes, settings.memory.kept_bytes)
-        self._epochs = EpochHistory(first, settings.service, older_bytes=older_bytes)
-        self._operations = Operations(
+        self._epochs = EpochHistory(
+            first,
+            settings.service,
+            older_bytes=lambda: min(settings.memory.epochs_bytes, mapper.memory.kept_bytes),
+        )
+        self.operations = Operations(
             session,
             mapper.name,
             settings.service,
@@ -64,11 +64,11 @@ class Service:
             origin=self._epochs.origin,
         )
         self._surface = SurfaceHistory(first, CHANGES_KEPT)
-        self._name = secrets.token_hex(8)  # of this process
+        self._name = secrets.token_hex(8)  # of this map, as this process has it
         self._trails = SourceTrails(first.field_settings.leaf_m, self._name)
         self._parts = ExitStack()  # closed in reverse order of opening
         try:
-            self._open(failed, memory or MemoryParts())
+            self._open(failed)
         except BaseException:
             self._parts.close()
             raise
@@ -86,9 +86,9 @@ class Service:
         """
         self._parts.close()
 
-    def _open(self, failed: Callable[[Stop], None], memory: MemoryParts) -> None:
+    def _open(self, failed: Callable[[Stop], None]) -> None:
         """Open the parts, in the reverse of the order in which they have to be closed."""
-        self._parts.callback(self._operations.close)
+        self._parts.callback(self.operations.close)
         self._mapper = self._open_mapper(failed)
         checkpoints = CheckpointWriter(self._mapper, self._store, self._settings.store)
         self.health = health = Health(
@@ -96,30 +96,34 @@ class Service:
             server=self._name,
             device=self._map.device,
             session=self.session,
-            operations=self._operations,
+            operations=self.operations,
             scans=self._scans,
             warnings=self._warnings,
             mapper=self._mapper,
             epochs=self._epochs,
             checkpoints=checkpoints,
-            memory=memory,
-            map_max_bytes=self._settings.memory.max_bytes,
+            memory=self._map.memory,
         )
-        kept_bytes = self._settings.memory.kept_bytes
-        tiles = TileCache(self._settings.mesh, self._map.teams.background, kept_bytes)
-        self._count(memory, tiles)
+        tiles = TileCache(
+            self._settings.mesh,
+            self._map.teams.background,
+            max_bytes=lambda: self._map.memory.kept_bytes,
+        )
+        self._count(tiles)
         checkpoints.start()
         self._parts.callback(checkpoints.close)
         answer_requests(health, tiles, self._surface, self._trails)
         # Closed before the last checkpoint is written: it contains every reset that was answered.
-        self._parts.callback(self._operations.close)
+        self._parts.callback(self.operations.close)
         self._parts.callback(self._mapper.pause)
         self._open_intake()
         self._announce(health)
-        self._parts.callback(self._operations.stop)  # before anything is waited for
+        self._parts.callback(self.operations.stop)  # before anything is waited for
 
-    def _count(self, memory: MemoryParts, tiles: TileCache) -> None:
-        """Have counted what takes memory besides the map."""
+    def _count(self, tiles: TileCache) -> None:
+        """Have counted what takes memory."""
+        memory = self._map.memory
+        memory.add("map", lambda: self._mapper.progress.map.map_bytes)
         memory.add("older epochs", lambda: self._epochs.older_bytes)
         memory.add("mesh tiles", lambda: tiles.nbytes)
         if self._store is not None:

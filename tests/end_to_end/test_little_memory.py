@@ -126,7 +126,7 @@ def test_what_is_too_large_to_be_downloaded_is_refused_with_the_remedy(tmp_path:
 
 def test_poses_of_what_left_memory_are_corrected(tmp_path: Path) -> None:
     nowhere = 3 * PLACES
-    with servers.service_and_client(LITTLE, tmp_path) as client:
+    with servers.service_and_client(SOME, tmp_path) as client:
         client.publish_scan(servers.sphere(8000), shifted(APART_M * nowhere), 1e9 - 5, "roof")
         visit(client, *range(1, PLACES))
         assert client.status().regions_cold > 0

@@ -33,7 +33,7 @@ SAFE = {
 def of_file(folder: Path, text: str, **options: Any) -> Configuration:
     file = folder / "zenoh.json5"
     file.write_text(text)
-    return network.configuration(NetworkOptions(config_file=file, **options), "lab", Settings())
+    return network.configuration(NetworkOptions(config_file=file, **options), Settings())
 
 
 def values(config: Configuration) -> dict[str, Any]:
@@ -41,7 +41,7 @@ def values(config: Configuration) -> dict[str, Any]:
 
 
 def test_what_is_not_set_is_safe(tmp_path):
-    plain = network.configuration(NetworkOptions(), "lab", Settings())
+    plain = network.configuration(NetworkOptions(), Settings())
     assert values(plain) == SAFE
     assert not plain.listens_beyond
     assert values(of_file(tmp_path, "{ timestamping: { enabled: true } }")) == SAFE
@@ -102,7 +102,7 @@ def test_a_file_that_is_none_is_an_error(tmp_path):
 
 def failure(**options: Any) -> str:
     with pytest.raises(ListenError) as caught:
-        open_session(configuration(NetworkOptions(**options), "lab", Settings()))
+        open_session(configuration(NetworkOptions(**options), Settings()))
     return str(caught.value)
 
 

@@ -16,7 +16,7 @@ from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.mapping.mapper import Mapper
 from triquad_server.mapping.mapper_thread import MapperThread
 from triquad_server.mapping.thread_time import ThreadTime
-from triquad_server.process.memory_parts import MemoryParts
+from triquad_server.process.memory_share import ServerMemory
 from triquad_server.process.stop import Stop
 from triquad_server.server_status import ENDLESS_S, STUCK_S, Health
 from triquad_server.serving.operations import Operations
@@ -46,8 +46,7 @@ def running(
         mapper=thread,
         epochs=epochs,
         checkpoints=CheckpointWriter(thread, None, StoreSettings()),
-        memory=MemoryParts(),
-        map_max_bytes=10**9,
+        memory=ServerMemory(10**9).open(),
     )
     with closing(thread):
         thread.start()

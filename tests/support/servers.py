@@ -1,5 +1,6 @@
 """Real servers and raw Zenoh sessions for the tests, on free ports of the loopback."""
 
+import queue
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -18,13 +19,15 @@ from triquad_format.wire.codec import Message
 from triquad_format.wire.mesh_messages import TileChangesRequest
 from triquad_format.wire.messages import ErrorReply, FlushReply, FlushRequest, Scan
 from triquad_format.wire.zenoh_config import QUIET, put
-from triquad_server.mapping.mapper import Mapper
+from triquad_server.launch_options import LaunchOptions
+from triquad_server.maps import Maps
 from triquad_server.network import NetworkOptions, configuration, open_session
-from triquad_server.service import Service
+from triquad_server.process.memory_share import ServerMemory
+from triquad_server.process.stop import Stop
+from triquad_server.process.threads import Teams
 from triquad_server.settings import Settings
 from triquad_server.settings.loading import load_settings
-from triquad_server.store.restore import ValidCheckpoint
-from triquad_server.store.store import Store
+from triquad_server.store.found_map import find_map
 from triquad_server.warm_up import warm_up
 
 from bench.clients.server_process import ServerProcess, free_endpoint
@@ -100,21 +103,16 @@ def running_service(
     """A service in this process; yields its endpoint, a free one unless it is given."""
     compiled()
     endpoint = endpoint or free_endpoint()
-    network = configuration(NetworkOptions((endpoint,), connect), map_name, settings)
-    opened = Store(store, map_name, settings.store) if store else None
-    restored: ValidCheckpoint | None = opened.newest() if opened else None
-    record, cold = restored.record if restored else None, opened.regions.known if opened else {}
-    mapper = Mapper(map_name, settings, "cpu", record, cold=cold)
-    if opened:
-        opened.log_scans(settings.field.leaf_m)
-    session = open_session(network)
-    try:
-        with closing(Service(session, mapper, settings, opened)):
-            yield endpoint
-    finally:
-        session.close()
-        if opened:
-            opened.close()
+    network = NetworkOptions((endpoint,), connect)
+    options = LaunchOptions((map_name,), network, settings, store, device="cpu")
+    memory, stops = ServerMemory(settings.memory.max_bytes), queue.SimpleQueue[Stop]()
+    with (
+        closing(Teams()) as teams,
+        closing(open_session(configuration(network, settings))) as session,
+        closing(Maps(session, options, teams, memory, failed=stops.put)) as maps,
+    ):
+        maps.begin([find_map(map_name, settings, store, memory=memory, split=teams.answer)])
+        yield endpoint
 
 
 @contextmanager

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from triquad_format.errors import InvalidInputError
+from triquad_format.errors import FormatError, InvalidInputError
 from triquad_format.printable import printable
+from triquad_format.wire import keys
 from triquad_format.wire.limits import MAX_SAMPLE_POINTS
+from triquad_format.wire.map_messages import CreateMapRequest, DropMapRequest
 from triquad_format.wire.messages import (
     CheckpointInfo,
     CheckpointRequest,
@@ -95,3 +97,43 @@ class ServerCalls:
     def maps(self) -> list[str]:
         """Return names of all maps that can be reached, also those of other servers."""
         return self._connection.maps()
+
+    def create_map(self, name: str, timeout_s: float = 60.0) -> None:
+        """Have the server of this map open another one, with the same settings, and wait for it.
+
+        It has a folder of its own in the server's store; what is there of a map of this name is
+        gone on with. A server that is started again with the same ``--map`` opens it, too.
+
+        Raises:
+            RefusedError: ``map_exists``, where a server in reach has a map of this name; ``store``,
+                where its folder cannot be used; ``busy``, where there is no memory for it.
+            InvalidInputError: no map can have this name.
+        """
+        request = CreateMapRequest(_map_name(name), new_ticket())
+        self._connection.ask_until_done(request, timeout_s)
+
+    def drop_map(self, name: str, timeout_s: float = 600.0) -> str | None:
+        """Have the server of this map close another one of its maps, for everybody.
+
+        With a store it writes a last checkpoint, and sets the map's folder aside.
+
+        Returns:
+            That folder on the server, ``None`` without a store. It may be deleted; in its old place
+            it is what :meth:`create_map` goes on with.
+
+        Raises:
+            RefusedError: ``no_map``, where the server does not have it; ``bad_request``, where it
+                is the map of this client; ``store``, where it cannot be written and goes on, or its
+                folder cannot be moved: the text says which.
+            InvalidInputError: no map can have this name.
+        """
+        request = DropMapRequest(_map_name(name), new_ticket())
+        reply = self._connection.ask_until_done(request, timeout_s)
+        return reply.kept if reply.kept is None else printable(reply.kept)
+
+
+def _map_name(name: str) -> str:
+    try:
+        return keys.check_name("map", name)
+    except FormatError as error:
+        raise InvalidInputError(str(error)) from None

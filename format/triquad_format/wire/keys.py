@@ -11,6 +11,9 @@ from triquad_format.wire.codec import PROTOCOL_VERSION, Message
 NAME = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}"
 """The form of the name of a map or a source."""
 
+DEFAULT_MAP = "default"
+"""The name of the map where none is given."""
+
 EVERY_MAP = "*"
 """The wildcard for a map's name in key expressions of all maps."""
 
@@ -39,6 +42,8 @@ MAP_CHUNK = "query/map_chunk"
 CHECKPOINT = "admin/checkpoint"
 RESET = "admin/reset"
 CORRECT_POSES = "admin/correct_poses"
+CREATE_MAP = "admin/create_map"
+DROP_MAP = "admin/drop_map"
 
 
 def is_name(name: str) -> bool:

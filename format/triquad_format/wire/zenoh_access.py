@@ -91,13 +91,13 @@ def access_control(grants: Sequence[Grant]) -> dict[str, Any]:
     }
 
 
-def without_credentials(map_name: str, *, ros2: Sequence[Rule] = ()) -> tuple[Grant, ...]:
+def without_credentials(*, ros2: Sequence[Rule] = ()) -> tuple[Grant, ...]:
     """Return the rights at a map server that distinguishes people only by where they come from.
 
-    Programs of this machine may do everything. What comes from beyond may question the map, follow
-    it and publish scans, and what ``ros2`` allows besides.
+    Programs of this machine may do everything. What comes from beyond may question all maps, follow
+    them and publish scans, and what ``ros2`` allows besides.
     """
-    beyond = (*view(map_name), *publish(map_name), *ros2)
+    beyond = (*view(keys.EVERY_MAP), *publish(keys.EVERY_MAP), *ros2)
     here = Grant("this-machine", everything(), interface=LOOPBACK)
     return here, Grant("everybody", beyond)
 
@@ -138,13 +138,11 @@ def nodes_of_ros2(domain: int) -> Rule:
     return Rule(Verb.ALL, (f"{domain}/**", f"{domain}/**/@adv/**", f"@ros2_lv/{domain}/**"))
 
 
-def take_part_in_ros2(
-    map_name: str, domain: int, published: Sequence[str] = ()
-) -> tuple[Rule, ...]:
+def take_part_in_ros2(domain: int, published: Sequence[str] = ()) -> tuple[Rule, ...]:
     """Return the rules for nodes of rmw_zenoh in a domain, or bridges that publish any topics.
 
     ``published`` are the keys on which bridges receive what the server publishes. Since a topic may
-    have any name, bridges may publish on all keys, but not on those of the server of the map.
+    have any name, bridges may publish on all keys, but not on those of map servers.
     """
     return (
         nodes_of_ros2(domain),
@@ -153,7 +151,7 @@ def take_part_in_ros2(
         Rule(Verb.ANSWER, ("@/*/@ros2_pub_cache/**", "**/@adv/**")),
         Rule(Verb.BE_FOUND, ("**/@adv/**",)),
         Rule(Verb.PUBLISH, ("**",)),
-        Rule(Verb.PUBLISH, (keys.status_key(map_name),), forbidden=True),
+        Rule(Verb.PUBLISH, (keys.status_key(keys.EVERY_MAP),), forbidden=True),
         *((Rule(Verb.RECEIVE, tuple(published)),) if published else ()),
     )
 

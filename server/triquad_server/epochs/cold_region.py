@@ -94,8 +94,8 @@ class ColdRegion:
 class RegionCache:
     """Keeps regions that were read lately; those asked about longest ago give way."""
 
-    def __init__(self, read: ReadParts, limit: int, split: Split) -> None:
-        """Read regions by ``read``; at most ``limit`` bytes stay, and the one read last.
+    def __init__(self, read: ReadParts, limit: Callable[[], int], split: Split) -> None:
+        """Read regions by ``read``; at most ``limit()`` bytes stay, and the one read last.
 
         ``split`` shares the work of a question.
         """
@@ -132,6 +132,6 @@ class RegionCache:
         """Drop what is too much; surfels that were fitted since the last time count, too."""
         sizes = {one: sum(buffers_of(read).values()) for one, read in self._kept.items()}
         self.bytes = sum(sizes.values())
-        while self.bytes > self._limit and len(self._kept) > 1:
+        while self.bytes > self._limit() and len(self._kept) > 1:
             dropped, _ = self._kept.popitem(last=False)
             self.bytes -= sizes[dropped]

@@ -36,7 +36,7 @@ class EpochHistory:
         first: Epoch,
         settings: ServiceSettings,
         clock: Callable[[], float] = time.monotonic,
-        older_bytes: int = MemorySettings().epochs_bytes,
+        older_bytes: Callable[[], int] = lambda: MemorySettings().epochs_bytes,
     ) -> None:
         """Begin with the epoch that is published ``first``.
 
@@ -44,7 +44,8 @@ class EpochHistory:
             first: the newest, for now.
             settings: which epochs stay.
             clock: seconds that never run backwards.
-            older_bytes: memory of older epochs, beyond what they share with newer ones.
+            older_bytes: returns the memory that older epochs may take, beyond what they share with
+                newer ones.
         """
         self.newest = first  # the epoch published last
         self.older_bytes = 0  # of older ones, beyond what they share with it
@@ -165,7 +166,7 @@ class EpochHistory:
                 continue
             buffers = self._epochs[number].buffers
             own = {start: size for start, size in buffers.items() if start not in counted}
-            if used + sum(own.values()) <= self._most_older_bytes:
+            if used + sum(own.values()) <= self._most_older_bytes():
                 used += sum(own.values())
                 counted.update(own)
                 stay.add(number)

@@ -161,8 +161,8 @@ class LiveRegions:
             raise RefusedError(
                 "busy",
                 f"the map would have {len(there)} regions and take {used / 1e6:.0f} MB, more than "
-                f"training.max_regions = {self._setup.training.max_regions} or memory.max_bytes = "
-                f"{self._budget.limit} allows: start the server with more",
+                f"training.max_regions = {self._setup.training.max_regions} or "
+                f"{self._budget.memory} allows: start the server with more",
             )
         self.all.remove(only)
         self.all.add(others)

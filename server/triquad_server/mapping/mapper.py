@@ -3,7 +3,7 @@
 import logging
 import math
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from types import MappingProxyType
 
 import numpy as np
@@ -23,6 +23,7 @@ from triquad_server.mapping.live_regions import LiveRegions
 from triquad_server.mapping.map_snapshot import MapFigures, MapSnapshot
 from triquad_server.mapping.memory_budget import MemoryBudget
 from triquad_server.mapping.region_setup import RegionSetup
+from triquad_server.process.memory_share import MemoryShare, ServerMemory
 from triquad_server.process.threads import Teams
 from triquad_server.settings import ANY_SOURCE, Settings
 
@@ -44,12 +45,12 @@ class Mapper:
         record: MapRecord | None = None,
         teams: Teams | None = None,
         cold: Mapping[RegionIndex, ColdRegion] = MappingProxyType({}),
-        beside: Callable[[], int] = lambda: 0,
+        memory: MemoryShare | None = None,
     ) -> None:
         """Make a map that goes on from ``record``; without ``teams`` it has threads of its own.
 
-        ``cold`` are regions that are not in the record, to be read when they are needed. What is
-        ``beside`` the map takes so many bytes of ``memory.max_bytes``.
+        ``cold`` are regions that are not in the record, to be read when they are needed. Without a
+        share of ``memory`` it has all that the settings allow.
         """
         self.name = name
         self.teams = teams or Teams()
@@ -64,8 +65,8 @@ class Mapper:
             sums=GradientSums(),
             team=self.teams.mapping,
         )
-        most = settings.memory.max_bytes
-        budget = MemoryBudget(most, self._setup.field, settings.training, beside)
+        self.memory = memory or ServerMemory(settings.memory.max_bytes).open()
+        budget = MemoryBudget(self.memory, self._setup.field, settings.training)
         self.regions = LiveRegions(self._setup, budget)
         self._number = record.epoch if record else 0
         self._epoch: Epoch | None = None

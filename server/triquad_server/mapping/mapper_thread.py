@@ -199,6 +199,8 @@ class MapperThread:
             self.time.begin(Activity.IDLE)
             if not self._epochs.is_recent:
                 self._mapper.release()
+            # Another map may have been created, whose share this one had.
+            self._schedule.is_changed |= self._mapper.regions.room.make_again()
             self._wake.wait(self._schedule.left_s)
         return else_s
 

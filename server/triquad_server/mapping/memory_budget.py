@@ -1,6 +1,6 @@
 """How much memory regions take, and how much they would."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 
 import numpy as np
 from triquad_format.records.field_settings import BLOCK_VOXELS, FieldSettings
@@ -12,6 +12,7 @@ from triquad_server.errors import ScanRefusedError
 from triquad_server.intake.rays import ScanRays
 from triquad_server.mapping.live_region import LiveRegion, RegionSize
 from triquad_server.mapping.replay.kept_rays import RAY_BYTES
+from triquad_server.process.memory_share import MemoryShare
 from triquad_server.settings import TrainingSettings
 
 _ROOM = 1.15
@@ -41,24 +42,15 @@ _RAYS_SHARE = 0.25
 for all else."""
 
 
-def _nothing() -> int:
-    return 0
-
-
 class MemoryBudget:
     """Estimates the bytes that regions take: live, with their rays, and in the newest epoch."""
 
     def __init__(
-        self,
-        limit: int,
-        field: FieldSettings,
-        training: TrainingSettings,
-        beside: Callable[[], int] = _nothing,
+        self, memory: MemoryShare, field: FieldSettings, training: TrainingSettings
     ) -> None:
-        """Let regions of such a ``field`` take ``limit`` bytes, less what is ``beside`` them."""
-        self.limit = limit
-        self._beside = beside
-        self.pool_bytes = min(training.pool_bytes, int(_RAYS_SHARE * limit))
+        """Let regions of such a ``field`` take a share of the server's memory."""
+        self.memory = memory
+        self._most_pool_bytes = training.pool_bytes
         self.rays_per_voxel = training.rays_per_voxel
         self._block_m = BLOCK_VOXELS * field.leaf_m
         levels = 0 if field.encoding == "fourier" else field.feature_levels
@@ -73,14 +65,19 @@ class MemoryBudget:
         self._vertex_bytes = features + 9 + 2 * _VERTEX_ENTRIES * _NUMBER_BYTES
 
     @property
+    def pool_bytes(self) -> int:
+        """The bytes that kept rays may take."""
+        return min(self._most_pool_bytes, int(_RAYS_SHARE * self.memory.limit))
+
+    @property
     def room(self) -> int:
         """The bytes that all regions may take now."""
-        return int((1 - _BETWEEN) * self.limit) - self._beside()
+        return int((1 - _BETWEEN) * self.memory.limit) - self.memory.beside()
 
     @property
     def reserve(self) -> int:
         """The bytes that stay free for scans while regions can go."""
-        return int(_RESERVE * self.limit)
+        return int(_RESERVE * self.memory.limit)
 
     def left(self, sizes: Iterable[RegionSize], *, are_kept: bool) -> int:
         """Return the bytes that are left beside regions; less than 0: there are too few.
@@ -131,7 +128,7 @@ class MemoryBudget:
         return ScanRefusedError(
             "map_full",
             f"the map takes {used / 1e6:.0f} MB and the scan would add some {needed / 1e6:.1f} MB, "
-            f"more than memory.max_bytes = {self.limit} allows: raise it, reset what is no longer "
+            f"more than there is room for ({self.memory}): raise that, reset what is no longer "
             "needed, start the server with --store, so that what was not seen for long can leave "
             "memory, or use a larger field.leaf_m for a new map",
         )

@@ -70,7 +70,7 @@ class RegionRoom:
         """
         left, budget = self.left, self._budget
         owed = [region for region in reached if region.is_owed]
-        if budget.copies(region.size for region in owed) > left:
+        if owed and budget.copies(region.size for region in owed) > left:
             self._copied_first = owed
             raise NoRoomYetError
         if budget.most_added(rays, [len(rays.ends)] * len(reached)) <= left:
@@ -112,6 +112,16 @@ class RegionRoom:
                 continue
             promised -= nbytes
         return excess <= 0
+
+    def make_again(self) -> bool:
+        """Do as :meth:`make` where nothing is needed; return whether a region has left.
+
+        While regions wait to leave, nothing happens: a scan may need more than them.
+        """
+        version = self._regions.version
+        if not self.waits_for_store:
+            self.make()
+        return self._regions.version != version
 
     def has(self, needed: int) -> bool:
         """Return whether ``needed`` bytes are left, once what can leave memory has left."""

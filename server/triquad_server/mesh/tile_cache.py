@@ -2,7 +2,7 @@
 
 import threading
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -49,8 +49,8 @@ class ShownTile:
 class ShownTiles:
     """Keeps tiles in memory; those unused for longest are dropped if there are too many."""
 
-    def __init__(self, limit: int) -> None:
-        """Keep at most ``limit`` bytes, or a single tile that is larger."""
+    def __init__(self, limit: Callable[[], int]) -> None:
+        """Keep at most ``limit()`` bytes, or a single tile that is larger."""
         self._limit = limit
         self.size = 0  # bytes of the tiles that are kept
         self._tiles: OrderedDict[TileKey, ShownTile] = OrderedDict()  # longest unused first
@@ -67,7 +67,7 @@ class ShownTiles:
         before = self._tiles.pop(key, None)
         self.size += tile.nbytes - (0 if before is None else before.nbytes)
         self._tiles[key] = tile
-        while self.size > self._limit and len(self._tiles) > 1:
+        while self.size > self._limit() and len(self._tiles) > 1:
             _, dropped = self._tiles.popitem(last=False)
             self.size -= dropped.nbytes
 
@@ -95,8 +95,10 @@ class TileCache:
     team.
     """
 
-    def __init__(self, settings: MeshSettings, team: Team, max_bytes: int = 2**40) -> None:
-        """Begin with no tiles, of which ``max_bytes`` are kept; ``team`` shares the work."""
+    def __init__(
+        self, settings: MeshSettings, team: Team, max_bytes: Callable[[], int] = lambda: 2**40
+    ) -> None:
+        """Begin with no tiles, of which ``max_bytes()`` are kept; ``team`` shares the work."""
         self._lock = threading.Lock()
         self._team = team
         self._settings = settings
@@ -104,7 +106,7 @@ class TileCache:
         self._changes: SurfaceChanges | None = None
         self.epoch = -1  # number of the epoch of the last refresh
         self._view: ComposedView | None = None  # epoch from which tiles are made
-        self._shown = ShownTiles(min(settings.cache_bytes, max_bytes))
+        self._shown = ShownTiles(lambda: min(settings.cache_bytes, max_bytes()))
 
     @property
     def nbytes(self) -> int:

@@ -6,7 +6,7 @@ import socket
 import socketserver
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from http.server import BaseHTTPRequestHandler
 from typing import Any
@@ -32,6 +32,10 @@ _TIMEOUT_S = 10.0  # for a request and its answer; slower connections are closed
 _TEXT = "text/plain; version=0.0.4; charset=utf-8"  # as Prometheus calls its format
 
 
+Shown = Callable[[], Sequence[Health]]
+"""Returns what tells how the maps of a server are doing."""
+
+
 class MonitoringServer(socketserver.ThreadingTCPServer):
     """Answers ``/metrics`` for Prometheus and ``/healthz``, on a bounded number of threads.
 
@@ -47,7 +51,7 @@ class MonitoringServer(socketserver.ThreadingTCPServer):
         Raises:
             ListenError: the port is taken, or cannot be listened on.
         """
-        self.shown: Health | str = "the server is starting: it restores its map and compiles code"
+        self.shown: Shown | str = "the server is starting: it restores its map and compiles code"
         self._since_s: dict[socket.socket, float] = {}  # of open connections, monotonic
         where = (settings.address, settings.port)
         named = f"[{where[0]}]:{where[1]}" if ":" in where[0] else f"{where[0]}:{where[1]}"
@@ -64,9 +68,9 @@ class MonitoringServer(socketserver.ThreadingTCPServer):
         _log.info("metrics on http://%s/metrics, health on /healthz", named)
 
     @contextmanager
-    def showing(self, health: Health) -> Iterator[None]:
+    def showing(self, shown: Shown) -> Iterator[None]:
         """Show the figures of a server that has started; after the context, that it stops."""
-        self.shown = health
+        self.shown = shown
         try:
             yield
         finally:
@@ -133,22 +137,27 @@ class _Handler(BaseHTTPRequestHandler):
         _log.debug("%s: " + format, self.address_string(), *args)
 
 
-def _page(path: str, shown: Health | str) -> tuple[int, str, str]:
+def _page(path: str, shown: Shown | str) -> tuple[int, str, str]:
     """Return status, content type and text of what is at a path."""
     if path == "/healthz":
-        report = {"problem": shown} if isinstance(shown, str) else _health(shown)
+        report = {"problem": shown} if isinstance(shown, str) else _health(shown())
         code = 200 if report["problem"] is None else 503
         return code, "application/json", json.dumps(report) + "\n"
     if path != "/metrics":
         return 404, _TEXT, f"nothing is at {path!r:.200}: use /metrics or /healthz\n"
     if isinstance(shown, str):
         return 503, _TEXT, shown + "\n"
-    return 200, _TEXT, exposition(Figures(shown.status(), shown.metrics()))
+    return 200, _TEXT, exposition([Figures(one.status(), one.metrics()) for one in shown()])
 
 
-def _health(health: Health) -> dict[str, object]:
+def _health(maps: Sequence[Health]) -> dict[str, object]:
     """Return what a supervisor reads; ``problem`` is ``None`` where all is well."""
+    found = {one.map_name: _of_map(one) for one in maps}
+    problem = next(filter(None, (one["problem"] for one in found.values())), None)
+    return {"problem": problem, "maps": found}
+
+
+def _of_map(health: Health) -> dict[str, object]:
     status = health.status()
     names = ("server", "epoch", "settled", "scans_taken", "uptime_s")
-    shown = {name: getattr(status, name) for name in names}
-    return {"problem": health.problem(), "map": status.map_name, **shown}
+    return {"problem": health.problem(), **{name: getattr(status, name) for name in names}}

@@ -12,11 +12,12 @@ from prometheus_client.registry import Collector
 from triquad_format.wire.metrics_messages import OperationMetrics, ServerMetrics, TimeHistogram
 from triquad_format.wire.status_messages import ServerStatus
 
-# Type, name, place in Figures, and meaning; a test compares docs/metrics.md with it. In a place,
-# {label} stands for the keys of a dictionary, and {label:a+b} for fields of a record: they become
-# values of that label. Names from the network stand in the label `source` alone.
+# Type, name, place in Figures, and meaning; each has the label `map` before its own. A test
+# compares docs/metrics.md with it. In a place, {label} stands for the keys of a dictionary, and
+# {label:a+b} for fields of a record: they become values of that label. Names from the network stand
+# in the label `source` alone.
 _TABLE = """
-gauge     triquad_server_info                  info.{map}.{server}.{version}.{device}               1; the labels name the map, this process, its release and what it computes on
+gauge     triquad_server_info                  info.{server}.{version}.{device}                     1; the labels name the map, this process, its release and what it computes on
 gauge     triquad_healthy                      healthy                                              1 while the server does all that it should, as /healthz says; else 0
 gauge     triquad_uptime_seconds               metrics.uptime_s                                     Time since the server began to serve
 gauge     triquad_sessions                     sessions.{kind}                                      Zenoh sessions that are connected, by kind: client, peer or router
@@ -79,15 +80,15 @@ class Family(NamedTuple):
     @property
     def labels(self) -> list[str]:
         """The names of its labels."""
-        return re.findall(r"{(\w+)", self.place)
+        return ["map", *re.findall(r"{(\w+)", self.place)]
 
 
 FAMILIES = tuple(Family(*row.split(maxsplit=3)) for row in _TABLE.strip().splitlines())
 
 
 @dataclass(frozen=True)
-class Figures(Collector):
-    """All that is known of a server at one time: its two messages, and what follows from them."""
+class Figures:
+    """All that is known of a map at one time: its two messages, and what follows from them."""
 
     status: ServerStatus
     metrics: ServerMetrics
@@ -101,7 +102,7 @@ class Figures(Collector):
     def info(self) -> dict[str, Any]:
         """The value 1 below the words that tell which server this is."""
         status = self.status
-        return {status.map_name: {status.server: {status.version: {status.device: 1}}}}
+        return {status.server: {status.version: {status.device: 1}}}
 
     @property
     def operations(self) -> dict[str, OperationMetrics]:
@@ -113,23 +114,37 @@ class Figures(Collector):
         """How many sessions of Zenoh of each kind are connected."""
         return Counter(self.metrics.sessions.values())
 
+
+@dataclass(frozen=True)
+class _Exposition(Collector):
+    """The metrics of all maps."""
+
+    maps: Sequence[Figures]
+
     def collect(self) -> Iterator[core.Metric]:
         """Make all metrics of the table."""
-        bounds = [*map(str, self.metrics.bounds_s.tolist()), "+Inf"]
         for family in FAMILIES:
-            metric: Any = _KINDS[family.kind](family.name, family.meaning, labels=family.labels)
-            for labels, value in _values(self, family.place.split(".")):
-                if isinstance(value, TimeHistogram):
-                    buckets = list(zip(bounds, np.cumsum(value.counts).tolist(), strict=True))
-                    metric.add_metric(labels, buckets, value.sum_s)
-                else:
-                    metric.add_metric(labels, value)
+            metric = _KINDS[family.kind](family.name, family.meaning, labels=family.labels)
+            for figures in self.maps:
+                _add(metric, family, figures)
             yield metric
 
 
-def exposition(figures: Figures) -> str:
-    """Return the metrics in Prometheus' text format."""
-    return generate_latest(figures).decode()
+def exposition(maps: Sequence[Figures]) -> str:
+    """Return the metrics of all maps in Prometheus' text format."""
+    return generate_latest(_Exposition(maps)).decode()
+
+
+def _add(metric: Any, family: Family, figures: Figures) -> None:
+    """Add what a metric says of a map."""
+    bounds = [*map(str, figures.metrics.bounds_s.tolist()), "+Inf"]
+    for labels, value in _values(figures, family.place.split(".")):
+        labels = (figures.status.map_name, *labels)
+        if isinstance(value, TimeHistogram):
+            buckets = list(zip(bounds, np.cumsum(value.counts).tolist(), strict=True))
+            metric.add_metric(labels, buckets, value.sum_s)
+        else:
+            metric.add_metric(labels, value)
 
 
 def _values(value: Any, place: Sequence[str]) -> Iterator[tuple[tuple[str, ...], Any]]:

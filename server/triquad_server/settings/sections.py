@@ -205,8 +205,8 @@ class MeshSettings(BaseModel):
     """A tile changes where its surface moved by more."""
 
     cache_bytes: Annotated[int, Field(ge=0, le=2**40)] = 200_000_000
-    """Bytes of encoded tiles that are cached, and at most a tenth of `memory.max_bytes`; others are
-    made again when they are asked for."""
+    """Bytes of encoded tiles that are cached, and at most a tenth of what the program leaves of
+    `memory.max_bytes`; others are made again when they are asked for."""
 
 
 class StoreSettings(BaseModel):
@@ -267,24 +267,16 @@ class MemorySettings(BaseModel):
     model_config = SECTION
 
     max_bytes: Annotated[int, Field(ge=1_000_000, le=2**50)] = 2_000_000_000
-    """Of the process in all; of a server within a program, of what it holds. Before more is needed,
-    regions that no scan has reached for longest leave memory, and are read from the store where
-    they are needed. Without a store a scan that would make the map larger is refused as `map_full`;
-    one that shows nothing new is taken on, and all else goes on too."""
+    """Of the process in all; of a server within a program, of what it holds. Maps have the same
+    share each. Before more is needed, regions that no scan has reached for longest leave memory,
+    and are read from the store where they are needed. Without a store a scan that would make
+    the map larger is refused as `map_full`; one that shows nothing new is taken on, and all else
+    goes on too."""
 
     epochs_bytes: Annotated[int, Field(ge=0, le=2**50)] = 300_000_000
     """Of older epochs that can be asked for by number, beyond what they share with newer ones, and
-    at most a tenth of `max_bytes`; those that were asked for last stay first."""
-
-    @property
-    def kept_bytes(self) -> int:
-        """What older epochs may take at most, and what encoded tiles may."""
-        return self.max_bytes // 10
-
-    @property
-    def cache_bytes(self) -> int:
-        """What regions may take that were read to answer: of 2 GB, six of 205 m of a street."""
-        return self.max_bytes // 8
+    at most a tenth of what the program leaves of `max_bytes`; those that were asked for last stay
+    first."""
 
 
 class MetricsSettings(BaseModel):

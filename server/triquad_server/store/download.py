@@ -14,7 +14,7 @@ from triquad_server.epochs.cold_region import ColdRegion
 from triquad_server.epochs.epoch import Epoch
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.mapping.mapper_thread import MapperThread
-from triquad_server.settings import MemorySettings
+from triquad_server.process.memory_share import MemoryShare
 from triquad_server.store.store import stamp_now_ns
 
 CHUNK_BYTES = 2**20
@@ -35,11 +35,11 @@ class MapDownloads:
         self,
         mapper: MapperThread,
         epochs: EpochHistory,
+        memory: MemoryShare,
         server: str = "",
-        max_bytes: int = MemorySettings().max_bytes,
     ) -> None:
-        """Make the handler; ``server`` is a name of this process, which may take ``max_bytes``."""
-        self._max_bytes = max_bytes
+        """Make the handler; ``server`` is a name of the map here, which may take ``memory``."""
+        self._memory = memory
         self._epochs = epochs
         self._server = server
         self._mapper = mapper
@@ -75,7 +75,7 @@ class MapDownloads:
         In a file regions have a fourth of the bytes that they take while they are mapped.
         """
         cold = (one for one in epoch.frozen_regions if isinstance(one, ColdRegion))
-        if sum(one.facts.memory_bytes for one in cold) > self._max_bytes:
+        if sum(one.facts.memory_bytes for one in cold) > self._memory.limit:
             raise RefusedError(
                 "too_large",
                 "the map is larger than the server's memory has room for: make a file of it where "

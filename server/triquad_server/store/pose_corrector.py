@@ -48,15 +48,13 @@ class PoseCorrector:
         mapper: MapperThread,
         checkpoints: CheckpointWriter,
         trails: SourceTrails,
-        max_bytes: int,
         is_stopping: Callable[[], bool],
     ) -> None:
         """Correct the map of ``mapper``, with its store, and the ``trails`` of its sources.
 
-        ``max_bytes`` are what maps may take together. Once ``is_stopping``, nothing is corrected.
+        Once ``is_stopping``, nothing is corrected.
         """
         self._mapper = mapper
-        self._max_bytes = max_bytes
         self._is_stopping = is_stopping
         self._checkpoints = checkpoints
         self._trails = trails
@@ -103,16 +101,16 @@ class PoseCorrector:
     def _check_room(self, again: "_MapAgain") -> None:
         """Raise :class:`RefusedError` where there is no room for regions that are made again."""
 
-        def lacking(mapper: Mapper) -> int:
+        def check(mapper: Mapper) -> None:
             needed = mapper.regions.all.bytes_of(again.touched)
-            return 0 if mapper.regions.room.has(needed) else needed
+            if not mapper.regions.room.has(needed):
+                raise RefusedError(
+                    "busy",
+                    f"it takes another {needed / 1e6:.0f} MB for a while, and there is no room for "
+                    f"that ({mapper.memory}): start the server with more",
+                )
 
-        if needed := self._mapper.call(lacking):
-            raise RefusedError(
-                "busy",
-                f"it takes another {needed / 1e6:.0f} MB for a while, and memory.max_bytes = "
-                f"{self._max_bytes} has no room for that: start the server with more",
-            )
+        self._mapper.call(check)
 
     def _correct(
         self,

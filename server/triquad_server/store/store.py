@@ -54,12 +54,12 @@ class Store:
         root: Path,
         map_name: str,
         settings: StoreSettings,
-        cache_bytes: int = 0,
+        cache_bytes: Callable[[], int] = lambda: 0,
         split: Split = in_one,
     ) -> None:
         """Lock ``root/map_name``, which is made if need be; delete unfinished files in it.
 
-        Regions that are read to answer questions take ``cache_bytes``, and ``split`` shares the
+        Regions that are read to answer questions take ``cache_bytes()``, and ``split`` shares the
         work of it.
 
         Raises:

@@ -1,7 +1,7 @@
 """The regions of a store, each as its newest checkpoint has it, to be read one by one."""
 
 import logging
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 
 from triquad_format.errors import FormatError, RefusedError
@@ -30,8 +30,8 @@ class StoredRegions:
     checkpoint names it.
     """
 
-    def __init__(self, folder: Path, cache_bytes: int, split: Split) -> None:
-        """Begin with none; of those that are read, ``cache_bytes`` stay in memory."""
+    def __init__(self, folder: Path, cache_bytes: Callable[[], int], split: Split) -> None:
+        """Begin with none; of those that are read, ``cache_bytes()`` stay in memory."""
         self._folder = folder
         self._parts = PartFiles(folder)
         self._map = MapRecord("none", 0, FieldSettings(), ())  # without regions

@@ -30,7 +30,7 @@ def held_start(endpoint: str, let: Event) -> Iterator[None]:
             assert let.wait(servers.WAIT_S)
 
     network = NetworkOptions(listen=(endpoint,))
-    options = LaunchOptions(servers.MAP, network, servers.SMALL, store=None, device="cpu")
+    options = LaunchOptions((servers.MAP,), network, servers.SMALL, store=None, device="cpu")
     over = Event()
 
     def serve() -> None:

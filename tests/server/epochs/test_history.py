@@ -85,7 +85,7 @@ def large(number, size):
 
 def test_older_epochs_stay_while_they_fit_in_their_memory_and_first_those_asked_for():
     kept_for = ServiceSettings(epochs_kept=4, epochs_pinned=8)
-    epochs = EpochHistory(large(1, 100), kept_for, Clock(), older_bytes=400)
+    epochs = EpochHistory(large(1, 100), kept_for, Clock(), older_bytes=lambda: 400)
     for number in range(2, 10):
         epochs.add(large(number, 100))
     assert [one.number for one in epochs.kept().epochs] == [6, 7, 8, 9]

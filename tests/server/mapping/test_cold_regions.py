@@ -37,7 +37,7 @@ class KeptMap:
     def __init__(self, folder: Path, max_bytes: int = 10**9) -> None:
         memory = MemorySettings(max_bytes=max_bytes)
         chosen = settings().model_copy(update={"memory": memory})
-        self.store = Store(folder, "test", StoreSettings(), CACHE_BYTES)
+        self.store = Store(folder, "test", StoreSettings(), lambda: CACHE_BYTES)
         newest = self.store.newest()
         record = None if newest is None else newest.record
         self.mapper = Mapper("test", chosen, "cpu", record, cold=self.store.regions.known)
@@ -268,7 +268,7 @@ def test_a_cache_keeps_to_its_bytes_and_reads_each_region_once(kept: KeptMap) ->
         reads.append(region)
         return regions.cache.read(region, topics)
 
-    counted = RegionCache(read, 10**9, in_one)
+    counted = RegionCache(read, lambda: 10**9, in_one)
     index, *_ = regions.known
     region = regions.known[index]
     begin = threading.Barrier(6)
@@ -281,7 +281,7 @@ def test_a_cache_keeps_to_its_bytes_and_reads_each_region_once(kept: KeptMap) ->
         got = list(threads.map(ask, range(6)))
     assert len({id(one) for one in got}) == 1
     assert len(reads) == 1
-    small = RegionCache(regions.cache.read, 1, in_one)
+    small = RegionCache(regions.cache.read, lambda: 1, in_one)
     for one in regions.known.values():
         small.get(one)
     assert 0 < small.bytes < counted.bytes * len(regions.known), "the one read last alone"
@@ -308,3 +308,18 @@ def test_a_region_that_cannot_be_read_is_named_and_the_others_go_on(kept: KeptMa
     kept.mapper.reset(np.full(3, -30.0), np.full(3, 30.0))
     kept.visit(0)
     assert (kept.mapper.publish().status(around(0)) == Status.SURFACE).any()
+
+
+def test_regions_leave_where_the_share_of_a_map_becomes_smaller(kept: KeptMap) -> None:
+    kept.visit(0, 1, 2, 3)
+    kept.checkpoint()
+    regions, memory = kept.mapper.regions, kept.mapper.memory.server
+    memory.limit = 2 * regions.bytes_used
+    assert not regions.room.make_again()
+    assert not regions.all.cold
+    other = memory.open()
+    assert regions.room.make_again()
+    assert regions.room.left > 0
+    assert regions.all.cold
+    memory.close(other)
+    assert not regions.room.make_again()

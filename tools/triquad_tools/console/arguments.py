@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import triquad_format
 from triquad_format.wire.endpoints import DEFAULT_ENDPOINT
+from triquad_format.wire.keys import DEFAULT_MAP
 from triquad_format.wire.limits import MAX_FILL_M
 
 if TYPE_CHECKING:
     from triquad_client import Client
 
-DEFAULT_MAP = "default"
 PAGE_PORT = 8080  # of the page that shows a map
 Place = tuple[float, float, float]  # metres
 

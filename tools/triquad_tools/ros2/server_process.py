@@ -14,13 +14,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from triquad_format.wire.endpoints import DEFAULT_ENDPOINT, full_endpoint
+from triquad_format.wire.keys import DEFAULT_MAP
 from triquad_format.wire.zenoh_access import (
     access_control,
     take_part_in_ros2,
     without_credentials,
 )
 
-from triquad_tools.console.arguments import DEFAULT_MAP
 from triquad_tools.ros2.options import TopicChoice
 from triquad_tools.ros2.topics import bridge_key
 
@@ -37,14 +37,14 @@ class ServerProcess:
         machine may take part in the domain of the ``topics``.
         """
         given = _parsed(arguments)
-        self.map_name: str = given.map
+        self.map_name: str = given.map[0] if given.map else DEFAULT_MAP
         # Where it listens on 0.0.0.0, connecting to that reaches it on this machine.
         self.endpoint = full_endpoint(given.listen[0] if given.listen else DEFAULT_ENDPOINT)
         self._folder = TemporaryDirectory(prefix="triquad-ros2-")
         command = [sys.executable, "-m", "triquad_server.cli", *arguments]
         if given.config is None:
             file = Path(self._folder.name) / "zenoh.json5"
-            file.write_text(_network(given.map, topics))
+            file.write_text(_network(topics))
             command += ["--config", str(file)]
         # A service manager may watch this process; it is the server that reports its state.
         environment = {key: value for key, value in os.environ.items() if key != "WATCHDOG_PID"}
@@ -76,17 +76,17 @@ class ServerProcess:
 def _parsed(arguments: Sequence[str]) -> argparse.Namespace:
     """Return what the bridge has to know of the server's arguments."""
     parser = argparse.ArgumentParser(add_help=False)
-    parser.add_argument("--map", default=DEFAULT_MAP)
+    parser.add_argument("--map", action="append")
     parser.add_argument("-l", "--listen", action="append")
     parser.add_argument("-c", "--config")
     return parser.parse_known_args(arguments)[0]
 
 
-def _network(map_name: str, topics: TopicChoice) -> str:
+def _network(topics: TopicChoice) -> str:
     published = [bridge_key(topics.mesh), bridge_key(topics.grid)]
-    rules = take_part_in_ros2(map_name, topics.domain, published)
+    rules = take_part_in_ros2(topics.domain, published)
     configuration = {
         "scouting": {"gossip": {"enabled": True}},  # nodes find each other through it
-        "access_control": access_control(without_credentials(map_name, ros2=rules)),
+        "access_control": access_control(without_credentials(ros2=rules)),
     }
     return json.dumps(configuration)

@@ -4,9 +4,9 @@ import argparse
 
 from triquad_format.mapfile.metadata import utc_time
 from triquad_format.mapfile.reader import MapFile, read_map_file
+from triquad_format.wire.keys import DEFAULT_MAP
 
 from triquad_tools.commands.inspect import COMMAND
-from triquad_tools.console.arguments import DEFAULT_MAP
 from triquad_tools.console.command import FAILED, OK, ToolError, complain, print_line, refuse
 from triquad_tools.console.progress import progress
 from triquad_tools.console.report import json_text
