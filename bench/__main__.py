@@ -29,6 +29,8 @@ PARTS = (
     "moving",
     "poses",
     "city",
+    "maps",
+    "batch",
     "presets",
     "start",
     "viewer",

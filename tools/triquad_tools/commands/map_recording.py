@@ -6,7 +6,7 @@ from pathlib import Path
 
 from triquad_server.process.installed import DEVICES
 
-from triquad_tools.console.arguments import SUFFIXES, add_fill, command_parser, not_negative
+from triquad_tools.console.arguments import SUFFIXES, add_fill, command_parser, count, not_negative
 from triquad_tools.console.command import run_work
 from triquad_tools.recordings.arguments import add_recording
 
@@ -22,7 +22,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog="Exit status: 0 done; 1 the map could not be written; 2 wrong usage, or input of "
         "which nothing can be used; 130 interrupted: the same command then goes on where it was.",
     )
-    add_recording(parser)
+    add_recording(parser, several=True)
     add = parser.add_argument
     add("output", type=Path, metavar="OUT", help="its name ends in " + ", ".join(SUFFIXES))
     preset = "settings for a kind of place and sensor, such as indoor (docs/settings.md)"
@@ -36,6 +36,10 @@ def _parser() -> argparse.ArgumentParser:
     most += "command without this and with --force goes on from there (default: until settled)"
     add("--train-for", type=not_negative, metavar="S", help=most)
     add("--training", action="store_true", help="keep what further training needs in the map file")
+    of_machine = "map by so many processes of this machine (extra cluster, docs/scale.md)"
+    add("--workers", type=count, metavar="N", help=of_machine)
+    scheduler = "map by the workers of a cluster of Dask, such as tcp://scheduler:8786"
+    add("--cluster", metavar="ADDRESS", help=scheduler)
     add("--force", action="store_true", help="replace OUT where it exists")
     return parser
 

@@ -23,20 +23,31 @@ from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
 from triquad_tools.mapping.output import why
 from triquad_tools.recordings.opening import Selection
+from triquad_tools.recordings.recording import ScanEntry
 
 MAP_NAME = "recording"
+OUTSIDE = "outside_world"  # the reason for which scans are refused that are too far away
 _SAVE_PERIOD_S, _SAVE_SHARE = 60.0, 0.05  # at least, and of the time: a large map takes seconds
-_SECTIONS = {"field", "scan", "change", "training", "sources"}  # that a map depends on
+SECTIONS = {"field", "scan", "change", "training", "sources"}  # that a map depends on
 _KEY_DIGITS = 40  # the name of a map has 64 characters at most, and the number of scans follows
 
 
 def mapping_key(selection: Selection, settings: Settings) -> str:
-    """Return a key that identifies the scans, poses and settings; it can be the name of a map."""
-    digest = hashlib.sha256(settings.model_dump_json(include=_SECTIONS).encode())
+    """Return a key that identifies the scans and settings; it can be the name of a map."""
+    digest = hashlib.sha256(settings.model_dump_json(include=SECTIONS).encode())
     digest.update(selection.way.encode())
     for entry in selection.entries:
         digest.update(f"{entry.stamp_ns} {entry.source}\n".encode())
     return digest.hexdigest()[:_KEY_DIGITS]
+
+
+def another_frame(refusal: str, scan: ScanEntry, first: ScanEntry) -> ToolError:
+    """Return the error for a second scan in a row that is out of the world."""
+    after_s = (scan.stamp_ns - first.stamp_ns) / 1e9
+    return ToolError(
+        f"{refusal}; this one is {after_s:.3f} s after the first: map what is before by --end, or "
+        "what is after by --start"
+    )
 
 
 @dataclass(frozen=True)
@@ -114,12 +125,9 @@ class MappingRun:
                 except ScanRefusedError as error:
                     self.refusals[error.reason] += 1
                     self.last_refusal = f"scan {self.scans_taken}: {error}"
-                    was_outside, self._outside = self._outside, error.reason == "outside_world"
+                    was_outside, self._outside = self._outside, error.reason == OUTSIDE
                     if self._outside and was_outside:
-                        after_s = (entry.stamp_ns - entries[0].stamp_ns) / 1e9
-                        told = f"{self.last_refusal}; this one is {after_s:.3f} s after the first:"
-                        told += " map what is before by --end, or what is after by --start"
-                        raise ToolError(told) from error
+                        raise another_frame(self.last_refusal, entry, entries[0]) from error
                 self.scans_taken += 1
                 self.mapper.train()
                 report(self.scans_taken, f"{self.scans_taken} of {total} scans")

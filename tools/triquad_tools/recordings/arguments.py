@@ -18,10 +18,12 @@ WORLD, SENSOR = "world", "sensor"  # the frames in which points may be
 _Add = Callable[..., argparse.Action]
 
 
-def add_recording(parser: argparse.ArgumentParser) -> None:
-    """Let a command take a recording, and choose from it."""
+def add_recording(parser: argparse.ArgumentParser, *, several: bool = False) -> None:
+    """Let a command take a recording, or ``several`` of one frame, and choose from each."""
     kinds = "a bag of ROS 1 or ROS 2, an MCAP file, or a folder of scans (docs/tools.md)"
-    parser.add_argument("recording", type=Path, metavar="RECORDING", help=kinds)
+    kinds += "; several have their poses in the same frame" if several else ""
+    number = "+" if several else 1
+    parser.add_argument("recordings", type=Path, nargs=number, metavar="RECORDING", help=kinds)
     _add_choice(parser.add_argument_group("which scans").add_argument)
     _add_ros(parser.add_argument_group("bags and MCAP files").add_argument)
     _add_folder(parser.add_argument_group("folders of clouds or depth images").add_argument)

@@ -11,6 +11,7 @@ from pathlib import Path
 from triquad_tools.console.arguments import MAP_SUFFIX, Place
 from triquad_tools.console.command import ToolError, print_remark
 from triquad_tools.recordings.arguments import WORLD
+from triquad_tools.recordings.chain import RecordingChain
 from triquad_tools.recordings.cloud import points_in_range
 from triquad_tools.recordings.folders.cloud_folder import is_cloud_folder, read_cloud_folder
 from triquad_tools.recordings.folders.depth_folder import is_depth_folder, read_depth_folder
@@ -124,7 +125,7 @@ def _refuse_others(what: str, meaningful: set[str], options: ReadingOptions) -> 
 class Selection:
     """Some scans of a recording, without points that are too near."""
 
-    recording: Recording
+    recording: Recording | RecordingChain
     indices: Sequence[int]
     range_min_m: float
     ray_origin: Place  # in the frame of the points
@@ -141,30 +142,60 @@ class Selection:
 
     def scans(self, start: int = 0) -> Iterator[PosedScan]:
         """Yield the scans from number ``start`` on, one after the other."""
-        for scan in self.recording.read(self.indices[start:]):
+        return self.read(range(start, len(self)))
+
+    def read(self, numbers: Sequence[int]) -> Iterator[PosedScan]:
+        """Yield the scans of these numbers, which rise."""
+        for scan in self.recording.read([self.indices[number] for number in numbers]):
             seen = as_rays(scan, self.ray_origin)
             yield replace(seen, points=points_in_range(seen.points, self.range_min_m))
 
 
 def open_selected(options: argparse.Namespace) -> Selection:
-    """Return the recording of the arguments and the scans they choose; its remarks are printed.
+    """Return the recordings of the arguments and the scans they choose; their remarks are printed.
+
+    Raises:
+        ToolError: one cannot be read, or no scan of it is left to map.
+    """
+    reading, paths = options_of(options), options.recordings
+    if len(paths) > 1 and (reading.odometry or reading.trajectory):
+        flag = "--odometry" if reading.odometry else "--trajectory"
+        raise ToolError(
+            f"{flag} gives each of {len(paths)} recordings poses in a frame of its own: map them "
+            "one by one, or give recordings that have poses in one frame"
+        )
+    parts = [_part(path, reading, options) for path in paths]
+    way = repr(([path.resolve() for path in paths], reading, options.range_min))
+    origin, range_min_m = reading.ray_origin or _ORIGIN, options.range_min
+    if len(parts) == 1:
+        return Selection(*parts[0], range_min_m, origin, way)
+    chosen, before = list[int](), 0
+    for recording, indices in parts:
+        chosen += [before + index for index in indices]
+        before += len(recording.entries)
+    chain = RecordingChain([recording for recording, _ in parts])
+    return Selection(chain, chosen, range_min_m, origin, way)
+
+
+def _part(
+    path: Path, reading: ReadingOptions, options: argparse.Namespace
+) -> tuple[Recording, list[int]]:
+    """Return a recording and the numbers of its scans that are chosen.
 
     Raises:
         ToolError: it cannot be read, or no scan is left to map.
     """
-    reading = options_of(options)
-    recording = open_recording(options.recording, reading)
+    recording = open_recording(path, reading)
     for remark in recording.remarks:
-        print_remark(f"{options.recording}: {remark}")
-    entries = entries_of(recording, options.recording)
+        print_remark(f"{path}: {remark}")
+    entries = entries_of(recording, path)
     indices = _chosen(entries, options)
     if not indices:
         raise ToolError(
-            f"{options.recording}: no scan is left of {len(entries)} in {length_s(entries):.1f} s: "
-            "see --start, --end and --every"
+            f"{path}: no scan is left of {len(entries)} in {length_s(entries):.1f} s: see --start, "
+            "--end and --every"
         )
-    way = repr((options.recording.resolve(), reading, options.range_min))
-    return Selection(recording, indices, options.range_min, reading.ray_origin or _ORIGIN, way)
+    return recording, indices
 
 
 def entries_of(recording: Recording, path: Path) -> Sequence[ScanEntry]:

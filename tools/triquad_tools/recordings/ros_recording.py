@@ -138,6 +138,8 @@ class RosRecording:
             if key in wanted:
                 wanted.discard(key)
                 yield self._read(message)
+                if not wanted:
+                    return
         if wanted:
             raise ToolError(
                 f"{self._bag.path}: {len(wanted)} scans are no longer there; has it changed since "

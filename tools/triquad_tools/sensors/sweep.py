@@ -63,6 +63,10 @@ class NoScanError(TriquadError):
         super().__init__(text)
         self.reason = reason
 
+    def __reduce__(self) -> tuple[object, ...]:
+        """Let it be sent to another process, with what a subclass adds."""
+        return type(self), (self.reason, str(self)), vars(self)
+
 
 class NoTransformError(NoScanError):
     """The pose of a sensor is not known; ``late`` if transforms that still come may give it."""

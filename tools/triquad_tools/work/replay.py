@@ -29,7 +29,7 @@ def work(options: argparse.Namespace) -> int:
 
 
 def _list(options: argparse.Namespace) -> int:
-    path = options.recording
+    (path,) = options.recordings
     recording = open_recording(path, options_of(options))
     titles = ("stream", "type", "count", "frame", "use")
     rows = [(s.name, s.kind, f"{s.count:,}", s.frame, s.use) for s in recording.streams]
