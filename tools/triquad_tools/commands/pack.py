@@ -18,7 +18,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = command_parser(
         COMMAND,
         description="Rewrite a map file: smaller, cropped, an earlier epoch of it, what is intact "
-        "of it, in the newest version, or as a mesh or a picture.",
+        "of it, joined with another map, in the newest version, or as a mesh or a picture.",
         epilog="Exit status: 0 done; 1 IN is damaged (with --recover: something of it is lost), or "
         "nothing lies in the box; 2 wrong usage, or input that cannot be used.",
     )
@@ -38,6 +38,8 @@ def _add_source(add: _Add) -> None:
     at += "2026-01-31T12:00:00Z (default: the newest of all)"
     add("--at", metavar="EPOCH_OR_TIME", help=at)
     add("--recover", action="store_true", help="save what is intact of a damaged file")
+    other = "join another map of the same frame with IN; what both know is learnt anew"
+    add("--merge", type=Path, metavar="OTHER", help=other)
 
 
 def _add_content(add: _Add) -> None:

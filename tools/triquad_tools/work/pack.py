@@ -65,9 +65,12 @@ def _check_usage(options: argparse.Namespace) -> None:
         ),
         f"--max-error is of map files: {suffix} has none": options.max_error and not is_map,
         "--cell is of meshes: a map file has none": options.cell and is_map,
-        f"{suffix} has scans: --at, --recover, --crop and --cell are of maps": (
+        f"{suffix} has scans: --at, --recover, --merge, --crop and --cell are of maps": (
             suffix == SCANS_SUFFIX
-            and bool(options.at or options.recover or options.crop or options.cell)
+            and any((options.at, options.recover, options.merge, options.crop, options.cell))
+        ),
+        "--merge is of whole maps: crop what it has made, or recover a map before": (
+            bool(options.merge and (options.crop or options.recover))
         ),
     }
     refuse(problems)
@@ -138,12 +141,28 @@ def _box(corners: list[float] | None) -> Box | None:
 
 
 def _source(options: argparse.Namespace, path: Path, box: Box | None) -> tuple[SourceMap, bool]:
+    if options.merge is not None:
+        return _merged(options, path), True
     if not options.recover:
         return read_source(path, box), True
     recovery = recover(path)
     _print_recovery(recovery)
     source = SourceMap(recovery.record, recovery.stamp_ns)
     return source if box is None else cropped(source, box), recovery.complete
+
+
+def _merged(options: argparse.Namespace, path: Path) -> SourceMap:
+    """Return the map joined with another one."""
+    try:
+        from triquad_tools.mapping.merge import merged
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.startswith("triquad"):
+            raise
+        raise ToolError(f"{error.name} is missing: install triquad[server]") from error
+
+    other = read_source(chosen_file(options.merge, None), None)
+    own = read_source(path, None)
+    return SourceMap(merged(other.record, own.record), max(other.stamp_ns, own.stamp_ns))
 
 
 def _print_recovery(recovery: RecoveredMap) -> None:
