@@ -20,7 +20,7 @@ from triquad_tools.simulation.street import street_drive
 from bench.figures import Figure
 from bench.street_pieces import PIECE_M, REACH_M, mean_f_score
 
-_LENGTH_M, _STEP_M, _EACH_M = 4000.0, 2.0, 500.0  # a piece is scored each so many
+_LENGTH_M, _STEP_M, _EACH_M = 1000.0, 2.0, 200.0  # a piece is scored each so many
 _SETTINGS = ("--set", "training.samples_per_ray=6")  # of 48: hours are not needed for a ratio
 _PROGRAM = "from triquad_tools.commands.map_recording import main; raise SystemExit(main())"
 _POLL_S = 0.2
@@ -38,6 +38,7 @@ def measure(options: argparse.Namespace) -> list[Figure]:
         figures = [
             Figure("one process", alone_s, "s"),
             Figure("one process: F", 100 * alone_f, "%"),
+            Figure("its map file", (folder / "map.triquad").stat().st_size / 1e6, "MB"),
         ]
         for workers, kills in ((1, False), (2, False), (2, True)):
             took_s, f_score = _mapped(folder, drive, ["--workers", str(workers)], kills=kills)

@@ -128,7 +128,7 @@ class Service:
         memory.add("mesh tiles", lambda: tiles.nbytes)
         if self._store is not None:
             cache = self._store.regions.cache
-            memory.add("regions read to answer", lambda: cache.bytes)
+            memory.add("regions read to answer", lambda: cache.bytes, cache.clear)
 
     def _announce(self, health: Health) -> None:
         """Say that the server is there, until it closes."""

@@ -24,6 +24,7 @@ from support.servers import (
 )
 from triquad_client import Client
 from triquad_format.wire import codec, keys
+from triquad_format.wire.map_messages import CreateMapRequest, DropMapRequest
 from triquad_format.wire.messages import CheckpointRequest, ResetRequest
 
 EVERYWHERE = ResetRequest(np.full(3, -np.inf), np.full(3, np.inf))
@@ -76,10 +77,15 @@ def test_the_log_says_what_listening_beyond_allows(server):
     assert "from beyond this machine may question and follow the map and publish scans" in line
 
 
-def test_twenty_resets_and_checkpoints_change_nothing(server, stranger):
+def test_twenty_requests_of_an_admin_change_nothing(server, stranger):
     with connected(server) as client:
         before = client.status()
-        requests = {keys.RESET: EVERYWHERE, keys.CHECKPOINT: CheckpointRequest()}
+        requests = {
+            keys.RESET: EVERYWHERE,
+            keys.CHECKPOINT: CheckpointRequest(),
+            keys.CREATE_MAP: CreateMapRequest("another"),
+            keys.DROP_MAP: DropMapRequest("another"),
+        }
         for _ in range(20):
             for operation, request in requests.items():
                 key = keys.operation_key(MAP, operation)
@@ -87,6 +93,7 @@ def test_twenty_resets_and_checkpoints_change_nothing(server, stranger):
         after = client.status()
         assert after.last_checkpoint == before.last_checkpoint
         assert after.epoch == before.epoch
+        assert client.maps() == [MAP]
         assert client.query_sdf(sphere(20)).status.all()
 
 

@@ -128,6 +128,12 @@ class RegionCache:
                 del self._kept[gone]
             self._drop()
 
+    def clear(self) -> None:
+        """Keep nothing any more: who asks reads again."""
+        with self._lock:
+            self._kept.clear()
+            self.bytes = 0
+
     def _drop(self) -> None:
         """Drop what is too much; surfels that were fitted since the last time count, too."""
         sizes = {one: sum(buffers_of(read).values()) for one, read in self._kept.items()}

@@ -211,7 +211,7 @@ class LiveRegions:
         """Bring back a region that has more to learn, if there is one and room for it."""
         unsettled = (one for one in self.all.cold.values() if one.facts.samples_left)
         region = min(unsettled, key=lambda one: one.facts.memory_bytes, default=None)
-        if region is None or not self.room.make(region.facts.memory_bytes):
+        if region is None or not self.room.has(region.facts.memory_bytes):
             return False
         try:
             self.all.read([region.index])

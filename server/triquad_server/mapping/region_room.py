@@ -124,7 +124,13 @@ class RegionRoom:
         return self._regions.version != version
 
     def has(self, needed: int) -> bool:
-        """Return whether ``needed`` bytes are left, once what can leave memory has left."""
+        """Return whether ``needed`` bytes are left, once what can leave memory has left.
+
+        What was read to answer questions gives way, too, where that does not suffice.
+        """
+        if self.make(needed) or needed <= self.left:
+            return True
+        self._budget.memory.drop()
         return self.make(needed) or needed <= self.left
 
     def begin_again(self) -> None:

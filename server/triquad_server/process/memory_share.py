@@ -56,6 +56,7 @@ class MemoryShare:
         """Use :meth:`ServerMemory.open`."""
         self.server = server
         self._parts: dict[str, Callable[[], int]] = {}  # replaced when it grows: others read it
+        self._drops: list[Callable[[], None]] = []  # what empties parts that can be had again
 
     @property
     def limit(self) -> int:
@@ -82,9 +83,20 @@ class MemoryShare:
         share = f", of which each of {maps} maps has {self.limit}" if maps > 1 else ""
         return f"memory.max_bytes = {self.server.limit}{share}"
 
-    def add(self, name: str, count: Callable[[], int]) -> None:
-        """Count another part from now on; ``map`` are the regions in memory."""
+    def add(
+        self, name: str, count: Callable[[], int], drop: Callable[[], None] | None = None
+    ) -> None:
+        """Count another part from now on; ``map`` are the regions in memory.
+
+        What can ``drop`` its bytes is emptied before regions go without room.
+        """
         self._parts = {**self._parts, name: count}
+        self._drops += [] if drop is None else [drop]
+
+    def drop(self) -> None:
+        """Empty the parts that can be had again."""
+        for drop in self._drops:
+            drop()
 
     def parts(self) -> dict[str, int]:
         """Return the bytes of the program, of this map by part, and of all others."""

@@ -57,6 +57,15 @@ def test_a_new_map_has_what_the_others_leave(memory: ServerMemory) -> None:
     assert small.parts() == {"program": 0, "map": second.regions.bytes_used}
 
 
+def test_what_can_be_read_again_gives_way_to_regions(memory: ServerMemory) -> None:
+    share, first = counted(memory)
+    kept = [int(0.8 * memory.limit)]
+    share.add("regions read to answer", lambda: sum(kept), kept.clear)
+    place(first)
+    assert first.scans_taken == 1
+    assert not kept
+
+
 def test_what_the_program_takes_is_shared_too() -> None:
     memory = ServerMemory(1_000_000_000)
     memory.count_program(350_000_000)
