@@ -169,7 +169,7 @@ class Maps:
             except (StoreError, OSError) as error:
                 still = "goes on" if name in self._services else "is closed, and stays in the store"
                 raise RefusedError("store", f"map {name!r} {still}: {error}") from error
-        _log.warning("map '%s' is dropped; what it was is in %s", name, kept or "no store")
+        _log.warning("map '%s' is dropped; what it was is kept in %s", name, kept or "no folder")
         return DropMapReply(tuple(self._services), None if kept is None else str(kept))
 
     def _open_another(self, name: str) -> None:

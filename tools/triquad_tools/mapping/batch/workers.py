@@ -22,13 +22,14 @@ def opened(cluster: str | None, workers: int | None) -> Iterator[Client]:
     """
     if cluster is None:
         # Dask would end workers that take more than their part of the memory: a map keeps to its
-        # own limit.
+        # own limit. Without certificates any user of the machine could run programs as this one.
         with (
             LocalCluster(  # type: ignore[no-untyped-call]
                 n_workers=workers,
                 threads_per_worker=1,
                 dashboard_address="127.0.0.1:0",
                 memory_limit=0,
+                security=True,
                 silence_logs=logging.ERROR,
             ) as local,
             Client(local) as client,  # type: ignore[no-untyped-call]
