@@ -33,8 +33,15 @@ def is_urgent() -> bool:
     return getattr(_thread, "niceness", 0) == 0
 
 
-THREADS = max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1)
-"""Threads that share the work: one per core that this process may use."""
+def _threads() -> int:
+    """Return one thread for each core, or as many as the environment allows, if that is fewer."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+    given = os.environ.get("TRIQUAD_THREADS", "")
+    return max(1, min(cores, int(given)) if given.isdecimal() else cores)
+
+
+THREADS = _threads()
+"""Threads that share the work: one per core that this process may use, unless fewer are set."""
 
 MIN_SHARE = 2048
 """Points of a field below which splitting work costs more than it gains."""

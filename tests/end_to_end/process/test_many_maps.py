@@ -124,7 +124,7 @@ def test_a_created_map_that_is_damaged_does_not_keep_the_others_from_it(tmp_path
 def test_what_a_dropped_map_took_is_free_again() -> None:
     with serving(maps=("a", "b")) as server, clients(server, "a", "b") as (a, b):
         b.publish_scan(servers.sphere(60_000, 20.0), shifted(0.0))
-        b.settle(servers.WAIT_S)
+        b.flush(servers.WAIT_S)
         took = b.status().map_bytes
         assert took > 10_000_000
         before = server.resident_bytes
