@@ -1,4 +1,4 @@
-"""Two maps in one server, each with a lidar at 5 Hz, beside each of them in a server of its own."""
+"""Two maps in one server, each with a lidar at 5 Hz; and each of them in a server of its own."""
 
 import argparse
 import time

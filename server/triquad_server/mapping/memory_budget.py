@@ -72,7 +72,7 @@ class MemoryBudget:
     @property
     def room(self) -> int:
         """The bytes that all regions may take now."""
-        return int((1 - _BETWEEN) * self.memory.limit) - self.memory.beside()
+        return int((1 - _BETWEEN) * self.memory.limit) - self.memory.reserved()
 
     @property
     def reserve(self) -> int:

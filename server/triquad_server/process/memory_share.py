@@ -24,7 +24,7 @@ class ServerMemory:
         self.program = nbytes + _LATER_BYTES
 
     def check(self, maps: int) -> None:
-        """See that there is room for so many maps.
+        """See that there is room for a number of maps.
 
         Raises:
             SettingsError: there is none.
@@ -109,7 +109,7 @@ class MemoryShare:
         """The bytes that the map takes, without the program."""
         return sum(count() for count in self._parts.values())
 
-    def beside(self) -> int:
+    def reserved(self) -> int:
         """Return the bytes of the share that are not for regions.
 
         Another map that takes more than its share, since it had a larger one, is left so much.

@@ -70,12 +70,12 @@ def test_what_the_program_takes_is_shared_too() -> None:
     memory = ServerMemory(1_000_000_000)
     memory.count_program(350_000_000)
     one = memory.open()
-    assert one.beside() == memory.program == 400_000_000
+    assert one.reserved() == memory.program == 400_000_000
     assert one.kept_bytes == 60_000_000
     other = memory.open()
-    assert one.beside() == 200_000_000
+    assert one.reserved() == 200_000_000
     other.add("map", lambda: 500_000_000)
     other.add("mesh tiles", lambda: 1_000_000)
     assert one.parts() == {"program": 400_000_000, "other maps": 501_000_000}
-    assert one.beside() == 200_000_000 + 201_000_000, "more than the 300 MB of its share"
-    assert other.beside() == 201_000_000
+    assert one.reserved() == 200_000_000 + 201_000_000, "more than the 300 MB of its share"
+    assert other.reserved() == 201_000_000

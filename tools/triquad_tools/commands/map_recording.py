@@ -36,7 +36,7 @@ def _parser() -> argparse.ArgumentParser:
     most += "command without this and with --force goes on from there (default: until settled)"
     add("--train-for", type=not_negative, metavar="S", help=most)
     add("--training", action="store_true", help="keep what further training needs in the map file")
-    of_machine = "map by so many processes of this machine (extra cluster, docs/scale.md)"
+    of_machine = "map by this number of processes of this machine (extra cluster, docs/scale.md)"
     add("--workers", type=count, metavar="N", help=of_machine)
     scheduler = "map by the workers of a cluster of Dask, such as tcp://scheduler:8786"
     add("--cluster", metavar="ADDRESS", help=scheduler)

@@ -38,7 +38,7 @@ def _add_source(add: _Add) -> None:
     at += "2026-01-31T12:00:00Z (default: the newest of all)"
     add("--at", metavar="EPOCH_OR_TIME", help=at)
     add("--recover", action="store_true", help="save what is intact of a damaged file")
-    other = "join another map of the same frame with IN; what both know is learnt anew"
+    other = "join another map of the same frame with IN; what both know is learnt again"
     add("--merge", type=Path, metavar="OTHER", help=other)
 
 

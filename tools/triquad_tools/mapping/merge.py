@@ -36,7 +36,7 @@ Removed = Mapping[RegionIndex, Longs]
 def merged(first: MapRecord, second: MapRecord, settings: Settings | None = None) -> MapRecord:
     """Return the map of both, with its training state.
 
-    A region that both know is settled anew on the rays of both: the features of two fields cannot
+    A region that both know is learnt again on the rays of both: the features of two fields cannot
     be joined, as each has a decoder of its own. Surface of the map that was seen earlier is removed
     where rays of the later one show that it is there no more, as in a map that is told of both.
 
@@ -166,12 +166,11 @@ def _joined(earlier: Region, later: Region, removed: Longs, settings: Settings) 
 
 
 def _settled(record: MapRecord, settings: Settings, teams: Teams, removed: Removed) -> MapRecord:
-    """Return a map once nothing is left to learn."""
+    """Return a map of joined regions once nothing is left to learn."""
     mapper = Mapper(record.name, settings, "cpu", record, teams)
     for live in mapper.regions:
-        if live.index in removed:
-            live.field.grow(_surface(live))
-            live.training.rays.forget_ends(removed[live.index])
+        live.field.grow(_surface(live))
+        live.training.rays.forget_ends(removed[live.index])
     mapper.publish()
     total = mapper.samples_left
     with progress("training", total) as report:
