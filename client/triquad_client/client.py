@@ -135,8 +135,9 @@ def connect(
 
     Args:
         endpoint: of the server, or of a router that leads to it: a host such as ``robot`` or
-            ``robot:7447``, or an endpoint of Zenoh; ``None``: where ``config`` says, and otherwise
-            port 7447 of this machine.
+            ``robot:7447``, or an endpoint of Zenoh; several, with commas between them, where one is
+            enough: when it goes, the next is connected to. ``None``: where ``config`` says, and
+            otherwise port 7447 of this machine.
         map: name of the map.
         timeout_s: for connecting and for each request, by default ten seconds: so long a server is
             waited for that is not there yet; a warning says so. By default, one that says what it

@@ -109,6 +109,7 @@ def _run(options: argparse.Namespace) -> int:
         store=options.store,
         device=options.device,
         restore=options.restore,
+        share=options.share,
     )
     # Only now, since it takes seconds to import.
     from triquad_server.launch import run_server
@@ -164,6 +165,12 @@ def _parser() -> argparse.ArgumentParser:
         metavar="EPOCH",
         help="take the map back to an older checkpoint of the store, such as the one that is kept "
         "before a reset (triquad-inspect STORE --log lists them); what it was stays on disk",
+    )
+    add(
+        "--share",
+        action="store_true",
+        help="share the map with other servers, which are started likewise and reach each other by "
+        "--connect and the same --store: each has some of its regions (docs/scale.md)",
     )
     add("--device", choices=DEVICES, default="cpu", help="what it trains on (default: cpu)")
     _add_settings(parser.add_argument_group("settings (docs/settings.md)"))

@@ -18,6 +18,10 @@ class StoreError(ServerError):
     """Checkpoints cannot be read or written."""
 
 
+class StoreInUseError(StoreError):
+    """Another server has the folder of a map."""
+
+
 class LastCheckpointError(StoreError):
     """The server stops, and what was mapped since its last checkpoint is lost."""
 
@@ -35,4 +39,4 @@ class ScanRefusedError(TriquadError):
 
 
 class NoRoomYetError(Exception):
-    """A scan for which there is room once a checkpoint lets regions leave memory."""
+    """A scan that has to wait, such as for room until regions leave memory."""

@@ -24,7 +24,7 @@ from triquad_server.process.service_manager import ServiceManager
 from triquad_server.process.stop import Stop, Stops, wait_for_stop
 from triquad_server.process.threads import Teams
 from triquad_server.settings import Settings
-from triquad_server.store.found_map import FoundMap, find_map
+from triquad_server.store.found_map import FoundMap, find_map, find_share
 from triquad_server.warm_up import Report, warm_up
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ def _open(
     """Open all parts of a server, to be closed by ``stack``."""
     check_device(options.device)
     settings = options.settings
-    network = configuration(options.network, settings)
+    network = configuration(options.network, settings, waits=not options.share)
     monitoring = _open_monitoring(settings, stack)
     session = stack.enter_context(closing(open_session(network)))
     created = [] if options.store is None else created_maps(options.store, options.map_names[0])
@@ -164,6 +164,12 @@ def _found(
     for name in names:
         is_named = name in options.map_names
         restore = options.restore if is_named else None
+        if options.share and options.store is not None:
+            one = find_share(
+                name, options.settings, options.store, memory=memory, split=teams.answer
+            )
+            stack.enter_context(one.opened)
+            return [one]
         try:
             one = find_map(
                 name,

@@ -20,6 +20,7 @@ class LaunchOptions:
     store: Path | None
     device: str  # "cpu" or "cuda"
     restore: int | None = None  # the epoch that the only map is restored to; None: the newest
+    share: bool = False  # other servers have regions of the only map, too
 
     def __post_init__(self) -> None:
         """Refuse bad names, and to restore without a store, or which of several maps is not clear.
@@ -34,6 +35,11 @@ class LaunchOptions:
                 raise ServerError(f"--map {name} is given twice")
         if self.restore is not None and self.store is None:
             raise ServerError("--restore needs the --store that the map is taken from")
+        if self.share and (self.store is None or len(self.map_names) > 1 or self.restore):
+            raise ServerError(
+                "--share is for one map, with the --store that all its servers share, and without "
+                "--restore"
+            )
         if self.restore is not None and len(self.map_names) > 1:
             raise ServerError(
                 "--restore is for one map: start the server with that --map alone, stop it, and "

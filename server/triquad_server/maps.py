@@ -5,7 +5,6 @@ import logging
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
-from datetime import datetime, timezone
 from pathlib import Path
 
 import zenoh
@@ -28,12 +27,23 @@ from triquad_server.process.threads import Teams
 from triquad_server.server_status import Health
 from triquad_server.service import Service
 from triquad_server.serving.operations import Lane
+from triquad_server.sharing.leases import Leases, now_ms
+from triquad_server.sharing.sharing import Sharing
+from triquad_server.sharing.stores import Stores
+from triquad_server.store.dropped import set_aside
 from triquad_server.store.found_map import FoundMap, find_map
 
 _log = logging.getLogger("triquad_server")
 
-_DROPPED = ".dropped"  # the folder of a store for maps that were dropped: no map has such a name
 _CREATED_BY = "created_by"  # the file in a created map's folder that names its server's first map
+_NO_LOG = (
+    "no scans are kept: after a division of the network, those of one side are lost; set "
+    "store.log_max_bytes"
+)
+_NO_PERIOD = (
+    "store.period_s = 0: other servers see what this one has learnt only once it is asked for a "
+    "checkpoint"
+)
 _OTHERS_S = 1.0  # to hear of maps of other servers
 
 
@@ -99,19 +109,53 @@ class Maps:
             self._options.device,
             found.record,
             self._teams,
-            cold=found.cold,
+            cold=found.cold if found.shared is None else {},
             memory=found.memory,
         )
         if found.store is not None:
             found.store.log_scans(found.settings.field.leaf_m)
-        service = Service(self._session, mapper, found.settings, found.store, self._failed)
-        found.opened.enter_context(closing(service))
-        service.operations.serve(CreateMapRequest, self._create, Lane.FILES)
-        service.operations.serve(
-            DropMapRequest, lambda request: self._drop(request, asked=found.name), Lane.FILES
+        shared = self._shared(found, mapper)
+        scans_of = None if found.shared is None else found.shared.map_name
+        service = Service(
+            self._session, mapper, found.settings, found.store, self._failed, scans_of
         )
+        found.opened.enter_context(closing(service))
+        if shared is not None:
+            sharing = Sharing(*shared, service.mapper, service.health.checkpoints)
+            found.opened.enter_context(closing(sharing))
+        if shared is None:
+            service.operations.serve(CreateMapRequest, self._create, Lane.FILES)
+            service.operations.serve(
+                DropMapRequest, lambda request: self._drop(request, asked=found.name), Lane.FILES
+            )
         self._open[found.name] = found.opened
         self._services = {**self._services, found.name: service}
+
+    def _shared(self, found: FoundMap, mapper: Mapper) -> tuple[Leases, Stores] | None:
+        """Return what is needed to share a map, if it is; it is left to others once closed."""
+        shared, store = found.shared, found.store
+        if shared is None or store is None:
+            return None
+        leases = Leases(self._session, shared.map_name, shared.number)
+        found.opened.enter_context(closing(leases))
+        stores = Stores(store, mapper.field, lambda: found.memory.cache_bytes, self._teams.answer)
+        found.memory.add("regions of other servers", lambda: stores.cache_bytes, stores.clear)
+        stores.refresh()
+        stores.check()
+        leases.wait_for_others(_OTHERS_S)
+        if leases.is_taken:
+            raise StoreError(
+                f"another server is number {shared.number} of map '{shared.map_name}', but has not "
+                f"locked {store.folder}: do all have the same --store?"
+            )
+        mapper.share(leases.may_have, now_ms)
+        mapper.regions.all.others_have(stores.newest(leases))
+        _log.info("map '%s' is shared: this is its server %d", shared.map_name, shared.number)
+        if not found.settings.store.log_max_bytes:
+            _log.warning(_NO_LOG)
+        if not found.settings.store.period_s:
+            _log.warning(_NO_PERIOD)
+        return leases, stores
 
     def close(self) -> None:
         """Close all maps, each with a last checkpoint; what is opened or dropped is waited for.
@@ -165,7 +209,7 @@ class Maps:
                 if root is not None:
                     self._services[name].health.checkpoints.write()
                 self._close(name)
-                kept = None if root is None else _set_aside(root, name)
+                kept = None if root is None else set_aside(root / name)
             except (StoreError, OSError) as error:
                 still = "goes on" if name in self._services else "is closed, and stays in the store"
                 raise RefusedError("store", f"map {name!r} {still}: {error}") from error
@@ -234,14 +278,6 @@ def created_maps(root: Path, first: str) -> list[str]:
             if file.read_bytes().strip() == first.encode() and keys.is_name(file.parent.name):
                 found.append(file.parent.name)
     return found
-
-
-def _set_aside(root: Path, name: str) -> Path:
-    """Move the folder of a map to where no map is looked for; return where it is."""
-    now = datetime.now(timezone.utc)
-    to = root / _DROPPED / f"{name}-{now:%Y%m%dT%H%M%S.%fZ}"
-    to.parent.mkdir(exist_ok=True)
-    return (root / name).rename(to)
 
 
 def _collect() -> None:

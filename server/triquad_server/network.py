@@ -19,6 +19,8 @@ from triquad_server.settings import Settings
 
 _CONNECT_MS = 5000  # a router that was started together with the server may need a moment
 
+_ONE_TRY_MS = 1000  # others of a shared map may come later: it is tried again all the time
+
 _LINKS: Mapping[str, Any] = {
     # A link that is opened and then sends nothing takes up one of the pending places.
     "transport/unicast/accept_timeout": 5000,
@@ -91,8 +93,10 @@ class Configuration:
         return tuple(endpoints)
 
 
-def configuration(options: NetworkOptions, settings: Settings) -> Configuration:
-    """Return the configuration of a server.
+def configuration(
+    options: NetworkOptions, settings: Settings, *, waits: bool = True
+) -> Configuration:
+    """Return the configuration of a server, which ``waits`` for those that it connects to.
 
     What the options leave out is as the file has it; what both leave out is safe: a router
     that only this machine reaches, that neither looks for others nor is found, and that takes no
@@ -102,17 +106,17 @@ def configuration(options: NetworkOptions, settings: Settings) -> Configuration:
         ServerError: the file cannot be read, or a value is not valid.
     """
     try:
-        return _configuration(options, _safe(settings))
+        return _configuration(options, _safe(settings), waits)
     except (zenoh.ZError, ValueError, OSError) as error:
         file = "" if options.config_file is None else f" {options.config_file}"
         raise ServerError(f"Zenoh configuration{file}: {reason(error)}") from error
 
 
-def _configuration(options: NetworkOptions, safe: dict[str, Any]) -> Configuration:
+def _configuration(options: NetworkOptions, safe: dict[str, Any], waits: bool) -> Configuration:
     unset = zenoh.Config()
     file = options.config_file
     config = zenoh.Config() if file is None else zenoh.Config.from_file(str(file))
-    put(config, _of_options(options))
+    put(config, _of_options(options, waits))
     fill(config, {"mode": "router"}, unset)
     is_own = not is_set(config, "access_control", unset)
     fill(config, safe, unset)
@@ -124,7 +128,7 @@ def _configuration(options: NetworkOptions, safe: dict[str, Any]) -> Configurati
     return found
 
 
-def _of_options(options: NetworkOptions) -> dict[str, Any]:
+def _of_options(options: NetworkOptions, waits: bool) -> dict[str, Any]:
     given: dict[str, Any] = {}
     if options.mode is not None:
         given["mode"] = options.mode
@@ -136,8 +140,8 @@ def _of_options(options: NetworkOptions) -> dict[str, Any]:
     if options.connect:
         given["connect/endpoints"] = options.connect
         # By default a router continues without, and reports nothing.
-        given["connect/timeout_ms"] = _CONNECT_MS
-        given["connect/exit_on_failure"] = True
+        given["connect/timeout_ms"] = _CONNECT_MS if waits else _ONE_TRY_MS
+        given["connect/exit_on_failure"] = waits
     return given
 
 

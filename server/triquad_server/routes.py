@@ -31,9 +31,17 @@ _KEYFRAME_BYTES = 80  # of a time, a position and a quaternion, with room
 
 
 def answer_requests(
-    parts: Health, tiles: TileCache, surface: SurfaceHistory, trails: SourceTrails
+    parts: Health,
+    tiles: TileCache,
+    surface: SurfaceHistory,
+    trails: SourceTrails,
+    *,
+    is_shared: bool = False,
 ) -> None:
-    """Answer the requests of clients from now on, by the parts of the server."""
+    """Answer the requests of clients from now on, by the parts of the server.
+
+    Of a map that ``is_shared``, poses cannot be corrected: other servers have some of its regions.
+    """
     serve = parts.operations.serve
     answers, max_bytes = Answers(parts.epochs.view), payload_limit(MAX_QUERY_POINTS)
     for question in QUESTIONS:
@@ -70,6 +78,7 @@ def answer_requests(
         trails,
         is_stopping=lambda: parts.operations.is_stopping,
     )
-    serve(CorrectPosesRequest, corrector.answer, Lane.FILES, _KEYFRAME_BYTES * MAX_KEYFRAMES)
+    if not is_shared:
+        serve(CorrectPosesRequest, corrector.answer, Lane.FILES, _KEYFRAME_BYTES * MAX_KEYFRAMES)
     serve(MapInfoRequest, downloads.info, Lane.FILES)
     serve(MapChunkRequest, downloads.chunk, Lane.LONG_QUESTIONS)

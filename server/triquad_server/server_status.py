@@ -87,6 +87,7 @@ class Health:
             regions_cold=epoch.cold_regions,
             fit=progress.fit,
             origin_m=epoch.origin,
+            region_pitch_m=epoch.field_settings.region_pitch_m,
             **vars(progress.map),
         )
 

@@ -6,9 +6,11 @@ from contextlib import ExitStack
 
 import zenoh
 from triquad_format.wire import keys
+from triquad_format.wire.messages import Scan
 
 from triquad_server.epochs.history import EpochHistory
 from triquad_server.epochs.surface_history import CHANGES_KEPT, SurfaceHistory
+from triquad_server.intake.rays import ScanRays
 from triquad_server.intake.scan_queue import ScanIntake, ScanQueue
 from triquad_server.intake.scan_warnings import ScanWarnings
 from triquad_server.intake.source_trails import SourceTrails
@@ -34,6 +36,7 @@ class Service:
         settings: Settings,
         store: Store | None = None,
         failed: Callable[[Stop], None] = lambda _: None,
+        scans_of: str | None = None,
     ) -> None:
         """Begin to serve.
 
@@ -43,12 +46,14 @@ class Service:
             settings: of the service.
             store: of its checkpoints; ``None``: they are not kept.
             failed: called with the reason if an error ends mapping.
+            scans_of: the map whose scans are taken; ``None``: this one's.
         """
         self.session = session
+        self._scans_of = scans_of or mapper.name
         self._map = mapper
         self._store = store
         self._settings = settings
-        self._scans = ScanQueue(settings.service.scan_queue)
+        self._scans = ScanQueue(settings.service.scan_queue, is_shared=scans_of is not None)
         self._warnings = ScanWarnings(self._scans, settings)
         first = mapper.publish()
         self._epochs = EpochHistory(
@@ -89,8 +94,8 @@ class Service:
     def _open(self, failed: Callable[[Stop], None]) -> None:
         """Open the parts, in the reverse of the order in which they have to be closed."""
         self._parts.callback(self.operations.close)
-        self._mapper = self._open_mapper(failed)
-        checkpoints = CheckpointWriter(self._mapper, self._store, self._settings.store)
+        self.mapper = self._open_mapper(failed)
+        checkpoints = CheckpointWriter(self.mapper, self._store, self._settings.store)
         self.health = health = Health(
             map_name=self._map.name,
             server=self._name,
@@ -99,7 +104,7 @@ class Service:
             operations=self.operations,
             scans=self._scans,
             warnings=self._warnings,
-            mapper=self._mapper,
+            mapper=self.mapper,
             epochs=self._epochs,
             checkpoints=checkpoints,
             memory=self._map.memory,
@@ -112,10 +117,11 @@ class Service:
         self._count(tiles)
         checkpoints.start()
         self._parts.callback(checkpoints.close)
-        answer_requests(health, tiles, self._surface, self._trails)
+        is_shared = self._scans_of != self._map.name
+        answer_requests(health, tiles, self._surface, self._trails, is_shared=is_shared)
         # Closed before the last checkpoint is written: it contains every reset that was answered.
         self._parts.callback(self.operations.close)
-        self._parts.callback(self._mapper.pause)
+        self._parts.callback(self.mapper.pause)
         self._open_intake()
         self._announce(health)
         self._parts.callback(self.operations.stop)  # before anything is waited for
@@ -123,7 +129,7 @@ class Service:
     def _count(self, tiles: TileCache) -> None:
         """Have counted what takes memory."""
         memory = self._map.memory
-        memory.add("map", lambda: self._mapper.progress.map.map_bytes)
+        memory.add("map", lambda: self.mapper.progress.map.map_bytes)
         memory.add("older epochs", lambda: self._epochs.older_bytes)
         memory.add("mesh tiles", lambda: tiles.nbytes)
         if self._store is not None:
@@ -133,34 +139,37 @@ class Service:
     def _announce(self, health: Health) -> None:
         """Say that the server is there, until it closes."""
         self._parts.callback(Heartbeat(self.session, health).close)
+        if self._scans_of != self._map.name:
+            return  # once it has its regions
         alive = keys.alive_key(health.map_name, health.server)
         self._parts.callback(self.session.liveliness().declare_token(alive).undeclare)
 
     def _open_mapper(self, failed: Callable[[Stop], None]) -> MapperThread:
-        warnings, trails, store = self._warnings, self._trails, self._store
+        warnings, trails = self._warnings, self._trails
         mapper = MapperThread(
             self._map,
             self._scans,
             self._epochs,
             self._settings.service.publish_period_s,
             failed=failed,
-            scan_taken=(
-                warnings.add,
-                trails.add,
-                *(() if store is None else (store.scans.add,)),
-            ),
+            scan_taken=(warnings.add, trails.add),
+            scan_learnt=self._keep_scan,
             published=self._surface.add,
         )
         mapper.start()
         self._parts.callback(mapper.close)
         return mapper
 
+    def _keep_scan(self, scan: Scan, rays: ScanRays) -> None:
+        if self._store is not None:
+            self._store.scans.add(scan, rays)
+
     def _open_intake(self) -> None:
         intake = ScanIntake(
             self.session,
-            self._map.name,
+            self._scans_of,
             self._scans,
             max_points=self._settings.scan.max_points,
-            arrived=self._mapper.wake,
+            arrived=self.mapper.wake,
         )
         self._parts.callback(intake.close)

@@ -14,12 +14,16 @@ import triquad_client
 import zenoh
 from support.attackers.role_files import free_tls_endpoint, opened, showing
 from support.attackers.role_matrix import OTHERS, OWN, achieved, expected
+from support.poses import shifted
 from support.ros.ros_bridge import MAST, bridging, stand
 from support.ros.ros_robot import RmwZenoh, Robot
 from support.ros_messages import RosMessages
 from support.servers import SMALL_FILE, WAIT_S, server_process, sphere
 from triquad_client.errors import ConnectError, NoReplyError, UnknownMapError
+from triquad_client.net.shared_connection import SharedConnection
+from triquad_format.records.status import Status
 from triquad_format.wire import keys
+from triquad_format.wire.shares import lease_key
 from triquad_tools.commands import inspect, top
 from triquad_tools.console.command import FAILED, OK
 from triquad_tools.credentials.certificates import new_authority
@@ -228,3 +232,40 @@ def test_tools_come_with_credentials(network: Network, capsys: pytest.CaptureFix
     assert json.loads(capsys.readouterr().out)["map"] == "default"
     assert top.main([*once, "--config", str(network.file("removed"))]) == FAILED
     assert "no server has a map 'default'" in capsys.readouterr().err
+
+
+def test_servers_share_a_map_behind_a_router(network: Network, tmp_path: Path) -> None:
+    router = ["--connect", network.endpoints["router"]]
+    words = ["--config", network.file("server"), "--settings", SMALL_FILE, *router]
+    words += ["--map", "town", "--share", "--store", tmp_path]
+    with ExitStack() as stack:
+        for _ in range(2):
+            stack.enter_context(server_process(words, free_tls_endpoint()))
+        robot, viewer, admin = (
+            stack.enter_context(
+                triquad_client.connect(
+                    network.endpoints["router"], "town", config=network.file(who)
+                )
+            )
+            for who in ("robot", "viewer", "admin")
+        )
+        places = [shifted(6.0 * number) for number in range(12)]
+        for pose in places:
+            robot.publish_scan(sphere(), pose, source=OWN)
+        assert robot.flush(WAIT_S).lost == 0
+        connection = viewer._connection
+        assert isinstance(connection, SharedConnection)
+        owners = {one for holders in connection.shares.leases.values() for one in holders}
+        assert owners == {1, 2}
+        for pose in places:
+            found = viewer.query_sdf(sphere(100) + pose[:3, 3])
+            assert (found.status == Status.SURFACE).mean() > 0.9
+        assert admin.checkpoint().bytes > 0
+        with pytest.raises(NoReplyError):
+            viewer.checkpoint()
+        forged = lease_key("town", 1, (0, 0, 0), 1)
+        with network.session("robot", "router") as hostile:
+            token = hostile.liveliness().declare_token(forged)
+            assert viewer.status().regions > 0
+            assert 1 not in connection.shares.holders((0, 0, 0)).values()
+            del token

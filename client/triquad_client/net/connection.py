@@ -1,5 +1,6 @@
 """Requests, and who answers them: a server at the other end of a connection, or a map in memory."""
 
+import copy
 import secrets
 import time
 import weakref
@@ -111,11 +112,11 @@ class Connection(Answering):
         """
         waiting: deque[tuple[Request[ReplyT], Iterable[zenoh.Reply]]] = deque()
         for request in requests:
-            waiting.append((request, self._send(request)))
+            waiting.append((request, self.sent(request)))
             if len(waiting) >= PARTS_IN_FLIGHT:
-                yield self._received(*waiting.popleft())
+                yield self.received(*waiting.popleft())
         while waiting:
-            yield self._received(*waiting.popleft())
+            yield self.received(*waiting.popleft())
 
     def ask_until_done(self, request: Request[ReplyT], timeout_s: float) -> ReplyT:
         """Return the reply to a request with a ticket, which is repeated while work is under way.
@@ -157,8 +158,12 @@ class Connection(Answering):
         except zenoh.ZError as error:
             raise self._broken(error) from error
 
-    def maps(self, map_name: str = "*") -> list[str]:
-        """Return the maps of all servers in reach, or those of this name; raises as :meth:`put`."""
+    def maps(self) -> list[str]:
+        """Return the maps of all servers in reach; raises as :meth:`put`."""
+        return sorted({map_name for map_name, _ in self.servers() if keys.is_name(map_name)})
+
+    def servers(self, map_name: str = "*") -> list[tuple[str, str]]:
+        """Return maps in reach, or that of a name, each with a server; raises as :meth:`put`."""
         try:
             replies = self._session.liveliness().get(
                 keys.alive_key(map_name, "*"),
@@ -167,8 +172,8 @@ class Connection(Answering):
             )
         except zenoh.ZError as error:
             raise self._broken(error) from error
-        names = {str(reply.ok.key_expr).split("/")[1] for reply in replies if reply.ok}
-        return sorted(filter(keys.is_name, names))
+        found = (str(reply.ok.key_expr).split("/") for reply in replies if reply.ok)
+        return [(key[1], key[-1]) for key in found]
 
     def start_stage(self) -> str | None:
         """Return what the server of the map does before it is ready; None: there is none such."""
@@ -180,7 +185,14 @@ class Connection(Answering):
             return None
         return "it is about to be ready"
 
-    def _send(self, request: Request[Any]) -> Iterable[zenoh.Reply]:
+    def of_map(self, map_name: str) -> "Connection":
+        """Return a connection to another map, by the same session: it is closed with this one."""
+        other = copy.copy(self)
+        other.map_name = map_name
+        return other
+
+    def sent(self, request: Request[Any]) -> Iterable[zenoh.Reply]:
+        """Send a request, and return the replies to come; raises as :meth:`put`."""
         try:
             return self._session.get(
                 self._key(request),
@@ -196,7 +208,8 @@ class Connection(Answering):
         except zenoh.ZError as error:
             raise self._broken(error) from error
 
-    def _received(self, request: Request[ReplyT], replies: Iterable[zenoh.Reply]) -> ReplyT:
+    def received(self, request: Request[ReplyT], replies: Iterable[zenoh.Reply]) -> ReplyT:
+        """Return the reply to a request that was sent; raises as :meth:`replies`."""
         for reply in replies:
             return self._read(request, reply)
         raise self._no_reply_error(request)
@@ -267,6 +280,12 @@ def retried(code: str, attempt: Callable[[], ResultT]) -> ResultT:
             if error.code != code:
                 raise
     return attempt()
+
+
+def is_cancelled() -> bool:
+    """Return whether the running call was cancelled."""
+    token = _cancellation.get()
+    return token is not None and token.is_cancelled
 
 
 @contextmanager

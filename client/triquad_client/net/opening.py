@@ -12,12 +12,14 @@ from triquad_format.errors import FormatError, InvalidInputError
 from triquad_format.wire import codec, keys
 from triquad_format.wire.bounds import MAX_COUNT
 from triquad_format.wire.endpoints import full_endpoint
+from triquad_format.wire.shares import is_share, share_number
 from triquad_format.wire.zenoh_config import QUIET, fill, put, reason
 
 from triquad_client import checks
 from triquad_client.errors import ConnectError, UnknownMapError
 from triquad_client.net.connection import Connection
 from triquad_client.net.diagnosis import REMEDY, Obstacle, why_no_link
+from triquad_client.net.shared_connection import SharedConnection
 
 _log = logging.getLogger("triquad_client")
 
@@ -64,11 +66,14 @@ def open_connection(
         session, map_name, timeout_s, max_download_bytes=most, local=local, where=where
     )
     try:
-        _wait_for_map(connection, patience, start_s)
+        names = _servers_of_map(connection, patience, start_s)
+        numbers = [share_number(name) for name in names if is_share(map_name, name)]
+        if numbers:
+            return SharedConnection(connection, filter(None, numbers))
+        return connection
     except BaseException:
         connection.close()
         raise
-    return connection
 
 
 class _Patience:
@@ -113,8 +118,8 @@ def _open(configured: zenoh.Config, where: str, patience: _Patience) -> zenoh.Se
             raise ConnectError(told + remedy) from error
 
 
-def _wait_for_map(connection: Connection, patience: _Patience, start_s: float) -> None:
-    """Return once the server of the map is there and ready; it may take ``start_s`` to start.
+def _servers_of_map(connection: Connection, patience: _Patience, start_s: float) -> list[str]:
+    """Return the servers of the map, once one is ready; it may take ``start_s`` to start.
 
     Raises:
         UnknownMapError: there is none.
@@ -122,16 +127,19 @@ def _wait_for_map(connection: Connection, patience: _Patience, start_s: float) -
     """
     name = connection.map_name
     # Asked for by name first: there may be any number of others.
-    while not connection.maps(name):
+    while not (found := connection.servers(name)):
         stage = connection.start_stage()
         if stage is not None:
             told = f"the server of map {name!r} is starting: {stage}"
             if not patience.wait(told, start_s):
                 raise ConnectError(f"{told}; connect again, or with a longer timeout_s")
-        elif (others := connection.maps()) or not patience.wait(
-            f"no server has a map {name!r} yet"
-        ):
-            raise UnknownMapError(name, others)
+            continue
+        there = connection.maps()
+        # It may have come since it was asked for.
+        has_others = bool(there) and name not in there
+        if has_others or not patience.wait(f"no server has a map {name!r} yet"):
+            raise UnknownMapError(name, there)
+    return [server for _, server in found]
 
 
 def _configuration(endpoint: str | None, timeout_s: float, file: str | Path | None) -> zenoh.Config:
@@ -141,8 +149,9 @@ def _configuration(endpoint: str | None, timeout_s: float, file: str | Path | No
     if endpoint is not None or not json.loads(config.get_json("connect/endpoints")):
         only_tls = json.loads(config.get_json("transport/link/protocols")) == ["tls"]
         protocol = "tls" if only_tls else "tcp"
-        full = full_endpoint(_HERE if endpoint is None else endpoint, protocol)
-        put(config, {"connect/endpoints": [full]})
+        several = (_HERE if endpoint is None else endpoint).split(",")
+        full = [full_endpoint(one.strip(), protocol) for one in several]
+        put(config, {"connect/endpoints": full})
     return config
 
 

@@ -193,6 +193,22 @@ class NewParts:
         self._unfinished[temporary] = path
         return self._entry(part, digest.digest(), stored=len(frame))
 
+    def copy(self, entry: Entry, folder: Path) -> None:
+        """Take a part from another folder of checkpoints, unless it is here.
+
+        Raises:
+            DamagedMapFileError: it is missing there, or is damaged.
+            OSError: it cannot be read, or written.
+        """
+        if self._files.has(entry):
+            return
+        PartFiles(folder).check(entry.name)
+        path = self._files.folder / entry.name
+        temporary = path.with_name(f".{path.name}.tmp")
+        with naming(path):
+            temporary.write_bytes((PartFiles(folder).folder / entry.name).read_bytes())
+        self._unfinished[temporary] = path
+
     def commit(self) -> None:
         """Make all parts durable, and give them their names.
 

@@ -101,6 +101,7 @@ class ServerStatus(Message):
     memory_parts: dict[Name, Count] = field(default_factory=dict)  # bytes, by what takes them
     regions_cold: Count = 0  # of the regions, those that are read from the store where needed
     correcting: Count = 0  # scans whose poses are being corrected: regions are made again
+    region_pitch_m: Length = 0.0  # from the middle of a region to that of the next; 0: not told
 
     def __repr__(self) -> str:
         told = f"{self.scans_taken} scans, {self.learnt_percent} % learnt; epoch {self.epoch}"

@@ -11,6 +11,7 @@ from enum import Enum
 from typing import Any
 
 from triquad_format.wire import keys
+from triquad_format.wire.shares import shares_key
 
 LOOPBACK = "lo"
 """The network interface of links from programs of the same machine, on Linux."""
@@ -107,7 +108,7 @@ def view(map_name: str) -> tuple[Rule, ...]:
     return (
         Rule(Verb.ASK, (keys.all_queries_key(map_name),)),
         Rule(Verb.RECEIVE, (keys.status_key(map_name),)),
-        Rule(Verb.FIND, (keys.alive_key("*", "*"),)),
+        Rule(Verb.FIND, (keys.alive_key("*", "*"), shares_key("*"))),
     )
 
 
@@ -129,7 +130,8 @@ def serve(map_name: str) -> tuple[Rule, ...]:
         Rule(Verb.ANSWER, (keys.all_queries_key(map_name), keys.all_admin_key(map_name))),
         Rule(Verb.RECEIVE, (keys.all_scans_key(map_name),)),
         Rule(Verb.PUBLISH, (keys.status_key(map_name),)),
-        Rule(Verb.BE_FOUND, (keys.alive_key(map_name, "*"),)),
+        Rule(Verb.BE_FOUND, (keys.alive_key(map_name, "*"), shares_key(map_name))),
+        Rule(Verb.FIND, (shares_key(map_name),)),
     )
 
 
@@ -158,7 +160,7 @@ def take_part_in_ros2(domain: int, published: Sequence[str] = ()) -> tuple[Rule,
 
 def everything() -> tuple[Rule, ...]:
     """Return rules for everything; Zenoh has no wildcard for chunks that begin with ``@``."""
-    own = ("**/@alive/**", "**/@adv/**", "@/**")
+    own = ("**/@alive/**", "**/@share/**", "**/@adv/**", "@/**")
     of_ros2 = ("@ros2_lv/**", "@/*/@ros2_lv/**", "@/*/@ros2_pub_cache/**")
     return (Rule(Verb.ALL, ("**", *own, *of_ros2)),)
 

@@ -40,6 +40,7 @@ class ColdRegion:
     epoch: int  # of the checkpoint: it has not changed since
     entries: tuple[Entry, ...]  # of its parts; of older ones, where one was found damaged
     cache: "RegionCache"
+    is_foreign: bool = False  # it is in the store of another server of a shared map
     reading: threading.Lock = field(default_factory=threading.Lock)
 
     @property

@@ -153,6 +153,8 @@ def _changes(before: Epoch, now: Epoch) -> VoxelChanges:
         one, other = old.get(index), new.get(index)
         if one is other or (one and isinstance(other, ColdRegion)):
             continue  # it left memory as it was
+        if isinstance(other, ColdRegion) and other.is_foreign:
+            continue  # the server that has it tells of it
         if isinstance(one, FrozenRegion) and other and one.evidence is other.evidence:
             continue
         was, has = _Surface.of(one), _Surface.of(other)

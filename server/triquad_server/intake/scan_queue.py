@@ -52,10 +52,15 @@ class ScanQueue:
     or of the one that has most.
     """
 
-    def __init__(self, limit: int, limit_bytes: int = _MAX_BYTES) -> None:
-        """Let at most ``limit`` scans of each source wait, and ``limit_bytes`` of all together."""
+    def __init__(
+        self, limit: int, limit_bytes: int = _MAX_BYTES, *, is_shared: bool = False
+    ) -> None:
+        """Let at most ``limit`` scans of each source wait, and ``limit_bytes`` of all together.
+
+        Several servers take them in where the map ``is_shared``.
+        """
         self.limit = limit
-        self.ledger = SourceLedger()
+        self.ledger = SourceLedger(is_shared=is_shared)
         self.dropped: Counter[str] = Counter()  # scans that are not in the map, by reason
         self.points_dropped: Counter[str] = Counter()  # of scans that are in the map, by reason
         self.received_bytes = 0  # of all messages of scans that arrived

@@ -88,8 +88,10 @@ class SourceLedger:
     Counts are those of this process: a scan of a session that it never received is lost.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, is_shared: bool = False) -> None:
+        """Begin; where servers share a map, one that is started later counts from then on."""
         self._lock = threading.Lock()
+        self._is_shared = is_shared
         self._sessions: OrderedDict[tuple[str, int], _Session] = OrderedDict()
 
     def arrive(self, scan: Scan) -> str | None:
@@ -101,6 +103,8 @@ class SourceLedger:
             if 0 <= session.arrived < scan.sequence - MAX_LEAP:
                 return "sequence_ahead"
             session.counts.heard_s = time.monotonic()
+            if self._is_shared and session.arrived < 0:
+                session.arrived = scan.sequence - 1
             if scan.sequence <= session.arrived:
                 return "sequence_backwards"
             session.counts.never_arrived += scan.sequence - session.arrived - 1

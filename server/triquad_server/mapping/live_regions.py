@@ -1,7 +1,7 @@
 """The regions of the live map: made as scans enter them, within the limits of the map."""
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -69,6 +69,8 @@ class LiveRegions:
         self.room = RegionRoom(self.all, budget)
         self._share = FairShare.of(0, budget)
         self._only = only
+        # Whether it may have a region: of a shared map, this also takes one that nobody has.
+        self.may_have: Callable[[RegionIndex], bool] = lambda index: only is None or index in only
 
     def __len__(self) -> int:
         return len(self.all)
@@ -119,6 +121,8 @@ class LiveRegions:
     def reached_by(self, rays: ScanRays) -> list[LiveRegion]:
         """Return the regions that a scan enters; new ones belong to the map from now on.
 
+        There are none where all that it enters are not of this map, or of another server's.
+
         Raises:
             NoRoomYetError: there is room for it once other regions have left memory.
             ScanRefusedError: the map would have too many regions, or take too much memory, or a
@@ -126,8 +130,7 @@ class LiveRegions:
         """
         there = self.all.indices
         around = regions_around(rays, there, self._setup.field)
-        if self._only is not None:
-            around = [index for index in around if index in self._only]
+        around = [index for index in around if self.may_have(index)]
         limit = self._setup.training.max_regions
         count = len({*there, *around})
         if count > limit:
@@ -209,7 +212,8 @@ class LiveRegions:
 
     def fetch_unsettled(self) -> bool:
         """Bring back a region that has more to learn, if there is one and room for it."""
-        unsettled = (one for one in self.all.cold.values() if one.facts.samples_left)
+        stay = (one for index, one in self.all.cold.items() if index not in self.room.given)
+        unsettled = (one for one in stay if one.facts.samples_left)
         region = min(unsettled, key=lambda one: one.facts.memory_bytes, default=None)
         if region is None or not self.room.has(region.facts.memory_bytes):
             return False

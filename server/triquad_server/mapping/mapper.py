@@ -3,12 +3,12 @@
 import logging
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
 import numpy as np
 from triquad_format.records.arrays import Doubles, Floats
-from triquad_format.records.field_settings import RegionIndex
+from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.records.region import MapProgress, MapRecord
 
 from triquad_server.engine.compiled_trainer import Loss
@@ -71,6 +71,7 @@ class Mapper:
         self._number = record.epoch if record else 0
         self._epoch: Epoch | None = None
         self._version: int | None = None  # of the regions, as they were published last
+        self._least_number: Callable[[], int] = lambda: 0  # of the next epoch
         self.rests = False  # it is not trained: regions are made again, which takes the cores
         # Chosen by the first scan, and kept as long as this process runs, also after a reset.
         is_begun = record is not None and (record.regions or record.progress.scans_taken)
@@ -89,6 +90,11 @@ class Mapper:
     def origin(self) -> Doubles:
         """[3] of the user's coordinates, from where the map counts: 0 0 0 until it is chosen."""
         return _NOWHERE_YET if self._origin is None else self._origin
+
+    @property
+    def field(self) -> FieldSettings:
+        """The settings of all fields."""
+        return self._setup.field
 
     @property
     def settled(self) -> bool:
@@ -149,7 +155,7 @@ class Mapper:
 
         Returns:
             What of it is used, from the map's origin, and how many points and rays without a
-            return are not.
+            return are not. It counts as taken where it reaches a region of this map.
 
         Raises:
             ScanRefusedError: the scan cannot be used; the map is unchanged.
@@ -161,9 +167,10 @@ class Mapper:
         reached = self.regions.reached_by(rays)
         if self._origin is None:
             self._origin = rays.map_origin
-        self._take_in(rays, reached, stamp_s)
-        self.regions.room.make()
-        self.scans_taken += 1
+        if reached:
+            self._take_in(rays, reached, stamp_s)
+            self.regions.room.make()
+            self.scans_taken += 1
         return rays
 
     def _usable_rays(
@@ -215,7 +222,7 @@ class Mapper:
         if self._epoch is not None and not changed:
             return self._epoch
         if self._epoch is not None or not self._number:
-            self._number += 1
+            self._number = max(self._number + 1, self._least_number())
         self._epoch = Epoch(
             name=self.name,
             number=self._number,
@@ -227,6 +234,19 @@ class Mapper:
         )
         self._version = self.regions.all.version
         return self._epoch
+
+    def share(
+        self, may_have: Callable[[RegionIndex], bool], least_number: Callable[[], int]
+    ) -> None:
+        """Have some regions of a map that several servers share, which counts from 0 0 0.
+
+        Args:
+            may_have: whether this server has a region, or takes it now.
+            least_number: of the next epoch. The same for all servers at a time, and rising, so that
+                of two versions of a region the newer one is known.
+        """
+        self.regions.may_have = may_have
+        self._least_number, self._origin = least_number, np.zeros(3)
 
     def release(self) -> None:
         """Free what only training needs, until there is something to learn again."""

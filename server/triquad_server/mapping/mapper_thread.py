@@ -62,6 +62,7 @@ class MapperThread:
         period_s: float,
         failed: Callable[[Stop], None],
         scan_taken: Sequence[Callable[[Scan, ScanRays], None]] = (),
+        scan_learnt: Callable[[Scan, ScanRays], None] = lambda _scan, _rays: None,
         published: Callable[[Epoch], None] = lambda _: None,
     ) -> None:
         """Make the thread, which begins with :meth:`start`.
@@ -73,6 +74,7 @@ class MapperThread:
             period_s: between two epochs while the map changes.
             failed: called with the reason where an error ends the thread.
             scan_taken: called with each scan, and what of it is used, from the map's origin.
+            scan_learnt: likewise, where it reaches regions that this server has.
             published: called with each epoch before others can see it; these are quick, and raise
                 nothing.
         """
@@ -81,6 +83,7 @@ class MapperThread:
         self._epochs = epochs
         self._failed = failed
         self._scan_taken = scan_taken
+        self._scan_learnt = scan_learnt
         self._published = published
         self.time = ThreadTime()
         self._stored: deque[Mapping[RegionIndex, ColdRegion] | None] = deque(maxlen=1)
@@ -150,9 +153,13 @@ class MapperThread:
         """
         return self._commands.carried_out(command, changes=True)
 
+    def ask(self, command: Callable[[Mapper], ResultT]) -> ResultT:
+        """Do as :meth:`call`, but return at once: an epoch shows it when the next one is due."""
+        return self._commands.carried_out(command, changes=False)
+
     def taken(self, owed: OwedCopy) -> RegionSnapshot:
         """Return the copy of a region, taken by the thread; errors are those of :meth:`call`."""
-        return self._commands.carried_out(lambda _: owed.take(), changes=False)
+        return self.ask(lambda _: owed.take())
 
     def _run(self) -> None:
         lower_priority(NICENESS)
@@ -249,12 +256,13 @@ class MapperThread:
             self._waiting = None
             sources.add(scan.source)
             self._ingest(scan)
-            if not self._commands.is_empty or time.monotonic() > ends_s:
+            if self._waiting or not self._commands.is_empty or time.monotonic() > ends_s:
                 break  # a command is at most a scan late: checkpoints begin when they are due
-        return bool(sources)
+        return bool(sources) and self._waiting is None
 
     def _ingest(self, scan: Scan) -> None:
         self.time.begin(Activity.SCANS)
+        before = self._mapper.scans_taken
         try:
             rays = self._mapper.ingest(
                 scan.points,
@@ -276,7 +284,9 @@ class MapperThread:
         seen = moved(scan, -rays.map_origin)
         for listener in self._scan_taken:
             listener(seen, rays)
-        self._schedule.is_changed = True
+        if self._mapper.scans_taken > before:
+            self._scan_learnt(seen, rays)
+            self._schedule.is_changed = True
         self._scans.taken(scan, rays)
 
     def _publish(self) -> None:

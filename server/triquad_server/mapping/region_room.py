@@ -26,6 +26,10 @@ class RegionRoom:
         self._are_kept = False  # the store can be written to
         self._stored: Mapping[RegionIndex, ColdRegion] = {}  # as the store has them
         self._reached: Collection[RegionIndex] = ()  # by the last scan: they stay in memory
+        self._reached_lately: set[RegionIndex] = set()
+        self.given: frozenset[RegionIndex] = frozenset()
+        """Those that leave memory in any case: another server of a shared map is to have them."""
+
         self.leaving: list[LiveRegion] = []
         """Those that leave memory as soon as the store has them as they are: they are not trained
         any more."""
@@ -58,6 +62,7 @@ class RegionRoom:
             ScanRefusedError: there will be none.
         """
         self._reached, self._copied_first = indices, []
+        self._reached_lately.update(indices)
         needed = self._regions.bytes_of([one for one in indices if one in self._regions.cold])
         if needed:
             self._claim(needed)
@@ -99,8 +104,10 @@ class RegionRoom:
         self.leaving = []
         excess = needed + self._budget.reserve - self.left
         promised = excess  # less what leaves later
-        for region in [one for one in self._regions if one.index not in self._reached]:
-            if promised <= 0:
+        given = [one for one in self._regions if one.index in self.given]
+        free = [one for one in self._regions if one.index not in {*self._reached, *self.given}]
+        for region in (*given, *free):
+            if promised <= 0 and region.index not in self.given:
                 break
             stored, nbytes = self._stored.get(region.index), self._budget.bytes_of([region.size])
             if stored is not None and region.is_as_of(stored.epoch):
@@ -112,6 +119,17 @@ class RegionRoom:
                 continue
             promised -= nbytes
         return excess <= 0
+
+    def give(self, indices: frozenset[RegionIndex]) -> None:
+        """Let some regions leave memory as soon as the store has them as they are."""
+        if self.given or indices:
+            self.given = indices
+            self.make()
+
+    def take_reached(self) -> set[RegionIndex]:
+        """Return the regions that scans have reached since the last time."""
+        reached, self._reached_lately = self._reached_lately, set()
+        return reached
 
     def make_again(self) -> bool:
         """Do as :meth:`make` where nothing is needed; return whether a region has left.

@@ -1,6 +1,7 @@
 """The regions of a map, those in memory and those that are in the store alone."""
 
 from collections.abc import Collection, Iterable, Iterator, KeysView, Mapping
+from types import MappingProxyType
 
 from triquad_format.mapfile.region_facts import RegionFacts
 from triquad_format.records.field_settings import RegionIndex
@@ -24,6 +25,10 @@ class RegionSet:
         self._budget = budget
         self._live: dict[RegionIndex, LiveRegion] = {}
         self.cold: dict[RegionIndex, ColdRegion] = {}  # those that are not in memory
+        self.elsewhere: Mapping[RegionIndex, ColdRegion] = MappingProxyType({})
+        """Those that other servers of a shared map have, as stores have them: they are read to
+        answer questions, and count for nothing else."""
+
         self._rays_discarded = self._samples_discarded = 0  # of those that are not in memory
         self.version = 0  # grows where regions come or go, or leave memory
 
@@ -74,11 +79,14 @@ class RegionSet:
     def facts(self) -> dict[RegionIndex, RegionFacts]:
         """Return what a checkpoint tells of all regions, as they were published last."""
         live = {one.index: one.facts(self._budget.bytes_of([one.size])) for one in self}
-        return live | {index: region.facts for index, region in self.cold.items()}
+        left = {i: one for i, one in self.elsewhere.items() if not one.is_foreign}
+        return {index: region.facts for index, region in (left | self.cold).items()} | live
 
     def publish(self, epoch: int) -> tuple[EpochRegion, ...]:
         """Return all regions as they are now, for an epoch."""
-        return (*(region.publish(epoch) for region in self), *self.cold.values())
+        live, own = [region.publish(epoch) for region in self], self.indices
+        others = [one for index, one in self.elsewhere.items() if index not in own]
+        return (*live, *self.cold.values(), *others)
 
     def at(self, index: RegionIndex) -> LiveRegion:
         """Return a region that is in memory, or one of which nothing is known: it is not added."""
@@ -120,6 +128,30 @@ class RegionSet:
         """Begin with regions as a checkpoint has them; each is read when a scan reaches it."""
         self.cold = dict(regions)
         self.version += 1
+
+    def adopt(self, region: ColdRegion) -> None:
+        """Have a region from now on that another server of a shared map had."""
+        self.cold[region.index] = region
+        self.elsewhere = {i: one for i, one in self.elsewhere.items() if i != region.index}
+        self.version += 1
+
+    def give(self, index: RegionIndex) -> ColdRegion | None:
+        """Leave a region that is not in memory to another server of a shared map; return it.
+
+        ``None``: it is in memory, or was removed meanwhile.
+        """
+        given = self.cold.pop(index, None)
+        if given is None:
+            return None
+        self.elsewhere = {**self.elsewhere, index: given}
+        self.version += 1
+        return given
+
+    def others_have(self, regions: Mapping[RegionIndex, ColdRegion]) -> None:
+        """Take notice of what other servers of a shared map have."""
+        if self.elsewhere != regions:
+            self.elsewhere = regions
+            self.version += 1
 
     def _count_discarded(self, region: LiveRegion) -> None:
         self._rays_discarded += region.training.rays.pool.discarded

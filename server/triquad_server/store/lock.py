@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 from typing import IO
 
-from triquad_server.errors import StoreError
+from triquad_server.errors import StoreInUseError
 
 _NAME = "lock"
 
@@ -17,7 +17,7 @@ class StoreLock:
         """Lock the folder.
 
         Raises:
-            StoreError: another process has it locked.
+            StoreInUseError: another process has it locked.
             OSError: the file cannot be made.
         """
         self._path = folder / _NAME
@@ -33,7 +33,7 @@ class StoreLock:
         Deleting it, alone or with the folder, would let another process in.
 
         Raises:
-            StoreError: another process has locked it first.
+            StoreInUseError: another process has locked it first.
             OSError: the file cannot be made.
         """
         path = self._path
@@ -47,9 +47,11 @@ def _locked(path: Path) -> IO[bytes]:
     file = path.open("a+b")
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
+    except OSError as error:
         file.close()
-        raise StoreError(
+        if not isinstance(error, BlockingIOError | PermissionError):  # of SMB the latter
+            raise
+        raise StoreInUseError(
             f"store {path.parent} is in use by another server: stop that one first, or give "
             "another --store or --map"
         ) from None

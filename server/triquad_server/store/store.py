@@ -15,6 +15,7 @@ from pathlib import Path
 
 from triquad_format.errors import FormatError
 from triquad_format.mapfile.checkpoint_folder import (
+    NewParts,
     PartFiles,
     checkpoint_files,
     checkpoint_name,
@@ -29,6 +30,7 @@ from triquad_format.records.region import MapRecord, Region
 from triquad_format.wire.messages import CheckpointInfo
 from triquad_map.compiled.team import Split, in_one
 
+from triquad_server.epochs.cold_region import ColdRegion
 from triquad_server.errors import StoreError
 from triquad_server.settings import StoreSettings
 from triquad_server.store.lock import StoreLock
@@ -101,6 +103,14 @@ class Store:
         """The epoch of the newest checkpoint; 0: there is none."""
         return 0 if self._newest is None else self._newest.facts.epoch
 
+    def versions(self) -> dict[RegionIndex, int]:
+        """Return when each region changed last that the newest checkpoint has, as an epoch."""
+        versions: dict[RegionIndex, int] = {}
+        for entry in () if self._newest is None else self._newest.entries:
+            index = entry.key.region
+            versions[index] = max(entry.epoch, versions.get(index, 0))
+        return versions
+
     @property
     def base_epoch(self) -> int | None:
         """The epoch after which changes are enough for a checkpoint; ``None``: all is needed.
@@ -165,6 +175,28 @@ class Store:
         """
         with self._writing(f"regions in {self.folder} cannot be written"):
             self.regions.put(record, self._parts_of(record, changed), facts)
+
+    def adopt(self, region: ColdRegion, other: StoredRegions) -> ColdRegion:
+        """Copy a region from the store of another server; the next checkpoint names it.
+
+        Raises:
+            StoreError: it cannot be read there, or not written here.
+        """
+        with self._writing(f"region {region.index} of {other.folder} cannot be taken"):
+            try:
+                self._copy(region, other)
+            except FormatError as error:
+                _log.error("region %s of %s: %s", region.index, other.folder, error)
+                if not other.take_older(region):
+                    raise
+                self._copy(region, other)
+            return self.regions.adopt(region, other.facts)
+
+    def _copy(self, region: ColdRegion, other: StoredRegions) -> None:
+        new = NewParts(self.folder, region.epoch)
+        for entry in region.entries:
+            new.copy(entry, other.folder)
+        new.commit()
 
     def keep_newest(self, undoes: str) -> CheckpointInfo | None:
         """Let the newest checkpoint stay for longer, as one that ``undoes`` something.

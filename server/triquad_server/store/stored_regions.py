@@ -30,11 +30,22 @@ class StoredRegions:
     checkpoint names it.
     """
 
-    def __init__(self, folder: Path, cache_bytes: Callable[[], int], split: Split) -> None:
-        """Begin with none; of those that are read, ``cache_bytes()`` stay in memory."""
-        self._folder = folder
+    def __init__(
+        self,
+        folder: Path,
+        cache_bytes: Callable[[], int],
+        split: Split,
+        *,
+        is_foreign: bool = False,
+    ) -> None:
+        """Begin with none; of those that are read, ``cache_bytes()`` stay in memory.
+
+        The folder ``is_foreign`` where another server of a shared map writes to it.
+        """
+        self._is_foreign = is_foreign
+        self.folder = folder
         self._parts = PartFiles(folder)
-        self._map = MapRecord("none", 0, FieldSettings(), ())  # without regions
+        self.facts = MapRecord("none", 0, FieldSettings(), ())  # without regions
         self.cache = RegionCache(self._read, cache_bytes, split)
         self.known: Mapping[RegionIndex, ColdRegion] = {}
 
@@ -54,11 +65,17 @@ class StoredRegions:
 
         Others stay as they were.
         """
-        self._map = record.facts
+        self.facts = record.facts
         centre = record.settings.region_centre
         written = {
             index: ColdRegion(
-                index, centre(index), facts[index], record.epoch, tuple(entries), self.cache
+                index,
+                centre(index),
+                facts[index],
+                record.epoch,
+                tuple(entries),
+                self.cache,
+                self._is_foreign,
             )
             for index, entries in parts.items()
         }
@@ -66,11 +83,21 @@ class StoredRegions:
         self.known = known if only is None else {i: r for i, r in known.items() if i in only}
         self.cache.drop_all_but(self.known)
 
+    def adopt(self, region: ColdRegion, facts: MapRecord) -> ColdRegion:
+        """Have a region of another store, whose parts were copied; ``facts`` are of its map.
+
+        Its epoch is none of this server's: once it is in memory, it is written before it leaves.
+        """
+        self.facts = facts
+        own = ColdRegion(region.index, region.centre, region.facts, 0, region.entries, self.cache)
+        self.known = {**self.known, region.index: own}
+        return own
+
     def mend(self, name: str) -> None:
         """Take older parts of a region whose part ``name`` is damaged, if there are any."""
         for region in self.known.values():
             if name in {entry.name for entry in region.entries}:
-                self._take_older(region)
+                self.take_older(region)
 
     def _read(self, region: ColdRegion, topics: Collection[str]) -> MapRecord:
         """Read the parts of a region; where one is damaged, those of an older checkpoint.
@@ -87,7 +114,7 @@ class StoredRegions:
             if self.known.get(region.index) is not region:
                 raise RefusedError("epoch_gone", "ask the newest: it is not kept") from error
             _log.error("region %s cannot be read: %s", region.index, error)
-            if not self._take_older(region):
+            if not self.take_older(region):
                 raise RefusedError(
                     "store",
                     f"region {region.index} cannot be read, and no older checkpoint has it whole: "
@@ -97,15 +124,15 @@ class StoredRegions:
 
     def _assembled(self, region: ColdRegion, topics: Collection[str]) -> MapRecord:
         entries = tuple(one for one in region.entries if one.key.topic in topics)
-        return assemble(Manifest(self._map, 0, entries), self._parts.payload)
+        return assemble(Manifest(self.facts, 0, entries), self._parts.payload)
 
-    def _take_older(self, region: ColdRegion) -> bool:
+    def take_older(self, region: ColdRegion) -> bool:
         """Have a region be as the newest checkpoint has it that has it whole, if there is any.
 
         The next checkpoint names these parts, so that they stay.
         """
         try:
-            files = checkpoint_files(self._folder)
+            files = checkpoint_files(self.folder)
         except OSError:
             return False
         for file in files:

@@ -5,6 +5,7 @@ nothing. What is published or claimed is watched from behind the server, where o
 which it let pass.
 """
 
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
@@ -12,6 +13,7 @@ from dataclasses import dataclass, field
 import zenoh
 from support.operations import OPERATIONS
 from triquad_format.wire import keys
+from triquad_format.wire.shares import lease_key, shares_key
 
 MAP = "default"
 OWN, OTHERS = "roof", "rear"  # sources of scans
@@ -26,6 +28,7 @@ WILD = "ask all keys at once"
 FORGE_STATUS = "publish the server's status"
 FORGE_ANSWER = "answer in the server's name"
 FORGE_TOKEN = "pass for a server"
+FORGE_LEASE = "have a region of a shared map"
 
 _REPLY_S = 20.0  # none comes where none is allowed: then the router says at once that it is over
 
@@ -57,8 +60,8 @@ def status_replies(session: zenoh.Session) -> list[zenoh.Reply]:
     return list(session.get(key, target=every, consolidation=apart, timeout=_REPLY_S))
 
 
-def tokens(session: zenoh.Session) -> set[str]:
-    found = session.liveliness().get(keys.alive_key("*", "*"), timeout=_REPLY_S)
+def tokens(session: zenoh.Session, wanted: str = keys.alive_key("*", "*")) -> set[str]:
+    found = session.liveliness().get(wanted, timeout=_REPLY_S)
     return {str(reply.ok.key_expr) for reply in found if reply.ok}
 
 
@@ -120,12 +123,16 @@ def _forged(role: str, session: zenoh.Session, observer: zenoh.Session) -> set[s
 
     answering = session.declare_queryable(key, answer, complete=True)
     token = session.liveliness().declare_token(keys.alive_key(MAP, f"false-{role}"))
+    forged = lease_key(MAP, 9, (0, 0, 0), zlib.crc32(role.encode()))
+    lease = session.liveliness().declare_token(forged)
     list(session.get(keys.operation_key(MAP, keys.SDF), timeout=_REPLY_S))
     texts = [reply.ok.payload.to_bytes() for reply in status_replies(observer) if reply.ok]
     done = {FORGE_ANSWER} if role.encode() in texts else set()
     done |= {FORGE_TOKEN} if keys.alive_key(MAP, f"false-{role}") in tokens(observer) else set()
+    done |= {FORGE_LEASE} if forged in tokens(observer, shares_key(MAP)) else set()
     answering.undeclare()
     token.undeclare()
+    lease.undeclare()
     return done
 
 
