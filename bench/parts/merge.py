@@ -1,0 +1,73 @@
+"""One street by two robots from both ends, their maps merged; and by one robot with all scans."""
+
+import argparse
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from triquad_client import open_map
+from triquad_tools.console.progress import progress
+from triquad_tools.evaluation.metrics import MeshScores
+from triquad_tools.simulation.lidar import Lidar
+from triquad_tools.simulation.street import street_drive
+
+from bench.driven import Driven, driven
+from bench.figures import Figure
+
+_LENGTH_M, _SCANS, _OVERLAP = 160.0, 160, 20  # scans beyond the middle that each robot has
+_VOXEL_M = 0.05
+_SETTINGS = ("--set", "training.samples_per_ray=12")  # of 48
+_PROGRAM = "from triquad_tools.commands.{0} import main; raise SystemExit(main())"
+
+
+def measure(options: argparse.Namespace) -> list[Figure]:
+    """Return how good the merged map is, beside that of one robot."""
+    drive = street_drive(options.seed, _SCANS, _LENGTH_M / _SCANS, _LENGTH_M, Lidar(columns=1024))
+    street = driven(drive, _VOXEL_M, "a street")
+    half = _SCANS // 2
+    with tempfile.TemporaryDirectory(prefix="triquad-bench-") as name:
+        folder = Path(name)
+        whole = _mapped(street, folder, "whole", range(_SCANS))
+        west = _mapped(street, folder, "west", range(half + _OVERLAP))
+        east = _mapped(street, folder, "east", range(_SCANS - 1, half - _OVERLAP - 1, -1))
+        merged = folder / "merged.triquad"
+        _run("pack", "--merge", west, east, merged)
+        one, two = _scores(street, whole), _scores(street, merged)
+        return [
+            Figure("one robot: F", 100 * one.f_score, "%"),
+            Figure("two, merged: less F", 100 * (one.f_score - two.f_score), "points", at_most=0.3),
+            Figure("one robot: mean error", 100 * one.accuracy_m, "cm"),
+            Figure("two, merged: of that", two.accuracy_m / one.accuracy_m, ""),
+            Figure("merged: bytes, of one robot's", merged.stat().st_size / whole.stat().st_size,
+                   ""),
+        ]  # fmt: skip
+
+
+def _mapped(street: Driven, folder: Path, name: str, chosen: range) -> Path:
+    """Map some scans of a drive, in this order, and return the file."""
+    recording, output = folder / name, folder / f"{name}.triquad"
+    recording.mkdir()
+    with progress(f"writing {name}", len(chosen)) as report:
+        for number, scan in enumerate(chosen):
+            points = street.scans[scan].points
+            rows = np.zeros((len(points), 4), "<f4")
+            rows[:, :3] = points
+            rows.tofile(recording / f"{number:06d}.bin")
+            report(number, f"{number} scans")
+    poses = street.drive.poses[list(chosen), :3].reshape(-1, 12)
+    np.savetxt(recording / "poses.txt", poses, fmt="%.9f")
+    _run("map_recording", *_SETTINGS, "--training", recording, output)
+    return output
+
+
+def _run(program: str, *words: str | Path) -> None:
+    """Run one of the programs; it raises where that fails."""
+    command = [sys.executable, "-c", _PROGRAM.format(program), *map(str, words)]
+    subprocess.run(command, check=True)
+
+
+def _scores(street: Driven, path: Path) -> MeshScores:
+    with open_map(path) as opened:
+        return street.mesh_scores(opened.mesh(street.drive.scene.box))
