@@ -34,6 +34,7 @@ from triquad_server.store.checkpoint_writer import CheckpointWriter
 _log = logging.getLogger(__name__)
 
 _TURN_S = 0.5  # after which it is looked again what others have
+_SEEN_S = 1.0  # until others have seen a checkpoint: so long what it lists is not given away
 _RESTS_S = 10.0  # for which no scan has reached a region that is given away
 
 
@@ -54,6 +55,7 @@ class Sharing:
         self._checkpoints = checkpoints
         self._elsewhere: dict[RegionIndex, ColdRegion] | None = None  # as it was told last
         self._was_leaving: frozenset[RegionIndex] = frozenset()
+        self._listed_s: dict[RegionIndex, float] = {}  # monotonic: since when others find them
         self._reached_s: dict[RegionIndex, float] = {}  # monotonic: when a scan last did
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="sharing")
@@ -69,6 +71,8 @@ class Sharing:
             self._checkpoints.write()
         except (StoreError, MapperStoppedError) as error:
             _log.error("the others go on from an older checkpoint of this server: %s", error)
+        if self._leases.others:
+            time.sleep(_SEEN_S)
         self._leases.close()
 
     def _run(self) -> None:
@@ -161,14 +165,16 @@ class Sharing:
         if leaving or self._was_leaving:
             self._mapper.ask(lambda mapper: mapper.regions.room.give(leaving))
         self._was_leaving = leaving
-        if not leaving:
-            return
-        live = self._mapper.ask(lambda mapper: leaving & mapper.regions.all.in_memory)
-        if live == leaving:
-            return
-        self._checkpoints.write()  # by its list others find them
-        for index in leaving - live:
-            self._give_region(index)
+        stored = leaving
+        if leaving:
+            stored -= self._mapper.ask(lambda mapper: leaving & mapper.regions.all.in_memory)
+        self._listed_s = {i: at_s for i, at_s in self._listed_s.items() if i in stored}
+        if new := stored - self._listed_s.keys():
+            self._checkpoints.write()  # by its list others find them
+            self._listed_s.update(dict.fromkeys(new, time.monotonic()))
+        for index, at_s in self._listed_s.items():
+            if time.monotonic() - at_s > _SEEN_S:
+                self._give_region(index)
 
     def _give_region(self, index: RegionIndex) -> None:
         given = self._mapper.call(lambda mapper: mapper.regions.all.give(index))
