@@ -12,7 +12,7 @@ from triquad_format.errors import FormatError, InvalidInputError
 from triquad_format.wire import codec, keys
 from triquad_format.wire.bounds import MAX_COUNT
 from triquad_format.wire.endpoints import full_endpoint
-from triquad_format.wire.shares import is_share, share_number
+from triquad_format.wire.shares import number_of_share
 from triquad_format.wire.zenoh_config import QUIET, fill, put, reason
 
 from triquad_client import checks
@@ -67,10 +67,8 @@ def open_connection(
     )
     try:
         names = _servers_of_map(connection, patience, start_s)
-        numbers = [share_number(name) for name in names if is_share(map_name, name)]
-        if numbers:
-            return SharedConnection(connection, filter(None, numbers))
-        return connection
+        numbers = frozenset(filter(None, (number_of_share(map_name, name) for name in names)))
+        return SharedConnection(connection, numbers) if numbers else connection
     except BaseException:
         connection.close()
         raise

@@ -65,7 +65,7 @@ class SharedConnection(Connection):
     so all answers of that number come from the same states, and none mixes two of one server.
     """
 
-    def __init__(self, whole: Connection, numbers: Iterable[int]) -> None:
+    def __init__(self, whole: Connection, numbers: frozenset[int]) -> None:
         """Go on with a connection, whose session closes once nobody refers to it.
 
         The servers of some ``numbers`` are there: they are known by now, or after a moment.
@@ -81,7 +81,7 @@ class SharedConnection(Connection):
             shares_key(self.map_name), heard, history=True
         )
         ends_s = time.monotonic() + _PATIENCE_S
-        while not self.shares.numbers.issuperset(numbers) and time.monotonic() < ends_s:
+        while not numbers <= self.shares.numbers and time.monotonic() < ends_s:
             time.sleep(_PAUSE_S / 10)
 
     def replies(self, requests: Iterable[Request[ReplyT]]) -> Iterator[ReplyT]:

@@ -33,10 +33,10 @@ def share_number(name: str) -> int | None:
     return None if match is None else int(match[1])
 
 
-def is_share(map_name: str, server: str) -> bool:
-    """Return whether a server of this name shares the map with others."""
+def number_of_share(map_name: str, server: str) -> int | None:
+    """Return the number of a server that shares the map; ``None``: it does not."""
     number = share_number(server)
-    return number is not None and server == f"{map_name}.{number}"
+    return number if server == f"{map_name}.{number}" else None
 
 
 def shares_key(map_name: str) -> str:
@@ -50,7 +50,7 @@ def share_key(map_name: str, number: int) -> str:
 
 
 def lease_key(map_name: str, number: int, index: RegionIndex, since_ms: int) -> str:
-    """Return the token by which a server has a region, since a time, milliseconds since 1970."""
+    """Return the token of a region that a server has since a time, milliseconds since 1970."""
     x, y, z = index
     return f"{share_key(map_name, number)}/{x}_{y}_{z}/{since_ms}"
 

@@ -9,8 +9,8 @@ from triquad_format.wire.shares import (
     Shares,
     ShareToken,
     chosen_share,
-    is_share,
     lease_key,
+    number_of_share,
     read_token,
     share_key,
     share_name,
@@ -85,8 +85,8 @@ def test_of_several_holders_the_lowest_answers():
 
 def test_the_names_of_servers_tell_whether_they_share_a_map():
     assert share_name("town", 3) == "town.3"
-    assert is_share("town", "town.3")
+    assert number_of_share("town", "town.3") == 3
     for other in ("town", "town.0", "town.x", "town.100", "towns.3", "d1a0b3c4", "townx3"):
-        assert not is_share("town", other)
+        assert number_of_share("town", other) is None
     with pytest.raises(FormatError):
         share_name("a" * 63, 3)
