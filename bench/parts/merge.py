@@ -23,7 +23,7 @@ _PROGRAM = "from triquad_tools.commands.{0} import main; raise SystemExit(main()
 
 
 def measure(options: argparse.Namespace) -> list[Figure]:
-    """Return how good the merged map is, beside that of one robot."""
+    """Return how good the merged map is, and that of one robot."""
     drive = street_drive(options.seed, _SCANS, _LENGTH_M / _SCANS, _LENGTH_M, Lidar(columns=1024))
     street = driven(drive, _VOXEL_M, "a street")
     half = _SCANS // 2

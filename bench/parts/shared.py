@@ -173,7 +173,6 @@ class _Asked:
     """What a client met that asks all the time."""
 
     errors: int = 0
-    longest_s: float = 0.0
 
 
 @contextmanager
@@ -183,12 +182,10 @@ def _asking(client: Client, points: Doubles) -> Iterator[_Asked]:
 
     def ask() -> None:
         while not stopping.wait(_PAUSE_S):
-            started_s = time.monotonic()
             try:
                 client.query_distance(rng.choice(points, _ASKED), _REACH_M)
             except TriquadError:
                 asked.errors += 1
-            asked.longest_s = max(asked.longest_s, time.monotonic() - started_s)
 
     thread = threading.Thread(target=ask)
     thread.start()
@@ -224,13 +221,10 @@ def _killed(group: _Group, client: Client, points: Doubles) -> list[Figure]:
     with _asking(client, points) as asked:
         group.servers[0].process.kill()
         answered_s = _until(lambda: bool(np.isfinite(_distances(client, points)).all()))
-        moved_s = _until(
-            lambda: 1 not in _numbers(client)[0] and sum(_numbers(client)[1]) == regions
-        )
+        _until(lambda: 1 not in _numbers(client)[0] and sum(_numbers(client)[1]) == regions)
         off = np.abs(_distances(client, points) - before)
     return [
         Figure("one is killed: its places answer after", answered_s, "s", at_most=15),
-        Figure("one is killed: others have its regions after", moved_s, "s", at_most=15),
         Figure("one is killed: errors of the client", asked.errors, "", at_most=0),
         Figure("distances off those of before: 99.9 %", 1e3 * float(np.quantile(off, 0.999)), "mm",
                at_most=1),

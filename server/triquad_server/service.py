@@ -50,10 +50,11 @@ class Service:
         """
         self.session = session
         self._scans_of = scans_of or mapper.name
+        self._is_shared = scans_of is not None
         self._map = mapper
         self._store = store
         self._settings = settings
-        self._scans = ScanQueue(settings.service.scan_queue, is_shared=scans_of is not None)
+        self._scans = ScanQueue(settings.service.scan_queue, is_shared=self._is_shared)
         self._warnings = ScanWarnings(self._scans, settings)
         first = mapper.publish()
         self._epochs = EpochHistory(
@@ -117,8 +118,7 @@ class Service:
         self._count(tiles)
         checkpoints.start()
         self._parts.callback(checkpoints.close)
-        is_shared = self._scans_of != self._map.name
-        answer_requests(health, tiles, self._surface, self._trails, is_shared=is_shared)
+        answer_requests(health, tiles, self._surface, self._trails, is_shared=self._is_shared)
         # Closed before the last checkpoint is written: it contains every reset that was answered.
         self._parts.callback(self.operations.close)
         self._parts.callback(self.mapper.pause)
@@ -139,7 +139,7 @@ class Service:
     def _announce(self, health: Health) -> None:
         """Say that the server is there, until it closes."""
         self._parts.callback(Heartbeat(self.session, health).close)
-        if self._scans_of != self._map.name:
+        if self._is_shared:
             return  # once it has its regions
         alive = keys.alive_key(health.map_name, health.server)
         self._parts.callback(self.session.liveliness().declare_token(alive).undeclare)

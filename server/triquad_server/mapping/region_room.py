@@ -105,7 +105,8 @@ class RegionRoom:
         excess = needed + self._budget.reserve - self.left
         promised = excess  # less what leaves later
         given = [one for one in self._regions if one.index in self.given]
-        free = [one for one in self._regions if one.index not in {*self._reached, *self.given}]
+        others = {*self._reached, *self.given}
+        free = [one for one in self._regions if one.index not in others]
         for region in (*given, *free):
             if promised <= 0 and region.index not in self.given:
                 break
