@@ -36,6 +36,14 @@ def moved_pose(pose: Doubles, by: Doubles) -> Doubles:
     return result
 
 
+def upright_pose(x: float, y: float, z: float, yaw_deg: float) -> Doubles:
+    """Return the pose [4, 4] of something upright, turned counterclockwise seen from above."""
+    yaw, pose = np.radians(yaw_deg), np.eye(4)
+    pose[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    pose[:3, 3] = x, y, z
+    return pose
+
+
 def orthonormal(pose: Doubles) -> Doubles:
     """Return a rigid pose as a new array, its rotation without the tolerance.
 

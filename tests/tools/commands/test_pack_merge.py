@@ -1,5 +1,6 @@
 """Two maps of one frame become one: as if one robot had seen all."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,18 +8,26 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support import servers
+from support.maps import small_world
 from support.maps.map_records import random_record
 from support.recordings.kitti_folder import write_folder
 from triquad_client import Status, open_map
 from triquad_format.mapfile.reader import read_map
 from triquad_format.mapfile.writer import write_map
+from triquad_format.records.pose import upright_pose
 from triquad_tools.commands.map_recording import main as map_recording
 from triquad_tools.commands.pack import main
+from triquad_tools.simulation.lidar import Lidar, SimulatedScan
+from triquad_tools.simulation.scene import Scene
+from triquad_tools.simulation.solids import box
 
 EACH_M = 4.0
 START_NS, LATER_NS = 10**18, 10**18 + 10**12
 SMALL_M, LARGE_M = 3.0, 4.0
 LOOKS = 8  # scans
+BOX_M, BOX_HALF_M = (3.0, 0.0, 0.8), 0.8
+BOX = box(BOX_M, (BOX_HALF_M,) * 3)  # that comes, or is taken away
+OTHER_FRAME = (31.0, -12.0, 0.7, 65.0)  # of a map, in the frame of another one: metres, degrees
 
 
 def mapped(path: Path, places: range, stamp_ns: int, radius_m: float = LARGE_M) -> Path:
@@ -39,6 +48,27 @@ def _mapped(path: Path, xs: NDArray[np.float64], stamp_ns: int, radius_m: float)
     write_folder(path.with_suffix(""), scans, poses, stamps)
     words = [str(path.with_suffix("")), str(path), "--settings", str(servers.SMALL_FILE)]
     assert map_recording([*words, "--training"]) == 0
+    return path
+
+
+def street_from(
+    path: Path, chosen: range, frame: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+) -> Path:
+    """The map of some scans of a street, with its training state, in a frame."""
+    return scanned(path, [small_world.world(12).scans[number] for number in chosen], frame)
+
+
+def scanned(
+    path: Path,
+    scans: Sequence[SimulatedScan],
+    frame: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
+    stamp_ns: int = START_NS,
+) -> Path:
+    poses = np.linalg.inv(upright_pose(*frame)) @ [scan.world_from_sensor for scan in scans]
+    stamps = [stamp_ns + number * 10**8 for number in range(len(scans))]
+    write_folder(path.with_suffix(""), [scan.points for scan in scans], poses, stamps)
+    words = [str(path.with_suffix("")), str(path), "--set", "training.samples_per_ray=8"]
+    assert map_recording([*words, "--set", "field.depth=8", "--training"]) == 0
     return path
 
 
@@ -111,6 +141,55 @@ def test_the_later_one_is_right_where_they_contradict(tmp_path: Path, first: str
         assert (outer == Status.SURFACE).mean() > 0.95
         is_there = (inner == Status.SURFACE).mean()
         assert is_there > 0.95 if first == "large" else is_there < 0.05
+
+
+def test_a_map_in_a_frame_of_its_own_is_aligned(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    west = street_from(tmp_path / "west.triquad", range(8))
+    east = street_from(tmp_path / "east.triquad", range(11, 3, -1), OTHER_FRAME)
+    both, output = [str(east), str(west)], str(tmp_path / "both.triquad")
+    guess = [f"{value:g}" for value in np.add(OTHER_FRAME, (0.6, -0.5, 0.2, 4.0))]
+    capsys.readouterr()
+    assert main(["--merge", *both, output, "--align", *guess]) == 0
+    found = capsys.readouterr().out.split("lies at")[1].split()[:4]
+    assert np.abs(np.subtract(np.array(found, float), OTHER_FRAME)).max() < 0.05
+    drive = small_world.world(12)
+    ways = np.array([scan.world_from_sensor[:3, 3] for scan in drive.scans])
+    with open_map(output) as merged:
+        hits, way = merged.query_distance(drive.hits[::50]), merged.query_distance(ways)
+    assert (hits.status == Status.SURFACE).mean() > 0.95
+    assert np.abs(hits.distance_m).mean() < 0.02
+    assert (way.status == Status.FREE).all()
+    assert np.abs(way.distance_m - drive.scene.sdf(ways)).max() < 0.1, (
+        "no surface that is not there"
+    )
+    turned = [*guess[:3], f"{OTHER_FRAME[3] + 90:g}"]
+    assert main(["--merge", *both, output, "--force", "--align", *turned]) == 2
+    assert "do not fit near the guess" in capsys.readouterr().err
+    assert main(["--merge", *both, output, "--force", "--align", "900", "0", "0", "0"]) == 2
+    assert "no surface in common" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("is_later", ["what stood there", "what is empty"])
+def test_of_maps_in_two_frames_the_later_one_is_right(tmp_path: Path, is_later: str) -> None:
+    solids = {"what stood there": (*small_world.WALLED, BOX), "what is empty": small_world.WALLED}
+    paths = {}
+    for name, of in solids.items():
+        scene = Scene(of, np.array(small_world.WALLED_BOUNDS))
+        rng = np.random.default_rng(0)
+        places = [upright_pose(-4.0 + 0.3 * number, 0.0, 1.7, 0.0) for number in range(LOOKS)]
+        scans = [Lidar(columns=360).scan(scene, place, rng) for place in places]
+        frame = OTHER_FRAME if name == "what stood there" else (0.0, 0.0, 0.0, 0.0)
+        stamp_ns = LATER_NS if name == is_later else START_NS
+        paths[name] = scanned(tmp_path / f"{name}.triquad", scans, frame, stamp_ns)
+    output = tmp_path / "both.triquad"
+    words = ["--merge", *map(str, paths.values()), str(output)]
+    assert main([*words, "--align", *map(str, OTHER_FRAME)]) == 0
+    across = np.random.default_rng(0).uniform(-0.4, 0.4, (50, 3)) * (0, 1, 1)
+    front = status_at(output, np.subtract(BOX_M, (BOX_HALF_M, 0, 0)) + across)
+    is_there = (front == Status.SURFACE).mean()
+    assert is_there > 0.9 if is_later == "what stood there" else is_there < 0.1
 
 
 def test_a_file_without_training_state_can_be_had(west: Path, east: Path, tmp_path: Path) -> None:

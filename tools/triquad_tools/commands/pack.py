@@ -11,6 +11,7 @@ from triquad_tools.console.command import run_work
 COMMAND = "triquad-pack"
 _CELL_RANGE_M = (0.01, 10.0)
 _ERROR_RANGE_M = (1e-5, 0.1)
+_POSE_RANGE = (-1e8, 1e8)  # metres, or degrees: coordinates of the Earth's grids are within
 _Add = Callable[..., argparse.Action]
 
 
@@ -38,8 +39,17 @@ def _add_source(add: _Add) -> None:
     at += "2026-01-31T12:00:00Z (default: the newest of all)"
     add("--at", metavar="EPOCH_OR_TIME", help=at)
     add("--recover", action="store_true", help="save what is intact of a damaged file")
-    other = "join another map of the same frame with IN; what both know is learnt again"
+    other = "join another map of the same frame (or see --align); what both know is learnt again"
     add("--merge", type=Path, metavar="OTHER", help=other)
+    guess = "about where the frame of OTHER is in that of IN, metres and degrees, within some 2 m "
+    guess += "and 10 degrees: OTHER is moved to where the surfaces of both fit"
+    add(
+        "--align",
+        type=partial(within, *_POSE_RANGE),
+        nargs=4,
+        metavar=("X", "Y", "Z", "YAW"),
+        help=guess,
+    )
 
 
 def _add_content(add: _Add) -> None:

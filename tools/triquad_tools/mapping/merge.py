@@ -1,11 +1,11 @@
-"""Two maps of one frame, as one."""
+"""Two maps as one."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
-from triquad_format.records.arrays import Longs
+from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.region import (
     MapProgress,
@@ -26,6 +26,7 @@ from triquad_server.warm_up import warm_up
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
+from triquad_tools.mapping.moved_map import aligned, learn, moved, newest_s
 
 _NO_LIMIT = 1 << 50  # bytes
 
@@ -33,7 +34,12 @@ Removed = Mapping[RegionIndex, Longs]
 """Voxels [N, 3] of regions that have lost their surface."""
 
 
-def merged(first: MapRecord, second: MapRecord, settings: Settings | None = None) -> MapRecord:
+def merged(
+    first: MapRecord,
+    second: MapRecord,
+    settings: Settings | None = None,
+    guess: Doubles | None = None,
+) -> MapRecord:
     """Return the map of both, with its training state.
 
     A region that both know is learnt again on the rays of both: the features of two fields cannot
@@ -41,19 +47,26 @@ def merged(first: MapRecord, second: MapRecord, settings: Settings | None = None
     where rays of the later one show that it is there no more, as in a map that is told of both.
 
     Args:
-        first: a map with its training state, in the same frame.
-        second: likewise; its name is that of the result.
+        first: a map with its training state.
+        second: likewise; its name and its frame are those of the result.
         settings: of beliefs and training; ``None``: the default ones.
+        guess: [4, 4] about where the frame of ``first`` is in that of ``second``: it is moved to
+            where both fit; ``None``: they have one frame, and one origin.
 
     Raises:
         ToolError: they do not fit together, or one has no rays.
     """
     _check(first, second)
+    if guess is None:
+        _check_origins(first, second)
     settings = _of_large_maps(settings or Settings()).with_field(second.settings)
-    earlier, later = sorted((first, second), key=_newest_s)
     with closing(Teams()) as teams:
         with progress("preparing") as report:
             warm_up(settings, "cpu", teams, report=lambda stage: report(0.0, stage))
+        if guess is not None:
+            pose = aligned(second, first, guess)
+            first = moved(first, pose, second.origin, settings, teams)
+        earlier, later = sorted((first, second), key=newest_s)
         removed = _removed(earlier, later, settings, teams)
         known = {region.index: region for region in earlier.regions}
         joined = (
@@ -81,10 +94,6 @@ def _of_large_maps(settings: Settings) -> Settings:
     return settings.model_copy(update={"memory": memory, "training": training})
 
 
-def _newest_s(record: MapRecord) -> int:
-    return max(int(region.evidence.seen_s.max(initial=0)) for region in record.regions)
-
-
 def _check(first: MapRecord, second: MapRecord) -> None:
     """Raise :class:`ToolError` for maps that do not fit together, or without rays."""
     for record, which in ((first, "first"), (second, "second")):
@@ -98,11 +107,15 @@ def _check(first: MapRecord, second: MapRecord) -> None:
             f"both maps need the same [field] settings: one has {first.settings}, the other "
             f"{second.settings}"
         )
+
+
+def _check_origins(first: MapRecord, second: MapRecord) -> None:
+    """Raise :class:`ToolError` for maps that count from different origins."""
     if first.origin_m != second.origin_m:
         raise ToolError(
             f"the maps count from different origins, {first.origin_m} and {second.origin_m} m, as "
-            "where coordinates are large and the first scans were not taken at one place: map the "
-            "recordings of both together instead (triquad-map ONE OTHER OUT)"
+            "where coordinates are large and the first scans were not taken at one place: give "
+            "--align 0 0 0 0, which moves one to the other's"
         )
 
 
@@ -172,9 +185,5 @@ def _settled(record: MapRecord, settings: Settings, teams: Teams, removed: Remov
         live.field.grow(_surface(live))
         live.training.rays.forget_ends(removed[live.index])
     mapper.publish()
-    total = mapper.samples_left
-    with progress("training", total) as report:
-        while not mapper.settled:
-            mapper.train()
-            report(total - mapper.samples_left, f"{mapper.samples_trained / 1e6:.1f} M samples")
+    learn(mapper)
     return mapper.snapshot_since(None).record()

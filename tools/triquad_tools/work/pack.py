@@ -8,6 +8,7 @@ import numpy as np
 from triquad_format.mapfile.checkpoint_folder import checkpoint_file, checkpoint_files, set_aside
 from triquad_format.mapfile.index import read_checkpoint
 from triquad_format.mapfile.parts.part import EVIDENCE, REGION, TRAINING, VERTICES
+from triquad_format.records.pose import upright_pose
 from triquad_format.records.region import VertexTable
 
 from triquad_tools.commands.pack import COMMAND
@@ -71,6 +72,9 @@ def _check_usage(options: argparse.Namespace) -> None:
         ),
         "--merge is of whole maps: crop what it has made, or recover a map before": (
             bool(options.merge and (options.crop or options.recover))
+        ),
+        "--align is for --merge: it moves the map that is joined": (
+            options.align is not None and options.merge is None
         ),
     }
     refuse(problems)
@@ -162,7 +166,9 @@ def _merged(options: argparse.Namespace, path: Path) -> SourceMap:
 
     other = read_source(chosen_file(options.merge, None), None)
     own = read_source(path, None)
-    return SourceMap(merged(other.record, own.record), max(other.stamp_ns, own.stamp_ns))
+    guess = None if options.align is None else upright_pose(*options.align)
+    record = merged(other.record, own.record, guess=guess)
+    return SourceMap(record, max(other.stamp_ns, own.stamp_ns))
 
 
 def _print_recovery(recovery: RecoveredMap) -> None:
