@@ -23,7 +23,7 @@ _log = logging.getLogger(__name__)
 MAX_SOURCES_WAITING = 64
 """The number of sources that may each have the full number of scans wait; more share that."""
 
-_BEHIND = 0.25
+_BEHIND = 0.5
 """A source falls behind if more than this share of its limit waits: then more of its scans are
 taken, and questions give way to them."""
 
