@@ -145,7 +145,7 @@ class PointQueries(Asking):
 
         corners = shape.corner + firsts * shape.cell_m
         answered = self._in_parts(request, corners, most=1, at_epoch=at_epoch)
-        fields = answered.joined()
+        fields = answered.joined(flat=("distance_m", "status"))
         for name in ("distance_m", "status"):
             fields[name] = fields[name].reshape(shape.counts)
         return Grid(shape, **fields)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from triquad_format.records.arrays import Doubles, Floats
 from triquad_format.wire.codec import Request
 from triquad_format.wire.messages import MapReply
@@ -42,6 +43,7 @@ class Answered(Generic[MapReplyT]):
         self,
         *,
         flags: Sequence[str] = (),
+        flat: Sequence[str] = (),
         placed: Sequence[str] = (),
         asked_for: Mapping[str, bool] | None = None,
     ) -> dict[str, Any]:
@@ -49,6 +51,7 @@ class Answered(Generic[MapReplyT]):
 
         Args:
             flags: fields that become truth values.
+            flat: fields of several axes that become one, as parts of a grid differ in all of them.
             placed: fields of positions relative to the origin of the part, or ``None``.
             asked_for: fields that are there on request, and whether they were; results have them
                 under the same name with an underscore before it, and ``None`` where they were not.
@@ -58,7 +61,7 @@ class Answered(Generic[MapReplyT]):
         """
         try:
             fields = {
-                name: np.concatenate([getattr(reply, name) for reply in self.replies])
+                name: self._end_to_end(name, flat=name in flat)
                 if isinstance(value, np.ndarray)
                 else value
                 for name, value in vars(self.replies[0]).items()
@@ -76,6 +79,10 @@ class Answered(Generic[MapReplyT]):
                 raise BadReplyError(f"the reply lacks {name}, which was asked for")
             fields[f"_{name}"] = part if wanted else None
         return fields | {flag: fields[flag].astype(np.bool_) for flag in flags}
+
+    def _end_to_end(self, name: str, *, flat: bool) -> NDArray[Any]:
+        arrays = [getattr(reply, name) for reply in self.replies]
+        return np.concatenate([array.reshape(-1) for array in arrays] if flat else arrays)
 
 
 class Asking:

@@ -193,6 +193,15 @@ def test_a_grid_of_several_requests_is_put_together_right(client):
     np.testing.assert_allclose(grid.distance_m.reshape(-1)[::501], some.distance_m, atol=1e-3)
 
 
+def test_a_grid_whose_layers_are_too_large_for_one_request(client):
+    """Some parts of a layer are smaller than others."""
+    grid = client.query_grid(((-1.0, -6, -6), (-0.9, 6, 6)), cell_m=0.08)
+    assert grid.shape.counts == (2, 150, 150)
+    some = client.query_distance(grid.shape.middles()[::501])
+    np.testing.assert_array_equal(grid.status.reshape(-1)[::501], some.status)
+    np.testing.assert_allclose(grid.distance_m.reshape(-1)[::501], some.distance_m, atol=1e-3)
+
+
 def test_no_points_are_no_error(client):
     nothing = client.query_sdf(np.zeros((0, 3)), gradient=True)
     assert (nothing.sdf.shape, nothing.gradient.shape) == ((0,), (0, 3))
