@@ -67,6 +67,14 @@ def refuse_unknown(what: str, meets: Bools) -> None:
         raise UnknownSpaceError(what, int(meets.argmax()), int(meets.sum()))
 
 
+def meets_surface(distance_m: Floats, status: Bytes, radius_m: float) -> Bools:
+    """Return which of N balls around points [N] a seen surface meets, by the points' distances.
+
+    Behind a surface distances are negative; how far, nobody knows where nobody saw.
+    """
+    return np.where(status == _UNKNOWN, np.abs(distance_m), distance_m) <= radius_m
+
+
 def are_free(what: str, blocked: Bools, meets: Bools, unknown: UnknownLike) -> Bools:
     """Return which of N things [N] can pass, where unknown space counts as asked.
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from triquad_client import Client, Grid, Status
 from triquad_format.scan_log.ros_messages import CdrWriter
+from triquad_map.questions.distance import meets_surface
 
 from triquad_tools.ros2.intake.scan_publisher import Place
 from triquad_tools.ros2.options import SliceShape
@@ -48,11 +49,8 @@ class GridPublisher:
 def occupancy(found: Grid) -> NDArray[np.int8]:
     """Return the values [y, x] of a slice's cells: occupied where a surface meets them."""
     distance, status = found.distance_m[:, :, 0].T, found.status[:, :, 0].T
-    is_unknown = status == Status.UNKNOWN
-    values = np.where(is_unknown, UNKNOWN, FREE).astype(np.int8)
-    # Behind a surface distances are negative; how far, nobody knows where nobody saw.
-    nearest = np.where(is_unknown, np.abs(distance), distance)
-    values[nearest <= found.shape.cell_m / 2] = OCCUPIED
+    values = np.where(status == Status.UNKNOWN, UNKNOWN, FREE).astype(np.int8)
+    values[meets_surface(distance, status, found.shape.cell_m / 2)] = OCCUPIED
     return values
 
 
