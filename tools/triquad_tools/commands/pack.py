@@ -1,4 +1,4 @@
-"""``triquad-pack``: rewrite a map file: smaller, from history, repaired, as a mesh or a picture."""
+"""``triquad-pack``: rewrite a map file: smaller, from history, repaired, or as something else."""
 
 import argparse
 from collections.abc import Callable
@@ -19,7 +19,9 @@ def _parser() -> argparse.ArgumentParser:
     parser = command_parser(
         COMMAND,
         description="Rewrite a map file: smaller, cropped, an earlier epoch of it, what is intact "
-        "of it, joined with another map, in the newest version, or as a mesh or a picture.",
+        "of it, joined with another map, in the newest version, or as a mesh (.ply, .glb, .obj, "
+        ".stl), a picture (.png), a map of Nav2 (.yaml, and .pgm beside it), an OctoMap (.bt) or "
+        "arrays of numpy (.npz).",
         epilog="Exit status: 0 done; 1 IN is damaged (with --recover: something of it is lost), or "
         "nothing lies in the box; 2 wrong usage, or input that cannot be used.",
     )
@@ -64,7 +66,8 @@ def _add_content(add: _Add) -> None:
 
 
 def _add_target(add: _Add) -> None:
-    cell = "side of cells of a mesh or a picture (default: half a leaf)"
+    cell = "side of cells of a mesh, a picture or a map of Nav2 (default: half a leaf), or of "
+    cell += "arrays (default: a leaf)"
     add("--cell", type=partial(within, *_CELL_RANGE_M), metavar="M", help=cell)
     add("--force", action="store_true", help="replace OUT where it exists")
 

@@ -19,7 +19,15 @@ Place = tuple[float, float, float]  # metres
 
 MAP_SUFFIX, PICTURE_SUFFIX, SCANS_SUFFIX = ".triquad", ".png", ".mcap"
 MESH_SUFFIXES = (".ply", ".glb", ".obj", ".stl")
-SUFFIXES = (MAP_SUFFIX, *MESH_SUFFIXES, PICTURE_SUFFIX)
+NAV2_SUFFIX, OCTOMAP_SUFFIX, GRID_SUFFIX = ".yaml", ".bt", ".npz"
+SUFFIXES = (
+    MAP_SUFFIX,
+    *MESH_SUFFIXES,
+    PICTURE_SUFFIX,
+    NAV2_SUFFIX,
+    OCTOMAP_SUFFIX,
+    GRID_SUFFIX,
+)
 """How the names of the files end that commands write."""
 
 _FARTHEST_M = 100.0  # that a sensor sits from the frame of its clouds

@@ -6,16 +6,26 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from triquad_client import OfflineMap
+from triquad_client import Mesh, OfflineMap
 from triquad_format.mapfile.files import replacing
 from triquad_format.mapfile.metadata import utc_time
 from triquad_format.mapfile.writer import write_map
 from triquad_format.records.region import MapRecord
 
-from triquad_tools.console.arguments import MAP_SUFFIX, PICTURE_SUFFIX, SUFFIXES
+from triquad_tools.console.arguments import (
+    GRID_SUFFIX,
+    MAP_SUFFIX,
+    NAV2_SUFFIX,
+    OCTOMAP_SUFFIX,
+    PICTURE_SUFFIX,
+    SUFFIXES,
+)
 from triquad_tools.console.command import ToolError, print_remark
 from triquad_tools.console.progress import progress
 from triquad_tools.mapfiles.crop import without_training
+from triquad_tools.mapfiles.grid_file import write_grid
+from triquad_tools.mapfiles.nav2_map import image_path, write_nav2_map
+from triquad_tools.mapfiles.octomap import write_octomap
 from triquad_tools.mapfiles.source import Box, NothingLeftError, SourceMap
 
 _MARKED = (".ply", ".glb", ".obj", PICTURE_SUFFIX)  # they can show which faces were not seen
@@ -37,8 +47,9 @@ def check_target(path: Path, *, force: bool, suffixes: Sequence[str] = SUFFIXES)
         raise ToolError(f"{path}: use a name that ends in {', '.join(suffixes)}")
     if path.is_dir():
         raise ToolError(f"{path} is a folder; give the name of a file")
-    if os.path.lexists(path) and not force:
-        raise ToolError(f"{path} exists; give --force to replace it")
+    for each in (path, image_path(path)) if path.suffix == NAV2_SUFFIX else (path,):
+        if os.path.lexists(each) and not force:
+            raise ToolError(f"{each} exists; give --force to replace it")
     if not path.parent.is_dir():
         raise ToolError(f"{path.parent} is not a folder: make it first")
 
@@ -56,17 +67,18 @@ def check_fill(path: Path, fill_m: float) -> None:
 def write_output(
     record: MapRecord, path: Path, *, cell_m: float, training: bool, fill_m: float = 0.0
 ) -> str:
-    """Write a map file, a mesh with cells of side ``cell_m`` or a picture; return what it is.
+    """Write a map file, or what :func:`export` does, by the suffix; return what it is.
 
-    A map file has the state that further training needs only with ``training``; the surface of a
-    mesh or a picture is continued by ``fill_m`` into unknown space.
+    A map file has the state that further training needs only with ``training``; a mesh or a picture
+    has cells of side ``cell_m``, and its surface is continued by ``fill_m`` into unknown space.
 
     Raises:
         OSError: it cannot be written.
     """
     source = SourceMap(record if training else without_training(record), time.time_ns())
     if path.suffix != MAP_SUFFIX:
-        return export(source, path, cell_m=cell_m, fill_m=fill_m)
+        is_grid = path.suffix in (NAV2_SUFFIX, GRID_SUFFIX)
+        return export(source, path, cell_m=None if is_grid else cell_m, fill_m=fill_m)
     size = write_map_file(source, path)
     told = f"{size:,} bytes, {len(record.regions)} regions, epoch {record.epoch}"
     origin = ", origin {:.12g} {:.12g} {:.12g} m".format(*record.origin_m)
@@ -104,28 +116,42 @@ def export(
     cell_m: float | None = None,
     fill_m: float = 0.0,
 ) -> str:
-    """Write a mesh or a picture of a map; return what it is.
+    """Write a mesh, a picture, a grid, an OctoMap or a map of Nav2; return what it is.
 
     Args:
         source: the map.
         path: the file to write.
-        box: the mesh has the faces whose centroids lie in it; ``None``: all.
-        cell_m: side of its cells; ``None``: half a leaf.
-        fill_m: how far surface is continued into unknown space.
+        box: what of the map is written; of a mesh, the faces whose centroids lie in it; ``None``:
+            all.
+        cell_m: side of the cells; ``None``: half a leaf, of a grid a leaf. An OctoMap has leaves.
+        fill_m: how far the surface of a mesh or a picture is continued into unknown space.
 
     Raises:
-        NothingLeftError: no surface was seen in the box, or there is none to be drawn.
+        NothingLeftError: nothing was seen in the box, or there is nothing to be drawn.
         InvalidInputError: the mesh is too large, or a library is missing.
+        ToolError: what is not a mesh is too large.
         OSError: it cannot be written.
     """
+    if path.suffix == OCTOMAP_SUFFIX:
+        return write_octomap(source.record, path, box)
+    with OfflineMap(source.record) as opened:
+        if path.suffix == NAV2_SUFFIX:
+            return write_nav2_map(opened, path, box, cell_m)
+        if path.suffix == GRID_SUFFIX:
+            return write_grid(opened, path, box, cell_m)
+        bounds = None if box is None else (box[0].tolist(), box[1].tolist())
+        with progress("meshing", 1.0) as report:
+            mesh = opened.mesh(
+                bounds, cell_m, lambda done, of: report(done / of, f"{done} blocks"), fill_m
+            )
+    return _write_mesh(source, mesh, path, is_cropped=box is not None)
+
+
+def _write_mesh(source: SourceMap, mesh: Mesh, path: Path, *, is_cropped: bool) -> str:
+    """Write a map's mesh, or a picture of it; return what it is."""
     record, is_picture = source.record, path.suffix == PICTURE_SUFFIX
-    bounds = None if box is None else (box[0].tolist(), box[1].tolist())
-    with OfflineMap(record) as opened, progress("meshing", 1.0) as report:
-        mesh = opened.mesh(
-            bounds, cell_m, lambda done, of: report(done / of, f"{done} blocks"), fill_m
-        )
-    if not len(mesh.faces) and (is_picture or box is not None):
-        where = "" if box is None else " in the box of --crop"
+    if not len(mesh.faces) and (is_picture or is_cropped):
+        where = " in the box of --crop" if is_cropped else ""
         raise NothingLeftError(f"{path} is not written: no surface was seen{where}")
     if is_picture:
         from triquad_tools.plots.picture import draw_mesh  # slow to import

@@ -1,4 +1,4 @@
-"""``triquad-pack``: rewrite a map file: smaller, from history, repaired, as a mesh or a picture."""
+"""``triquad-pack``: rewrite a map file: smaller, from history, repaired, or as something else."""
 
 import argparse
 from dataclasses import replace
@@ -12,9 +12,16 @@ from triquad_format.records.pose import upright_pose
 from triquad_format.records.region import VertexTable
 
 from triquad_tools.commands.pack import COMMAND
-from triquad_tools.console.arguments import MAP_SUFFIX, SCANS_SUFFIX, SUFFIXES
+from triquad_tools.console.arguments import (
+    GRID_SUFFIX,
+    MAP_SUFFIX,
+    OCTOMAP_SUFFIX,
+    SCANS_SUFFIX,
+    SUFFIXES,
+)
 from triquad_tools.console.command import FAILED, OK, ToolError, complain, print_line, refuse
 from triquad_tools.mapfiles.crop import without_training
+from triquad_tools.mapfiles.grid_file import REACH_M
 from triquad_tools.mapfiles.quantise import quantise
 from triquad_tools.mapfiles.recovery import Loss, RecoveredMap, recover
 from triquad_tools.mapfiles.scan_export import export_scans
@@ -34,7 +41,7 @@ _MARGIN_CELLS = 16  # or of larger ones
 
 
 def work(options: argparse.Namespace) -> int:
-    """Write a map file, a mesh or a picture of a map."""
+    """Write a map file, or what :func:`export` makes of a map."""
     _check_usage(options)
     if options.output.suffix == SCANS_SUFFIX:
         check_target(options.output, force=options.force, suffixes=(SCANS_SUFFIX,))
@@ -66,6 +73,9 @@ def _check_usage(options: argparse.Namespace) -> None:
         ),
         f"--max-error is of map files: {suffix} has none": options.max_error and not is_map,
         "--cell is of meshes: a map file has none": options.cell and is_map,
+        f"--cell is of meshes: {suffix} has the map's leaves": (
+            options.cell and suffix == OCTOMAP_SUFFIX
+        ),
         f"{suffix} has scans: --at, --recover, --merge, --crop and --cell are of maps": (
             suffix == SCANS_SUFFIX
             and any((options.at, options.recover, options.merge, options.crop, options.cell))
@@ -128,6 +138,8 @@ def _tables(source: SourceMap) -> list[VertexTable]:
 def _export(options: argparse.Namespace, path: Path) -> int:
     box, output = _box(options.crop), options.output
     margin_m = max(_MARGIN_M, _MARGIN_CELLS * (options.cell or 0.0)) + options.fill
+    if output.suffix == GRID_SUFFIX:
+        margin_m += REACH_M
     needed = None if box is None else box + [[-margin_m], [margin_m]]
     source, complete = _source(options, path, needed)
     written = export(source, output, box=box, cell_m=options.cell, fill_m=options.fill)
