@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from support.files.mapfile_edit import file_bytes
+from support.maps.exact_maps import exact_map, table
 from support.maps.map_records import random_record
 from support.maps.small_world import settled_epoch
 from triquad_format.mapfile.reader import read_map
@@ -14,6 +15,7 @@ from triquad_map.composition.composed_view import RecordedView
 from triquad_tools.commands.pack import main
 from triquad_tools.mapfiles.crop import crop_record
 from triquad_tools.mapfiles.meshfile import read_mesh
+from triquad_tools.mapping.output import write_output
 
 BOX = ["0.1", "-4.7", "-2", "12.3", "4.1", "3"]
 LOW, HIGH = np.array([0.1, -4.7, -2]), np.array([12.3, 4.1, 3])
@@ -77,6 +79,17 @@ def test_a_map_that_has_seen_nothing(tmp_path, capsys):
     source.write_bytes(file_bytes(crop_record(random_record(1), [7.9] * 3, [7.95] * 3)))
     assert main([str(source), str(tmp_path / "out.ply")]) == 0
     assert " 0 faces" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["plan.yaml", "tree.bt", "grid.npz"])
+def test_a_recording_becomes_what_is_made_of_its_map(tmp_path, name):
+    source, out = tmp_path / "in.triquad", tmp_path / name
+    source.write_bytes(file_bytes(exact_map(table(0.1, 1.1))))
+    written = write_output(read_map(source), out, cell_m=0.05, training=False)
+    data = out.read_bytes()
+    assert f"{len(data):,} bytes" in written or "cells of 0.1 m" in written
+    assert main([str(source), str(out), "--force"]) == 0
+    assert out.read_bytes() == data
 
 
 def test_refusals(map_file, tmp_path, capsys):
