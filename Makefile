@@ -1,12 +1,13 @@
 # make test      set up a virtual environment and run every check and test
 # make test-long   campaigns, deep fuzzing, every page of the browser, whole demonstrations: 45 minutes
-# make check     the checks alone: style, types, which package may import which
-# make docs      write the tables of docs/settings.md and docs/numbers.md from the code
+# make check     the checks alone: style, types, which package may import which, links of the pages
+# make docs      write the tables of docs/settings.md and docs/numbers.md, then the site docs/_build/
 # make pictures  make the pictures of the documentation again; those of the viewer need Chromium
 # make pretrained   train the MLP that regions begin with, on simulated streets: 10 minutes
 # make bench     how fast and how good triquad is on this machine; PART=core: one part of it
 # make campaign  try for 5 minutes to break a server and its files; CAMPAIGN_MINUTES=60: for an hour
-# make wheel     build the wheel, and try it in an environment of its own
+# make paper    the experiments of the 3QFP paper in two simulated worlds, for docs/paper.md: 20 minutes
+# make wheel     build sdist and wheel, and try them in a clean environment; PYTHON=python3.12
 # make demo      set up a virtual environment and map a street, end to end
 VENV ?= .venv
 PYTHON ?= python3
@@ -31,7 +32,7 @@ define pip_install
 	  > $(PIP_LOG) 2>&1 || { tail -n 30 $(PIP_LOG); exit 1; }
 endef
 
-.PHONY: bench campaign check clean demo docs kernels pictures pretrained test test-long wheel
+.PHONY: bench campaign check clean demo docs kernels paper pictures pretrained test test-long wheel
 
 demo: $(INSTALLED_DEMO)
 	$(BIN)/triquad-demo --out demo-out
@@ -54,6 +55,10 @@ test-long: kernels
 docs: $(INSTALLED)
 	$(BIN)/python docs/settings_tables.py
 	$(BIN)/python docs/numbers_table.py
+	$(BIN)/sphinx-build -q -E -W --keep-going docs docs/_build
+
+paper: $(INSTALLED_DEMO)
+	PYTHONPATH=. $(BIN)/python -m bench.paper
 
 pictures: $(INSTALLED)
 	PYTHONPATH=. $(BIN)/python docs/pictures.py
@@ -71,6 +76,7 @@ check: $(INSTALLED)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	PYTHONPATH=. $(BIN)/lint-imports
+	$(BIN)/python -m pytest -q tests/end_to_end/documents/test_references.py -k links
 
 $(INSTALLED_DEMO): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -85,8 +91,9 @@ $(INSTALLED): $(INSTALLED_DEMO)
 wheel:
 	rm -rf dist
 	$(PYTHON) -m venv dist/try
-	dist/try/bin/python -m pip wheel -q --no-deps $(PIP_FLAGS) -w dist .
-	dist/try/bin/python -m pip install -q --no-compile $(PIP_FLAGS) -c constraints.txt "$$(ls dist/*.whl)[demo]"
+	dist/try/bin/python -m pip install -q $(PIP_FLAGS) build
+	dist/try/bin/python -m build -q --outdir dist .
+	dist/try/bin/python -m pip install -q --no-compile $(PIP_FLAGS) "$$(ls dist/*.whl)[demo]"
 	cd dist && try/bin/triquad-demo --scans 5 --out demo-out
 	rm -rf dist/try dist/demo-out
 
@@ -94,4 +101,4 @@ pretrained: $(INSTALLED)
 	$(BIN)/python -m bench.studies.pretraining
 
 clean:
-	rm -rf $(VENV) demo-out
+	rm -rf $(VENV) demo-out docs/_build

@@ -1,5 +1,6 @@
 """Two maps of one frame become one: as if one robot had seen all."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from support import servers
 from support.maps import small_world
-from support.maps.map_records import random_record
+from support.maps.map_records import random_record, with_rays
 from support.recordings.kitti_folder import write_folder
 from triquad_client import Status, open_map
 from triquad_format.mapfile.reader import read_map
@@ -25,6 +26,7 @@ EACH_M = 4.0
 START_NS, LATER_NS = 10**18, 10**18 + 10**12
 SMALL_M, LARGE_M = 3.0, 4.0
 LOOKS = 8  # scans
+POSE_TOLD = re.compile(r"lies at (\S+) (\S+) (\S+), roll pitch yaw \S+ \S+ (\S+) ")
 BOX_M, BOX_HALF_M = (3.0, 0.0, 0.8), 0.8
 BOX = box(BOX_M, (BOX_HALF_M,) * 3)  # that comes, or is taken away
 OTHER_FRAME = (31.0, -12.0, 0.7, 65.0)  # of a map, in the frame of another one: metres, degrees
@@ -143,6 +145,28 @@ def test_the_later_one_is_right_where_they_contradict(tmp_path: Path, first: str
         assert is_there > 0.95 if first == "large" else is_there < 0.05
 
 
+def test_maps_with_origins_of_their_own_are_aligned(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One counts from 20 km away, which is the same place in its own frame."""
+    west = street_from(tmp_path / "west.triquad", range(8))
+    record = read_map(street_from(tmp_path / "east.triquad", range(11, 3, -1)))
+    far, output = tmp_path / "far.triquad", tmp_path / "both.triquad"
+    write_map(replace(record, origin_m=(20_000.0, -500.0, 40.0)), far)
+    capsys.readouterr()
+    guess = ["-20000.4", "500.3", "-40.1", "0"]
+    assert main(["--merge", str(far), str(west), str(output), "--align", *guess]) == 0
+    both = read_map(output)
+    assert both.origin_m == (0.0, 0.0, 0.0)
+    seen_s = np.concatenate([region.evidence.seen_s for region in both.regions])
+    assert np.abs(seen_s[seen_s > 0] - START_NS / 1e9).max() <= 60.0, "a file has whole minutes"
+    drive = small_world.world(12)
+    with open_map(output) as merged:
+        hits = merged.query_distance(drive.hits[::50])
+    assert (hits.status == Status.SURFACE).mean() > 0.95
+    assert np.abs(hits.distance_m).mean() < 0.02
+
+
 def test_a_map_in_a_frame_of_its_own_is_aligned(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -152,8 +176,11 @@ def test_a_map_in_a_frame_of_its_own_is_aligned(
     guess = [f"{value:g}" for value in np.add(OTHER_FRAME, (0.6, -0.5, 0.2, 4.0))]
     capsys.readouterr()
     assert main(["--merge", *both, output, "--align", *guess]) == 0
-    found = capsys.readouterr().out.split("lies at")[1].split()[:4]
-    assert np.abs(np.subtract(np.array(found, float), OTHER_FRAME)).max() < 0.05
+    told = re.search(
+        r"lies at (\S+) (\S+) (\S+), roll pitch yaw \S+ \S+ (\S+) ", capsys.readouterr().out
+    )
+    assert told is not None
+    assert np.abs(np.subtract(np.array(told.groups(), float), OTHER_FRAME)).max() < 0.05
     drive = small_world.world(12)
     ways = np.array([scan.world_from_sensor[:3, 3] for scan in drive.scans])
     with open_map(output) as merged:
@@ -206,7 +233,7 @@ def test_maps_that_do_not_fit_are_refused(
     others = {
         "no rays to learn from": bare,
         "different origins": replace(record, origin_m=(100.0, 0.0, 0.0)),
-        "the same [field] settings": random_record(1),
+        "the same [field] settings": with_rays(random_record(1), 40),
     }
     for told, other in others.items():
         path = tmp_path / "other.triquad"

@@ -108,7 +108,7 @@ def test_what_is_refused(tmp_path, capsys) -> None:
         assert not out.exists()
 
     refused(2, "reaches 8,192 m from the map's origin, 32,768 cells of 0.25 m, and the map 8,40")
-    refused(2, "--cell is of meshes: .bt has the map's leaves", "--cell", "0.1")
+    refused(2, "--cell is of meshes and grids: .bt has the map's leaves", "--cell", "0.1")
     refused(2, "--fill is of what can mark it", "--fill", "1")
     refused(1, "of --crop", "--crop", "900", "0", "0", "901", "1", "1")
     near = ["--crop", "-8", "-8", "-8", "8", "8", "8"]

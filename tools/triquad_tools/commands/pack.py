@@ -43,8 +43,10 @@ def _add_source(add: _Add) -> None:
     add("--recover", action="store_true", help="save what is intact of a damaged file")
     other = "join another map of the same frame (or see --align); what both know is learnt again"
     add("--merge", type=Path, metavar="OTHER", help=other)
-    guess = "about where the frame of OTHER is in that of IN, metres and degrees, within some 2 m "
-    guess += "and 10 degrees: OTHER is moved to where the surfaces of both fit"
+    guess = (
+        "about where the frame of OTHER is in that of IN, metres and degrees; at what both know "
+    )
+    guess += "within 2 m and 10 degrees. OTHER is moved to where the surfaces of both fit"
     add(
         "--align",
         type=partial(within, *_POSE_RANGE),

@@ -68,10 +68,10 @@ def score_mesh(
     points = thin(np.asarray(reference, np.float64), settings.voxel_m)
     samples = _samples(mesh, points, settings)
     if distance is None:
-        distances = _nearest(points, samples, settings.accuracy_cut_m)
+        distances = nearest_m(points, samples, settings.accuracy_cut_m)
     else:
         distances = np.abs(distance(samples))
-    return _scores(distances, samples, points, settings)
+    return scores_of(distances, samples, points, settings)
 
 
 def _samples(mesh: Mesh, reference: Doubles, settings: ScoreSettings) -> Doubles:
@@ -90,17 +90,18 @@ def _samples(mesh: Mesh, reference: Doubles, settings: ScoreSettings) -> Doubles
     return thin(samples[inside], settings.voxel_m)
 
 
-def _nearest(points: Doubles, places: Doubles, limit_m: float) -> Doubles:
+def nearest_m(points: Doubles, places: Doubles, limit_m: float) -> Doubles:
     """Return the distances [N] of places [N, 3] to the nearest point; infinite beyond a limit."""
     tree = cKDTree(points, balanced_tree=False, compact_nodes=False)  # much faster to build
     return np.asarray(tree.query(places, distance_upper_bound=limit_m, workers=-1)[0])
 
 
-def _scores(
+def scores_of(
     distances: Doubles, samples: Doubles, truth: Doubles, settings: ScoreSettings
 ) -> MeshScores:
+    """Return scores of a mesh's samples [N, 3], ``distances`` [N] from the truth [M, 3]."""
     cut_m = settings.completion_cut_m
-    missing_m = np.minimum(_nearest(samples, truth, cut_m), cut_m)
+    missing_m = np.minimum(nearest_m(samples, truth, cut_m), cut_m)
     kept = distances[distances < settings.accuracy_cut_m]
     accuracy_ratio = mean_or_nan(kept < settings.threshold_m)
     completion_ratio = mean_or_nan(missing_m < settings.threshold_m)

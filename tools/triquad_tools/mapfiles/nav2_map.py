@@ -46,14 +46,14 @@ def write_nav2_map(opened: OfflineMap, path: Path, box: Box | None, cell_m: floa
     shown = surface_box(opened, path) if box is None else box
     side_m = _CELL_LEAVES * opened.leaf_m if cell_m is None else cell_m
     shape = checked_shape(path, shown, side_m, layers=1)
+    checked_shape(path, shown, opened.leaf_m, layers=1)  # the ground is sought leaf by leaf
     with progress("looking for the ground", 1.0) as report:
         found = occupancy(opened, shape, shown, report)
     if not (found.occupied | found.free).any():
         raise NothingLeftError(f"{path} is not written: no ground was seen in the box of --crop")
     image = image_path(path)
-    with replacing(image) as stream:
-        stream.write(_image(found))
-    with replacing(path) as stream:
+    with replacing(path) as stream, replacing(image) as pixels:
+        pixels.write(_image(found))
         stream.write(_description(found, image.name).encode())
     shares = f"{found.occupied.mean():.1%} occupied, {found.free.mean():.1%} free"
     return (
@@ -73,12 +73,12 @@ def _image(found: Occupancy) -> bytes:
 
 def _description(found: Occupancy, image: str) -> str:
     """Return the YAML file; the origin is the least corner of the pixel at the lower left."""
-    x, y, _ = found.shape.corner.round(6).tolist()
+    x, y, _ = found.shape.corner.tolist()
     return (
         f"image: {json.dumps(image)}\n"
         "mode: trinary\n"
         f"resolution: {found.shape.cell_m!r}\n"
-        f"origin: [{x!r}, {y!r}, 0.0]\n"
+        f"origin: [{x:.6f}, {y:.6f}, 0.0]\n"
         "negate: 0\n"
         f"occupied_thresh: {_OCCUPIED_THRESH}\n"
         f"free_thresh: {_FREE_THRESH}\n"

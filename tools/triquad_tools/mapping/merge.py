@@ -26,9 +26,11 @@ from triquad_server.warm_up import warm_up
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
-from triquad_tools.mapping.moved_map import aligned, learn, moved, newest_s
+from triquad_tools.mapping.learning import learn
+from triquad_tools.mapping.moved_map import aligned, moved_map
 
 _NO_LIMIT = 1 << 50  # bytes
+_MOST_REGIONS = 1_000_000
 
 Removed = Mapping[RegionIndex, Longs]
 """Voxels [N, 3] of regions that have lost their surface."""
@@ -65,8 +67,8 @@ def merged(
             warm_up(settings, "cpu", teams, report=lambda stage: report(0.0, stage))
         if guess is not None:
             pose = aligned(second, first, guess)
-            first = moved(first, pose, second.origin, settings, teams)
-        earlier, later = sorted((first, second), key=newest_s)
+            first = moved_map(first, pose, second.origin, settings, teams)
+        earlier, later = sorted((first, second), key=_newest_s)
         removed = _removed(earlier, later, settings, teams)
         known = {region.index: region for region in earlier.regions}
         joined = (
@@ -88,16 +90,22 @@ def merged(
 
 
 def _of_large_maps(settings: Settings) -> Settings:
-    """Return settings with which no ray gives way for lack of memory."""
+    """Return settings with which no ray and no region is left out for lack of memory."""
     memory = settings.memory.model_copy(update={"max_bytes": _NO_LIMIT})
-    training = settings.training.model_copy(update={"pool_bytes": _NO_LIMIT})
+    limits = {"pool_bytes": _NO_LIMIT, "max_regions": _MOST_REGIONS}
+    training = settings.training.model_copy(update=limits)
     return settings.model_copy(update={"memory": memory, "training": training})
+
+
+def _newest_s(record: MapRecord) -> int:
+    return max(int(region.evidence.seen_s.max(initial=0)) for region in record.regions)
 
 
 def _check(first: MapRecord, second: MapRecord) -> None:
     """Raise :class:`ToolError` for maps that do not fit together, or without rays."""
     for record, which in ((first, "first"), (second, "second")):
-        if not record.regions or any(one.training is None for one in record.regions):
+        states = [one.training for one in record.regions]
+        if not any(state is not None and len(state.rays) for state in states) or None in states:
             raise ToolError(
                 f"the {which} map has no rays to learn from: give a server's store, or a file of "
                 "client.download_map(training=True) or of triquad-map --training"

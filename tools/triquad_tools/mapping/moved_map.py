@@ -2,14 +2,15 @@
 
 from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from triquad_format.records import morton
 from triquad_format.records.arrays import Bytes, Doubles, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS, RegionIndex
 from triquad_format.records.pose import moved_pose
-from triquad_format.records.region import MapRecord, Region, no_evidence
-from triquad_format.records.replay_rays import ReplayRays
+from triquad_format.records.region import BLOCK_BYTES, MapRecord, Region, no_evidence
 from triquad_format.records.status import Status
 from triquad_map.evidence.merged_evidence import merged_evidence
 from triquad_map.opening import open_view
@@ -22,6 +23,9 @@ from triquad_server.settings import Settings
 
 from triquad_tools.console.command import ToolError, print_line
 from triquad_tools.console.progress import progress
+from triquad_tools.mapping.kept_rays import kept_ends, kept_scans
+from triquad_tools.mapping.learning import learn
+from triquad_tools.sensors.sweep import moved
 
 _REACH_M = 2.0
 """Surfaces that a guess has farther from each other do not pull; as of ``client.align``."""
@@ -31,19 +35,13 @@ _POINTS = 20_000
 
 _BLOCKS_AT_ONCE = 2000  # of which the voxels are looked up
 
-_TOGETHER_M = 1e-3
-"""Rays whose origins differ by less come from one scan: each region tells of its own."""
-
-_ALL_RAYS = {"range_min_m": 0.0, "range_max_m": 1e4, "thin_m": 1e-3}
-"""Of scans that have been thinned: only what several regions tell alike is left out."""
-
-
-@dataclass(frozen=True)
-class KeptScan:
-    """The rays of a scan that a map has kept, metres, from the map's origin."""
-
-    origin: Doubles  # [3]
-    ends: Doubles  # [N, 3]
+_ALL_RAYS = {
+    "range_min_m": 0.0,
+    "range_max_m": 1e4,
+    "thin_m": 0.01,
+    "max_points": 20_000_000,
+}
+"""Of scans that have been thinned: little but what several regions tell alike is left out."""
 
 
 def aligned(record: MapRecord, other: MapRecord, guess: Doubles) -> Doubles:
@@ -52,18 +50,18 @@ def aligned(record: MapRecord, other: MapRecord, guess: Doubles) -> Doubles:
     Args:
         record: a map.
         other: the map to be moved, with its training state.
-        guess: [4, 4] the frame of ``other`` in that of ``record``, off by at most some 2 m
-            and 10 degrees.
+        guess: [4, 4] the frame of ``other`` in that of ``record``, off by at most some 2 m and 10
+            degrees at the place that both have seen.
 
     Raises:
         ToolError: they do not fit there.
     """
     # Maps count from origins of their own.
     pose = _shift(-record.origin) @ guess @ _shift(other.origin)
-    ends = np.concatenate([_ends(region, other) for region in other.regions])
+    ends = kept_ends(other)
     ends = ends[:: -(-len(ends) // _POINTS)]
     with closing(open_view(record)) as view:
-        both = distances(view, _moved(pose, ends), _REACH_M).found
+        both = distances(view, moved(ends, pose), _REACH_M).found
         if not both.any():
             raise ToolError(
                 "the maps have no surface in common where --align has the other one: give a better "
@@ -78,19 +76,23 @@ def aligned(record: MapRecord, other: MapRecord, guess: Doubles) -> Doubles:
             "or map more of what both robots have seen"
         )
     exact = _shift(record.origin) @ found.world_from_sensor @ _shift(-middle - other.origin)
-    x, y, z = exact[:3, 3]
-    yaw_deg = np.degrees(np.arctan2(exact[1, 0], exact[0, 0]))
-    print_line(f"the other map lies at {x:.3f} {y:.3f} {z:.3f} {yaw_deg:.2f} ({_told(found)})")
+    off_m = float(np.linalg.norm(found.world_from_sensor[:3, 3] - moved(middle[None], pose)[0]))
+    turned = Rotation.from_matrix(exact[:3, :3]).as_euler("xyz", degrees=True)
+    print_line(
+        "the other map lies at {:.3f} {:.3f} {:.3f}, roll pitch yaw ".format(*exact[:3, 3])
+        + "{:.3f} {:.3f} {:.3f} degrees: ".format(*turned)
+        + f"{off_m:.2f} m from the guess at the place that both know ({_told(found)})"
+    )
     return exact
 
 
-def moved(
+def moved_map(
     record: MapRecord, pose: Doubles, origin: Doubles, settings: Settings, teams: Teams
 ) -> MapRecord:
     """Return a map in another frame, learnt again.
 
     Its surface is that of the rays that it has kept, as from scans. Other voxels are free where
-    their centres were: rays that met nothing are not kept.
+    their centres were, in regions that these rays reach: rays that met nothing are not kept.
 
     Args:
         record: a map with its training state.
@@ -103,11 +105,11 @@ def moved(
     settings = settings.model_copy(update={"scan": scan, "sources": {}})
     pose = _shift(-origin) @ pose @ _shift(record.origin)
     mapper = Mapper(record.name, settings, "cpu", teams=teams)
-    scans = _kept_scans(record)
+    scans = kept_scans(record)
     with progress("moving", len(scans)) as report:
         for done, kept in enumerate(scans):
             points = (kept.ends - kept.origin).astype(np.float32)
-            mapper.ingest(points, pose @ _shift(kept.origin), newest_s(record), local=True)
+            mapper.ingest(points, pose @ _shift(kept.origin), kept.stamp_s, local=True)
             report(done, f"{done} of {len(scans)} scans")
     learn(mapper)
     made = mapper.snapshot_since(None).record()
@@ -126,15 +128,25 @@ class _FreeSpace:
     record: MapRecord
     pose: Doubles  # [4, 4] of the map's frame in the other one, from the origins of both
 
+    @cached_property
+    def _centres(self) -> Doubles:
+        """Where the centres of the map's blocks are, [B, 3] in the other frame."""
+        settings = self.record.settings
+        side_m = BLOCK_VOXELS * settings.leaf_m
+        blocks = [
+            settings.region_corner(one.index)
+            + side_m * (morton.decode(one.evidence.codes, 3) + 0.5)
+            for one in self.record.regions
+        ]
+        return moved(np.concatenate(blocks), self.pose)
+
     def added_to(self, region: Region) -> Region:
         """Return a region of the other frame in which this is free, too."""
         codes = self._codes_near(region.index)
-        free = np.concatenate(
-            [
-                self._mask(codes[first : first + _BLOCKS_AT_ONCE], region.index)
-                for first in range(0, len(codes), _BLOCKS_AT_ONCE)
-            ]
-        )
+        masks = [np.zeros((0, BLOCK_BYTES), np.uint8)]
+        for first in range(0, len(codes), _BLOCKS_AT_ONCE):
+            masks.append(self._mask(codes[first : first + _BLOCKS_AT_ONCE], region.index))
+        free = np.concatenate(masks)
         used = np.flatnonzero(free.any(axis=1))
         added = replace(
             no_evidence(),
@@ -149,19 +161,14 @@ class _FreeSpace:
     def _codes_near(self, index: RegionIndex) -> Longs:
         """Return the codes, in order, of the blocks of a region that blocks of the map may meet."""
         settings = self.record.settings
-        side_m = BLOCK_VOXELS * settings.leaf_m
-        blocks = [
-            settings.region_corner(one.index)
-            + side_m * (morton.decode(one.evidence.codes, 3) + 0.5)
-            for one in self.record.regions
-        ]
-        centres = _moved(self.pose, np.concatenate(blocks)) - settings.region_corner(index)
-        cells = np.unique(np.floor(centres / side_m).astype(np.int64), axis=0)
+        sides = (1 << settings.depth) // BLOCK_VOXELS
+        offsets = self._centres - settings.region_corner(index)
+        cells = np.floor(offsets / (BLOCK_VOXELS * settings.leaf_m)).astype(np.int64)
+        cells = np.unique(cells[((cells >= -1) & (cells <= sides)).all(axis=1)], axis=0)
         # Half the diagonal of a cube is less than its side.
         around = np.indices((3, 3, 3)).reshape(3, -1).T - 1
         near = (cells[:, None] + around).reshape(-1, 3)
-        inside = ((near >= 0) & (near < (1 << settings.depth) // BLOCK_VOXELS)).all(axis=1)
-        return np.unique(morton.encode(near[inside]))
+        return np.unique(morton.encode(near[((near >= 0) & (near < sides)).all(axis=1)]))
 
     def _mask(self, codes: Longs, index: RegionIndex) -> Bytes:
         """Return the bits [B, BLOCK_BYTES] of voxels of blocks whose centres are free."""
@@ -169,60 +176,14 @@ class _FreeSpace:
         inner = np.indices((BLOCK_VOXELS,) * 3).reshape(3, -1).T + 0.5
         voxels: Doubles = BLOCK_VOXELS * morton.decode(codes, 3)[:, None] + inner
         centres: Doubles = settings.region_corner(index) + settings.leaf_m * voxels.reshape(-1, 3)
-        back = np.linalg.inv(self.pose).astype(np.float64)
-        status = self.view.status(_moved(back, centres), 0.0)
+        status = self.view.status(moved(centres, np.linalg.inv(self.pose)), 0.0)
         free = (status == Status.FREE).reshape(len(codes), -1)
         return np.packbits(free, axis=1, bitorder="little")
-
-
-def learn(mapper: Mapper) -> None:
-    """Train a map until nothing is left to learn."""
-    total = mapper.samples_left
-    with progress("training", total) as report:
-        while not mapper.settled:
-            mapper.train()
-            report(total - mapper.samples_left, f"{mapper.samples_trained / 1e6:.1f} M samples")
-
-
-def newest_s(record: MapRecord) -> int:
-    """Return when a map was seen last, seconds since 1970."""
-    return max(int(region.evidence.seen_s.max(initial=0)) for region in record.regions)
-
-
-def _kept_scans(record: MapRecord) -> list[KeptScan]:
-    """Return the rays of a map by the scans that they come from."""
-    starts = np.concatenate([_starts(region, record) for region in record.regions])
-    ends = np.concatenate([_ends(region, record) for region in record.regions])
-    cells = np.round(starts / _TOGETHER_M).astype(np.int64)
-    _, first, scan_of = np.unique(cells, axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(scan_of.ravel(), kind="stable")
-    parts = np.split(ends[order], np.cumsum(np.bincount(scan_of.ravel()))[:-1])
-    return [KeptScan(starts[row], some) for row, some in zip(first, parts, strict=True)]
-
-
-def _starts(region: Region, record: MapRecord) -> Doubles:
-    rays = _rays(region)
-    centre = record.settings.region_centre(region.index)
-    return centre + rays.origins[rays.origin_of].astype(np.float64)
-
-
-def _ends(region: Region, record: MapRecord) -> Doubles:
-    return record.settings.region_centre(region.index) + _rays(region).ends_m(record.settings)
-
-
-def _rays(region: Region) -> ReplayRays:
-    assert region.training is not None, "it was checked"
-    return region.training.rays
 
 
 def _shift(by: Doubles) -> Doubles:
     """Return a pose [4, 4] that moves by [3], and does not turn."""
     return moved_pose(np.eye(4), by)
-
-
-def _moved(pose: Doubles, points: Doubles) -> Doubles:
-    moved_points: Doubles = points @ pose[:3, :3].T + pose[:3, 3]
-    return moved_points
 
 
 def _told(found: Alignment) -> str:

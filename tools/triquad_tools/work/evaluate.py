@@ -1,18 +1,12 @@
 """``triquad-eval``: how good a mesh is."""
 
 import argparse
-from pathlib import Path
-
-import numpy as np
-from triquad_format.records.arrays import Doubles
 
 from triquad_tools.console.command import OK, ToolError, print_line
 from triquad_tools.console.report import Row, centimetres, json_text, percent, print_rows
 from triquad_tools.evaluation.metrics import MeshScores, ScoreSettings, score_mesh
+from triquad_tools.evaluation.references import read_reference
 from triquad_tools.mapfiles.meshfile import read_mesh
-from triquad_tools.recordings.cloud import merged, world_points
-from triquad_tools.recordings.folders.cloud_folder import read_cloud_folder
-from triquad_tools.recordings.recording import ReadingOptions
 
 
 def work(options: argparse.Namespace) -> int:
@@ -21,27 +15,13 @@ def work(options: argparse.Namespace) -> int:
     if not len(mesh.faces):
         raise ToolError(f"{options.mesh}: has no faces; a cloud can only be a --reference")
     settings = ScoreSettings(options.threshold, accuracy_cut_m=2 * options.threshold)
-    reference = _reference(options.reference, settings.voxel_m, options.range_min)
+    reference = read_reference(options.reference, settings.voxel_m, options.range_min)
     scores = score_mesh(mesh, reference, settings)
     if options.json:
         print_line(json_text(scores))
     else:
         print_rows(str(options.mesh), _rows(scores))
     return OK
-
-
-def _reference(path: Path, voxel_m: float, range_min_m: float) -> Doubles:
-    """Return the points ``[N, 3]`` of a cloud, or of all scans of a folder in the world frame."""
-    if path.is_dir():
-        # Points are what counts, from wherever they were seen.
-        folder = read_cloud_folder(path, ReadingOptions(ray_origin=(0.0, 0.0, 0.0)))
-        clouds = (world_points(scan, range_min_m) for scan in folder.read(range(len(folder))))
-        points = merged(clouds, voxel_m)
-    else:
-        points = np.asarray(read_mesh(path).vertices, np.float64)
-    if not len(points):
-        raise ToolError(f"{path}: holds no points")
-    return points
 
 
 def _rows(scores: MeshScores) -> list[Row]:

@@ -72,8 +72,8 @@ def _check_usage(options: argparse.Namespace) -> None:
             is_endpoint(str(given))
         ),
         f"--max-error is of map files: {suffix} has none": options.max_error and not is_map,
-        "--cell is of meshes: a map file has none": options.cell and is_map,
-        f"--cell is of meshes: {suffix} has the map's leaves": (
+        "--cell is of meshes and grids: a map file has none": options.cell and is_map,
+        f"--cell is of meshes and grids: {suffix} has the map's leaves": (
             options.cell and suffix == OCTOMAP_SUFFIX
         ),
         f"{suffix} has scans: --at, --recover, --merge, --crop and --cell are of maps": (

@@ -1,0 +1,1 @@
+"""Worlds that are like those of the 3QFP paper, and its experiments in them."""

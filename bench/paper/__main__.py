@@ -1,0 +1,100 @@
+"""Make ``docs/paper.md``: the experiments of the 3QFP paper, in two worlds of our own.
+
+Where VDBFusion is installed, it is run as well: its wheels are for Python 3.10.
+"""
+
+import argparse
+import os
+import platform
+import shutil
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from triquad_client import Mesh
+from triquad_tools.commands.evaluate import main as evaluate
+from triquad_tools.console.progress import progress
+from triquad_tools.recordings.cloud import merged
+from triquad_tools.simulation.lidar import Lidar, SimulatedDrive
+from triquad_tools.simulation.street import street_drive
+
+from bench.paper.quad import quad_walk
+
+_DOCS = Path(__file__).parents[2] / "docs"
+_SPACING_M = 0.03  # of the truth: 2 cm would have twice as many points
+_TRUE_BEAMS, _TRUE_COLUMNS = 256, 4096  # of the sensor that looks for the truth
+
+
+@dataclass(frozen=True)
+class _World:
+    """A world, and the set of the paper that it is like."""
+
+    name: str
+    style: str
+    drive: SimulatedDrive
+    lidar: Lidar
+    true_every: int  # scans, from where one looks for the truth
+
+
+def _worlds(seed: int) -> tuple[_World, ...]:
+    lidar = Lidar(elevation_max_deg=5.0)
+    street = street_drive(seed, 60, 1.0, 60.0, lidar)
+    noisy = Lidar(elevation_min_deg=-30.0, elevation_max_deg=30.0, noise_m=0.05)
+    court = quad_walk(seed, 180, noisy)
+    return (
+        _World("A street like MaiCity's", "maicity", street, lidar, 2),
+        _World("A court like the Newer College's", "newer-college", court, noisy, 6),
+    )
+
+
+def main() -> None:
+    """Write the page and its pictures."""
+    parser = argparse.ArgumentParser(prog="python -m bench.paper", description=__doc__)
+    parser.add_argument("--seed", type=int, default=11, help="of both worlds")
+    options = parser.parse_args()
+    parts = [(Path(__file__).with_name("intro.md")).read_text()]
+    parts.append(f"Measured with Python {platform.python_version()} on {os.cpu_count()} cores.\n")
+    with tempfile.TemporaryDirectory(prefix="triquad-paper-") as name:
+        for world in _worlds(options.seed):
+            folder, report = Path(name) / world.style, Path(name) / f"{world.style}-report"
+            truth = folder.with_suffix(".ply")
+            _write(world, folder, truth)
+            words = ["paper", str(folder), str(report), "--reference", str(truth)]
+            words += ["--style", world.style, "--as-published", "--name", world.name]
+            words += ["--spacing", str(_SPACING_M)]
+            if evaluate(words) != 0:
+                raise SystemExit(f"{world.name}: the experiments ended with an error")
+            prefix = f"paper-{world.style}-"
+            for picture in report.glob("*.png"):
+                shutil.copy(picture, _DOCS / "images" / f"{prefix}{picture.name}")
+            page = (report / "report.md").read_text()
+            for picture in report.glob("*.png"):
+                page = page.replace(f"({picture.name})", f"(images/{prefix}{picture.name})")
+            parts.append(page)
+    (_DOCS / "paper.md").write_text("\n".join(parts))
+
+
+def _write(world: _World, folder: Path, truth: Path) -> None:
+    """Write a world's scans and poses as KITTI's, and its true surface as points."""
+    folder.mkdir()
+    drive = world.drive
+    with progress(f"simulating: {world.name}", len(drive)) as report:
+        for number, scan in enumerate(drive):
+            rows = np.zeros((len(scan.points), 4), "<f4")
+            rows[:, :3] = scan.points
+            rows.tofile(folder / f"{number:06d}.bin")
+            report(number, f"{number} of {len(drive)} scans")
+    np.savetxt(folder / "poses.txt", drive.poses[:, :3].reshape(-1, 12), fmt="%.9f")
+    low, high = drive.scene.bounds
+    sensor = replace(world.lidar, beams=_TRUE_BEAMS, columns=_TRUE_COLUMNS, noise_m=0.0)
+    seen = SimulatedDrive(drive.scene, sensor, drive.poses[:: world.true_every])
+    hits = (scan.true_hits for scan in seen)
+    points = merged(
+        (some[((some >= low) & (some <= high)).all(axis=1)] for some in hits), _SPACING_M
+    )
+    Mesh(points, np.zeros((0, 3), np.int32), None).save(truth)
+
+
+if __name__ == "__main__":
+    main()

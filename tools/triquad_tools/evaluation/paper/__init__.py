@@ -1,0 +1,1 @@
+"""The experiments of the 3QFP paper, as a command."""
