@@ -3,4 +3,4 @@
 This package needs numpy, msgpack and mcap only; it imports neither the server nor the client.
 """
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

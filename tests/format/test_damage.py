@@ -141,7 +141,7 @@ def test_other_mcap_files(names: list[str], has_checksums: bool) -> None:
 @pytest.mark.parametrize(
     ("changes", "error", "text"),
     [
-        ({"min_reader_version": "3"}, UnsupportedMapFileError, "version 3.*triquad 0.1.0"),
+        ({"min_reader_version": "3"}, UnsupportedMapFileError, "version 3.*triquad 0.2.0"),
         ({"min_reader_version": None}, DamagedMapFileError, "min_reader_version"),
         ({"min_reader_version": "9" * 5000}, DamagedMapFileError, "min_reader_version"),
         ({"epoch": "8"}, DamagedMapFileError, "epoch"),
