@@ -37,10 +37,10 @@ def test_the_page_tells_what_is_missed_and_why(tmp_path: Path) -> None:
     MEASURED.write(tmp_path)
     text = page(tmp_path)
     assert "## core: 2026-01-31, a machine, street 2" in text
-    assert "| a | 1 s | at most 2 | yes |" in text
-    assert "| b | 5 | at least 6 | **no** |" in text
-    assert "| d | nan s | at most 1 | **no** |" in text
-    assert "Also measured: c 7 MB." in text
+    assert "| a | 1 s | at most 2 |" in text
+    assert "| b | 5 | at least 6: **missed** |" in text
+    assert "| d | nan s | at most 1: **missed** |" in text
+    assert "| c | 7 MB | |" in text
     assert "b is missed for a reason." in text
 
 

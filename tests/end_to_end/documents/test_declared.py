@@ -1,10 +1,12 @@
 """What the packages import is what ``pyproject.toml`` declares."""
 
 import ast
+import re
 import sys
 from pathlib import Path
 
 import pytest
+import triquad_format
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -23,7 +25,7 @@ DISTRIBUTIONS = {
     "prometheus_client": "prometheus-client",
     "small_gicp": "small-gicp",
 }
-EVERY_EXTRA = tuple(PROJECT["optional-dependencies"].keys() - {"demo", "dev"})
+EVERY_EXTRA = tuple(PROJECT["optional-dependencies"].keys() - {"demo", "dev", "docs"})
 
 
 def declared(*extras: str) -> set[str]:
@@ -76,3 +78,18 @@ def test_what_is_declared_is_imported() -> None:
     folders = ("format", "map", "client", "server", "tools")
     used = set().union(*(imported(folder) for folder in folders))
     assert declared(*EVERY_EXTRA) <= used
+
+
+def test_badges_say_what_is_declared() -> None:
+    badges = re.findall(r"img\.shields\.io/badge/([^)]*)\)", (ROOT / "README.md").read_text())
+    minors = [int(each) for each in re.findall(r"Python :: 3\.(\d+)", str(PROJECT["classifiers"]))]
+    assert PROJECT["requires-python"] == f">=3.{min(minors)}"
+    python = f"python-3.{min(minors)}_to_3.{max(minors)}-blue"
+    assert badges == [python, f"licence-{PROJECT['license']}-blue", "platform-Linux-blue"]
+    assert "Operating System :: POSIX :: Linux" in PROJECT["classifiers"]
+
+
+def test_the_version_is_told_alike() -> None:
+    version = re.escape(triquad_format.__version__)
+    for name, line in (("CITATION.cff", f"version: {version}"), ("CHANGELOG.md", f"## {version}")):
+        assert re.search(f"^{line}\\b", (ROOT / name).read_text(), re.MULTILINE), name

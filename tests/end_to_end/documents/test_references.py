@@ -74,7 +74,7 @@ def anchors(page: str) -> set[str]:
 
 
 def test_links_lead_to_pages_and_headings_that_there_are() -> None:
-    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    pages = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
     links = [(page, link) for page in pages for link in LINK.findall(page.read_text())]
     lost = []
     for page, link in links:

@@ -1,0 +1,146 @@
+"""What pages show is run: Python against a server, commands by the parsers of their options."""
+
+import argparse
+import importlib
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import triquad_client
+from support import servers
+from support.maps import small_world
+
+ROOT = Path(__file__).parents[3]
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    *(page for page in sorted((ROOT / "docs").rglob("*.md")) if "_build" not in page.parts),
+]
+PYTHON = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
+CODE = re.compile(r"^```(?:bash|sh)?\n(.*?)^```", re.DOTALL | re.MULTILINE)
+CONNECTING = re.compile(r"(\bconnect(?:_async)?\()\s*(?:\"[^\"]*\"|config=\"[^\"]*\")")
+NAMED = re.compile(r"(\bconnect\([^)]*?)(, \"garage\"|, \"town\"|, map=\"demo\")")
+
+ELSEWHERE = {
+    "while True": "goes on for ever: the questions in it are those of test_changes.py",
+    "while driving": "goes on while a robot drives: tests/client/test_sync.py",
+    "make_reader": "is of docs/examples/map_file_as_mcap.py, which is run",
+    "triquad_server.serve": "starts a server of its own: tests/end_to_end/process/test_embedded.py",
+    "create_map": "is of two maps: tests/end_to_end/process/test_many_maps.py",
+    "keyframe_stamps_s": "is of docs/examples/correct_poses.py, which is run",
+    "offline.mesh(bounds": "goes on with the block before",
+    ">>>": "is a dialogue, whose answers differ",
+    "time.sleep(10)": "waits; metrics are those of test_metrics.py",
+    "as watch": "waits for changes: tests/client/mesh/test_mesh_watch.py",
+}
+"""What blocks have that are not run here, and what is done instead."""
+
+PARSERS = {
+    "triquad-server": ("triquad_server.cli", "_parser"),
+    "triquad-demo": ("triquad_tools.commands.demo", "_parser"),
+    "triquad-eval": ("triquad_tools.commands.evaluate", "_parser"),
+    "triquad-inspect": ("triquad_tools.commands.inspect", "_parser"),
+    "triquad-keys": ("triquad_tools.commands.keys", "_parser"),
+    "triquad-map": ("triquad_tools.commands.map_recording", "_parser"),
+    "triquad-pack": ("triquad_tools.commands.pack", "_parser"),
+    "triquad-replay": ("triquad_tools.commands.replay", "_parser"),
+    "triquad-ros2": ("triquad_tools.commands.ros2", "parser"),
+    "triquad-top": ("triquad_tools.commands.top", "_parser"),
+    "triquad-view": ("triquad_tools.commands.view", "_parser"),
+}
+
+
+def python_blocks() -> list[tuple[str, str]]:
+    """A name and the text of each block of Python."""
+    found = []
+    for page in PAGES:
+        for number, block in enumerate(PYTHON.findall(page.read_text(encoding="utf-8"))):
+            found.append((f"{page.relative_to(ROOT)}-{number}", block))
+    return found
+
+
+def commands() -> list[tuple[str, str]]:
+    """A page and a line of each command of triquad that it shows in a block."""
+    found = []
+    for page in PAGES:
+        for block in CODE.findall(page.read_text(encoding="utf-8")):
+            lines = block.replace("\\\n", " ").splitlines()
+            for line in (one.removeprefix("$ ").strip() for one in lines):
+                if line.split(" ")[0] in PARSERS:
+                    found.append((str(page.relative_to(ROOT)), line))
+    return found
+
+
+BLOCKS = python_blocks()
+COMMANDS = commands()
+
+
+@pytest.fixture(scope="module")
+def endpoint() -> Iterator[str]:
+    with servers.running_service() as endpoint, triquad_client.connect(endpoint) as client:
+        for scan in small_world.world(3).scans:
+            client.publish_scan(scan.points, scan.world_from_sensor)
+        client.flush(servers.WAIT_S)
+        yield endpoint
+
+
+@pytest.fixture
+def names(
+    endpoint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[dict[str, Any]]:
+    """What the text around a block speaks of."""
+    monkeypatch.chdir(tmp_path)
+    scan = small_world.world(3).scans[0]
+    depth = np.full((48, 64), 3.0)
+    with triquad_client.connect(endpoint) as client:
+        client.download_map(tmp_path / "site.triquad")
+        yield {
+            "np": np,
+            "triquad_client": triquad_client,
+            "client": client,
+            "points": scan.points,
+            "world_from_sensor": scan.world_from_sensor,
+            "directions": np.array([[0.0, 0.0, 1.0]]),
+            "cloud": np.ones((64, 1024, 3)),
+            "bounds": ((0, -8, -1), (10, 8, 5)),
+            "depth": depth,
+            "intrinsics": triquad_client.Intrinsics(fx=50.0, fy=50.0, cx=31.5, cy=23.5),
+            "world_from_camera": scan.world_from_sensor,
+        }
+
+
+@pytest.mark.parametrize(("name", "block"), BLOCKS, ids=[name for name, _ in BLOCKS])
+def test_python_runs_as_it_is_shown(
+    name: str, block: str, names: dict[str, Any], endpoint: str
+) -> None:
+    for text, why in ELSEWHERE.items():
+        if text in block:
+            pytest.skip(why)
+    block = NAMED.sub(r"\1", block)
+    exec(compile(CONNECTING.sub(rf'\1"{endpoint}"', block), name, "exec"), names)  # noqa: S102
+
+
+def test_whatever_is_not_run_is_on_some_page() -> None:
+    texts = "".join(block for _, block in BLOCKS)
+    assert [text for text in ELSEWHERE if text not in texts] == []
+    assert len(BLOCKS) > 25
+
+
+@pytest.mark.parametrize("command", PARSERS)
+def test_commands_have_the_options_that_are_shown(command: str) -> None:
+    module, parser = PARSERS[command]
+    lines = [line for _, line in COMMANDS if line.split(" ")[0] == command]
+    assert lines
+    for line in lines:
+        words = shlex.split(line, comments=True)[1:]
+        made: argparse.ArgumentParser = getattr(importlib.import_module(module), parser)()
+        if command == "triquad-eval" and words[0] == "paper":
+            made, words = importlib.import_module(module)._paper_parser(), words[1:]
+        try:
+            made.parse_args(words)
+        except SystemExit as stop:
+            pytest.fail(f"{line} ends with {stop.code}")
