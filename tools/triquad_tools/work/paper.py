@@ -9,22 +9,22 @@ from triquad_server.settings.loading import load_settings
 from triquad_tools.console.command import OK, ToolError, print_line
 from triquad_tools.console.progress import progress
 from triquad_tools.evaluation.metrics import ScoreSettings
-from triquad_tools.evaluation.paper.plots import (
+from triquad_tools.evaluation.references import read_reference
+from triquad_tools.paper.plots import (
     Pictured,
     picture_holes,
     plot_memory,
     plot_sparse,
 )
-from triquad_tools.evaluation.paper.published_figures import SETS
-from triquad_tools.evaluation.paper.report import Report
-from triquad_tools.evaluation.paper.runs import (
+from triquad_tools.paper.published_figures import SETS
+from triquad_tools.paper.report import Report
+from triquad_tools.paper.runs import (
     Method,
     Task,
     all_runs,
     memory_by_scans,
     scans_needed,
 )
-from triquad_tools.evaluation.references import read_reference
 from triquad_tools.recordings.folders.cloud_folder import read_cloud_folder
 from triquad_tools.recordings.recording import ReadingOptions
 from triquad_tools.sensors.sweep import PosedScan

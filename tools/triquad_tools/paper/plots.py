@@ -14,9 +14,9 @@ from triquad_map.clusters import tight_boxes
 from triquad_map.height_scale import HeightScale
 
 from triquad_tools.evaluation.metrics import nearest_m
-from triquad_tools.evaluation.paper.published_figures import PublishedSet
-from triquad_tools.evaluation.paper.runs import MemoryAt, Run
 from triquad_tools.evaluation.shine_protocol import faces_inside
+from triquad_tools.paper.published_figures import PublishedSet
+from triquad_tools.paper.runs import MemoryAt, Run
 from triquad_tools.plots.picture import BACKGROUND, draw_faces, view_along
 from triquad_tools.recordings.cloud import thin
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 from triquad_tools.console.report import json_text
 from triquad_tools.evaluation.metrics import ScoreSettings
-from triquad_tools.evaluation.paper.published_figures import PublishedScores, PublishedSet, Style
-from triquad_tools.evaluation.paper.runs import ABLATED_EVERY, MemoryAt, Run
+from triquad_tools.paper.published_figures import PublishedScores, PublishedSet, Style
+from triquad_tools.paper.runs import ABLATED_EVERY, MemoryAt, Run
 
 _COLUMNS = (
     "method",

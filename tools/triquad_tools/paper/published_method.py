@@ -28,7 +28,7 @@ from triquad_server.settings import Settings
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
-from triquad_tools.evaluation.paper.intake import taken
+from triquad_tools.paper.intake import taken
 from triquad_tools.recordings.cloud import points_in_range, thin
 from triquad_tools.sensors.sweep import PosedScan, moved
 

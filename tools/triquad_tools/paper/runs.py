@@ -21,12 +21,12 @@ from triquad_server.warm_up import warm_up
 
 from triquad_tools.console.progress import progress
 from triquad_tools.evaluation.metrics import MeshScores, ScoreSettings
-from triquad_tools.evaluation.paper.intake import taken
-from triquad_tools.evaluation.paper.other_mappers import has_vdbfusion, vdbfusion_mesh
-from triquad_tools.evaluation.paper.published_method import published_map
 from triquad_tools.evaluation.shine_protocol import shine_scores
 from triquad_tools.mapfiles.crop import without_training
 from triquad_tools.mapping.learning import learn
+from triquad_tools.paper.intake import taken
+from triquad_tools.paper.other_mappers import has_vdbfusion, vdbfusion_mesh
+from triquad_tools.paper.published_method import published_map
 from triquad_tools.sensors.sweep import PosedScan
 
 Method = Literal["triquad", "as published", "VDBFusion"]
