@@ -6,12 +6,12 @@ Where VDBFusion is installed, it is run as well: its wheels are for Python 3.10.
 import argparse
 import os
 import platform
-import shutil
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 from triquad_client import Mesh
 from triquad_tools.commands.evaluate import main as evaluate
 from triquad_tools.console.progress import progress
@@ -21,6 +21,10 @@ from triquad_tools.simulation.street import street_drive
 
 from bench.paper.quad import quad_walk
 
+PICTURES = ("sparse.png", "memory.png", "holes.png")
+"""The pictures of each report."""
+
+_COLOURS = 256  # of a picture on the page: a third of the bytes
 _DOCS = Path(__file__).parents[2] / "docs"
 _SPACING_M = 0.03  # of the truth: 2 cm would have twice as many points
 _TRUE_BEAMS, _TRUE_COLUMNS = 256, 4096  # of the sensor that looks for the truth
@@ -55,9 +59,12 @@ def main() -> None:
     options = parser.parse_args()
     parts = [(Path(__file__).with_name("intro.md")).read_text()]
     parts.append(f"Measured with Python {platform.python_version()} on {os.cpu_count()} cores.\n")
-    with tempfile.TemporaryDirectory(prefix="triquad-paper-") as name:
+    with tempfile.TemporaryDirectory(prefix="triquad-paper-") as temporary:
         for world in _worlds(options.seed):
-            folder, report = Path(name) / world.style, Path(name) / f"{world.style}-report"
+            folder, report = (
+                Path(temporary) / world.style,
+                Path(temporary) / f"{world.style}-report",
+            )
             truth = folder.with_suffix(".ply")
             _write(world, folder, truth)
             words = ["paper", str(folder), str(report), "--reference", str(truth)]
@@ -65,12 +72,12 @@ def main() -> None:
             words += ["--spacing", str(_SPACING_M)]
             if evaluate(words) != 0:
                 raise SystemExit(f"{world.name}: the experiments ended with an error")
-            prefix = f"paper-{world.style}-"
-            for picture in report.glob("*.png"):
-                shutil.copy(picture, _DOCS / "images" / f"{prefix}{picture.name}")
             page = (report / "report.md").read_text()
-            for picture in report.glob("*.png"):
-                page = page.replace(f"({picture.name})", f"(images/{prefix}{picture.name})")
+            for name in PICTURES:
+                target = f"paper-{world.style}-{name}"
+                picture = Image.open(report / name).convert("RGB").quantize(_COLOURS)
+                picture.save(_DOCS / "images" / target, optimize=True)
+                page = page.replace(f"({name})", f"(images/{target})")
             parts.append(page)
     (_DOCS / "paper.md").write_text("\n".join(parts))
 
