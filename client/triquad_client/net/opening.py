@@ -133,8 +133,9 @@ def _servers_of_map(connection: Connection, patience: _Patience, start_s: float)
                 raise ConnectError(f"{told}; connect again, or with a longer timeout_s")
             continue
         there = connection.maps()
-        # It may have come since it was asked for.
-        has_others = bool(there) and name not in there
+        # It, or a server that shares it, may have come since it was asked for.
+        has_it = any(other == name or number_of_share(name, other) is not None for other in there)
+        has_others = bool(there) and not has_it
         if has_others or not patience.wait(f"no server has a map {name!r} yet"):
             raise UnknownMapError(name, there)
     return [server for _, server in found]

@@ -167,7 +167,7 @@ def test_sources_take_turns_and_the_busiest_loses_alone():
 
 def test_a_source_is_passed_over_until_it_falls_behind():
     queue = ScanQueue(8)
-    for sequence in range(4):
+    for sequence in range(6):
         queue.put(servers.scan(sequence))
     taken = [queue.take({"lidar"}).sequence, queue.take({"lidar"}).sequence]
     assert taken == [0, 1]
@@ -178,10 +178,10 @@ def test_a_source_is_passed_over_until_it_falls_behind():
 def test_questions_give_way_while_a_source_is_about_to_lose_scans(monkeypatch):
     monkeypatch.setattr(scan_queue, "_GIVE_WAY_S", servers.WAIT_S)
     queue = ScanQueue(limit=16)
-    for sequence in range(4):
+    for sequence in range(8):
         queue.put(servers.scan(sequence))
     queue.give_way()  # returns at once
-    queue.put(servers.scan(4))
+    queue.put(servers.scan(8))
     waiting = threading.Thread(target=queue.give_way)
     waiting.start()
     waiting.join(0.1)

@@ -83,7 +83,9 @@ def checked_shape(path: Path, box: Box, cell_m: float, *, layers: int | None = N
     x, y, z = (int(count) for count in np.maximum(np.ceil((box[1] - box[0]) / cell_m - 1e-6), 1))
     shape = GridShape(box[0], cell_m, (x, y, z if layers is None else layers))
     if shape.cells > _MAX_CELLS:
-        sides = " x ".join(f"{count:.6g}" for count in shape.counts)
+        sides = " x ".join(
+            f"{count:,}" if count < _MAX_CELLS else "very many" for count in shape.counts
+        )
         raise ToolError(
             f"{path} would have {sides} cells of {cell_m:g} m, more than {_MAX_CELLS:,} of them: "
             "use --crop, or a larger --cell, of triquad-pack"
