@@ -1,8 +1,10 @@
 """Simulated drives, their scans, and the surface that a map of them should have."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
+import numpy as np
 from triquad_client import Mesh
 from triquad_format.records.arrays import Doubles
 from triquad_tools.console.progress import progress
@@ -23,6 +25,18 @@ class Driven:
     def mesh_scores(self, mesh: Mesh, settings: ScoreSettings | None = None) -> MeshScores:
         """Return scores of a mesh within the scene's bounds."""
         return score_mesh(mesh, self.visible, settings or ScoreSettings(), self.drive.scene.sdf)
+
+
+def write_recording(folder: Path, scans: Sequence[PosedScan], poses: Doubles, name: str) -> None:
+    """Write scans into a new folder as KITTI's, with poses [n, 4, 4]."""
+    folder.mkdir()
+    with progress(f"writing {name}", len(scans)) as report:
+        for number, scan in enumerate(scans):
+            rows = np.zeros((len(scan.points), 4), "<f4")
+            rows[:, :3] = scan.points
+            rows.tofile(folder / f"{number:06d}.bin")
+            report(number, f"{number} scans")
+    np.savetxt(folder / "poses.txt", poses[:, :3].reshape(-1, 12), fmt="%.9f")
 
 
 def driven(drive: SimulatedDrive, voxel_m: float, name: str = "the drive") -> Driven:

@@ -14,11 +14,11 @@ import numpy as np
 from PIL import Image
 from triquad_client import Mesh
 from triquad_tools.commands.evaluate import main as evaluate
-from triquad_tools.console.progress import progress
 from triquad_tools.recordings.cloud import merged
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive
 from triquad_tools.simulation.street import street_drive
 
+from bench.driven import write_recording
 from bench.paper.quad import quad_walk
 
 PICTURES = ("sparse.png", "memory.png", "holes.png")
@@ -61,10 +61,8 @@ def main() -> None:
     parts.append(f"Measured with Python {platform.python_version()} on {os.cpu_count()} cores.\n")
     with tempfile.TemporaryDirectory(prefix="triquad-paper-") as temporary:
         for world in _worlds(options.seed):
-            folder, report = (
-                Path(temporary) / world.style,
-                Path(temporary) / f"{world.style}-report",
-            )
+            folder = Path(temporary) / world.style
+            report = folder.with_name(f"{world.style}-report")
             truth = folder.with_suffix(".ply")
             _write(world, folder, truth)
             words = ["paper", str(folder), str(report), "--reference", str(truth)]
@@ -84,15 +82,8 @@ def main() -> None:
 
 def _write(world: _World, folder: Path, truth: Path) -> None:
     """Write a world's scans and poses as KITTI's, and its true surface as points."""
-    folder.mkdir()
     drive = world.drive
-    with progress(f"simulating: {world.name}", len(drive)) as report:
-        for number, scan in enumerate(drive):
-            rows = np.zeros((len(scan.points), 4), "<f4")
-            rows[:, :3] = scan.points
-            rows.tofile(folder / f"{number:06d}.bin")
-            report(number, f"{number} of {len(drive)} scans")
-    np.savetxt(folder / "poses.txt", drive.poses[:, :3].reshape(-1, 12), fmt="%.9f")
+    write_recording(folder, list(drive), drive.poses, world.name)
     low, high = drive.scene.bounds
     sensor = replace(world.lidar, beams=_TRUE_BEAMS, columns=_TRUE_COLUMNS, noise_m=0.0)
     seen = SimulatedDrive(drive.scene, sensor, drive.poses[:: world.true_every])

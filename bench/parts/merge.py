@@ -12,12 +12,11 @@ from pathlib import Path
 import numpy as np
 from triquad_client import open_map
 from triquad_format.records.pose import upright_pose
-from triquad_tools.console.progress import progress
 from triquad_tools.evaluation.metrics import MeshScores
 from triquad_tools.simulation.lidar import Lidar
 from triquad_tools.simulation.street import street_drive
 
-from bench.driven import Driven, driven
+from bench.driven import Driven, driven, write_recording
 from bench.figures import Figure
 
 _LENGTH_M, _SCANS, _OVERLAP = 160.0, 160, 20  # scans beyond the middle that each robot has
@@ -66,16 +65,8 @@ def _mapped(
 ) -> Path:
     """Map some scans of a drive, in this order and in a frame; return the file."""
     recording, output = folder / name, folder / f"{name}.triquad"
-    recording.mkdir()
-    with progress(f"writing {name}", len(chosen)) as report:
-        for number, scan in enumerate(chosen):
-            points = street.scans[scan].points
-            rows = np.zeros((len(points), 4), "<f4")
-            rows[:, :3] = points
-            rows.tofile(recording / f"{number:06d}.bin")
-            report(number, f"{number} scans")
-    poses = (np.linalg.inv(upright_pose(*frame)) @ street.drive.poses[list(chosen)])[:, :3]
-    np.savetxt(recording / "poses.txt", poses.reshape(-1, 12), fmt="%.9f")
+    poses = np.linalg.inv(upright_pose(*frame)) @ street.drive.poses[list(chosen)]
+    write_recording(recording, [street.scans[scan] for scan in chosen], poses, name)
     _run("map_recording", *_SETTINGS, "--training", recording, output)
     return output
 

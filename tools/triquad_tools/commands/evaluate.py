@@ -50,9 +50,7 @@ def _paper_parser() -> argparse.ArgumentParser:
     add("--every", type=partial(whole, 1, 1000), nargs="+", metavar="N", help=every)
     published = "also map as published: projective labels, its sampling, random initial weights"
     add("--as-published", action="store_true", help=published)
-    samples = (
-        "train maps as published on so many samples (default: 20,000,000, of which three times "
-    )
+    samples = "train maps as published on this number of samples (default: 20,000,000; three times "
     samples += "as many gained 0.4 points of F on a simulated street)"
     add("--samples", type=partial(whole, 1, None), default=20_000_000, metavar="N", help=samples)
     drawn = "points that are drawn of a mesh (default: 10,000,000)"

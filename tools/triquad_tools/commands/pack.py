@@ -20,7 +20,7 @@ def _parser() -> argparse.ArgumentParser:
         COMMAND,
         description="Rewrite a map file: smaller, cropped, an earlier epoch of it, what is intact "
         "of it, joined with another map, in the newest version, or as a mesh (.ply, .glb, .obj, "
-        ".stl), a picture (.png), a map of Nav2 (.yaml, and .pgm beside it), an OctoMap (.bt) or "
+        ".stl), a picture (.png), a map of Nav2 (.yaml, with a .pgm), an OctoMap (.bt) or "
         "arrays of numpy (.npz).",
         epilog="Exit status: 0 done; 1 IN is damaged (with --recover: something of it is lost), or "
         "nothing lies in the box; 2 wrong usage, or input that cannot be used.",

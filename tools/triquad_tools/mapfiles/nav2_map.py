@@ -22,7 +22,7 @@ _OCCUPIED_THRESH, _FREE_THRESH = 0.65, 0.196  # of (255 - pixel) / 255; a larger
 
 
 def image_path(path: Path) -> Path:
-    """Return the name of the image beside a YAML file."""
+    """Return the name of the image that belongs to a YAML file."""
     return path.with_suffix(".pgm")
 
 
@@ -31,7 +31,7 @@ def write_nav2_map(opened: OfflineMap, path: Path, box: Box | None, cell_m: floa
 
     Args:
         opened: the map.
-        path: the YAML file to write; the image lies beside it.
+        path: the YAML file to write; the image lies in the same folder.
         box: what is shown, of which only surface in it counts; ``None``: all.
         cell_m: side of a cell, which is a pixel; ``None``: half a leaf.
 

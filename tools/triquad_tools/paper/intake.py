@@ -1,14 +1,24 @@
-"""Scans that a map takes in, and those that it refuses."""
+"""The points of scans that the paper uses, and scans that a map takes in or refuses."""
 
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from triquad_server.errors import ScanRefusedError
 from triquad_server.mapping.mapper import Mapper
 
 from triquad_tools.console.command import print_remark
 from triquad_tools.console.progress import progress
 from triquad_tools.sensors.sweep import PosedScan
+
+_RANGE_M = (1.5, 50.0)
+
+
+def in_range(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the points [N, 3], sensor frame, of the ranges that the paper uses."""
+    ranges = np.linalg.norm(points, axis=1)
+    chosen: NDArray[np.float64] = points[(ranges >= _RANGE_M[0]) & (ranges <= _RANGE_M[1])]
+    return chosen
 
 
 def taken(mapper: Mapper, scans: Sequence[PosedScan]) -> Iterator[int]:

@@ -7,10 +7,10 @@ import numpy as np
 from triquad_client import Mesh
 
 from triquad_tools.console.progress import progress
-from triquad_tools.sensors.sweep import PosedScan
+from triquad_tools.paper.intake import in_range
+from triquad_tools.sensors.sweep import PosedScan, moved
 
 VOXEL_M, TRUNCATION_M = 0.1, 0.3  # as in 3QFP, section IV
-_RANGE_M = (1.5, 50.0)
 
 
 def has_vdbfusion() -> bool:
@@ -25,11 +25,9 @@ def vdbfusion_mesh(scans: Sequence[PosedScan]) -> Mesh:
     volume = vdbfusion.VDBVolume(VOXEL_M, TRUNCATION_M, space_carving=False)
     with progress("VDBFusion", len(scans)) as report:
         for number, scan in enumerate(scans):
-            points = np.asarray(scan.points, np.float64)
-            ranges = np.linalg.norm(points, axis=1)
-            points = points[(ranges >= _RANGE_M[0]) & (ranges <= _RANGE_M[1])]
+            points = in_range(np.asarray(scan.points, np.float64))
             pose = np.asarray(scan.world_from_sensor, np.float64)
-            volume.integrate(points @ pose[:3, :3].T + pose[:3, 3], pose)
+            volume.integrate(moved(points, pose), pose)
             report(number, f"{number} of {len(scans)} scans")
     vertices, faces = volume.extract_triangle_mesh(fill_holes=False, min_weight=0.0)
     return Mesh(vertices, faces.astype(np.int32), None)

@@ -1,4 +1,4 @@
-"""Figures that papers have published, beside which measured ones are put."""
+"""Figures that papers have published, to compare measured ones with."""
 
 from dataclasses import dataclass
 from typing import Literal

@@ -28,8 +28,8 @@ from triquad_server.settings import Settings
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
-from triquad_tools.paper.intake import taken
-from triquad_tools.recordings.cloud import points_in_range, thin
+from triquad_tools.paper.intake import in_range, taken
+from triquad_tools.recordings.cloud import thin
 from triquad_tools.sensors.sweep import PosedScan, moved
 
 DEPTH = 12
@@ -40,7 +40,6 @@ _BAND_M = 0.3  # around the ends of rays
 _FREE_FROM = 0.3  # of the range
 _BEHIND_M = 0.8
 _THIN_M = 0.05
-_RANGE_M = (1.5, 50.0)
 _ONLY: RegionIndex = (0, 0, 0)
 
 
@@ -104,8 +103,7 @@ def _rays(scans: Sequence[PosedScan], origin: Doubles) -> _Rays:
     """Return the rays of scans, from the map's origin [3]."""
     origins, ends = [], []
     for scan in scans:
-        points = points_in_range(thin(np.asarray(scan.points, np.float64), _THIN_M), _RANGE_M[0])
-        points = points[np.linalg.norm(points, axis=1) <= _RANGE_M[1]]
+        points = in_range(thin(np.asarray(scan.points, np.float64), _THIN_M))
         pose = moved_pose(scan.world_from_sensor, -origin)
         ends.append(moved(points, pose).astype(np.float32))
         origins.append(np.broadcast_to(pose[:3, 3].astype(np.float32), ends[-1].shape))
