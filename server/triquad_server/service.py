@@ -132,6 +132,7 @@ class Service:
         memory.add("map", lambda: self.mapper.progress.map.map_bytes)
         memory.add("older epochs", lambda: self._epochs.older_bytes)
         memory.add("mesh tiles", lambda: tiles.nbytes)
+        memory.add("scans that wait", lambda: self._scans.nbytes)
         if self._store is not None:
             cache = self._store.regions.cache
             memory.add("regions read to answer", lambda: cache.bytes, cache.clear)

@@ -73,6 +73,11 @@ class ScanQueue:
     def __len__(self) -> int:
         return len(self._scans) + self._in_hand
 
+    @property
+    def nbytes(self) -> int:
+        """The bytes of the scans that wait."""
+        return self._scans.nbytes
+
     def put(self, scan: Scan) -> None:
         """Add a scan, unless its sequence or stamp refuses it."""
         with self._taken:

@@ -75,6 +75,16 @@ class OwedCopy:
         self._copy: Callable[[], RegionSnapshot] | None = copy
         self._made: RegionSnapshot | None = None
 
+    @property
+    def is_due(self) -> bool:
+        """Whether it has to be made before the region changes."""
+        return self._copy is not None
+
+    @property
+    def waits(self) -> bool:
+        """Whether it is made, and waits to be taken."""
+        return self._made is not None
+
     def make(self) -> None:
         """Make the copy, unless it is made."""
         if self._copy is not None:
@@ -112,7 +122,7 @@ class LiveRegion:
         self._setup = setup
         self._published: FrozenRegion | None = None
         self.is_changed = True  # changed since it was published
-        self._owed: WeakSet[OwedCopy] = WeakSet()  # that are made before the next change
+        self._owed: WeakSet[OwedCopy] = WeakSet()
 
     @property
     def size(self) -> RegionSize:
@@ -211,7 +221,12 @@ class LiveRegion:
     @property
     def is_owed(self) -> bool:
         """Whether somebody waits for a copy of it as it is."""
-        return len(self._owed) > 0
+        return any(copy.is_due for copy in self._owed)
+
+    @property
+    def copies(self) -> int:
+        """How many copies of it, as it was, wait to be written."""
+        return sum(copy.waits for copy in self._owed)
 
     def owe(self) -> OwedCopy:
         """Return a copy of the region as it is now, which is made as late as can be."""
@@ -222,7 +237,6 @@ class LiveRegion:
     def _begin_change(self) -> None:
         for owed in self._owed:
             owed.make()
-        self._owed.clear()
         self.is_changed = True
 
     def _snapshot(self) -> RegionSnapshot:

@@ -79,14 +79,17 @@ class MemoryBudget:
         """The bytes that stay free for scans while regions can go."""
         return int(_RESERVE * self.memory.limit)
 
-    def left(self, sizes: Iterable[RegionSize], *, are_kept: bool) -> int:
+    def left(
+        self, sizes: Iterable[RegionSize], copied: Iterable[RegionSize], *, are_kept: bool
+    ) -> int:
         """Return the bytes that are left beside regions; less than 0: there are too few.
 
-        Of those that ``are_kept`` in a store, a copy of the largest counts as well.
+        Copies of some wait to be written. Of those that ``are_kept`` in a store, one of the largest
+        counts as well.
         """
         taken = [self.bytes_of([size]) for size in sizes]
-        copied = int(_COPY * max(taken, default=0)) if are_kept else 0
-        return self.room - sum(taken) - copied
+        written = int(_COPY * max(taken, default=0)) if are_kept else 0
+        return self.room - sum(taken) - self.copies(copied) - written
 
     def copies(self, sizes: Iterable[RegionSize]) -> int:
         """Return the bytes of copies of some regions, from which a checkpoint is written."""

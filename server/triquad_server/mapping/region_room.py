@@ -51,7 +51,8 @@ class RegionRoom:
     def left(self) -> int:
         """The bytes that are left for regions."""
         sizes = (region.size for region in self._regions)
-        return self._budget.left(sizes, are_kept=self._are_kept)
+        copied = (region.size for region in self._regions for _ in range(region.copies))
+        return self._budget.left(sizes, copied, are_kept=self._are_kept)
 
     def reach(self, indices: Collection[RegionIndex]) -> None:
         """Have some regions stay in memory, which a scan reaches.
@@ -160,7 +161,7 @@ class RegionRoom:
         """See that there is room for a scan; errors are those of :meth:`reach`."""
         if self.has(needed):
             return
-        if self.leaving:
+        if self.leaving or (self._are_kept and any(region.copies for region in self._regions)):
             self._is_full = True
             raise NoRoomYetError
         used = self._budget.bytes_of(region.size for region in self._regions)

@@ -249,6 +249,18 @@ def test_a_checkpoint_has_the_map_as_it_was_when_it_began(kept: KeptMap) -> None
         assert_same(other.training.rays, one.training.rays)
 
 
+def test_copies_that_wait_to_be_written_take_room_until_they_are(kept: KeptMap) -> None:
+    kept.visit(0, 1)
+    room = kept.mapper.regions.room
+    snapshot = kept.mapper.snapshot_since(None)
+    before, used = room.left, kept.mapper.regions.bytes_used
+    kept.visit(0, 1)
+    assert before - room.left > used / 2, "both regions were copied before they changed"
+    for _ in snapshot.records():
+        pass
+    assert before - room.left < used / 4
+
+
 def test_a_copy_that_nobody_waits_for_any_more_holds_up_nothing(kept: KeptMap) -> None:
     kept.visit(0)
     owed = kept.mapper.snapshot_since(None)
