@@ -1,9 +1,13 @@
 """Pages of others in a browser cannot reach the map that is shown beside them."""
 
 import asyncio
+import logging
 import multiprocessing
+import socket
 from collections.abc import Iterator
 from contextlib import closing
+from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 import viser
@@ -74,6 +78,21 @@ def test_the_map_is_told_to_our_page_and_to_programs_alone(viewer: Viewer) -> No
     for origin in (None, viewer.url, f"https://{ALLOWED}"):
         assert isinstance(asyncio.run(first_message(viewer, origin)), bytes)
     assert asyncio.run(first_message(viewer, "http://evil.example")) == 403
+
+
+def test_a_browser_that_leaves_at_once_is_no_error(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The viewer's library has it silenced from the first request on, in all of a process.
+    monkeypatch.setattr(logging.getLogger("websockets.server"), "filters", [])
+    path = write_checkpoint(tmp_path, 1, EMPTY)
+    with closing(Viewer(FileSource(path, "file"), "127.0.0.1", 0)) as viewer:
+        address = urlsplit(viewer.url)
+        with socket.create_connection((address.hostname, address.port)) as browser:
+            browser.sendall(b"GET / HTTP/1.1\r\nHost:")
+        # What is answered later was seen later.
+        assert isinstance(asyncio.run(first_message(viewer, None)), bytes)
+    assert caplog.messages == []
 
 
 def test_nobody_who_reaches_the_page_can_show_it_to_the_internet(

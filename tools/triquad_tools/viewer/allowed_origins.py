@@ -6,6 +6,7 @@ A browser lets any page send requests to this machine. Its ``Origin`` says whose
 
 import http
 import ipaddress
+import logging
 import socket
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -15,6 +16,10 @@ from urllib.parse import urlsplit
 import websockets.asyncio.server
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
+
+_log = logging.getLogger(f"{__name__}.websockets")
+# Browsers leave before they have said what they want, which is no error of ours.
+_log.addFilter(lambda record: record.getMessage() != "opening handshake failed")
 
 
 def refusal(headers: Headers, allowed_hosts: Sequence[str]) -> str | None:
@@ -52,7 +57,7 @@ def serving_only(allowed_hosts: Sequence[str]) -> Iterator[None]:
             headers = Headers({"Content-Type": "text/plain", "Content-Length": str(len(body))})
             return Response(forbidden, forbidden.phrase, headers, body)
 
-        return serve(*arguments, process_request=answer_allowed, **options)
+        return serve(*arguments, process_request=answer_allowed, logger=_log, **options)
 
     websockets.asyncio.server.serve = guarded  # type: ignore[assignment, misc]
     try:
