@@ -233,6 +233,20 @@ def test_a_recording_of_which_nothing_can_be_used_is_told(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_recording_that_memory_has_no_room_for_is_told_with_what_helps(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    far = POSES.copy()
+    far[:, 0, 3] = 3.0 * np.arange(COUNT)
+    write_folder(tmp_path / "scans", [SPHERE] * COUNT, far, STAMPS)
+    little = ("--set", "memory.max_bytes=5_000_000")
+    words = [str(tmp_path / "scans"), str(tmp_path / "map.triquad"), "--settings", SETTINGS]
+    assert main([*words, *little]) == 0
+    told = capsys.readouterr().err
+    assert re.search(r"\d of 8 scans could not be used \(map_full: \d\)", told)
+    assert "--workers 2 maps one region after the other" in told
+
+
 def test_poses_that_go_on_in_another_frame_are_refused(tmp_path: Path, capsys) -> None:
     """As where a first GPS fix comes late. A single pose that is wrong is left out and told."""
     for lost, status in ((1, 0), (3, 2)):

@@ -79,6 +79,8 @@ def _check_result(mapper: Mapper, mapping: MappingRun, selection: Selection) -> 
         raise ToolError(f"nothing was mapped: {told}")
     if told:
         print_remark(f"{COMMAND}: {told}")
+    if "map_full" in mapping.refusals:
+        print_remark("--workers 2 maps one region after the other: then memory does not end a map")
 
 
 def _refused(refusals: Mapping[str, int], last: str, total: int) -> str:
