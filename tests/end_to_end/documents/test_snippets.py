@@ -13,15 +13,8 @@ import pytest
 import triquad_client
 from support import servers
 from support.maps import small_world
+from support.pages import PARSERS, commands, python_blocks
 
-ROOT = Path(__file__).parents[3]
-PAGES = [
-    ROOT / "README.md",
-    ROOT / "CONTRIBUTING.md",
-    *(page for page in sorted((ROOT / "docs").rglob("*.md")) if "_build" not in page.parts),
-]
-PYTHON = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
-CODE = re.compile(r"^```(?:bash|sh)?\n(.*?)^```", re.DOTALL | re.MULTILINE)
 CONNECTING = re.compile(r"(\bconnect(?:_async)?\()\s*(?:\"[^\"]*\"|config=\"[^\"]*\")")
 NAMED = re.compile(r"(\bconnect\([^)]*?)(, \"garage\"|, \"town\"|, map=\"demo\")")
 
@@ -38,42 +31,6 @@ ELSEWHERE = {
     "as watch": "waits for changes: tests/client/mesh/test_mesh_watch.py",
 }
 """What blocks have that are not run here, and what is done instead."""
-
-PARSERS = {
-    "triquad-server": ("triquad_server.cli", "_parser"),
-    "triquad-demo": ("triquad_tools.commands.demo", "_parser"),
-    "triquad-eval": ("triquad_tools.commands.evaluate", "_parser"),
-    "triquad-inspect": ("triquad_tools.commands.inspect", "_parser"),
-    "triquad-keys": ("triquad_tools.commands.keys", "_parser"),
-    "triquad-map": ("triquad_tools.commands.map_recording", "_parser"),
-    "triquad-pack": ("triquad_tools.commands.pack", "_parser"),
-    "triquad-replay": ("triquad_tools.commands.replay", "_parser"),
-    "triquad-ros2": ("triquad_tools.commands.ros2", "parser"),
-    "triquad-top": ("triquad_tools.commands.top", "_parser"),
-    "triquad-view": ("triquad_tools.commands.view", "_parser"),
-}
-
-
-def python_blocks() -> list[tuple[str, str]]:
-    """A name and the text of each block of Python."""
-    found = []
-    for page in PAGES:
-        for number, block in enumerate(PYTHON.findall(page.read_text(encoding="utf-8"))):
-            found.append((f"{page.relative_to(ROOT)}-{number}", block))
-    return found
-
-
-def commands() -> list[tuple[str, str]]:
-    """A page and a line of each command of triquad that it shows in a block."""
-    found = []
-    for page in PAGES:
-        for block in CODE.findall(page.read_text(encoding="utf-8")):
-            lines = block.replace("\\\n", " ").splitlines()
-            for line in (one.removeprefix("$ ").strip() for one in lines):
-                if line.split(" ")[0] in PARSERS:
-                    found.append((str(page.relative_to(ROOT)), line))
-    return found
-
 
 BLOCKS = python_blocks()
 COMMANDS = commands()
@@ -133,7 +90,7 @@ def test_whatever_is_not_run_is_on_some_page() -> None:
 @pytest.mark.parametrize("command", PARSERS)
 def test_commands_have_the_options_that_are_shown(command: str) -> None:
     module, parser = PARSERS[command]
-    lines = [line for _, line in COMMANDS if line.split(" ")[0] == command]
+    lines = [line for line in COMMANDS if line.split(" ")[0] == command]
     assert lines
     for line in lines:
         words = shlex.split(line, comments=True)[1:]
