@@ -36,7 +36,7 @@ def _paper_parser() -> argparse.ArgumentParser:
         f"triquad-eval {_PAPER}",
         description="Make the experiments of the 3QFP paper with a folder of scans: dense input, "
         "each n-th scan, memory by number of scans, and the ablation. OUT gets report.md, "
-        "report.json and pictures. VDBFusion is run as well where it is installed.",
+        "report.json and pictures. VDBFusion and Open3D are run as well where they are installed.",
         epilog="Exit status: 0 done, 2 wrong usage or input.",
     )
     add = parser.add_argument

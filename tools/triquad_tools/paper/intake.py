@@ -1,6 +1,6 @@
 """The points of scans that the paper uses, and scans that a map takes in or refuses."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,16 +21,16 @@ def in_range(points: NDArray[np.float64]) -> NDArray[np.float64]:
     return chosen
 
 
-def taken(mapper: Mapper, scans: Sequence[PosedScan]) -> Iterator[int]:
-    """Take in scans, and yield how many are; those that the map refuses are left out, and told."""
+def taken(mapper: Mapper, scans: Iterable[PosedScan], total: int) -> Iterator[int]:
+    """Take in ``total`` scans, and yield how many are; those that the map refuses are told."""
     refused, why = 0, ""
-    with progress("mapping", len(scans)) as report:
+    with progress("mapping", total) as report:
         for number, scan in enumerate(scans, start=1):
             try:
                 mapper.ingest(np.asarray(scan.points, np.float32), scan.world_from_sensor)
             except ScanRefusedError as error:
                 refused, why = refused + 1, str(error)
-            report(number, f"{number} of {len(scans)} scans")
+            report(number, f"{number} of {total} scans")
             yield number
     if refused:
-        print_remark(f"{refused} of {len(scans)} scans were refused, the last since {why}")
+        print_remark(f"{refused} of {total} scans were refused, the last since {why}")

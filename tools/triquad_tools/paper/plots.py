@@ -25,6 +25,7 @@ _COLOURS = {
     "triquad": "#0072b2",
     "as published": "#009e73",
     "VDBFusion": "#d55e00",
+    "Open3D": "#e69f00",
     "SHINE-Mapping": "#cc79a7",
     "3QFP": "#009e73",
 }
@@ -66,13 +67,13 @@ def plot_sparse(runs: Sequence[Run], published: PublishedSet, path: Path) -> Non
 
 
 def plot_memory(points: Sequence[MemoryAt], path: Path) -> None:
-    """Plot parameters, bytes of the file and resident memory against the number of scans."""
+    """Plot parameters, bytes of the file and memory against the number of scans."""
     figure = Figure((13, 3.6), _DPI, layout="constrained")
     scans = [point.scans for point in points]
     values: list[tuple[str, Callable[[MemoryAt], float]]] = [
         ("learnable parameters in millions", lambda point: point.parameters / 1e6),
         ("map file in MB", lambda point: point.file_bytes / 1e6),
-        ("resident memory of the process in MB", lambda point: point.resident_bytes / 1e6),
+        ("memory of the map in MB", lambda point: point.resident_bytes / 1e6),
     ]
     for axes, (name, value) in zip(figure.subplots(1, 3), values, strict=True):
         axes.plot(scans, [value(point) for point in points], marker="o", color=_COLOURS["triquad"])
@@ -105,6 +106,9 @@ def picture_holes(
         axes.set(xticks=[], yticks=[], facecolor=BACKGROUND)
         axes.spines[:].set_visible(False)
         faces = faces_inside(mesh, truth, threshold_m)
+        if not len(faces):
+            axes.set_title(f"{run.method}, n = {run.every}: no surface", loc="left", fontsize=10)
+            continue
         draw_faces(axes, view, mesh.vertices, faces, heights.colours(mesh.vertices[:, 2]))
         holes = _holes(mesh, few, 2 * threshold_m)
         for hole in holes:

@@ -16,7 +16,6 @@ class PublishedScores:
     accuracy_cm: float
     completion_percent: float  # share below the threshold
     accuracy_percent: float
-    source: str
 
 
 @dataclass(frozen=True)
@@ -34,8 +33,8 @@ class PublishedSet:
     ablation: tuple[PublishedScores, ...] = ()
 
 
-_DENSE = "3QFP (ICRA 2024), table I"
-_ABLATION = "3QFP (ICRA 2024), ablation"
+DENSE_SOURCE = "3QFP (ICRA 2024), table I"
+ABLATION_SOURCE = "3QFP (ICRA 2024), ablation"
 
 SETS: dict[Style, PublishedSet] = {
     "maicity": PublishedSet(
@@ -43,9 +42,9 @@ SETS: dict[Style, PublishedSet] = {
         accuracy_cut_m=0.2,
         every=(1, 2, 3, 4, 5, 6),
         dense=(
-            PublishedScores("VDBFusion", None, 27.33, 1.36, 78.12, 99.13, _DENSE),
-            PublishedScores("SHINE-Mapping", 4_530_000, 3.34, 1.66, 95.43, 97.09, _DENSE),
-            PublishedScores("3QFP", 1_270_000, 2.68, 1.52, 97.27, 97.60, _DENSE),
+            PublishedScores("VDBFusion", None, 27.33, 1.36, 78.12, 99.13),
+            PublishedScores("SHINE-Mapping", 4_530_000, 3.34, 1.66, 95.43, 97.09),
+            PublishedScores("3QFP", 1_270_000, 2.68, 1.52, 97.27, 97.60),
         ),
         completion_percent={
             "VDBFusion": (78.1, 73.5, 69.1, 65.9, 58.6, 58.1),
@@ -53,9 +52,9 @@ SETS: dict[Style, PublishedSet] = {
             "3QFP": (97.3, 96.0, 92.2, 92.6, 91.1, 90.8),
         },
         ablation=(
-            PublishedScores("3QFP, features", None, 8.05, 3.07, 90.95, 94.71, _ABLATION),
-            PublishedScores("3QFP, fourier", None, 9.27, 2.95, 89.44, 96.30, _ABLATION),
-            PublishedScores("3QFP, both", None, 7.88, 2.60, 91.10, 96.25, _ABLATION),
+            PublishedScores("3QFP, features", None, 8.05, 3.07, 90.95, 94.71),
+            PublishedScores("3QFP, fourier", None, 9.27, 2.95, 89.44, 96.30),
+            PublishedScores("3QFP, both", None, 7.88, 2.60, 91.10, 96.25),
         ),
     ),
     "newer-college": PublishedSet(
@@ -63,9 +62,9 @@ SETS: dict[Style, PublishedSet] = {
         accuracy_cut_m=0.4,
         every=(3, 6, 9, 12, 15, 18),
         dense=(
-            PublishedScores("VDBFusion", None, 13.20, 5.50, 91.51, 98.10, _DENSE),
-            PublishedScores("SHINE-Mapping", 11_400_000, 9.55, 7.60, 94.58, 91.37, _DENSE),
-            PublishedScores("3QFP", 1_600_000, 9.68, 6.72, 94.10, 93.69, _DENSE),
+            PublishedScores("VDBFusion", None, 13.20, 5.50, 91.51, 98.10),
+            PublishedScores("SHINE-Mapping", 11_400_000, 9.55, 7.60, 94.58, 91.37),
+            PublishedScores("3QFP", 1_600_000, 9.68, 6.72, 94.10, 93.69),
         ),
         completion_percent={
             "VDBFusion": (91.5, 93.5, 85.5, 81.9, 78.0, 73.5),

@@ -78,7 +78,7 @@ def published_map(
     """
     settings = settings.with_field(replace(settings.field, depth=DEPTH))
     evidence = Mapper("paper", settings, "cpu", teams=teams)
-    for _ in taken(evidence, scans):
+    for _ in taken(evidence, scans, len(scans)):
         pass
     rays = _rays(scans, evidence.origin)
     if [region.index for region in evidence.regions] != [_ONLY]:

@@ -5,13 +5,19 @@ from dataclasses import dataclass
 
 from triquad_tools.console.report import json_text
 from triquad_tools.evaluation.metrics import ScoreSettings
-from triquad_tools.paper.published_figures import PublishedScores, PublishedSet, Style
+from triquad_tools.paper.published_figures import (
+    ABLATION_SOURCE,
+    DENSE_SOURCE,
+    PublishedScores,
+    PublishedSet,
+    Style,
+)
 from triquad_tools.paper.runs import ABLATED_EVERY, MemoryAt, Run
 
 _COLUMNS = (
     "method",
     "figures",
-    "learnable parameters",
+    "parameters",
     "completion cm",
     "accuracy cm",
     "completion ratio %",
@@ -69,12 +75,13 @@ class Report:
             if run.every == min(self.every):
                 yield _measured(run.method, run)
         yield from map(_published, self.published.dense)
+        yield f"\nPublished: {DENSE_SOURCE}."
 
     def _sparse(self) -> Iterator[str]:
         yield "\n### Every n-th scan\n"
         yield "![ratios and parameters against n](sparse.png)\n"
         ratios = ("completion ratio %", "accuracy ratio %")
-        yield from _table_head(("method", "n", "scans", "learnable parameters", *ratios, "seconds"))
+        yield from _table_head(("method", "n", "scans", "parameters", *ratios, "seconds"))
         for run in self.whole():
             completion, accuracy = run.scores.completion_ratio, run.scores.accuracy_ratio
             yield _row(
@@ -96,14 +103,14 @@ class Report:
         for run in self.runs:
             if run.every == every and run.parameters is not None:
                 yield _measured(f"{run.method}, {_ENCODINGS[run.encoding]}", run)
-        yield from map(_published, self.published.ablation)
+        if self.published.ablation:
+            yield from map(_published, self.published.ablation)
+            yield f"\nPublished: {ABLATION_SOURCE}."
 
     def _memory(self) -> Iterator[str]:
         yield "\n### Memory by number of scans\n"
         yield "![memory against scans](memory.png)\n"
-        yield from _table_head(
-            ("scans", "learnable parameters", "map file MB", "resident memory of the process MB")
-        )
+        yield from _table_head(("scans", "parameters", "map file MB", "memory MB"))
         for point in self.memory:
             file_mb, resident_mb = point.file_bytes / 1e6, point.resident_bytes / 1e6
             yield _row(point.scans, f"{point.parameters:,}", f"{file_mb:.2f}", f"{resident_mb:.0f}")
@@ -128,14 +135,14 @@ def _measured(name: str, run: Run) -> str:
     lengths = (f"{100 * value:.2f}" for value in (scores.completion_m, scores.accuracy_m))
     shares = (scores.completion_ratio, scores.accuracy_ratio, scores.f_score)
     ratios = (f"{100 * value:.2f}" for value in shares)
-    return _row(name, "measured here", _count(run.parameters), *lengths, *ratios)
+    return _row(name, "here", _count(run.parameters), *lengths, *ratios)
 
 
 def _published(row: PublishedScores) -> str:
     one, other = row.completion_percent, row.accuracy_percent
     values = (row.completion_cm, row.accuracy_cm, one, other, 2 * one * other / (one + other))
     cells = (f"{value:.2f}" for value in values)
-    return _row(row.method, f"published, {row.source}", _count(row.parameters), *cells)
+    return _row(row.method, "published", _count(row.parameters), *cells)
 
 
 def _count(parameters: int | None) -> str:

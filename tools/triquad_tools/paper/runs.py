@@ -2,11 +2,10 @@
 
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 from triquad_client import Mesh, open_map
 from triquad_format.mapfile.writer import write_map
@@ -14,7 +13,7 @@ from triquad_format.records.arrays import Doubles
 from triquad_format.records.field_settings import ENCODINGS, Encoding
 from triquad_format.records.region import MapRecord
 from triquad_server.mapping.mapper import Mapper
-from triquad_server.process.resources import resident_bytes
+from triquad_server.process.resources import give_back_free, resident_bytes
 from triquad_server.process.threads import Teams
 from triquad_server.settings import Settings
 from triquad_server.warm_up import warm_up
@@ -25,11 +24,12 @@ from triquad_tools.evaluation.shine_protocol import shine_scores
 from triquad_tools.mapfiles.crop import without_training
 from triquad_tools.mapping.learning import learn
 from triquad_tools.paper.intake import taken
-from triquad_tools.paper.other_mappers import has_vdbfusion, vdbfusion_mesh
+from triquad_tools.paper.other_mappers import installed_mappers
 from triquad_tools.paper.published_method import published_map
 from triquad_tools.sensors.sweep import PosedScan
 
-Method = Literal["triquad", "as published", "VDBFusion"]
+LEARNED = ("triquad", "as published")
+"""The methods of this project; others are those that are installed."""
 
 ABLATED_EVERY = 5
 """The paper's ablation takes each fifth scan of its densest input."""
@@ -41,7 +41,7 @@ _TENTHS = 10
 class Run:
     """A map of some of the scans, and how good it is."""
 
-    method: Method
+    method: str
     every: int  # n: each n-th scan is used
     encoding: Encoding
     scans: int
@@ -59,7 +59,7 @@ class MemoryAt:
     scans: int
     parameters: int
     file_bytes: int
-    resident_bytes: int  # of the process, with what was read of the scans
+    resident_bytes: int  # of the process, beyond what it took before the first scan
 
 
 @dataclass(frozen=True)
@@ -74,20 +74,17 @@ class Task:
 
 
 def all_runs(
-    task: Task, every: Sequence[int], methods: Sequence[Method]
+    task: Task, every: Sequence[int], methods: Sequence[str]
 ) -> Iterator[tuple[Run, Mesh]]:
     """Yield maps of each n-th scan by some methods, and those of the ablation, with their meshes.
 
     Args:
         task: scans, truth and settings.
         every: the numbers n.
-        methods: what maps them; VDBFusion is left out where it is not installed.
+        methods: what maps them.
     """
-    if not has_vdbfusion():
-        methods = [method for method in methods if method != "VDBFusion"]
     with closing(Teams()) as teams:
-        with progress("preparing") as report:
-            warm_up(task.settings, "cpu", teams, report=lambda stage: report(0.0, stage))
+        _prepare(task.settings, teams)
         for method in methods:
             for n, encoding in _variants(method, every):
                 yield _run(task, method, n, encoding, teams)
@@ -98,34 +95,29 @@ def scans_needed(every: Sequence[int]) -> int:
     return 1 + max(*every, ABLATED_EVERY * min(every))
 
 
-def _variants(method: Method, every: Sequence[int]) -> list[tuple[int, Encoding]]:
+def _variants(method: str, every: Sequence[int]) -> list[tuple[int, Encoding]]:
     """Return the numbers n and the encodings of a method's runs."""
     variants: list[tuple[int, Encoding]] = [(n, "both") for n in every]
     ablated = ABLATED_EVERY * min(every)
     others = [(ablated, encoding) for encoding in ENCODINGS]
-    return variants if method == "VDBFusion" else list(dict.fromkeys([*variants, *others]))
+    return list(dict.fromkeys([*variants, *others])) if method in LEARNED else variants
 
 
-def _run(
-    task: Task, method: Method, every: int, encoding: Encoding, teams: Teams
-) -> tuple[Run, Mesh]:
+def _run(task: Task, method: str, every: int, encoding: Encoding, teams: Teams) -> tuple[Run, Mesh]:
     """Map each n-th scan, and score the mesh."""
     scans = task.scans[::every]
     started_s = time.monotonic()
-    record, mesh = None, None
-    if method == "VDBFusion":
-        mesh = vdbfusion_mesh(scans)
-    else:
+    record, size = None, None
+    if method in LEARNED:
         settings = task.settings.with_field(replace(task.settings.field, encoding=encoding))
         if method == "triquad":
             record = _learnt(scans, settings, teams)
         else:
             record = published_map(scans, settings, task.samples, teams)
-    size = None
-    if record is not None:
         mesh, size = _meshed(record)
+    else:
+        mesh = installed_mappers()[method](scans)
     seconds = time.monotonic() - started_s
-    assert mesh is not None, "each method makes one"
     run = Run(
         method=method,
         every=every,
@@ -143,7 +135,7 @@ def _run(
 def _learnt(scans: Sequence[PosedScan], settings: Settings, teams: Teams) -> MapRecord:
     """Return the map of scans by triquad's own choices, with nothing left to learn."""
     mapper = Mapper("paper", settings, "cpu", teams=teams)
-    for _ in taken(mapper, scans):
+    for _ in taken(mapper, scans, len(scans)):
         mapper.train()
     learn(mapper)
     return mapper.publish().record()
@@ -158,16 +150,29 @@ def _meshed(record: MapRecord) -> tuple[Mesh, int]:
             return opened.mesh(), size
 
 
-def memory_by_scans(task: Task) -> list[MemoryAt]:
-    """Return the memory of triquad's map at each tenth of the scans; nothing is trained."""
+def memory_by_scans(scans: Iterable[PosedScan], total: int, settings: Settings) -> list[MemoryAt]:
+    """Return the memory of triquad's map at each tenth of ``total`` scans; nothing is trained.
+
+    The scans are read as they are taken in, so that the memory is that of the map.
+    """
     points = []
     with closing(Teams()) as teams, tempfile.TemporaryDirectory(prefix="triquad-paper-") as folder:
-        mapper = Mapper("paper", task.settings, "cpu", teams=teams)
-        tenths = {len(task.scans) * (part + 1) // _TENTHS for part in range(_TENTHS)}
-        for count in taken(mapper, task.scans):
+        _prepare(settings, teams)
+        mapper = Mapper("paper", settings, "cpu", teams=teams)
+        give_back_free()
+        before = resident_bytes()
+        tenths = {total * (part + 1) // _TENTHS for part in range(_TENTHS)}
+        for count in taken(mapper, scans, total):
             if count in tenths:
                 record = mapper.publish().record()
                 size = write_map(record, Path(folder) / f"{count}.triquad").bytes
                 parameters = sum(one.parameters for one in record.regions)
-                points.append(MemoryAt(count, parameters, size, resident_bytes()))
+                del record
+                give_back_free()
+                points.append(MemoryAt(count, parameters, size, resident_bytes() - before))
     return points
+
+
+def _prepare(settings: Settings, teams: Teams) -> None:
+    with progress("preparing") as report:
+        warm_up(settings, "cpu", teams, report=lambda stage: report(0.0, stage))

@@ -10,6 +10,7 @@ from triquad_tools.console.command import OK, ToolError, print_line
 from triquad_tools.console.progress import progress
 from triquad_tools.evaluation.metrics import ScoreSettings
 from triquad_tools.evaluation.references import read_reference
+from triquad_tools.paper.other_mappers import installed_mappers
 from triquad_tools.paper.plots import (
     Pictured,
     picture_holes,
@@ -19,15 +20,15 @@ from triquad_tools.paper.plots import (
 from triquad_tools.paper.published_figures import SETS
 from triquad_tools.paper.report import Report
 from triquad_tools.paper.runs import (
-    Method,
+    LEARNED,
     Task,
     all_runs,
     memory_by_scans,
     scans_needed,
 )
 from triquad_tools.recordings.folders.cloud_folder import read_cloud_folder
+from triquad_tools.recordings.folders.scan_folder import ScanFolder
 from triquad_tools.recordings.recording import ReadingOptions
-from triquad_tools.sensors.sweep import PosedScan
 
 
 def work(options: argparse.Namespace) -> int:
@@ -43,10 +44,17 @@ def work(options: argparse.Namespace) -> int:
         voxel_m=options.spacing,
         samples_max=options.mesh_samples,
     )
-    scans = _scans(options.folder, scans_needed(every))
+    recording = _opened(options.folder, scans_needed(every))
     truth = read_reference(options.reference, options.spacing)
-    task = Task(scans, truth, settings, scoring, options.samples)
     options.output.mkdir()
+    everything = range(len(recording))
+    memory = memory_by_scans(recording.read(everything), len(recording), settings)
+    with progress("reading", len(recording)) as told:
+        scans = []
+        for scan in recording.read(everything):
+            scans.append(scan)
+            told(len(scans), f"{len(scans)} of {len(recording)} scans")
+    task = Task(scans, truth, settings, scoring, options.samples)
     report = Report(
         options.name or options.folder.resolve().name,
         options.style,
@@ -54,11 +62,10 @@ def work(options: argparse.Namespace) -> int:
         scoring,
         len(scans),
         every,
-        memory=tuple(memory_by_scans(task)),
+        memory=tuple(memory),
     )
-    methods: list[Method] = ["triquad", "VDBFusion"]
-    if options.as_published:
-        methods.insert(1, "as published")
+    learned = LEARNED if options.as_published else LEARNED[:1]
+    methods = [*learned, *installed_mappers()]
     pictured = []
     for run, mesh in all_runs(task, every, methods):
         if run.encoding == "both" and run.every == max(every):
@@ -78,17 +85,12 @@ def _write(report: Report, folder: Path) -> None:
     (folder / "report.md").write_text(report.page())
 
 
-def _scans(folder: Path, needed: int) -> list[PosedScan]:
-    """Return all scans of a folder."""
+def _opened(folder: Path, needed: int) -> ScanFolder:
+    """Open a folder of at least so many scans."""
     recording = read_cloud_folder(folder, ReadingOptions())
     if len(recording) < needed:
         raise ToolError(
             f"{folder} has {len(recording)} scans, and {needed} are needed: give smaller numbers "
             "to --every"
         )
-    scans = []
-    with progress("reading", len(recording)) as report:
-        for scan in recording.read(range(len(recording))):
-            scans.append(scan)
-            report(len(scans), f"{len(scans)} of {len(recording)} scans")
-    return scans
+    return recording
