@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from concurrent.futures import TimeoutError as WaitedTooLongError  # Python 3.10 has its own
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Protocol, TypeVar
@@ -66,7 +67,7 @@ class LongWork:
                 self._tasks[type(request), request.ticket] = task
         try:
             result = task.result.result(_TOLD_AFTER_S if request.ticket else None)
-        except TimeoutError:
+        except WaitedTooLongError:
             if task.result.done():  # the work itself had no time left
                 raise
             waited_s = time.monotonic() - task.begun_s
