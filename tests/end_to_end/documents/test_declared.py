@@ -91,5 +91,9 @@ def test_badges_say_what_is_declared() -> None:
 
 def test_the_version_is_told_alike() -> None:
     version = re.escape(triquad_format.__version__)
-    for name, line in (("CITATION.cff", f"version: {version}"), ("CHANGELOG.md", f"## {version}")):
+    for name, line in (
+        ("CITATION.cff", f"version: {version}"),
+        ("CHANGELOG.md", f"## {version}"),
+        ("docs/versions.md", rf"\| the program \| {version}"),
+    ):
         assert re.search(f"^{line}\\b", (ROOT / name).read_text(), re.MULTILINE), name
