@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
-from weakref import WeakSet
+from weakref import ref
 
 import numpy as np
 from triquad_format.mapfile.region_facts import RegionFacts
@@ -81,7 +81,7 @@ class OwedCopy:
         return self._copy is not None
 
     @property
-    def waits(self) -> bool:
+    def is_made(self) -> bool:
         """Whether it is made, and waits to be taken."""
         return self._made is not None
 
@@ -122,7 +122,7 @@ class LiveRegion:
         self._setup = setup
         self._published: FrozenRegion | None = None
         self.is_changed = True  # changed since it was published
-        self._owed: WeakSet[OwedCopy] = WeakSet()
+        self._copies: list[ref[OwedCopy]] = []  # that somebody wants, or has taken by now
 
     @property
     def size(self) -> RegionSize:
@@ -221,23 +221,27 @@ class LiveRegion:
     @property
     def is_owed(self) -> bool:
         """Whether somebody waits for a copy of it as it is."""
-        return any(copy.is_due for copy in self._owed)
+        return any(copy.is_due for copy in self._wanted())
 
     @property
-    def copies(self) -> int:
-        """How many copies of it, as it was, wait to be written."""
-        return sum(copy.waits for copy in self._owed)
+    def copies_waiting(self) -> int:
+        """How many copies of it, as it was, wait to be taken."""
+        return sum(copy.is_made for copy in self._wanted())
 
     def owe(self) -> OwedCopy:
         """Return a copy of the region as it is now, which is made as late as can be."""
         owed = OwedCopy(self._snapshot)
-        self._owed.add(owed)
+        self._copies = [*map(ref, self._wanted()), ref(owed)]
         return owed
 
     def _begin_change(self) -> None:
-        for owed in self._owed:
-            owed.make()
+        for copy in self._wanted():
+            copy.make()
         self.is_changed = True
+
+    def _wanted(self) -> list[OwedCopy]:
+        """Return the copies that somebody still refers to."""
+        return [copy for one in self._copies if (copy := one()) is not None]
 
     def _snapshot(self) -> RegionSnapshot:
         live = self.evidence.live

@@ -46,6 +46,10 @@ class MapSnapshot:
         while self.changed:
             yield take(self.changed.popleft()).record()
 
+    def close(self) -> None:
+        """Let go of copies that nobody took: an error that is kept may keep this snapshot."""
+        self.changed.clear()
+
     def record(self) -> MapRecord:
         """Return the map with the changed regions, where the caller's thread owns the map."""
         return self.epoch.record(tuple(self.records()))

@@ -88,10 +88,10 @@ class MemoryBudget:
         counts as well.
         """
         taken = [self.bytes_of([size]) for size in sizes]
-        written = int(_COPY * max(taken, default=0)) if are_kept else 0
-        return self.room - sum(taken) - self.copies(copied) - written
+        being_written = int(_COPY * max(taken, default=0)) if are_kept else 0
+        return self.room - sum(taken) - self.copy_bytes(copied) - being_written
 
-    def copies(self, sizes: Iterable[RegionSize]) -> int:
+    def copy_bytes(self, sizes: Iterable[RegionSize]) -> int:
         """Return the bytes of copies of some regions, from which a checkpoint is written."""
         return int(_COPY * self.bytes_of(sizes))
 

@@ -5,6 +5,7 @@ stay.
 """
 
 from collections.abc import Collection, Mapping
+from typing import NoReturn
 
 from triquad_format.records.field_settings import RegionIndex
 
@@ -40,7 +41,7 @@ class RegionRoom:
     @property
     def is_full(self) -> bool:
         """Whether scans have to wait: until regions have left, or copies of some are taken."""
-        return self._is_full or any(region.is_owed for region in self._copied_first)
+        return self._is_full or any(map(_is_wanted, self._copied_first))
 
     @property
     def waits_for_store(self) -> bool:
@@ -51,7 +52,7 @@ class RegionRoom:
     def left(self) -> int:
         """The bytes that are left for regions."""
         sizes = (region.size for region in self._regions)
-        copied = (region.size for region in self._regions for _ in range(region.copies))
+        copied = (region.size for region in self._regions for _ in range(region.copies_waiting))
         return self._budget.left(sizes, copied, are_kept=self._are_kept)
 
     def reach(self, indices: Collection[RegionIndex]) -> None:
@@ -76,15 +77,18 @@ class RegionRoom:
         """
         left, budget = self.left, self._budget
         owed = [region for region in reached if region.is_owed]
-        if owed and budget.copies(region.size for region in owed) > left:
-            self._copied_first = owed
-            raise NoRoomYetError
+        copies = budget.copy_bytes(region.size for region in owed)
+        if owed and copies > left:
+            self._wait_for(owed)
+        left -= copies
         if budget.most_added(rays, [len(rays.ends)] * len(reached)) <= left:
             return
         if budget.most_added(rays, [region.new_voxels(rays) for region in reached]) <= left:
             return
         unseen = sum(region.index not in self._regions.in_memory for region in reached)
         if needed := budget.added(rays, reached, unseen):
+            if owed and needed > left:
+                self._wait_for(owed)
             self._claim(needed)
 
     def stored(self, regions: Mapping[RegionIndex, ColdRegion] | None) -> None:
@@ -112,7 +116,8 @@ class RegionRoom:
             if promised <= 0 and region.index not in self.given:
                 break
             stored, nbytes = self._stored.get(region.index), self._budget.bytes_of([region.size])
-            if stored is not None and region.is_as_of(stored.epoch):
+            # While somebody wants a copy, its memory would not be free.
+            if stored and region.is_as_of(stored.epoch) and not _is_wanted(region):
                 self._regions.leave(stored)
                 excess -= nbytes
             elif self._are_kept:
@@ -161,8 +166,20 @@ class RegionRoom:
         """See that there is room for a scan; errors are those of :meth:`reach`."""
         if self.has(needed):
             return
-        if self.leaving or (self._are_kept and any(region.copies for region in self._regions)):
+        if self.leaving:
             self._is_full = True
             raise NoRoomYetError
+        if wanted := [region for region in self._regions if _is_wanted(region)]:
+            self._wait_for(wanted)
         used = self._budget.bytes_of(region.size for region in self._regions)
         raise self._budget.refusal(used, needed)
+
+    def _wait_for(self, copies_of: list[LiveRegion]) -> NoReturn:
+        """Have a scan wait until copies of some regions are taken."""
+        self._copied_first = copies_of
+        raise NoRoomYetError
+
+
+def _is_wanted(region: LiveRegion) -> bool:
+    """Return whether somebody waits for a copy of a region, which is made or not."""
+    return region.is_owed or region.copies_waiting > 0

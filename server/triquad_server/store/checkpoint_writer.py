@@ -5,7 +5,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 
 from triquad_format.errors import FormatError, RefusedError
@@ -191,8 +191,9 @@ class CheckpointWriter:
         with self._told():
             try:
                 leaving = self._mapper.call(lambda mapper: mapper.snapshot_of_leaving())
-                changed = leaving.records(self._mapper.taken)
-                store.put(leaving.epoch.record(()), changed, leaving.facts)
+                with closing(leaving):
+                    changed = leaving.records(self._mapper.taken)
+                    store.put(leaving.epoch.record(()), changed, leaving.facts)
             except MemoryError as error:
                 raise StoreError(f"no region can leave memory: {NO_MEMORY}") from error
             self._mapper.stored(store.regions.known)
@@ -208,14 +209,15 @@ class CheckpointWriter:
         try:
             asked_s = time.monotonic()
             snapshot, scans = self._mapper.call(cut)
-            store.scans.keep(scans, snapshot.epoch.number)
-            # The base is the last checkpoint, as long as its file and parts are there.
-            if not undoes and last is not None and last.epoch == snapshot.epoch.number == base:
-                self._saved_s = asked_s
-                return last
-            started = time.monotonic()
-            changed = snapshot.records(self._mapper.taken)
-            info = store.write(snapshot.epoch.record(()), changed, snapshot.facts, undoes)
+            with closing(snapshot):
+                store.scans.keep(scans, snapshot.epoch.number)
+                # The base is the last checkpoint, as long as its file and parts are there.
+                if not undoes and last is not None and last.epoch == snapshot.epoch.number == base:
+                    self._saved_s = asked_s
+                    return last
+                started = time.monotonic()
+                changed = snapshot.records(self._mapper.taken)
+                info = store.write(snapshot.epoch.record(()), changed, snapshot.facts, undoes)
             self._mapper.stored(store.regions.known)
         except MemoryError as error:
             raise StoreError(f"a checkpoint was not written: {NO_MEMORY}") from error

@@ -2,6 +2,7 @@
 
 import io
 from collections import deque
+from contextlib import closing
 from dataclasses import dataclass
 
 from triquad_format.errors import RefusedError
@@ -86,9 +87,9 @@ class MapDownloads:
         """Return the map with its training state, and its epoch."""
         snapshot = self._mapper.call(lambda mapper: mapper.snapshot_since(None))
         epoch = snapshot.epoch
-        live = snapshot.records(self._mapper.taken)
         cold = (one.whole() for one in epoch.frozen_regions if isinstance(one, ColdRegion))
-        return epoch.record((*live, *cold)), epoch
+        with closing(snapshot):
+            return epoch.record((*snapshot.records(self._mapper.taken), *cold)), epoch
 
     def chunk(self, request: MapChunkRequest) -> MapChunk:
         """Return bytes of a file, at most ``CHUNK_BYTES``.

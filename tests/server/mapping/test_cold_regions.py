@@ -261,6 +261,35 @@ def test_copies_that_wait_to_be_written_take_room_until_they_are(kept: KeptMap) 
     assert before - room.left < used / 4
 
 
+def test_a_scan_waits_for_copies_that_take_its_room(tmp_path: Path) -> None:
+    """Without a store that is written to, as while the map is downloaded."""
+    with closing((kept := KeptMap(tmp_path, LITTLE_BYTES)).store):
+        room = kept.mapper.regions.room
+        room.stored(None)
+        kept.visit(0)
+        snapshot = kept.mapper.snapshot_since(None)
+        kept.visit(0)
+        with pytest.raises(NoRoomYetError):
+            kept.visit(1)
+        assert room.is_full
+        for _ in snapshot.records():
+            pass
+        assert not room.is_full
+        kept.visit(1)
+
+
+def test_copies_that_nobody_took_are_let_go(kept: KeptMap) -> None:
+    """Though whoever keeps the error of a checkpoint keeps what it was made of."""
+    kept.visit(0, 1)
+    room = kept.mapper.regions.room
+    with closing(kept.mapper.snapshot_since(None)) as snapshot:
+        before = room.left
+        kept.visit(0, 1)
+        assert room.left < before
+    assert room.left > before - kept.mapper.regions.bytes_used / 4
+    assert not snapshot.changed
+
+
 def test_a_copy_that_nobody_waits_for_any_more_holds_up_nothing(kept: KeptMap) -> None:
     kept.visit(0)
     owed = kept.mapper.snapshot_since(None)
