@@ -51,11 +51,18 @@ def _worlds(seed: int) -> tuple[_World, ...]:
     noisier = replace(noisy, noise_m=0.2)
     noisier_court = quad_walk(seed, 180, noisier)
     college = "newer-college"
+    like_street = _World("A street like MaiCity's", "maicity", "maicity", street, lidar, 2)
+    like_college = _World("A court like the Newer College's", college, college, court, noisy, 6)
     return (
-        _World("A street like MaiCity's", "maicity", "maicity", street, lidar, 2),
-        _World("A court like the Newer College's", college, college, court, noisy, 6),
-        _World(
-            "The court with noise of 20 cm", "noisy", college, noisier_court, noisier, 6, (3, 9, 18)
+        like_street,
+        like_college,
+        replace(
+            like_college,
+            name="The court with noise of 20 cm",
+            key="noisy",
+            drive=noisier_court,
+            lidar=noisier,
+            every=(3, 9, 18),
         ),
     )
 

@@ -9,6 +9,7 @@ from support.maps import small_world
 from support.recordings.kitti_folder import write_folder
 from triquad_client import Mesh
 from triquad_tools.commands.evaluate import main
+from triquad_tools.paper import other_mappers
 
 SCANS = 12
 QUICK = ("--samples", "400000", "--mesh-samples", "300000", "--spacing", "0.05")
@@ -74,3 +75,22 @@ def test_what_cannot_be_used_is_told(
     assert not output.exists()
     assert main(words(folder, tmp_path)) == 2
     assert "exists: give the name of a new folder" in capsys.readouterr().err
+
+
+def test_depth_images_show_each_point_where_its_camera_sees_it() -> None:
+    """What Open3D is given of a scan: the faces of a cube."""
+    ends = np.random.default_rng(0).normal(size=(300, 3)) * 10
+    np.testing.assert_allclose(np.linalg.det(other_mappers.FACES), 1.0)
+    seen = np.zeros(len(ends), int)
+    for face in other_mappers.FACES:
+        for number, end in enumerate(ends @ face.T):
+            image = other_mappers.depth_image(end[None])
+            rows, columns = np.nonzero(image)
+            if not len(rows):
+                continue
+            half = image.shape[0] / 2 - 1
+            assert image[rows[0], columns[0]] == pytest.approx(end[2])
+            across = (np.array([columns[0], rows[0]]) + 0.5 - half - 1) / half
+            np.testing.assert_allclose(across, end[:2] / end[2], atol=0.51 / half)
+            seen[number] += 1
+    assert (seen >= 1).all()

@@ -17,9 +17,9 @@ from triquad_tools.sensors.sweep import PosedScan, moved
 
 VOXEL_M, TRUNCATION_M = 0.1, 0.3
 
-_PIXELS = 128  # of a side of a depth image of 90 degrees: 0.7 degrees; with 256 it is as good
+_PIXELS = 128  # of 90 degrees of a depth image, which has one more at each side
 _BLOCKS = 100_000  # of 8^3 voxels, for which there is room at first
-_FACES = np.array(
+FACES = np.array(
     [
         [[0, -1, 0], [0, 0, -1], [1, 0, 0]],  # ahead: right, down and forward as rows
         [[0, 1, 0], [0, 0, -1], [-1, 0, 0]],
@@ -73,32 +73,40 @@ def open3d_mesh(scans: Sequence[PosedScan]) -> Mesh:
         block_resolution=8,
         block_count=_BLOCKS,
     )
-    half = _PIXELS / 2
-    pinhole = core.Tensor([[half, 0.0, half - 0.5], [0.0, half, half - 0.5], [0.0, 0.0, 1.0]])
+    half = _PIXELS / 2  # a pixel is found by rounding down, as in the images
+    pinhole = core.Tensor([[half, 0.0, half + 1], [0.0, half, half + 1], [0.0, 0.0, 1.0]])
     ratio = TRUNCATION_M / VOXEL_M
     for points, pose in _used(scans, "Open3D"):
-        farthest = float(np.linalg.norm(points, axis=1).max(initial=1.0))
-        for face in _FACES:
-            image = _depth_image(points @ face.T)
-            if not image.any():
-                continue
+        if not len(points):
+            continue
+        ends = open3d.t.geometry.PointCloud(core.Tensor(moved(points, pose).astype(np.float32)))
+        # Of an image it would look at one pixel in sixteen.
+        blocks = grid.compute_unique_block_coordinates(ends, ratio)
+        farthest = float(np.linalg.norm(points, axis=1).max())
+        for face in FACES:
             camera = np.eye(4)
             camera[:3, :3] = face
             extrinsic = core.Tensor(camera @ np.linalg.inv(pose))
-            depth = open3d.t.geometry.Image(core.Tensor(image[:, :, None]))
+            depth = open3d.t.geometry.Image(core.Tensor(depth_image(points @ face.T)[:, :, None]))
             scale = (1.0, farthest)  # metres in a unit of depth, and the largest depth
-            blocks = grid.compute_unique_block_coordinates(depth, pinhole, extrinsic, *scale, ratio)
             grid.integrate(blocks, depth, pinhole, extrinsic, *scale, ratio)
-    mesh = grid.extract_triangle_mesh(weight_threshold=1.0)  # whatever was seen once
+    mesh = grid.extract_triangle_mesh(weight_threshold=0.0)  # whatever was seen once
     faces = mesh.triangle.indices.numpy().astype(np.int32)
     return Mesh(mesh.vertex.positions.numpy().astype(np.float64), faces, None)
 
 
-def _depth_image(points: Doubles) -> NDArray[np.float32]:
-    """Return the nearest depths of points [N, 3], camera frame, in metres; 0: nothing is there."""
-    points = points[points[:, 2] > np.abs(points[:, :2]).max(axis=1)]
-    pixels = ((points[:, :2] / points[:, 2:] + 1.0) * (_PIXELS / 2)).astype(int)
-    image = np.full((_PIXELS, _PIXELS), np.inf, np.float32)
+def depth_image(points: Doubles) -> NDArray[np.float32]:
+    """Return the nearest depths of points [N, 3], camera frame, in metres; 0: nothing is there.
+
+    Its field of view is 90 degrees, with a pixel more at each side.
+    """
+    side = _PIXELS + 2
+    ahead = points[points[:, 2] > 0]
+    pixels = np.floor(ahead[:, :2] / ahead[:, 2:] * (_PIXELS / 2) + side / 2)
+    pixels = pixels.clip(-1, side).astype(int)
+    inside = ((pixels >= 0) & (pixels < side)).all(axis=1)
+    points, pixels = ahead[inside], pixels[inside]
+    image = np.full((side, side), np.inf, np.float32)
     np.minimum.at(image, (pixels[:, 1], pixels[:, 0]), points[:, 2].astype(np.float32))
     image[np.isinf(image)] = 0.0
     return image

@@ -73,7 +73,7 @@ def plot_memory(points: Sequence[MemoryAt], path: Path) -> None:
     values: list[tuple[str, Callable[[MemoryAt], float]]] = [
         ("learnable parameters in millions", lambda point: point.parameters / 1e6),
         ("map file in MB", lambda point: point.file_bytes / 1e6),
-        ("memory of the map in MB", lambda point: point.resident_bytes / 1e6),
+        ("memory of the map in MB", lambda point: point.memory_bytes / 1e6),
     ]
     for axes, (name, value) in zip(figure.subplots(1, 3), values, strict=True):
         axes.plot(scans, [value(point) for point in points], marker="o", color=_COLOURS["triquad"])

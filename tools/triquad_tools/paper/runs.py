@@ -59,7 +59,7 @@ class MemoryAt:
     scans: int
     parameters: int
     file_bytes: int
-    resident_bytes: int  # of the process, beyond what it took before the first scan
+    memory_bytes: int  # of the process, beyond what it took before the first scan
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,6 @@ def work(options: argparse.Namespace) -> int:
     )
     recording = _opened(options.folder, scans_needed(every))
     truth = read_reference(options.reference, options.spacing)
-    options.output.mkdir()
     everything = range(len(recording))
     memory = memory_by_scans(recording.read(everything), len(recording), settings)
     with progress("reading", len(recording)) as told:
@@ -54,6 +53,7 @@ def work(options: argparse.Namespace) -> int:
         for scan in recording.read(everything):
             scans.append(scan)
             told(len(scans), f"{len(scans)} of {len(recording)} scans")
+    options.output.mkdir()
     task = Task(scans, truth, settings, scoring, options.samples)
     report = Report(
         options.name or options.folder.resolve().name,
