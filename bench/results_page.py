@@ -19,8 +19,8 @@ PAGE = _HERE.parent / "docs" / "benchmarks.md"
 
 _ABOUT = {
     "answers": "How right the answers of a map are, and how fast, for one planner and for sixteen.",
-    "batch": "A map of 4 km of a street by one process and by workers, with little training.",
-    "city": "Streets that are longer than memory: 1.6 km and 20 km, driven at 10 m/s.",
+    "batch": "A map of a recording by one process and by several workers.",
+    "city": "Streets that are longer than memory: 1.6, 5 and 20 km, driven at 10 m/s.",
     "core": "The map in one process, without a network. The baseline is torch on all cores.",
     "file": "How small map files are, how close to the live map, and how soon they are open.",
     "maps": "Two maps in one server, and each of them in a server of its own.",

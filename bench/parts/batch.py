@@ -20,9 +20,8 @@ from triquad_tools.simulation.street import street_drive
 from bench.figures import Figure
 from bench.street_pieces import PIECE_M, REACH_M, mean_f_score
 
-_LENGTH_M, _STEP_M, _EACH_M = 4000.0, 2.0, 500.0  # from a scored piece to the next
-_SETTINGS = ("--set", "training.samples_per_ray=1")  # of 48: hours are not needed for a ratio
-_ROOM = ("--set", "memory.max_bytes=12_000_000_000")  # one process has all of the map in memory
+_LENGTH_M, _STEP_M, _EACH_M = 600.0, 2.0, 100.0  # from a scored piece to the next
+_SETTINGS = ("--set", "training.samples_per_ray=6")  # of 48: hours are not needed for a ratio
 _PROGRAM = "from triquad_tools.commands.map_recording import main; raise SystemExit(main())"
 _POLL_S = 0.2
 
@@ -35,7 +34,7 @@ def measure(options: argparse.Namespace) -> list[Figure]:
     with tempfile.TemporaryDirectory(prefix="triquad-bench-") as name:
         folder = Path(name)
         _write(drive, folder / "scans")
-        alone_s, alone_f = _mapped(folder, drive, _ROOM)
+        alone_s, alone_f = _mapped(folder, drive, [])
         figures = [
             Figure("one process", alone_s, "s"),
             Figure("one process: F", 100 * alone_f, "%"),

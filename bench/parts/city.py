@@ -50,6 +50,7 @@ class _Way:
 
 _WAYS = (
     _Way("1.6 km with 0.7 GB, regions of 51 m", 1600.0, 700_000_000, ("field.depth=8",)),
+    _Way("5 km with 2 GB", 5000.0, 2_000_000_000),
     _Way("20 km with 2 GB", 20_000.0, 2_000_000_000),
 )
 

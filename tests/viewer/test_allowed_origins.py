@@ -1,7 +1,6 @@
 """Pages of others in a browser cannot reach the map that is shown beside them."""
 
 import asyncio
-import logging
 import multiprocessing
 import socket
 from collections.abc import Iterator
@@ -13,6 +12,7 @@ import pytest
 import viser
 import websockets.asyncio.client
 from support.files.changing_store import EMPTY, write_checkpoint
+from triquad_tools.viewer import allowed_origins
 from triquad_tools.viewer.allowed_origins import refusal
 from triquad_tools.viewer.sources import FileSource
 from triquad_tools.viewer.viewer import Viewer
@@ -83,8 +83,9 @@ def test_the_map_is_told_to_our_page_and_to_programs_alone(viewer: Viewer) -> No
 def test_a_browser_that_leaves_at_once_is_no_error(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # The viewer's library has it silenced from the first request on, in all of a process.
-    monkeypatch.setattr(logging.getLogger("websockets.server"), "filters", [])
+    # The viewer's library silences it, too, from the first request of a process on.
+    own = [one for one in allowed_origins._log.filters if type(one).__name__ != "NoHttpErrors"]
+    monkeypatch.setattr(allowed_origins._log, "filters", own)
     path = write_checkpoint(tmp_path, 1, EMPTY)
     with closing(Viewer(FileSource(path, "file"), "127.0.0.1", 0)) as viewer:
         address = urlsplit(viewer.url)

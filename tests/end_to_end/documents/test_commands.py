@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,7 +19,9 @@ from support.pages import PARSERS, commands
 from support.recordings.bags import drive, messages_for, write_bag
 from support.recordings.kitti_folder import write_folder
 from support.recordings.point_files import columns, write_ply
+from support.recordings.trajectories import write_tum
 from triquad_client import Mesh
+from triquad_client.pose import Pose
 from triquad_tools.commands import demo, map_recording
 
 from bench.clients.server_process import free_port
@@ -28,8 +31,9 @@ STAMPS = [10**18 + number * 10**8 for number in range(SCANS)]
 MAPS = ("map", "IN", "FILE", "A", "B", "monday", "tuesday", "demo-again/map")
 STORES = ("STORE", "store", "served", "OTHER", "maps")
 RECORDINGS = ("RECORDING", "MONDAY", "TUESDAY", "FOLDER")
+WRITTEN = (".triquad", ".png", ".ply", ".mcap", ".yaml", ".bt", ".npz")
 ENDPOINTS = ("tcp/127.0.0.1:7447", "tcp/robot:7447")
-LISTENING = ("--listen", "--config")  # and what follows
+LISTENING = "--listen"  # and what follows
 
 ELSEWHERE = {
     "triquad-demo": "a minute each: tests/end_to_end/process/test_demo.py, and the fixture here",
@@ -90,7 +94,8 @@ def _write_recordings(path: Path) -> None:
     (path / "scans").mkdir()
     for number, cloud in enumerate(points):
         write_ply(path / "scans" / f"{number:06d}.ply", columns(cloud))
-    shutil.copy(path / "RECORDING" / "poses.txt", path / "poses.tum")
+    moves = [Pose(pose[:3, 3], (0.0, 0.0, 0.0, 1.0)) for pose in poses]  # without its turns
+    write_tum(path / "poses.tum", STAMPS, moves)
     Mesh(world.hits, np.zeros((0, 3), np.int32), None).save(path / "CLOUD.ply")
     shutil.copy(path / "demo-out" / "street.ply", path / "MESH.ply")
 
@@ -121,13 +126,13 @@ def test_commands_do_what_the_pages_show(
         once = ["--once"] if command == "triquad-top" else []
         work = importlib.import_module(PARSERS[command][0])
         assert work.main([*words, *once]) == 0
+        assert all(Path(word).exists() for word in words if word.endswith(WRITTEN))
 
 
 def _serve(words: list[str]) -> None:
     """Start a server where it cannot meet others, and stop it."""
-    for flag in LISTENING:
-        if flag in words:
-            del words[words.index(flag) : words.index(flag) + 2]
+    if LISTENING in words:
+        del words[words.index(LISTENING) : words.index(LISTENING) + 2]
     with servers.server_process(words) as server:
         server.process.send_signal(signal.SIGINT)
         assert server.wait() == 0
@@ -141,8 +146,11 @@ def _view(words: list[str], endpoint: str) -> None:
     command = [sys.executable, "-c", program, *words, "--port", str(free_port())]
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as viewer:
+        late = threading.Timer(servers.WAIT_S, viewer.kill)
+        late.start()
         assert viewer.stdout is not None
         told = next((text for text in viewer.stdout if "http://" in text), None)
+        late.cancel()
         viewer.send_signal(signal.SIGINT)
         assert told, "no address was told"
         assert viewer.wait(servers.WAIT_S) == 130

@@ -244,7 +244,7 @@ def test_a_recording_that_memory_has_no_room_for_is_told_with_what_helps(
     assert main([*words, *little]) == 0
     told = capsys.readouterr().err
     assert re.search(r"\d of 8 scans could not be used \(map_full: \d\)", told)
-    assert "--workers 2 maps one region after the other" in told
+    assert "--workers 2 maps region by region" in told
 
 
 def test_poses_that_go_on_in_another_frame_are_refused(tmp_path: Path, capsys) -> None:

@@ -80,7 +80,7 @@ def _check_result(mapper: Mapper, mapping: MappingRun, selection: Selection) -> 
     if told:
         print_remark(f"{COMMAND}: {told}")
     if "map_full" in mapping.refusals:
-        print_remark("--workers 2 maps one region after the other: then memory does not end a map")
+        print_remark("--workers 2 maps region by region: then the map may be larger than memory")
 
 
 def _refused(refusals: Mapping[str, int], last: str, total: int) -> str:
