@@ -81,7 +81,7 @@ class Report:
         yield "\n### Every n-th scan\n"
         yield "![ratios and parameters against n](sparse.png)\n"
         ratios = ("completion ratio %", "accuracy ratio %")
-        yield from _table_head(("method", "n", "scans", "parameters", *ratios, "seconds"))
+        yield from _table_head(("method", "n", "scans", "parameters", *ratios))
         for run in self.whole():
             completion, accuracy = run.scores.completion_ratio, run.scores.accuracy_ratio
             yield _row(
@@ -91,7 +91,6 @@ class Report:
                 _count(run.parameters),
                 f"{100 * completion:.1f}",
                 f"{100 * accuracy:.1f}",
-                f"{run.seconds:.0f}",
             )
         yield f"\nMeshes with n = {max(self.every)}, and their largest holes:\n"
         yield "![meshes with circled holes](holes.png)"
