@@ -24,6 +24,9 @@ from bench.paper.quad import quad_walk
 PICTURES = ("sparse.png", "memory.png", "holes.png")
 """The pictures of each report."""
 
+WORLDS = ("maicity", "newer-college", "noisy")
+"""The keys of the worlds, in the names of their pictures."""
+
 _COLOURS = 256  # of a picture on the page: a third of the bytes
 _DOCS = Path(__file__).parents[2] / "docs"
 _SPACING_M = 0.03  # of the truth: 2 cm would have twice as many points

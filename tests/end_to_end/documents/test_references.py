@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 from triquad_server.monitoring.prometheus import FAMILIES
-from triquad_tools.paper.published_figures import SETS
 
-from bench.paper.__main__ import PICTURES
+from bench.paper.__main__ import PICTURES, WORLDS
 
 ROOT = Path(__file__).parents[3]
 PACKAGES = ("format", "map", "client", "server", "tools")
@@ -102,7 +101,7 @@ def test_every_picture_is_made_by_make_pictures_and_shown_on_a_page(
         assert f"docs/{program}" in (ROOT / "Makefile").read_text()
         names = runpy.run_path(str(docs / program))
         made |= {*names["PICTURES"]} if "PICTURES" in names else {names["PICTURE"].name}
-    made |= {f"paper-{style}-{name}" for style in SETS for name in PICTURES}
+    made |= {f"paper-{key}-{name}" for key in WORLDS for name in PICTURES}
     kept = {path.name for path in (docs / "images").iterdir()}
     shown = {
         name for page in pages for name in re.findall(r"images/([\w-]+\.\w+)\)", page.read_text())
