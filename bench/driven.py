@@ -1,6 +1,6 @@
 """Simulated drives, their scans, and the surface that a map of them should have."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,10 +27,10 @@ class Driven:
         return score_mesh(mesh, self.visible, settings or ScoreSettings(), self.drive.scene.sdf)
 
 
-def write_recording(folder: Path, scans: Sequence[PosedScan], poses: Doubles, name: str) -> None:
-    """Write scans into a new folder as KITTI's, with poses [n, 4, 4]."""
+def write_recording(folder: Path, scans: Iterable[PosedScan], poses: Doubles, name: str) -> None:
+    """Write scans into a new folder as KITTI's, one by one, with their poses [n, 4, 4]."""
     folder.mkdir()
-    with progress(f"writing {name}", len(scans)) as report:
+    with progress(f"writing {name}", len(poses)) as report:
         for number, scan in enumerate(scans):
             rows = np.zeros((len(scan.points), 4), "<f4")
             rows[:, :3] = scan.points

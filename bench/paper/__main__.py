@@ -53,8 +53,8 @@ def _worlds(seed: int) -> tuple[_World, ...]:
     court = quad_walk(seed, 180, noisy)
     noisier = replace(noisy, noise_m=0.2)
     noisier_court = quad_walk(seed, 180, noisier)
-    college = "newer-college"
-    like_street = _World("A street like MaiCity's", "maicity", "maicity", street, lidar, 2)
+    maicity, college, with_noise = WORLDS
+    like_street = _World("A street like MaiCity's", maicity, maicity, street, lidar, 2)
     like_college = _World("A court like the Newer College's", college, college, court, noisy, 6)
     return (
         like_street,
@@ -62,7 +62,7 @@ def _worlds(seed: int) -> tuple[_World, ...]:
         replace(
             like_college,
             name="The court with noise of 20 cm",
-            key="noisy",
+            key=with_noise,
             drive=noisier_court,
             lidar=noisier,
             every=(3, 9, 18),
@@ -103,7 +103,7 @@ def main() -> None:
 def _write(world: _World, folder: Path, truth: Path) -> None:
     """Write a world's scans and poses as KITTI's, and its true surface as points."""
     drive = world.drive
-    write_recording(folder, list(drive), drive.poses, world.name)
+    write_recording(folder, drive, drive.poses, world.name)
     low, high = drive.scene.bounds
     sensor = replace(world.lidar, beams=_TRUE_BEAMS, columns=_TRUE_COLUMNS, noise_m=0.0)
     seen = SimulatedDrive(drive.scene, sensor, drive.poses[:: world.true_every])

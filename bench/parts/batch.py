@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 from triquad_client import open_map
-from triquad_tools.console.progress import progress
 from triquad_tools.simulation.lidar import Lidar, SimulatedDrive
 from triquad_tools.simulation.street import street_drive
 
+from bench.driven import write_recording
 from bench.figures import Figure
 from bench.street_pieces import PIECE_M, REACH_M, mean_f_score
 
@@ -33,7 +33,7 @@ def measure(options: argparse.Namespace) -> list[Figure]:
     )
     with tempfile.TemporaryDirectory(prefix="triquad-bench-") as name:
         folder = Path(name)
-        _write(drive, folder / "scans")
+        write_recording(folder / "scans", drive, drive.poses, "the recording")
         alone_s, alone_f = _mapped(folder, drive, [])
         figures = [
             Figure("one process", alone_s, "s"),
@@ -48,19 +48,6 @@ def measure(options: argparse.Namespace) -> list[Figure]:
                 Figure(f"{name}: less F", 100 * (alone_f - f_score), "points", at_most=0.2),
             ]
         return figures
-
-
-def _write(drive: SimulatedDrive, folder: Path) -> None:
-    """Write a drive as a folder of KITTI."""
-    folder.mkdir()
-    with progress("writing the recording", len(drive)) as report:
-        for number in range(len(drive)):
-            points = drive.scan(number).points
-            rows = np.zeros((len(points), 4), "<f4")
-            rows[:, :3] = points
-            rows.tofile(folder / f"{number:06d}.bin")
-            report(number, f"{number} scans")
-    np.savetxt(folder / "poses.txt", drive.poses[:, :3].reshape(-1, 12), fmt="%.9f")
 
 
 def _mapped(

@@ -228,6 +228,11 @@ class LiveRegion:
         """How many copies of it, as it was, wait to be taken."""
         return sum(copy.is_made for copy in self._wanted())
 
+    @property
+    def is_wanted(self) -> bool:
+        """Whether somebody waits for a copy of it, which is made or not."""
+        return any(copy.is_due or copy.is_made for copy in self._wanted())
+
     def owe(self) -> OwedCopy:
         """Return a copy of the region as it is now, which is made as late as can be."""
         owed = OwedCopy(self._snapshot)

@@ -41,7 +41,7 @@ class RegionRoom:
     @property
     def is_full(self) -> bool:
         """Whether scans have to wait: until regions have left, or copies of some are taken."""
-        return self._is_full or any(map(_is_wanted, self._copied_first))
+        return self._is_full or any(region.is_wanted for region in self._copied_first)
 
     @property
     def waits_for_store(self) -> bool:
@@ -117,7 +117,7 @@ class RegionRoom:
                 break
             stored, nbytes = self._stored.get(region.index), self._budget.bytes_of([region.size])
             # While somebody wants a copy, its memory would not be free.
-            if stored and region.is_as_of(stored.epoch) and not _is_wanted(region):
+            if stored and region.is_as_of(stored.epoch) and not region.is_wanted:
                 self._regions.leave(stored)
                 excess -= nbytes
             elif self._are_kept:
@@ -169,7 +169,7 @@ class RegionRoom:
         if self.leaving:
             self._is_full = True
             raise NoRoomYetError
-        if wanted := [region for region in self._regions if _is_wanted(region)]:
+        if wanted := [region for region in self._regions if region.is_wanted]:
             self._wait_for(wanted)
         used = self._budget.bytes_of(region.size for region in self._regions)
         raise self._budget.refusal(used, needed)
@@ -178,8 +178,3 @@ class RegionRoom:
         """Have a scan wait until copies of some regions are taken."""
         self._copied_first = copies_of
         raise NoRoomYetError
-
-
-def _is_wanted(region: LiveRegion) -> bool:
-    """Return whether somebody waits for a copy of a region, which is made or not."""
-    return region.is_owed or region.copies_waiting > 0

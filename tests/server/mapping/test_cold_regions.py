@@ -279,7 +279,7 @@ def test_a_scan_waits_for_copies_that_take_its_room(tmp_path: Path) -> None:
 
 
 def test_copies_that_nobody_took_are_let_go(kept: KeptMap) -> None:
-    """Though whoever keeps the error of a checkpoint keeps what it was made of."""
+    """Although the error of a checkpoint, where it is kept, keeps what that was made of."""
     kept.visit(0, 1)
     room = kept.mapper.regions.room
     with closing(kept.mapper.snapshot_since(None)) as snapshot:

@@ -111,8 +111,8 @@ class Report:
         yield "![memory against scans](memory.png)\n"
         yield from _table_head(("scans", "parameters", "map file MB", "memory MB"))
         for point in self.memory:
-            file_mb, resident_mb = point.file_bytes / 1e6, point.memory_bytes / 1e6
-            yield _row(point.scans, f"{point.parameters:,}", f"{file_mb:.2f}", f"{resident_mb:.0f}")
+            file_mb, memory_mb = point.file_bytes / 1e6, point.memory_bytes / 1e6
+            yield _row(point.scans, f"{point.parameters:,}", f"{file_mb:.2f}", f"{memory_mb:.0f}")
         yield ""
 
     def whole(self) -> Sequence[Run]:

@@ -86,7 +86,7 @@ def _write(report: Report, folder: Path) -> None:
 
 
 def _opened(folder: Path, needed: int) -> ScanFolder:
-    """Open a folder of at least so many scans."""
+    """Open a folder of scans, which has to have as many as are ``needed``."""
     recording = read_cloud_folder(folder, ReadingOptions())
     if len(recording) < needed:
         raise ToolError(
