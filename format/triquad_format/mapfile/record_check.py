@@ -200,5 +200,5 @@ def _check_floats(
     ArraySpec(dtype, shape).check(name, array)
     if not np.isfinite(array).all():
         raise FormatError(f"{name}: a value is not finite")
-    if array.min(initial=0.0) < low:
+    if low > -np.inf and array.min(initial=0.0) < low:
         raise FormatError(f"{name}: a value is below {low:g}")

@@ -4,6 +4,7 @@ import threading
 from collections.abc import Sequence
 
 import numpy as np
+from triquad_format.records import morton
 from triquad_format.records.arrays import Doubles, Longs
 from triquad_format.records.field_settings import BLOCK_VOXELS
 from triquad_format.records.leaf_box import leaf_box
@@ -60,11 +61,9 @@ class RecordedRegion:
         """Return the cubes [C, 3] with surface, and the number of each block's [B]; -1: none."""
         cells, touched = self.evidence.cells, self.evidence.surface.any(axis=1)
         of_blocks = np.full(len(cells), -1, np.int64)
-        cubes, numbers = np.unique(
-            cells[touched] // (self._cube_voxels // BLOCK_VOXELS), axis=0, return_inverse=True
-        )
-        of_blocks[touched] = numbers.ravel()
-        return cubes, of_blocks
+        codes = morton.encode(cells[touched] // (self._cube_voxels // BLOCK_VOXELS))
+        cubes, of_blocks[touched] = np.unique(codes, return_inverse=True)
+        return morton.decode(cubes, 3), of_blocks
 
     def _surfels_in(self, cube: int) -> SurfelMap:
         if cube not in self._surfels:

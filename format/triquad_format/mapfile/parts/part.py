@@ -198,9 +198,11 @@ def split_bits(numbers: Bytes, width: int) -> Bytes:
 def join_bits(planes: Bytes, count: int) -> Bytes:
     """Return ``count`` numbers; the inverse of :func:`split_bits`."""
     numbers = np.zeros(count, np.uint8)
-    for plane in np.bitwise_xor.accumulate(planes, axis=0):
+    above = np.zeros(planes.shape[1], np.uint8)
+    for plane in planes:
+        above ^= plane
         numbers <<= 1
-        numbers |= np.unpackbits(plane, count=count, bitorder="little")
+        numbers |= np.unpackbits(above, count=count, bitorder="little")
     return numbers
 
 
