@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from triquad_format.errors import RefusedError
 
 _KEPT = 256
-"""Numbers that are remembered; the oldest is forgotten."""
+"""Numbers that are remembered; the one that was used longest ago is forgotten."""
 
 Epochs = Mapping[int, int]
 """The epoch of each server, by the server's number."""
@@ -29,6 +29,8 @@ class SharedEpochs:
         """
         with self._lock:
             known = self._epochs.get(number)
+            if known is not None:
+                self._epochs.move_to_end(number)
         if known is None:
             raise RefusedError(
                 "epoch_gone",

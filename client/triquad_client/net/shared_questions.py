@@ -230,6 +230,7 @@ def _status(replies: Sequence[ServerStatus]) -> ServerStatus:
         changes[name] = dict(counts)
     sources = {source for one in replies for source in one.scans_lost}
     lost = {source: max(one.scans_lost.get(source, 0) for one in replies) for source in sources}
+    in_memory = sum(one.regions - one.regions_cold for one in replies)
     return replace(
         replies[0],
         **changes,
@@ -239,5 +240,5 @@ def _status(replies: Sequence[ServerStatus]) -> ServerStatus:
         warnings=tuple(dict.fromkeys(line for one in replies for line in one.warnings)),
         fit=None,
         kept_scans=None,
-        regions_cold=min(one.regions_cold for one in replies),
+        regions_cold=max(0, changes["regions"] - in_memory),
     )

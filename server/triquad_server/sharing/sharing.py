@@ -131,13 +131,18 @@ class Sharing:
     def _take_free(
         self, newest: Mapping[RegionIndex, ColdRegion], awaited: set[RegionIndex]
     ) -> None:
+        unreadable = self._leases.stores.unreadable
+        for index in unreadable.keys() - newest.keys():
+            unreadable.pop(index, None)  # its folder was moved away
         for index in sorted(newest, key=lambda index: index not in awaited):
             if self._leases.is_free(index):
                 try:
                     self._take_region(newest[index])
                 except StoreError as error:
-                    self._leases.stores.unreadable[index] = str(error)
-                    _log.error("%s", error)
+                    why = f"{error}; restore that folder from a backup, or move it away"
+                    if unreadable.get(index) != why:
+                        _log.error("%s", why)
+                    unreadable[index] = why
 
     def _take_region(self, region: ColdRegion) -> None:
         # No checkpoint may be written in between: it would be without the region.

@@ -185,8 +185,7 @@ class Store:
         with self._writing(f"region {region.index} of {other.folder} cannot be taken"):
             try:
                 self._copy(region, other)
-            except FormatError as error:
-                _log.error("region %s of %s: %s", region.index, other.folder, error)
+            except FormatError:
                 if not other.take_older(region):
                     raise
                 self._copy(region, other)

@@ -120,7 +120,10 @@ class StoredRegions:
                     f"region {region.index} cannot be read, and no older checkpoint has it whole: "
                     f"{error}; reset its box to begin it again, or restore a backup",
                 ) from error
-        return self._assembled(region, topics)
+        try:
+            return self._assembled(region, topics)
+        except (FormatError, OSError) as error:
+            raise RefusedError("store", f"region {region.index} cannot be read: {error}") from error
 
     def _assembled(self, region: ColdRegion, topics: Collection[str]) -> MapRecord:
         entries = tuple(one for one in region.entries if one.key.topic in topics)

@@ -12,6 +12,8 @@ from support.poses import shifted
 from triquad_client import Client, RefusedError, connect
 from triquad_client.net.shared_connection import SharedConnection
 from triquad_format.errors import InvalidInputError
+from triquad_format.mapfile.checkpoint_folder import checkpoint_files
+from triquad_format.mapfile.reader import open_manifest
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.status import Status
 from triquad_format.wire.shares import share_name
@@ -144,6 +146,7 @@ def test_what_was_asked_of_an_epoch_stays(tmp_path: Path) -> None:
 def test_where_one_is_killed_the_others_answer(tmp_path: Path) -> None:
     with several(tmp_path, 3) as shared, client_of(*shared, shares=3) as client:
         publish(client, PLACES)
+        servers.until(lambda: client.status().regions_cold == 0)  # one of them has each
         client.settle(servers.WAIT_S)
         client.checkpoint()
         for killed, left in ((shared[0], 2), (shared[2], 1)):  # the client is linked to the first
@@ -268,6 +271,40 @@ def test_a_server_does_not_start_beside_a_store_that_cannot_be_read(tmp_path: Pa
     with server_process(words, ready=False) as refused:
         assert refused.wait() == 4
         assert f"{MAP}.2 has no valid checkpoint of a shared map: move it away" in refused.log
+
+
+def test_a_region_that_cannot_be_read_is_begun_again_once_its_folder_is_moved_away(
+    tmp_path: Path,
+) -> None:
+    with several(tmp_path, 2) as (first, second), client_of(first, shares=2) as client:
+        publish(client, PLACES)
+        client.checkpoint()
+        for server in (second, first):
+            server.process.kill()
+            server.wait()
+    folder = tmp_path / f"{MAP}.2"
+    newest, *older = checkpoint_files(folder)
+    for file in older:
+        file.path.unlink()
+    rotten = open_manifest(newest).entries[0]
+    (folder / "parts" / rotten.name).write_bytes(bytes(rotten.stored))
+
+    def refused(client: Client) -> bool:
+        before = client.flush(servers.WAIT_S).refused
+        client.publish_scan(servers.sphere(), shifted(25.6 * rotten.key.region[0]))
+        return client.flush(servers.WAIT_S).refused > before
+
+    with sharing(tmp_path, free_endpoint(), []) as again, client_of(again, shares=1) as client:
+        servers.until(lambda: refused(client))
+        told = client.flush(servers.WAIT_S).last_refusal
+        assert told is not None
+        assert f"{folder} cannot be taken" in told
+        assert "restore that folder from a backup, or move it away" in told
+        folder.rename(tmp_path / "aside")
+        servers.until(lambda: not refused(client))
+        again.process.terminate()
+        again.wait()
+        assert again.log.count("restore that folder") < 5, "each turn tells it again"
 
 
 def test_what_a_shared_map_cannot_do_is_refused(tmp_path: Path) -> None:
