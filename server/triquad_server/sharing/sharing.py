@@ -139,10 +139,9 @@ class Sharing:
                 try:
                     self._take_region(newest[index])
                 except StoreError as error:
-                    why = f"{error}; restore that folder from a backup, or move it away"
-                    if unreadable.get(index) != why:
-                        _log.error("%s", why)
-                    unreadable[index] = why
+                    if unreadable.get(index) != str(error):
+                        _log.error("%s", error)
+                    unreadable[index] = str(error)
 
     def _take_region(self, region: ColdRegion) -> None:
         # No checkpoint may be written in between: it would be without the region.

@@ -185,9 +185,10 @@ class Store:
         with self._writing(f"region {region.index} of {other.folder} cannot be taken"):
             try:
                 self._copy(region, other)
-            except FormatError:
+            except FormatError as error:
                 if not other.take_older(region):
-                    raise
+                    remedy = "restore that folder from a backup, or move it away"
+                    raise FormatError(f"{error}; {remedy}") from error
                 self._copy(region, other)
             return self.regions.adopt(region, other.facts)
 
