@@ -4,7 +4,9 @@ import argparse
 import importlib
 import re
 import shlex
+import shutil
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -63,9 +65,10 @@ def names(
     monkeypatch.chdir(tmp_path)
     scan = small_world.world(3).scans[0]
     depth = np.full((48, 64), 3.0)
-    with triquad_client.connect(endpoint) as client:
+    with triquad_client.connect(endpoint) as client, ExitStack() as stack:
         client.download_map(tmp_path / "site.triquad")
-        client.download_map(tmp_path / "map.triquad")
+        shutil.copy(tmp_path / "site.triquad", tmp_path / "map.triquad")
+        offline = stack.enter_context(triquad_client.open_map(tmp_path / "site.triquad"))
         yield {
             "np": np,
             "triquad_client": triquad_client,
@@ -78,7 +81,7 @@ def names(
             "depth": depth,
             "intrinsics": triquad_client.Intrinsics(fx=50.0, fy=50.0, cx=31.5, cy=23.5),
             "world_from_camera": scan.world_from_sensor,
-            "offline": triquad_client.open_map(tmp_path / "site.triquad"),
+            "offline": offline,
         }
 
 

@@ -82,6 +82,16 @@ def shows(client: Client, places: Sequence[float]) -> bool:
     return bool(seen.reshape(len(places), -1).mean(axis=1).min() > 0.9)
 
 
+def leave_by_two_that_are_killed(store: Path) -> None:
+    """Have two servers map all places, write it, and be killed."""
+    with several(store, 2) as (first, second), client_of(first, shares=2) as client:
+        publish(client, PLACES)
+        client.checkpoint()
+        for server in (second, first):
+            server.process.kill()
+            server.wait()
+
+
 def has_all(client: Client, number: int) -> bool:
     regions = holders(client)[1]
     return len(regions) >= 6 and all(who == {number} for who in regions.values())
@@ -254,12 +264,7 @@ def test_what_was_reset_does_not_come_back_from_a_server_that_went(tmp_path: Pat
 
 
 def test_a_server_does_not_start_beside_a_store_that_cannot_be_read(tmp_path: Path) -> None:
-    with several(tmp_path, 2) as (first, second), client_of(first, shares=2) as client:
-        publish(client, PLACES)
-        client.checkpoint()
-        for server in (second, first):
-            server.process.kill()
-            server.wait()
+    leave_by_two_that_are_killed(tmp_path)
     newest, *older = sorted((tmp_path / f"{MAP}.2").glob("*.checkpoint"), reverse=True)
     newest.write_bytes(b"rot")
     words = ["--map", MAP, "--share", "--store", tmp_path, "--settings", servers.SMALL_FILE]
@@ -276,12 +281,7 @@ def test_a_server_does_not_start_beside_a_store_that_cannot_be_read(tmp_path: Pa
 def test_a_region_that_cannot_be_read_is_begun_again_once_its_folder_is_moved_away(
     tmp_path: Path,
 ) -> None:
-    with several(tmp_path, 2) as (first, second), client_of(first, shares=2) as client:
-        publish(client, PLACES)
-        client.checkpoint()
-        for server in (second, first):
-            server.process.kill()
-            server.wait()
+    leave_by_two_that_are_killed(tmp_path)
     folder = tmp_path / f"{MAP}.2"
     newest, *older = checkpoint_files(folder)
     for file in older:
