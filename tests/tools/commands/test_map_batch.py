@@ -3,9 +3,12 @@
 import os
 import shutil
 import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +29,8 @@ from triquad_tools.mapping.batch.workers import opened
 from triquad_tools.recordings.folders.cloud_folder import read_cloud_folder
 from triquad_tools.recordings.opening import Selection
 from triquad_tools.recordings.recording import ReadingOptions
+
+from bench.clients.server_process import free_endpoint
 
 COUNT = 12
 EACH_M = 4.0  # through regions of 24 m
@@ -130,6 +135,35 @@ def test_a_worker_that_is_killed_loses_nothing(
     assert record.progress.scans_taken == COUNT
     servers.until(lambda: len(workers.scheduler_info()["workers"]) == 2)
     assert len(before & {*workers.run(os.getpid).values()}) == 1
+
+
+def test_a_scheduler_that_is_gone_is_told(recording: Path, tmp_path: Path) -> None:
+    port = free_endpoint().rpartition(":")[2]
+    address = f"tcp://127.0.0.1:{port}"
+    module = [sys.executable, "-m"]
+    with (
+        ended([*module, "distributed.cli.dask_scheduler", "--port", port]) as scheduler,
+        ended([*module, "distributed.cli.dask_worker", address, "--nthreads", "1"]),
+        Client(address, timeout=servers.WAIT_S) as client,
+    ):
+        client.wait_for_workers(1, timeout=servers.WAIT_S)
+        run = run_of(client, recording, tmp_path / "parts", "training.samples_per_ray=100")
+        with ThreadPoolExecutor() as threads:
+            record = threads.submit(run.record)
+            servers.until(lambda: any(client.processing().values()))
+            scheduler.kill()
+            with pytest.raises(ToolError, match="the scheduler of Dask is gone"):
+                record.result()
+
+
+@contextmanager
+def ended(command: list[str]) -> "Iterator[subprocess.Popen[bytes]]":
+    """A process that is ended in the end."""
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
 def test_what_is_done_is_not_done_again(recording: Path, workers: Client, tmp_path: Path) -> None:

@@ -119,7 +119,7 @@ def _by_workers(options: argparse.Namespace, settings: Settings) -> int:
         folder.mkdir(exist_ok=True)
         check_workers(client, [folder, *options.recordings])
         run = BatchRun(client, selection, place, folder)
-        record = run.record()
+        record = run.record(training=options.training)
     if run.refused:
         *_, last = run.refused.values()
         print_remark(f"{COMMAND}: {_refused(run.refusals, last.text, len(selection))}")

@@ -3,6 +3,7 @@
 import hashlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError
 from operator import mul
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from triquad_format.records.region import MapProgress, MapRecord
 
 from triquad_tools.console.command import ToolError
 from triquad_tools.console.progress import progress
+from triquad_tools.mapfiles.crop import without_training
 from triquad_tools.mapping.batch.cut_scans import CutScan
 from triquad_tools.mapping.batch.job import Cut, Place, Refusal, cut, mapped
 from triquad_tools.mapping.mapping_run import MAP_NAME, OUTSIDE, SECTIONS, another_frame
@@ -43,8 +45,12 @@ class BatchRun:
         """How many scans cannot be used, by reason."""
         return Counter(one.reason for one in self.refused.values())
 
-    def record(self) -> MapRecord:
+    def record(self, *, training: bool = False) -> MapRecord:
         """Return the map, once all regions have settled.
+
+        Args:
+            training: it has the state that further training needs, which takes three times as much
+                memory as the map.
 
         Raises:
             ToolError: a worker cannot do it, or the poses go on in another frame.
@@ -71,7 +77,8 @@ class BatchRun:
         with progress("mapping", len(files)) as report:
             for done, _ in enumerate(_results(futures), start=len(files) - len(left) + 1):
                 report(done, f"{done} of {len(files)} regions")
-        return self._joined([read_map(file) for file in files.values()])
+        whole = (read_map(file) for file in files.values())
+        return self._joined([one if training else without_training(one) for one in whole])
 
     def _cut(self) -> tuple[list[RegionIndex], dict[int, CutScan]]:
         """Return the regions that scans make, and where each scan is."""
@@ -145,7 +152,8 @@ def _results(futures: Iterable["Future[Any]"]) -> Iterator[Any]:
     """Yield what tasks return, as they are done.
 
     Raises:
-        ToolError: one ends each worker that tries it, as where memory is too short.
+        ToolError: one ends each worker that tries it, as where memory is too short, or the
+            scheduler is gone.
     """
     try:
         for future in as_completed(list(futures)):  # type: ignore[no-untyped-call]
@@ -154,4 +162,9 @@ def _results(futures: Iterable["Future[Any]"]) -> Iterator[Any]:
         raise ToolError(
             f"workers end while they do {error.task}: look into their logs; they may lack memory, "
             "of which each takes up to memory.max_bytes"
+        ) from error
+    except CancelledError as error:
+        raise ToolError(
+            "the scheduler of Dask is gone: start it and its workers again, and the same command "
+            f"does what is left ({error})"
         ) from error
