@@ -123,6 +123,7 @@ class Maps:
         if shared is not None:
             sharing = Sharing(*shared, service.mapper, service.health.checkpoints)
             found.opened.enter_context(closing(sharing))
+            service.health.warned_by.append(sharing.warnings)
         if shared is None:
             service.operations.serve(CreateMapRequest, self._create, Lane.FILES)
             service.operations.serve(

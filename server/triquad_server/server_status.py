@@ -4,7 +4,9 @@ import logging
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from itertools import chain
 
 import numpy as np
 import triquad_format
@@ -50,6 +52,8 @@ class Health:
     epochs: EpochHistory
     checkpoints: CheckpointWriter
     memory: MemoryShare
+    # What tells more warnings.
+    warned_by: list[Callable[[], Iterable[str]]] = field(default_factory=list)
     started_s: float = field(default_factory=time.monotonic)  # monotonic
 
     def status(self) -> ServerStatus:
@@ -81,7 +85,11 @@ class Health:
             store_error=self.checkpoints.error,
             kept_scans=self.checkpoints.kept_scans,
             correcting=self.checkpoints.correcting,
-            warnings=(*filter(None, [self.checkpoints.warning]), *self.warnings.all()),
+            warnings=(
+                *filter(None, [self.checkpoints.warning]),
+                *chain.from_iterable(warned() for warned in self.warned_by),
+                *self.warnings.all(),
+            ),
             map_max_bytes=self.memory.server.limit,
             memory_parts=self._memory_parts(),
             regions_cold=epoch.cold_regions,

@@ -11,7 +11,7 @@ from typing import Any
 import zenoh
 from triquad_format.errors import RefusedError
 from triquad_format.wire.codec import Request
-from triquad_format.wire.messages import MapReply, ResetReply
+from triquad_format.wire.messages import MapReply, ResetReply, ResetRequest
 from triquad_format.wire.query_messages import ChangesReply, ChangesRequest
 from triquad_format.wire.shares import Shares, read_token, share_name, shares_key
 from triquad_format.wire.status_messages import ServerStatus, StatusRequest
@@ -174,10 +174,7 @@ class SharedConnection(Connection):
     def _joined(self, asked: _Asked) -> Any:
         """Return the reply to a question; errors are those of :meth:`Connection.replies`."""
         parts = [sent.part for sent in asked.sent]
-        replies = [
-            self.server(sent.part.number).received(sent.part.request, sent.replies)
-            for sent in asked.sent
-        ]
+        replies = [self._received(sent) for sent in asked.sent]
         told: dict[str, Any] = {}
         if isinstance(replies[0], _COUNTED):
             told["epoch"] = self._counted(asked.epoch, parts, replies)
@@ -187,6 +184,20 @@ class SharedConnection(Connection):
             names = "+".join(reply.server for reply in replies)
             told |= {"map_name": self.map_name, "server": names[:256]}
         return joined(parts, replies, told, self.places)
+
+    def _received(self, sent: _Sent) -> Any:
+        """Return the reply of one server; errors are those of :meth:`Connection.replies`."""
+        number, request = sent.part.number, sent.part.request
+        try:
+            return self.server(number).received(request, sent.replies)
+        except RefusedError as error:
+            if not isinstance(request, ResetRequest):
+                raise
+            raise RefusedError(
+                error.code,
+                f"server {number} has not reset, and others may have: reset again once it can "
+                f"({error})",
+            ) from error
 
     def _counted(self, epoch: int, parts: Sequence[Part[Any]], replies: list[Any]) -> int:
         """Return the number of the epochs of replies that were asked for ``epoch``, or NEWEST.

@@ -8,6 +8,7 @@ from triquad_format.records.field_settings import RegionIndex
 from triquad_format.wire import keys
 from triquad_format.wire.shares import (
     Shares,
+    ShareToken,
     chosen_share,
     lease_key,
     read_token,
@@ -19,6 +20,8 @@ from triquad_format.wire.shares import (
 from triquad_server.errors import NoRoomYetError, ScanRefusedError
 from triquad_server.sharing.contests import Contests
 from triquad_server.sharing.seen_stores import SeenStores
+
+_CLOCKS_AGREE_S = 1.0
 
 
 def now_ms() -> int:
@@ -48,6 +51,7 @@ class Leases:
         self._tokens: dict[RegionIndex, zenoh.LivelinessToken] = {}
         self._own: list[zenoh.LivelinessToken] = []
         self._is_closed = False
+        self._ahead_s: dict[int, float] = {}  # by how much the clocks of others are
         self._shares.add(share_key(map_name, number))
         self._subscriber = self._liveliness.declare_subscriber(
             shares_key(map_name),
@@ -87,6 +91,14 @@ class Leases:
     def holders(self, index: RegionIndex) -> dict[int, int]:
         """Return who has a region, the lowest first, and since when, milliseconds since 1970."""
         return self._shares.holders(index)
+
+    def clock_problems(self) -> list[str]:
+        """Return whose clocks are ahead of this server's: epochs are numbered by them."""
+        return [
+            f"the clock of server {number} is {ahead_s:.0f} s ahead of this one's: set both right, "
+            "or regions may go on from an older state"
+            for number, ahead_s in list(self._ahead_s.items())
+        ]
 
     def is_chosen(self, index: RegionIndex) -> bool:
         """Return whether this server is to have a region, of all that are there."""
@@ -185,6 +197,7 @@ class Leases:
             self.is_taken |= not self._own
             return
         if sample.kind == zenoh.SampleKind.PUT:
+            self._see_clock(token)
             self._shares.add(key)
             if token.region in self._tokens:
                 self.contests.see(token.region, self._shares.holders(token.region))
@@ -192,3 +205,11 @@ class Leases:
             self.stores.one_has_gone()
             self._shares.remove(key)
         self.changed.set()
+
+    def _see_clock(self, token: ShareToken) -> None:
+        """See when another server says that it takes a region: that is now, or before."""
+        ahead_s = (token.since_ms - now_ms()) / 1e3
+        if ahead_s > _CLOCKS_AGREE_S:
+            self._ahead_s[token.number] = ahead_s
+        elif token.region is None:  # it has come, or gone
+            self._ahead_s.pop(token.number, None)

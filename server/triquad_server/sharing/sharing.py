@@ -10,7 +10,7 @@ it; the others write it to their stores and give it away, and the first learns f
 import logging
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 from triquad_format.errors import FormatError
 from triquad_format.records.field_settings import RegionIndex
@@ -57,6 +57,7 @@ class Sharing:
         self._was_leaving: frozenset[RegionIndex] = frozenset()
         self._listed_s: dict[RegionIndex, float] = {}  # monotonic: since when others find them
         self._reached_s: dict[RegionIndex, float] = {}  # monotonic: when a scan last did
+        self._problem = ""  # why regions are not taken or given
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="sharing")
         self._thread.start()
@@ -75,6 +76,12 @@ class Sharing:
             time.sleep(_SEEN_S)
         self._leases.close()
 
+    def warnings(self) -> list[str]:
+        """Return what keeps this server from sharing the map as it should."""
+        stores = self._leases.stores
+        problems = [self._problem, stores.problem, *list(stores.unreadable.values())]
+        return [*filter(None, problems), *self._leases.clock_problems()]
+
     def _run(self) -> None:
         self._leases.appear()
         self._try()
@@ -85,12 +92,15 @@ class Sharing:
             self._try()
 
     def _try(self) -> None:
+        before, self._problem = self._problem, ""
         try:
             self._turn()
         except MapperStoppedError:
             _log.debug("no regions are taken or given any more: mapping has ended")
-        except StoreError as error:
-            _log.error("regions are not taken or given: %s", error)
+        except (StoreError, OSError) as error:
+            self._problem = f"regions are not taken or given: {error}"
+            if self._problem != before:
+                _log.error("%s", self._problem)
         except Exception:
             _log.exception("regions are not taken or given")
 
@@ -196,23 +206,31 @@ class Sharing:
         wanted = contest.regions & self._leases.held
         if not wanted:
             return  # it is the other one that keeps them
+        self._checkpoints.write()  # so that the own log has all scans until now
+        known = {_name_of(scan) for scan in self._kept(self._leases.number, contest.since_ms)}
         learnt = 0
-        for segment in segments(self._stores.folder(contest.number) / LOG_NAME):
-            if segment.epoch < contest.since_ms:
-                continue
-            try:
-                for entry in read_segment(segment.path):
-                    if self._leases.changed.is_set():  # a scan may wait for a region
-                        self._leases.changed.clear()
-                        self._see()
-                    if isinstance(entry, LoggedScan):
-                        learnt += self._learn(entry, wanted)
-            except (FormatError, OSError) as error:
-                _log.error("scans of server %d cannot be read: %s", contest.number, error)
+        for scan in self._kept(contest.number, contest.since_ms):
+            if self._leases.changed.is_set():  # a scan may wait for a region
+                self._leases.changed.clear()
+                self._see()
+            if _name_of(scan) not in known:
+                learnt += self._learn(scan, wanted)
         _log.warning(
             "server %d had %d regions of this one, too: %d scans that it kept are taken in",
             *(contest.number, len(wanted), learnt),
         )
+
+    def _kept(self, number: int, since_ms: int) -> Iterator[LoggedScan]:
+        """Yield the scans that a server has kept since a time, or somewhat before."""
+        for segment in segments(self._stores.folder(number) / LOG_NAME):
+            if segment.epoch < since_ms:
+                continue
+            try:
+                for entry in read_segment(segment.path):
+                    if isinstance(entry, LoggedScan):
+                        yield entry
+            except (FormatError, OSError) as error:
+                _log.error("scans of server %d cannot be read: %s", number, error)
 
     def _learn(self, scan: LoggedScan, wanted: frozenset[RegionIndex]) -> bool:
         """Take in a scan where it reaches regions; return whether it does."""
@@ -244,3 +262,8 @@ class Sharing:
                 _log.debug("a scan of another server is not used: %s", error)
                 return False
         return False
+
+
+def _name_of(scan: LoggedScan) -> tuple[str, int, bytes]:
+    """Return what the logs of two servers have alike of a scan that both took in."""
+    return scan.source, scan.stamp_ns, scan.world_from_sensor.tobytes()

@@ -173,7 +173,7 @@ class Stores:
         for number in gone:
             store = self._others[number]
             owners = {index: next(iter(leases.holders(index)), number) for index in store.known}
-            if store.epoch and number not in owners.values():
+            if number not in owners.values():
                 own = self._own.versions()
                 if all(
                     self._version_at(owner, index, own) >= version_of(store.known[index])

@@ -85,6 +85,7 @@ def find_map(
         stack.callback(memory.close, share)
         if root is None:
             return FoundMap(name, settings, share, stack.pop_all())
+        _check_alone(root, name)
         store = Store(root, name, settings.store, lambda: share.cache_bytes, split)
         stack.enter_context(closing(store))
         if restore is not None:
@@ -115,6 +116,16 @@ def find_share(
             (root / own / _IS_SHARED).touch()
             return replace(found, shared=SharedName(name, number))
     raise StoreError(f"{MAX_SHARES} servers share map {name!r} already: more are not possible")
+
+
+def _check_alone(root: Path, name: str) -> None:
+    """Raise :class:`StoreError` where a map of this name is in the folders of several servers."""
+    shared = [str(folder) for folder in root.glob(f"{name}.[0-9]*") if is_share_folder(folder)]
+    if shared:
+        raise StoreError(
+            f"map {name!r} is shared, in {', '.join(sorted(shared))}: start with --share, or have "
+            "one server take it over (docs/scale.md)"
+        )
 
 
 def is_share_folder(folder: Path) -> bool:

@@ -1,5 +1,7 @@
 """A map that several servers share: they answer as one, and come and go without it being seen."""
 
+import re
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
@@ -16,7 +18,7 @@ from triquad_format.mapfile.checkpoint_folder import checkpoint_files
 from triquad_format.mapfile.reader import open_manifest
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.status import Status
-from triquad_format.wire.shares import share_name
+from triquad_format.wire.shares import lease_key, share_name
 
 from bench.campaign.cutting_proxy import CuttingProxy
 from bench.clients.server_process import ServerProcess, free_endpoint, server_process
@@ -206,12 +208,17 @@ def test_who_joins_takes_regions_and_leaves_them(tmp_path: Path) -> None:
         assert shows(client, PLACES + 2.0)
 
 
-def test_after_the_network_was_divided_nothing_is_missing(tmp_path: Path) -> None:
+@contextmanager
+def divided(store: Path) -> Iterator[tuple[Client, Client, ServerProcess]]:
+    """Clients of two servers that cannot reach each other while in use, but after; and the first.
+
+    Both servers had scans of some regions before.
+    """
     end = free_endpoint()
     with (
-        sharing(tmp_path, end, []) as first,
+        sharing(store, end, []) as first,
         closing(CuttingProxy(end)) as between,
-        sharing(tmp_path, free_endpoint(), [between.endpoint]) as second,
+        sharing(store, free_endpoint(), [between.endpoint]) as second,
         client_of(first, shares=2) as west,
         client_of(second, shares=2) as east,
     ):
@@ -220,13 +227,30 @@ def test_after_the_network_was_divided_nothing_is_missing(tmp_path: Path) -> Non
         between.hold()
         between.cut()
         servers.until(lambda: len(holders(west)[0]) == len(holders(east)[0]) == 1)
-        publish(west, WEST)
-        publish(east, EAST)
+        yield west, east, first
         between.heal()
         servers.until(lambda: len(holders(west)[0]) == 2)
         servers.until(lambda: all(len(who) == 1 for who in holders(west)[1].values()))
         servers.until(lambda: shows(west, PLACES) and shows(east, PLACES))
         first.wait_for("that it kept are taken in")
+
+
+def test_after_the_network_was_divided_nothing_is_missing(tmp_path: Path) -> None:
+    with divided(tmp_path) as (west, east, _):
+        publish(west, WEST)
+        publish(east, EAST)
+
+
+def test_scans_that_both_sides_had_are_taken_in_once(tmp_path: Path) -> None:
+    with divided(tmp_path) as (west, east, first):
+        for place in PLACES:
+            stamp_s = time.time()
+            for side in (west, east):
+                side.publish_scan(servers.sphere(), shifted(place), stamp_s)
+        for side in (west, east):
+            assert side.flush(servers.WAIT_S).refused == 0
+    learnt = re.findall(r"([0-9]+) scans that it kept are taken in", first.log)
+    assert set(learnt) == {"0"}
 
 
 def test_a_map_that_was_not_shared_is_gone_on_with(tmp_path: Path) -> None:
@@ -241,8 +265,18 @@ def test_a_map_that_was_not_shared_is_gone_on_with(tmp_path: Path) -> None:
     with several(tmp_path, 2) as shared, client_of(*shared, shares=2) as client:
         servers.until(lambda: len(holders(client)[1]) == 1)
         assert shows(client, [0.0])
-    assert {path.name for path in tmp_path.iterdir()} >= {f"{MAP}.1", f"{MAP}.2"}
     assert not (tmp_path / MAP).exists()
+    with server_process(words, ready=False) as refused:
+        assert refused.wait() == 4
+        assert "is shared, in" in refused.log
+    second = tmp_path / f"{MAP}.2"
+    with sharing(tmp_path, free_endpoint(), []) as last:
+        servers.until(lambda: not second.exists())
+        last.process.terminate()
+        assert last.wait() == 0, last.log
+    (tmp_path / f"{MAP}.1").rename(tmp_path / MAP)
+    with server_process(words) as alone, connect(alone.endpoint, MAP) as client:
+        assert shows(client, [0.0])
 
 
 def test_what_was_reset_does_not_come_back_from_a_server_that_went(tmp_path: Path) -> None:
@@ -300,11 +334,25 @@ def test_a_region_that_cannot_be_read_is_begun_again_once_its_folder_is_moved_aw
         assert told is not None
         assert f"{folder} cannot be taken" in told
         assert "restore that folder from a backup, or move it away" in told
+        assert any(str(folder) in line for line in client.status().warnings)
         folder.rename(tmp_path / "aside")
         servers.until(lambda: not refused(client))
         again.process.terminate()
         again.wait()
         assert again.log.count("restore that folder") < 5, "each turn tells it again"
+
+
+def test_a_clock_that_is_ahead_is_told(tmp_path: Path) -> None:
+    with (
+        several(tmp_path, 1) as (server,),
+        client_of(server, shares=1) as client,
+        servers.raw_session(connect=server.endpoint) as session,
+    ):
+        assert client.status().warnings == ()
+        ahead_ms = (time.time_ns() + 90 * 10**9) // 10**6
+        token = session.liveliness().declare_token(lease_key(MAP, 2, (9, 9, 9), ahead_ms))
+        servers.until(lambda: "90 s ahead" in str(client.status().warnings))
+        token.undeclare()
 
 
 def test_what_a_shared_map_cannot_do_is_refused(tmp_path: Path) -> None:
