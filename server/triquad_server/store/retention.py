@@ -65,6 +65,11 @@ def files_of(checkpoints: Iterable[StoredCheckpoint]) -> dict[str, int]:
     return files
 
 
+def delete_unfinished(folder: Path) -> None:
+    """Delete files that were not written to their end."""
+    _delete([*folder.glob(_UNFINISHED), *PartFiles(folder).folder.glob(_UNFINISHED)])
+
+
 def delete_unneeded(
     folder: Path,
     settings: StoreSettings,
@@ -79,8 +84,8 @@ def delete_unneeded(
     file with a higher number is damaged, or not this server's, and must not push out a valid
     checkpoint. One that was set aside as damaged names its parts, too: the others can be saved.
     """
+    delete_unfinished(folder)
     parts = PartFiles(folder)
-    _delete([*folder.glob(_UNFINISHED), *parts.folder.glob(_UNFINISHED)])
     try:
         stored = {file: _read(file.path) for file in checkpoint_files(folder)}
         aside = [_read(path) for path in set_aside(folder)]

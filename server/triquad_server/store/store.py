@@ -41,7 +41,7 @@ from triquad_server.store.restore import (
     newest_valid,
     valid_checkpoint,
 )
-from triquad_server.store.retention import delete_unneeded
+from triquad_server.store.retention import delete_unfinished, delete_unneeded
 from triquad_server.store.scan_log import ScanLog
 from triquad_server.store.stored_regions import StoredRegions, write_regions
 
@@ -86,7 +86,7 @@ class Store:
                 f"store {self.folder} cannot be written to: {error.strerror or error}; choose "
                 "another --store, or let this user write there"
             ) from error
-        delete_unneeded(self.folder, self._settings)
+        delete_unfinished(self.folder)
 
     def log_scans(self, leaf_m: float) -> None:
         """Keep scans, too, from the newest checkpoint on; ``leaf_m`` is the side of a voxel."""

@@ -11,8 +11,11 @@ from support import hall, servers
 from support.maps.drifted import SETTINGS
 from triquad_client import Client, Intrinsics, Pose, RefusedError
 from triquad_format.records.arrays import Doubles
+from triquad_server.settings.loading import load_settings
 
 SCANS = 36
+WIDE = load_settings(servers.SMALL_FILE, ["field.depth=10"])
+"""Wrong poses spread scans over a kilometre: fewer regions take less time."""
 Meant = Callable[[Doubles], Doubles]
 CAMERA = Intrinsics(60.0, 60.0, 39.5, 29.5)
 OPTICAL = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # a camera that looks ahead
@@ -101,13 +104,13 @@ def assert_told(told: str, client: Client) -> None:
 def test_poses_of_another_meaning_are_told_with_the_remedy(
     drive: Callable[[Client, Meant], None], meant: Meant, told: str
 ) -> None:
-    with servers.service_and_client() as client:
+    with servers.service_and_client(WIDE) as client:
         drive(client, meant)
         assert_told(told, client)
 
 
 def test_points_in_the_map_frame_are_told_with_the_remedy() -> None:
-    with servers.service_and_client() as client:
+    with servers.service_and_client(WIDE) as client:
         drive_lidar(client, as_it_is, in_map=True)
         assert_told("rays begin elsewhere: give points in the frame of the sensor", client)
 

@@ -3,6 +3,7 @@ import os
 import random
 from contextlib import closing, suppress
 
+from support.files.growing_store import changes
 from support.files.store_writer import KEPT, record_at, write_for_ever
 from support.maps.map_records import assert_same
 from triquad_format.mapfile.checkpoint_folder import PartFiles, checkpoint_files
@@ -55,7 +56,9 @@ def test_whenever_the_writer_is_killed_all_that_was_acknowledged_is_there(tmp_pa
         assert_same(read_map(file.path), record_at(file.epoch))
     assert not list((tmp_path / "lab").glob("*.damaged"))
     parts = PartFiles(tmp_path / "lab")
+    with closing(Store(tmp_path, "lab", StoreSettings(keep=KEPT))) as store:
+        store.write(*changes(record_at(epoch + 1)))
+        files = checkpoint_files(store.folder)
     named = {e.name for file in files for e in open_manifest(file).entries}
-    with closing(Store(tmp_path, "lab", StoreSettings(keep=KEPT))):
-        assert parts.names() == named, "parts stay that no checkpoint names, or others are gone"
-        assert len(list(parts.folder.iterdir())) == len(named)
+    assert parts.names() == named, "parts stay that no checkpoint names, or others are gone"
+    assert len(list(parts.folder.iterdir())) == len(named)
