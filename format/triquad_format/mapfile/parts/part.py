@@ -157,9 +157,11 @@ def shuffle_counts(counts: Longs) -> Bytes:
 
 def unshuffle_counts(planes: Bytes) -> Longs:
     """Invert :func:`shuffle_counts`; it takes at most seven rows."""
-    wide = np.zeros((8, planes.shape[1]), np.uint8)
-    wide[: len(planes)] = planes
-    return unshuffle(wide, "<i8").astype(np.int64)
+    counts = np.zeros(planes.shape[1], np.int64)
+    for plane in planes[::-1]:
+        counts <<= 8
+        counts |= plane
+    return counts
 
 
 def split_integers(integers: NDArray[np.int16]) -> NDArray[np.int8]:
