@@ -22,7 +22,7 @@ from support.recordings.point_files import columns, write_ply
 from support.recordings.trajectories import write_tum
 from triquad_client import Mesh
 from triquad_client.pose import Pose
-from triquad_tools.commands import demo, map_recording
+from triquad_tools.commands import demo, keys, map_recording
 
 from bench.clients.server_process import free_port
 
@@ -42,14 +42,11 @@ ELSEWHERE = {
     "--preset indoor --intrinsics": "of images: tests/tools/recordings/test_depth_folder.py",
     "--odometry": "of a drive without poses: tests/tools/odometry/test_odometry.py",
     "triquad-eval paper": "of minutes: tests/tools/commands/test_paper.py",
-    "robot keys": "goes on with the command before: tests/tools/commands/test_keys.py",
-    "viewer keys": "goes on with the command before: tests/tools/commands/test_keys.py",
     "--config keys": "goes on with the command before: tests/attacks",
     "--cluster": "of processes that share the work: tests/tools/commands/test_map_batch.py",
     "triquad-view drive.triquad": "shows a map file, as map.triquad is shown",
     "--align": "of two frames: tests/tools/commands/test_pack_merge.py",
     "--share": "of two servers: tests/end_to_end/process/test_shared_map.py",
-    "--settings FILE.toml": "of a file of the reader's: tests/server/settings",
     "--at 2026": "of a store that old: tests/tools/mapfiles/test_checkpoint_history.py",
     "epoch-000000015": "shows what it prints: tests/tools/commands/test_inspect.py",
 }
@@ -77,6 +74,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         _write_recordings(path)
         assert map_recording.main(["RECORDING", "west.triquad", "--training"]) == 0
         shutil.copy("west.triquad", "east.triquad")
+        shutil.copy(servers.SMALL_FILE, "FILE.toml")
         whole = (path / "IN").read_bytes()
         for name in ("BROKEN", "broken.triquad"):
             (path / name).write_bytes(whole[: len(whole) - 1000])
@@ -118,6 +116,8 @@ def test_commands_do_what_the_pages_show(
     monkeypatch.chdir(tmp_path)
     command, *words = shlex.split(line, comments=True)
     words = [endpoint if word in ENDPOINTS else word for word in words]
+    if command == "triquad-keys" and words[0] != "init":
+        assert keys.main(["init", "keys"]) == 0
     if command == "triquad-server":
         _serve(words)
     elif command == "triquad-view":
