@@ -25,12 +25,15 @@ from support.server_records import METRICS, STATUS, later, operation
 from support.terminal import Terminal, terminal
 from triquad_client import Client, ServerMetrics, ServerStatus
 from triquad_format.wire.metrics_messages import QueueMetrics, SourceMetrics
+from triquad_server.settings.loading import load_settings
 from triquad_tools.commands.top import main
 from triquad_tools.console.amounts import count, duration, millimetres, rate, size
 from triquad_tools.work.top import Sample, page
 
 CODE = "import sys; from triquad_tools.commands.entry_points import top; sys.exit(top())"
 CAUSE = "source 'camera': range_min_m = 1.5 drops 12 % of its points: set scan.range_min_m to less"
+ROOMY = load_settings(servers.SMALL_FILE, ["memory.max_bytes=16_000_000_000"])
+"""For the process of the tests, in which other tests may have left much."""
 COUNTS = st.integers(0, 10**12)
 EXTREMES: dict[type, tuple[Any, ...]] = {
     bool: (True, False),
@@ -168,7 +171,7 @@ def no_width_of_the_tests(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    with servers.running_service(store=tmp_path_factory.mktemp("store")) as endpoint:
+    with servers.running_service(ROOMY, store=tmp_path_factory.mktemp("store")) as endpoint:
         yield endpoint
 
 
