@@ -52,7 +52,7 @@ class Health:
     epochs: EpochHistory
     checkpoints: CheckpointWriter
     memory: MemoryShare
-    # What tells more warnings.
+    # These give warnings of their own, such as of regions that cannot be taken.
     warned_by: list[Callable[[], Iterable[str]]] = field(default_factory=list)
     started_s: float = field(default_factory=time.monotonic)  # monotonic
 

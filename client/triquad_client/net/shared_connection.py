@@ -196,7 +196,7 @@ class SharedConnection(Connection):
             raise RefusedError(
                 error.code,
                 f"server {number} has not reset, and others may have: reset again once it can "
-                f"({error})",
+                f"({error.message})",
             ) from error
 
     def _counted(self, epoch: int, parts: Sequence[Part[Any]], replies: list[Any]) -> int:

@@ -21,7 +21,7 @@ from triquad_server.errors import NoRoomYetError, ScanRefusedError
 from triquad_server.sharing.contests import Contests
 from triquad_server.sharing.seen_stores import SeenStores
 
-_CLOCKS_AGREE_S = 1.0
+_CLOCKS_AGREE_S = 1.0  # by which clocks may differ: epochs and leases are numbered by them
 
 
 def now_ms() -> int:
@@ -51,7 +51,7 @@ class Leases:
         self._tokens: dict[RegionIndex, zenoh.LivelinessToken] = {}
         self._own: list[zenoh.LivelinessToken] = []
         self._is_closed = False
-        self._ahead_s: dict[int, float] = {}  # by how much the clocks of others are
+        self._ahead_s: dict[int, float] = {}  # by how much the clocks of others are ahead
         self._shares.add(share_key(map_name, number))
         self._subscriber = self._liveliness.declare_subscriber(
             shares_key(map_name),
@@ -197,19 +197,22 @@ class Leases:
             self.is_taken |= not self._own
             return
         if sample.kind == zenoh.SampleKind.PUT:
-            self._see_clock(token)
+            if token.region is not None:
+                self._see_clock(token)
             self._shares.add(key)
             if token.region in self._tokens:
                 self.contests.see(token.region, self._shares.holders(token.region))
         else:
+            if token.region is None:
+                self._ahead_s.pop(token.number, None)
             self.stores.one_has_gone()
             self._shares.remove(key)
         self.changed.set()
 
     def _see_clock(self, token: ShareToken) -> None:
-        """See when another server says that it takes a region: that is now, or before."""
+        """See when another server says that it took a region, which cannot be later than now."""
         ahead_s = (token.since_ms - now_ms()) / 1e3
         if ahead_s > _CLOCKS_AGREE_S:
             self._ahead_s[token.number] = ahead_s
-        elif token.region is None:  # it has come, or gone
+        elif ahead_s > -_CLOCKS_AGREE_S:  # it was just now: the clocks agree by now
             self._ahead_s.pop(token.number, None)

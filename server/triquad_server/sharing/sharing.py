@@ -10,7 +10,7 @@ it; the others write it to their stores and give it away, and the first learns f
 import logging
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 
 from triquad_format.errors import FormatError
 from triquad_format.records.field_settings import RegionIndex
@@ -35,6 +35,7 @@ _log = logging.getLogger(__name__)
 
 _TURN_S = 0.5  # after which it is looked again what others have
 _SEEN_S = 1.0  # until others have seen a checkpoint: so long what it lists is not given away
+_TOLD = 8  # problems that the status tells
 _RESTS_S = 10.0  # for which no scan has reached a region that is given away
 
 
@@ -79,8 +80,9 @@ class Sharing:
     def warnings(self) -> list[str]:
         """Return what keeps this server from sharing the map as it should."""
         stores = self._leases.stores
-        problems = [self._problem, stores.problem, *list(stores.unreadable.values())]
-        return [*filter(None, problems), *self._leases.clock_problems()]
+        told = [*filter(None, [self._problem, stores.problem]), *stores.unreadable.values()]
+        more = [f"{len(told) - _TOLD} more regions cannot be taken"] if len(told) > _TOLD else []
+        return [*told[:_TOLD], *more, *self._leases.clock_problems()]
 
     def _run(self) -> None:
         self._leases.appear()
@@ -92,17 +94,19 @@ class Sharing:
             self._try()
 
     def _try(self) -> None:
-        before, self._problem = self._problem, ""
+        problem = ""
         try:
             self._turn()
         except MapperStoppedError:
             _log.debug("no regions are taken or given any more: mapping has ended")
         except (StoreError, OSError) as error:
-            self._problem = f"regions are not taken or given: {error}"
-            if self._problem != before:
-                _log.error("%s", self._problem)
+            problem = f"regions are not taken or given: {error}"
+            if problem != self._problem:
+                _log.error("%s", problem)
         except Exception:
+            problem = "regions are not taken or given: an internal error; the log has the details"
             _log.exception("regions are not taken or given")
+        self._problem = problem
 
     def _turn(self) -> None:
         self._see()
@@ -142,8 +146,9 @@ class Sharing:
         self, newest: Mapping[RegionIndex, ColdRegion], awaited: set[RegionIndex]
     ) -> None:
         unreadable = self._leases.stores.unreadable
-        for index in unreadable.keys() - newest.keys():
-            unreadable.pop(index, None)  # its folder was moved away
+        for index in list(unreadable):
+            if index not in newest or self._leases.holders(index):
+                unreadable.pop(index, None)  # its folder was moved away, or another could read it
         for index in sorted(newest, key=lambda index: index not in awaited):
             if self._leases.is_free(index):
                 try:
@@ -206,31 +211,23 @@ class Sharing:
         wanted = contest.regions & self._leases.held
         if not wanted:
             return  # it is the other one that keeps them
-        self._checkpoints.write()  # so that the own log has all scans until now
-        known = {_name_of(scan) for scan in self._kept(self._leases.number, contest.since_ms)}
         learnt = 0
-        for scan in self._kept(contest.number, contest.since_ms):
-            if self._leases.changed.is_set():  # a scan may wait for a region
-                self._leases.changed.clear()
-                self._see()
-            if _name_of(scan) not in known:
-                learnt += self._learn(scan, wanted)
+        for segment in segments(self._stores.folder(contest.number) / LOG_NAME):
+            if segment.epoch < contest.since_ms:
+                continue
+            try:
+                for entry in read_segment(segment.path):
+                    if self._leases.changed.is_set():  # a scan may wait for a region
+                        self._leases.changed.clear()
+                        self._see()
+                    if isinstance(entry, LoggedScan):
+                        learnt += self._learn(entry, wanted)
+            except (FormatError, OSError) as error:
+                _log.error("scans of server %d cannot be read: %s", contest.number, error)
         _log.warning(
             "server %d had %d regions of this one, too: %d scans that it kept are taken in",
             *(contest.number, len(wanted), learnt),
         )
-
-    def _kept(self, number: int, since_ms: int) -> Iterator[LoggedScan]:
-        """Yield the scans that a server has kept since a time, or somewhat before."""
-        for segment in segments(self._stores.folder(number) / LOG_NAME):
-            if segment.epoch < since_ms:
-                continue
-            try:
-                for entry in read_segment(segment.path):
-                    if isinstance(entry, LoggedScan):
-                        yield entry
-            except (FormatError, OSError) as error:
-                _log.error("scans of server %d cannot be read: %s", number, error)
 
     def _learn(self, scan: LoggedScan, wanted: frozenset[RegionIndex]) -> bool:
         """Take in a scan where it reaches regions; return whether it does."""
@@ -262,8 +259,3 @@ class Sharing:
                 _log.debug("a scan of another server is not used: %s", error)
                 return False
         return False
-
-
-def _name_of(scan: LoggedScan) -> tuple[str, int, bytes]:
-    """Return what the logs of two servers have alike of a scan that both took in."""
-    return scan.source, scan.stamp_ns, scan.world_from_sensor.tobytes()

@@ -6,7 +6,11 @@ from contextlib import closing
 from pathlib import Path
 
 from triquad_format.errors import DamagedMapFileError, FormatError
-from triquad_format.mapfile.checkpoint_folder import CheckpointFile, checkpoint_files
+from triquad_format.mapfile.checkpoint_folder import (
+    CheckpointFile,
+    PartFiles,
+    checkpoint_files,
+)
 from triquad_format.mapfile.index import Checkpoint, read_checkpoint
 from triquad_format.records.field_settings import FieldSettings, RegionIndex
 from triquad_format.wire.shares import share_number
@@ -173,7 +177,8 @@ class Stores:
         for number in gone:
             store = self._others[number]
             owners = {index: next(iter(leases.holders(index)), number) for index in store.known}
-            if number not in owners.values():
+            is_empty = not store.epoch and not PartFiles(self.folder(number)).names()
+            if (store.epoch or is_empty) and number not in owners.values():
                 own = self._own.versions()
                 if all(
                     self._version_at(owner, index, own) >= version_of(store.known[index])

@@ -241,6 +241,7 @@ class CheckpointWriter:
             _log.warning("how far back poses can be corrected is not known: %s", error)
 
     def _write_regularly(self) -> None:
+        self._try(self._tidy)
         period_s = self._period_s or math.inf
         due_s = time.monotonic() + period_s
         while not self._stopping.wait(min(_LOOK_S, max(0.0, due_s - time.monotonic()))):
@@ -249,6 +250,12 @@ class CheckpointWriter:
             if time.monotonic() >= due_s:
                 due_s = time.monotonic() + period_s  # from the beginning of one to the next
                 self._try(self.write)
+
+    def _tidy(self) -> None:
+        """Delete what a server that was killed has left."""
+        with self.writing:
+            if self.store is not None:
+                self.store.tidy()
 
     def _try(self, write: Callable[[], object]) -> None:
         try:

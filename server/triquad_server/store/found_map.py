@@ -10,7 +10,7 @@ from pathlib import Path
 from triquad_format.errors import SettingsError
 from triquad_format.records.field_settings import RegionIndex
 from triquad_format.records.region import MapRecord
-from triquad_format.wire.shares import MAX_SHARES, share_name
+from triquad_format.wire.shares import MAX_SHARES, number_of_share, share_name
 from triquad_map.compiled.team import Split
 
 from triquad_server.epochs.cold_region import ColdRegion
@@ -120,7 +120,11 @@ def find_share(
 
 def _check_alone(root: Path, name: str) -> None:
     """Raise :class:`StoreError` where a map of this name is in the folders of several servers."""
-    shared = [str(folder) for folder in root.glob(f"{name}.[0-9]*") if is_share_folder(folder)]
+    shared = [
+        str(folder)
+        for folder in root.glob(f"{name}.*")
+        if number_of_share(name, folder.name) is not None and is_share_folder(folder)
+    ]
     if shared:
         raise StoreError(
             f"map {name!r} is shared, in {', '.join(sorted(shared))}: start with --share, or have "

@@ -309,10 +309,14 @@ class Store:
         )
         self._newest, self._facts, self._is_whole = manifest, facts, True
         self.last = info
-        self._tidy(info.epoch)
+        self.tidy(info.epoch)
         return info
 
-    def _tidy(self, newest: int | None = None) -> None:
+    def tidy(self, newest: int | None = None) -> None:
+        """Delete parts that nothing needs, and older checkpoints than ``newest``, if it is given.
+
+        How many of these stay, the settings say.
+        """
         delete_unneeded(self.folder, self._settings, newest, also_needed=self.regions.part_names)
 
     @contextmanager
@@ -326,7 +330,7 @@ class Store:
             self._lock.renew()
             yield
         except (FormatError, OSError) as error:
-            self._tidy()
+            self.tidy()
             raise StoreError(f"{failure}: {error}{hint()}") from error
 
 

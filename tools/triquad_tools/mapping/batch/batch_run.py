@@ -49,8 +49,8 @@ class BatchRun:
         """Return the map, once all regions have settled.
 
         Args:
-            training: it has the state that further training needs, which takes three times as much
-                memory as the map.
+            training: it has the state that further training needs: then it takes four times as
+                much memory.
 
         Raises:
             ToolError: a worker cannot do it, or the poses go on in another frame.
@@ -165,6 +165,6 @@ def _results(futures: Iterable["Future[Any]"]) -> Iterator[Any]:
         ) from error
     except CancelledError as error:
         raise ToolError(
-            "the scheduler of Dask is gone: start it and its workers again, and the same command "
-            f"does what is left ({error})"
+            "the scheduler of Dask is gone, or has dropped the work: start it and its workers "
+            f"again, and the same command does what is left ({error})"
         ) from error
