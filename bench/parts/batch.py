@@ -23,7 +23,8 @@ from bench.street_pieces import PIECE_M, REACH_M, mean_f_score
 _LENGTH_M, _STEP_M, _EACH_M = 4000.0, 4.0, 200.0  # from a scored piece to the next
 _SETTINGS = (
     *("--set", "training.samples_per_ray=6"),  # of 48: hours are not needed for a ratio
-    *("--set", "memory.max_bytes=12000000000"),  # one process has all of it in memory
+    *("--set", "memory.max_bytes=12000000000"),  # one process has all of it in memory,
+    *("--set", "training.pool_bytes=3000000000"),  # and keeps as many rays as workers do
 )
 _PROGRAM = "from triquad_tools.commands.map_recording import main; raise SystemExit(main())"
 _POLL_S = 0.2
