@@ -6,7 +6,7 @@
 # make pretrained   train the MLP that regions begin with, on simulated streets: 10 minutes
 # make bench     how fast and how good triquad is on this machine; PART=core: one part of it
 # make campaign  try for 5 minutes to break a server and its files; CAMPAIGN_MINUTES=60: for an hour
-# make paper    the experiments of the 3QFP paper in simulated worlds, for docs/paper.md: half an hour
+# make paper    the experiments of the 3QFP paper in simulated worlds, for docs/paper.md: 45 minutes
 # make wheel     build sdist and wheel, and try them in a clean environment; PYTHON=python3.12
 # make demo      set up a virtual environment and map a street, end to end
 VENV ?= .venv
