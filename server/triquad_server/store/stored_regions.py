@@ -21,7 +21,6 @@ from triquad_server.epochs.cold_region import ColdRegion, RegionCache
 _log = logging.getLogger(__name__)
 
 _FEATURE_DTYPE = "<f2"
-_PARTS_EACH = 8  # that a thread reads at least: some 4 ms of a street, on an EPYC
 
 
 class StoredRegions:
@@ -46,7 +45,6 @@ class StoredRegions:
         self._is_foreign = is_foreign
         self.folder = folder
         self._parts = PartFiles(folder)
-        self._split = split
         self.facts = MapRecord("none", 0, FieldSettings(), ())  # without regions
         self.cache = RegionCache(self._read, cache_bytes, split)
         self.known: Mapping[RegionIndex, ColdRegion] = {}
@@ -129,14 +127,7 @@ class StoredRegions:
 
     def _assembled(self, region: ColdRegion, topics: Collection[str]) -> MapRecord:
         entries = tuple(one for one in region.entries if one.key.topic in topics)
-        payloads = dict.fromkeys(entries, b"")
-
-        def read(first: int, last: int) -> None:
-            for entry in entries[first:last]:
-                payloads[entry] = self._parts.payload(entry)
-
-        self._split(len(entries), read, least=_PARTS_EACH)
-        return assemble(Manifest(self.facts, 0, entries), payloads.pop)
+        return assemble(Manifest(self.facts, 0, entries), self._parts.payload)
 
     def take_older(self, region: ColdRegion) -> bool:
         """Have a region be as the newest checkpoint has it that has it whole, if there is any.
